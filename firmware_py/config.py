@@ -1,0 +1,172 @@
+"""The constants that are flashed: one section per part of the flight core, filled from a profile.
+
+No value has a default here: a profile states them all, with their reasons. Units are SI, angles in radians.
+"""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from firmware_py.core.structs import HORIZON_LIMIT, Parameters
+from firmware_py.core.subset import Block
+
+Gain = Annotated[float, Field(ge=-20, le=20)]
+Coupling = Annotated[float, Field(ge=-5000, le=5000)]
+Variance = Annotated[float, Field(gt=0, le=100)]
+Trim = Annotated[float, Field(ge=-12000, le=12000)]
+
+
+class Section(BaseModel):
+    """A strict, immutable part of the configuration."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ModelConfig(Section):
+    """The linear model on board: the paper's f_{affected, influencing} at hover, couplings to vx and vy included."""
+
+    flap_rate: float = Field(gt=1, le=1000, description="inverse time constant of servo and linkage [1/s]")
+    roll_u1: Coupling = Field(description="roll acceleration per u1 [1/s^2]")
+    roll_roll: Coupling = Field(description="roll acceleration per roll [1/s^2]")
+    roll_rate: Coupling = Field(description="roll acceleration per roll rate [1/s]")
+    roll_vy: Coupling = Field(description="roll acceleration per velocity to the left [rad/s/m]")
+    y_u1: Coupling = Field(description="y acceleration per u1 [m/s^2/rad]")
+    y_roll: Coupling = Field(description="y acceleration per roll [m/s^2/rad]")
+    y_vy: Coupling = Field(description="y acceleration per y velocity [1/s]")
+    pitch_u2: Coupling = Field(description="pitch acceleration per u2 [1/s^2]")
+    pitch_pitch: Coupling = Field(description="pitch acceleration per pitch [1/s^2]")
+    pitch_rate: Coupling = Field(description="pitch acceleration per pitch rate [1/s]")
+    pitch_vx: Coupling = Field(description="pitch acceleration per x velocity [rad/s/m]")
+    x_u2: Coupling = Field(description="x acceleration per u2 [m/s^2/rad]")
+    x_pitch: Coupling = Field(description="x acceleration per pitch [m/s^2/rad]")
+    x_vx: Coupling = Field(description="x acceleration per x velocity [1/s]")
+    yaw_u3: Coupling = Field(description="yaw acceleration per u3 [1/s^2]")
+    yaw_rate: Coupling = Field(description="yaw acceleration per yaw rate [1/s]")
+    z_u4: Coupling = Field(description="z acceleration per u4 [m/s^2/rad]")
+    z_vz: Coupling = Field(description="z acceleration per z velocity [1/s]")
+
+
+class EstimatorConfig(Section):
+    """Noise, gate and bounds of the Kalman filter."""
+
+    process_position: Variance = Field(description="variance per 10 ms tick [m^2]")
+    process_velocity: Variance = Field(description="variance per tick [m^2/s^2]")
+    process_attitude: Variance = Field(description="variance per tick [rad^2]")
+    process_rate: Variance = Field(description="variance per tick [rad^2/s^2]")
+    process_flap: Variance = Field(description="variance per tick [rad^2]")
+    measured_position: Variance = Field(description="variance of a mocap position [m^2]")
+    measured_attitude: Variance = Field(description="variance of a mocap angle [rad^2]")
+    measured_rate: Variance = Field(description="variance of a gyro sample, mean of 10 [rad^2/s^2]")
+    gate_sigma: float = Field(gt=1, le=100, description="innovation gate [standard deviations]")
+    gate_position: float = Field(gt=0, le=10, description="the gate never refuses less than this [m]")
+    gate_attitude: float = Field(gt=0, le=4, description="the gate never refuses less than this [rad]")
+    bound_position: float = Field(gt=0, le=10, description="bound on each position [m]")
+    bound_velocity: float = Field(gt=0, le=20, description="bound on each velocity [m/s]")
+    bound_tilt: float = Field(gt=0, le=1.5, description="bound on roll and pitch [rad]")
+    bound_rate: float = Field(gt=0, le=40, description="bound on body rates [rad/s]")
+
+
+class PredictorConfig(Section):
+    """Delay compensation."""
+
+    enabled: bool = Field(description="false: every pose counts as current, as in the original firmware")
+    age: Literal["measured", "fixed"] = Field(
+        description="measured: poses tell their age and the horizon follows; fixed: always `horizon` ticks"
+    )
+    horizon: int = Field(ge=1, le=HORIZON_LIMIT, description="first or fixed horizon [ticks of 10 ms]")
+    default_age_us: int = Field(ge=0, le=120_000, description="age of a pose that does not tell it [us]")
+
+
+class ControllerConfig(Section):
+    """Gains in the paper's signs: u = gain (target - estimate) - gains (velocity, attitude, rate)."""
+
+    gain_y: Gain = Field(description="u1 per y error [rad/m]")
+    gain_vy: Gain = Field(description="u1 per -vy [rad s/m]")
+    gain_roll: Gain = Field(description="u1 per -roll")
+    gain_p: Gain = Field(description="u1 per -p [s]")
+    gain_x: Gain = Field(description="u2 per x error [rad/m]")
+    gain_vx: Gain = Field(description="u2 per -vx [rad s/m]")
+    gain_pitch: Gain = Field(description="u2 per -pitch")
+    gain_q: Gain = Field(description="u2 per -q [s]")
+    gain_yaw: Gain = Field(description="u3 per yaw error")
+    gain_r: Gain = Field(description="u3 per -r [s]")
+    gain_z: Gain = Field(description="u4 per z error [rad/m]")
+    gain_vz: Gain = Field(description="u4 per -vz [rad s/m]")
+    gain_iz: Gain = Field(description="u4 per integral of the z error [rad/m/s]")
+    limit_xy: float = Field(gt=0, le=5, description="limit on the x and y errors [m]")
+    limit_u: float = Field(gt=0, le=1.5, description="limit on u1, u2 and u4 [rad]")
+    limit_u3: float = Field(gt=0, le=1.5, description="limit on u3 [rad]")
+    limit_iz: float = Field(ge=0, le=5, description="limit on the integral of the z error [m s]")
+
+
+class AllocationConfig(Section):
+    """Hover angle and range of the flaps, as openings (positive for every flap)."""
+
+    hover_angle: float = Field(ge=0, le=1.2, description="opening at hover, theta_H [rad]")
+    opening_min: float = Field(ge=-1, le=1.5, description="least opening [rad]")
+    opening_max: float = Field(ge=-1, le=1.5, description="greatest opening [rad]")
+
+
+class ServoConfig(Section):
+    """Trim and direction of the four servo outputs."""
+
+    trim: tuple[Trim, Trim, Trim, Trim] = Field(description="added to the 16-bit word, 31290 per rad")
+    direction: tuple[Literal[-1, 1], Literal[-1, 1], Literal[-1, 1], Literal[-1, 1]] = Field(
+        description="sense of rotation"
+    )
+
+
+class SupervisorConfig(Section):
+    """When the loop is closed."""
+
+    pose_timeout_us: int = Field(
+        ge=20_000, le=5_000_000, description="silence after which the flaps go to hover [us]"
+    )
+
+
+Cost = Annotated[int, Field(ge=0, le=100_000)]
+
+
+class CpuConfig(Section):
+    """Processor time that the tasks take on the 168 MHz Cortex-M4F; all zero switches the model off."""
+
+    sensors_us: Cost = Field(description="SENSORS, per IMU sample [us]")
+    stabilizer_us: Cost = Field(description="STABILIZER, per tick without the controller [us]")
+    controller_us: Cost = Field(description="STABILIZER, controller and servo mapping, per 100 Hz step [us]")
+    kalman_us: Cost = Field(description="KALMAN, per tick without a step [us]")
+    estimator_us: Cost = Field(description="KALMAN, per 100 Hz step [us]")
+    syslink_us: Cost = Field(description="SYSLINK, per packet [us]")
+    crtp_us: Cost = Field(description="CRTP-RX and CRTP-TX, per packet [us]")
+    log_us: Cost = Field(description="LOG, per telemetry packet [us]")
+
+
+class FirmwareConfig(Section):
+    """Everything that is flashed."""
+
+    model: ModelConfig
+    estimator: EstimatorConfig
+    predictor: PredictorConfig
+    controller: ControllerConfig
+    allocation: AllocationConfig
+    servo: ServoConfig
+    supervisor: SupervisorConfig
+    cpu: CpuConfig
+
+
+GYRO_SCALE = 2000.0 / 32768.0 * 3.141592653589793 / 180.0  # [rad/s per count] BMI088 at +-2000 deg/s
+
+
+def parameters_of(config: FirmwareConfig) -> Block:
+    """Return the core's parameter block for a configuration."""
+    block = Parameters.allocate()
+    values: dict[str, Any] = {"gyro_scale": GYRO_SCALE}
+    for section in (config.model, config.estimator, config.controller, config.allocation, config.servo):
+        values.update(section.model_dump())
+    predictor = config.predictor
+    values["predict"] = int(predictor.enabled)
+    values["age_measured"] = int(predictor.age == "measured")
+    values["horizon"] = predictor.horizon
+    values["default_age_us"] = predictor.default_age_us
+    for name, value in values.items():
+        block.memory[name] = value
+    return block
