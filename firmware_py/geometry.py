@@ -1,0 +1,94 @@
+"""Attitudes as plain Python floats: quaternions, Euler angles, rotations.
+
+Quaternions are Hamilton, `(w, x, y, z)`, of unit length; `q_WB` turns a vector's B coordinates into W
+coordinates. Euler angles are zyx (yaw about z, then pitch about the new y, then roll about the new x) in rad.
+Single attitudes are tuples because one numpy call costs more than the arithmetic; a whole flight's attitudes
+are converted as one array.
+"""
+
+from math import asin, atan2, cos, pi, remainder, sin, tau
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+def multiply(q_AB: Quaternion, q_BC: Quaternion) -> Quaternion:
+    """`q_AC`: the rotation `q_BC` followed by `q_AB`."""
+    aw, ax, ay, az = q_AB
+    bw, bx, by, bz = q_BC
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def conjugate(q_AB: Quaternion) -> Quaternion:
+    """`q_BA`, the opposite rotation."""
+    w, x, y, z = q_AB
+    return (w, -x, -y, -z)
+
+
+def rotate(q_AB: Quaternion, v_B: Vector) -> Vector:
+    """`v_A`, the coordinates in A of the vector `v_B`."""
+    w, x, y, z = q_AB
+    a, b, c = v_B
+    # v + 2 w (u x v) + 2 u x (u x v), u = (x, y, z)
+    tx = 2.0 * (y * c - z * b)
+    ty = 2.0 * (z * a - x * c)
+    tz = 2.0 * (x * b - y * a)
+    return (a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx)
+
+
+def rotation_matrix(q_AB: Quaternion) -> NDArray[np.float64]:
+    """`R_AB`, (3, 3), with `v_A = R_AB @ v_B`."""
+    return np.array([rotate(q_AB, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]).T
+
+
+def yaw_quaternion(yaw: float) -> Quaternion:
+    """The rotation by `yaw` about z."""
+    return (cos(0.5 * yaw), 0.0, 0.0, sin(0.5 * yaw))
+
+
+def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """The attitude with these zyx angles."""
+    cr, sr = cos(0.5 * roll), sin(0.5 * roll)
+    cp, sp = cos(0.5 * pitch), sin(0.5 * pitch)
+    cy, sy = cos(0.5 * yaw), sin(0.5 * yaw)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def to_euler_zyx(q: Quaternion) -> Vector:
+    """`(roll, pitch, yaw)`: roll and yaw in -pi..pi, pitch in -pi/2..pi/2 (where roll and yaw merge)."""
+    w, x, y, z = q
+    return (
+        atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z),
+        asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))),
+        atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z),
+    )
+
+
+def euler_zyx_of(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`to_euler_zyx` for a whole flight: quaternions (N, 4) to roll, pitch, yaw (N, 3) [rad]."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return np.stack((roll, pitch, yaw), axis=1)
+
+
+def wrap_angle(angle: float) -> float:
+    """The same direction in -pi..pi, pi itself included and -pi not."""
+    wrapped = remainder(angle, tau)
+    return pi if wrapped == -pi else wrapped

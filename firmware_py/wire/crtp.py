@@ -1,0 +1,137 @@
+"""CRTP, the Crazyflie's packet protocol: the header, the external pose, and log data.
+
+A packet is one header byte and up to 30 bytes of data, little-endian. Here the quaternion changes its order
+(x y z w on the wire, w x y z inside) and time its unit; everything inside is SI. Malformed bytes raise
+`WireError`; who receives them counts it. Sources: Bitcraze's CRTP documentation, cflib 0.1.34; the tests
+compare with cflib's own bytes.
+"""
+
+import struct
+from dataclasses import dataclass
+from math import isfinite
+
+from firmware_py.wire import WireError
+
+MAX_DATA = 30
+
+PORT_LOG = 5
+CHANNEL_LOG_DATA = 2
+PORT_LOCALISATION = 6
+CHANNEL_GENERIC = 1
+EXT_POSE = 8  # type byte of the generic localisation channel
+
+MAX_LOG_VALUES = 26  # 30 less the block's id and the time stamp
+LOG_TIME_MODULUS_MS = 1 << 24
+
+AGE_UNIT_US = 500
+AGE_MAX_CODE = 254  # and everything older: 127 ms
+AGE_UNKNOWN_CODE = 255
+
+_RESERVED_BITS = 0x0C  # set by cflib, ignored by everybody
+_POSE = struct.Struct("<B7f")
+_POSE_WITH_AGE = struct.Struct("<BB7fB")
+_LOG_HEAD = struct.Struct("<BBHB")
+_MIN_NORM2, _MAX_NORM2 = 0.9**2, 1.1**2
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One CRTP packet: port 0..15, channel 0..3, 0..30 bytes of data."""
+
+    port: int
+    channel: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class PoseMessage:
+    """The body's pose in the goal frame as it was `age_us` before the message arrived."""
+
+    p_GB: tuple[float, float, float]  # [m]
+    q_GB: tuple[float, float, float, float]  # w x y z, length 0.9..1.1
+    age_us: int | None  # None: the sender does not know
+
+
+def header(port: int, channel: int) -> int:
+    """The header byte as cflib sends it."""
+    return port << 4 | _RESERVED_BITS | channel
+
+
+def encode(packet: Packet) -> bytes:
+    """The bytes of any packet."""
+    if len(packet.data) > MAX_DATA:
+        raise WireError(f"{len(packet.data)} bytes of data: at most {MAX_DATA} fit a CRTP packet")
+    return bytes((header(packet.port, packet.channel),)) + packet.data
+
+
+def decode(raw: bytes) -> Packet:
+    """The packet in `raw`; its reserved header bits are ignored."""
+    if not 1 <= len(raw) <= 1 + MAX_DATA:
+        raise WireError(f"a CRTP packet of {len(raw)} bytes: 1..{1 + MAX_DATA} are possible")
+    return Packet(raw[0] >> 4, raw[0] & 3, raw[1:])
+
+
+_POSE_HEADER = header(PORT_LOCALISATION, CHANNEL_GENERIC)
+_LOG_HEADER = header(PORT_LOG, CHANNEL_LOG_DATA)
+
+
+def encode_ext_pose(
+    p_GB: tuple[float, float, float], q_GB: tuple[float, float, float, float], age_us: int | None
+) -> bytes:
+    """The complete packet of cflib's `send_extpose` and one more byte, the age.
+
+    Stock firmware reads the pose and ignores the byte behind it. Raises `WireError` for a pose that the
+    receiver would refuse.
+    """
+    _check_pose(p_GB, q_GB)
+    x, y, z = p_GB
+    qw, qx, qy, qz = q_GB
+    try:
+        return _POSE_WITH_AGE.pack(_POSE_HEADER, EXT_POSE, x, y, z, qx, qy, qz, qw, _age_code(age_us))
+    except OverflowError as error:
+        raise WireError(f"position {p_GB} m: outside float32") from error
+
+
+def decode_ext_pose(data: bytes) -> PoseMessage:
+    """The pose in the data of a generic localisation packet; without an age byte the age is unknown."""
+    if len(data) < _POSE.size or data[0] != EXT_POSE:
+        raise WireError(f"not an external pose: {data.hex()}")
+    _, x, y, z, qx, qy, qz, qw = _POSE.unpack_from(data)
+    p_GB, q_GB = (x, y, z), (qw, qx, qy, qz)
+    _check_pose(p_GB, q_GB)
+    code = data[_POSE.size] if len(data) > _POSE.size else AGE_UNKNOWN_CODE
+    return PoseMessage(p_GB, q_GB, None if code == AGE_UNKNOWN_CODE else code * AGE_UNIT_US)
+
+
+def encode_log_data(block_id: int, timestamp_ms: int, values: bytes) -> bytes:
+    """The complete packet with a log block's values, at most 26 bytes; the time stamp wraps after 2^24 ms."""
+    if len(values) > MAX_LOG_VALUES:
+        raise WireError(f"log block {block_id}: {len(values)} bytes of values, at most {MAX_LOG_VALUES} fit")
+    try:
+        head = _LOG_HEAD.pack(_LOG_HEADER, block_id, timestamp_ms & 0xFFFF, timestamp_ms >> 16 & 0xFF)
+    except struct.error as error:
+        raise WireError(f"log block {block_id}: the number must be 0..255") from error
+    return head + values
+
+
+def decode_log_data(data: bytes) -> tuple[int, int, bytes]:
+    """`(block id, time stamp [ms], values)` from the data of a log data packet."""
+    if len(data) < 4:
+        raise WireError(f"log data of {len(data)} bytes: at least 4 are needed")
+    return data[0], int.from_bytes(data[1:4], "little"), data[4:]
+
+
+def _age_code(age_us: int | None) -> int:
+    """Half milliseconds, rounded, held at 0 and 254."""
+    if age_us is None:
+        return AGE_UNKNOWN_CODE
+    return max(0, min(AGE_MAX_CODE, (age_us + AGE_UNIT_US // 2) // AGE_UNIT_US))
+
+
+def _check_pose(p_GB: tuple[float, float, float], q_GB: tuple[float, float, float, float]) -> None:
+    """Both ends refuse the same poses. The comparison is false for NaN and infinity, too."""
+    w, x, y, z = q_GB
+    if not _MIN_NORM2 <= w * w + x * x + y * y + z * z <= _MAX_NORM2:
+        raise WireError(f"quaternion {q_GB}: its length must be 0.9..1.1")
+    if not isfinite(p_GB[0] + p_GB[1] + p_GB[2]):
+        raise WireError(f"position {p_GB} m: must be finite")

@@ -1,0 +1,174 @@
+"""CRTP bytes against cflib, and the telemetry blocks over them."""
+
+import struct
+from contextlib import suppress
+from math import inf, nan
+
+import pytest
+from cflib.crazyflie.localization import Localization
+from cflib.crazyflie.log import LogConfig
+from cflib.crtp.crtpstack import CRTPPacket
+from hypothesis import given
+from hypothesis import strategies as st
+
+from firmware_py.wire import WireError, crtp, telemetry
+
+metres = st.floats(-100.0, 100.0, width=32)
+Q = (0.5, -0.5, 0.5, 0.5)
+
+
+class Recorder:
+    """Stands where cflib has its radio and keeps the bytes that would go there."""
+
+    def __init__(self):
+        self.sent = b""
+
+    def add_port_callback(self, port, callback):
+        pass
+
+    def send_packet(self, packet):
+        self.sent = bytes((packet.get_header(), *packet.data))
+
+
+def cflib_ext_pose(position, q_xyzw):
+    crazyflie = Recorder()
+    Localization(crazyflie).send_extpose(position, q_xyzw)
+    return crazyflie.sent
+
+
+@given(st.integers(0, 15), st.integers(0, 3), st.binary(max_size=30))
+def test_packets_are_cflibs(port, channel, data):
+    theirs = CRTPPacket()
+    theirs.set_header(port, channel)
+    theirs.data = data
+    raw = crtp.encode(crtp.Packet(port, channel, data))
+    assert raw == bytes((theirs.get_header(), *theirs.data))
+    assert crtp.decode(raw) == crtp.Packet(port, channel, data)
+
+
+@given(st.tuples(metres, metres, metres), st.integers(0, 200_000))
+def test_external_pose_is_cflibs_bytes_and_the_age(p, age_us):
+    ours = crtp.encode_ext_pose(p, (0.5, -0.5, 0.5, -0.5), age_us)
+    assert ours[:-1] == cflib_ext_pose(p, (-0.5, 0.5, -0.5, 0.5))
+    assert len(ours) == 1 + 30
+
+
+def test_external_pose_of_one_two_three_has_these_bytes():
+    golden = "6d08" + struct.pack("<7f", 1, 2, 3, -0.5, 0.5, 0.5, 0.5).hex()
+    assert cflib_ext_pose((1, 2, 3), (-0.5, 0.5, 0.5, 0.5)).hex() == golden
+    assert crtp.encode_ext_pose((1, 2, 3), Q, 40_000).hex() == golden + "50"
+
+
+@given(st.tuples(metres, metres, metres), st.integers(-1000, 1_000_000))
+def test_pose_survives_the_wire_with_its_age_to_half_a_unit(p, age_us):
+    message = crtp.decode_ext_pose(crtp.decode(crtp.encode_ext_pose(p, Q, age_us)).data)
+    assert (message.p_GB, message.q_GB) == (p, Q)
+    assert abs(message.age_us - min(max(age_us, 0), 127_000)) <= 250
+
+
+def test_stock_pose_has_no_age():
+    assert crtp.decode_ext_pose(cflib_ext_pose((1, 2, 3), (0, 0, 0, 1))[1:]).age_us is None
+    assert crtp.decode_ext_pose(crtp.encode_ext_pose((1, 2, 3), Q, None)[1:]).age_us is None
+
+
+@pytest.mark.parametrize(
+    ("p", "q"),
+    [
+        ((nan, 0, 0), Q),
+        ((0, inf, 0), Q),
+        ((inf, -inf, 0), Q),
+        ((0, 0, 0), (nan, 0, 0, 0)),
+        ((0, 0, 0), (0, 0, 0, 0)),
+        ((0, 0, 0), (0.89, 0, 0, 0)),
+        ((0, 0, 0), (0, 1.11, 0, 0)),
+    ],
+)
+def test_both_ends_refuse_a_pose_that_is_none(p, q):
+    with pytest.raises(WireError):
+        crtp.encode_ext_pose(p, q, 0)
+    with pytest.raises(WireError):
+        crtp.decode_ext_pose(struct.pack("<B7fB", 8, *p, *q[1:], q[0], 0))
+
+
+def test_position_beyond_float32_cannot_be_sent():
+    with pytest.raises(WireError, match="float32"):
+        crtp.encode_ext_pose((1e39, 0, 0), Q, 0)
+
+
+@given(st.binary(max_size=40))
+def test_any_bytes_decode_or_are_refused(raw):
+    for decode in (crtp.decode, crtp.decode_ext_pose, telemetry.decode_sample):
+        with suppress(WireError):
+            decode(raw)
+
+
+@pytest.mark.parametrize("raw", [b"", bytes(32)])
+def test_packet_of_impossible_length_is_refused(raw):
+    with pytest.raises(WireError):
+        crtp.decode(raw)
+
+
+@given(st.integers(0, 255), st.integers(0, 1 << 25), st.binary(max_size=26))
+def test_log_data_is_laid_out_as_cflib_reads_it(block_id, timestamp_ms, values):
+    # cflib/crazyflie/log.py: port 5, channel 2; id, then three bytes of time
+    packet = CRTPPacket(0, list(crtp.encode_log_data(block_id, timestamp_ms, values)))
+    raw = bytes(packet.data)
+    assert (raw[0] >> 4, raw[0] & 3, raw[1]) == (5, 2, block_id)
+    low, middle, high = struct.unpack("<BBB", raw[2:5])
+    assert low | middle << 8 | high << 16 == timestamp_ms % (1 << 24)
+    assert raw[5:] == values
+    assert crtp.decode_log_data(raw[1:]) == (block_id, timestamp_ms % (1 << 24), values)
+
+
+def test_more_than_fits_is_refused():
+    with pytest.raises(WireError):
+        crtp.encode_log_data(1, 0, bytes(27))
+    with pytest.raises(WireError):
+        crtp.encode(crtp.Packet(0, 0, bytes(31)))
+
+
+@pytest.mark.parametrize("block", telemetry.BLOCKS, ids=lambda block: f"block{block.id}")
+def test_block_fits_a_packet_and_comes_back(block):
+    values = tuple(range(1, 1 + len(block.variables)))
+    raw = telemetry.encode_sample(block, 123_456, values)
+    assert len(raw) <= 31
+    assert telemetry.decode_sample(crtp.decode(raw).data) == telemetry.Sample(block, 123_456, values)
+
+
+@pytest.mark.parametrize("block", telemetry.BLOCKS, ids=lambda block: f"block{block.id}")
+def test_cflib_reads_the_block(block):
+    names = {
+        telemetry.LogType.U8: "uint8_t",
+        telemetry.LogType.U16: "uint16_t",
+        telemetry.LogType.F32: "float",
+    }
+    config = LogConfig("theirs", telemetry.PERIOD_MS)
+    for variable in block.variables:
+        config.add_variable(variable.name, names[variable.type])
+    received = {}
+    config.data_received_cb.add_callback(lambda timestamp, data, config: received.update(data))
+    values = tuple(range(1, 1 + len(block.variables)))
+    config.unpack_log_data(telemetry.encode_sample(block, 0, values)[5:], 0)
+    assert received == {variable.name: value for variable, value in zip(block.variables, values, strict=True)}
+
+
+def test_variables_have_one_home():
+    names = [variable.name for block in telemetry.BLOCKS for variable in block.variables]
+    assert len(names) == len(set(names))
+    assert len({block.id for block in telemetry.BLOCKS}) == len(telemetry.BLOCKS)
+
+
+def test_counter_wraps_as_on_the_board():
+    block = telemetry.BLOCKS[3]
+    raw = telemetry.encode_sample(block, 0, (0.5, 0.5, 0.5, 0.5, 256 + 3, 65536 + 7, 65536, -1))
+    assert telemetry.decode_sample(raw[1:]).values == (0.5, 0.5, 0.5, 0.5, 3, 7, 0, 65535)
+
+
+def test_block_that_does_not_fit_or_match_is_refused():
+    variable = telemetry.Variable("a.b", telemetry.LogType.F32, "")
+    with pytest.raises(WireError):
+        telemetry.Block(9, (variable,) * 7)
+    with pytest.raises(WireError, match="5 values"):
+        telemetry.encode_sample(telemetry.BLOCKS[0], 0, (1.0,) * 5)
+    with pytest.raises(WireError, match="block 77"):
+        telemetry.decode_sample(b"\x4d\0\0\0")
