@@ -1,0 +1,3 @@
+"""The ways from the ground station to the board. Each encodes corrections and decodes telemetry in its own
+protocol.
+"""

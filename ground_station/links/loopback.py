@@ -1,0 +1,27 @@
+"""The link inside one process: the CRTP bytes of a real flight, handed to whatever carries them."""
+
+from collections.abc import Callable
+
+from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, encode_ext_pose
+from firmware_py.wire.telemetry import Sample, decode_sample
+from ground_station.corrections import Correction
+
+
+class LoopbackLink:
+    """CRTP to a carrier in the same process. `latency_us` is what the carrier is expected to need."""
+
+    def __init__(self, transmit: Callable[[int, bytes], object], latency_us: int) -> None:
+        self._transmit = transmit
+        self._latency_us = latency_us
+
+    def send(self, now_us: int, correction: Correction) -> None:
+        """Hand the correction to the carrier, with the age that it will have on arrival."""
+        age_us = correction.age_us + self._latency_us
+        self._transmit(now_us, encode_ext_pose(correction.p_GB, correction.q_GB, age_us))
+
+    def decode(self, data: bytes) -> Sample | None:
+        """The telemetry in a packet from the board, None for a packet of another service."""
+        packet = decode(data)
+        if packet.port != PORT_LOG or packet.channel != CHANNEL_LOG_DATA:
+            return None
+        return decode_sample(packet.data)

@@ -1,0 +1,104 @@
+"""The ground station: frames in, corrections out, telemetry into the log. It never looks at a clock: callers
+bring the time.
+
+The tracked pose is compared with the goal of the moment, as in the original: a new goal counts at once, not
+after the camera's latency.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from firmware_py.wire import WireError
+from firmware_py.wire.telemetry import Sample
+from ground_station.corrections import Correction, correct
+from ground_station.mocap import MocapFrame
+from ground_station.telemetry_log import TelemetryLog
+from ground_station.trajectory import Trajectory
+
+
+class StationConfig(BaseModel):
+    """What the ground station does with frames."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    send_every: int = Field(
+        4, ge=1, le=200, description="frames per correction [1]; 200 Hz to 50 Hz; original"
+    )
+    link_latency_us: int = Field(
+        1400,
+        ge=0,
+        le=100_000,
+        description="expected from the link's input to the board [us]; mean of VirtualRadio",
+    )
+
+
+class Link(Protocol):
+    """One way to the board and its protocol."""
+
+    def send(self, now_us: int, correction: Correction) -> None:
+        """Send `correction`, older by what the link needs; `WireError` for a pose that cannot be sent."""
+        ...
+
+    def decode(self, data: bytes) -> Sample | None:
+        """The telemetry in `data`, None if it is something else; `WireError` if it is malformed."""
+        ...
+
+
+@dataclass(slots=True)
+class StationCounters:
+    """What went through the ground station."""
+
+    frames: int = 0  # from motion capture
+    invalid: int = 0  # of these, not tracked or not a pose
+    sent: int = 0  # corrections
+    received: int = 0  # packets from the board
+    malformed: int = 0  # of these, not decodable
+
+
+class GroundStation:
+    """Passive: `on_frame` for each frame of motion capture, `on_packet` for each packet of the board."""
+
+    def __init__(
+        self, link: Link, trajectory: Trajectory, log: TelemetryLog | None, config: StationConfig
+    ) -> None:
+        self.counters = StationCounters()
+        self._link = link
+        self._trajectory = trajectory
+        self._log = log
+        self._send_every = config.send_every
+        self._frames_until_due = 0
+        self._last_frame: MocapFrame | None = None
+
+    def on_frame(self, frame: MocapFrame, now_us: int) -> None:
+        """Send the correction of every `send_every`-th frame, or of the first usable one after it."""
+        counters = self.counters
+        counters.frames += 1
+        due = self._frames_until_due <= 0
+        self._frames_until_due -= 1
+        if not frame.valid:
+            counters.invalid += 1
+            return
+        self._last_frame = frame
+        if not due:
+            return
+        try:
+            self._link.send(now_us, correct(frame, self._trajectory.at(now_us), now_us))
+        except WireError:
+            counters.invalid += 1
+            return
+        counters.sent += 1
+        # The slots keep their phase: a late correction does not delay the next one.
+        self._frames_until_due %= self._send_every
+
+    def on_packet(self, now_us: int, data: bytes) -> None:
+        """Take a packet of the board: telemetry goes to the log, what cannot be read is counted."""
+        self.counters.received += 1
+        try:
+            sample = self._link.decode(data)
+        except WireError:
+            self.counters.malformed += 1
+            return
+        if sample is not None and self._log is not None:
+            self._log.write(now_us, sample, self._trajectory.at(now_us), self._last_frame)

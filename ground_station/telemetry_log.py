@@ -1,0 +1,87 @@
+"""The ground station's own record of a flight: a CSV file with one row per telemetry time stamp.
+
+A row joins the blocks that carry the same time stamp with what the ground station itself knew when the first
+of them arrived: its clock, the goal and the last tracked pose. What was missing is `nan`. The header names
+each column's unit: `stateEstimate.x [m]`. The file is complete to about a second when the process dies;
+memory holds one row.
+"""
+
+from math import nan
+from pathlib import Path
+
+from firmware_py.geometry import to_euler_zyx
+from firmware_py.wire.telemetry import BLOCKS, Block, Sample
+from ground_station.mocap import MocapFrame
+from ground_station.trajectory import Goal
+
+FLUSH_PERIOD_US = 1_000_000
+
+_GROUND_COLUMNS = (
+    "ground.t [s]",
+    "goal.x [m]",
+    "goal.y [m]",
+    "goal.z [m]",
+    "goal.yaw [rad]",
+    "mocap.t [s]",
+    "mocap.x [m]",
+    "mocap.y [m]",
+    "mocap.z [m]",
+    "mocap.roll [rad]",
+    "mocap.pitch [rad]",
+    "mocap.yaw [rad]",
+)
+
+
+def _columns_of(blocks: tuple[Block, ...]) -> tuple[list[str], dict[int, int]]:
+    """The telemetry columns' titles, and where each block begins among them."""
+    titles: list[str] = []
+    first: dict[int, int] = {}
+    for block in blocks:
+        first[block.id] = len(titles)
+        titles += [f"{variable.name} [{variable.unit}]" for variable in block.variables]
+    return titles, first
+
+
+_TELEMETRY_COLUMNS, _FIRST_COLUMN = _columns_of(BLOCKS)
+_ROW = ",".join(["%d", "%.6f"] + ["%.7g"] * (len(_GROUND_COLUMNS) - 1 + len(_TELEMETRY_COLUMNS))) + "\n"
+
+
+class TelemetryLog:
+    """Writes the CSV file at `path`; an unwritable path raises `OSError`."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="utf-8", newline="\n")
+        self._file.write(",".join(("board.t [ms]", *_GROUND_COLUMNS, *_TELEMETRY_COLUMNS)) + "\n")
+        self._timestamp_ms: int | None = None
+        self._ground: tuple[float, ...] = ()
+        self._telemetry: list[float] = []
+        self._next_flush_us = 0
+
+    def write(self, now_us: int, sample: Sample, goal: Goal, frame: MocapFrame | None) -> None:
+        """Put `sample`, received at `now_us`, into its row; `goal` and `frame` are of that instant."""
+        if sample.timestamp_ms != self._timestamp_ms:
+            self._write_row()
+            self._timestamp_ms = sample.timestamp_ms
+            self._ground = _ground_values(now_us, goal, frame)
+            self._telemetry = [nan] * len(_TELEMETRY_COLUMNS)
+        first = _FIRST_COLUMN[sample.block.id]
+        self._telemetry[first : first + len(sample.values)] = sample.values
+        if now_us >= self._next_flush_us:
+            self._file.flush()
+            self._next_flush_us = now_us + FLUSH_PERIOD_US
+
+    def close(self) -> None:
+        """Write the last row and close the file; a second call does nothing."""
+        if not self._file.closed:
+            self._write_row()
+            self._file.close()
+
+    def _write_row(self) -> None:
+        if self._timestamp_ms is not None:
+            self._file.write(_ROW % (self._timestamp_ms, *self._ground, *self._telemetry))
+
+
+def _ground_values(now_us: int, goal: Goal, frame: MocapFrame | None) -> tuple[float, ...]:
+    if frame is None:
+        return (now_us * 1e-6, *goal.p_WG, goal.yaw, *[nan] * 7)
+    return (now_us * 1e-6, *goal.p_WG, goal.yaw, frame.t_us * 1e-6, *frame.p_WB, *to_euler_zyx(frame.q_WB))

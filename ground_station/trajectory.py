@@ -1,0 +1,99 @@
+"""Where the robot shall be: goals as functions of time.
+
+`Hold` stays; `Offsets` adds one signal per axis to a home goal. The experiments of the paper are one line
+each, for example `Offsets(home, start_us, yaw=Sine(pi / 2, 0.15))`. Signals count time from the start of the
+trajectory, so that a flight can be repeated.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import sin, tau
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """The goal frame G: upright, turned by `yaw`."""
+
+    p_WG: tuple[float, float, float]  # [m]
+    yaw: float  # [rad]
+
+
+class Trajectory(Protocol):
+    """A goal for every instant."""
+
+    def at(self, t_us: int) -> Goal:
+        """The goal at `t_us`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """One goal for ever."""
+
+    goal: Goal
+
+    def at(self, t_us: int) -> Goal:
+        return self.goal
+
+
+Signal = Callable[[int], float]  # time since the start [us], never negative, to an offset [m or rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Sine:
+    """A sine from zero."""
+
+    amplitude: float
+    frequency_hz: float
+
+    def __call__(self, elapsed_us: int) -> float:
+        return self.amplitude * sin(tau * self.frequency_hz * elapsed_us * 1e-6)
+
+
+@dataclass(frozen=True, slots=True)
+class Square:
+    """`high` in the first half of each period, `low` in the second."""
+
+    high: float
+    low: float
+    frequency_hz: float
+
+    def __call__(self, elapsed_us: int) -> float:
+        return self.high if self.frequency_hz * elapsed_us * 1e-6 % 1.0 < 0.5 else self.low
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A jump by `size` at the start."""
+
+    size: float
+
+    def __call__(self, elapsed_us: int) -> float:
+        return self.size
+
+
+def _zero(elapsed_us: int) -> float:
+    return 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Offsets:
+    """`home` until `start_us`, then `home` and the signal of each axis."""
+
+    home: Goal
+    start_us: int
+    x: Signal = _zero
+    y: Signal = _zero
+    z: Signal = _zero
+    yaw: Signal = _zero
+
+    def at(self, t_us: int) -> Goal:
+        elapsed_us = t_us - self.start_us
+        if elapsed_us < 0:
+            return self.home
+        x, y, z = self.home.p_WG
+        return Goal(
+            (x + self.x(elapsed_us), y + self.y(elapsed_us), z + self.z(elapsed_us)),
+            self.home.yaw + self.yaw(elapsed_us),
+        )

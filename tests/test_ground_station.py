@@ -1,0 +1,187 @@
+"""Frames in, corrections out, telemetry into the log."""
+
+import csv
+from math import isnan, nan, pi
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from firmware_py.geometry import from_euler_zyx
+from firmware_py.wire import crtp, telemetry
+from ground_station.corrections import correct
+from ground_station.links.loopback import LoopbackLink
+from ground_station.mocap import MocapFrame
+from ground_station.station import GroundStation, StationConfig
+from ground_station.telemetry_log import TelemetryLog
+from ground_station.trajectory import Goal, Hold, Offsets, Sine, Square, Step
+
+HOME = Goal((0.0, 0.0, 1.15), 0.0)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+metres = st.floats(-2.0, 2.0)
+angle = st.floats(-pi, pi)
+
+
+class Bench:
+    """A ground station whose packets end in a list."""
+
+    def __init__(self, send_every=4, latency_us=1000, log=None, trajectory=None):
+        self.sent = []
+        link = LoopbackLink(lambda now_us, data: self.sent.append((now_us, data)), latency_us)
+        self.station = GroundStation(
+            link, trajectory or Hold(HOME), log, StationConfig(send_every=send_every)
+        )
+
+    def frames(self, count, valid=lambda number: True, p=lambda number: (0.001 * number, 0.0, 1.15)):
+        for number in range(count):
+            frame = MocapFrame(5000 * number, p(number), UPRIGHT, valid(number))
+            self.station.on_frame(frame, frame.t_us + 38_000)
+
+    def numbers(self):
+        """Which frames were sent, by their x."""
+        return [round(crtp.decode_ext_pose(data[1:]).p_GB[0] * 1000) for _, data in self.sent]
+
+
+def test_correction_of_one_two_three_seen_from_a_goal_that_looks_left():
+    # The goal looks along +y, so world x is to its right and world y ahead.
+    correction = correct(
+        MocapFrame(1000, (1.0, 2.0, 3.0), UPRIGHT, True), Goal((0.0, 0.0, 0.0), pi / 2), 41_000
+    )
+    assert correction.p_GB == pytest.approx((2.0, -1.0, 3.0))
+    assert correction.q_GB == pytest.approx((np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)))
+    assert correction.age_us == 40_000
+
+
+@given(st.tuples(metres, metres, metres), st.tuples(metres, metres, metres), angle, angle, angle, angle)
+def test_correction_is_scipys_pose_in_the_goal_frame(p, goal, goal_yaw, roll, pitch, yaw):
+    correction = correct(MocapFrame(0, p, from_euler_zyx(roll, pitch, yaw), True), Goal(goal, goal_yaw), 0)
+    R_GW = Rotation.from_euler("z", goal_yaw).inv()
+    R_WB = Rotation.from_euler("ZYX", (yaw, pitch, roll))
+    assert correction.p_GB == pytest.approx(R_GW.apply(np.subtract(p, goal)), abs=1e-9)
+    ours = Rotation.from_quat(correction.q_GB, scalar_first=True)
+    assert (ours.inv() * R_GW * R_WB).magnitude() < 1e-7
+
+
+def test_every_fourth_frame_is_sent_at_once():
+    bench = Bench()
+    bench.frames(20)
+    assert bench.numbers() == [0, 4, 8, 12, 16]
+    assert [now_us for now_us, _ in bench.sent] == [38_000 + 20_000 * k for k in range(5)]
+    assert (bench.station.counters.frames, bench.station.counters.sent) == (20, 5)
+
+
+def test_sent_age_is_that_on_arrival():
+    bench = Bench(latency_us=2000)
+    bench.frames(1)
+    assert crtp.decode_ext_pose(bench.sent[0][1][1:]).age_us == 40_000
+
+
+def test_untracked_frames_are_never_sent_and_the_slots_keep_their_phase():
+    bench = Bench()
+    bench.frames(20, valid=lambda number: number not in (4, 5, *range(8, 15)))
+    assert bench.numbers() == [0, 6, 15, 16]
+    assert bench.station.counters.invalid == 9
+
+
+def test_a_frame_without_a_pose_is_not_sent():
+    bench = Bench(send_every=1)
+    bench.frames(3, p=lambda number: (nan, 0.0, 0.0) if number == 1 else (0.001 * number, 0.0, 1.15))
+    assert bench.numbers() == [0, 2]
+    assert bench.station.counters.invalid == 1
+
+
+def test_the_goal_of_the_moment_counts_not_that_of_the_exposure():
+    bench = Bench(send_every=1, trajectory=Offsets(HOME, 40_000, x=Step(0.5)))
+    bench.frames(2, p=lambda number: HOME.p_WG)  # arrive at 38 and 43 ms
+    assert bench.numbers() == [0, -500]
+
+
+@given(st.binary(max_size=40))
+def test_any_packet_is_counted_and_none_is_raised(data):
+    bench = Bench()
+    bench.station.on_packet(0, data)
+    assert bench.station.counters.received == 1
+    assert bench.station.counters.malformed <= 1
+
+
+def test_unreadable_telemetry_is_counted_and_other_services_are_not():
+    bench = Bench()
+    bench.station.on_packet(0, b"\x5e\x63\0\0\0")
+    assert bench.station.counters.malformed == 1
+    bench.station.on_packet(0, b"\x0chello")  # console
+    assert bench.station.counters.malformed == 1
+
+
+@pytest.mark.parametrize("change", [{"send_every": 0}, {"link_latency_us": -1}, {"sendevery": 4}])
+def test_bad_configuration_is_refused(change):
+    with pytest.raises(ValidationError):
+        StationConfig(**change)
+
+
+def telemetry_packets(timestamp_ms, blocks=telemetry.BLOCKS):
+    for block in blocks:
+        yield telemetry.encode_sample(block, timestamp_ms, [0.5 + block.id] * len(block.variables))
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = Bench(log=log)
+    bench.frames(1, p=lambda number: (0.25, 0.0, 1.15))
+    for timestamp_ms in (20, 40):
+        for data in telemetry_packets(timestamp_ms):
+            bench.station.on_packet(timestamp_ms * 1000 + 900, data)
+    log.close()
+    log.close()
+    first, second = rows(tmp_path / "telemetry.csv")
+    assert (first["board.t [ms]"], second["board.t [ms]"]) == ("20", "40")
+    assert float(first["ground.t [s]"]) == 0.0209
+    assert float(first["goal.z [m]"]) == 1.15
+    assert float(first["mocap.x [m]"]) == 0.25
+    for block in telemetry.BLOCKS:
+        for variable in block.variables:
+            expected = 0.5 + block.id if variable.type is telemetry.LogType.F32 else block.id
+            assert float(first[f"{variable.name} [{variable.unit}]"]) == expected
+
+
+def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = Bench(log=log)
+    for timestamp_ms, blocks in ((20, telemetry.BLOCKS), (40, telemetry.BLOCKS[1:])):
+        for data in telemetry_packets(timestamp_ms, blocks):
+            bench.station.on_packet(0, data)
+    log.close()
+    first, second = rows(tmp_path / "telemetry.csv")
+    assert float(first["stateEstimate.x [m]"]) == 1.5
+    assert isnan(float(second["stateEstimate.x [m]"]))
+    assert float(second["stateEstimate.roll [rad]"]) == 2.5
+    assert isnan(float(second["mocap.x [m]"]))
+
+
+def test_log_on_disk_is_never_much_more_than_a_second_old(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = Bench(log=log)
+    for timestamp_ms in range(0, 10_000, 500):  # few bytes: no buffer is ever full
+        for data in telemetry_packets(timestamp_ms):
+            bench.station.on_packet(timestamp_ms * 1000, data)
+    # not closed, as after a crash
+    assert int(rows(tmp_path / "telemetry.csv")[-1]["board.t [ms]"]) >= 8000
+    log.close()
+
+
+def test_hold_holds_and_offsets_begin_at_their_start():
+    assert Hold(HOME).at(0) == Hold(HOME).at(10**9) == HOME
+    trajectory = Offsets(HOME, 1_000_000, y=Square(0.05, -0.05, 0.1), z=Sine(0.2, 0.05), yaw=Step(1.5))
+    assert trajectory.at(999_999) == HOME
+    assert trajectory.at(1_000_000) == Goal((0.0, 0.05, 1.15), 1.5)
+    assert trajectory.at(5_999_999).p_WG[1] == 0.05
+    assert trajectory.at(6_000_000).p_WG[1] == -0.05
+    assert trajectory.at(6_000_000).p_WG[2] == pytest.approx(1.35)
+    assert trajectory.at(11_000_000).p_WG == pytest.approx((0.0, 0.05, 1.15))
