@@ -1,0 +1,41 @@
+"""Hardware events in the order of simulated time: one heap, integer microseconds.
+
+An event is a callback and the instant it was planned for. Events at the same instant run in the order in
+which they were planned.
+"""
+
+from collections.abc import Callable
+from heapq import heappop, heappush
+
+Callback = Callable[[int], None]  # receives the planned instant [us]
+
+
+class EventQueue:
+    """What the hardware does next. `next_us`: the earliest planned instant, None when there is none."""
+
+    __slots__ = ("_heap", "_order", "next_us", "now_us")
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, Callback]] = []
+        self._order = 0
+        self.next_us: int | None = None
+        self.now_us = 0
+
+    def at(self, time_us: int, callback: Callback) -> None:
+        """Plan `callback(time_us)`; an instant that has passed is a `ValueError`."""
+        if time_us < self.now_us:
+            raise ValueError(f"event at {time_us} us: it is already {self.now_us} us")
+        self._order += 1
+        heappush(self._heap, (time_us, self._order, callback))
+        self.next_us = self._heap[0][0]
+
+    def run(self, now_us: int) -> None:
+        """Run everything due by `now_us`, what the callbacks themselves plan by then included."""
+        heap = self._heap
+        try:
+            while heap and heap[0][0] <= now_us:
+                self.now_us, _, callback = heappop(heap)
+                callback(self.now_us)
+            self.now_us = now_us
+        finally:
+            self.next_us = heap[0][0] if heap else None

@@ -1,0 +1,55 @@
+"""The order of hardware events."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.events import EventQueue
+
+
+@given(st.lists(st.integers(0, 20)), st.integers(0, 25))
+def test_due_events_run_in_time_order_and_first_come_first_served(times, now_us):
+    events, ran = EventQueue(), []
+    for number, time_us in enumerate(times):
+        events.at(time_us, lambda planned_us, number=number: ran.append((planned_us, number)))
+    assert events.next_us == min(times, default=None)
+    events.run(now_us)
+    in_order = sorted((time_us, number) for number, time_us in enumerate(times))
+    assert ran == [event for event in in_order if event[0] <= now_us]
+    assert events.next_us == min((time_us for time_us in times if time_us > now_us), default=None)
+
+
+def test_what_a_callback_plans_runs_in_the_same_run_when_due():
+    events, ran = EventQueue(), []
+
+    def again(time_us):
+        ran.append(time_us)
+        events.at(time_us + 10, again)
+
+    events.at(0, again)
+    events.run(35)
+    assert ran == [0, 10, 20, 30]
+    assert events.next_us == 40
+
+
+def test_the_past_cannot_be_planned():
+    events = EventQueue()
+    events.run(10)
+    events.at(10, lambda time_us: None)
+    with pytest.raises(ValueError, match="9 us"):
+        events.at(9, lambda time_us: None)
+
+
+def test_a_callback_that_raises_leaves_the_rest_planned():
+    events, ran = EventQueue(), []
+
+    def fail(time_us):
+        raise RuntimeError("broken")
+
+    events.at(1, fail)
+    events.at(2, ran.append)
+    with pytest.raises(RuntimeError):
+        events.run(5)
+    assert events.next_us == 2
+    events.run(5)
+    assert ran == [2]
