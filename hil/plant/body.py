@@ -1,0 +1,55 @@
+"""Geometry G0 (physics.md section 3): nine plates and their places, from the design to the kernel's constants.
+
+A flap is a quadrant of the footprint without the base plate's corner; the strip along its y edge is bent up. It turns
+about a horizontal radial axis through the body's z axis. n and r of a part are A + B cos phi + C sin phi (Rodrigues),
+written down for flap 2 in the quadrant (+,+); the others are mirror images.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.plant import layout as at
+from hil.plant.config import PlantConfig
+from hil.plant.plates import State
+
+MIRRORS = np.array([[1, -1, 1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1]], float)  # signs of x, y, z for each flap
+SIGNS = np.array([1, -1, 1, -1], float)  # of the flap angles at hover (paper, eq. input_signals)
+MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)  # the same equation
+AXIS = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0])  # of flap 2, outwards
+
+
+def _turning(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return A, B, C, (3, 3), of a vector that turns about AXIS."""
+    along = AXIS * (AXIS @ vector)
+    return np.array([along, vector - along, np.cross(AXIS, vector)])
+
+
+def place_plates(s: State, config: PlantConfig) -> None:
+    """Write the areas, normals and centres of pressure of all plates, and the hover angles."""
+    side, corner = config.footprint / 2, config.base_side / 2
+    width, kink = config.strip_width, config.kink_angle
+    quadrant, strip = side**2 - corner**2, width * side
+    flat = quadrant - strip
+    moment = (side**3 - corner**3) / 2  # of the quadrant without its corner, about either side
+    flat_centre = np.array([moment - strip * side / 2, moment - strip * (side - width / 2), 0.0]) / flat
+    strip_centre = np.array([side / 2, side - width + width / 2 * math.cos(kink), width / 2 * math.sin(kink)])
+    normals = _turning(np.array([0.0, 0.0, 1.0])), _turning(np.array([0.0, -math.sin(kink), math.cos(kink)]))
+    centres = _turning(flat_centre), _turning(strip_centre)
+
+    s[at.BASE_AREA] = config.base_side**2
+    s[at.AXIS_HEIGHT] = config.axis_height
+    s[at.HOVER_FLAPS : at.HOVER_FLAPS + 4] = SIGNS * config.hover_angle
+    lift = np.array([[0.0, 0.0, config.axis_height], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    for flap in range(4):
+        s[at.FLOW_POINTS + 2 * flap : at.FLOW_POINTS + 2 * flap + 2] = config.flow_point * MIRRORS[flap, :2]
+        for part in range(2):
+            plate = 2 * flap + part
+            n = MIRRORS[flap] * normals[part]
+            r = MIRRORS[flap] * centres[part] + lift
+            s[at.AREA + plate] = (flat, strip)[part]
+            s[at.NORMAL + 9 * plate : at.NORMAL + 9 * plate + 9] = n.ravel()
+            s[at.CENTRE + 9 * plate : at.CENTRE + 9 * plate + 9] = r.ravel()

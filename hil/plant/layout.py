@@ -1,0 +1,124 @@
+"""Where each quantity of the plant lies in its one flat float64 array.
+
+One array is the whole plant: state, what was computed from it, inputs that may change during a flight, and constants.
+A compiled kernel call then costs one argument, and truth is read through numpy views. Units are SI; frames are in the
+names or comments: W world (z up), B body (x forward, y left, z up, at the centre of mass).
+Flaps count 0..3 here, at the quadrants (+,-), (+,+), (-,+), (-,-) of B; plate 2i is the flat part of flap i, 2i+1 its kink.
+"""
+
+_size = 0
+
+
+def _take(count: int = 1) -> int:
+    """Reserve the next `count` places and return the first."""
+    global _size
+    start = _size
+    _size += count
+    return start
+
+
+# State, on the millisecond grid
+TIME_US = _take()
+P = _take(3)  # [m] p_WB
+V = _take(3)  # [m/s] v_WB
+Q = _take(4)  # q_WB, w x y z
+OMEGA = _take(3)  # [rad/s] of B against W, in B
+FLAPS = _take(4)  # [rad] signed flap angles
+GUSTS = _take(14)  # [m/s] fast u v w, slow u v w, four flaps fast, four flaps slow
+NOISE_ROW = _take()  # next row of the block of normal draws
+
+# Computed from the state by `drag`
+R = _take(9)  # R_WB, row by row
+FLOW = _take(3)  # [m/s] of the air at the centre of mass, in W
+UPFLOW = _take()  # [m/s] its mean part, without gusts and side wind
+WIND = _take(3)  # [m/s] relative to the body there, in B
+ROUGHNESS = _take()  # factor on the gusts at this place
+DRAG = _take(6)  # force [N] and torque about the centre of mass [N m] of the flow, in B
+HOVER_DRAG = _take(6)  # the same with the flaps at the hover angle; before any correction
+PLATE_FORCES = _take(15)  # [N] base and four flaps as isolated plates, in W
+
+# Computed from all that by `evaluate`
+ACC = _take(3)  # [m/s2] of the centre of mass, in W, gravity included
+ALPHA = _take(3)  # [rad/s2] in B
+SPECIFIC_FORCE = _take(3)  # [m/s2] what an accelerometer at the centre of mass feels, in B
+PULL = _take(3)  # [N] of the tether, in W
+
+# Servos
+COMMAND = _take(4)  # [rad] commanded angles in force
+NEXT_US = _take()  # instant at which NEXT takes effect, inf: never
+NEXT = _take(4)
+AFTER_US = _take()  # instant at which AFTER takes effect, inf: never
+AFTER = _take(4)
+SERVO_TRIM = _take(4)  # [rad] error added to the command
+SERVO_SPEED = _take(4)  # 1 healthy, 0 stuck
+SERVO_TAU = _take()
+SERVO_RATE = _take()
+DEAD_BAND = _take()
+
+# Inputs from outside
+HELD = _take()  # 1: the body is clamped where it is
+PUSH = _take(3)  # [N] in W
+PUSH_TORQUE = _take(3)  # [N m] in B
+LOST = _take()  # cause, 0: flying
+LOST_US = _take()
+LOST_VALUE = _take()  # what exceeded its limit: [m] or [rad]
+
+# Tunnel
+SPEED = _take()  # [m/s] mean at the hover point
+PROFILE_RADIUS = _take()  # [m]
+HEIGHT_SLOPE = _take()  # [1/m] loss of speed with height
+HOVER_HEIGHT = _take()  # [m] z of the hover point in W
+FAN = _take()  # factor on everything the fans blow
+SIDE_WIND = _take(3)  # [m/s] in W
+OCCLUSION = _take(4)  # x, y [m] in W, radius [m], depth 0..1
+GUST_SCALE = _take()
+GUST_RADIUS = _take()  # [m]
+GUST_GROWTH_MAX = _take()
+GUST_DECAY = _take(14)  # per step
+GUST_KICK = _take(14)  # [m/s] per step and unit normal draw
+
+# Body
+MASS = _take()
+INERTIA = _take(3)
+DRAG_FACTOR = _take()
+HOVER_FLAPS = _take(4)  # [rad] signed
+AXIS_HEIGHT = _take()  # [m] flap axes above the centre of mass
+FLOW_POINTS = _take(8)  # [m] x, y of the point where each flap's flow is taken, in B
+PRESSURE = _take()  # [kg/m3] rho C_D / 2
+BASE_AREA = _take()  # [m2]
+AREA = _take(8)  # [m2]
+NORMAL = _take(72)  # n(phi) = n0 + n1 cos phi + n2 sin phi: nine numbers per plate, in B
+CENTRE = _take(72)  # [m] centre of pressure r(phi), likewise, from the centre of mass
+
+# Identified correction (see correction.py); forces [N], torques [N m]
+CORRECTED = _take()  # 0: isolated plates only
+AIRSPEED = _take()  # [m/s] of the design
+X_INPUT = _take()
+X_TILT = _take()
+Y_INPUT = _take()
+Y_TILT = _take()
+Z_INPUT = _take()
+LIFT_FIT = _take(7)
+ROLL_INPUT = _take()
+ROLL_TILT = _take()
+ROLL_RATE = _take()
+PITCH_INPUT = _take()
+PITCH_TILT = _take()
+PITCH_RATE = _take()
+YAW_INPUT = _take()
+YAW_RATE = _take()
+
+# Tether and limits
+TETHER_ANCHOR = _take(3)  # [m] in W
+TETHER_LENGTH = _take()
+TETHER_STIFFNESS = _take()
+TETHER_DAMPING = _take()
+LIMIT_RADIUS = _take()
+LIMIT_BELOW = _take()
+LIMIT_ABOVE = _take()
+LIMIT_COS_TILT = _take()
+
+SIZE = _size
+
+LEFT_SIDEWAYS, ROSE, FELL, TETHER_TAUT, TUMBLED = 1, 2, 3, 4, 5  # causes in LOST
+STEP_US = 1000

@@ -1,0 +1,99 @@
+"""The wind tunnel: mean profile, gusts, side wind, fans, a blocked patch; constants, and what may change in flight.
+
+The air is computed inside the plant's kernel (`hil.plant.plates`); `Tunnel` writes that kernel's inputs. World frame: z
+up, origin in the middle of the tunnel's exit, hover point `hover_height` above it.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from hil.errors import LabError
+from hil.plant import layout as at
+
+# physics.md section 6. Rows as in layout.GUSTS: time constant [s]; then rms [m/s] per level.
+GUST_TAU = (0.015, 0.015, 0.015, 0.4, 0.4, 0.4, *4 * (0.010,), *4 * (0.15,))
+GUST_RMS = {
+    "none": 14 * (0.0,),
+    "T0": (0.35, 0.35, 0.20, 0.05, 0.05, 0.03, *4 * (0.40,), *4 * (0.10,)),  # as rough as the paper's hover
+    "T1": (0.40, 0.40, 0.20, 0.06, 0.06, 0.03, *4 * (0.50,), *4 * (0.15,)),  # harder
+}
+GUST_RADIUS = 0.25  # [m] gusts grow as 1 + (r / GUST_RADIUS)^4 ...
+GUST_GROWTH_MAX = 6.0  # ... up to this
+
+
+class TunnelConfig(BaseModel):
+    """The flow of one flight; physics.md section 6 is the source where none is named."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    speed: float = Field(
+        10.0, gt=0, le=30, description="mean flow at the hover point [m/s]; paper, Setup specifications"
+    )
+    profile_radius: float = Field(
+        0.45, gt=0.05, le=5, description="w(r) = speed / (1 + (r / profile_radius)^6) [m]; assumed"
+    )
+    height_slope: float = Field(0.05, ge=0, le=0.5, description="loss of speed with height [1/m]; assumed")
+    hover_height: float = Field(
+        1.15, gt=0, le=3, description="hover point above the exit [m]; paper, Hover: 115 cm"
+    )
+    turbulence: Literal["none", "T0", "T1"] = Field(
+        "T0", description="gust level; T0 gives the paper's hover"
+    )
+    gust_scale: float = Field(1.0, ge=0, le=5, description="factor on the gusts of that level")
+    side_wind: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="added everywhere, x y z of W [m/s]"
+    )
+    fan_factor: float = Field(1.0, ge=0, le=2, description="factor on everything that the fans blow")
+
+
+class Tunnel:
+    """The knobs of the tunnel during a flight; a change acts from the next millisecond on."""
+
+    def __init__(self, config: TunnelConfig, state: NDArray[np.float64]) -> None:
+        self._s = s = state
+        s[at.SPEED] = config.speed
+        s[at.PROFILE_RADIUS] = config.profile_radius
+        s[at.HEIGHT_SLOPE] = config.height_slope
+        s[at.HOVER_HEIGHT] = config.hover_height
+        s[at.GUST_RADIUS], s[at.GUST_GROWTH_MAX] = GUST_RADIUS, GUST_GROWTH_MAX
+        decay = np.exp(-at.STEP_US * 1e-6 / np.array(GUST_TAU))
+        s[at.GUST_DECAY : at.GUST_DECAY + 14] = decay  # exact discretisation of an Ornstein-Uhlenbeck process
+        s[at.GUST_KICK : at.GUST_KICK + 14] = np.array(GUST_RMS[config.turbulence]) * np.sqrt(1.0 - decay**2)
+        self.set_gust_scale(config.gust_scale)
+        self.set_side_wind(*config.side_wind)
+        self.set_fan_factor(config.fan_factor)
+        self.block(0.0, 0.0, 1.0, 0.0)
+
+    def set_fan_factor(self, factor: float) -> None:
+        """Scale the mean flow and the gusts: 1 as configured, 0 fans off."""
+        self._s[at.FAN] = _inside("fan factor", factor, 0.0, 2.0)
+
+    def set_gust_scale(self, scale: float) -> None:
+        """Scale the gusts of the configured level."""
+        self._s[at.GUST_SCALE] = _inside("gust scale", scale, 0.0, 5.0)
+
+    def set_side_wind(self, x: float, y: float, z: float = 0.0) -> None:
+        """Add a wind [m/s, W] everywhere; a fan beside the tunnel."""
+        wind = [_inside("side wind", component, -20.0, 20.0) for component in (x, y, z)]
+        self._s[at.SIDE_WIND : at.SIDE_WIND + 3] = wind
+
+    def block(self, x: float, y: float, radius: float, depth: float) -> None:
+        """Take the share `depth` of the flow away around (x, y) [m, W], half of it at `radius` [m]; depth 0 clears."""
+        self._s[at.OCCLUSION : at.OCCLUSION + 4] = (
+            _inside("occlusion x", x, -2.0, 2.0),
+            _inside("occlusion y", y, -2.0, 2.0),
+            _inside("occlusion radius", radius, 0.01, 5.0),
+            _inside("occlusion depth", depth, 0.0, 1.0),
+        )
+
+
+def _inside(what: str, value: float, low: float, high: float) -> float:
+    """Return `value`, or raise LabError when it is not a number inside [low, high]."""
+    if not low <= value <= high:
+        raise LabError(f"{what} = {value}: outside {low:g}..{high:g}")
+    return value

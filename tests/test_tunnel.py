@@ -1,0 +1,129 @@
+"""Laws of the air: mean profile, gust statistics, and the knobs of the tunnel."""
+
+import math
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from hil.errors import LabError
+from hil.plant import layout as at
+from hil.plant.config import PlantConfig, ServoConfig
+from hil.plant.plant import Plant
+from hil.tunnel import TunnelConfig
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def make(**tunnel: object) -> Plant:
+    config = TunnelConfig.model_validate({"turbulence": "none", "hover_height": 1.0} | tunnel)
+    return Plant(PlantConfig(), config, ServoConfig(), np.random.default_rng(5))
+
+
+def flow(plant: Plant, x: float, y: float, z: float) -> list[float]:
+    plant.place((x, y, z), LEVEL)
+    return plant.flow_W.tolist()
+
+
+def test_mean_flow_falls_with_radius_and_height() -> None:
+    plant = make(speed=9.0)
+    assert flow(plant, 0, 0, 1.0) == pytest.approx([0, 0, 9.0])
+    assert flow(plant, 0.27, -0.36, 1.0) == pytest.approx([0, 0, 4.5])
+    assert flow(plant, 0.225, 0, 1.0) == pytest.approx([0, 0, 9.0 * 64 / 65])
+    assert flow(plant, 0, 0, 1.4) == pytest.approx([0, 0, 9.0 * 0.98])
+
+
+def test_fans_scale_what_they_blow_and_not_the_side_wind() -> None:
+    plant = make(side_wind=(1.0, 2.0, 3.0), fan_factor=0.5)
+    assert flow(plant, 0, 0, 1.0) == pytest.approx([1, 2, 8])
+    plant.tunnel.set_fan_factor(0.8)
+    plant.tunnel.set_side_wind(-1.0, 0.5)
+    assert flow(plant, 0, 0, 1.0) == pytest.approx([-1, 0.5, 8])
+
+
+def test_blocked_patch_takes_half_its_depth_at_its_radius_and_clears() -> None:
+    plant = make()
+    plant.tunnel.block(0.06, 0.08, 0.1, 0.4)
+    free = 10 / (1 + (0.1 / 0.45) ** 6)
+    assert flow(plant, 0.06, 0.08, 1.0)[2] == pytest.approx(free * 0.6)
+    assert flow(plant, 0, 0, 1.0)[2] == pytest.approx(10 * 0.8)
+    plant.tunnel.block(0, 0, 1, 0)
+    assert flow(plant, 0, 0, 1.0)[2] == pytest.approx(10)
+
+
+def test_blocking_one_side_unloads_the_flaps_there() -> None:
+    plant = make()
+    plant.tunnel.block(0.1, 0.0, 0.08, 0.5)
+    flow(plant, 0, 0, 1.0)
+    lift = plant.plate_forces_W[1:, 2]
+    assert lift[0] == pytest.approx(lift[1])
+    assert lift[2] == pytest.approx(lift[3])
+    assert lift[0] < 0.7 * lift[2]
+
+
+@pytest.mark.parametrize(
+    ("level", "rms"),
+    [
+        ("T0", [0.35, 0.35, 0.20, 0.05, 0.05, 0.03] + [0.40] * 4 + [0.10] * 4),
+        ("T1", [0.40, 0.40, 0.20, 0.06, 0.06, 0.03] + [0.50] * 4 + [0.15] * 4),
+    ],
+)
+def test_gusts_have_the_levels_and_time_constants_of_the_specification(level: str, rms: list[float]) -> None:
+    tau = np.array([0.015] * 3 + [0.4] * 3 + [0.010] * 4 + [0.15] * 4)
+    plant = make(turbulence=level)
+    plant.hold()
+    series = np.empty((120_000, 14))
+    for step in range(len(series)):
+        plant.advance(1000 * (step + 1))
+        series[step] = plant._s[at.GUSTS : at.GUSTS + 14]
+    series = series[5000:]
+    spread = 3.5 * np.sqrt(tau / 115) + 0.005  # an estimate of the rms over 115 s varies by sqrt(tau / 115 s)
+    assert (np.abs(series.std(axis=0) / rms - 1) < spread).all()
+    decay = np.exp(-1e-3 / tau)  # exact discretisation: s' = decay s + white noise of rms sqrt(1 - decay^2)
+    kicks = series[1:] - decay * series[:-1]
+    assert kicks.std(axis=0) == pytest.approx(rms * np.sqrt(1 - decay**2), rel=0.01)
+    for i in range(14):
+        assert abs(np.corrcoef(kicks[1:, i], kicks[:-1, i])[0, 1]) < 0.015
+        assert abs(np.corrcoef(kicks[:, i], series[:-1, i])[0, 1]) < 0.015
+    crossed = np.corrcoef(series[:, [0, 1, 2, 6, 7, 8, 9]].T) - np.eye(7)
+    assert np.abs(crossed).max() < 0.06
+
+
+def test_gusts_shake_every_flap_on_its_own() -> None:
+    plant = make(turbulence="T1")
+    plant.hold()
+    lifts = np.empty((20_000, 4))
+    for step in range(len(lifts)):
+        plant.advance(1000 * (step + 1))
+        lifts[step] = plant.plate_forces_W[1:, 2]
+    # Lift goes with the square of the wind: 2 x 0.52 m/s own gust, 0.20 common vertical, 0.40 horizontal on 20 deg slopes
+    assert lifts.std(axis=0) / lifts.mean(axis=0) == pytest.approx(4 * [0.118], rel=0.1)
+    assert np.abs(np.corrcoef(lifts.T) - np.eye(4)).max() < 0.35
+
+
+def test_gusts_grow_towards_the_edge_and_then_no_more() -> None:
+    plant = make(turbulence="T1")
+    plant.hold()
+    plant.advance(100_000)
+    u = flow(plant, 0, 0, 1.0)[0]
+    assert u != 0
+    assert flow(plant, 0.25, 0, 1.0)[0] == pytest.approx(2 * u)
+    assert flow(plant, 0, 0.45, 1.0)[0] == pytest.approx(6 * u)
+    plant.tunnel.set_gust_scale(0.5)
+    assert flow(plant, 0, 0, 1.0)[0] == pytest.approx(0.5 * u)
+
+
+def test_knobs_refuse_what_is_no_wind() -> None:
+    tunnel = make().tunnel
+    for turn in (
+        lambda: tunnel.set_fan_factor(math.nan),
+        lambda: tunnel.set_fan_factor(-0.1),
+        lambda: tunnel.set_gust_scale(6.0),
+        lambda: tunnel.set_side_wind(math.inf, 0.0),
+        lambda: tunnel.block(0.0, 0.0, 0.0, 0.5),
+        lambda: tunnel.block(0.0, 0.0, 0.1, 1.5),
+    ):
+        with pytest.raises(LabError, match="outside"):
+            turn()
+    with pytest.raises(ValidationError):
+        TunnelConfig.model_validate({"turbulence": "T2"})

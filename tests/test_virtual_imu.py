@@ -1,0 +1,124 @@
+"""Laws of the virtual BMI088: axes, scale, low pass, noise, saturation, faults."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter
+from scipy.spatial.transform import Rotation
+
+from hil.errors import LabError
+from hil.plant.config import PlantConfig, ServoConfig
+from hil.plant.plant import Plant
+from hil.tunnel import TunnelConfig
+from hil.virtual_imu import ImuConfig, VirtualImu
+
+GYRO_LSB = math.radians(2000 / 32768)  # [rad/s] data sheet
+ACCEL_LSB = 24 * 9.81 / 32768  # [m/s2] data sheet
+SILENT = ImuConfig(gyro_noise=0, accel_noise=0, gyro_bias=0, accel_bias=0)
+HOME = (0.0, 0.0, 1.15)
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def make_plant() -> Plant:
+    plant = Plant(PlantConfig(), TunnelConfig(turbulence="none"), ServoConfig(), np.random.default_rng(1))
+    plant.hold()
+    return plant
+
+
+def settled(imu: VirtualImu, plant: Plant) -> tuple[int, ...]:
+    for _ in range(50):
+        counts = imu.sample(plant)
+    return counts
+
+
+def test_original_firmware_reads_body_rates_and_forces_from_the_counts() -> None:
+    """original-firmware.md (c): p = .7071 (gx + gy), q = .7071 (gy - gx), r = gz; on (1, 2, 3)."""
+    plant = make_plant()
+    tilt = Rotation.from_euler("ZYX", [0.3, -0.5, 0.7])
+    plant.place(HOME, tilt.as_quat(scalar_first=True), omega_B=(1, 2, 3))
+    counts = settled(VirtualImu(SILENT, np.random.default_rng(1)), plant)
+    assert all(type(count) is int for count in counts)
+    gx, gy, gz = np.array(counts[:3]) * GYRO_LSB
+    assert [0.7071 * (gx + gy), 0.7071 * (gy - gx), gz] == pytest.approx([1, 2, 3], abs=1.5 * GYRO_LSB)
+    ax, ay, az = np.array(counts[3:]) * ACCEL_LSB
+    expected = tilt.inv().apply([0, 0, 9.81])
+    assert [0.7071 * (ax + ay), 0.7071 * (ay - ax), az] == pytest.approx(expected, abs=1.5 * ACCEL_LSB)
+
+
+def test_low_pass_is_second_order_butterworth_at_the_sample_instants() -> None:
+    plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
+    turning = np.random.default_rng(2).uniform(-3, 3, 300)
+    tilting = np.random.default_rng(3).uniform(-1, 1, 300)
+    counts = []
+    for rate, angle in zip(turning, tilting, strict=True):
+        plant.place(HOME, (math.cos(angle / 2), 0, math.sin(angle / 2), 0), omega_B=(0, 0, rate))
+        counts.append(imu.sample(plant))
+    gyro = lfilter(*butter(2, 116, fs=1000), turning)
+    accel = lfilter(*butter(2, 145, fs=1000), 9.81 * np.cos(tilting))
+    assert np.abs(np.array(counts)[:, 2] - gyro / GYRO_LSB).max() <= 0.5 + 1e-6
+    assert np.abs(np.array(counts)[:, 5] - accel / ACCEL_LSB).max() <= 0.5 + 1e-6
+
+
+def test_mean_of_ten_samples_has_the_noise_of_the_specification() -> None:
+    plant = make_plant()
+    imu = VirtualImu(ImuConfig(gyro_bias=0, accel_bias=0), np.random.default_rng(1))
+    counts = np.array([imu.sample(plant) for _ in range(20_000)])[50:-50].reshape(-1, 10, 6)
+    means = counts.mean(axis=1)
+    assert means[:, :3].std(axis=0) * GYRO_LSB == pytest.approx(3 * [0.02], rel=0.07)
+    assert counts[..., 3:].reshape(-1, 3).std(axis=0) * ACCEL_LSB == pytest.approx(3 * [0.05], rel=0.03)
+    assert np.abs(means[:, :3].mean(axis=0)).max() * GYRO_LSB < 0.002
+    assert np.abs(np.corrcoef(counts.reshape(-1, 6).T) - np.eye(6)).max() < 0.04
+
+
+def test_every_specimen_has_its_own_constant_bias() -> None:
+    plant = make_plant()
+    quiet = ImuConfig(gyro_noise=0, accel_noise=0, gyro_bias=0.03, accel_bias=0.2)
+    rests = []
+    for seed in range(300):
+        rests.append(settled(VirtualImu(quiet, np.random.default_rng(seed)), plant))
+    assert np.array(rests)[:, :3].std() * GYRO_LSB == pytest.approx(0.03, rel=0.1)
+    assert np.array(rests)[:, 3:].std(axis=0) * ACCEL_LSB == pytest.approx(3 * [0.2], rel=0.15)
+
+
+def test_counts_saturate() -> None:
+    plant = make_plant()
+    plant.place(HOME, LEVEL, omega_B=(0, 0, 60))
+    imu = VirtualImu(SILENT, np.random.default_rng(1))
+    assert settled(imu, plant)[2] == 32767
+    plant.place(HOME, LEVEL, omega_B=(0, 0, -60))
+    assert settled(imu, plant)[2] == -32768
+
+
+def test_faults_act_on_their_channel_and_heal() -> None:
+    plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
+    before = settled(imu, plant)
+    imu.set_fault(1, bias=0.5)
+    imu.set_fault(5, stuck=True)
+    plant.place(HOME, (0.0, 1.0, 0.0, 0.0))
+    during = settled(imu, plant)
+    assert (during[1] - before[1]) * GYRO_LSB == pytest.approx(0.5, abs=GYRO_LSB)
+    assert during[5] == before[5]
+    for channel in range(6):
+        imu.set_fault(channel)
+    after = settled(imu, plant)
+    assert after[1] == before[1]
+    assert after[5] == pytest.approx(-before[5], abs=1)
+
+
+def test_noise_can_be_scaled_but_not_to_nonsense() -> None:
+    plant, imu = make_plant(), VirtualImu(ImuConfig(), np.random.default_rng(1))
+    settled(imu, plant)
+    plain = np.array([imu.sample(plant) for _ in range(2000)]).std(axis=0)
+    imu.set_noise_scale(3.0)
+    assert np.array([imu.sample(plant) for _ in range(2000)]).std(axis=0) == pytest.approx(3 * plain, rel=0.1)
+    for scale in (-1.0, math.nan):
+        with pytest.raises(LabError, match="noise scale"):
+            imu.set_noise_scale(scale)
+
+
+def test_same_seed_same_counts() -> None:
+    plant = make_plant()
+    one, two, other = (VirtualImu(ImuConfig(), np.random.default_rng(seed)) for seed in (1, 1, 2))
+    runs = [[imu.sample(plant) for _ in range(3000)] for imu in (one, two, other)]
+    assert runs[0] == runs[1] != runs[2]

@@ -1,0 +1,71 @@
+"""Laws of the virtual cameras: noise, lost frames, wrong frames."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ground_station.mocap import MocapFrame
+from hil.plant.config import PlantConfig, ServoConfig
+from hil.plant.plant import Plant
+from hil.tunnel import TunnelConfig
+from hil.virtual_mocap import MocapConfig, VirtualMocap
+
+TURN = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
+PLACE = (0.1, 0.2, 0.3)
+
+
+def make_plant() -> Plant:
+    plant = Plant(PlantConfig(), TunnelConfig(turbulence="none"), ServoConfig(), np.random.default_rng(1))
+    plant.place(PLACE, TURN.as_quat(scalar_first=True))
+    plant.hold()
+    return plant
+
+
+def frames(count: int, config: MocapConfig, seed: int = 1) -> list[MocapFrame]:
+    plant, mocap = make_plant(), VirtualMocap(config, np.random.default_rng(seed))
+    return [mocap.expose(5000 * i, plant) for i in range(count)]
+
+
+def test_frames_carry_the_exposure_and_white_noise_of_the_specification() -> None:
+    seen = frames(4000, MocapConfig())
+    assert [frame.t_us for frame in seen[:3]] == [0, 5000, 10000]
+    assert all(frame.valid for frame in seen)
+    error = np.array([frame.p_WB for frame in seen]) - PLACE
+    assert error.std(axis=0) == pytest.approx(3 * [0.0005], rel=0.06)
+    assert np.abs(error.mean(axis=0)).max() < 4e-5
+    q_WB = np.array([frame.q_WB for frame in seen])
+    assert np.linalg.norm(q_WB, axis=1) == pytest.approx(np.ones(4000))
+    turned = (TURN.inv() * Rotation.from_quat(q_WB, scalar_first=True)).as_rotvec()
+    assert turned.std(axis=0) == pytest.approx(3 * [0.004], rel=0.06)
+    assert np.abs(turned.mean(axis=0)).max() < 3e-4
+    together = np.corrcoef(np.hstack([error, turned]).T) - np.eye(6)
+    assert np.abs(together).max() < 0.07
+
+
+def test_share_of_lost_and_wrong_frames_is_the_configured_one() -> None:
+    lost = sum(not frame.valid for frame in frames(4000, MocapConfig(dropout=0.2)))
+    assert lost / 4000 == pytest.approx(0.2, abs=0.025)
+    seen = frames(4000, MocapConfig(outlier=0.1, outlier_size=0.5))
+    off = np.array([math.dist(frame.p_WB, PLACE) for frame in seen])
+    assert (off > 0.1).mean() == pytest.approx(0.1, abs=0.02)
+    assert off[off > 0.1] == pytest.approx(0.5, abs=0.004)
+
+
+def test_faults_leave_the_other_frames_as_they_were() -> None:
+    plain, broken = frames(500, MocapConfig()), frames(500, MocapConfig(dropout=0.3, outlier=0.1))
+    untouched = [a == b for a, b in zip(plain, broken, strict=True)]
+    assert 0.5 < np.mean(untouched) < 0.75
+
+
+def test_blind_cameras_see_nothing_until_they_see_again() -> None:
+    plant, mocap = make_plant(), VirtualMocap(MocapConfig(), np.random.default_rng(1))
+    mocap.blind = True
+    assert not mocap.expose(0, plant).valid
+    mocap.blind = False
+    assert mocap.expose(5000, plant).valid
+
+
+def test_same_seed_same_frames() -> None:
+    assert frames(50, MocapConfig(), 3) == frames(50, MocapConfig(), 3) != frames(50, MocapConfig(), 4)
