@@ -68,7 +68,7 @@ def process_variance(parameters: Parameters, state: Integer) -> f32:
 
 @kernel
 def predict(parameters: Parameters, estimator: Estimator, row: Integer) -> None:
-    """Advance filter state and covariance by one tick under the command in that row of the history."""
+    """Advance filter state and covariance by one tick under the command in that row; `keep_sane` wraps the yaw."""
     sine = sin(estimator.x[ATTITUDE + 2])
     cosine = cos(estimator.x[ATTITUDE + 2])
     advance_state(
@@ -86,7 +86,6 @@ def predict(parameters: Parameters, estimator: Estimator, row: Integer) -> None:
     )
     for i in range(STATES):
         estimator.P[i, i] = estimator.P[i, i] + process_variance(parameters, i)
-    estimator.x[ATTITUDE + 2] = wrap(estimator.x[ATTITUDE + 2])
 
 
 @kernel

@@ -95,9 +95,11 @@ def file_pose(parameters: Parameters, data: Input, estimator: Estimator) -> i32:
     if parameters.predict == 0:
         age_us = i32(0)
     elif parameters.age_measured == 0:
-        age_us = i32(parameters.horizon * TICK_US)
+        age_us = i32(clamp_horizon(parameters.horizon) * TICK_US)
     elif age_us < 0:
         age_us = parameters.default_age_us
+    if age_us < 0:
+        age_us = i32(0)
     if age_us > (HORIZON_LIMIT + 1) * TICK_US:
         age_us = i32((HORIZON_LIMIT + 1) * TICK_US)
     ticks = (age_us + TICK_US // 2) // TICK_US
@@ -106,7 +108,7 @@ def file_pose(parameters: Parameters, data: Input, estimator: Estimator) -> i32:
     tick = estimator.tick + 1 - ticks
     if tick <= estimator.filtered_tick:
         estimator.too_old = i32(estimator.too_old + 1)
-        if parameters.age_measured != 0:
+        if parameters.age_measured != 0 and ticks > estimator.horizon:
             estimator.horizon = clamp_horizon(ticks)
         return i32(POSE_TOO_OLD)
     row = tick % HISTORY

@@ -1,10 +1,10 @@
 """The typed subset of Python in which the flight core is written, and its two ways to run.
 
-Subset: module constants `f32(..)`, `i32(..)`, plain ints and float32 tables; state structs (`class Name(Struct)` with
-`f32`, `i32` or `Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs; `for` over
-`range`, `while` never, `if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons,
-`and`/`or`/`not`; calls of other kernels; `sqrt`. Floats never meet ints without `f32(..)`, and every constant is
-explicitly float32: numba would otherwise compute in double where CPython and C do not.
+Subset: module constants `f32(..)`, `i32(..)` and plain ints; state structs (`class Name(Struct)` with `f32`, `i32` or
+`Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs; `for` over `range`,
+`if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons, `and`/`or`/`not`; calls of
+other kernels; `abs`, `sqrt`. Floats never meet ints without `f32(..)`, and every constant is explicitly float32: numba
+would otherwise compute in double where CPython and C do not.
 
 A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, numba and the
 microcontroller can be compared byte by byte. Kernels are compiled by numba and cached beside this file; with

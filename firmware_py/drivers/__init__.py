@@ -1,0 +1,1 @@
+"""Drivers: raw counts of the board to what the core takes."""

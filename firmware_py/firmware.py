@@ -1,0 +1,79 @@
+"""The firmware as one object: the only place where its parts are connected.
+
+Hardware calls `imu_ready` and `radio_received` (interrupts), then `run`. Everything else goes through the `Board`.
+"""
+
+from firmware_py.board import Board
+from firmware_py.config import FirmwareConfig, parameters_of
+from firmware_py.core import entry
+from firmware_py.core.structs import Control, Estimator, Input
+from firmware_py.drivers.imu import GyroZero
+from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.measurements import Measurement
+from firmware_py.rtos import Kernel, Queue
+from firmware_py.signals import Signals
+from firmware_py.supervisor import Supervisor
+from firmware_py.tasks import CoreBlocks, estimator_task, sensors_task, stabilizer_task
+from firmware_py.variables import telemetry_reader
+
+MEASUREMENT_QUEUE = 20  # original firmware
+
+
+class Firmware:
+    """A booted board. `kernel` may be looked at; `signals` are views on the core."""
+
+    def __init__(self, config: FirmwareConfig, board: Board) -> None:
+        self.kernel = Kernel(preemption=True)
+        self._board = board
+        core = CoreBlocks(parameters_of(config), Input.allocate(), Estimator.allocate(), Control.allocate())
+        entry.reset(core.parameters.arg, core.estimator.arg)
+        entry.control(core.parameters.arg, core.data.arg, core.estimator.arg, core.control.arg)
+        board.write_compare(core.control.fields.count.tolist())  # hover from the first PWM period on
+        self._core = core
+        self._zero = GyroZero()
+        self._supervisor = Supervisor(config.supervisor.pose_timeout_us, board.debug_write)
+        self._imu_ready = self.kernel.create_binary_semaphore("imuReady")
+        data_ready = self.kernel.create_binary_semaphore("dataReady")
+        estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
+        self.measurements: Queue[Measurement] = self.kernel.create_queue(MEASUREMENT_QUEUE, "measurements")
+        kernel, cost = self.kernel, config.cpu
+        kernel.create_task(
+            "SENSORS", 4, sensors_task,
+            kernel, cost, board, self._imu_ready, self.measurements, data_ready, self._zero, self._zero_found,
+        )  # fmt: skip
+        kernel.create_task(
+            "STABILIZER", 5, stabilizer_task,
+            kernel, cost, board, data_ready, estimator_run, self._supervisor, core,
+        )  # fmt: skip
+        kernel.create_task(
+            "KALMAN", 2, estimator_task,
+            kernel, cost, estimator_run, self.measurements, self._supervisor, core,
+        )  # fmt: skip
+        read = telemetry_reader(core.estimator.fields, core.control.fields, lambda: self._supervisor.state)
+        self.link = CrtpStack(kernel, cost, board, self.measurements, read)
+        self.signals = Signals.of(core.estimator, core.control, self._supervisor)
+        self.kernel.start()
+
+    @property
+    def next_wake_us(self) -> int | None:
+        """The next instant at which the firmware acts without an interrupt."""
+        return self.kernel.next_wake_us
+
+    def imu_ready(self) -> None:
+        """Interrupt: the IMU has a new sample."""
+        self._imu_ready.give_from_isr()
+
+    def radio_received(self, data: bytes) -> None:
+        """Interrupt: the radio chip has a packet."""
+        self.link.received(data)
+
+    def run(self, now_us: int) -> None:
+        """Run the tasks until all are blocked or busy."""
+        self.kernel.run(now_us)
+
+    def _zero_found(self) -> None:
+        bias = self._zero.bias
+        assert bias is not None
+        self._core.data.fields.gyro_bias[:] = bias
+        self._supervisor.calibrated = True
+        self._board.debug_write("imu: gyro zero found, {:.1f} {:.1f} {:.1f} counts".format(*bias))

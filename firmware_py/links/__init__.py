@@ -1,0 +1,1 @@
+"""The on-board ends of the links."""

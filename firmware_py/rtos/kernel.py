@@ -1,0 +1,136 @@
+"""What tasks call, and where everything is made: tasks, queues, semaphores, mutexes, timers.
+
+Waiting and working calls are used with `yield from`. Times are ticks of 1 ms, except for `work`, which is microseconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable
+from typing import Any
+
+from firmware_py.rtos.errors import KernelError
+from firmware_py.rtos.queue import Queue
+from firmware_py.rtos.scheduler import TICK_US, Scheduler, Trace
+from firmware_py.rtos.semaphore import Mutex, Semaphore
+from firmware_py.rtos.task import GO_ON, SWITCH, Task
+from firmware_py.rtos.timer import SERVICE_PRIORITY, Callback, Timer, TimerService
+
+TaskFunction = Callable[..., Generator[int, None, Any]]
+
+
+class Kernel(Scheduler):
+    """One processor with its tasks. Create tasks and objects, `start`, then `run` from instant to instant.
+
+    `next_wake_us` is the next instant at which anything happens without a new interrupt, None when nothing ever will.
+    """
+
+    def __init__(self, preemption: bool = True, trace: Trace | None = None) -> None:
+        super().__init__(preemption, trace)
+        self.tasks: list[Task] = []
+        self.queues: list[Queue[Any]] = []
+        self._timers = TimerService(self)
+        self._first: Task | None = None  # the task that `start` runs first
+
+    def create_task(self, name: str, priority: int, function: TaskFunction, *args: Any) -> Task:
+        """Makes a ready task that runs the generator `function(*args)`; higher numbers are more urgent."""
+        task = Task(self, name, priority, function(*args))
+        self.tasks.append(task)
+        self.make_ready(task)
+        if self._started:
+            self.switch_if(priority > self.current.priority)
+        elif self._first is None or priority >= self._first.priority:
+            self._first = task
+        return task
+
+    def create_queue(self, length: int, name: str) -> Queue[Any]:
+        """Makes an empty queue for at most `length` items."""
+        queue: Queue[Any] = Queue(self, length, name)
+        self.queues.append(queue)
+        return queue
+
+    def create_binary_semaphore(self, name: str) -> Semaphore:
+        """Makes a semaphore of maximum 1 that must be given before it can be taken."""
+        return Semaphore(self, 1, 0, name)
+
+    def create_counting_semaphore(self, maximum: int, initial: int, name: str) -> Semaphore:
+        """Makes a semaphore that counts from `initial` up to `maximum`."""
+        return Semaphore(self, maximum, initial, name)
+
+    def create_mutex(self, name: str) -> Mutex:
+        """Makes a free mutex."""
+        return Mutex(self, name)
+
+    def create_timer(self, name: str, period_ticks: int, autoreload: bool, callback: Callback) -> Timer:
+        """Makes a dormant timer whose `callback(timer)` runs in the timer service task."""
+        return Timer(self._timers, name, period_ticks, autoreload, callback)
+
+    def start(self) -> None:
+        """Creates the idle and the timer service task; the tasks begin at the first `run`."""
+        if self._started:
+            raise KernelError("the scheduler was started already")
+        self._idle = self.create_task("IDLE", 0, self._idle_task)
+        self.create_task("Tmr Svc", SERVICE_PRIORITY, self._timers.run)
+        assert self._first is not None
+        self._started = True
+        self.current = self._first
+        self.next_wake_us = self.now_us
+        self._record_switch()
+
+    def run_time_us(self, task: Task) -> int:
+        """Processor time that the task consumed up to now, between two runs; of the idle task what all others left."""
+        if task is self._idle:
+            return self.now_us - sum(self.run_time_us(other) for other in self.tasks if other is not task)
+        left_us = self._work_end_us - self.now_us if task is self.current else task.work_left_us
+        return task.work_us - left_us
+
+    def work(self, duration_us: int) -> Iterable[int]:
+        """Takes processor time; others may run in between."""
+        return (duration_us,) if duration_us > 0 else GO_ON
+
+    def task_yield(self) -> Iterable[int]:
+        """Lets the next task of the same priority run."""
+        return SWITCH
+
+    def delay(self, ticks: int) -> Iterable[int]:
+        """Waits until the tick count has risen by `ticks`; 0 is `task_yield`."""
+        if ticks > 0:
+            if self.trace is not None:
+                self.record("DELAY", ticks)
+            self.block(None, self.tick_count + ticks)
+        return SWITCH
+
+    def delay_until(self, wake_tick: int) -> Iterable[int]:
+        """Waits until the tick count is `wake_tick`; when that is past it is `task_yield`."""
+        if wake_tick > self.tick_count:
+            if self.trace is not None:
+                self.record("DELAY_UNTIL", wake_tick)
+            self.block(None, wake_tick)
+        return SWITCH
+
+    def notify_take(self, clear: bool, timeout: int) -> Generator[int, None, int]:
+        """Waits up to `timeout` ticks for the running task's notification value to be above zero and returns it.
+
+        Then sets it to zero (`clear`) or lowers it by one. 0 means that no notification came.
+        """
+        return self.current.take_notification(clear, timeout)
+
+    def suspend_all(self) -> None:
+        """Keeps the running task running, ticks pend, until as many calls of `resume_all`."""
+        self._suspended += 1
+
+    def resume_all(self) -> Iterable[int]:
+        """Ends the innermost `suspend_all`; after the outermost what pended happens now."""
+        if self._suspended == 0:
+            raise KernelError("resume_all without suspend_all")
+        self._suspended -= 1
+        if self._suspended:
+            return GO_ON
+        while self._pending_ready:
+            task = self._pending_ready.pop(0)
+            task.waiting_in = None
+            self.unblock(task)
+            self._switch_pending |= task.priority >= self.current.priority
+        while (self.tick_count + 1) * TICK_US < self._next_tick_us:
+            self._tick(self.tick_count + 1)
+        self._switch_pending &= self.preemption
+        return SWITCH if self._switch_pending else GO_ON

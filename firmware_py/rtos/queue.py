@@ -1,0 +1,159 @@
+"""Bounded queues: tasks send and receive with a timeout, interrupts send at once or not at all.
+
+A full queue drops the newest item once its timeout is over and counts it in `dropped`. Items are any object but None,
+which stands for "nothing came". Waiting tasks are served by priority, first come first served among equals.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Iterable
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from firmware_py.rtos.errors import KernelError
+from firmware_py.rtos.task import FOREVER, GO_ON
+
+if TYPE_CHECKING:
+    from firmware_py.rtos.scheduler import Scheduler
+    from firmware_py.rtos.task import Task
+
+T = TypeVar("T")
+
+
+class Queue(Generic[T]):
+    """A queue of at most `length` items; made by `Kernel.create_queue`. With length 1 it is also a mailbox."""
+
+    __slots__ = (
+        "_items",
+        "_kernel",
+        "_receivers",
+        "_senders",
+        "dropped",
+        "high_water",
+        "length",
+        "name",
+        "number",
+    )
+
+    def __init__(self, kernel: Scheduler, length: int, name: str) -> None:
+        if length < 1:
+            raise KernelError(f"queue {name}: length {length}, a queue holds at least one item")
+        self._kernel = kernel
+        self._items: deque[T] = deque()
+        self._receivers: list[Task] = []
+        self._senders: list[Task] = []
+        self.length = length
+        self.name = name
+        self.number = 0  # how the trace calls this queue
+        self.dropped = 0  # items that found the queue full
+        self.high_water = 0  # the most items that ever waited
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def send(self, item: T, timeout: int = FOREVER) -> Generator[int, None, bool]:
+        """Appends `item`, waiting up to `timeout` ticks for space; False when it was dropped."""
+        kernel = self._kernel
+        items = self._items
+        if len(items) >= self.length:
+            deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
+            while len(items) >= self.length:
+                if 0 <= deadline <= kernel.tick_count:
+                    self.dropped += 1
+                    kernel.failed("Q_SEND_FAIL", self.number)
+                    return False
+                if kernel.trace is not None:
+                    kernel.record("Q_SEND_BLOCK", self.number)
+                kernel.block(self._senders, deadline)
+                yield 0
+        if kernel.trace is not None:
+            kernel.record("Q_SEND", self.number, len(items))
+        items.append(item)
+        if len(items) > self.high_water:
+            self.high_water = len(items)
+        if self._receivers and kernel.wake(self._receivers.pop(0)) and kernel.preemption:
+            yield 0
+        return True
+
+    def receive(self, timeout: int = FOREVER) -> Generator[int, None, T | None]:
+        """Takes the oldest item, waiting up to `timeout` ticks for one; None when none came."""
+        kernel = self._kernel
+        items = self._items
+        if not items:
+            deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
+            while not items:
+                if 0 <= deadline <= kernel.tick_count:
+                    kernel.failed("Q_RECV_FAIL", self.number)
+                    return None
+                if kernel.trace is not None:
+                    kernel.record("Q_RECV_BLOCK", self.number)
+                kernel.block(self._receivers, deadline)
+                yield 0
+        if kernel.trace is not None:
+            kernel.record("Q_RECV", self.number, len(items))
+        item = items.popleft()
+        if self._senders and kernel.wake(self._senders.pop(0)) and kernel.preemption:
+            yield 0
+        return item
+
+    def receive_nowait(self) -> T | None:
+        """Takes the oldest item, None when there is none; a plain call.
+
+        A sender of higher priority that waited for the space runs at the caller's next `yield from` that blocks,
+        yields or works, not here: use `receive(0)` where that matters.
+        """
+        kernel = self._kernel
+        items = self._items
+        if not items:
+            kernel.failed("Q_RECV_FAIL", self.number)
+            return None
+        if kernel.trace is not None:
+            kernel.record("Q_RECV", self.number, len(items))
+        item = items.popleft()
+        if self._senders:
+            kernel.switch_if(kernel.wake(self._senders.pop(0)))
+        return item
+
+    def overwrite(self, item: T) -> Iterable[int]:
+        """Puts `item` into a mailbox in place of what is there.
+
+        `yield from mailbox.overwrite(item)` lets a reader of higher priority run at once; the plain call lets it run
+        at the caller's next `yield from` that blocks, yields or works.
+        """
+        if self.length != 1:
+            raise KernelError(
+                f"queue {self.name}: overwrite needs a queue of length 1, this one holds {self.length}"
+            )
+        kernel = self._kernel
+        if kernel.trace is not None:
+            kernel.record("Q_SEND", self.number, len(self._items))
+        self._items.clear()
+        self._items.append(item)
+        self.high_water = 1
+        return kernel.switch_if(kernel.wake(self._receivers.pop(0))) if self._receivers else GO_ON
+
+    def peek(self) -> T | None:
+        """The oldest item, left in place; None when there is none."""
+        return self._items[0] if self._items else None
+
+    def wait_for_item(self, wake_tick: int) -> None:
+        """Blocks the running task until an item comes or, unless negative, `wake_tick`; for the timer service."""
+        self._kernel.block(self._receivers, wake_tick)
+
+    def send_from_isr(self, item: T) -> bool:
+        """Appends `item` from an interrupt; False when the queue was full and it was dropped."""
+        kernel = self._kernel
+        items = self._items
+        if len(items) >= self.length:
+            if kernel.trace is not None:
+                kernel.trace(kernel.now_us, "Q_SEND_ISR_FAIL", "isr", self.number, 0)
+            self.dropped += 1
+            kernel.interrupted(False)
+            return False
+        if kernel.trace is not None:
+            kernel.trace(kernel.now_us, "Q_SEND_ISR", "isr", self.number, len(items))
+        items.append(item)
+        if len(items) > self.high_water:
+            self.high_water = len(items)
+        kernel.interrupted(bool(self._receivers) and kernel.wake(self._receivers.pop(0)))
+        return True

@@ -1,0 +1,328 @@
+"""The processor: which task runs, for how long, and when the next thing happens.
+
+Time is integer microseconds and comes from outside: `run(now_us)` brings the processor to that instant. Code between
+two kernel calls takes no time and is atomic; work takes time and can be preempted by ticks and interrupts. Hardware
+goes first at equal time: raise the interrupts of an instant, then `run` it. Ticks at which nothing can happen cost
+nothing, the tick count jumps over them (with a trace every tick is visited, because the trace shows it).
+
+Ready tasks of one priority form a ring, as in FreeRTOS: a list whose last element ran last, with None as a marker that
+is skipped. New tasks go in front of the last element, which makes the order equal to FreeRTOS's in every corner.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable, Generator, Iterable
+from typing import Any
+
+from firmware_py.rtos.errors import KernelError, StuckTaskError, TaskError
+from firmware_py.rtos.task import DELAYED, DELETED, GO_ON, READY, SUSPENDED, SWITCH, Task
+
+TICK_US = 1000
+STUCK_CALLS = 100_000  # calls of the kernel at one instant after which the running task counts as stuck
+_STUCK_SWITCHES = range(STUCK_CALLS)
+_FOR_EVER_US = 1 << 50
+
+# Instant [us], event, who, and two numbers that depend on the event; as in tests/vectors/README.md, without CALL and RET.
+Trace = Callable[[int, str, str, int, int], None]
+
+
+class Scheduler:
+    """The part of the kernel that decides who runs; `Kernel` adds what tasks call.
+
+    `run`, `advance` and `next_wake_us` are for the harness, all else for this package.
+    """
+
+    def __init__(self, preemption: bool = True, trace: Trace | None = None) -> None:
+        self.preemption = preemption
+        self.trace = trace
+        self.observed = trace is not None  # whether switches are traced or counted
+        self.now_us = 0
+        self.next_wake_us: int | None = None
+        self.tick_count = 0  # up to date while tasks run
+        self._rings: list[list[Any]] = []  # by priority; of tasks and the marker None
+        self.current = Task(self, "main", 0, _nothing())  # whoever calls before the scheduler starts
+        self.task_woken = False  # whether the latest call from an interrupt woke a task above the running one
+        self._idle = self.current
+        self._idle_slept = False
+        self._started = False
+        self._ready_bits = 0  # bit n is set when ring n holds a task
+        self._wake_ticks: list[int] = []  # ascending, parallel to _delayed
+        self._delayed: list[Task] = []
+        self._pending_ready: list[Task] = []  # woken by interrupts while the scheduler is suspended
+        self._suspended = 0
+        self._switch_pending = False
+        self._interrupted = False
+        self._next_tick_us = TICK_US
+        self._work_end_us = 0  # of the running task, when it has work left
+        self._spins = 0
+
+    def run(self, now_us: int) -> None:
+        """Does all that falls due up to and including `now_us`, until every task waits or works."""
+        if not self._started:
+            raise KernelError("run before start")
+        if now_us < self.now_us:
+            raise KernelError(f"time runs backwards: from {self.now_us} us to {now_us} us")
+        while True:
+            wake_us = self.next_wake_us
+            if wake_us is not None and wake_us <= now_us:
+                self.now_us = wake_us
+            else:
+                self.now_us = now_us
+                if not self._interrupted:
+                    return
+            self._interrupted = False
+            if self.now_us >= self._next_tick_us:
+                self._pass_ticks()
+            self._dispatch()
+            wake_us = self.next_wake_us
+            if wake_us is None or wake_us > now_us:
+                self.now_us = now_us
+                return
+
+    def advance(self, now_us: int) -> None:
+        """Sets the clock before the interrupts of `now_us` are raised, so that they are recorded at the right time.
+
+        Optional where neither a trace nor statistics are kept. Nothing may fall due before `now_us`.
+        """
+        if now_us < self.now_us or (self.next_wake_us is not None and now_us > self.next_wake_us):
+            raise KernelError(f"advance({now_us}): outside {self.now_us}..{self.next_wake_us}")
+        self.now_us = now_us
+
+    def block(self, waiters: list[Task] | None, wake_tick: int) -> None:
+        """Takes the running task off the ready ring until it is woken or, unless negative, `wake_tick` comes."""
+        task = self.current
+        if self._suspended:
+            raise KernelError(f"task {task.name} must not wait while the scheduler is suspended")
+        if waiters is not None:
+            if waiters:
+                priority = task.event_priority
+                place = next(
+                    (i for i, other in enumerate(waiters) if other.event_priority < priority), len(waiters)
+                )
+                waiters.insert(place, task)
+            else:
+                waiters.append(task)
+            task.waiting_in = waiters
+        ring = task.ring
+        if ring[-1] is task:
+            ring.pop()
+        else:
+            ring.remove(task)
+        if len(ring) == 1:
+            self._ready_bits ^= task.ready_bit
+        if wake_tick < 0:
+            task.place = SUSPENDED
+        else:
+            task.place = DELAYED
+            place = bisect_right(self._wake_ticks, wake_tick)
+            self._wake_ticks.insert(place, wake_tick)
+            self._delayed.insert(place, task)
+        if task.watch is not None:
+            task.watch.finished(self.now_us)
+
+    def wake(self, task: Task) -> bool:
+        """Makes a waiting task ready, later if the scheduler is suspended; True when it outranks the running one."""
+        if self._suspended:
+            self._pending_ready.append(task)
+            task.waiting_in = self._pending_ready
+        else:
+            task.waiting_in = None
+            self.unblock(task)
+        return task.priority > self.current.priority
+
+    def unblock(self, task: Task) -> None:
+        """Makes a waiting or suspended task ready."""
+        if task.place == DELAYED:
+            self.unlink(task)
+        if self.trace is not None:
+            self.trace(self.now_us, "READY", task.name, task.priority, 0)
+        task.place = READY
+        task.ring.insert(-1, task)
+        self._ready_bits |= task.ready_bit
+        if task.watch is not None:
+            task.watch.released(self.now_us)
+
+    def make_ready(self, task: Task) -> None:
+        """Appends the task to the ring of its priority."""
+        if self.trace is not None:
+            self.trace(self.now_us, "READY", task.name, task.priority, 0)
+        task.place = READY
+        task.ring.insert(-1, task)
+        self._ready_bits |= task.ready_bit
+
+    def unlink(self, task: Task) -> None:
+        """Removes the task from the ring or the delayed list."""
+        if task.place == READY:
+            ring = task.ring
+            if ring[-1] is task:
+                ring.pop()
+            else:
+                ring.remove(task)
+            if len(ring) == 1:
+                self._ready_bits ^= task.ready_bit
+        elif task.place == DELAYED:
+            place = self._delayed.index(task)
+            del self._delayed[place], self._wake_ticks[place]
+
+    def switch_if(self, outranked: bool) -> Iterable[int]:
+        """What a plain call returns after it made another task ready that may outrank the running one."""
+        if outranked and self.preemption:
+            self._switch_pending = True
+            return SWITCH
+        return GO_ON
+
+    def interrupted(self, task_woken: bool) -> None:
+        """Ends every call from an interrupt."""
+        self._interrupted = True
+        self.task_woken = task_woken
+        if task_woken:
+            self._switch_pending = True
+
+    def ring(self, priority: int) -> list[Any]:
+        """The ready ring of that priority."""
+        while len(self._rings) <= priority:
+            self._rings.append([None])
+        return self._rings[priority]
+
+    def record(self, event: str, a: int = 0, b: int = 0) -> None:
+        """Traces what the running task does; only with a trace."""
+        assert self.trace is not None
+        self.trace(self.now_us, event, self.current.name, a, b)
+
+    def failed(self, event: str, a: int) -> None:
+        """Traces a call that came to nothing, and counts it, because a task might try for ever."""
+        if self.trace is not None:
+            self.record(event, a)
+        self.spin()
+
+    def spin(self) -> None:
+        """Counts a call that a task could repeat for ever without yielding."""
+        self._spins += 1
+        if self._spins > STUCK_CALLS:
+            raise StuckTaskError(
+                self.current.name, self.now_us, f"{STUCK_CALLS} calls of the kernel at one instant"
+            )
+
+    def _pass_ticks(self) -> None:
+        """Takes the tick that is due now, if one is; jumps over those before at which nothing could happen."""
+        tick = self.now_us // TICK_US
+        self._next_tick_us = tick * TICK_US + TICK_US
+        if self._suspended:
+            if self.trace is not None:
+                self.record("TICK", self.tick_count + 1)
+        elif self.now_us == tick * TICK_US:
+            self._tick(tick)
+        else:
+            self.tick_count = tick
+
+    def _tick(self, tick: int) -> None:
+        if self.trace is not None:
+            self.record("TICK", tick)
+        self.tick_count = tick
+        current = self.current
+        switch = len(current.ring) > 2  # the time slice is over
+        wake_ticks = self._wake_ticks
+        while wake_ticks and wake_ticks[0] <= tick:
+            del wake_ticks[0]
+            task = self._delayed.pop(0)
+            task.place = SUSPENDED  # in no list, for a moment
+            if task.waiting_in is not None:
+                task.waiting_in.remove(task)
+                task.waiting_in = None
+            self.unblock(task)
+            if task.priority >= current.priority:
+                switch = True
+        if switch and self.preemption:
+            self._switch_pending = True
+
+    def _dispatch(self) -> None:
+        """Runs tasks at this instant until the running one has work to do, then works out `next_wake_us`."""
+        task = self.current
+        idle = self._idle
+        now_us = self.now_us
+        observed = self.observed
+        switch = self._switch_pending and not self._suspended
+        self._spins = 0
+        if task.work_left_us:  # every interrupt ends the sleep of the idle task
+            task.work_left_us = 0 if task is idle else self._work_end_us - now_us
+        result: Any = 0
+        try:
+            for _ in _STUCK_SWITCHES:
+                if switch:
+                    self._switch_pending = False
+                    ring = self._rings[self._ready_bits.bit_length() - 1]
+                    if len(ring) == 2:
+                        if ring[1] is None:
+                            ring.reverse()
+                        task = ring[1]
+                        if task is idle and self.preemption:  # nobody to yield to: sleeps at once
+                            task.work_left_us = _FOR_EVER_US
+                            self._idle_slept = True
+                    else:
+                        ring.append(ring.pop(0))
+                        if ring[-1] is None:
+                            ring.append(ring.pop(0))
+                        task = ring[-1]
+                    self.current = task
+                    if observed:
+                        self._record_switch()
+                if task.work_left_us:
+                    break
+                result = task.step(None)
+                if result:
+                    task.work_left_us = result
+                    task.work_us += result
+                    switch = self._switch_pending and not self._suspended
+                elif self._suspended:
+                    self._switch_pending = True
+                    switch = False
+                else:
+                    switch = True
+            else:
+                raise StuckTaskError(task.name, now_us, f"{STUCK_CALLS} switches at one instant")
+        except StopIteration:
+            if self._suspended:
+                raise TaskError(task.name, now_us, "ended while the scheduler was suspended") from None
+            self.unlink(task)
+            task.place = DELETED
+            self._switch_pending = True
+            return self._dispatch()
+        except TaskError:
+            raise
+        except Exception as error:
+            what = f"{type(error).__name__}: {error}"
+            if not isinstance(result, int):
+                what = f"yielded a {type(result).__name__}; kernel calls need `yield from`"
+            raise TaskError(task.name, now_us, what) from error
+        wake_us: int | None = None
+        if self.trace is not None or (len(task.ring) > 2 and self.preemption):
+            wake_us = self._next_tick_us
+        elif self._wake_ticks and not self._suspended:
+            wake_us = self._wake_ticks[0] * TICK_US
+        if task is not idle:
+            self._work_end_us = work_end_us = now_us + task.work_left_us
+            if wake_us is None or work_end_us < wake_us:
+                wake_us = work_end_us
+        self.next_wake_us = wake_us
+
+    def _record_switch(self) -> None:
+        task = self.current
+        if self.trace is not None:
+            self.record("IN", task.priority)
+        if task.watch is not None:
+            task.watch.started(self.now_us)
+
+    def _idle_task(self) -> Generator[int, None, None]:
+        """Lets others of priority 0 run, then sleeps until the next interrupt, like the Crazyflie's idle hook."""
+        while True:
+            if not self.preemption or len(self._rings[0]) > 2:
+                self._idle_slept = False
+                yield 0
+                if self._idle_slept:
+                    continue
+            yield _FOR_EVER_US
+
+
+def _nothing() -> Generator[int, None, None]:
+    yield from ()

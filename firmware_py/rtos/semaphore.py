@@ -1,0 +1,170 @@
+"""Semaphores, binary and counting, and mutexes with priority inheritance.
+
+To the trace they are queues, as they are in FreeRTOS: take is Q_RECV, give is Q_SEND.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import TYPE_CHECKING
+
+from firmware_py.rtos.errors import KernelError
+from firmware_py.rtos.task import FOREVER
+
+if TYPE_CHECKING:
+    from firmware_py.rtos.scheduler import Scheduler
+    from firmware_py.rtos.task import Task
+
+
+class Semaphore:
+    """A count between 0 and `maximum`; made by `Kernel.create_binary_semaphore` or `create_counting_semaphore`."""
+
+    __slots__ = ("_kernel", "_takers", "count", "maximum", "name", "number", "overruns")
+
+    def __init__(self, kernel: Scheduler, maximum: int, initial: int, name: str) -> None:
+        if not 0 <= initial <= maximum or maximum < 1:
+            raise KernelError(f"semaphore {name}: initial count {initial} is outside 0..{maximum}")
+        self._kernel = kernel
+        self._takers: list[Task] = []
+        self.count = initial
+        self.maximum = maximum
+        self.overruns = 0  # gives that found the count at its maximum: the taker did not keep up
+        self.name = name
+        self.number = 0  # how the trace calls it
+
+    def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
+        """Lowers the count by one, waiting up to `timeout` ticks until it is above zero; False when it never was."""
+        kernel = self._kernel
+        if self.count == 0:
+            deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
+            while self.count == 0:
+                if 0 <= deadline <= kernel.tick_count:
+                    kernel.failed("Q_RECV_FAIL", self.number)
+                    return False
+                if kernel.trace is not None:
+                    kernel.record("Q_RECV_BLOCK", self.number)
+                kernel.block(self._takers, deadline)
+                yield 0
+        if kernel.trace is not None:
+            kernel.record("Q_RECV", self.number, self.count)
+        self.count -= 1
+        return True
+
+    def give(self) -> Generator[int, None, bool]:
+        """Raises the count by one and wakes the first taker; False when the count is at its maximum."""
+        kernel = self._kernel
+        if self.count >= self.maximum:
+            self.overruns += 1
+            kernel.failed("Q_SEND_FAIL", self.number)
+            return False
+        if kernel.trace is not None:
+            kernel.record("Q_SEND", self.number, self.count)
+        self.count += 1
+        if self._takers and kernel.wake(self._takers.pop(0)) and kernel.preemption:
+            yield 0
+        return True
+
+    def give_from_isr(self) -> bool:
+        """Like `give`, from an interrupt."""
+        kernel = self._kernel
+        if self.count >= self.maximum:
+            self.overruns += 1
+            if kernel.trace is not None:
+                kernel.trace(kernel.now_us, "Q_SEND_ISR_FAIL", "isr", self.number, 0)
+            kernel.interrupted(False)
+            return False
+        if kernel.trace is not None:
+            kernel.trace(kernel.now_us, "Q_SEND_ISR", "isr", self.number, self.count)
+        self.count += 1
+        kernel.interrupted(bool(self._takers) and kernel.wake(self._takers.pop(0)))
+        return True
+
+
+class Mutex:
+    """A lock whose holder inherits the priority of the most urgent task that waits for it.
+
+    Made by `Kernel.create_mutex`; free at first. Only the holder may give it, and it may not take it twice.
+    """
+
+    __slots__ = ("_kernel", "_takers", "holder", "name", "number")
+
+    def __init__(self, kernel: Scheduler, name: str) -> None:
+        self._kernel = kernel
+        self._takers: list[Task] = []
+        self.holder: Task | None = None
+        self.name = name
+        self.number = 0  # how the trace calls it
+        if kernel.trace is not None:  # FreeRTOS makes a mutex by giving it once
+            kernel.record("Q_SEND", self.number)
+
+    def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
+        """Becomes the holder, waiting up to `timeout` ticks while somebody else is; False when time ran out."""
+        kernel = self._kernel
+        task = kernel.current
+        deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
+        lent = False
+        while (holder := self.holder) is not None:
+            if 0 <= deadline <= kernel.tick_count:
+                if lent:
+                    self._lower_after_timeout(holder)
+                kernel.failed("Q_RECV_FAIL", self.number)
+                return False
+            if kernel.trace is not None:
+                kernel.record("Q_RECV_BLOCK", self.number)
+            lent = self._lend_priority(holder, task)
+            kernel.block(self._takers, deadline)
+            yield 0
+        if kernel.trace is not None:
+            kernel.record("Q_RECV", self.number, 1)
+        self.holder = task
+        task.mutexes_held += 1
+        return True
+
+    def give(self) -> Generator[int, None, bool]:
+        """Sets the mutex free and, with the last one held, returns to the task's own priority; always True."""
+        kernel = self._kernel
+        task = kernel.current
+        if self.holder is not task:
+            holder = "nobody" if self.holder is None else self.holder.name
+            raise KernelError(f"mutex {self.name}: given by {task.name}, held by {holder}")
+        if kernel.trace is not None:
+            kernel.record("Q_SEND", self.number)
+        self.holder = None
+        task.mutexes_held -= 1
+        lowered = task.priority != task.base_priority and task.mutexes_held == 0
+        if lowered:
+            kernel.unlink(task)
+            if kernel.trace is not None:
+                kernel.trace(kernel.now_us, "DISINHERIT", task.name, task.base_priority, 0)
+            task.event_priority = task.base_priority
+            task.set_priority(task.base_priority)
+            kernel.make_ready(task)
+        if self._takers:
+            lowered = kernel.wake(self._takers.pop(0))
+        if lowered and kernel.preemption:
+            yield 0
+        return True
+
+    def _lend_priority(self, holder: Task, waiter: Task) -> bool:
+        """Raises the holder to the waiter's priority; True when it owes its priority to a waiter like this one."""
+        if holder.priority >= waiter.priority:
+            return holder.base_priority < waiter.priority
+        holder.event_priority = waiter.priority
+        holder.change_priority(waiter.priority)
+        kernel = self._kernel
+        if kernel.trace is not None:
+            kernel.trace(kernel.now_us, "INHERIT", holder.name, waiter.priority, 0)
+        return True
+
+    def _lower_after_timeout(self, holder: Task) -> None:
+        """Takes back what a waiter lent that gave up; a holder of several mutexes keeps it until it gives them."""
+        priority = holder.base_priority
+        if self._takers and self._takers[0].event_priority > priority:
+            priority = self._takers[0].event_priority
+        if holder.priority == priority or holder.mutexes_held != 1:
+            return
+        kernel = self._kernel
+        if kernel.trace is not None:
+            kernel.trace(kernel.now_us, "DISINHERIT", holder.name, priority, 0)
+        holder.event_priority = priority
+        holder.change_priority(priority)

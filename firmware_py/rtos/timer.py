@@ -1,0 +1,155 @@
+"""Software timers: a service task runs their callbacks and obeys the commands in its queue.
+
+Starting, stopping or resetting a timer sends a command; it takes effect when the service task gets to it. The tick at
+which a command was given counts, not the tick at which it was obeyed.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from firmware_py.rtos.errors import KernelError
+from firmware_py.rtos.queue import Queue
+from firmware_py.rtos.task import FOREVER
+
+if TYPE_CHECKING:
+    from firmware_py.rtos.scheduler import Scheduler
+
+RELOAD, START, RESET, STOP, CHANGE_PERIOD = range(5)  # FreeRTOS's command numbers
+COMMAND_QUEUE_LENGTH = 20  # crazyflie-firmware, FreeRTOSConfig.h
+SERVICE_PRIORITY = 1  # the same
+
+Callback = Callable[["Timer"], Generator[int, None, Any]]
+
+
+class Timer:
+    """Calls `callback(timer)`, a generator function that must not block, `period_ticks` after its start.
+
+    Made by `Kernel.create_timer`, dormant at first. The commands wait up to `timeout` ticks for space in the queue of
+    the service task and are False when there was none.
+    """
+
+    __slots__ = ("_service", "active", "autoreload", "callback", "expiry_tick", "name", "period_ticks")
+
+    def __init__(
+        self, service: TimerService, name: str, period_ticks: int, autoreload: bool, callback: Callback
+    ) -> None:
+        _check_period(name, period_ticks)
+        self._service = service
+        self.name = name
+        self.period_ticks = period_ticks
+        self.autoreload = autoreload
+        self.callback = callback
+        self.expiry_tick = 0
+        self.active = False  # whether the service task waits for it
+
+    def start(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
+        """Expires one period from now, also when it was running already."""
+        return self._service.send(START, self, self._service.kernel.tick_count, timeout)
+
+    def reset(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
+        """The same as `start`."""
+        return self._service.send(RESET, self, self._service.kernel.tick_count, timeout)
+
+    def stop(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
+        """Makes the timer dormant."""
+        return self._service.send(STOP, self, 0, timeout)
+
+    def change_period(self, period_ticks: int, timeout: int = FOREVER) -> Generator[int, None, bool]:
+        """Expires one new period after the service task obeys, also when the timer was dormant."""
+        _check_period(self.name, period_ticks)
+        return self._service.send(CHANGE_PERIOD, self, period_ticks, timeout)
+
+
+def _check_period(name: str, period_ticks: int) -> None:
+    if period_ticks < 1:
+        raise KernelError(f"timer {name}: period {period_ticks} ticks, it must be at least 1")
+
+
+@dataclass(frozen=True, slots=True)
+class _Command:
+    number: int
+    timer: Timer
+    value: int  # the tick at which it was given, or the new period
+
+
+class TimerService:
+    """The timer service task ("Tmr Svc"), its command queue and the running timers in the order of their expiry."""
+
+    def __init__(self, kernel: Scheduler) -> None:
+        self.kernel = kernel
+        self.commands: Queue[_Command] = Queue(kernel, COMMAND_QUEUE_LENGTH, "timer commands")
+        self._running: list[Timer] = []
+
+    def send(self, number: int, timer: Timer, value: int, timeout: int) -> Generator[int, None, bool]:
+        """Queues a command from the running task."""
+        sent = yield from self.commands.send(_Command(number, timer, value), timeout)
+        if self.kernel.trace is not None:
+            self.kernel.record("TMR_CMD", number, int(sent))
+        return sent
+
+    def run(self) -> Generator[int, None, None]:
+        """The body of the service task."""
+        while True:
+            now = self.kernel.tick_count
+            if self._running and self._running[0].expiry_tick <= now:
+                yield from self._expire(self._running.pop(0), now)
+            else:
+                self._wait(now)
+                yield 0
+            while (command := (yield from self.commands.receive(0))) is not None:
+                yield from self._obey(command)
+
+    def _wait(self, now: int) -> None:
+        if len(self.commands):
+            return
+        wake_tick = self._running[0].expiry_tick if self._running else FOREVER
+        if self.kernel.trace is not None:  # FreeRTOS's "for ever" wraps around to the tick before now
+            self.kernel.record("DELAY_UNTIL", wake_tick if wake_tick != FOREVER else now - 1)
+        self.commands.wait_for_item(wake_tick)
+
+    def _expire(self, timer: Timer, now: int) -> Generator[int, None, None]:
+        self._record("TMR_EXPIRED", timer)
+        timer.active = False
+        if timer.autoreload:
+            expired = timer.expiry_tick
+            if not self._run_from(timer, expired, now):
+                yield from self.send(RELOAD, timer, expired, 0)
+        yield from timer.callback(timer)
+
+    def _obey(self, command: _Command) -> Generator[int, None, None]:
+        timer = command.timer
+        if timer.active:
+            self._running.remove(timer)
+            timer.active = False
+        self._record("TMR_CMD_RX", timer, command.number, command.value)
+        now = self.kernel.tick_count
+        if command.number == STOP:
+            return
+        if command.number == CHANGE_PERIOD:
+            timer.period_ticks = command.value
+            self._run_from(timer, now, now)
+            return
+        if self._run_from(timer, command.value, now):
+            return
+        yield from timer.callback(timer)
+        self._record("TMR_EXPIRED", timer)
+        if timer.autoreload:
+            yield from self.send(RELOAD, timer, command.value + timer.period_ticks, 0)
+
+    def _run_from(self, timer: Timer, start_tick: int, now: int) -> bool:
+        """Lets the timer run for one period from `start_tick`; False when that is already over."""
+        expiry_tick = start_tick + timer.period_ticks
+        if expiry_tick <= now:
+            return False
+        timer.expiry_tick = expiry_tick
+        timer.active = True
+        insort(self._running, timer, key=lambda running: running.expiry_tick)
+        return True
+
+    def _record(self, event: str, timer: Timer, a: int = 0, b: int = 0) -> None:
+        if self.kernel.trace is not None:
+            self.kernel.trace(self.kernel.now_us, event, timer.name, a, b)

@@ -1,0 +1,138 @@
+"""The tasks of the flight path, each reading like its specification. Ticks are 1 ms.
+
+The IMU interrupt wakes SENSORS, which reads it and lets STABILIZER run on the next tick edge; STABILIZER lets the
+estimator run, closes the loop in every tenth tick and leaves servo counts in the timers. The estimator works one tick
+before the controller, so that a pose reaches the flaps in 1 to 11 ms.
+"""
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+from firmware_py.board import Board
+from firmware_py.config import CpuConfig
+from firmware_py.core import entry
+from firmware_py.core.structs import POSE_ON_TIME
+from firmware_py.core.subset import Block
+from firmware_py.drivers.imu import GyroZero
+from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement
+from firmware_py.rtos import TICK_US, Kernel, Queue, Semaphore
+from firmware_py.supervisor import Supervisor
+
+Task = Generator[int, None, None]
+
+TICKS_PER_STEP = 10  # 100 Hz
+CONTROL_PHASE = 0  # the controller runs in ticks 0, 10, 20 …
+ESTIMATOR_PHASE = 9  # and the estimator in the ticks before
+DATA_TIMEOUT = 1  # tick edge without a sample at which the stabilizer goes on without the IMU
+
+
+def sensors_task(
+    kernel: Kernel,
+    cost: CpuConfig,
+    board: Board,
+    imu_ready: Semaphore,
+    measurements: Queue[Measurement],
+    data_ready: Semaphore,
+    zero: GyroZero,
+    zero_found: Callable[[], None],
+) -> Task:
+    """Read the IMU whenever it has data."""
+    cost_us = cost.sensors_us
+    while True:
+        yield from imu_ready.take()
+        yield from kernel.work(cost_us)
+        counts = board.read_imu()
+        if zero.bias is None and zero.add(counts):
+            zero_found()
+        yield from measurements.send((GYRO, counts), 0)
+        yield from measurements.send((ACCELEROMETER, counts), 0)
+        yield from data_ready.give()
+
+
+def stabilizer_task(
+    kernel: Kernel,
+    cost: CpuConfig,
+    board: Board,
+    data_ready: Semaphore,
+    estimator_run: Semaphore,
+    supervisor: Supervisor,
+    core: "CoreBlocks",
+) -> Task:
+    """Run at 1 kHz on the tick edge after each IMU sample; control at 100 Hz."""
+    control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
+    while True:
+        if (yield from data_ready.take(DATA_TIMEOUT)):
+            yield from kernel.delay_until(kernel.tick_count + 1)
+        yield from kernel.work(cost.stabilizer_us)
+        yield from estimator_run.give()
+        if kernel.tick_count >= control_tick:
+            control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
+            yield from kernel.work(cost.controller_us)
+            core.data.fields.mode = supervisor.mode(kernel.now_us)
+            entry.control(core.parameters.arg, core.data.arg, core.estimator.arg, core.control.arg)
+            board.write_compare(core.control.fields.count.tolist())
+
+
+def estimator_task(
+    kernel: Kernel,
+    cost: CpuConfig,
+    estimator_run: Semaphore,
+    measurements: Queue[Measurement],
+    supervisor: Supervisor,
+    core: "CoreBlocks",
+) -> Task:
+    """Take in measurements at 1 kHz, estimate at 100 Hz."""
+    data = core.data.fields
+    samples = x = y = z = 0
+    step_tick = next_step(kernel.tick_count, ESTIMATOR_PHASE)
+    while True:
+        yield from estimator_run.take()
+        yield from kernel.work(cost.kalman_us)
+        while (measurement := measurements.receive_nowait()) is not None:
+            kind, value = measurement
+            if kind == GYRO:
+                samples += 1
+                x += value[0]
+                y += value[1]
+                z += value[2]
+            elif kind == POSE:
+                file_pose(kernel, value, supervisor, core)
+        if kernel.tick_count >= step_tick:
+            step_tick = next_step(kernel.tick_count, ESTIMATOR_PHASE)
+            yield from kernel.work(cost.estimator_us)
+            data.gyro_sum[:] = x, y, z
+            data.gyro_samples = samples
+            samples = x = y = z = 0
+            entry.estimate(core.parameters.arg, core.data.arg, core.estimator.arg, core.control.arg)
+
+
+def next_step(tick: int, phase: int) -> int:
+    """Return the first tick of a phase after `tick`: a step that is late does not move the next one."""
+    return tick + 1 + (phase - tick - 1) % TICKS_PER_STEP
+
+
+def file_pose(kernel: Kernel, measurement: Any, supervisor: Supervisor, core: "CoreBlocks") -> None:
+    """Hand a pose to the core with the age that it will have at the estimator's next step."""
+    data = core.data.fields
+    message = measurement.message
+    data.pose_position[:] = message.p_GB
+    data.pose_quaternion[:] = message.q_GB
+    if message.age_us is None:
+        data.pose_age_us = -1
+    else:
+        ticks_to_step = (ESTIMATOR_PHASE - kernel.tick_count) % TICKS_PER_STEP
+        data.pose_age_us = kernel.now_us - measurement.t_us + message.age_us + ticks_to_step * TICK_US
+    if entry.file_pose(core.parameters.arg, core.data.arg, core.estimator.arg) == POSE_ON_TIME:
+        supervisor.last_pose_us = measurement.t_us
+
+
+class CoreBlocks:
+    """The memory of the flight core, as the tasks share it: each block has one writer but the parameters."""
+
+    __slots__ = ("control", "data", "estimator", "parameters")
+
+    def __init__(self, parameters: Block, data: Block, estimator: Block, control: Block) -> None:
+        self.parameters = parameters
+        self.data = data  # written by the estimator task, but for the mode: the stabilizer
+        self.estimator = estimator  # written by the estimator task; its `now` is the stabilizer's mailbox
+        self.control = control  # written by the stabilizer task

@@ -1,0 +1,298 @@
+"""The command line: `floaty fly | list | view | report`.
+
+Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C in 130 with the log kept.
+"""
+
+import math
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+
+from hil.errors import LabError
+
+if TYPE_CHECKING:
+    from hil.run import Request, Result
+
+INTERRUPTED = 130
+DURATION_MAX_S = 86_400.0
+SEEDS_MAX = 10_000
+
+console = Console(highlight=False)
+notices = Console(stderr=True, highlight=False)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="floaty-hil", prog_name="floaty")
+def app() -> None:
+    """Floaty virtual laboratory: firmware, ground station and wind tunnel, joined by real bytes."""
+
+
+run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+
+
+@app.command()
+@click.argument("experiment")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=1, show_default=True, help="Of everything random."
+)
+@click.option(
+    "--seeds", type=click.IntRange(1, SEEDS_MAX), default=1, metavar="N",
+    help="Fly N seeds from --seed on, in parallel; logs without pictures.",
+)  # fmt: skip
+@click.option("--duration", type=float, metavar="S", help="Free flight [s]; default: the experiment's.")
+@click.option(
+    "--profile",
+    default="floaty",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="A profile that ships, or a TOML file.",
+)
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
+    help="Override a value of the profile; repeatable.",
+)
+@click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
+@click.option("--view", "watch", is_flag=True, help="Watch live in the rerun viewer.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
+)
+def fly(
+    experiment: str,
+    seed: int,
+    seeds: int,
+    duration: float | None,
+    profile: str,
+    overrides: tuple[str, ...],
+    realtime: bool,
+    watch: bool,
+    out: Path | None,
+) -> int:
+    """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
+
+    Exit code 0: all limits hold; 1: a limit fails; 2: bad input; 130: interrupted.
+    """
+    from hil.config import load_config
+    from hil.experiments import find_experiment
+
+    chosen = find_experiment(experiment)
+    flown_s = chosen.duration_s if duration is None else duration
+    if not 0.0 < flown_s <= DURATION_MAX_S:
+        raise LabError(f"--duration {flown_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}")
+    if seeds > 1 and (realtime or watch):
+        raise LabError(
+            f"--seeds {seeds}: many seeds fly as fast as they can; --realtime and --view are for one"
+        )
+    config = load_config(profile, overrides)
+    announce_compilation()
+    from hil.run import Request
+
+    requests = [Request(chosen, config, profile, overrides, seed + index, flown_s) for index in range(seeds)]
+    if seeds > 1:
+        return _fly_many(requests, out or Path("runs"))
+    return _fly_one(requests[0], out or Path("runs") / f"{chosen.name}-{seed}", realtime, watch)
+
+
+@app.command("list")
+def list_experiments() -> None:
+    """List the experiments and the profiles."""
+    from hil.config import DEFAULT_PROFILE, profile_names
+    from hil.experiments import EXPERIMENTS
+
+    width = max(map(len, EXPERIMENTS))
+    for experiment in EXPERIMENTS.values():
+        console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
+    names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
+    console.print(f"\nprofiles: {', '.join(names)}")
+
+
+@app.command()
+@run_folder
+def view(run: Path) -> None:
+    """Open RUN, a run folder, in the rerun viewer."""
+    from hil.viewer import view_run
+
+    view_run(run)
+
+
+@app.command()
+@run_folder
+def report(run: Path) -> None:
+    """Write the report of RUN, a run folder, again."""
+    from hil.report import write_report
+
+    console.print(f"report  {write_report(run)}")
+
+
+def announce_compilation() -> None:
+    """Say that the first run compiles, because it takes a while."""
+    cache = Path(__file__).parent / "plant" / "__pycache__"
+    if not os.environ.get("NUMBA_DISABLE_JIT") and not any(cache.glob("*.nbi")):
+        notices.print("first run on this machine: compiling flight core and plant, once, about half a minute")
+
+
+def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool) -> int:
+    """Fly one seed with all its pictures; returns the exit code."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from hil.clock import FreeRunning, Paced
+    from hil.harness import Flight
+    from hil.report import write_report
+    from hil.run import fly, prepare
+    from hil.viewer import LiveViewer, write_run_rrd
+
+    prepare(folder)
+    viewer = LiveViewer(folder) if watch else None
+    clock = Paced() if realtime else FreeRunning()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[now]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=notices, transient=True) as progress:
+        bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
+
+        def show(now_us: int, flight: Flight) -> None:
+            progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
+
+        result = fly(request, folder, clock, show, viewer.send if viewer else None)
+        progress.update(bar, description="writing recording and report", total=None, now="")
+        for write in (write_run_rrd, write_report):
+            try:
+                write(folder)
+            except LabError as error:  # the log is there: `floaty view` and `floaty report` can try again
+                notices.print(f"floaty: {error}")
+        missed = viewer.close() if viewer else 0
+    _print_result(result)
+    if missed:
+        console.print(f"the live viewer was too slow for {missed} of the flight's seconds; the recording has them all")
+    if isinstance(clock, Paced):
+        console.print(f"paced to the wall clock, never more than {clock.worst_lag_us / 1000:.1f} ms late")
+    if result.outcome == "interrupted":
+        return INTERRUPTED
+    return 0 if result.passed else 1
+
+
+def _fly_many(requests: "list[Request]", parent: Path) -> int:
+    """Fly seeds in parallel processes; one row per seed as they finish, a summary at the end; returns the exit code."""
+    from hil.sweep import fly_all
+
+    rows: list[Result] = []
+    try:
+        for result in fly_all(requests, parent, notices):
+            rows.append(result)
+    except KeyboardInterrupt:
+        notices.print(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
+        _print_seeds(rows)
+        return INTERRUPTED
+    _print_seeds(rows)
+    return 0 if all(result.passed for result in rows) else 1
+
+
+SEED_COLUMNS = (
+    ("rms x y z [cm]", ("rms_x", "rms_y", "rms_z"), 100.0, 2),
+    ("max x y z [cm]", ("max_x", "max_y", "max_z"), 100.0, 1),
+    ("< 6 cm x y z [%]", ("within_6cm_x", "within_6cm_y", "within_6cm_z"), 100.0, 1),
+    ("in box [%]", ("in_box",), 100.0, 1),
+    ("attitude max [deg]", ("attitude_max",), math.degrees(1.0), 1),
+)
+
+
+def _print_seeds(rows: "list[Result]") -> None:
+    """Print one row per seed and the summary."""
+    from rich.table import Table
+
+    if not rows:
+        return
+    table = Table(title=f"{rows[0].request.experiment.name}, profile {rows[0].request.profile}")
+    for heading in ("seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict"):
+        table.add_column(heading, justify="right")
+    for result in rows:
+        failed = ", ".join(verdict.metric for verdict in result.verdicts if not verdict.holds)
+        verdict = "ok" if result.passed else result.cause or f"fails: {failed}"
+        table.add_row(
+            str(result.request.seed),
+            *(
+                " ".join(f"{result.metrics[name] * scale:.{digits}f}" for name in names)
+                for _, names, scale, digits in SEED_COLUMNS
+            ),
+            result.hash[:12],
+            verdict,
+        )
+    wide = Console(highlight=False, width=max(console.width, 140))
+    wide.print(table)
+    completed = [result.metrics for result in rows if result.outcome == "completed"]
+    lost = sum(result.outcome == "lost" for result in rows)
+    passed = sum(result.passed for result in rows)
+    console.print(f"{len(rows)} seeds: {passed} hold all limits, {lost} lost")
+    if completed:
+        shares, rms = (
+            " ".join(
+                f"{axis} {100.0 * sum(metrics[name + axis] for metrics in completed) / len(completed):.{digits}f}"
+                for axis in "xyz"
+            )
+            for name, digits in (("within_6cm_", 1), ("rms_", 2))
+        )
+        console.print(f"mean of the completed: rms {rms} cm; < 6 cm {shares} % of the time")
+
+
+def _print_result(result: "Result") -> None:
+    """Print the verdicts of one flight and where to look."""
+    from rich.table import Table
+
+    from hil.metrics import METRICS
+
+    request = result.request
+    table = Table(title=f"{request.experiment.name}, seed {request.seed}, profile {request.profile}")
+    table.add_column("metric")
+    for heading in ("value", "limit", "verdict"):
+        table.add_column(heading, justify="right")
+    verdicts = {verdict.metric: verdict for verdict in result.verdicts}
+    for name, value in result.metrics.items():
+        metric = METRICS[name]
+        limit = mark = ""
+        if name in verdicts:
+            limit = f"{'<=' if metric.bound == 'max' else '>='} {metric.show(verdicts[name].bound)}"
+            mark = "ok" if verdicts[name].holds else "FAILS"
+        table.add_row(name, metric.show(value), limit, mark)
+    console.print(table)
+    cause = f": {result.cause}" if result.cause else ""
+    console.print(
+        f"{result.outcome}{cause}; {result.real_time_factor:.0f} times real time; hash {result.hash[:16]}"
+    )
+    for name in ("report.html", "flight.rrd", "log.parquet"):
+        if (result.folder / name).is_file():
+            hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""
+            console.print(f"  {result.folder / name}{hint}", soft_wrap=True)
+
+
+def main() -> None:
+    """Run the command line and leave with its exit code."""
+    try:
+        code = app.main(standalone_mode=False)
+    except LabError as error:
+        sys.exit(_refuse(str(error)))
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message(), file=sys.stderr)
+        sys.exit(2)
+    except click.ClickException as error:
+        sys.exit(_refuse(error.format_message()))
+    except (click.Abort, KeyboardInterrupt):
+        sys.exit(INTERRUPTED)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _refuse(text: str) -> int:
+    print("floaty:", " ".join(text.split()), file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""A profile: everything about a flight that is not the experiment, as one TOML file checked by one typed model.
+
+`base = "name"` at the top of a profile builds on another one. `--set section.key=value` overrides single values.
+Every mistake becomes a `LabError` that names the key, its value and what is allowed.
+"""
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from firmware_py.config import FirmwareConfig
+from ground_station.station import StationConfig
+from hil.errors import LabError
+from hil.plant.config import PlantConfig, ServoConfig
+from hil.tunnel import TunnelConfig
+from hil.virtual_imu import ImuConfig
+from hil.virtual_mocap import MocapConfig
+from hil.virtual_radio import RadioConfig
+
+DEFAULT_PROFILE = "floaty"
+_FOLDERS = (Path(__file__).parent.parent / "profiles", Path(__file__).parent / "profiles")
+
+
+class FlightConfig(BaseModel):
+    """Where and when the flight begins."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    home: tuple[float, float, float] = Field(
+        (0.0, 0.0, 1.15), description="home goal and start, W [m]; paper: 115 cm above the tunnel's centre"
+    )
+    start_offset: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="start relative to home, W [m]"
+    )
+    release_us: int = Field(
+        1_000_000,
+        ge=0,
+        le=60_000_000,
+        description="the robot is held until then: gyro zero, first poses [us]",
+    )
+
+
+class LabConfig(FirmwareConfig):
+    """What is flashed, and the world around it."""
+
+    plant: PlantConfig = Field(default_factory=PlantConfig)
+    actuators: ServoConfig = Field(default_factory=ServoConfig)
+    tunnel: TunnelConfig = Field(default_factory=TunnelConfig)
+    imu: ImuConfig = Field(default_factory=ImuConfig)
+    mocap: MocapConfig = Field(default_factory=MocapConfig)
+    radio: RadioConfig = Field(default_factory=RadioConfig)
+    station: StationConfig = Field(default_factory=StationConfig)
+    flight: FlightConfig = Field(default_factory=FlightConfig)
+    limits: dict[str, dict[str, float]] = Field(
+        default_factory=dict, description="limits by experiment that replace the experiment's own"
+    )
+
+
+def profile_names() -> list[str]:
+    """Return the names of the profiles that ship."""
+    return sorted({path.stem for folder in _FOLDERS if folder.is_dir() for path in folder.glob("*.toml")})
+
+
+def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -> LabConfig:
+    """Return the configuration of a profile (a name that ships, or a path) with `section.key=value` overrides."""
+    tree = _read_profile(profile, ())
+    for override in overrides:
+        _apply(tree, override)
+    try:
+        return LabConfig.model_validate(tree)
+    except ValidationError as error:
+        raise LabError("; ".join(_explain(tree, detail) for detail in error.errors()[:3])) from None
+
+
+def _read_profile(profile: str, children: tuple[Path, ...]) -> dict[str, Any]:
+    path = _find_profile(profile, children)
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LabError(f"profile {profile}: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise LabError(f"profile {path}: not TOML: {error}") from None
+    base = tree.pop("base", None)
+    if base is None:
+        return tree
+    if not isinstance(base, str):
+        raise LabError(f"profile {path}: base = {base!r}: expected the name or path of a profile")
+    if path in children:
+        raise LabError(f"profile {path}: base = {base!r} leads back to itself")
+    return _merge(_read_profile(base, (*children, path)), tree)
+
+
+def _find_profile(profile: str, children: tuple[Path, ...]) -> Path:
+    if profile.endswith(".toml"):
+        path = Path(profile)
+        beside = children[-1].parent / path if children and not path.is_absolute() else path
+        return (beside if beside.is_file() else path).resolve()
+    for folder in _FOLDERS:
+        if (folder / f"{profile}.toml").is_file():
+            return (folder / f"{profile}.toml").resolve()
+    raise LabError(
+        f"profile {profile!r}: neither the name of a profile{_hint(profile, profile_names())} "
+        "nor a path that ends in .toml"
+    )
+
+
+def _merge(base: dict[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in change.items():
+        below = merged.get(key)
+        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _apply(tree: dict[str, Any], override: str) -> None:
+    """Put `section.key=value` or `section.key[i]=value` into the tree; the value is TOML, or a bare word."""
+    name, equals, text = override.partition("=")
+    keys = name.strip().split(".")
+    if not equals or len(keys) < 2 or not all(keys):
+        raise LabError(f"--set {override}: expected section.key=value")
+    value = _toml_value(text.strip())
+    for key in keys[:-1]:
+        below = tree.setdefault(key, {})
+        if not isinstance(below, dict):
+            raise LabError(f"--set {override}: {key} is a value, not a section")
+        tree = below
+    leaf, bracket, index = keys[-1].partition("[")
+    if not bracket:
+        tree[leaf] = value
+        return
+    items = tree.get(leaf)
+    position = index.rstrip("]")
+    if not isinstance(items, list) or not position.isdigit() or int(position) >= len(items):
+        raise LabError(f"--set {override}: {leaf} has no element [{position}] in this profile")
+    tree[leaf] = [*items[: int(position)], value, *items[int(position) + 1 :]]
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _explain(tree: Mapping[str, Any], detail: ErrorDetails) -> str:
+    """Return one line: what, the value, what is allowed."""
+    location = [str(part) for part in detail["loc"]]
+    name = (
+        ".".join(location).replace(".0", "[0]").replace(".1", "[1]").replace(".2", "[2]").replace(".3", "[3]")
+    )
+    if detail["type"] == "missing":
+        return f"{name}: missing; a profile without `base` states every constant that is flashed"
+    value = detail["input"]
+    if detail["type"] == "extra_forbidden":
+        return f"{name} = {value!r}: unknown key{_hint(location[-1], _allowed(location[:-1]))}"
+    return f"{name} = {value!r}: {detail['msg'][0].lower()}{detail['msg'][1:]}"
+
+
+def _allowed(location: list[str]) -> list[str]:
+    model: Any = LabConfig
+    for part in location:
+        annotation = model.model_fields[part].annotation
+        candidates = [annotation, *get_args(annotation)]
+        model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
+        if model is None:
+            return []
+    return list(model.model_fields)
+
+
+def _hint(word: str, allowed: list[str]) -> str:
+    near = difflib.get_close_matches(word, allowed, 1, 0.5)
+    return f" (did you mean {near[0]}?)" if near else f" (there are {', '.join(allowed)})" if allowed else ""

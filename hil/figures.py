@@ -1,0 +1,236 @@
+"""The figures of a flight as PNG, after the paper's figure Hover_figure; also of a flight that was lost or never began.
+
+Axes carry cm, degrees, ms and seconds of simulated time. Grey: the robot was still held.
+"""
+
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hil import curves, scene
+from hil.curves import Curves
+from hil.metrics import BOX, column, free_flight
+
+WIDTH, DPI = 9.2, 115  # [in], 1/in
+TENTH, SECOND = 10, 100  # rows
+BOX_CM = 100 * BOX
+STYLE: Any = {
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "agg.path.chunksize": 10_000,  # a long flight's noise overflows the renderer otherwise
+    "font.size": 8.5,
+    "grid.alpha": 0.3,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "lines.linewidth": 0.9,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure of the report."""
+
+    title: str
+    caption: str
+    draw: Callable[[pa.Table], Figure]
+
+    def png(self, rows: pa.Table) -> bytes:
+        """Return the figure of a flight log."""
+        with matplotlib.rc_context(STYLE):
+            file = io.BytesIO()
+            self.draw(rows).savefig(file, format="png", dpi=DPI)
+        return file.getvalue()
+
+
+def _stack(heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
+    """Return a figure of axes one above the other [in] that share their time axis."""
+    figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
+    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0].tolist()
+    axes[-1].set_xlabel("time [s]")
+    return figure, axes
+
+
+def _seconds(rows: pa.Table) -> NDArray[np.float64]:
+    return 1e-6 * column(rows, "t")
+
+
+def _lines(
+    axes: Axes, times: NDArray[np.float64], plot: Curves, values: NDArray[np.float64], label: str
+) -> None:
+    for index, (name, colour) in enumerate(zip(plot.names, plot.colours, strict=True)):
+        axes.plot(times, values[:, index], color=colour, label=name)
+    axes.set_ylabel(f"{label} [{plot.unit}]")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def _limits(axes: Axes, limit: float) -> None:
+    for value in (-limit, limit):
+        axes.axhline(value, color="black", linestyle="--", linewidth=0.8)
+
+
+def _shade_hold(axes: Sequence[Axes], rows: pa.Table) -> None:
+    held = _seconds(rows)[column(rows, "flight.free") < 0.5]
+    for one in axes:
+        one.margins(x=0)
+        if len(held) > 1:
+            one.axvspan(held[0], held[-1], color=curves.GREY, alpha=0.2, linewidth=0)
+
+
+def track(rows: pa.Table) -> Figure:
+    """Draw the way around the target: in space, from above, from the side."""
+    points = curves.POSITION.read(free_flight(rows))
+    x, y, z = points.T
+    figure = Figure(figsize=(WIDTH, 3.3), layout="constrained")
+    grid = figure.add_gridspec(1, 3, width_ratios=(1.3, 1, 1), wspace=0.12)
+    space: Any = figure.add_subplot(grid[0], projection="3d")
+    space.plot(x, y, z, color=curves.BLUE, linewidth=0.6)
+    space.plot([0.0], [0.0], [0.0], "+", color="red", markersize=9, markeredgewidth=1.8)
+    for line in scene.box_lines(BOX_CM):
+        space.plot(*line.T, color="black", linewidth=0.7)
+    space.set(xlabel="x [cm]", ylabel="y [cm]", zlabel="z [cm]")
+    reach = max(1.1 * BOX_CM, float(np.abs(points).max(initial=0.0)))
+    space.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
+    space.locator_params(nbins=5)
+    space.set_box_aspect((1, 1, 1), zoom=0.9)
+    square = BOX_CM * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
+    for place, across, up, label in ((grid[1], x, y, "y"), (grid[2], x, z, "z")):
+        axes = figure.add_subplot(place)
+        axes.plot(across, up, color=curves.BLUE, linewidth=0.6)
+        axes.plot(*square.T, color="black", linewidth=0.9)
+        axes.plot(0.0, 0.0, "+", color="red", markersize=9, markeredgewidth=1.8)
+        axes.set(
+            xlabel="x [cm]",
+            ylabel=f"{label} [cm]",
+            aspect="equal",
+            xlim=(-reach, reach),
+            ylim=(-reach, reach),
+        )
+    return figure
+
+
+def errors(rows: pa.Table) -> Figure:
+    """Draw position and attitude errors over time with the paper's limits."""
+    figure, axes = _stack((2.1, 2.1))
+    times = _seconds(rows)
+    _lines(axes[0], times, curves.POSITION, curves.POSITION.read(rows), "position error")
+    _limits(axes[0], curves.NEAR_CM)
+    _lines(axes[1], times, curves.ATTITUDE, curves.ATTITUDE.read(rows), "attitude error")
+    _limits(axes[1], curves.ATTITUDE_DEG)
+    _shade_hold(axes, rows)
+    return figure
+
+
+def flaps(rows: pa.Table) -> Figure:
+    """Draw what the flaps were told and what they did."""
+    figure = Figure(figsize=(WIDTH, 3.8), layout="constrained")
+    grid = figure.subplots(2, 2, sharex=True)
+    times, angles, commands = _seconds(rows), curves.FLAPS.read(rows), curves.FLAPS_COMMAND.read(rows)
+    for index, axes in enumerate((grid[0, 1], grid[0, 0], grid[1, 0], grid[1, 1])):
+        axes.plot(times, commands[:, index], color="black", linewidth=0.6, alpha=0.55, label="command")
+        axes.plot(times, angles[:, index], color=curves.FLAPS.colours[index], label="true")
+        axes.set_title(curves.FLAPS.names[index], loc="left", fontsize=9)
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2)
+    for axes in grid[:, 0]:
+        axes.set_ylabel("angle [deg]")
+    for axes in grid[1]:
+        axes.set_xlabel("time [s]")
+    _shade_hold(list(grid.flat), rows)
+    return figure
+
+
+def link(rows: pa.Table) -> Figure:
+    """Draw the age of the poses, the time in the air and the packets that were lost."""
+    figure, axes = _stack((1.5, 1.5, 1.5))
+    _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
+    seconds = rows.take(np.arange(0, rows.num_rows, SECOND))
+    for index, name in enumerate(("up", "down")):
+        axes[1].plot(
+            _seconds(seconds)[1:],
+            curves.latency(seconds)[:, index],
+            color=curves.FLAP_COLOURS[index],
+            label=name,
+        )
+    axes[1].set_ylabel("mean latency [ms]")
+    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    _lines(axes[2], _seconds(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
+    _shade_hold(axes, rows)
+    return figure
+
+
+def board(rows: pa.Table) -> Figure:
+    """Draw the load of the processor by task, the measurement queue and the states."""
+    figure, axes = _stack((1.8, 1.1, 0.8))
+    load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
+    axes[0].stackplot(_seconds(tenths)[1:], load.read(tenths).T, labels=load.names, colors=load.colours)
+    axes[0].set_ylim(bottom=0.0)
+    axes[0].set_ylabel("processor [%]")
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    _lines(axes[1], _seconds(rows), curves.QUEUE, curves.QUEUE.read(rows), "queue")
+    lanes = (curves.SUPERVISOR, curves.RELEASE)
+    end = _seconds(rows)[-1:]
+    for height, states in enumerate(lanes):
+        begins, names = curves.changes(rows, states)
+        edges = np.append(1e-6 * begins, end)
+        for start, stop, name in zip(edges[:-1], edges[1:], names, strict=True):
+            colour = states.colours[states.names.index(name)]
+            axes[2].barh(height, stop - start, 0.8, start, color=colour, label=name)
+    axes[2].set_yticks(range(len(lanes)), ("supervisor", "robot"))
+    axes[2].grid(visible=False)
+    named = dict(zip(*reversed(axes[2].get_legend_handles_labels()), strict=True))  # one entry per name
+    axes[2].legend(named.values(), named.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.2))
+    _shade_hold(axes, rows)
+    return figure
+
+
+def estimate(rows: pa.Table) -> Figure:
+    """Draw what the estimator believed, less the truth, in the goal frame."""
+    figure, axes = _stack((1.8, 1.8))
+    _lines(axes[0], _seconds(rows), curves.POSITION_MISS, curves.POSITION_MISS.read(rows), "position")
+    _lines(axes[1], _seconds(rows), curves.ATTITUDE_MISS, curves.ATTITUDE_MISS.read(rows), "attitude")
+    _shade_hold(axes, rows)
+    return figure
+
+
+PICTURES = (
+    Picture(
+        "Track",
+        "Position of the body relative to the target (red +) after the release, in the goal frame, with the 20 cm box.",
+        track,
+    ),
+    Picture(
+        "Errors",
+        "Truth against the goal. Dashed: 6 cm, which the paper's robot mostly keeps, and 20 degrees, which it always keeps.",
+        errors,
+    ),
+    Picture(
+        "Flaps",
+        "True angle of each flap and the angle that the controller asked for, placed as seen from above.",
+        flaps,
+    ),
+    Picture(
+        "Link",
+        "Age of the pose when the estimator takes it and the horizon of its predictor; mean time of a packet in the air, "
+        "per second; packets lost and sent again, since the start.",
+        link,
+    ),
+    Picture(
+        "Board",
+        "Share of the processor by task, over 0.1 s; fullest state so far of the measurement queue and poses dropped from "
+        "it; states of the supervisor and of the robot.",
+        board,
+    ),
+    Picture(
+        "Estimate",
+        "What the estimator believed, less the truth, in the goal frame.",
+        estimate,
+    ),
+)

@@ -1,0 +1,194 @@
+"""One flight: the board, the ground station and the world on one time line.
+
+Hardware events own time; at equal time hardware goes first, then the firmware's tasks. Everything random comes from one
+seed, split into one stream per component. The loop is the one of ARCHITECTURE.md.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.firmware import Firmware
+from ground_station.links.loopback import LoopbackLink
+from ground_station.mocap import MocapFrame
+from ground_station.station import GroundStation
+from ground_station.telemetry_log import TelemetryLog
+from ground_station.trajectory import Goal
+from hil.channels import flight_channels
+from hil.clock import Clock, FreeRunning
+from hil.config import LabConfig
+from hil.events import EventQueue
+from hil.experiments import Experiment
+from hil.plant.plant import Plant
+from hil.recorder import Channel, Recorder
+from hil.virtual_board import VirtualBoard
+from hil.virtual_imu import VirtualImu
+from hil.virtual_mocap import VirtualMocap
+from hil.virtual_radio import VirtualRadio
+
+IMU_PERIOD_US = 1_000
+MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms before its step
+RECORD_PERIOD_US = 10_000
+RECORD_PHASE_US = 250  # just after the controller
+PROGRESS_PERIOD_US = 250_000
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a flight ended."""
+
+    end_us: int
+    lost: str | None  # cause of a crash
+    interrupted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """One random stream per component, all from one seed."""
+
+    gusts: np.random.Generator
+    imu: np.random.Generator
+    mocap: np.random.Generator
+    radio: np.random.Generator
+
+    @classmethod
+    def of_seed(cls, seed: int) -> "Streams":
+        """Split a seed."""
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(4)))
+
+
+class Flight:
+    """A board in its virtual tunnel with its ground station, ready to be released."""
+
+    def __init__(
+        self,
+        config: LabConfig,
+        experiment: Experiment,
+        duration_s: float,
+        seed: int,
+        telemetry_path: Path | None,
+        clock: Clock | None = None,
+    ) -> None:
+        streams = Streams.of_seed(seed)
+        home, offset = config.flight.home, config.flight.start_offset
+        self.config = config
+        self.events = EventQueue()
+        self.clock: Clock = clock or FreeRunning()
+        self.release_us = config.flight.release_us
+        self.end_us = self.release_us + round(duration_s * 1e6)
+        self.lost: str | None = None
+        self.free = False
+        self.recorder: Recorder | None = None
+        self.trajectory = experiment.trajectory(Goal(home, 0.0), self.release_us)
+        self.plant = Plant(
+            config.plant, config.tunnel, config.actuators, streams.gusts,
+            (home[0] + offset[0], home[1] + offset[1], home[2] + offset[2]),
+        )  # fmt: skip
+        self.imu = VirtualImu(config.imu, streams.imu)
+        self.mocap = VirtualMocap(config.mocap, streams.mocap)
+        self.radio = VirtualRadio(config.radio, self.events, streams.radio)
+        link = LoopbackLink(self.radio.uplink, config.station.link_latency_us)
+        self.telemetry = TelemetryLog(telemetry_path) if telemetry_path else None
+        self.station = GroundStation(link, self.trajectory, self.telemetry, config.station)
+        self.board = VirtualBoard(self.plant.set_counts, self.radio.downlink, self._console)
+        self.firmware = Firmware(config, self.board)
+        self.radio.connect(self._radio_to_board, self.station.on_packet)
+        self.plant.hold()
+        self.events.at(self.release_us, self._release)
+        self.events.at(IMU_PERIOD_US, self._imu_sample)
+        self.events.at(MOCAP_PHASE_US, self._expose)
+        self.events.at(RECORD_PHASE_US, self._record)
+
+    @property
+    def now_us(self) -> int:
+        """The present instant of the simulation."""
+        return self.board.now_us
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return what there is to record."""
+        return flight_channels(
+            self.plant, self.board, self.firmware, self.radio, self.trajectory, lambda: self.free
+        )
+
+    def run(self, progress: Callable[[int], None] | None = None) -> Outcome:
+        """Fly to the end, the crash, or Ctrl-C; the log is left open for the caller to close."""
+        try:
+            self._loop(progress or _silent)
+        except KeyboardInterrupt:
+            self._note("lab", "interrupted by the user")
+            return Outcome(self.board.now_us, self.lost, interrupted=True)
+        return Outcome(self.board.now_us, self.lost, interrupted=False)
+
+    def _loop(self, progress: Callable[[int], None]) -> None:
+        """Go from one instant at which anything happens to the next."""
+        events, firmware, board, wait_until = self.events, self.firmware, self.board, self.clock.wait_until
+        kernel = firmware.kernel
+        now_us = next_progress_us = 0
+        while now_us < self.end_us:
+            now_us = self.end_us
+            event_us, wake_us = events.next_us, kernel.next_wake_us
+            if event_us is not None and event_us < now_us:
+                now_us = event_us
+            if wake_us is not None and wake_us < now_us:
+                now_us = wake_us
+            wait_until(now_us)
+            board.now_us = now_us
+            if event_us == now_us:
+                events.run(now_us)
+            firmware.run(now_us)
+            if now_us >= next_progress_us:
+                progress(now_us)
+                next_progress_us = now_us + PROGRESS_PERIOD_US
+
+    # Hardware events
+
+    def _imu_sample(self, now_us: int) -> None:
+        self.plant.advance(now_us)
+        self.board.imu = self.imu.sample(self.plant)
+        self.firmware.imu_ready()
+        self.events.at(now_us + IMU_PERIOD_US, self._imu_sample)
+
+    def _expose(self, now_us: int) -> None:
+        self.plant.advance(now_us)
+        frame = self.mocap.expose(now_us, self.plant)
+        self.events.at(now_us + self.config.mocap.latency_us, self._deliver(frame))
+        self.events.at(now_us + self.config.mocap.period_us, self._expose)
+
+    def _deliver(self, frame: MocapFrame) -> Callable[[int], None]:
+        return lambda now_us: self.station.on_frame(frame, now_us)
+
+    def _radio_to_board(self, now_us: int, data: bytes) -> None:
+        self.firmware.radio_received(data)
+
+    def _release(self, now_us: int) -> None:
+        self.plant.release()
+        self.free = True
+        self._note("lab", "released")
+
+    def _record(self, now_us: int) -> None:
+        self.plant.advance(now_us)
+        if self.recorder is not None:
+            self.recorder.row(now_us)
+        if self.plant.lost is not None:
+            self.lost = self.plant.lost
+            self.end_us = now_us
+            self._note("lab", f"lost: {self.lost}")
+        self.events.at(now_us + RECORD_PERIOD_US, self._record)
+
+    def _console(self, now_us: int, text: str) -> None:
+        self._note("board", text)
+
+    def _note(self, source: str, text: str) -> None:
+        if self.recorder is not None:
+            self.recorder.note(self.board.now_us, source, text)
+
+    def close(self) -> None:
+        """Close what the flight itself opened."""
+        if self.telemetry is not None:
+            self.telemetry.close()
+
+
+def _silent(now_us: int) -> None:
+    """Show no progress."""

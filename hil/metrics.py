@@ -1,0 +1,131 @@
+"""From a flight log to figures and verdicts: computed from the truth, after the release, never from the estimate."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from firmware_py.geometry import euler_zyx_of
+from hil.errors import LabError
+
+NEAR = 0.06  # [m] "less than 6 cm over each axis"
+BOX = 0.10  # [m] half of the 20 cm box
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A figure of a flight; a limit on it is an upper or a lower bound."""
+
+    unit: str
+    bound: Literal["max", "min"]
+    meaning: str
+
+    def show(self, value: float) -> str:
+        """Return a value as people read it: lengths in cm, angles in deg, shares in percent."""
+        scale, unit = SHOWN.get(self.unit, (1.0, self.unit))
+        return f"{value * scale:.4g} {unit}".strip()
+
+
+SHOWN = {"m": (100.0, "cm"), "rad": (180.0 / np.pi, "deg"), "share": (100.0, "%")}
+
+METRICS: Mapping[str, Metric] = {
+    "lost": Metric("", "max", "1 when the flight ended as a crash"),
+    "flown": Metric("s", "min", "free flight, from the release to the end"),
+    "rms_x": Metric("m", "max", "root mean square of the x error, goal frame"),
+    "rms_y": Metric("m", "max", "root mean square of the y error"),
+    "rms_z": Metric("m", "max", "root mean square of the z error"),
+    "max_x": Metric("m", "max", "largest x error"),
+    "max_y": Metric("m", "max", "largest y error"),
+    "max_z": Metric("m", "max", "largest z error"),
+    "within_6cm_x": Metric("share", "min", "share of the time with |x error| < 6 cm"),
+    "within_6cm_y": Metric("share", "min", "share of the time with |y error| < 6 cm"),
+    "within_6cm_z": Metric("share", "min", "share of the time with |z error| < 6 cm"),
+    "in_box": Metric("share", "min", "share of the time inside the 20 cm box around the goal"),
+    "attitude_max": Metric("rad", "max", "largest roll, pitch or yaw error"),
+    "y_over_x": Metric("", "min", "rms of y over rms of x"),
+    "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
+    "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One limit, judged."""
+
+    metric: str
+    value: float
+    bound: float
+    holds: bool
+
+    def __str__(self) -> str:
+        metric = METRICS[self.metric]
+        relation = "<=" if metric.bound == "max" else ">="
+        return f"{self.metric} = {metric.show(self.value)} (limit {relation} {metric.show(self.bound)})"
+
+
+def column(table: pa.Table, *names: str) -> NDArray[np.float64]:
+    """Return columns of a log as an array (N,) or (N, len(names))."""
+    arrays = [table.column(name).to_numpy().astype(np.float64) for name in names]
+    return arrays[0] if len(arrays) == 1 else np.stack(arrays, axis=1)
+
+
+def position_error(table: pa.Table) -> NDArray[np.float64]:
+    """Return the body's position in the goal frame, (N, 3) [m]."""
+    offset = column(table, "truth.x", "truth.y", "truth.z") - column(table, "goal.x", "goal.y", "goal.z")
+    yaw = column(table, "goal.yaw")
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack(
+        (c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]), axis=1
+    )
+
+
+def attitude_error(table: pa.Table) -> NDArray[np.float64]:
+    """Return roll, pitch and yaw relative to the goal, (N, 3) [rad], yaw in -pi..pi."""
+    angles = euler_zyx_of(column(table, "truth.qw", "truth.qx", "truth.qy", "truth.qz"))
+    angles[:, 2] = np.angle(np.exp(1j * (angles[:, 2] - column(table, "goal.yaw"))))
+    return angles
+
+
+def free_flight(table: pa.Table) -> pa.Table:
+    """Return the rows after the release."""
+    return table.filter(np.asarray(column(table, "flight.free")) > 0.5)
+
+
+def measure(table: pa.Table, lost: bool) -> dict[str, float]:
+    """Return every metric of METRICS; NaN where the flight was too short to tell."""
+    flight = free_flight(table)
+    values = dict.fromkeys(METRICS, float("nan"))
+    values["lost"] = float(lost)
+    values["flown"] = 0.0
+    if flight.num_rows < 2:
+        return values
+    error = np.abs(position_error(flight))
+    times = column(flight, "t")
+    rms = np.sqrt((error**2).mean(axis=0))
+    for index, axis in enumerate("xyz"):
+        values[f"rms_{axis}"] = float(rms[index])
+        values[f"max_{axis}"] = float(error[:, index].max())
+        values[f"within_6cm_{axis}"] = float((error[:, index] < NEAR).mean())
+    values["flown"] = float(times[-1] - times[0]) * 1e-6
+    values["in_box"] = float((error <= BOX).all(axis=1).mean())
+    values["attitude_max"] = float(np.abs(attitude_error(flight)).max())
+    values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
+    values["age_mean"] = float(column(flight, "estimator.pose_age_us").mean()) * 1e-6
+    refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
+    values["poses_refused"] = float(refused[-1])
+    return values
+
+
+def judge(values: Mapping[str, float], limits: Mapping[str, float]) -> list[Verdict]:
+    """Return the verdict on each limit; a metric that is not a number fails. Unknown metrics raise `LabError`."""
+    verdicts = []
+    for name, bound in limits.items():
+        if name not in METRICS:
+            raise LabError(f"limit on {name!r}: no such metric, there are {', '.join(METRICS)}")
+        value = values[name]
+        holds = value <= bound if METRICS[name].bound == "max" else value >= bound
+        verdicts.append(Verdict(name, value, bound, holds))
+    return verdicts

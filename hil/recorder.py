@@ -1,0 +1,163 @@
+"""The flight log: one row per 10 ms, written while the flight goes on, so that a crash keeps what was flown.
+
+During the flight the rows go to `log.arrows` (an Arrow stream, one batch per second); closing turns it into `log.parquet`.
+Texts (console, supervisor, causes) go to `events.jsonl`, line by line. Each column carries `unit` and `frame` in its
+metadata; the schema carries configuration, seed, versions and commit. `load_log` reads whichever file there is.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.ipc
+import pyarrow.parquet
+from numpy.typing import NDArray
+
+from hil.errors import LabError
+
+ROWS_PER_BATCH = 100
+PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """Columns that share a unit and a frame (W, B, G, S or empty)."""
+
+    names: tuple[str, ...]
+    unit: str
+    frame: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """What is read together: `read` returns the values of all the quantities' columns in order (or one number)."""
+
+    dtype: str
+    read: Callable[[], Any]
+    quantities: tuple[Quantity, ...]
+
+
+class Recorder:
+    """Writes one flight into its run folder.
+
+    `on_batch` receives every finished batch as a `pyarrow.RecordBatch`, for the live viewer.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        channels: tuple[Channel, ...],
+        metadata: Mapping[str, str],
+        on_batch: Callable[[pa.RecordBatch], None] | None = None,
+    ) -> None:
+        self.folder = folder
+        self._columns: list[tuple[Callable[[], Any], NDArray[Any]]] = []
+        self._arrays: list[NDArray[Any]] = []
+        self._times = np.zeros(ROWS_PER_BATCH, np.int64)
+        self._row = 0
+        self._on_batch = on_batch
+        fields = [pa.field("t", pa.int64(), metadata={"unit": "us", "frame": ""})]
+        for channel in channels:
+            columns = [(name, quantity) for quantity in channel.quantities for name in quantity.names]
+            block = np.zeros((ROWS_PER_BATCH, len(columns)), channel.dtype)
+            self._columns.append((channel.read, block if len(columns) > 1 else block[:, 0]))
+            for index, (name, quantity) in enumerate(columns):
+                self._arrays.append(block[:, index])
+                metadata_of_column = {"unit": quantity.unit, "frame": quantity.frame}
+                fields.append(pa.field(name, pa.from_numpy_dtype(block.dtype), metadata=metadata_of_column))
+        self._schema = pa.schema(fields, metadata=dict(metadata))
+        self._hash = hashlib.sha256()
+        self._stream = pa.ipc.new_stream(str(folder / STREAM), self._schema)
+        self._events = (folder / EVENTS).open("w", encoding="utf-8")
+
+    def row(self, now_us: int) -> None:
+        """Take one sample of every channel."""
+        row = self._row
+        self._times[row] = now_us
+        for read, block in self._columns:
+            block[row] = read()
+        self._row = row + 1
+        if self._row == ROWS_PER_BATCH:
+            self._write_batch()
+
+    def note(self, now_us: int, source: str, text: str) -> None:
+        """Add a line of text to the log, on disk at once."""
+        self._events.write(json.dumps({"t_us": now_us, "source": source, "text": text}) + "\n")
+        self._events.flush()
+
+    def close(self) -> str:
+        """Finish the files; returns the SHA-256 over times, names and values of all columns."""
+        if self._row:
+            self._write_batch()
+        self._stream.close()
+        self._events.close()
+        finish_log(self.folder)
+        return self._hash.hexdigest()
+
+    def _write_batch(self) -> None:
+        rows = self._row
+        self._row = 0
+        columns = [self._times[:rows].copy(), *(array[:rows].copy() for array in self._arrays)]
+        for field, values in zip(self._schema, columns, strict=True):
+            self._hash.update(field.name.encode())
+            self._hash.update(values.tobytes())
+        batch = pa.record_batch([pa.array(values) for values in columns], schema=self._schema)
+        self._stream.write_batch(batch)
+        if self._on_batch is not None:
+            self._on_batch(batch)
+
+
+def finish_log(folder: Path) -> None:
+    """Turn what the stream holds into `log.parquet`, even when the flight ended in the middle of a batch."""
+    stream = folder / STREAM
+    table = _read_stream(stream)
+    partial = folder / (PARQUET + ".partial")
+    pa.parquet.write_table(table, partial, compression="zstd")
+    partial.replace(folder / PARQUET)
+    stream.unlink()
+
+
+def load_log(folder: Path) -> pa.Table:
+    """Return the log of a run folder; a run whose process died is read up to its last complete second.
+
+    Raises `LabError` when the folder holds no log.
+    """
+    if (folder / PARQUET).is_file():
+        return pa.parquet.read_table(folder / PARQUET)
+    if (folder / STREAM).is_file():
+        return _read_stream(folder / STREAM)
+    raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
+
+
+def load_events(folder: Path) -> list[dict[str, Any]]:
+    """Return the texts of a run: dicts with `t_us`, `source` and `text`."""
+    path = folder / EVENTS
+    if not path.is_file():
+        return []
+    return list(_complete_lines(path))
+
+
+def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            yield json.loads(line)
+        except json.JSONDecodeError:  # the line that was being written when the process died
+            return
+
+
+def _read_stream(path: Path) -> pa.Table:
+    try:
+        with pa.ipc.open_stream(str(path)) as reader:
+            schema, batches = reader.schema, []
+            while True:
+                try:
+                    batches.append(reader.read_next_batch())
+                except (StopIteration, pa.ArrowInvalid, OSError):
+                    return pa.Table.from_batches(batches, schema)
+    except pa.ArrowInvalid as error:
+        raise LabError(f"{path}: not a flight log ({error})") from error

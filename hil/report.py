@@ -1,0 +1,86 @@
+"""The report of a flight: `report.html` in its run folder, one file that needs nothing else.
+
+From `result.json`, `log.parquet` and `events.jsonl`; a flight that was lost, interrupted or killed has a report as well.
+"""
+
+import base64
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from hil.figures import PICTURES
+from hil.metrics import METRICS, SHOWN
+from hil.recorder import load_events, load_log
+from hil.run import read_result
+
+REPORT = "report.html"
+TEMPLATE = "report.html.j2"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table of metrics, ready to print; `holds` is None where there is no limit."""
+
+    name: str
+    meaning: str
+    value: str
+    unit: str
+    limit: str
+    holds: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A figure with its picture as a data URI."""
+
+    title: str
+    caption: str
+    source: str
+
+
+def write_report(folder: Path) -> Path:
+    """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log."""
+    log, result = load_log(folder), read_result(folder)
+    shown = [Shown(picture.title, picture.caption, _data_uri(picture.png(log))) for picture in PICTURES]
+    config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    page = environment.get_template(TEMPLATE).render(
+        result=result,
+        rows=metric_rows(result),
+        events=load_events(folder),
+        pictures=shown,
+        log_rows=log.num_rows,
+        config=json.dumps(config, indent=2),
+    )
+    path = folder / REPORT
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def metric_rows(result: Mapping[str, Any]) -> list[Row]:
+    """Return one row per metric of a `result.json`, those with a limit first."""
+    verdicts = {verdict["metric"]: verdict for verdict in result["verdicts"]}
+    rows = []
+    for name, metric in METRICS.items():
+        value = result["metrics"].get(name)
+        scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
+        verdict = verdicts.get(name)
+        limit = (
+            ""
+            if verdict is None
+            else f"{'≤' if metric.bound == 'max' else '≥'} {verdict['bound'] * scale:.4g}"
+        )
+        text = "–" if value is None else f"{value * scale:.4g}"
+        rows.append(Row(name, metric.meaning, text, unit, limit, verdict and verdict["holds"]))
+    return sorted(rows, key=lambda row: row.holds is None)
+
+
+def _data_uri(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode()

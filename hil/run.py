@@ -1,0 +1,211 @@
+"""A run: one flight into its folder, with log, telemetry, events, result, recording and report.
+
+`runs/<experiment>-<seed>/` holds `log.parquet`, `events.jsonl`, `telemetry.csv`, `result.json`, `flight.rrd` and
+`report.html`. Whatever ends the flight (its time, a crash, Ctrl-C, an error in a task), what was flown is kept.
+"""
+
+import json
+import math
+import platform
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from hil.clock import Clock
+from hil.config import LabConfig
+from hil.errors import LabError
+from hil.experiments import Experiment
+from hil.harness import Flight
+from hil.metrics import METRICS, Verdict, judge, measure
+from hil.recorder import Recorder, load_log
+
+RESULT = "result.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the user asked for."""
+
+    experiment: Experiment
+    config: LabConfig
+    profile: str
+    overrides: tuple[str, ...]
+    seed: int
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """How a run went; `outcome` is completed, lost, interrupted or error."""
+
+    folder: Path
+    request: Request
+    outcome: str
+    cause: str | None
+    metrics: Mapping[str, float]
+    verdicts: tuple[Verdict, ...]
+    hash: str
+    real_time_factor: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the flight came to its end and every limit holds."""
+        return self.outcome == "completed" and all(verdict.holds for verdict in self.verdicts)
+
+
+def fly(
+    request: Request,
+    folder: Path,
+    clock: Clock | None = None,
+    progress: Callable[[int, Flight], None] | None = None,
+    on_batch: Callable[[pa.RecordBatch], None] | None = None,
+) -> Result:
+    """Fly once and write everything but the pictures into `folder`, which `prepare` has made.
+
+    An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
+    """
+    limits = request.config.limits.get(request.experiment.name, request.experiment.limits)
+    judge(dict.fromkeys(METRICS, 0.0), limits)  # refuse unknown metrics before the flight
+    flight = Flight(
+        request.config, request.experiment, request.duration_s, request.seed, folder / "telemetry.csv", clock
+    )
+    recorder = Recorder(folder, flight.channels(), metadata_of(request), on_batch)
+    flight.recorder = recorder
+    outcome, cause = "error", None
+    start_ns = time.monotonic_ns()
+    try:
+        end = flight.run(None if progress is None else lambda now_us: progress(now_us, flight))
+        outcome = "interrupted" if end.interrupted else "lost" if end.lost else "completed"
+        cause = end.lost
+    except Exception as error:
+        cause = f"{type(error).__name__}: {error}"
+        recorder.note(flight.now_us, "lab", cause)
+    finally:
+        wall_s = (time.monotonic_ns() - start_ns) * 1e-9
+        digest = recorder.close()
+        flight.close()
+    metrics = measure(load_log(folder), outcome == "lost")
+    verdicts = tuple(judge(metrics, limits))
+    factor = flight.now_us * 1e-6 / wall_s
+    result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor)
+    write_result(result)
+    return result
+
+
+def prepare(folder: Path) -> None:
+    """Make an empty run folder; one that holds something else than a run is left alone. Raises `LabError`."""
+    try:
+        if folder.exists():
+            if any(folder.iterdir()) and not any(
+                (folder / name).exists() for name in (RESULT, "events.jsonl")
+            ):
+                raise LabError(
+                    f"--out {folder}: the folder is not empty and holds no run; choose another one"
+                )
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
+
+
+def write_result(result: Result) -> None:
+    """Write `result.json`."""
+    request = result.request
+    content = {
+        "experiment": request.experiment.name,
+        "profile": request.profile,
+        "overrides": list(request.overrides),
+        "seed": request.seed,
+        "duration_s": request.duration_s,
+        "outcome": result.outcome,
+        "cause": result.cause,
+        "metrics": {name: value if math.isfinite(value) else None for name, value in result.metrics.items()},
+        "verdicts": [
+            {
+                "metric": verdict.metric,
+                "value": verdict.value if math.isfinite(verdict.value) else None,
+                "bound": verdict.bound,
+                "holds": verdict.holds,
+            }
+            for verdict in result.verdicts
+        ],
+        "passed": result.passed,
+        "hash": result.hash,
+        "versions": versions(),
+        "commit": commit(),
+        "real_time_factor": round(result.real_time_factor, 2),
+    }
+    (result.folder / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """Return the content of a run's `result.json`; a flight that was killed has none: then a minimal one."""
+    path = folder / RESULT
+    if path.is_file():
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return content
+    metadata = {
+        key.decode(): value.decode() for key, value in (load_log(folder).schema.metadata or {}).items()
+    }
+    metrics = measure(load_log(folder), lost=False)
+    return {
+        "experiment": metadata.get("experiment", "?"),
+        "profile": metadata.get("profile", "?"),
+        "overrides": json.loads(metadata.get("overrides", "[]")),
+        "seed": int(metadata.get("seed", 0)),
+        "duration_s": float(metadata.get("duration_s", 0)),
+        "outcome": "error",
+        "cause": "the process ended before the flight did",
+        "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
+        "verdicts": [],
+        "passed": False,
+        "hash": "",
+        "versions": json.loads(metadata.get("versions", "{}")),
+        "commit": metadata.get("commit", ""),
+        "real_time_factor": None,
+    }
+
+
+def metadata_of(request: Request) -> dict[str, str]:
+    """Return the metadata of the log's schema."""
+    return {
+        "experiment": request.experiment.name,
+        "profile": request.profile,
+        "overrides": json.dumps(request.overrides),
+        "seed": str(request.seed),
+        "duration_s": str(request.duration_s),
+        "config": request.config.model_dump_json(),
+        "versions": json.dumps(versions()),
+        "commit": commit(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computed the flight."""
+    found = {"python": platform.python_version()}
+    for name in ("floaty-hil", "numpy", "numba", "pyarrow"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def commit() -> str:
+    """Return the git commit of the sources, with `+` when they were changed; empty outside a clone."""
+    source = Path(__file__).parent
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"],
+            cwd=source, capture_output=True, text=True, timeout=10, check=True,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return described.stdout.strip()

@@ -1,0 +1,146 @@
+"""Who may import whom, and which files alone may touch clocks, threads, randomness and heavy libraries."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("firmware_py", "ground_station", "hil")
+
+# What a package may import of ours, longest prefix of the importing module first. A name allows what is below it.
+LAYERS: dict[str, tuple[str, ...]] = {
+    "firmware_py.core": ("firmware_py.core",),
+    "firmware_py.wire": ("firmware_py.wire",),
+    "firmware_py.geometry": (),
+    "firmware_py": ("firmware_py",),
+    "ground_station": ("ground_station", "firmware_py.wire", "firmware_py.geometry"),
+    "hil": (
+        "hil", "ground_station",
+        "firmware_py.firmware", "firmware_py.board", "firmware_py.config", "firmware_py.signals",
+        "firmware_py.wire", "firmware_py.geometry", "firmware_py.errors",
+    ),
+}  # fmt: skip
+
+# Outside libraries that the core may use at all.
+CORE_LIBRARIES = {"numpy", "typing"}
+
+# Module or attribute -> the files that alone may use it.
+CONFINED: dict[str, tuple[str, ...]] = {
+    "numba": ("firmware_py/core/subset.py", "hil/plant/compiled.py"),
+    "rerun": ("hil/viewer.py", "hil/scene.py"),
+    "time": ("hil/clock.py", "hil/run.py"),
+    "datetime": (),
+    "asyncio": (),
+    "threading": ("hil/viewer.py",),
+    "multiprocessing": ("hil/sweep.py",),
+    "concurrent": ("hil/sweep.py",),
+    "subprocess": ("hil/run.py", "hil/viewer.py"),
+    "socket": ("hil/viewer.py",),
+    "random": (),
+    "secrets": (),
+    "numpy.random.default_rng": ("hil/harness.py",),
+    "numpy.random.seed": (),
+    "cflib": (),
+    "serial": (),
+    "pymavlink": (),
+    "filterpy": (),
+    "motioncapture": (),
+    "scipy": (),
+    "matplotlib": ("hil/figures.py", "hil/report.py"),
+    "pyarrow": ("hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/scene.py", "hil/report.py", "hil/figures.py"),
+}  # fmt: skip
+SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
+
+
+def imported(tree: ast.AST) -> list[tuple[int, str]]:
+    """Line and full name of everything imported; `from a import b` counts as a.b."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide the layer"
+            found += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
+    return found
+
+
+def used_attributes(tree: ast.AST) -> list[tuple[int, str]]:
+    """Line and dotted name of attribute chains on names, with `np` written out."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            name = ast.unparse(node)
+            found.append((node.lineno, "numpy" + name[2:] if name.startswith("np.") else name))
+    return found
+
+
+def below(name: str, prefix: str) -> bool:
+    return name == prefix or name.startswith(prefix + ".")
+
+
+def violations(path: str, source: str) -> list[str]:
+    """What in a source file breaks the architecture; path is relative to the root, with slashes."""
+    tree = ast.parse(source)
+    module = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    layer = next(layer for layer in LAYERS if below(module, layer))
+    found = []
+    for line, name in imported(tree):
+        if any(below(name, package) for package in PACKAGES):
+            if not any(below(name, allowed) for allowed in LAYERS[layer]):
+                found.append(f"{path}:{line}: {layer} must not import {name}")
+        elif layer == "firmware_py.core" and path != SUBSET and name.split(".")[0] not in CORE_LIBRARIES:
+            found.append(f"{path}:{line}: the core must not import {name}")
+    for line, name in imported(tree) + used_attributes(tree):
+        for confined, files in CONFINED.items():
+            if below(name, confined) and path not in files:
+                found.append(f"{path}:{line}: {confined} belongs to {', '.join(files) or 'no file'}")
+    return found
+
+
+def sources() -> list[Path]:
+    return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_file_keeps_to_its_room(path: Path) -> None:
+    assert violations(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("firmware_py/core/model.py", "import math"),
+        ("firmware_py/core/model.py", "from firmware_py.geometry import multiply"),
+        ("firmware_py/core/model.py", "import numba"),
+        ("firmware_py/wire/crtp.py", "from firmware_py.board import Board"),
+        ("firmware_py/geometry.py", "import firmware_py.wire"),
+        ("firmware_py/tasks.py", "from hil.events import EventQueue"),
+        ("firmware_py/tasks.py", "from ground_station.mocap import MocapFrame"),
+        ("firmware_py/tasks.py", "import time"),
+        ("firmware_py/rtos/kernel.py", "from time import monotonic"),
+        ("ground_station/station.py", "from firmware_py.firmware import Firmware"),
+        ("ground_station/station.py", "from hil.errors import LabError"),
+        ("ground_station/tracker.py", "from firmware_py.core import maths"),
+        ("hil/harness.py", "from firmware_py.core import entry"),
+        ("hil/harness.py", "from firmware_py.tasks import estimator_task"),
+        ("hil/plant/plates.py", "from firmware_py.core.model import derivative"),
+        ("hil/events.py", "import threading"),
+        ("hil/report.py", "import rerun as rr"),
+        ("hil/virtual_imu.py", "import numpy as np\nrng = np.random.default_rng()"),
+        ("hil/virtual_imu.py", "from numpy.random import default_rng"),
+        ("hil/virtual_imu.py", "import random"),
+    ],
+)
+def test_a_planted_violation_is_caught(path: str, source: str) -> None:
+    assert violations(path, source) != []
+
+
+def test_a_legal_file_is_not_accused() -> None:
+    source = "import numpy as np\nfrom ground_station.station import GroundStation\nfrom firmware_py.wire import crtp\n"
+    assert violations("hil/harness.py", source) == []
+
+
+def test_every_confined_file_exists() -> None:
+    files = {file for files in CONFINED.values() for file in files} | {SUBSET}
+    assert {file for file in files if not (ROOT / file).is_file()} == set()

@@ -1,0 +1,96 @@
+"""Profiles: strict, typed, and every mistake is one line that names key, value and what is allowed."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.config import parameters_of
+from firmware_py.core.structs import Parameters
+from hil.config import load_config, profile_names
+from hil.errors import LabError
+
+
+def test_shipped_profiles_load() -> None:
+    assert profile_names() == ["as-flown", "floaty"]
+    for name in profile_names():
+        load_config(name)
+
+
+def test_as_flown_differs_from_floaty_in_gains_and_limits_only() -> None:
+    floaty, flown = (load_config(name).model_dump() for name in ("floaty", "as-flown"))
+    assert {key for key in floaty if floaty[key] != flown[key]} == {"controller", "limits"}
+    assert flown["controller"]["gain_roll"] == 0.2
+
+
+def test_every_parameter_of_the_core_comes_from_the_profile() -> None:
+    marked = load_config()
+    block = parameters_of(marked)
+    unset = {name for name in Parameters.dtype.names or () if not np.any(block.memory[name])}
+    # `target` is the set-point, zero by design; the gains of pitch are zero in the tuned set
+    assert unset == {"target", "gain_pitch", "gain_q", "opening_min"}
+
+
+@pytest.mark.parametrize(
+    ("override", "value"),
+    [
+        ("tunnel.speed=9.5", lambda c: c.tunnel.speed == 9.5),
+        ("predictor.enabled=false", lambda c: c.predictor.enabled is False),
+        ("tunnel.turbulence=T1", lambda c: c.tunnel.turbulence == "T1"),
+        ('tunnel.turbulence="none"', lambda c: c.tunnel.turbulence == "none"),
+        ("servo.trim[1]=-4000", lambda c: c.servo.trim == (-3600, -4000, -9000, 6200)),
+        ("tunnel.side_wind=[0.0, 1.5, 0.0]", lambda c: c.tunnel.side_wind == (0.0, 1.5, 0.0)),
+        ("plant.limits.radius=0.3", lambda c: c.plant.limits.radius == 0.3),
+    ],
+)
+def test_an_override_reaches_its_value(override: str, value: object) -> None:
+    assert callable(value)
+    assert value(load_config("floaty", [override]))
+
+
+@pytest.mark.parametrize(
+    ("profile", "override", "message"),
+    [
+        ("floaty", "tunnel.sped=3", r"tunnel\.sped = 3: unknown key \(did you mean speed\?\)"),
+        ("floaty", "tunel.speed=3", r"did you mean tunnel\?"),
+        ("floaty", "controller.gain_y=nan", r"controller\.gain_y = nan: input should be a finite number"),
+        ("floaty", "controller.gain_y=inf", r"controller\.gain_y = inf"),
+        ("floaty", "controller.gain_y=1e9", r"controller\.gain_y = 1000000000\.0: .*less than or equal to 20"),
+        ("floaty", "tunnel.speed=-1", r"tunnel\.speed = -1: .*greater than 0"),
+        ("floaty", "servo.trim[1]=99999", r"servo\.trim\[1\] = 99999: .*12000"),
+        ("floaty", "servo.trim[7]=0", r"no element \[7\]"),
+        ("floaty", "controller.gain_y", r"expected section\.key=value"),
+        ("floaty", "gain_y=1", r"expected section\.key=value"),
+        ("floaty", "controller.gain_y.deeper=1", r"gain_y is a value, not a section"),
+        ("floaty", "predictor.horizon=13", r"predictor\.horizon = 13"),
+        ("flaoty", "", r"did you mean floaty\?"),
+        ("nowhere/x.toml", "", r"No such file"),
+    ],
+)
+def test_a_mistake_is_one_line_with_key_and_value(profile: str, override: str, message: str) -> None:
+    with pytest.raises(LabError, match=message) as caught:
+        load_config(profile, [override] if override else [])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_profile_builds_on_another(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('base = "as-flown"\n[tunnel]\nspeed = 9.75\n')
+    (tmp_path / "mine2.toml").write_text('base = "mine.toml"\n[controller]\ngain_z = 2.5\n')
+    config = load_config(str(tmp_path / "mine2.toml"))
+    assert (config.tunnel.speed, config.controller.gain_z, config.controller.gain_roll) == (9.75, 2.5, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[controller\n", "not TOML"),
+        ('base = "self.toml"\n', "leads back to itself"),
+        ("base = 3\n", "expected the name or path"),
+        ("[tunnel]\nspeed = 10\n", r"model: missing"),
+    ],
+)
+def test_a_broken_profile_says_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "self.toml"
+    path.write_text(text)
+    with pytest.raises(LabError, match=message):
+        load_config(str(path))

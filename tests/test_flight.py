@@ -1,0 +1,171 @@
+"""Whole flights: the limits of the hover, determinism, what the predictor saves, how flights end."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.clock import FreeRunning, Paced
+from hil.config import load_config
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS, find_experiment
+from hil.harness import Flight
+from hil.metrics import METRICS, column, judge
+from hil.recorder import load_events, load_log
+from hil.run import Request, Result, fly, prepare, read_result
+
+HOVER = EXPERIMENTS["hover"]
+
+
+def hover(folder: Path, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float = 30.0) -> Result:
+    request = Request(HOVER, load_config(profile, overrides), profile, overrides, seed, duration_s)
+    prepare(folder)
+    return fly(request, folder)
+
+
+def explain(result: Result) -> str:
+    return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
+
+
+@pytest.mark.parametrize("seed", [1, 10, 1234])
+def test_hover_holds_its_limits(tmp_path: Path, seed: int) -> None:
+    result = hover(tmp_path / "run", seed=seed)
+    assert result.passed, explain(result)
+    assert {verdict.metric for verdict in result.verdicts} == set(HOVER.limits)
+
+
+def test_hover_with_the_authors_gains_swings_in_y_and_survives(tmp_path: Path) -> None:
+    results = [hover(tmp_path / str(seed), profile="as-flown", seed=seed) for seed in (1, 2, 3, 4)]
+    for result in results:
+        assert result.passed, explain(result)
+    rms = {axis: np.mean([result.metrics[f"rms_{axis}"] for result in results]) for axis in "xy"}
+    assert rms["y"] > rms["x"]
+    for axis in "xyz":
+        assert np.mean([result.metrics[f"within_6cm_{axis}"] for result in results]) > 0.95
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_without_the_predictor_the_authors_gains_lose_the_robot(tmp_path: Path, seed: int) -> None:
+    result = hover(tmp_path / "run", "predictor.enabled=false", profile="as-flown", seed=seed)
+    assert result.outcome == "lost", explain(result)
+    assert result.cause is not None
+
+
+def test_same_seed_same_hash_other_seed_other_hash(tmp_path: Path) -> None:
+    first, again, other = (
+        hover(tmp_path / name, seed=seed, duration_s=3.0) for name, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
+    assert first.hash == again.hash
+    assert first.hash != other.hash
+    assert load_log(first.folder).equals(load_log(again.folder))
+    assert (first.folder / "telemetry.csv").read_bytes() == (again.folder / "telemetry.csv").read_bytes()
+
+
+def test_pacing_changes_the_time_it_takes_and_nothing_else(tmp_path: Path) -> None:
+    request = Request(HOVER, load_config("floaty", ["flight.release_us=100000"]), "floaty", (), 3, 0.2)
+    for name in ("free", "paced"):
+        prepare(tmp_path / name)
+    free = fly(request, tmp_path / "free", FreeRunning())
+    paced = fly(request, tmp_path / "paced", Paced())
+    assert free.hash == paced.hash
+    assert paced.real_time_factor <= 1.01
+
+
+def test_a_flow_too_weak_ends_as_a_crash_with_its_cause(tmp_path: Path) -> None:
+    result = hover(tmp_path / "run", "tunnel.speed=7.0")
+    assert result.outcome == "lost"
+    assert result.cause is not None
+    assert "fell" in result.cause or "tether" in result.cause
+    assert not result.passed
+    assert any("lost" in event["text"] for event in load_events(result.folder))
+    assert load_log(result.folder).num_rows < 3000
+
+
+def test_leaving_the_flow_sideways_is_named(tmp_path: Path) -> None:
+    result = hover(tmp_path / "run", "tunnel.side_wind=[3.0, 0.0, 0.0]")
+    assert result.outcome == "lost"
+    assert "left the flow" in str(result.cause)
+
+
+def test_ctrl_c_keeps_what_was_flown(tmp_path: Path) -> None:
+    def interrupt(now_us: int, flight: Flight) -> None:
+        if now_us > 2_000_000:
+            raise KeyboardInterrupt
+
+    request = Request(HOVER, load_config(), "floaty", (), 1, 30.0)
+    prepare(tmp_path / "run")
+    result = fly(request, tmp_path / "run", progress=interrupt)
+    assert result.outcome == "interrupted"
+    assert not result.passed
+    assert load_log(result.folder).num_rows == pytest.approx(200, abs=30)
+    assert read_result(result.folder)["outcome"] == "interrupted"
+
+
+def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -> None:
+    def sabotage(now_us: int, flight: Flight) -> None:
+        if now_us > 1_500_000:
+            flight.board.read_imu = lambda: None  # type: ignore[method-assign,assignment,return-value]
+
+    request = Request(HOVER, load_config(), "floaty", (), 1, 30.0)
+    prepare(tmp_path / "run")
+    result = fly(request, tmp_path / "run", progress=sabotage)
+    assert result.outcome == "error"
+    assert "task KALMAN at 1" in str(result.cause)
+    assert load_log(result.folder).num_rows > 140
+
+
+def test_log_carries_units_frames_and_origin(tmp_path: Path) -> None:
+    table = load_log(hover(tmp_path / "run", duration_s=0.5).folder)
+    assert table.schema.field("truth.x").metadata == {b"unit": b"m", b"frame": b"W"}
+    assert table.schema.field("motor.m1").metadata[b"unit"] == b"counts"
+    metadata = table.schema.metadata
+    assert metadata[b"seed"] == b"1"
+    assert json.loads(metadata[b"config"])["controller"]["gain_y"] == -1.8
+    assert b"numba" in metadata[b"versions"]
+
+
+def test_estimate_follows_the_truth(tmp_path: Path) -> None:
+    table = load_log(hover(tmp_path / "run", duration_s=10.0).folder)
+    late = column(table, "t") > 2_000_000
+    for name, limit in (("x", 0.01), ("y", 0.01), ("vx", 0.08), ("vy", 0.08)):
+        error = column(table, f"estimate.{name}") - column(table, f"truth.{name}")
+        assert np.sqrt((error[late] ** 2).mean()) < limit, name
+    flap = column(table, "estimate.flap_1") + 0.436332 - column(table, "truth.flap_1")
+    assert np.sqrt((flap[late] ** 2).mean()) < 0.03
+    p = column(table, "estimate.p") - column(table, "truth.p")
+    assert np.sqrt((p[late] ** 2).mean()) < 0.15
+
+
+def test_pose_is_about_forty_milliseconds_old(tmp_path: Path) -> None:
+    result = hover(tmp_path / "run", duration_s=5.0)
+    assert result.metrics["age_mean"] == pytest.approx(0.042, abs=0.002)
+
+
+def test_a_killed_run_is_readable_up_to_its_last_second(tmp_path: Path) -> None:
+    result = hover(tmp_path / "run", duration_s=0.5)
+    (result.folder / "result.json").unlink()
+    content = read_result(result.folder)
+    assert content["outcome"] == "error"
+    assert content["seed"] == 1
+
+
+def test_a_folder_with_other_things_in_it_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(LabError, match="not empty"):
+        hover(tmp_path)
+    assert (tmp_path / "thesis.txt").exists()
+
+
+def test_an_unknown_experiment_names_the_nearest() -> None:
+    with pytest.raises(LabError, match="did you mean hover"):
+        find_experiment("hovre")
+
+
+def test_judge_fails_what_is_not_a_number_and_refuses_unknown_metrics() -> None:
+    values = dict.fromkeys(METRICS, float("nan"))
+    assert not judge(values, {"rms_x": 1.0})[0].holds
+    assert judge({**values, "rms_x": 0.5}, {"rms_x": 0.5})[0].holds
+    assert not judge({**values, "in_box": 0.98}, {"in_box": 0.99})[0].holds
+    with pytest.raises(LabError, match="no such metric"):
+        judge(values, {"rms_q": 1.0})

@@ -1,0 +1,89 @@
+"""The recorder: what was written is what was read, whatever ends the flight."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from hil.errors import LabError
+from hil.recorder import Channel, Quantity, Recorder, load_events, load_log
+
+
+def make(folder: Path, values: np.ndarray) -> Recorder:
+    return Recorder(
+        folder,
+        (
+            Channel("float64", lambda: values, (Quantity(("a.x",), "m", "W"), Quantity(("a.y",), "m", "W"))),
+            Channel("int32", lambda: int(values[0]), (Quantity(("n",), ""),)),
+        ),
+        {"seed": "7"},
+    )
+
+
+def test_rows_survive_the_way_to_parquet(tmp_path: Path) -> None:
+    values = np.zeros(2)
+    recorder = make(tmp_path, values)
+    for row in range(250):
+        values[:] = row, -row
+        recorder.row(row * 10)
+    recorder.close()
+    table = load_log(tmp_path)
+    assert table.column("t").to_pylist() == list(range(0, 2500, 10))
+    assert table.column("a.y").to_pylist() == [-row for row in range(250)]
+    assert table.column("n").to_pylist() == list(range(250))
+    assert table.schema.metadata[b"seed"] == b"7"
+    assert not (tmp_path / "log.arrows").exists()
+
+
+def killed(folder: Path, lost_bytes: int = 0) -> Path:
+    """What lies on disk of a run of 250 rows when the process dies, and when the disk lost the last bytes."""
+    (folder / "run").mkdir()
+    recorder = make(folder / "run", np.zeros(2))
+    for row in range(250):
+        recorder.row(row)
+    recorder.note(5, "lab", "half way")
+    left = folder / "left"
+    shutil.copytree(folder / "run", left)
+    recorder.close()
+    stream = left / "log.arrows"
+    stream.write_bytes(stream.read_bytes()[: -lost_bytes or None])
+    return left
+
+
+def test_a_killed_process_leaves_all_complete_seconds(tmp_path: Path) -> None:
+    left = killed(tmp_path)
+    assert load_log(left).num_rows == 200
+    assert load_events(left) == [{"t_us": 5, "source": "lab", "text": "half way"}]
+
+
+def test_a_batch_cut_in_the_middle_is_dropped(tmp_path: Path) -> None:
+    assert load_log(killed(tmp_path, lost_bytes=500)).num_rows == 100
+
+
+def test_hash_depends_on_values_and_names_only(tmp_path: Path) -> None:
+    digests = []
+    for name, value in (("a", 1.0), ("b", 1.0), ("c", 1.0 + 2**-52)):
+        (tmp_path / name).mkdir()
+        recorder = make(tmp_path / name, np.array([value, 0.0]))
+        recorder.row(0)
+        digests.append(recorder.close())
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_every_batch_reaches_the_listener(tmp_path: Path) -> None:
+    batches: list[pa.RecordBatch] = []
+    recorder = Recorder(tmp_path, (Channel("int32", lambda: 1, (Quantity(("n",), ""),)),), {}, batches.append)
+    for row in range(250):
+        recorder.row(row)
+    recorder.close()
+    assert [batch.num_rows for batch in batches] == [100, 100, 50]
+
+
+def test_a_folder_without_a_log_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(LabError, match=r"no log\.parquet"):
+        load_log(tmp_path)
+    (tmp_path / "log.arrows").write_bytes(b"not arrow at all")
+    with pytest.raises(LabError, match="not a flight log"):
+        load_log(tmp_path)

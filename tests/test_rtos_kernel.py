@@ -1,0 +1,696 @@
+"""Laws of the scheduler that hold for every program: property tests, errors, statistics."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_py.rtos import FOREVER, TICK_US, Kernel, KernelError, Statistics, StuckTaskError, TaskError
+
+
+def run_until(kernel, end_us, interrupts=()):
+    """The harness's loop: hardware first. `interrupts` are (instant, call), in any order."""
+    for instant_us, interrupt in sorted(interrupts, key=lambda pair: pair[0]):
+        while kernel.next_wake_us is not None and kernel.next_wake_us < instant_us:
+            kernel.run(kernel.next_wake_us)
+        kernel.advance(instant_us)
+        interrupt()
+        kernel.run(instant_us)
+    kernel.run(end_us)
+
+
+INSTANTS_US = st.lists(st.integers(0, 20_000), max_size=30)
+
+
+@given(
+    starts=st.tuples(st.integers(0, 3_000), st.integers(0, 3_000), st.integers(0, 3_000)),
+    critical_us=st.integers(1, 4_000),
+    medium_us=st.integers(1, 8_000),
+)
+def test_a_mutex_costs_its_taker_no_more_than_the_holders_critical_section(starts, critical_us, medium_us):
+    kernel = Kernel()
+    mutex = kernel.create_mutex("mutex")
+    waited_us = []
+
+    def low():
+        yield from kernel.notify_take(True, FOREVER)
+        yield from mutex.take()
+        yield from kernel.work(critical_us)
+        yield from mutex.give()
+
+    def medium():
+        yield from kernel.notify_take(True, FOREVER)
+        yield from kernel.work(medium_us)
+
+    def high():
+        yield from kernel.notify_take(True, FOREVER)
+        asked_us = kernel.now_us
+        yield from mutex.take()
+        waited_us.append(kernel.now_us - asked_us)
+        yield from mutex.give()
+
+    tasks = [
+        kernel.create_task(body.__name__, priority, body)
+        for priority, body in enumerate((low, medium, high), 1)
+    ]
+    kernel.start()
+    run_until(kernel, 50_000, zip(starts, [task.notify_from_isr for task in tasks], strict=True))
+    assert len(waited_us) == 1
+    assert waited_us[0] <= critical_us
+    assert all(task.priority == task.base_priority for task in tasks)
+
+
+@given(gives=INSTANTS_US, work_us=st.integers(0, 1_500), maximum=st.integers(1, 8), preemption=st.booleans())
+def test_every_give_that_succeeds_wakes_one_take(gives, work_us, maximum, preemption):
+    kernel = Kernel(preemption)
+    semaphore = kernel.create_counting_semaphore(maximum, 0, "semaphore")
+    succeeded = []
+    taken = []
+
+    def taker():
+        while True:
+            assert (yield from semaphore.take())
+            taken.append(kernel.now_us)
+            yield from kernel.work(work_us)
+
+    kernel.create_task("taker", 2, taker)
+    kernel.start()
+    run_until(kernel, 100_000, [(us, lambda: succeeded.append(semaphore.give_from_isr())) for us in gives])
+    assert len(taken) == sum(succeeded)
+    assert semaphore.overruns == len(gives) - sum(succeeded)
+
+
+@given(order=st.permutations(range(4)), priorities=st.lists(st.integers(1, 3), min_size=4, max_size=4))
+def test_waiting_tasks_are_served_by_priority_and_in_the_order_of_their_coming(order, priorities):
+    kernel = Kernel()
+    queue = kernel.create_queue(4, "queue")
+    served = []
+
+    def receiver(number):
+        yield from kernel.delay(order[number] + 1)
+        yield from queue.receive()
+        served.append(number)
+
+    for number, priority in enumerate(priorities):
+        kernel.create_task(f"receiver {number}", priority, receiver, number)
+    kernel.start()
+    # One item per tick, each served before the next: the order of service is the order of the waiters.
+    run_until(
+        kernel, 20_000, [((10 + i) * TICK_US + 500, lambda: queue.send_from_isr("item")) for i in range(4)]
+    )
+    assert served == sorted(range(4), key=lambda number: (-priorities[number], order[number]))
+
+
+@given(
+    asked_us=st.integers(0, 5_500),
+    timeout=st.integers(0, 6),
+    wait=st.sampled_from(["receive", "send", "take", "mutex", "notify"]),
+    preemption=st.booleans(),
+)
+def test_a_timeout_ends_at_the_tick_that_is_so_many_after_the_call(asked_us, timeout, wait, preemption):
+    kernel = Kernel(preemption)
+    empty = kernel.create_queue(1, "empty")
+    full = kernel.create_queue(1, "full")
+    full.overwrite("item")
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    mutex = kernel.create_mutex("mutex")
+    came_back = []
+
+    def holder():
+        yield from mutex.take()
+        yield from kernel.notify_take(True, FOREVER)
+
+    def waiter():
+        yield from kernel.work(asked_us)
+        calls = {
+            "receive": lambda: empty.receive(timeout),
+            "send": lambda: full.send("more", timeout),
+            "take": lambda: semaphore.take(timeout),
+            "mutex": lambda: mutex.take(timeout),
+            "notify": lambda: kernel.notify_take(True, timeout),
+        }
+        result = yield from calls[wait]()
+        came_back.append((kernel.now_us, bool(result)))
+
+    kernel.create_task("waiter", 1, waiter)
+    kernel.create_task("holder", 2, holder)
+    kernel.start()
+    run_until(kernel, 20_000)
+    ends_us = (asked_us // TICK_US + timeout) * TICK_US if timeout else asked_us
+    assert came_back == [(ends_us, False)]
+
+
+@given(
+    length=st.integers(1, 5),
+    from_isr=INSTANTS_US,
+    period=st.integers(1, 4),
+    timeout=st.integers(0, 3),
+    work_us=st.integers(0, 9_000),
+)
+def test_a_queue_never_holds_more_than_its_length_and_loses_only_what_it_counts(
+    length, from_isr, period, timeout, work_us
+):
+    kernel = Kernel()
+    queue = kernel.create_queue(length, "queue")
+    sent, received, waiting = [], [], []
+
+    def send_from_isr(number):
+        sent.append(number)
+        queue.send_from_isr(number)
+        waiting.append(len(queue))
+
+    def sender():
+        for number in range(1_000, 1_008):
+            yield from kernel.delay(period)
+            sent.append(number)
+            yield from queue.send(number, timeout)
+            waiting.append(len(queue))
+
+    def receiver():
+        while True:
+            received.append((yield from queue.receive()))
+            yield from kernel.work(work_us)
+
+    kernel.create_task("receiver", 1, receiver)
+    kernel.create_task("sender", 2, sender)
+    kernel.start()
+    run_until(kernel, 500_000, [(us, lambda n=n: send_from_isr(n)) for n, us in enumerate(sorted(from_isr))])
+    assert max(waiting) <= queue.high_water <= length
+    assert len(queue) == 0
+    assert len(received) + queue.dropped == len(sent)
+    for source in (range(1_000), range(1_000, 2_000)):
+        numbers = [number for number in received if number in source]
+        assert numbers == sorted(numbers)
+
+
+@given(works=st.lists(st.integers(1, 4_000), min_size=2, max_size=4), switched_off=st.booleans())
+def test_tasks_of_equal_priority_share_the_processor_tick_by_tick(works, switched_off):
+    """With preemption nobody is more than one slice ahead; without it everybody works to his end."""
+    kernel = Kernel(preemption=not switched_off)
+    tasks = []
+    ended = []
+
+    def worker(name, work_us):
+        yield from kernel.work(work_us)
+        ended.append(name)
+
+    for number, work_us in enumerate(works):
+        tasks.append(kernel.create_task(f"worker {number}", 1, worker, number, work_us))
+    kernel.start()
+    for tick in range(1, 20):
+        kernel.run(tick * TICK_US - 1)
+        working = [kernel.run_time_us(task) for task, work_us in zip(tasks, works, strict=True)]
+        unfinished = [us for us, work_us in zip(working, works, strict=True) if us < work_us]
+        assert switched_off or not unfinished or max(unfinished) - min(unfinished) <= 2 * TICK_US
+    assert sorted(ended) == list(range(len(works)))
+    assert [kernel.run_time_us(task) for task in tasks] == works
+
+
+@settings(max_examples=50)
+@given(
+    interrupts=INSTANTS_US,
+    works=st.lists(st.integers(0, 900), min_size=3, max_size=3),
+    periods=st.lists(st.integers(1, 4), min_size=3, max_size=3),
+)
+def test_the_running_task_is_always_the_most_urgent_that_is_ready(interrupts, works, periods):
+    """Checked on the trace; the ready tasks are those that became ready and did not wait since."""
+    priority_of = {"IDLE": 0, "Tmr Svc": 1, "main": 0}
+    ready = set()
+
+    def check(us, event, who, a, b):
+        if event == "READY":
+            ready.add(who)
+        elif event in ("DELAY", "DELAY_UNTIL", "Q_RECV_BLOCK", "Q_SEND_BLOCK"):
+            ready.discard(who)
+        elif event == "IN":
+            assert priority_of[who] == max(priority_of[name] for name in ready)
+
+    kernel = Kernel(trace=check)
+    semaphore = kernel.create_counting_semaphore(3, 0, "semaphore")
+
+    def periodic(period, work_us):
+        wake_tick = kernel.tick_count
+        while True:
+            wake_tick += period
+            yield from kernel.delay_until(wake_tick)
+            yield from kernel.work(work_us)
+            yield from semaphore.give()
+
+    def taker():
+        while True:
+            yield from semaphore.take(2)
+            yield from kernel.work(200)
+
+    for number, (period, work_us) in enumerate(zip(periods, works, strict=True)):
+        priority_of[f"periodic {number}"] = 2 + number
+        kernel.create_task(f"periodic {number}", 2 + number, periodic, period, work_us)
+    priority_of["taker"] = 3
+    kernel.create_task("taker", 3, taker)
+    kernel.start()
+    run_until(kernel, 25_000, [(us, semaphore.give_from_isr) for us in interrupts])
+
+
+def test_a_periodic_task_keeps_its_planned_instants_however_long_it_works():
+    kernel = Kernel()
+    woke_us = []
+
+    def periodic():
+        wake_tick = 0
+        while True:
+            wake_tick += 10
+            yield from kernel.delay_until(wake_tick)
+            woke_us.append(kernel.now_us)
+            yield from kernel.work(7_300)
+
+    kernel.create_task("periodic", 1, periodic)
+    kernel.start()
+    kernel.run(100_500)
+    assert woke_us == [10_000 * n for n in range(1, 11)]
+
+
+def test_nothing_falls_due_while_all_tasks_wait_for_interrupts():
+    kernel = Kernel()
+    semaphore = kernel.create_binary_semaphore("semaphore")
+
+    def taker():
+        yield from semaphore.take()
+        yield from kernel.delay(3)
+
+    kernel.create_task("taker", 1, taker)
+    kernel.start()
+    kernel.run(0)
+    assert kernel.next_wake_us is None
+    kernel.run(1_234_567)
+    semaphore.give_from_isr()
+    kernel.run(1_234_567)
+    assert kernel.tick_count == 1_234
+    assert kernel.next_wake_us == 1_237_000
+
+
+def test_a_task_of_priority_0_runs_at_the_interrupt_that_wakes_it():
+    """Also after it shared its priority with the idle task, which is then somewhere inside its loop."""
+    kernel = Kernel()
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    woke_us = []
+
+    def background():
+        while True:
+            yield from semaphore.take()
+            woke_us.append(kernel.now_us)
+            yield from kernel.work(2_500)
+
+    kernel.create_task("background", 0, background)
+    kernel.start()
+    instants_us = [300, 20_300, 40_300, 60_300, 80_300]
+    run_until(kernel, 100_000, [(us, semaphore.give_from_isr) for us in instants_us])
+    assert woke_us == instants_us
+
+
+def test_an_interrupt_at_the_instant_at_which_work_ends_comes_first():
+    kernel = Kernel()
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    order = []
+
+    def low():
+        yield from kernel.work(700)
+        order.append("work ends")
+
+    def high():
+        yield from semaphore.take()
+        order.append("interrupt")
+
+    kernel.create_task("low", 1, low)
+    kernel.create_task("high", 2, high)
+    kernel.start()
+    run_until(kernel, 700, [(700, semaphore.give_from_isr)])
+    assert order == ["interrupt", "work ends"]
+
+
+def test_a_suspended_task_does_not_run_until_it_is_resumed():
+    kernel = Kernel()
+    ran_us = []
+
+    def worker():
+        while True:
+            yield from kernel.delay(1)
+            ran_us.append(kernel.now_us)
+
+    worker_task = kernel.create_task("worker", 1, worker)
+
+    def boss():
+        yield from kernel.delay(3)
+        yield from worker_task.suspend()
+        yield from kernel.delay(5)
+        yield from worker_task.resume()
+
+    kernel.create_task("boss", 2, boss)
+    kernel.start()
+    kernel.run(10_000)
+    assert ran_us == [1_000, 2_000, 8_000, 9_000, 10_000]
+
+
+def test_while_the_scheduler_is_suspended_ticks_and_interrupts_pend():
+    kernel = Kernel()
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    order = []
+
+    def low():
+        kernel.suspend_all()
+        kernel.suspend_all()
+        yield from kernel.work(3_500)
+        yield from kernel.task_yield()
+        yield from kernel.resume_all()
+        order.append(("low", kernel.now_us, kernel.tick_count))
+        yield from kernel.resume_all()
+        order.append(("low again", kernel.now_us, kernel.tick_count))
+
+    def high():
+        yield from semaphore.take()
+        order.append(("interrupt", kernel.now_us, kernel.tick_count))
+
+    def higher():
+        yield from kernel.delay(2)
+        order.append(("tick", kernel.now_us, kernel.tick_count))
+
+    for priority, body in enumerate((low, high, higher), 1):
+        kernel.create_task(body.__name__, priority, body)
+    kernel.start()
+    run_until(kernel, 10_000, [(500, semaphore.give_from_isr)])
+    assert order == [("low", 3_500, 0), ("tick", 3_500, 3), ("interrupt", 3_500, 3), ("low again", 3_500, 3)]
+
+
+def test_timers_expire_at_their_ticks_and_obey_stop_reset_and_period():
+    kernel = Kernel()
+    expired = []
+
+    def callback(timer):
+        expired.append((timer.name, kernel.now_us // TICK_US))
+        yield from ()
+
+    once = kernel.create_timer("once", 3, False, callback)
+    again = kernel.create_timer("again", 4, True, callback)
+
+    def commander():
+        yield from once.start()
+        yield from again.start()
+        yield from kernel.delay(2)
+        yield from once.reset()  # at 2: expires at 5 instead of 3
+        yield from kernel.delay(8)
+        yield from again.change_period(6)  # at 10: 16, 22, ...
+        yield from kernel.delay(10)
+        yield from again.stop()
+
+    kernel.create_task("commander", 2, commander)
+    kernel.start()
+    kernel.run(50_000)
+    assert expired == [("again", 4), ("once", 5), ("again", 8), ("again", 16)]
+
+
+def test_a_mailbox_holds_the_newest_item_and_wakes_its_reader_when_the_writer_gives_way():
+    kernel = Kernel()
+    mailbox = kernel.create_queue(1, "mailbox")
+    order = []
+
+    def writer():
+        mailbox.overwrite("old")
+        mailbox.overwrite("new")
+        order.append("written")
+        yield from kernel.work(10)
+        yield from mailbox.overwrite("newest")
+        order.append("written again")
+
+    def reader():
+        while True:
+            order.append((yield from mailbox.receive()))
+
+    kernel.create_task("writer", 1, writer)
+    kernel.create_task("reader", 2, reader)
+    kernel.start()
+    kernel.run(20)
+    assert order == ["written", "new", "newest", "written again"]
+    assert mailbox.peek() is None
+
+
+def test_a_plain_receive_lets_a_more_urgent_sender_go_on_when_the_receiver_gives_way():
+    kernel = Kernel()
+    queue = kernel.create_queue(1, "queue")
+    order = []
+
+    def receiver():
+        order.append(queue.receive_nowait())
+        order.append("goes on")
+        yield from kernel.work(10)
+        order.append(queue.peek())
+        order.append(queue.receive_nowait())
+        order.append(queue.receive_nowait())
+
+    def sender():
+        yield from queue.send(1)
+        yield from queue.send(2)
+        order.append("sent")
+
+    kernel.create_task("receiver", 1, receiver)
+    kernel.create_task("sender", 2, sender)
+    kernel.start()
+    kernel.run(20)
+    assert order == [1, "goes on", "sent", 2, 2, None]
+
+
+def test_two_kernels_know_nothing_of_each_other():
+    woke = {}
+
+    def sleeper(kernel, name, ticks):
+        yield from kernel.delay(ticks)
+        woke[name] = kernel.now_us
+
+    kernels = Kernel(), Kernel(preemption=False)
+    for number, kernel in enumerate(kernels):
+        kernel.create_task("sleeper", 1, sleeper, kernel, number, number + 1)
+        kernel.start()
+    for us in range(0, 3_000, 500):
+        for kernel in kernels:
+            kernel.run(us)
+    assert woke == {0: 1_000, 1: 2_000}
+
+
+def test_a_task_that_raises_is_named_with_the_time_and_the_others_can_go_on():
+    kernel = Kernel()
+    ticks = []
+
+    def careless():
+        yield from kernel.delay(2)
+        yield from kernel.work(345)
+        raise ValueError("no such gain")
+
+    def careful():
+        while True:
+            yield from kernel.delay(1)
+            ticks.append(kernel.tick_count)
+
+    kernel.create_task("careless", 1, careless)
+    kernel.create_task("careful", 2, careful)
+    kernel.start()
+    with pytest.raises(TaskError, match=r"task careless at 2\.345 ms: ValueError: no such gain") as caught:
+        kernel.run(10_000)
+    assert isinstance(caught.value.__cause__, ValueError)
+    assert (caught.value.task, caught.value.time_us) == ("careless", 2_345)
+    kernel.run(10_000)
+    assert ticks == list(range(1, 11))
+
+
+def spinning(kernel, call):
+    def body():
+        yield from kernel.delay(1)
+        while True:
+            yield from call()
+
+    return body
+
+
+@pytest.mark.parametrize("spin", ["task_yield", "receive", "take", "give", "notify", "notify_take"])
+def test_a_task_that_never_lets_time_pass_is_named(spin):
+    kernel = Kernel()
+    queue = kernel.create_queue(1, "queue")
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    calls = {
+        "task_yield": kernel.task_yield,
+        "receive": lambda: queue.receive(0),
+        "take": lambda: semaphore.take(0),
+        "give": semaphore.give,
+        "notify": lambda: kernel.current.notify(),
+        "notify_take": lambda: kernel.notify_take(True, 0),
+    }
+    kernel.create_task("spinner", 1, spinning(kernel, calls[spin]))
+    kernel.start()
+    with pytest.raises(StuckTaskError, match=r"task spinner at 1\.000 ms: 100000 .* at one instant"):
+        kernel.run(5_000)
+
+
+def wrong_yield(kernel):
+    yield kernel.create_queue(1, "queue").receive()
+
+
+def wait_while_suspended(kernel):
+    kernel.suspend_all()
+    yield from kernel.delay(1)
+
+
+def end_while_suspended(kernel):
+    kernel.suspend_all()
+    yield from ()
+
+
+def give_a_mutex_of_another(kernel):
+    yield from kernel.create_mutex("lock").give()
+
+
+def resume_too_often(kernel):
+    yield from kernel.resume_all()
+
+
+def negative_priority(kernel):
+    yield from kernel.current.priority_set(-1)
+
+
+@pytest.mark.parametrize(
+    ("body", "complaint"),
+    [
+        (wrong_yield, "yielded a generator; kernel calls need `yield from`"),
+        (wait_while_suspended, "must not wait while the scheduler is suspended"),
+        (end_while_suspended, "ended while the scheduler was suspended"),
+        (give_a_mutex_of_another, "mutex lock: given by task, held by nobody"),
+        (resume_too_often, "resume_all without suspend_all"),
+        (negative_priority, "priority -1 is negative"),
+    ],
+)
+def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
+    kernel = Kernel()
+    kernel.create_task("task", 1, body, kernel)
+    kernel.start()
+    with pytest.raises(TaskError, match=r"^task task at 0\.000 ms: ") as caught:
+        kernel.run(1_000)
+    assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda kernel: kernel.create_queue(0, "q"), "queue q: length 0"),
+        (
+            lambda kernel: kernel.create_queue(2, "q").overwrite(1),
+            "queue q: overwrite needs a queue of length 1",
+        ),
+        (lambda kernel: kernel.create_counting_semaphore(2, 3, "s"), "semaphore s: initial count 3"),
+        (lambda kernel: kernel.create_timer("t", 0, True, iter), "timer t: period 0"),
+        (lambda kernel: kernel.create_task("t", -1, wrong_yield, kernel), "task t: priority -1"),
+        (
+            lambda kernel: kernel.create_task("t", 1, lambda: 5),
+            "task t: its function returned int, not a generator",
+        ),
+        (lambda kernel: kernel.run(0), "run before start"),
+        (lambda kernel: (kernel.start(), kernel.start()), "started already"),
+        (lambda kernel: (kernel.start(), kernel.run(5), kernel.run(4)), "time runs backwards"),
+        (lambda kernel: (kernel.start(), kernel.advance(4)), "advance(4)"),
+        (lambda kernel: Statistics(kernel, {"nobody": 5}), "deadline of 'nobody'"),
+    ],
+)
+def test_misuse_from_outside_is_named(make, complaint):
+    with pytest.raises(KernelError) as caught:
+        make(Kernel())
+    assert complaint in str(caught.value)
+
+
+def test_statistics_count_time_responses_and_missed_deadlines():
+    kernel = Kernel()
+    ready = kernel.create_binary_semaphore("ready")
+
+    def urgent():
+        while True:
+            yield from ready.take()
+            yield from kernel.work(300)
+
+    def late():
+        while True:
+            yield from kernel.delay(2)
+            yield from kernel.work(1_000)
+
+    kernel.create_task("urgent", 2, urgent)
+    kernel.create_task("late", 1, late)
+    statistics = Statistics(kernel, {"late": 1_200})
+    kernel.start()
+    # "late" works from 2000, 5000 and 8000 on; the first interrupt costs it 300 us, the second finds it waiting.
+    run_until(kernel, 8_500, [(2_500, ready.give_from_isr), (7_000, ready.give_from_isr)])
+    urgent_report, late_report = statistics.reports()
+    assert urgent_report.run_time_us == 600
+    assert urgent_report.activations == 1 + 2  # up to its first wait, and two interrupts
+    assert urgent_report.worst_response_us == 300
+    assert late_report.run_time_us == 2_000 + 500
+    assert late_report.worst_response_us == 1_300
+    assert late_report.deadline_misses == 1
+    assert statistics.load() == pytest.approx(3_100 / 8_500)
+    assert kernel.run_time_us(kernel.tasks[2]) == 8_500 - 3_100  # of the idle task
+
+
+def test_statistics_show_a_task_that_starves():
+    kernel = Kernel()
+
+    def greedy():
+        while True:
+            yield from kernel.work(1_000)
+
+    def starving():
+        yield from kernel.delay(1)
+
+    kernel.create_task("greedy", 2, greedy)
+    kernel.create_task("starving", 1, starving)
+    statistics = Statistics(kernel, {"starving": 5_000})
+    kernel.start()
+    kernel.run(9_000)
+    _, report = statistics.reports()
+    assert (report.activations, report.worst_response_us, report.deadline_misses) == (0, 9_000, 1)
+    assert statistics.load() == 1.0
+
+
+def test_start_latencies_fall_into_their_class():
+    kernel = Kernel()
+    wakes = [kernel.create_binary_semaphore("first"), kernel.create_binary_semaphore("second")]
+
+    def body(wake):
+        while True:
+            yield from wake.take()
+            yield from kernel.work(150)
+
+    for priority, wake in zip((2, 1), wakes, strict=True):
+        kernel.create_task(wake.name, priority, body, wake)
+    statistics = Statistics(kernel, {})
+    kernel.start()
+    run_until(kernel, 5_000, [(us, wake.give_from_isr) for us in (1_100, 2_100) for wake in wakes])
+    first, second = statistics.reports()
+    assert first.latency_histogram == (3, *[0] * 11)
+    assert second.latency_histogram == (1, 0, 0, 0, 0, 2, *[0] * 6)  # 150 us: between 100 and 200
+    assert second.worst_latency_us == 150
+
+
+def test_switches_take_the_order_of_a_ring_also_after_a_priority_change():
+    """A task raised to the running one's level goes behind those that wait there."""
+    kernel = Kernel()
+    order = []
+
+    def worker(name):
+        for _ in range(2):
+            order.append(name)
+            yield from kernel.task_yield()
+
+    tasks = [
+        kernel.create_task(name, priority, worker, name) for name, priority in (("a", 2), ("b", 2), ("c", 1))
+    ]
+
+    def boss():
+        yield from tasks[2].priority_set(2)
+
+    kernel.create_task("boss", 3, boss)
+    kernel.start()
+    kernel.run(0)
+    assert order == ["a", "b", "c", "a", "b", "c"]
+    assert all(earlier != later for earlier, later in pairwise(order))

@@ -1,0 +1,148 @@
+"""Microseconds per task activation of our kernel and of simpy, on the flight's own pattern of waking.
+
+Every millisecond an interrupt gives a semaphore to a task of priority 4, which sends a sample to a queue and gives a
+semaphore to a task of priority 5, which waits for the next tick and gives a semaphore to a task of priority 2, which
+drains the queue: four activations. simpy has no priorities, so its version only wakes the same tasks as often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from time import perf_counter
+from typing import Any
+
+import simpy
+
+from firmware_py.rtos import TICK_US, Kernel, Queue, Semaphore
+
+ACTIVATIONS_PER_TICK = 4
+IMU_PHASE_US = 300
+WORK_US = (
+    30,
+    50,
+    50,
+    200,
+)  # of sensors, stabilizer before and after the tick, estimator; where work is switched on
+
+
+def kernel_run(ticks: int, work: bool = False) -> int:
+    """Runs the pattern for `ticks` milliseconds of simulated time; returns the number of samples that arrived."""
+    kernel = Kernel()
+    imu_ready = kernel.create_binary_semaphore("imu_ready")
+    sample_ready = kernel.create_binary_semaphore("sample_ready")
+    run_estimator = kernel.create_binary_semaphore("run_estimator")
+    samples: Queue[int] = kernel.create_queue(20, "samples")
+    arrived = 0
+
+    def sensors() -> Generator[int, None, None]:
+        while True:
+            yield from imu_ready.take()
+            if work:
+                yield from kernel.work(WORK_US[0])
+            yield from samples.send(1, 0)
+            yield from sample_ready.give()
+
+    def stabilizer() -> Generator[int, None, None]:
+        while True:
+            yield from sample_ready.take()
+            if work:
+                yield from kernel.work(WORK_US[1])
+            yield from kernel.delay_until(kernel.tick_count + 1)
+            if work:
+                yield from kernel.work(WORK_US[2])
+            yield from run_estimator.give()
+
+    def estimator() -> Generator[int, None, None]:
+        nonlocal arrived
+        while True:
+            yield from run_estimator.take()
+            if work:
+                yield from kernel.work(WORK_US[3])
+            while (sample := samples.receive_nowait()) is not None:
+                arrived += sample
+
+    kernel.create_task("STABILIZER", 5, stabilizer)
+    kernel.create_task("SENSORS", 4, sensors)
+    kernel.create_task("ESTIMATOR", 2, estimator)
+    kernel.start()
+    kernel.run(0)
+    _drive(kernel, imu_ready, ticks)
+    return arrived
+
+
+def _drive(kernel: Kernel, imu_ready: Semaphore, ticks: int) -> None:
+    """The harness's loop, with the IMU as the only hardware."""
+    imu_us = IMU_PHASE_US
+    end_us = ticks * TICK_US
+    while imu_us < end_us:
+        wake_us = kernel.next_wake_us
+        now_us = imu_us if wake_us is None or imu_us < wake_us else wake_us
+        if now_us == imu_us:
+            imu_ready.give_from_isr()
+            imu_us += TICK_US
+        kernel.run(now_us)
+
+
+def simpy_run(ticks: int) -> int:
+    """The same pattern with simpy's stores and timeouts."""
+    environment = simpy.Environment()
+    imu_ready = simpy.Store(environment)
+    sample_ready = simpy.Store(environment)
+    run_estimator = simpy.Store(environment)
+    samples = simpy.Store(environment, capacity=20)
+    arrived = 0
+
+    def imu() -> Generator[Any, Any, None]:
+        yield environment.timeout(IMU_PHASE_US)
+        while True:
+            yield imu_ready.put(1)
+            yield environment.timeout(TICK_US)
+
+    def sensors() -> Generator[Any, Any, None]:
+        while True:
+            yield imu_ready.get()
+            yield samples.put(1)
+            yield sample_ready.put(1)
+
+    def stabilizer() -> Generator[Any, Any, None]:
+        while True:
+            yield sample_ready.get()
+            yield environment.timeout(TICK_US - environment.now % TICK_US)
+            yield run_estimator.put(1)
+
+    def estimator() -> Generator[Any, Any, None]:
+        nonlocal arrived
+        while True:
+            yield run_estimator.get()
+            while samples.items:
+                arrived += yield samples.get()
+
+    for process in (imu, sensors, stabilizer, estimator):
+        environment.process(process())
+    environment.run(until=ticks * TICK_US)
+    return arrived
+
+
+def kernel_us_per_activation(ticks: int = 20_000, work: bool = False) -> float:
+    """The best of three runs of our kernel [us]."""
+    return _best_us(lambda: kernel_run(ticks, work), ticks)
+
+
+def simpy_us_per_activation(ticks: int = 20_000) -> float:
+    """The best of three runs of simpy [us]."""
+    return _best_us(lambda: simpy_run(ticks), ticks)
+
+
+def _best_us(run: Callable[[], int], ticks: int) -> float:
+    seconds = []
+    for _ in range(3):
+        start = perf_counter()
+        run()
+        seconds.append(perf_counter() - start)
+    return min(seconds) * 1e6 / (ticks * ACTIVATIONS_PER_TICK)
+
+
+if __name__ == "__main__":
+    print(f"kernel                   {kernel_us_per_activation():6.3f} us per activation")
+    print(f"kernel, tasks that work  {kernel_us_per_activation(work=True):6.3f} us per activation")
+    print(f"simpy                    {simpy_us_per_activation():6.3f} us per activation")

@@ -1,0 +1,293 @@
+"""Prints the trace of a FreeRTOS scenario on our kernel: `python tools/freertos_scenario.py FILE --mode coop|preempt`.
+
+The formats of scenario and trace stand in tests/vectors/README.md. Exit code 2 for a file or a mode that is no good.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from firmware_py.rtos import TICK_US, Kernel, KernelError, Mutex, Queue, Semaphore, Task, Timer
+
+# The operands of each operation: n number, p positive number, q id of a queue, s of a semaphore, l of a semaphore or
+# mutex, t name of a task, T index of a timer.
+OPERATIONS = {
+    "work": "n",
+    "delay": "n",
+    "delay_until": "n",
+    "send": "qnn",
+    "recv": "qn",
+    "take": "ln",
+    "give": "l",
+    "notify": "t",
+    "ntake": "nn",
+    "yield": "",
+    "suspend": "t",
+    "resume": "t",
+    "prio": "tn",
+    "suspend_all": "",
+    "resume_all": "",
+    "tmr_start": "Tn",
+    "tmr_stop": "Tn",
+    "tmr_reset": "Tn",
+    "tmr_period": "Tpn",
+}
+INTERRUPTS = {"isr_send": "qn", "isr_give": "s", "isr_notify": "t"}
+NOT_HELD = -2  # result of giving a mutex that the task does not hold
+
+Operation = tuple[str, list[Any]]
+Record = Callable[[int, str, str, int, int], None]
+
+
+class ScenarioError(Exception):
+    """A scenario that cannot be run; says the line and the reason."""
+
+
+@dataclass(slots=True)
+class Scenario:
+    """A parsed file. Operations hold words, which are looked up when everything is known."""
+
+    ticks: int = 0
+    queues: dict[int, int] = field(default_factory=dict)  # id to length
+    mutexes: list[int] = field(default_factory=list)
+    semaphores: dict[int, tuple[int, int]] = field(default_factory=dict)  # id to maximum and initial count
+    timers: list[tuple[str, int, bool, Operation]] = field(default_factory=list)
+    interrupts: list[tuple[int, Operation]] = field(default_factory=list)
+    tasks: list[tuple[str, int, bool, list[Operation]]] = field(
+        default_factory=list
+    )  # name, priority, once, ...
+
+    def kinds(self) -> dict[str, Any]:
+        """What each operand may name."""
+        semaphores = set(self.semaphores)
+        return {
+            "q": set(self.queues),
+            "s": semaphores,
+            "l": semaphores | set(self.mutexes),
+            "t": {name for name, *_ in self.tasks},
+            "T": set(range(len(self.timers))),
+        }
+
+
+def parse(text: str) -> Scenario:
+    """Reads a scenario; raises ScenarioError."""
+    scenario = Scenario()
+    unchecked: list[tuple[int, Operation, dict[str, str]]] = []
+    for line_number, line in enumerate(text.splitlines(), 1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            unchecked += [(line_number, *found) for found in _parse_line(scenario, words)]
+        except (ValueError, IndexError):
+            raise ScenarioError(f"line {line_number}: cannot read {line.strip()!r}") from None
+    kinds = scenario.kinds()
+    for line_number, (name, operands), known in unchecked:
+        _check(line_number, name, operands, known, kinds)
+    if scenario.ticks <= 0:
+        raise ScenarioError("no line `run TICKS` with at least one tick")
+    for name, _, _, operations in scenario.tasks:
+        if not operations:
+            raise ScenarioError(f"task {name} has no operations")
+    return scenario
+
+
+def _parse_line(scenario: Scenario, words: list[str]) -> list[tuple[Operation, dict[str, str]]]:
+    """Enters one line into the scenario; returns the operations that it holds, with the names allowed there."""
+    match words:
+        case ["run", ticks]:
+            scenario.ticks = int(ticks)
+        case ["queue", number, length]:
+            scenario.queues[int(number)] = int(length)
+        case ["mutex", number]:
+            scenario.mutexes.append(int(number))
+        case ["sem", number, maximum, initial]:
+            scenario.semaphores[int(number)] = int(maximum), int(initial)
+        case ["timer", name, period, autoreload, *operation]:
+            called = operation[0], operation[1:]
+            scenario.timers.append((name, int(period), bool(int(autoreload)), called))
+            return [(called, OPERATIONS)]
+        case ["at", instant_us, *operation]:
+            raised = operation[0], operation[1:]
+            scenario.interrupts.append((int(instant_us), raised))
+            return [(raised, INTERRUPTS)]
+        case ["task" | "once" as kind, name, priority]:
+            scenario.tasks.append((name, int(priority), kind == "once", []))
+        case [name, *operands]:
+            scripted: Operation = name, list(operands)
+            scenario.tasks[-1][3].append(scripted)
+            return [(scripted, OPERATIONS)]
+    return []
+
+
+def _check(line: int, name: str, operands: list[Any], known: dict[str, str], kinds: dict[str, Any]) -> None:
+    """Checks an operation and turns its numbers into ints, in place."""
+    if name not in known:
+        raise ScenarioError(f"line {line}: {name!r} is none of {', '.join(known)}")
+    signature = known[name]
+    if len(operands) != len(signature):
+        raise ScenarioError(f"line {line}: {name} takes {len(signature)} operands, not {len(operands)}")
+    for place, kind in enumerate(signature):
+        if kind != "t":
+            try:
+                operands[place] = int(operands[place])
+            except ValueError:
+                raise ScenarioError(f"line {line}: {operands[place]!r} is not a number") from None
+        if kind in kinds and operands[place] not in kinds[kind]:
+            raise ScenarioError(f"line {line}: {name} {operands[place]}: there is no such object for it")
+
+
+class Run:
+    """One scenario on one kernel; `record` gets the runner's events and, when `traced`, the kernel's."""
+
+    def __init__(self, scenario: Scenario, preemption: bool, record: Record, traced: bool = True) -> None:
+        self.scenario = scenario
+        self.record = record
+        self.kernel = kernel = Kernel(preemption, record if traced else None)
+        self.objects: dict[int, Any] = {}
+        for number, length in scenario.queues.items():
+            self.objects[number] = kernel.create_queue(length, f"queue {number}")
+        for number, (maximum, initial) in scenario.semaphores.items():
+            self.objects[number] = kernel.create_counting_semaphore(maximum, initial, f"semaphore {number}")
+        for number in scenario.mutexes:
+            self.objects[number] = kernel.create_mutex(f"mutex {number}")
+        for number, made in self.objects.items():
+            made.number = number
+        self.timers = [
+            kernel.create_timer(name, period, autoreload, self._timer_callback(operation))
+            for name, period, autoreload, operation in scenario.timers
+        ]
+        self.tasks: dict[str, Task] = {}
+        for name, priority, once, operations in scenario.tasks:
+            self.tasks[name] = kernel.create_task(name, priority, self._scripted_task, name, operations, once)
+
+    def run(self) -> None:
+        """Runs to the end; the instant of the end itself is not run."""
+        kernel = self.kernel
+        end_us = self.scenario.ticks * TICK_US
+        kernel.start()
+        for instant_us, (name, operands) in sorted(
+            self.scenario.interrupts, key=lambda interrupt: interrupt[0]
+        ):
+            if instant_us >= end_us:
+                break
+            kernel.run(instant_us - 1)
+            kernel.advance(instant_us)
+            self._interrupt(name, operands)
+            kernel.run(instant_us)
+        kernel.run(end_us - 1)
+        self.record(end_us, "END", "-", 0, 0)
+
+    def _interrupt(self, name: str, operands: list[Any]) -> None:
+        result = 0
+        if name == "isr_send":
+            result = int(self.objects[operands[0]].send_from_isr(operands[1]))
+        elif name == "isr_give":
+            result = int(self.objects[operands[0]].give_from_isr())
+        else:
+            self.tasks[operands[0]].notify_from_isr()
+        self.record(self.kernel.now_us, "ISR", name, result, int(self.kernel.task_woken))
+
+    def _scripted_task(
+        self, name: str, operations: list[Operation], once: bool
+    ) -> Generator[int, None, None]:
+        wake_tick = [self.kernel.tick_count]
+        while True:
+            for place, operation in enumerate(operations):
+                self.record(self.kernel.now_us, "CALL", name, place, 0)
+                result = yield from self._perform(operation, wake_tick)
+                self.record(self.kernel.now_us, "RET", name, place, result)
+            while once:
+                yield from self.kernel.current.suspend()
+
+    def _timer_callback(self, operation: Operation) -> Callable[[Timer], Generator[int, None, None]]:
+        def callback(timer: Timer) -> Generator[int, None, None]:
+            self.record(self.kernel.now_us, "TMR_CB", timer.name, 0, 0)
+            result = yield from self._perform(operation, [0])
+            self.record(self.kernel.now_us, "TMR_RET", timer.name, 0, result)
+
+        return callback
+
+    def _perform(self, operation: Operation, wake_tick: list[int]) -> Generator[int, None, int]:
+        """Does one operation in the running task; `wake_tick` holds the task's latest planned wake-up."""
+        kernel = self.kernel
+        name, operands = operation
+        match name:
+            case "work":
+                yield from kernel.work(operands[0])
+            case "delay":
+                yield from kernel.delay(operands[0])
+            case "delay_until":
+                early = (
+                    kernel.tick_count < wake_tick[0]
+                )  # FreeRTOS takes this for an overflow and does not wait
+                wake_tick[0] += operands[0]
+                waits = not early and wake_tick[0] > kernel.tick_count
+                yield from kernel.delay_until(0 if early else wake_tick[0])
+                return int(waits)
+            case "send":
+                queue: Queue[int] = self.objects[operands[0]]
+                return int((yield from queue.send(operands[1], operands[2])))
+            case "recv":
+                item = yield from self.objects[operands[0]].receive(operands[1])
+                return -1 if item is None else item
+            case "take":
+                return int((yield from self.objects[operands[0]].take(operands[1])))
+            case "give":
+                given: Semaphore | Mutex = self.objects[operands[0]]
+                if isinstance(given, Mutex) and given.holder is not kernel.current:
+                    return NOT_HELD
+                return int((yield from given.give()))
+            case "notify":
+                return int((yield from self.tasks[operands[0]].notify()))
+            case "ntake":
+                return (yield from kernel.notify_take(bool(operands[0]), operands[1]))
+            case "yield":
+                yield from kernel.task_yield()
+            case "suspend":
+                yield from self.tasks[operands[0]].suspend()
+            case "resume":
+                yield from self.tasks[operands[0]].resume()
+            case "prio":
+                yield from self.tasks[operands[0]].priority_set(operands[1])
+            case "suspend_all":
+                kernel.suspend_all()
+            case "resume_all":
+                yield from kernel.resume_all()
+            case "tmr_start":
+                return int((yield from self.timers[operands[0]].start(operands[1])))
+            case "tmr_stop":
+                return int((yield from self.timers[operands[0]].stop(operands[1])))
+            case "tmr_reset":
+                return int((yield from self.timers[operands[0]].reset(operands[1])))
+            case "tmr_period":
+                timer: Timer = self.timers[operands[0]]
+                return int((yield from timer.change_period(operands[1], operands[2])))
+        return 0
+
+
+def trace(text: str, preemption: bool, write: Callable[[str], Any]) -> None:
+    """Runs the scenario `text` and calls `write` with every line of its trace."""
+    Run(parse(text), preemption, lambda us, event, who, a, b: write(f"{us},{event},{who},{a},{b}\n")).run()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Prints the trace of a FreeRTOS scenario on our kernel.")
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--mode", choices=["coop", "preempt"], default="preempt")
+    arguments = parser.parse_args()
+    try:
+        trace(arguments.file.read_text(), arguments.mode == "preempt", sys.stdout.write)
+    except (OSError, UnicodeDecodeError, ScenarioError, KernelError) as error:
+        print(f"{arguments.file}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
