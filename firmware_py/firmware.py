@@ -16,6 +16,8 @@ from firmware_py.supervisor import Supervisor
 from firmware_py.tasks import CoreBlocks, estimator_task, sensors_task, stabilizer_task
 from firmware_py.variables import telemetry_reader
 
+__all__ = ["Firmware", "Kernel"]
+
 MEASUREMENT_QUEUE = 20  # original firmware
 
 

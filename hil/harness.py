@@ -94,6 +94,7 @@ class Flight:
         self.station = GroundStation(link, self.trajectory, self.telemetry, config.station)
         self.board = VirtualBoard(self.plant.set_counts, self.radio.downlink, self._console)
         self.firmware = Firmware(config, self.board)
+        self.board.run_on(self.firmware.kernel, self.events)
         self.radio.connect(self._radio_to_board, self.station.on_packet)
         self.plant.hold()
         self.events.at(self.release_us, self._release)
@@ -123,21 +124,17 @@ class Flight:
 
     def _loop(self, progress: Callable[[int], None]) -> None:
         """Go from one instant at which anything happens to the next."""
-        events, firmware, board, wait_until = self.events, self.firmware, self.board, self.clock.wait_until
-        kernel = firmware.kernel
+        events, kernel, wait_until = self.events, self.firmware.kernel, self.clock.wait_until
         now_us = next_progress_us = 0
         while now_us < self.end_us:
-            now_us = self.end_us
-            event_us, wake_us = events.next_us, kernel.next_wake_us
-            if event_us is not None and event_us < now_us:
-                now_us = event_us
-            if wake_us is not None and wake_us < now_us:
-                now_us = wake_us
+            now_us = min(self.end_us, events.next_us or self.end_us)
+            kernel.run(now_us - 1)  # by itself, up to the next thing that hardware does
+            if events.next_us is not None and events.next_us < now_us:
+                continue  # a task has set hardware going that acts earlier
             wait_until(now_us)
-            board.now_us = now_us
-            if event_us == now_us:
-                events.run(now_us)
-            firmware.run(now_us)
+            kernel.advance(now_us)
+            events.run(now_us)
+            kernel.run(now_us)
             if now_us >= next_progress_us:
                 progress(now_us)
                 next_progress_us = now_us + PROGRESS_PERIOD_US

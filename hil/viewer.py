@@ -68,6 +68,7 @@ class Stage:
         self._plant = PlantConfig.model_validate(json.loads(metadata.get("config", "{}")).get("plant", {}))
         self._processor = curves.processor(schema.names)
         self._last: pa.Table | None = None  # the last row so far
+        recording.set_log_time_enabled(False)
         recording.send_recording_name(
             f"{metadata.get('experiment', 'flight')}, seed {metadata.get('seed', '?')}"
         )

@@ -3,15 +3,16 @@
 from collections.abc import Callable, Sequence
 
 from firmware_py.board import ImuCounts
+from firmware_py.firmware import Kernel
+from hil.events import EventQueue
 
 STILL: ImuCounts = (0, 0, 0, 0, 0, 0)
 
 
 class VirtualBoard:
-    """Implements `firmware_py.board.Board`.
+    """Implements `firmware_py.board.Board`; `servo`, `radio` and `console` are where the pins lead to.
 
-    `now_us` is set by the harness before hardware or firmware act; `servo`, `radio` and `console` are where the pins
-    lead to.
+    `run_on(kernel, events)` tells it whose time it is, and which hardware its pins may set going.
     """
 
     def __init__(
@@ -20,11 +21,21 @@ class VirtualBoard:
         radio: Callable[[int, bytes], bool],
         console: Callable[[int, str], None],
     ) -> None:
-        self.now_us = 0
         self.imu: ImuCounts = STILL
         self._servo = servo
         self._radio = radio
         self._console = console
+        self._kernel: Kernel | None = None
+        self._events: EventQueue | None = None
+
+    def run_on(self, kernel: Kernel, events: EventQueue) -> None:
+        """Join the pins to a booted processor and to the queue of hardware events."""
+        self._kernel, self._events = kernel, events
+
+    @property
+    def now_us(self) -> int:
+        """The processor's present instant; 0 while it boots."""
+        return self._kernel.now_us if self._kernel else 0
 
     def read_imu(self) -> ImuCounts:
         """Return the last sample."""
@@ -36,7 +47,10 @@ class VirtualBoard:
 
     def radio_send(self, data: bytes) -> bool:
         """Hand a packet to the radio chip."""
-        return self._radio(self.now_us, data)
+        accepted = self._radio(self.now_us, data)
+        if self._kernel and self._events and self._events.next_us is not None:
+            self._kernel.until_us = min(self._kernel.until_us, self._events.next_us - 1)  # hardware goes first
+        return accepted
 
     def debug_write(self, text: str) -> None:
         """Hand a line to the console."""

@@ -536,6 +536,11 @@ def wait_while_suspended(kernel):
     yield from kernel.delay(1)
 
 
+def suspend_itself_while_suspended(kernel):
+    kernel.suspend_all()
+    yield from kernel.current.suspend()
+
+
 def end_while_suspended(kernel):
     kernel.suspend_all()
     yield from ()
@@ -558,6 +563,7 @@ def negative_priority(kernel):
     [
         (wrong_yield, "yielded a generator; kernel calls need `yield from`"),
         (wait_while_suspended, "must not wait while the scheduler is suspended"),
+        (suspend_itself_while_suspended, "must not wait while the scheduler is suspended"),
         (end_while_suspended, "ended while the scheduler was suspended"),
         (give_a_mutex_of_another, "mutex lock: given by task, held by nobody"),
         (resume_too_often, "resume_all without suspend_all"),

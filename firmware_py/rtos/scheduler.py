@@ -56,29 +56,31 @@ class Scheduler:
         self._next_tick_us = TICK_US
         self._work_end_us = 0  # of the running task, when it has work left
         self._spins = 0
+        self.until_us = 0  # how far `run` goes
 
     def run(self, now_us: int) -> None:
-        """Does all that falls due up to and including `now_us`, until every task waits or works."""
+        """Does all that falls due up to and including `now_us`, until every task waits or works.
+
+        Hardware that a task sets going may lower `until_us` meanwhile: then the run ends there, and `now_us` before its
+        argument.
+        """
         if not self._started:
             raise KernelError("run before start")
         if now_us < self.now_us:
             raise KernelError(f"time runs backwards: from {self.now_us} us to {now_us} us")
-        while True:
-            wake_us = self.next_wake_us
-            if wake_us is not None and wake_us <= now_us:
-                self.now_us = wake_us
-            else:
-                self.now_us = now_us
-                if not self._interrupted:
-                    return
+        self.until_us = now_us
+        wake_us = self.next_wake_us
+        if self._interrupted and (wake_us is None or wake_us > now_us):
+            wake_us = now_us
+        while wake_us is not None and wake_us <= self.until_us:
+            self.now_us = wake_us
             self._interrupted = False
-            if self.now_us >= self._next_tick_us:
+            if wake_us >= self._next_tick_us:
                 self._pass_ticks()
             self._dispatch()
             wake_us = self.next_wake_us
-            if wake_us is None or wake_us > now_us:
-                self.now_us = now_us
-                return
+        if self.until_us > self.now_us:
+            self.now_us = self.until_us
 
     def advance(self, now_us: int) -> None:
         """Sets the clock before the interrupts of `now_us` are raised, so that they are recorded at the right time.
@@ -93,7 +95,7 @@ class Scheduler:
         """Takes the running task off the ready ring until it is woken or, unless negative, `wake_tick` comes."""
         task = self.current
         if self._suspended:
-            raise KernelError(f"task {task.name} must not wait while the scheduler is suspended")
+            self.check_may_wait()
         if waiters is not None:
             if waiters:
                 priority = task.event_priority
@@ -120,6 +122,11 @@ class Scheduler:
             self._delayed.insert(place, task)
         if task.watch is not None:
             task.watch.finished(self.now_us)
+
+    def check_may_wait(self) -> None:
+        """Raises KernelError if the running task would wait while nobody else may run."""
+        if self._suspended:
+            raise KernelError(f"task {self.current.name} must not wait while the scheduler is suspended")
 
     def wake(self, task: Task) -> bool:
         """Makes a waiting task ready, later if the scheduler is suspended; True when it outranks the running one."""

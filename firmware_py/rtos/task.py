@@ -25,7 +25,7 @@ FOREVER = -1  # a timeout that never ends, FreeRTOS's portMAX_DELAY; any other t
 
 
 class Task:
-    """One task; made by `Kernel.create_task`. Only its name, its priorities and the methods up to `priority_set` are for everybody."""
+    """One task; made by `Kernel.create_task`. Its fields, but for the name and the priorities, belong to the kernel."""
 
     __slots__ = (
         "_notification",
@@ -41,7 +41,6 @@ class Task:
         "ring",
         "step",
         "waiting_in",
-        "wake_tick",
         "watch",
         "work_left_us",
         "work_us",
@@ -57,13 +56,10 @@ class Task:
         self.step = body.send
         self.set_priority(priority)
         self.base_priority = priority
-        self.event_priority = (
-            priority  # by which waiters are ordered; a change does not move a task that waits
-        )
+        self.event_priority = priority  # orders the waiters; a change does not move a task that waits already
         self.mutexes_held = 0
         self.place = SUSPENDED
         self.waiting_in: list[Task] | None = None  # the waiters' list of a queue, or the pending-ready list
-        self.wake_tick = 0  # meaningful while DELAYED
         self.work_left_us = 0  # what is left of the current `work`
         self.work_us = 0  # all work so far, with what is left of the current one
         self.watch: TaskStatistics | None = None
@@ -118,6 +114,8 @@ class Task:
     def suspend(self) -> Iterable[int]:
         """Stops this task until `resume`, whatever it is doing or waiting for."""
         kernel = self.kernel
+        if self is kernel.current:
+            kernel.check_may_wait()
         if kernel.trace is not None:
             kernel.trace(kernel.now_us, "SUSPEND", self.name, 0, 0)
         kernel.unlink(self)
