@@ -137,7 +137,7 @@ class CpuConfig(Section):
     estimator_us: Cost = Field(description="KALMAN, per 100 Hz step [us]")
     syslink_us: Cost = Field(description="SYSLINK, per packet [us]")
     crtp_us: Cost = Field(description="CRTP-RX and CRTP-TX, per packet [us]")
-    log_us: Cost = Field(description="LOG, per telemetry packet [us]")
+    log_us: Cost = Field(description="LOG, per period of 20 ms [us]")
 
 
 class FirmwareConfig(Section):

@@ -11,14 +11,21 @@ from firmware_py.drivers.imu import GyroZero
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.measurements import Measurement
 from firmware_py.rtos import Kernel, Queue
+from firmware_py.rtos.statistics import Statistics
 from firmware_py.signals import Signals
 from firmware_py.supervisor import Supervisor
-from firmware_py.tasks import CoreBlocks, estimator_task, sensors_task, stabilizer_task
+from firmware_py.tasks import CoreBlocks, Thief, estimator_task, sensors_task, stabilizer_task, thief_task
 from firmware_py.variables import telemetry_reader
 
 __all__ = ["Firmware", "Kernel"]
 
 MEASUREMENT_QUEUE = 20  # original firmware
+DEADLINES_US = {  # of each activation: whatever the flight path does in a tick is over before the next one
+    "SENSORS": 1000,
+    "STABILIZER": 1000,
+    "KALMAN": 1000,
+}
+THIEF_PRIORITY = 6  # above every task, like interrupts that do not end
 
 
 class Firmware:
@@ -54,6 +61,8 @@ class Firmware:
         read = telemetry_reader(core.estimator.fields, core.control.fields, lambda: self._supervisor.state)
         self.link = CrtpStack(kernel, cost, board, self.measurements, read)
         self.signals = Signals.of(core.estimator, core.control, self._supervisor)
+        self.deadlines_us = DEADLINES_US
+        self.statistics = Statistics(self.kernel, DEADLINES_US)
         self.kernel.start()
 
     @property
@@ -72,6 +81,12 @@ class Firmware:
     def run(self, now_us: int) -> None:
         """Run the tasks until all are blocked or busy."""
         self.kernel.run(now_us)
+
+    def add_thief(self) -> Thief:
+        """Add a task that takes a share of every tick before all others; it takes nothing until told to."""
+        thief = Thief()
+        self.kernel.create_task("THIEF", THIEF_PRIORITY, thief_task, self.kernel, thief)
+        return thief
 
     def _zero_found(self) -> None:
         bias = self._zero.bias

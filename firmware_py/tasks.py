@@ -44,8 +44,8 @@ def sensors_task(
         counts = board.read_imu()
         if zero.bias is None and zero.add(counts):
             zero_found()
-        yield from measurements.send((GYRO, counts), 0)
-        yield from measurements.send((ACCELEROMETER, counts), 0)
+        yield from measurements.send_nowait((GYRO, counts))
+        yield from measurements.send_nowait((ACCELEROMETER, counts))
         yield from data_ready.give()
 
 
@@ -104,6 +104,22 @@ def estimator_task(
             data.gyro_samples = samples
             samples = x = y = z = 0
             entry.estimate(core.parameters.arg, core.data.arg, core.estimator.arg, core.control.arg)
+
+
+class Thief:
+    """How much of every tick the thief takes, 0..1; may change while it runs."""
+
+    __slots__ = ("share",)
+
+    def __init__(self) -> None:
+        self.share = 0.0
+
+
+def thief_task(kernel: Kernel, thief: Thief) -> Task:
+    """Take a share of every tick: a load to test the others with."""
+    while True:
+        yield from kernel.delay_until(kernel.tick_count + 1)
+        yield from kernel.work(round(thief.share * TICK_US))
 
 
 def next_step(tick: int, phase: int) -> int:

@@ -33,7 +33,9 @@ def flight_channels(
 ) -> tuple[Channel, ...]:
     """Return the channels of a flight; the first column, `t`, is the recorder's own."""
     signals, queue = firmware.signals, firmware.measurements
-    tasks, run_time_us = firmware.kernel.tasks, firmware.kernel.run_time_us
+    kernel = firmware.kernel
+    tasks = kernel.tasks
+    timed = [task for task in tasks if task.name in firmware.deadlines_us]
     up, down, air = radio.up, radio.down, radio.air
 
     def goal() -> tuple[float, ...]:
@@ -44,6 +46,7 @@ def flight_channels(
         return (
             up.sent, up.delivered, up.dropped, down.sent, down.delivered, down.dropped,
             air.retried, air.unanswered, up.latency_sum_us, down.latency_sum_us, queue.high_water, queue.dropped,
+            *[task.deadline_misses for task in timed], *[kernel.run_time_us(task) for task in tasks],
         )  # fmt: skip
 
     flaps = "flap_1 flap_2 flap_3 flap_4"
@@ -100,11 +103,8 @@ def flight_channels(
                 ),
                 _of("link", "up_latency_sum down_latency_sum", "us"),
                 _of("rtos", "measurements_high_water measurements_dropped"),
+                _of("late", " ".join(task.name for task in timed)),
+                Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),
             ),
-        ),
-        Channel(
-            "int64",
-            lambda: tuple([run_time_us(task) for task in tasks]),
-            (Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),),
         ),
     )

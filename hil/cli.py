@@ -172,7 +172,9 @@ def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool) -> i
         missed = viewer.close() if viewer else 0
     _print_result(result)
     if missed:
-        console.print(f"the live viewer was too slow for {missed} of the flight's seconds; the recording has them all")
+        console.print(
+            f"the live viewer was too slow for {missed} of the flight's seconds; the recording has them all"
+        )
     if isinstance(clock, Paced):
         console.print(f"paced to the wall clock, never more than {clock.worst_lag_us / 1000:.1f} ms late")
     if result.outcome == "interrupted":

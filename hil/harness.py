@@ -98,9 +98,9 @@ class Flight:
         self.radio.connect(self._radio_to_board, self.station.on_packet)
         self.plant.hold()
         self.events.at(self.release_us, self._release)
-        self.events.at(IMU_PERIOD_US, self._imu_sample)
-        self.events.at(MOCAP_PHASE_US, self._expose)
-        self.events.at(RECORD_PHASE_US, self._record)
+        self.events.every(IMU_PERIOD_US, IMU_PERIOD_US, self._imu_sample)
+        self.events.every(config.mocap.period_us, MOCAP_PHASE_US, self._expose)
+        self.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._record)
 
     @property
     def now_us(self) -> int:
@@ -125,12 +125,14 @@ class Flight:
     def _loop(self, progress: Callable[[int], None]) -> None:
         """Go from one instant at which anything happens to the next."""
         events, kernel, wait_until = self.events, self.firmware.kernel, self.clock.wait_until
-        now_us = next_progress_us = 0
-        while now_us < self.end_us:
-            now_us = min(self.end_us, events.next_us or self.end_us)
-            kernel.run(now_us - 1)  # by itself, up to the next thing that hardware does
-            if events.next_us is not None and events.next_us < now_us:
-                continue  # a task has set hardware going that acts earlier
+        next_progress_us = 0
+        while kernel.now_us < self.end_us:
+            now_us = self.end_us if events.next_us is None else min(events.next_us, self.end_us)
+            wake_us = kernel.next_wake_us
+            if wake_us is not None and wake_us < now_us:
+                kernel.run(now_us - 1)  # by itself, up to the next thing that hardware does
+                if events.next_us is not None and events.next_us < now_us:
+                    continue  # a task has set hardware going that acts earlier
             wait_until(now_us)
             kernel.advance(now_us)
             events.run(now_us)
@@ -145,13 +147,11 @@ class Flight:
         self.plant.advance(now_us)
         self.board.imu = self.imu.sample(self.plant)
         self.firmware.imu_ready()
-        self.events.at(now_us + IMU_PERIOD_US, self._imu_sample)
 
     def _expose(self, now_us: int) -> None:
         self.plant.advance(now_us)
         frame = self.mocap.expose(now_us, self.plant)
         self.events.at(now_us + self.config.mocap.latency_us, self._deliver(frame))
-        self.events.at(now_us + self.config.mocap.period_us, self._expose)
 
     def _deliver(self, frame: MocapFrame) -> Callable[[int], None]:
         return lambda now_us: self.station.on_frame(frame, now_us)
@@ -172,7 +172,6 @@ class Flight:
             self.lost = self.plant.lost
             self.end_us = now_us
             self._note("lab", f"lost: {self.lost}")
-        self.events.at(now_us + RECORD_PERIOD_US, self._record)
 
     def _console(self, now_us: int, text: str) -> None:
         self._note("board", text)

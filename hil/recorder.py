@@ -56,8 +56,7 @@ class Recorder:
         on_batch: Callable[[pa.RecordBatch], None] | None = None,
     ) -> None:
         self.folder = folder
-        self._columns: list[tuple[Callable[[], Any], NDArray[Any]]] = []
-        self._arrays: list[NDArray[Any]] = []
+        self._sources: list[tuple[Callable[[], Any], NDArray[Any]]] = []
         self._times = np.zeros(ROWS_PER_BATCH, np.int64)
         self._row = 0
         self._on_batch = on_batch
@@ -65,13 +64,12 @@ class Recorder:
         for channel in channels:
             columns = [(name, quantity) for quantity in channel.quantities for name in quantity.names]
             block = np.zeros((ROWS_PER_BATCH, len(columns)), channel.dtype)
-            self._columns.append((channel.read, block if len(columns) > 1 else block[:, 0]))
-            for index, (name, quantity) in enumerate(columns):
-                self._arrays.append(block[:, index])
+            self._sources.append((channel.read, block))
+            for name, quantity in columns:
                 metadata_of_column = {"unit": quantity.unit, "frame": quantity.frame}
                 fields.append(pa.field(name, pa.from_numpy_dtype(block.dtype), metadata=metadata_of_column))
         self._schema = pa.schema(fields, metadata=dict(metadata))
-        self._hash = hashlib.sha256()
+        self._hash = hashlib.sha256(" ".join(self._schema.names).encode())
         self._stream = pa.ipc.new_stream(str(folder / STREAM), self._schema)
         self._events = (folder / EVENTS).open("w", encoding="utf-8")
 
@@ -79,7 +77,7 @@ class Recorder:
         """Take one sample of every channel."""
         row = self._row
         self._times[row] = now_us
-        for read, block in self._columns:
+        for read, block in self._sources:
             block[row] = read()
         self._row = row + 1
         if self._row == ROWS_PER_BATCH:
@@ -102,10 +100,11 @@ class Recorder:
     def _write_batch(self) -> None:
         rows = self._row
         self._row = 0
-        columns = [self._times[:rows].copy(), *(array[:rows].copy() for array in self._arrays)]
-        for field, values in zip(self._schema, columns, strict=True):
-            self._hash.update(field.name.encode())
-            self._hash.update(values.tobytes())
+        columns = [self._times[:rows].copy()]
+        for _, block in self._sources:
+            columns.extend(block[:rows].T.copy())
+        for values in columns:
+            self._hash.update(values.data)
         batch = pa.record_batch([pa.array(values) for values in columns], schema=self._schema)
         self._stream.write_batch(batch)
         if self._on_batch is not None:

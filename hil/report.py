@@ -72,11 +72,8 @@ def metric_rows(result: Mapping[str, Any]) -> list[Row]:
         value = result["metrics"].get(name)
         scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
         verdict = verdicts.get(name)
-        limit = (
-            ""
-            if verdict is None
-            else f"{'≤' if metric.bound == 'max' else '≥'} {verdict['bound'] * scale:.4g}"
-        )
+        sign = "≤" if metric.bound == "max" else "≥"
+        limit = "" if verdict is None else f"{sign} {verdict['bound'] * scale:.4g}"
         text = "–" if value is None else f"{value * scale:.4g}"
         rows.append(Row(name, metric.meaning, text, unit, limit, verdict and verdict["holds"]))
     return sorted(rows, key=lambda row: row.holds is None)

@@ -7,6 +7,7 @@ this file raises `LabError`.
 
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,7 @@ class Stage:
         if rows.num_rows == 0:
             return
         joined = rows if self._last is None else pa.concat_tables([self._last, rows])
+        fresh = joined.num_rows - rows.num_rows  # the first row of `joined` that is new
         self._last = rows.slice(rows.num_rows - 1)
         self._move(rows)
         for path, plot in PLOTS.items():
@@ -88,26 +90,25 @@ class Stage:
         slow = joined.take(np.arange(0, joined.num_rows, SLOW))
         times = column(slow, "t")
         for path, limit in LIMITS.items():
-            self._send(
-                f"plot/{path}", times, rr.Scalars.columns(scalars=np.full((len(times), 2), (limit, -limit)))
-            )
-        if len(times) > 1:
-            self._send("plot/processor", times[1:], rr.Scalars.columns(scalars=self._processor.read(slow)))
+            lines = np.full((len(times) - fresh, 2), (limit, -limit))
+            self._send(f"plot/{path}", times[fresh:], rr.Scalars.columns(scalars=lines))
+        self._send("plot/processor", times[1:], rr.Scalars.columns(scalars=self._processor.read(slow)))
         for path, states in STATES.items():
             begins, names = curves.changes(joined, states)
-            self._send(f"state/{path}", begins, rr.StateChange.columns(state=names))
-        if joined.num_rows > 1:
-            track = column(joined, "truth.x", "truth.y", "truth.z")
-            steps = np.stack((track[:-1], track[1:]), axis=1).astype(np.float32)
-            self._send("world/trail", column(joined, "t")[1:], rr.LineStrips3D.columns(strips=steps))
+            self._send(f"state/{path}", begins[fresh:], rr.StateChange.columns(state=names[fresh:]))
+        track = column(joined, "truth.x", "truth.y", "truth.z")
+        steps = np.stack((track[:-1], track[1:]), axis=1).astype(np.float32)
+        self._send("world/trail", column(joined, "t")[1:], rr.LineStrips3D.columns(strips=steps))
 
     def add_events(self, events: Iterable[Mapping[str, Any]]) -> None:
         """Put up texts: `t_us`, `source`, `text`."""
         for event in events:
-            self._recording.set_time(TIMELINE, duration=event["t_us"] * 1e-6)
+            self._recording.set_time(TIMELINE, duration=np.timedelta64(event["t_us"], "us"))
             self._recording.log(f"text/{event['source']}", rr.TextLog(f"{event['source']}: {event['text']}"))
 
     def _send(self, path: str, times_us: NDArray[np.float64], columns: Iterable[Any]) -> None:
+        if len(times_us) == 0:
+            return
         index = rr.TimeColumn(TIMELINE, duration=times_us.astype("timedelta64[us]"))
         self._recording.send_columns(path, [index], columns)
 
@@ -235,6 +236,7 @@ def blueprint() -> rrb.Blueprint:
         name="Wind tunnel",
         origin="world",
         eye_controls=rrb.EyeControls3D(position=(0.62, -0.48, 1.45), look_target=(0.0, 0.0, 1.12)),
+        background=(14, 18, 22),  # pale lines stay visible in a light theme, too
         line_grid=False,
         overrides={
             "world/trail": [rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=before, end=now))]
@@ -322,6 +324,8 @@ class LiveViewer:
     def close(self) -> int:
         """Let the window catch up for a few seconds; returns how many batches it has missed."""
         self._feed.close(CATCH_UP_S)
+        with suppress(RuntimeError):  # a window that was closed, or is stuck
+            self._recording.flush(timeout_sec=CATCH_UP_S)
         return self._feed.dropped
 
     def _show(self, batch: pa.RecordBatch) -> None:

@@ -49,7 +49,9 @@ class VirtualBoard:
         """Hand a packet to the radio chip."""
         accepted = self._radio(self.now_us, data)
         if self._kernel and self._events and self._events.next_us is not None:
-            self._kernel.until_us = min(self._kernel.until_us, self._events.next_us - 1)  # hardware goes first
+            self._kernel.until_us = min(
+                self._kernel.until_us, self._events.next_us - 1
+            )  # hardware goes first
         return accepted
 
     def debug_write(self, text: str) -> None:

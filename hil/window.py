@@ -21,8 +21,12 @@ LOOPBACK, PORT = (
     9876,
 )  # rerun's own port: a window that is already open takes the next flight, too
 START_TIMEOUT_S, POLL_S = 20.0, 0.05
+SETTLE_S = 1.0  # it listens first and looks for a display then
 QUEUE_BATCHES = 64  # a minute of flight
-COMMAND = (sys.executable, "-m", "rerun_cli", "--bind", LOOPBACK)
+_RERUN = (
+    "import sys; from rerun_cli.__main__ import main; sys.exit(main())"  # `-m rerun_cli` loses the exit code
+)
+COMMAND = (sys.executable, "-c", _RERUN, "--bind", LOOPBACK)
 
 Item = TypeVar("Item")
 
@@ -82,11 +86,12 @@ def open_window() -> str:
             env=_environment(), start_new_session=True,
         )  # fmt: skip
         for _ in range(round(START_TIMEOUT_S / POLL_S)):
+            settle_s = SETTLE_S if _is_open() else POLL_S
             try:
-                viewer.wait(POLL_S)
+                viewer.wait(settle_s)
                 break
             except subprocess.TimeoutExpired:
-                if _is_open():
+                if settle_s == SETTLE_S:
                     return address
         else:
             viewer.kill()

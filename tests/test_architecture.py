@@ -28,15 +28,15 @@ CORE_LIBRARIES = {"numpy", "typing"}
 # Module or attribute -> the files that alone may use it.
 CONFINED: dict[str, tuple[str, ...]] = {
     "numba": ("firmware_py/core/subset.py", "hil/plant/compiled.py"),
-    "rerun": ("hil/viewer.py", "hil/scene.py"),
+    "rerun": ("hil/viewer.py",),
     "time": ("hil/clock.py", "hil/run.py"),
     "datetime": (),
     "asyncio": (),
-    "threading": ("hil/viewer.py",),
+    "threading": ("hil/window.py",),
     "multiprocessing": ("hil/sweep.py",),
     "concurrent": ("hil/sweep.py",),
-    "subprocess": ("hil/run.py", "hil/viewer.py"),
-    "socket": ("hil/viewer.py",),
+    "subprocess": ("hil/run.py", "hil/window.py"),
+    "socket": ("hil/window.py",),
     "random": (),
     "secrets": (),
     "numpy.random.default_rng": ("hil/harness.py",),
@@ -48,7 +48,10 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "motioncapture": (),
     "scipy": (),
     "matplotlib": ("hil/figures.py", "hil/report.py"),
-    "pyarrow": ("hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/scene.py", "hil/report.py", "hil/figures.py"),
+    "pyarrow": (
+        "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
+        "hil/figures.py", "hil/curves.py",
+    ),
 }  # fmt: skip
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
 

@@ -41,7 +41,9 @@ def test_fly_writes_everything_and_says_where(
     assert json.loads((folder / "result.json").read_text())["passed"] is True
 
 
-def test_a_failed_limit_is_exit_code_one(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_limit_is_exit_code_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     code = floaty(monkeypatch, "fly", "hover", "--set", "tunnel.speed=7", "--out", "crash")
     assert code == 1
     assert "lost" in capsys.readouterr().out
@@ -105,7 +107,9 @@ def test_seeds_fly_in_other_processes_with_the_same_hash(
 
 def start(*arguments: str) -> "subprocess.Popen[str]":
     """Start the command and wait until the flight runs (its event log exists)."""
-    process = subprocess.Popen([*FLOATY, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        [*FLOATY, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     assert process.stdout is not None
     while not Path("run/log.arrows").exists() or Path("run/log.arrows").stat().st_size < 50_000:
         assert process.poll() is None, process.stdout.read()

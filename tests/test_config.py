@@ -55,7 +55,11 @@ def test_an_override_reaches_its_value(override: str, value: object) -> None:
         ("floaty", "tunel.speed=3", r"did you mean tunnel\?"),
         ("floaty", "controller.gain_y=nan", r"controller\.gain_y = nan: input should be a finite number"),
         ("floaty", "controller.gain_y=inf", r"controller\.gain_y = inf"),
-        ("floaty", "controller.gain_y=1e9", r"controller\.gain_y = 1000000000\.0: .*less than or equal to 20"),
+        (
+            "floaty",
+            "controller.gain_y=1e9",
+            r"controller\.gain_y = 1000000000\.0: .*less than or equal to 20",
+        ),
         ("floaty", "tunnel.speed=-1", r"tunnel\.speed = -1: .*greater than 0"),
         ("floaty", "servo.trim[1]=99999", r"servo\.trim\[1\] = 99999: .*12000"),
         ("floaty", "servo.trim[7]=0", r"no element \[7\]"),

@@ -53,3 +53,14 @@ def test_a_callback_that_raises_leaves_the_rest_planned():
     assert events.next_us == 2
     events.run(5)
     assert ran == [2]
+
+
+def test_a_period_counts_from_the_planned_instant():
+    events, ran = EventQueue(), []
+    events.every(10, 5, ran.append)
+    events.at(15, lambda planned_us: ran.append(-planned_us))
+    events.run(12)
+    events.run(38)  # late: nothing is skipped
+    assert ran == [5, -15, 15, 25, 35]
+    with pytest.raises(ValueError, match="period of 0"):
+        events.every(0, 50, ran.append)

@@ -55,7 +55,9 @@ class Bench:
             self.firmware.imu_ready()
         self.events.at(now_us + 1000, self._sample)
 
-    def pose(self, at_us: int, p: tuple[float, float, float] = (0.0, 0.0, 0.0), age_us: int | None = 40_000) -> None:
+    def pose(
+        self, at_us: int, p: tuple[float, float, float] = (0.0, 0.0, 0.0), age_us: int | None = 40_000
+    ) -> None:
         data = crtp.encode_ext_pose(p, LEVEL, age_us)
         self.events.at(at_us, lambda now_us: self.firmware.radio_received(data))
 
@@ -140,7 +142,12 @@ def test_controller_goes_on_when_the_imu_falls_silent(bench: Bench) -> None:
 
 def test_garbage_on_the_radio_is_counted_and_flies_on(bench: Bench) -> None:
     bench.poses(605_000, 800_000)
-    for at_us, data in ((650_100, b""), (650_200, b"\x6d\x08\x00"), (650_300, bytes(31)), (650_400, bytes(40))):
+    for at_us, data in (
+        (650_100, b""),
+        (650_200, b"\x6d\x08\x00"),
+        (650_300, bytes(31)),
+        (650_400, bytes(40)),
+    ):
         bench.events.at(at_us, lambda now_us, data=data: bench.firmware.radio_received(data))
     bench.run(800_000)
     assert bench.firmware.link.malformed == 3  # 31 zero bytes are a well-formed packet of another port

@@ -18,7 +18,9 @@ from hil.run import Request, Result, fly, prepare, read_result
 HOVER = EXPERIMENTS["hover"]
 
 
-def hover(folder: Path, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float = 30.0) -> Result:
+def hover(
+    folder: Path, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float = 30.0
+) -> Result:
     request = Request(HOVER, load_config(profile, overrides), profile, overrides, seed, duration_s)
     prepare(folder)
     return fly(request, folder)

@@ -123,7 +123,9 @@ def start_up_s(cache: Path | None) -> float:
 
 
 def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     arguments.add_argument("--compile", action="store_true", help="measure a first compilation too")
     options = arguments.parse_args()
     with tempfile.TemporaryDirectory() as folder:  # warm up
@@ -155,7 +157,9 @@ def main() -> None:
     table.add_row("start to first tick, warm", f"{best(lambda: start_up_s(None)):.2f} s", "")
     if options.compile:
         with tempfile.TemporaryDirectory() as folder:
-            table.add_row("start to first tick, first compilation ever", f"{start_up_s(Path(folder)):.1f} s", "")
+            table.add_row(
+                "start to first tick, first compilation ever", f"{start_up_s(Path(folder)):.1f} s", ""
+            )
     Console(width=100).print(table)
 
 

@@ -105,6 +105,9 @@ def file_pose(parameters: Parameters, data: Input, estimator: Estimator) -> i32:
     ticks = (age_us + TICK_US // 2) // TICK_US
     if ticks >= estimator.horizon:
         estimator.quiet_ticks = i32(0)
+    elif parameters.age_measured != 0 and estimator.quiet_ticks > QUIET_TICKS:
+        estimator.quiet_ticks = i32(0)
+        estimator.horizon = clamp_horizon(estimator.horizon - 1)
     tick = estimator.tick + 1 - ticks
     if tick <= estimator.filtered_tick:
         estimator.too_old = i32(estimator.too_old + 1)
@@ -154,9 +157,6 @@ def follow_age(parameters: Parameters, estimator: Estimator) -> i32:
     if parameters.age_measured == 0:
         return clamp_horizon(parameters.horizon)
     estimator.quiet_ticks = i32(estimator.quiet_ticks + 1)
-    if estimator.quiet_ticks > QUIET_TICKS:
-        estimator.quiet_ticks = i32(0)
-        return clamp_horizon(estimator.horizon - 1)
     return clamp_horizon(estimator.horizon)
 
 

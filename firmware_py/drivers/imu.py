@@ -3,7 +3,9 @@
 from firmware_py.board import ImuCounts
 
 SAMPLES = 512  # original firmware
-VARIANCE_LIMIT = 10_000.0  # [counts^2] 0.1 rad/s rms: more than sensor noise in the flow, less than a moving robot
+VARIANCE_LIMIT = (
+    10_000.0  # [counts^2] 0.1 rad/s rms: more than sensor noise in the flow, less than a moving robot
+)
 
 
 class GyroZero:

@@ -85,7 +85,7 @@ class CrtpStack:
             wake_tick += telemetry.PERIOD_MS
             yield from self._kernel.delay_until(wake_tick)
             stamp_ms = self._kernel.tick_count
+            yield from self._kernel.work(self._cost.log_us)
             for block in telemetry.BLOCKS:
-                yield from self._kernel.work(self._cost.log_us)
                 packet = telemetry.encode_sample(block, stamp_ms, self._read_block(block))
                 yield from self._transmit.send(packet, 0)

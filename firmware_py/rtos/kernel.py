@@ -74,7 +74,9 @@ class Kernel(Scheduler):
         self._started = True
         self.current = self._first
         self.next_wake_us = self.now_us
-        self._record_switch()
+        self.current.fresh = False
+        if self.trace is not None:
+            self.record("IN", self.current.priority)
 
     def run_time_us(self, task: Task) -> int:
         """Processor time that the task consumed up to now, between two runs; of the idle task what all others left."""

@@ -75,6 +75,25 @@ class Queue(Generic[T]):
             yield 0
         return True
 
+    def send_nowait(self, item: T) -> Iterable[int]:
+        """Appends `item`, or drops and counts it when there is no space.
+
+        `yield from` it lets a receiver of higher priority run at once; the plain call lets it run at the caller's next
+        `yield from` that blocks, yields or works.
+        """
+        kernel = self._kernel
+        items = self._items
+        if len(items) >= self.length:
+            self.dropped += 1
+            kernel.failed("Q_SEND_FAIL", self.number)
+            return GO_ON
+        if kernel.trace is not None:
+            kernel.record("Q_SEND", self.number, len(items))
+        items.append(item)
+        if len(items) > self.high_water:
+            self.high_water = len(items)
+        return kernel.switch_if(kernel.wake(self._receivers.pop(0))) if self._receivers else GO_ON
+
     def receive(self, timeout: int = FOREVER) -> Generator[int, None, T | None]:
         """Takes the oldest item, waiting up to `timeout` ticks for one; None when none came."""
         kernel = self._kernel

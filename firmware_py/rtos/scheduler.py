@@ -36,7 +36,6 @@ class Scheduler:
     def __init__(self, preemption: bool = True, trace: Trace | None = None) -> None:
         self.preemption = preemption
         self.trace = trace
-        self.observed = trace is not None  # whether switches are traced or counted
         self.now_us = 0
         self.next_wake_us: int | None = None
         self.tick_count = 0  # up to date while tasks run
@@ -82,10 +81,14 @@ class Scheduler:
         if self.until_us > self.now_us:
             self.now_us = self.until_us
 
+    def set_trace(self, trace: Trace | None) -> None:
+        """Begins or ends tracing, between two runs; the tasks notice nothing of it."""
+        self.trace = trace
+
     def advance(self, now_us: int) -> None:
         """Sets the clock before the interrupts of `now_us` are raised, so that they are recorded at the right time.
 
-        Optional where neither a trace nor statistics are kept. Nothing may fall due before `now_us`.
+        Without it their traces and the tasks' response times are too early. Nothing may fall due before `now_us`.
         """
         if now_us < self.now_us or (self.next_wake_us is not None and now_us > self.next_wake_us):
             raise KernelError(f"advance({now_us}): outside {self.now_us}..{self.next_wake_us}")
@@ -120,8 +123,12 @@ class Scheduler:
             place = bisect_right(self._wake_ticks, wake_tick)
             self._wake_ticks.insert(place, wake_tick)
             self._delayed.insert(place, task)
-        if task.watch is not None:
-            task.watch.finished(self.now_us)
+        task.activations += 1
+        response_us = self.now_us - task.released_us
+        if response_us > task.worst_response_us:
+            task.worst_response_us = response_us
+        if response_us > task.deadline_us:
+            task.deadline_misses += 1
 
     def check_may_wait(self) -> None:
         """Raises KernelError if the running task would wait while nobody else may run."""
@@ -147,8 +154,8 @@ class Scheduler:
         task.place = READY
         task.ring.insert(-1, task)
         self._ready_bits |= task.ready_bit
-        if task.watch is not None:
-            task.watch.released(self.now_us)
+        task.released_us = self.now_us
+        task.fresh = True
 
     def make_ready(self, task: Task) -> None:
         """Appends the task to the ring of its priority."""
@@ -248,7 +255,7 @@ class Scheduler:
         task = self.current
         idle = self._idle
         now_us = self.now_us
-        observed = self.observed
+        trace = self.trace
         switch = self._switch_pending and not self._suspended
         self._spins = 0
         if task.work_left_us:  # every interrupt ends the sleep of the idle task
@@ -272,8 +279,13 @@ class Scheduler:
                             ring.append(ring.pop(0))
                         task = ring[-1]
                     self.current = task
-                    if observed:
-                        self._record_switch()
+                    if trace is not None:
+                        trace(now_us, "IN", task.name, task.priority, 0)
+                    if task.fresh:
+                        task.fresh = False
+                        if now_us > task.released_us:
+                            latency_us = now_us - task.released_us
+                            task.latencies[latency_us] = task.latencies.get(latency_us, 0) + 1
                 if task.work_left_us:
                     break
                 result = task.step(None)
@@ -312,13 +324,6 @@ class Scheduler:
             if wake_us is None or work_end_us < wake_us:
                 wake_us = work_end_us
         self.next_wake_us = wake_us
-
-    def _record_switch(self) -> None:
-        task = self.current
-        if self.trace is not None:
-            self.record("IN", task.priority)
-        if task.watch is not None:
-            task.watch.started(self.now_us)
 
     def _idle_task(self) -> Generator[int, None, None]:
         """Lets others of priority 0 run, then sleeps until the next interrupt, like the Crazyflie's idle hook."""

@@ -13,7 +13,6 @@ from firmware_py.rtos.errors import KernelError
 
 if TYPE_CHECKING:
     from firmware_py.rtos.scheduler import Scheduler
-    from firmware_py.rtos.statistics import TaskStatistics
 
 SWITCH = (0,)  # what a call returns for `yield from` when the processor may go to another task
 GO_ON: tuple[int, ...] = ()  # ... and when the caller just continues
@@ -24,26 +23,35 @@ READY, DELAYED, SUSPENDED, DELETED = range(4)
 FOREVER = -1  # a timeout that never ends, FreeRTOS's portMAX_DELAY; any other timeout is a number of ticks
 
 
+NO_DEADLINE_US = 1 << 62
+
+
 class Task:
     """One task; made by `Kernel.create_task`. Its fields, but for the name and the priorities, belong to the kernel."""
 
     __slots__ = (
         "_notification",
         "_notify_waiting",
+        "activations",
         "base_priority",
+        "deadline_misses",
+        "deadline_us",
         "event_priority",
+        "fresh",
         "kernel",
+        "latencies",
         "mutexes_held",
         "name",
         "place",
         "priority",
         "ready_bit",
+        "released_us",
         "ring",
         "step",
         "waiting_in",
-        "watch",
         "work_left_us",
         "work_us",
+        "worst_response_us",
     )
 
     def __init__(self, kernel: Scheduler, name: str, priority: int, body: Generator[int, None, Any]) -> None:
@@ -62,7 +70,17 @@ class Task:
         self.waiting_in: list[Task] | None = None  # the waiters' list of a queue, or the pending-ready list
         self.work_left_us = 0  # what is left of the current `work`
         self.work_us = 0  # all work so far, with what is left of the current one
-        self.watch: TaskStatistics | None = None
+        # How it keeps up. An activation lasts from the instant at which the task becomes ready after a wait to its next
+        # wait; its response time is that duration, its start latency the part before it first runs.
+        self.released_us = kernel.now_us
+        self.fresh = True  # released, and has not run since
+        self.activations = 0
+        self.worst_response_us = 0
+        self.deadline_us = NO_DEADLINE_US
+        self.deadline_misses = 0
+        self.latencies: dict[
+            int, int
+        ] = {}  # number of activations by start latency, without those that ran at once
         self._notification = 0
         self._notify_waiting = False
 

@@ -1,0 +1,134 @@
+"""The core's float32 functions against numpy in float64, over everything that a float32 can hold."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from firmware_py.core import maths
+
+f32 = np.float32
+law = settings(deadline=None)  # the first call compiles
+any_number = st.floats(width=32)  # NaN, infinities, denormals and -0.0 included
+angles = st.floats(-1000, 1000, width=32)
+finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
+LARGEST = float(np.finfo(f32).max)
+
+
+def turn_apart(a: float, b: float) -> float:
+    """Return the distance of two angles on the circle."""
+    return abs(math.remainder(a - b, 2 * math.pi))
+
+
+@law
+@given(angles)
+@example(1000.0)
+@example(-1000.0)
+@example(0.7853981852531433)
+def test_sine_and_cosine_are_exact_to_1e_7(x: float) -> None:
+    assert float(maths.sin(f32(x))) == pytest.approx(math.sin(x), abs=1.0e-7)
+    assert float(maths.cos(f32(x))) == pytest.approx(math.cos(x), abs=1.0e-7)
+
+
+def test_sine_and_cosine_are_exact_in_every_quadrant() -> None:
+    x = np.linspace(-30, 30, 20_001).astype(f32)
+    exact = x.astype(float)
+    assert np.abs([maths.sin(a) for a in x] - np.sin(exact)).max() < 1.0e-7
+    assert np.abs([maths.cos(a) for a in x] - np.cos(exact)).max() < 1.0e-7
+
+
+@law
+@given(finite, finite)
+@example(0.0, -1.0)
+@example(-0.0, -1.0)
+@example(1.0, 0.0)
+@example(-1.401298464324817e-45, 1.401298464324817e-45)
+@example(LARGEST, -LARGEST)
+@example(1.0, 0.4142135679721832)
+def test_arc_tangent_is_exact_to_3e_7_on_the_circle(y: float, x: float) -> None:
+    got = float(maths.atan2(f32(y), f32(x)))
+    if x == 0.0 and y == 0.0:
+        assert got == 0.0
+    else:
+        assert turn_apart(got, math.atan2(y, x)) < 3e-7
+        assert math.copysign(1, got) == math.copysign(1, y) or y == 0.0
+
+
+def test_arc_tangent_is_exact_all_around() -> None:
+    x = np.linspace(-math.pi, math.pi, 20_001)
+    rows = np.column_stack([np.sin(x), np.cos(x)]).astype(f32)
+    errors = [turn_apart(float(maths.atan2(y, x)), math.atan2(y, x)) for y, x in rows]
+    assert max(errors) < 3e-7
+
+
+@law
+@given(st.floats(-1, 1, width=32))
+@example(1.0)
+@example(-1.0)
+@example(0.9999999403953552)
+def test_arc_sine_is_exact_to_3e_7(x: float) -> None:
+    assert float(maths.asin(f32(x))) == pytest.approx(math.asin(x), abs=3e-7)
+
+
+@law
+@given(any_number)
+def test_arc_sine_saturates_outside_its_domain(x: float) -> None:
+    expected = math.asin(min(max(x, -1.0), 1.0)) if x == x else -math.pi / 2
+    assert float(maths.asin(f32(x))) == pytest.approx(expected, abs=3e-7)
+
+
+@law
+@given(st.floats(-10, 10, width=32))
+@example(3.1415927410125732)
+@example(-3.1415927410125732)
+@example(9.42477798461914)
+def test_wrapped_angle_is_the_same_angle_inside_half_a_turn(x: float) -> None:
+    got = float(maths.wrap(f32(x)))
+    assert turn_apart(got, x) < 5e-7
+    assert abs(got) <= float(f32(math.pi))
+
+
+@law
+@given(angles)
+def test_wrap_loses_less_than_6e_5_rad_within_a_hundred_turns(x: float) -> None:
+    assert turn_apart(float(maths.wrap(f32(x))), x) < 6e-5
+
+
+@law
+@given(any_number, any_number)
+@example(math.nan, math.nan)
+@example(math.inf, -math.inf)
+@example(math.nan, 1.0)
+@example(1.0, math.nan)
+@example(math.inf, 1.0)
+def test_no_number_gives_more_than_a_bounded_number(y: float, x: float) -> None:
+    for function in (maths.sin, maths.cos):
+        assert abs(float(function(f32(x)))) <= 1.0 + 1e-7
+    for angle in (maths.wrap(f32(x)), maths.atan2(f32(y), f32(x))):
+        assert abs(float(angle)) <= float(f32(math.pi))
+    assert abs(float(maths.asin(f32(x)))) <= math.pi / 2 + 3e-7
+
+
+@law
+@given(any_number)
+def test_angles_out_of_range_saturate(x: float) -> None:
+    held = float(np.clip(x, -1000.0, 1000.0)) if x == x else -1000.0
+    assert float(maths.sin(f32(x))) == pytest.approx(math.sin(held), abs=1.0e-7)
+    assert float(maths.cos(f32(x))) == pytest.approx(math.cos(held), abs=1.0e-7)
+    assert turn_apart(float(maths.wrap(f32(x))), held) < 6e-5
+
+
+@law
+@given(any_number, finite, finite)
+def test_clamp_is_numpys_and_takes_nan_to_the_lower_bound(x: float, a: float, b: float) -> None:
+    low, high = min(a, b), max(a, b)
+    expected = low if x != x else float(np.clip(x, low, high))
+    assert float(maths.clamp(f32(x), f32(low), f32(high))) == expected
+
+
+@law
+@given(any_number)
+def test_finite_is_numpys(x: float) -> None:
+    assert bool(maths.finite(f32(x))) == bool(np.isfinite(x))

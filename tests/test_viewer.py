@@ -1,0 +1,248 @@
+"""The viewer: what stands in a recording, the shape of the picture, and that a window never holds a flight."""
+
+import importlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
+
+from firmware_py.supervisor import State
+from hil import curves, scene, viewer, window
+from hil.config import load_config
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.metrics import column
+from hil.plant import layout as at
+from hil.plant.body import place_plates
+from hil.plant.config import PlantConfig
+from hil.recorder import load_events, load_log
+from hil.run import Request, fly, prepare
+
+angles = st.floats(-1.5, 1.5)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder: 1 s held, 0.5 s free, 150 rows."""
+    folder = tmp_path_factory.mktemp("viewer") / "run"
+    prepare(folder)
+    fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 0.5), folder)
+    return folder
+
+
+def chunks(path: Path, entity: str) -> list[pa.RecordBatch]:
+    """The batches of an entity that move with time, in its order."""
+    found = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity]
+    moving = [batch for batch in found if viewer.TIMELINE in batch.schema.names]
+    return sorted(moving, key=lambda batch: batch.column(viewer.TIMELINE)[0].value)
+
+
+def values(path: Path, entity: str, component: str) -> NDArray[np.float64]:
+    return np.array([row for batch in chunks(path, entity) for row in batch.column(component).to_pylist()])
+
+
+def moments(path: Path, entity: str) -> list[int]:
+    """The instants [ns] of an entity."""
+    return [moment.value for batch in chunks(path, entity) for moment in batch.column(viewer.TIMELINE)]
+
+
+def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:
+    log, path = load_log(folder), viewer.write_run_rrd(folder)
+    assert log.num_rows == 150
+    fast = ["robot", "robot/plates/flap_1", "robot/plates/flap_4", "goal", "goal/estimate", "drag", "flow"]
+    for entity in (*(f"/world/{name}" for name in fast), *(f"/plot/{name}" for name in viewer.PLOTS)):
+        assert moments(path, entity) == [1000 * t for t in log.column("t").to_pylist()], entity
+    assert moments(path, "/world/trail") == [1000 * t for t in log.column("t").to_pylist()[1:]]
+    truth = column(log, "truth.x", "truth.y", "truth.z")
+    np.testing.assert_allclose(
+        values(path, "/world/robot", "Transform3D:translation")[:, 0], truth, atol=1e-6
+    )
+    xyzw = column(log, "truth.qx", "truth.qy", "truth.qz", "truth.qw")
+    np.testing.assert_allclose(values(path, "/world/robot", "Transform3D:quaternion")[:, 0], xyzw, atol=1e-6)
+
+
+def test_texts_and_changes_of_state_are_recorded_once(folder: Path) -> None:
+    path = viewer.write_run_rrd(folder)
+    states = values(path, "/state/supervisor", "StateChange:state")[:, 0].tolist()
+    assert states == ["calibrating", "flying"] or states == ["calibrating", "waiting", "flying"]
+    assert values(path, "/state/robot", "StateChange:state")[:, 0].tolist() == ["held", "free"]
+    for event in load_events(folder):
+        assert 1000 * event["t_us"] in moments(path, f"/text/{event['source']}")
+
+
+def rows_by_entity(path: Path) -> Counter[str]:
+    rows: Counter[str] = Counter()
+    for chunk in RrdReader(path).stream():
+        rows[chunk.entity_path] += chunk.to_record_batch().num_rows
+    return rows
+
+
+def free_port() -> int:
+    with socket.create_server((window.LOOPBACK, 0)) as free:
+        return int(free.getsockname()[1])
+
+
+def live_sink(path: Path) -> "subprocess.Popen[bytes]":
+    """A rerun server that writes what it receives, the headless stand-in for the window."""
+    command = [*window.COMMAND, "--port", str(window.PORT), "--save", str(path)]
+    return subprocess.Popen(
+        command, env={**os.environ, "CI": "1", "RUST_LOG": "error"}, start_new_session=True
+    )
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the sink is interrupted
+def test_a_live_flight_sends_what_the_file_holds(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected, path = rows_by_entity(viewer.write_run_rrd(folder)), tmp_path / "live.rrd"
+    monkeypatch.setattr(window, "PORT", free_port())
+    sink = live_sink(path)
+    try:
+        while sink.poll() is None and not window._is_open():
+            pass
+        live = viewer.LiveViewer(folder)
+        for batch in load_log(folder).combine_chunks().to_batches(max_chunksize=40):
+            live.send(batch)
+        assert live.close() == 0
+        for _ in range(100):
+            if rows_by_entity(path) == expected:
+                break
+            with suppress(subprocess.TimeoutExpired):
+                sink.wait(0.1)
+    finally:
+        os.killpg(sink.pid, signal.SIGKILL)
+        sink.wait()
+    assert rows_by_entity(path) == expected
+
+
+def test_an_empty_log_has_a_recording(folder: Path, tmp_path: Path) -> None:
+    viewer.write_rrd(load_log(folder).slice(0, 0), [], tmp_path / "empty.rrd")
+    assert rows_by_entity(tmp_path / "empty.rrd")["/world/robot/plates/flap_1"] == 1  # its mesh
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
+def test_without_a_display_the_error_says_so(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(window, "PORT", free_port())
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(LabError, match="needs a display"):
+        viewer.LiveViewer(folder)
+    with pytest.raises(LabError, match="needs a display"):
+        viewer.view_run(folder)
+    assert (folder / viewer.RECORDING).is_file()
+
+
+def test_without_rerun_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.delitem(sys.modules, "hil.viewer")
+    with pytest.raises(LabError, match=r"floaty-hil\[view\]"):
+        importlib.import_module("hil.viewer")
+
+
+def test_a_full_feed_drops_the_oldest_and_never_waits() -> None:
+    busy, go_on, seen = threading.Event(), threading.Event(), list[int]()
+
+    def sink(item: int) -> None:
+        busy.set()
+        go_on.wait()
+        seen.append(item)
+
+    feed = window.LiveFeed(sink, capacity=3)
+    feed.offer(0)
+    busy.wait()
+    for item in range(1, 9):
+        feed.offer(item)
+    assert feed.dropped == 5
+    assert not feed.close(timeout_s=0.05)
+    go_on.set()
+    assert feed.close(timeout_s=10)
+    assert seen == [0, 6, 7, 8]
+
+
+@given(angles, st.integers(0, 3))
+def test_a_drawn_flap_lies_where_the_plant_has_it(angle: float, flap: int) -> None:
+    plant, s = PlantConfig(), np.zeros(at.SIZE)
+    place_plates(s, plant)
+    mesh = scene.flap_mesh(plant, flap)
+    turn = Rotation.from_quat(
+        scene.turn_quaternion(scene.FLAP_AXES[flap], np.array([angle]))[0], scalar_first=True
+    )
+    vertices = np.add(turn.apply(mesh.vertices), (0, 0, plant.axis_height))
+    phi = -angle if flap % 2 == 0 else angle  # the plant's flaps 1 and 3 are mirror images
+    series = np.array([1.0, np.cos(phi), np.sin(phi)])
+    for plate, triangles in (
+        (2 * flap, _part(mesh, flat=True)),
+        (2 * flap + 1, _part(mesh, flat=False)),
+    ):
+        part = scene.Mesh(vertices, triangles)
+        n, r = (series @ s[base + 9 * plate :][:9].reshape(3, 3) for base in (at.NORMAL, at.CENTRE))
+        np.testing.assert_allclose(scene.mesh_centre(part), r, atol=1e-12)
+        np.testing.assert_allclose(_area(part), s[at.AREA + plate], rtol=1e-12)
+        normal = turn.apply(mesh.normals()[part.triangles[0, 0]])
+        np.testing.assert_allclose(normal, n, atol=1e-12)
+
+
+def _part(mesh: scene.Mesh, flat: bool) -> NDArray[np.int64]:
+    raised = mesh.vertices[mesh.triangles][:, :, 2].max(axis=1) > 0
+    return mesh.triangles[raised != flat]
+
+
+def _area(mesh: scene.Mesh) -> float:
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def test_the_drawn_areas_are_the_papers() -> None:
+    plant = PlantConfig()
+    parts = [scene.base_mesh(plant), *(scene.flap_mesh(plant, flap) for flap in range(4))]
+    areas = [_area(part) for part in parts]
+    assert areas == pytest.approx([0.0064, 0.0116, 0.0116, 0.0116, 0.0116], abs=5e-5)
+    assert sum(areas) == pytest.approx(0.23**2)
+
+
+def test_drag_acts_on_the_turned_flaps(folder: Path) -> None:
+    log, plant = load_log(folder), PlantConfig()
+    p_WB = column(log, "truth.x", "truth.y", "truth.z")
+    q_WB = column(log, "truth.qw", "truth.qx", "truth.qy", "truth.qz")
+    flaps = column(log, *(f"truth.flap_{number}" for number in (1, 2, 3, 4)))
+    origins = scene.drag_origins(plant, p_WB, q_WB, flaps)
+    body = Rotation.from_quat(q_WB, scalar_first=True)
+    np.testing.assert_allclose(origins[:, 0], p_WB + body.apply([0, 0, 0.07]), atol=1e-12)
+    for flap in range(4):
+        turn = body * Rotation.from_rotvec(flaps[:, flap, None] * scene.FLAP_AXES[flap])
+        centre = scene.mesh_centre(scene.flap_mesh(plant, flap))
+        np.testing.assert_allclose(origins[:, flap + 1], origins[:, 0] + turn.apply(centre), atol=1e-12)
+
+
+def test_the_shares_of_the_processor_are_spent_time_over_time() -> None:
+    rows = pa.table({"t": [0, 10_000, 30_000], "cpu.A": [0, 1_000, 2_000], "cpu.IDLE": [0, 9_000, 28_000]})
+    load = curves.processor(rows.column_names)
+    assert load.names == ("A",)
+    assert load.read(rows)[:, 0].tolist() == [10.0, 5.0]
+
+
+def test_the_latency_is_that_of_the_packets_that_arrived() -> None:
+    sums, arrived = [0, 6_000, 6_000], [0, 3, 3]
+    rows = pa.table(
+        {f"link.{way}_latency_sum": sums for way in ("up", "down")}
+        | {f"link.{way}_delivered": arrived for way in ("up", "down")}
+    )
+    np.testing.assert_array_equal(curves.latency(rows), [[2.0, 2.0], [np.nan, np.nan]])
+
+
+def test_states_have_the_supervisors_names() -> None:
+    assert curves.SUPERVISOR.names == tuple(state.name.lower() for state in State)
