@@ -10,14 +10,14 @@ from firmware_py.core.structs import Control, Estimator, Input
 from firmware_py.drivers.imu import GyroZero
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.measurements import Measurement
-from firmware_py.rtos import Kernel, Queue
-from firmware_py.rtos.statistics import Statistics
+from firmware_py.rtos import Kernel, Queue, WatchdogError
+from firmware_py.rtos.statistics import LATENCY_BOUNDS_US, Statistics, TaskReport
 from firmware_py.signals import Signals
 from firmware_py.supervisor import Supervisor
 from firmware_py.tasks import CoreBlocks, Thief, estimator_task, sensors_task, stabilizer_task, thief_task
 from firmware_py.variables import telemetry_reader
 
-__all__ = ["Firmware", "Kernel"]
+__all__ = ["LATENCY_BOUNDS_US", "Firmware", "Kernel", "TaskReport", "Thief", "WatchdogError"]
 
 MEASUREMENT_QUEUE = 20  # original firmware
 DEADLINES_US = {  # of each activation: whatever the flight path does in a tick is over before the next one
@@ -25,6 +25,7 @@ DEADLINES_US = {  # of each activation: whatever the flight path does in a tick 
     "STABILIZER": 1000,
     "KALMAN": 1000,
 }
+WATCHDOG_US = 353_000  # the longest that the Crazyflie's independent watchdog may take
 THIEF_PRIORITY = 6  # above every task, like interrupts that do not end
 
 
@@ -71,12 +72,21 @@ class Firmware:
         return self.kernel.next_wake_us
 
     def imu_ready(self) -> None:
-        """Interrupt: the IMU has a new sample."""
-        self._imu_ready.give_from_isr()
+        """Interrupt: the IMU has a new sample. While interrupts are off, samples pass unnoticed."""
+        if not self.kernel.interrupts_off:
+            self._imu_ready.give_from_isr()
 
     def radio_received(self, data: bytes) -> None:
-        """Interrupt: the radio chip has a packet."""
-        self.link.received(data)
+        """Interrupt: the radio chip has a packet. While interrupts are off, packets are lost."""
+        if not self.kernel.interrupts_off:
+            self.link.received(data)
+
+    def check_watchdog(self) -> None:
+        """Raise `WatchdogError` when the stabilizer has not come round for too long; hardware, called now and then."""
+        late_us = self.kernel.now_us - self._core.watchdog_fed_us
+        if late_us > WATCHDOG_US:
+            text = f"watchdog reset, STABILIZER has not run for {late_us / 1000:.0f} ms and this task has the processor"
+            raise WatchdogError(self.kernel.current.name, self.kernel.now_us, text)
 
     def run(self, now_us: int) -> None:
         """Run the tasks until all are blocked or busy."""

@@ -63,6 +63,7 @@ def stabilizer_task(
     while True:
         if (yield from data_ready.take(DATA_TIMEOUT)):
             yield from kernel.delay_until(kernel.tick_count + 1)
+        core.watchdog_fed_us = kernel.now_us
         yield from kernel.work(cost.stabilizer_us)
         yield from estimator_run.give()
         if kernel.tick_count >= control_tick:
@@ -145,10 +146,11 @@ def file_pose(kernel: Kernel, measurement: Any, supervisor: Supervisor, core: "C
 class CoreBlocks:
     """The memory of the flight core, as the tasks share it: each block has one writer but the parameters."""
 
-    __slots__ = ("control", "data", "estimator", "parameters")
+    __slots__ = ("control", "data", "estimator", "parameters", "watchdog_fed_us")
 
     def __init__(self, parameters: Block, data: Block, estimator: Block, control: Block) -> None:
         self.parameters = parameters
         self.data = data  # written by the estimator task, but for the mode: the stabilizer
         self.estimator = estimator  # written by the estimator task; its `now` is the stabilizer's mailbox
         self.control = control  # written by the stabilizer task
+        self.watchdog_fed_us = 0  # by the stabilizer task

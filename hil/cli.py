@@ -16,6 +16,7 @@ from hil.errors import LabError
 
 if TYPE_CHECKING:
     from hil.run import Request, Result
+    from hil.viewer import LiveViewer
 
 INTERRUPTED = 130
 DURATION_MAX_S = 86_400.0
@@ -60,6 +61,7 @@ run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path
 )
 @click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
 @click.option("--view", "watch", is_flag=True, help="Watch live in the rerun viewer.")
+@click.option("--perfetto", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace.")
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
 )
@@ -72,6 +74,7 @@ def fly(
     overrides: tuple[str, ...],
     realtime: bool,
     watch: bool,
+    perfetto: bool,
     out: Path | None,
 ) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
@@ -96,7 +99,7 @@ def fly(
     requests = [Request(chosen, config, profile, overrides, seed + index, flown_s) for index in range(seeds)]
     if seeds > 1:
         return _fly_many(requests, out or Path("runs"))
-    return _fly_one(requests[0], out or Path("runs") / f"{chosen.name}-{seed}", realtime, watch)
+    return _fly_one(requests[0], out or Path("runs") / f"{chosen.name}-{seed}", realtime, watch, perfetto)
 
 
 @app.command("list")
@@ -137,18 +140,16 @@ def announce_compilation() -> None:
         notices.print("first run on this machine: compiling flight core and plant, once, about half a minute")
 
 
-def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool) -> int:
+def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool, perfetto: bool) -> int:
     """Fly one seed with all its pictures; returns the exit code."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from hil.clock import FreeRunning, Paced
     from hil.harness import Flight
-    from hil.report import write_report
     from hil.run import fly, prepare
-    from hil.viewer import LiveViewer, write_run_rrd
 
     prepare(folder)
-    viewer = LiveViewer(folder) if watch else None
+    viewer = _live_viewer(folder) if watch else None
     clock = Paced() if realtime else FreeRunning()
     columns = (
         TextColumn("{task.description}"),
@@ -162,13 +163,13 @@ def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool) -> i
         def show(now_us: int, flight: Flight) -> None:
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
-        result = fly(request, folder, clock, show, viewer.send if viewer else None)
+        result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto)
         progress.update(bar, description="writing recording and report", total=None, now="")
-        for write in (write_run_rrd, write_report):
-            try:
-                write(folder)
-            except LabError as error:  # the log is there: `floaty view` and `floaty report` can try again
-                notices.print(f"floaty: {error}")
+        _write_pictures(folder)
+        if perfetto:
+            from hil.perfetto import write_perfetto
+
+            write_perfetto(folder)
         missed = viewer.close() if viewer else 0
     _print_result(result)
     if missed:
@@ -180,6 +181,26 @@ def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool) -> i
     if result.outcome == "interrupted":
         return INTERRUPTED
     return 0 if result.passed else 1
+
+
+def _live_viewer(folder: Path) -> "LiveViewer":
+    """Open the live viewer."""
+    from hil.viewer import LiveViewer
+
+    return LiveViewer(folder)
+
+
+def _write_pictures(folder: Path) -> None:
+    """Write recording and report; what cannot be written is said, for the log is there and can be shown later."""
+    try:
+        from hil.viewer import write_run_rrd
+
+        write_run_rrd(folder)
+    except LabError as error:
+        notices.print(f"floaty: no recording: {error}", soft_wrap=True)
+    from hil.report import write_report
+
+    write_report(folder)
 
 
 def _fly_many(requests: "list[Request]", parent: Path) -> int:
@@ -258,6 +279,8 @@ def _print_result(result: "Result") -> None:
         table.add_column(heading, justify="right")
     verdicts = {verdict.metric: verdict for verdict in result.verdicts}
     for name, value in result.metrics.items():
+        if math.isnan(value) and name not in verdicts:
+            continue
         metric = METRICS[name]
         limit = mark = ""
         if name in verdicts:
@@ -269,7 +292,7 @@ def _print_result(result: "Result") -> None:
     console.print(
         f"{result.outcome}{cause}; {result.real_time_factor:.0f} times real time; hash {result.hash[:16]}"
     )
-    for name in ("report.html", "flight.rrd", "log.parquet"):
+    for name in ("report.html", "flight.rrd", "flight.perfetto-trace", "log.parquet"):
         if (result.folder / name).is_file():
             hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""
             console.print(f"  {result.folder / name}{hint}", soft_wrap=True)

@@ -17,7 +17,7 @@ ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
 )  # fmt: skip
 AXIS_COLOURS = (RED, GREEN, BLUE)  # x, y, z; roll, pitch, yaw
 FLAP_COLOURS = (BLUE, ORANGE, GREEN, PINK)
-TASK_COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, YELLOW, GREY)
+TASK_COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, YELLOW, GREY, "#332288", "#882255", "#117733", "#000000")
 
 NEAR_CM, ATTITUDE_DEG = 6.0, 20.0  # paper, Hover_figure: errors below 6 cm most of the time, below 20 degrees
 TICK_MS = 10.0  # of the estimator's horizon

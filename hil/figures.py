@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from hil import curves, scene
 from hil.curves import Curves
-from hil.metrics import BOX, column, free_flight
+from hil.metrics import BOX, column, free_flight, position_error, thief_load
+from hil.schedule import runs
 
 WIDTH, DPI = 9.2, 115  # [in], 1/in
 TENTH, SECOND = 10, 100  # rows
+SCHEDULE_US = 20_000  # of the scheduler's picture
 BOX_CM = 100 * BOX
 STYLE: Any = {
     "axes.grid": True,
@@ -42,9 +44,10 @@ class Picture:
     title: str
     caption: str
     draw: Callable[[pa.Table], Figure]
+    needs: str = "t"  # a column without which there is nothing to draw
 
     def png(self, rows: pa.Table) -> bytes:
-        """Return the figure of a flight log."""
+        """Return the figure of a flight log, or of a schedule."""
         with matplotlib.rc_context(STYLE):
             file = io.BytesIO()
             self.draw(rows).savefig(file, format="png", dpi=DPI)
@@ -200,6 +203,57 @@ def estimate(rows: pa.Table) -> Figure:
     return figure
 
 
+def overload(rows: pa.Table) -> Figure:
+    """Draw what a thief of processor time does: late tasks and position error over its share."""
+    flight = free_flight(rows)
+    load = 5 * np.round(20 * thief_load(flight)).astype(int)  # the steps of the experiment
+    shares = np.unique(load)
+    figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True)
+    late = [name for name in flight.column_names if name.startswith("late.")]
+    for name in late:
+        misses = np.diff(column(flight, name), prepend=0.0)
+        per_second = [misses[load == share].mean() * SECOND for share in shares]
+        axes[0].plot(shares, per_second, "o-", label=name.removeprefix("late."))
+    axes[0].set_ylabel("missed deadlines [1/s]")
+    axes[0].set_yscale("symlog", linthresh=1.0)
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    error = 100 * np.abs(position_error(flight))
+    for axis, name, colour in zip(range(3), "xyz", curves.POSITION.colours, strict=True):
+        worst = [error[load == share, axis].max() for share in shares]
+        axes[1].plot(shares, worst, "o-", color=colour, label=name)
+    axes[1].axhline(BOX_CM, color="black", linestyle="--", linewidth=0.8)
+    axes[1].set_ylabel("largest error [cm]")
+    axes[1].set_yscale("log")
+    axes[1].set_xlabel("share of every tick that the thief takes [%]")
+    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def schedule(table: pa.Table) -> Figure:
+    """Draw which task has the processor, over the first 20 ms of a schedule."""
+    figure = Figure(figsize=(WIDTH, 2.4), layout="constrained")
+    axes = figure.subplots()
+    stretches = [run for run in runs(table) if run.task != "IDLE"]
+    begin_us = table.column("us")[0].as_py() if table.num_rows else 0
+    stretches = [run for run in stretches if run.start_us < begin_us + SCHEDULE_US]
+    names = sorted({run.task for run in stretches}, reverse=True)
+    for height, name in enumerate(names):
+        bars = [
+            (1e-3 * (r.start_us - begin_us), 1e-3 * (r.end_us - r.start_us))
+            for r in stretches
+            if r.task == name
+        ]
+        axes.broken_barh(
+            bars, (height - 0.4, 0.8), color=curves.TASK_COLOURS[height % len(curves.TASK_COLOURS)]
+        )
+    axes.set_yticks(range(len(names)), names)
+    axes.set_xlim(0.0, 1e-3 * SCHEDULE_US)
+    axes.set_xticks(range(0, SCHEDULE_US // 1000 + 1))
+    axes.set_xlabel(f"time after {1e-6 * begin_us:.3f} s [ms]; a line per tick")
+    return figure
+
+
 PICTURES = (
     Picture(
         "Track",
@@ -233,4 +287,12 @@ PICTURES = (
         "What the estimator believed, less the truth, in the goal frame.",
         estimate,
     ),
+    Picture(
+        "Overload",
+        "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
+        "Dashed: the 20 cm box. A task that starves completes nothing, late or not.",
+        overload,
+        needs="cpu.THIEF",
+    ),
 )
+SCHEDULE = Picture("Scheduler", "Which task had the processor, for 20 ms.", schedule)

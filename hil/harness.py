@@ -23,6 +23,7 @@ from hil.events import EventQueue
 from hil.experiments import Experiment
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Recorder
+from hil.schedule import WINDOW_US, ScheduleTrace
 from hil.virtual_board import VirtualBoard
 from hil.virtual_imu import VirtualImu
 from hil.virtual_mocap import VirtualMocap
@@ -33,6 +34,7 @@ MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms b
 RECORD_PERIOD_US = 10_000
 RECORD_PHASE_US = 250  # just after the controller
 PROGRESS_PERIOD_US = 250_000
+DROP_NOTE_PERIOD_US = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,7 @@ class Flight:
         seed: int,
         telemetry_path: Path | None,
         clock: Clock | None = None,
+        trace_all: bool = False,
     ) -> None:
         streams = Streams.of_seed(seed)
         home, offset = config.flight.home, config.flight.start_offset
@@ -80,6 +83,8 @@ class Flight:
         self.end_us = self.release_us + round(duration_s * 1e6)
         self.lost: str | None = None
         self.free = False
+        self._drops_noted: dict[str, int] = {}
+        self._next_drop_note_us = 0
         self.recorder: Recorder | None = None
         self.trajectory = experiment.trajectory(Goal(home, 0.0), self.release_us)
         self.plant = Plant(
@@ -98,6 +103,11 @@ class Flight:
         self.radio.connect(self._radio_to_board, self.station.on_packet)
         self.plant.hold()
         self.events.at(self.release_us, self._release)
+        experiment.script(self)
+        self.schedule = ScheduleTrace(self.firmware.kernel)
+        start_us = 0 if trace_all else self.release_us
+        self.events.at(start_us, self.schedule.begin)
+        self.events.at(self.end_us if trace_all else start_us + WINDOW_US, self.schedule.end)
         self.events.every(IMU_PERIOD_US, IMU_PERIOD_US, self._imu_sample)
         self.events.every(config.mocap.period_us, MOCAP_PHASE_US, self._expose)
         self.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._record)
@@ -118,7 +128,7 @@ class Flight:
         try:
             self._loop(progress or _silent)
         except KeyboardInterrupt:
-            self._note("lab", "interrupted by the user")
+            self.note("lab", "interrupted by the user")
             return Outcome(self.board.now_us, self.lost, interrupted=True)
         return Outcome(self.board.now_us, self.lost, interrupted=False)
 
@@ -162,21 +172,32 @@ class Flight:
     def _release(self, now_us: int) -> None:
         self.plant.release()
         self.free = True
-        self._note("lab", "released")
+        self.note("lab", "released")
 
     def _record(self, now_us: int) -> None:
         self.plant.advance(now_us)
         if self.recorder is not None:
             self.recorder.row(now_us)
+        self.firmware.check_watchdog()
+        self._note_drops(now_us)
         if self.plant.lost is not None:
             self.lost = self.plant.lost
             self.end_us = now_us
-            self._note("lab", f"lost: {self.lost}")
+            self.note("lab", f"lost: {self.lost}")
+
+    def _note_drops(self, now_us: int) -> None:
+        """Say which queue drops, once per second at most."""
+        for queue in self.firmware.kernel.queues:
+            if queue.dropped > self._drops_noted.get(queue.name, 0) and now_us >= self._next_drop_note_us:
+                self.note("board", f"queue {queue.name} is full: {queue.dropped} dropped so far")
+                self._drops_noted[queue.name] = queue.dropped
+                self._next_drop_note_us = now_us + DROP_NOTE_PERIOD_US
 
     def _console(self, now_us: int, text: str) -> None:
-        self._note("board", text)
+        self.note("board", text)
 
-    def _note(self, source: str, text: str) -> None:
+    def note(self, source: str, text: str) -> None:
+        """Put a line into the event log."""
         if self.recorder is not None:
             self.recorder.note(self.board.now_us, source, text)
 

@@ -116,7 +116,7 @@ def finish_log(folder: Path) -> None:
     stream = folder / STREAM
     table = _read_stream(stream)
     partial = folder / (PARQUET + ".partial")
-    pa.parquet.write_table(table, partial, compression="zstd")
+    pa.parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
     partial.replace(folder / PARQUET)
     stream.unlink()
 

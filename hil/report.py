@@ -10,12 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from hil.figures import PICTURES
+from firmware_py.firmware import LATENCY_BOUNDS_US
+from hil.figures import PICTURES, SCHEDULE, Picture
 from hil.metrics import METRICS, SHOWN
 from hil.recorder import load_events, load_log
 from hil.run import read_result
+from hil.schedule import load_schedule
 
 REPORT = "report.html"
 TEMPLATE = "report.html.j2"
@@ -45,7 +48,8 @@ class Shown:
 def write_report(folder: Path) -> Path:
     """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log."""
     log, result = load_log(folder), read_result(folder)
-    shown = [Shown(picture.title, picture.caption, _data_uri(picture.png(log))) for picture in PICTURES]
+    shown = [_show(picture, log) for picture in PICTURES if picture.needs in log.column_names]
+    shown.append(_show(SCHEDULE, load_schedule(folder)))
     config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
@@ -56,6 +60,7 @@ def write_report(folder: Path) -> Path:
         rows=metric_rows(result),
         events=load_events(folder),
         pictures=shown,
+        latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,
         config=json.dumps(config, indent=2),
     )
@@ -79,5 +84,9 @@ def metric_rows(result: Mapping[str, Any]) -> list[Row]:
     return sorted(rows, key=lambda row: row.holds is None)
 
 
-def _data_uri(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+def _show(picture: Picture, rows: pa.Table) -> Shown:
+    return Shown(
+        picture.title,
+        picture.caption,
+        "data:image/png;base64," + base64.b64encode(picture.png(rows)).decode(),
+    )

@@ -11,13 +11,14 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
+from firmware_py.firmware import TaskReport, WatchdogError
 from hil.clock import Clock
 from hil.config import LabConfig
 from hil.errors import LabError
@@ -42,6 +43,16 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
+class QueueReport:
+    """How full a queue became."""
+
+    name: str
+    length: int
+    high_water: int
+    dropped: int
+
+
+@dataclass(frozen=True, slots=True)
 class Result:
     """How a run went; `outcome` is completed, lost, interrupted or error."""
 
@@ -53,11 +64,13 @@ class Result:
     verdicts: tuple[Verdict, ...]
     hash: str
     real_time_factor: float
+    tasks: tuple[TaskReport, ...]
+    queues: tuple[QueueReport, ...]
 
     @property
     def passed(self) -> bool:
-        """Whether the flight came to its end and every limit holds."""
-        return self.outcome == "completed" and all(verdict.holds for verdict in self.verdicts)
+        """Whether the flight came to an end of its own, which may be a crash, and every limit holds."""
+        return self.outcome in ("completed", "lost") and all(verdict.holds for verdict in self.verdicts)
 
 
 def fly(
@@ -66,6 +79,7 @@ def fly(
     clock: Clock | None = None,
     progress: Callable[[int, Flight], None] | None = None,
     on_batch: Callable[[pa.RecordBatch], None] | None = None,
+    trace_all: bool = False,
 ) -> Result:
     """Fly once and write everything but the pictures into `folder`, which `prepare` has made.
 
@@ -74,8 +88,9 @@ def fly(
     limits = request.config.limits.get(request.experiment.name, request.experiment.limits)
     judge(dict.fromkeys(METRICS, 0.0), limits)  # refuse unknown metrics before the flight
     flight = Flight(
-        request.config, request.experiment, request.duration_s, request.seed, folder / "telemetry.csv", clock
-    )
+        request.config, request.experiment, request.duration_s, request.seed, folder / "telemetry.csv", clock,
+        trace_all,
+    )  # fmt: skip
     recorder = Recorder(folder, flight.channels(), metadata_of(request), on_batch)
     flight.recorder = recorder
     outcome, cause = "error", None
@@ -84,6 +99,9 @@ def fly(
         end = flight.run(None if progress is None else lambda now_us: progress(now_us, flight))
         outcome = "interrupted" if end.interrupted else "lost" if end.lost else "completed"
         cause = end.lost
+    except WatchdogError as error:
+        outcome, cause = "lost", str(error)
+        recorder.note(flight.now_us, "board", cause)
     except Exception as error:
         cause = f"{type(error).__name__}: {error}"
         recorder.note(flight.now_us, "lab", cause)
@@ -91,10 +109,18 @@ def fly(
         wall_s = (time.monotonic_ns() - start_ns) * 1e-9
         digest = recorder.close()
         flight.close()
+        flight.schedule.end(flight.now_us)
+        flight.schedule.write(folder)
     metrics = measure(load_log(folder), outcome == "lost")
     verdicts = tuple(judge(metrics, limits))
     factor = flight.now_us * 1e-6 / wall_s
-    result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor)
+    firmware = flight.firmware
+    queues = tuple(
+        QueueReport(queue.name, queue.length, queue.high_water, queue.dropped)
+        for queue in firmware.kernel.queues
+    )
+    tasks = tuple(firmware.statistics.reports())
+    result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues)
     write_result(result)
     return result
 
@@ -137,6 +163,8 @@ def write_result(result: Result) -> None:
             for verdict in result.verdicts
         ],
         "passed": result.passed,
+        "tasks": [asdict(task) for task in result.tasks],
+        "queues": [asdict(queue) for queue in result.queues],
         "hash": result.hash,
         "versions": versions(),
         "commit": commit(),
@@ -165,6 +193,8 @@ def read_result(folder: Path) -> dict[str, Any]:
         "cause": "the process ended before the flight did",
         "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
         "verdicts": [],
+        "tasks": [],
+        "queues": [],
         "passed": False,
         "hash": "",
         "versions": json.loads(metadata.get("versions", "{}")),

@@ -8,6 +8,7 @@ this file raises `LabError`.
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from hil.errors import LabError
 from hil.metrics import BOX, column
 from hil.plant.config import PlantConfig
 from hil.recorder import load_events, load_log
+from hil.schedule import load_schedule, runs
 from hil.window import LiveFeed, open_window, show_file
 
 try:
@@ -56,6 +58,7 @@ PLOTS: Mapping[str, Curves] = {
 }
 PALE = "flaps/command"
 LIMITS = {"position/limit": curves.NEAR_CM, "attitude/limit": curves.ATTITUDE_DEG}
+STRETCHES_SHOWN = 2000  # of the schedule; the whole of it is for Perfetto
 STATES: Mapping[str, States] = {"supervisor": curves.SUPERVISOR, "robot": curves.RELEASE}
 
 
@@ -99,6 +102,19 @@ class Stage:
         track = column(joined, "truth.x", "truth.y", "truth.z")
         steps = np.stack((track[:-1], track[1:]), axis=1).astype(np.float32)
         self._send("world/trail", column(joined, "t")[1:], rr.LineStrips3D.columns(strips=steps))
+
+    def add_schedule(self, schedule: pa.Table) -> None:
+        """Put up which task had the processor, a lane per task."""
+        stretches = list(islice(runs(schedule), STRETCHES_SHOWN))
+        for name in sorted({run.task for run in stretches} - {"IDLE"}):
+            mine = [run for run in stretches if run.task == name]
+            times = np.array([us for run in mine for us in (run.start_us, run.end_us)], np.float64)
+            states = [state for _ in mine for state in ("runs", "-")]
+            lane = rr.StateConfiguration(
+                values=("runs", "-"), colors=_rgba_array((curves.GREEN, curves.GREY))
+            )
+            self._recording.log(f"state/task/{name}", lane, static=True)
+            self._send(f"state/task/{name}", times, rr.StateChange.columns(state=states))
 
     def add_events(self, events: Iterable[Mapping[str, Any]]) -> None:
         """Put up texts: `t_us`, `source`, `text`."""
@@ -278,14 +294,15 @@ def blueprint() -> rrb.Blueprint:
     )
 
 
-def write_rrd(table: pa.Table, events: Iterable[Mapping[str, Any]], path: Path) -> None:
-    """Write a flight log (metadata in its schema) and its texts as a rerun file."""
+def write_rrd(table: pa.Table, events: Iterable[Mapping[str, Any]], schedule: pa.Table, path: Path) -> None:
+    """Write a flight log (metadata in its schema), its texts and its schedule as a rerun file."""
     partial = path.with_name(path.name + ".partial")
     recording = rr.RecordingStream(APPLICATION)
     recording.save(partial, default_blueprint=blueprint())
     stage = Stage(recording, table.schema)
     stage.add_rows(table)
     stage.add_events(events)
+    stage.add_schedule(schedule)
     recording.disconnect()
     partial.replace(path)
 
@@ -293,7 +310,7 @@ def write_rrd(table: pa.Table, events: Iterable[Mapping[str, Any]], path: Path) 
 def write_run_rrd(folder: Path) -> Path:
     """Write `flight.rrd` of a run folder from its log. Raises `LabError` when there is none."""
     path = folder / RECORDING
-    write_rrd(load_log(folder), load_events(folder), path)
+    write_rrd(load_log(folder), load_events(folder), load_schedule(folder), path)
     return path
 
 

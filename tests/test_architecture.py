@@ -47,10 +47,11 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "filterpy": (),
     "motioncapture": (),
     "scipy": (),
+    "perfetto": ("hil/perfetto.py",),
     "matplotlib": ("hil/figures.py", "hil/report.py"),
     "pyarrow": (
         "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
-        "hil/figures.py", "hil/curves.py",
+        "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
     ),
 }  # fmt: skip
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library

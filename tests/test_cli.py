@@ -133,3 +133,16 @@ def test_a_killed_flight_can_still_be_reported(monkeypatch: pytest.MonkeyPatch, 
     assert not Path("run/log.parquet").exists()
     assert load_log(tmp_path / "run").num_rows >= 100
     assert floaty(monkeypatch, "report", "run") == 0
+
+
+def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.delitem(sys.modules, "hil.viewer", raising=False)
+    assert floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--out", "run") == 0
+    assert "view" in capsys.readouterr().err
+    assert not Path("run/flight.rrd").exists()
+    assert Path("run/report.html").exists()
+    monkeypatch.delitem(sys.modules, "hil.viewer", raising=False)
+    assert floaty(monkeypatch, "fly", "hover", "--view", "--out", "run2") == 2

@@ -31,6 +31,7 @@ from hil.plant.body import place_plates
 from hil.plant.config import PlantConfig
 from hil.recorder import load_events, load_log
 from hil.run import Request, fly, prepare
+from hil.schedule import SCHEMA
 
 angles = st.floats(-1.5, 1.5)
 
@@ -108,7 +109,10 @@ def live_sink(path: Path) -> "subprocess.Popen[bytes]":
 def test_a_live_flight_sends_what_the_file_holds(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected, path = rows_by_entity(viewer.write_run_rrd(folder)), tmp_path / "live.rrd"
+    whole, path = rows_by_entity(viewer.write_run_rrd(folder)), tmp_path / "live.rrd"
+    assert "/state/task/KALMAN" in whole
+    # The schedule is there only after the flight.
+    expected = Counter({name: rows for name, rows in whole.items() if not name.startswith("/state/task/")})
     monkeypatch.setattr(window, "PORT", free_port())
     sink = live_sink(path)
     try:
@@ -130,7 +134,7 @@ def test_a_live_flight_sends_what_the_file_holds(
 
 
 def test_an_empty_log_has_a_recording(folder: Path, tmp_path: Path) -> None:
-    viewer.write_rrd(load_log(folder).slice(0, 0), [], tmp_path / "empty.rrd")
+    viewer.write_rrd(load_log(folder).slice(0, 0), [], SCHEMA.empty_table(), tmp_path / "empty.rrd")
     assert rows_by_entity(tmp_path / "empty.rrd")["/world/robot/plates/flap_1"] == 1  # its mesh
 
 

@@ -4,7 +4,7 @@
 FreeRTOS's words in Python spelling; ticks are 1 ms, instants are integer microseconds.
 """
 
-from firmware_py.rtos.errors import KernelError, StuckTaskError, TaskError
+from firmware_py.rtos.errors import KernelError, StuckTaskError, TaskError, WatchdogError
 from firmware_py.rtos.kernel import Kernel
 from firmware_py.rtos.queue import Queue
 from firmware_py.rtos.scheduler import TICK_US
@@ -27,4 +27,5 @@ __all__ = [
     "TaskError",
     "TaskReport",
     "Timer",
+    "WatchdogError",
 ]

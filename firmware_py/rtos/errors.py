@@ -18,3 +18,7 @@ class TaskError(KernelError):
 
 class StuckTaskError(TaskError):
     """A task keeps calling the kernel while no time passes, so that simulated time cannot go on."""
+
+
+class WatchdogError(TaskError):
+    """The watchdog was not fed in time; `task` is the one that had the processor."""

@@ -116,6 +116,19 @@ class Kernel(Scheduler):
         """
         return self.current.take_notification(clear, timeout)
 
+    def enter_critical(self) -> None:
+        """Keeps the running task running and, until `exit_critical`, interrupts waiting.
+
+        Hardware looks at `interrupts_off`. Ticks are caught up afterwards, where a real processor loses all but one.
+        """
+        self.suspend_all()
+        self.interrupts_off = True
+
+    def exit_critical(self) -> Iterable[int]:
+        """Ends `enter_critical`, which must not be nested; what pended happens now."""
+        self.interrupts_off = False
+        return self.resume_all()
+
     def suspend_all(self) -> None:
         """Keeps the running task running, ticks pend, until as many calls of `resume_all`."""
         self._suspended += 1

@@ -50,6 +50,7 @@ class Scheduler:
         self._delayed: list[Task] = []
         self._pending_ready: list[Task] = []  # woken by interrupts while the scheduler is suspended
         self._suspended = 0
+        self.interrupts_off = False
         self._switch_pending = False
         self._interrupted = False
         self._next_tick_us = TICK_US

@@ -5,8 +5,9 @@ import difflib
 from hil.errors import LabError
 from hil.experiments.experiment import Experiment
 from hil.experiments.hover import HOVER
+from hil.experiments.overload import OVERLOAD
 
-EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in (HOVER,)}
+EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in (HOVER, OVERLOAD)}
 
 __all__ = ["EXPERIMENTS", "Experiment", "find_experiment"]
 

@@ -1,19 +1,11 @@
 """Hover: hold one point of the flow, the paper's figure Hover_figure (30 s at 1.15 m, 20 cm box, 6 cm, 20 deg)."""
 
-from ground_station.trajectory import Goal, Hold, Trajectory
 from hil.experiments.experiment import Experiment
-
-
-def stay(home: Goal, release_us: int) -> Trajectory:
-    """Hold the home goal."""
-    return Hold(home)
-
 
 HOVER = Experiment(
     name="hover",
     summary="hold one point of the flow for 30 s (paper: 20 cm box, mostly < 6 cm, < 20 deg)",
     duration_s=30.0,
-    trajectory=stay,
     limits={
         "lost": 0.0,
         "within_6cm_x": 0.98,

@@ -1,0 +1,76 @@
+"""Which task ran when: the kernel's trace of a window of the flight, as `schedule.parquet`.
+
+Columns: `us` (instant), `event` and `who` (the words of tests/vectors/README.md), `a`, `b`. Without further wish the window
+is the 50 ms after the release, enough for a picture; `floaty fly --perfetto` traces the whole flight.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet
+
+from firmware_py.firmware import Kernel
+
+FILE = "schedule.parquet"
+WINDOW_US = 50_000
+SCHEMA = pa.schema(
+    {"us": pa.int64(), "event": pa.string(), "who": pa.string(), "a": pa.int64(), "b": pa.int64()}
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A task had the processor."""
+
+    task: str
+    start_us: int
+    end_us: int
+
+
+class ScheduleTrace:
+    """Collects the kernel's trace between `begin` and `end`; the flight plans both as events."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        self._kernel = kernel
+        self._rows: list[tuple[int, str, str, int, int]] = []
+
+    def begin(self, now_us: int) -> None:
+        """Start tracing; the task that has the processor is noted as if it had just been switched to."""
+        self._take(now_us, "IN", self._kernel.current.name, self._kernel.current.priority, 0)
+        self._kernel.set_trace(self._take)
+
+    def end(self, now_us: int) -> None:
+        """Stop tracing, if it goes on."""
+        if self._kernel.trace is not None:
+            self._take(now_us, "END", "-", 0, 0)
+            self._kernel.set_trace(None)
+
+    def write(self, folder: Path) -> None:
+        """Write `schedule.parquet`."""
+        columns = list(zip(*self._rows, strict=True)) or [()] * len(SCHEMA)
+        table = pa.table([pa.array(c, f.type) for c, f in zip(columns, SCHEMA, strict=True)], schema=SCHEMA)
+        pa.parquet.write_table(table, folder / FILE, compression="zstd")
+
+    def _take(self, us: int, event: str, who: str, a: int, b: int) -> None:
+        self._rows.append((us, event, who, a, b))
+
+
+def load_schedule(folder: Path) -> pa.Table:
+    """Return a run's schedule; an empty one when it has none, as after a kill."""
+    path = folder / FILE
+    return pa.parquet.read_table(path) if path.is_file() else SCHEMA.empty_table()
+
+
+def runs(schedule: pa.Table) -> Iterator[Run]:
+    """Yield who had the processor from when to when, the idle task included, instants of no length left out."""
+    events, times, names = (schedule.column(name).to_pylist() for name in ("event", "us", "who"))
+    task, start_us = "", 0
+    for event, us, who in zip(events, times, names, strict=True):
+        if event not in ("IN", "END"):
+            continue
+        if task and us > start_us and who != task:
+            yield Run(task, start_us, us)
+        if who != task:
+            task, start_us = who, us
