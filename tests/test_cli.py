@@ -33,7 +33,9 @@ def test_fly_writes_everything_and_says_where(
 ) -> None:
     assert floaty(monkeypatch, "fly", "hover", "--duration", "3", "--seed", "5") == 0
     folder = tmp_path / "runs" / "hover-5"
-    expected = {"log.parquet", "events.jsonl", "telemetry.csv", "result.json", "flight.rrd", "report.html"}
+    expected = {
+        "log.parquet", "events.jsonl", "telemetry.csv", "schedule.parquet", "result.json", "flight.rrd", "report.html",
+    }  # fmt: skip
     assert {path.name for path in folder.iterdir()} == expected
     shown = capsys.readouterr().out
     assert "within_6cm_x" in shown
@@ -62,6 +64,7 @@ def test_a_failed_limit_is_exit_code_one(
         (["fly", "hover", "--set", "controler.gain_z=1"], "did you mean controller?"),
         (["fly", "hover", "--out", "/proc/floaty/run"], "--out /proc/floaty/run: cannot be written"),
         (["fly", "hover", "--seeds", "2", "--view"], "--seeds 2"),
+        (["fly", "hover", "--seeds", "2", "--perfetto"], "--seeds 2"),
         (["fly", "hover", "--bogus"], "No such option"),
         (["fly"], "Missing argument"),
         (["report", "nowhere"], "nowhere"),
@@ -86,6 +89,14 @@ def test_list_names_experiments_and_profiles(
     shown = capsys.readouterr().out
     assert shown.startswith("hover  ")
     assert "profiles: as-flown, floaty (default)" in shown
+
+
+def test_perfetto_writes_its_trace(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--perfetto", "--out", "run") == 0
+    assert "run/flight.perfetto-trace" in capsys.readouterr().out
+    assert Path("run/flight.perfetto-trace").stat().st_size > 10_000
 
 
 def test_report_can_be_written_again(monkeypatch: pytest.MonkeyPatch) -> None:

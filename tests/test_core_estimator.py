@@ -254,7 +254,7 @@ def flight() -> list[Record]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(entry, "file_pose", listen_pose)
         patch.setattr(entry, "estimate", listen_tick)
-        flight = Flight(CONFIG, Experiment("tour", "", 10.0, tour, {}), 10.0, 3, None)
+        flight = Flight(CONFIG, Experiment("tour", "", 10.0, {}, tour), 10.0, 3, None)
         for at_us, force, torque in (
             (3_000_000, (0.3, 0.0, 0.0), (0.0, 0.0, 0.003)),
             (5_000_000, (0.0, -0.5, 0.3), (0.002, 0.0, 0.0)),
