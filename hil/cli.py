@@ -88,10 +88,10 @@ def fly(
     flown_s = chosen.duration_s if duration is None else duration
     if not 0.0 < flown_s <= DURATION_MAX_S:
         raise LabError(f"--duration {flown_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}")
-    if seeds > 1 and (realtime or watch):
-        raise LabError(
-            f"--seeds {seeds}: many seeds fly as fast as they can; --realtime and --view are for one"
-        )
+    if seeds > 1 and (realtime or watch or perfetto):
+        raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
+    if perfetto:
+        import hil.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
     config = load_config(profile, overrides)
     announce_compilation()
     from hil.run import Request
