@@ -137,7 +137,7 @@ def announce_compilation() -> None:
     """Say that the first run compiles, because it takes a while."""
     cache = Path(__file__).parent / "plant" / "__pycache__"
     if not os.environ.get("NUMBA_DISABLE_JIT") and not any(cache.glob("*.nbi")):
-        notices.print("first run on this machine: compiling flight core and plant, once, about half a minute")
+        notices.print("first run on this machine: compiling flight core and plant, once, some ten seconds")
 
 
 def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool, perfetto: bool) -> int:
@@ -263,7 +263,7 @@ def _print_seeds(rows: "list[Result]") -> None:
             )
             for name, digits in (("within_6cm_", 1), ("rms_", 2))
         )
-        console.print(f"mean of the completed: rms {rms} cm; < 6 cm {shares} % of the time")
+        console.print(f"mean of the completed: rms {rms} cm; < 6 cm {shares} % of the time", soft_wrap=True)
 
 
 def _print_result(result: "Result") -> None:
