@@ -14,6 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from ground_station.mocap import MocapFrame
 from hil.plant.plant import Plant
 
+NOISE_ROWS = 512  # frames of noise drawn at once
+
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -53,13 +55,16 @@ class VirtualMocap:
         self._config = config
         self._rng = rng
         (self._rng_faults,) = rng.spawn(1)  # so that faults leave the noise of the other frames as it was
+        self._draws: list[list[float]] = []
         self.dropout = config.dropout
         self.outlier = config.outlier
         self.blind = False
 
     def expose(self, now_us: int, plant: Plant) -> MocapFrame:
         """Return what the cameras see at this instant; the harness has advanced the plant to it."""
-        x, y, z, a, b, c = self._rng.standard_normal(6).tolist()
+        if not self._draws:
+            self._draws = self._rng.standard_normal((NOISE_ROWS, 6)).tolist()
+        x, y, z, a, b, c = self._draws.pop()
         if self.blind or (self.dropout > 0.0 and self._rng_faults.random() < self.dropout):
             return MocapFrame(now_us, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), valid=False)
         px, py, pz = plant.p_WB.tolist()

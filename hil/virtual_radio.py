@@ -14,7 +14,7 @@ its phase uniform). Figures: Crazyradio, nRF24L01+ and cflib, reference/crazyfli
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Literal
 
 import numpy as np
@@ -225,16 +225,11 @@ class VirtualRadio:
         length_us = host_us + exchange_us(POLL_BYTES, EMPTY_ACK_BYTES, config.bits_per_second)
         since_us, answered = self._idle_since_us, True
         if t_us >= since_us + length_us:
-            again_us = self._again_us[POLL_BYTES]
             heard = 1.0 - self._loss(self.uplink_loss, POLL_BYTES)
             lost = 1.0 - heard * (1.0 - self._loss(self.downlink_loss, EMPTY_ACK_BYTES))
             if lost:
-                # One meets a poll in proportion to how often it happens and to how long it takes.
-                lengths = [length_us + tries * again_us for tries in range(RETRIES + 1)]
-                lengths.append(host_us + (RETRIES + 1) * again_us)
-                weights = [(1.0 - lost) * lost**tries * lengths[tries] for tries in range(RETRIES + 1)]
-                weights.append(lost ** (RETRIES + 1) * lengths[-1])
-                rest, kind = self._uniform() * sum(weights), 0
+                lengths, weights, total = _polls_met(lost, length_us, host_us, self._again_us[POLL_BYTES])
+                rest, kind = self._uniform() * total, 0
                 while kind <= RETRIES and rest >= weights[kind]:
                     rest -= weights[kind]
                     kind += 1
@@ -324,6 +319,22 @@ class VirtualRadio:
         if not self._uniforms:
             self._uniforms = self._rng.random(256).tolist()
         return self._uniforms.pop()
+
+
+@lru_cache(maxsize=8)
+def _polls_met(
+    lost: float, length_us: int, host_us: int, again_us: int
+) -> tuple[tuple[int, ...], tuple[float, ...], float]:
+    """Lengths [us] of polls by number of repetitions, and how likely one meets them: by frequency and by length."""
+    lengths = (
+        *(length_us + tries * again_us for tries in range(RETRIES + 1)),
+        host_us + (RETRIES + 1) * again_us,
+    )
+    weights = (
+        *((1.0 - lost) * lost**tries * lengths[tries] for tries in range(RETRIES + 1)),
+        lost ** (RETRIES + 1) * lengths[-1],
+    )
+    return lengths, weights, sum(weights)
 
 
 def _syslink_us(data: bytes) -> int:
