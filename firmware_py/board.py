@@ -5,12 +5,22 @@ from typing import Protocol
 
 ImuCounts = tuple[int, int, int, int, int, int]  # gyro x y z, accelerometer x y z, int16, sensor frame
 
+EEPROM_SIZE = 8192
+DECK_MEMORY_SIZE = 112
+
 
 class Board(Protocol):
     """The hardware below the drivers."""
 
+    eeprom: bytearray  # (8192,) survives power cycles; all 0xFF when new
+    deck_memory: bytearray  # (112,) the one-wire memory of the deck that carries the servo connectors
+
     def read_imu(self) -> ImuCounts:
         """Return the registers of the BMI088 as they are now."""
+        ...
+
+    def read_battery_mv(self) -> int:
+        """Return the supply voltage [mV]."""
         ...
 
     def write_compare(self, counts: Sequence[int]) -> None:

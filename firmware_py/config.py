@@ -122,6 +122,7 @@ class SupervisorConfig(Section):
     pose_timeout_us: int = Field(
         ge=20_000, le=5_000_000, description="silence after which the flaps go to hover [us]"
     )
+    low_battery_mv: int = Field(ge=0, le=20_000, description="supply below which flight ends after 5 s [mV]")
 
 
 Cost = Annotated[int, Field(ge=0, le=100_000)]
@@ -137,7 +138,7 @@ class CpuConfig(Section):
     estimator_us: Cost = Field(description="KALMAN, per 100 Hz step [us]")
     syslink_us: Cost = Field(description="SYSLINK, per packet [us]")
     crtp_us: Cost = Field(description="CRTP-RX and CRTP-TX, per packet [us]")
-    log_us: Cost = Field(description="LOG, per period of 20 ms [us]")
+    log_us: Cost = Field(description="LOG and STREAM, per packet [us]")
 
 
 class FirmwareConfig(Section):

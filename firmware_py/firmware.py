@@ -8,14 +8,40 @@ from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input
 from firmware_py.drivers.imu import GyroZero
+from firmware_py.links.console import Console
 from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.links.localisation import LocalisationService
+from firmware_py.links.log import LogService
+from firmware_py.links.memories import MemoryService, Tester, memories
+from firmware_py.links.parameters import ParameterService
+from firmware_py.links.platform import PlatformService
+from firmware_py.links.storage import ParameterStorage
+from firmware_py.links.stream import TelemetryStream
+from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
+from firmware_py.parameters import parameters
 from firmware_py.rtos import Kernel, Queue, WatchdogError
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US, Statistics, TaskReport
 from firmware_py.signals import Signals
 from firmware_py.supervisor import Supervisor
-from firmware_py.tasks import CoreBlocks, Thief, estimator_task, sensors_task, stabilizer_task, thief_task
-from firmware_py.variables import telemetry_reader
+from firmware_py.tasks import (
+    CoreBlocks,
+    Thief,
+    estimator_task,
+    power_task,
+    sensors_task,
+    stabilizer_task,
+    thief_task,
+)
+from firmware_py.variables import Running, log_variables, telemetry_reader
+from firmware_py.wire import WireError
+from firmware_py.wire.memories import (
+    CONFIG_SIZE,
+    RadioSettings,
+    decode_config,
+    encode_config,
+    encode_one_wire,
+)
 
 __all__ = ["LATENCY_BOUNDS_US", "Firmware", "Kernel", "TaskReport", "Thief", "WatchdogError"]
 
@@ -26,11 +52,12 @@ DEADLINES_US = {  # of each activation: whatever the flight path does in a tick 
     "KALMAN": 1000,
 }
 WATCHDOG_US = 353_000  # the longest that the Crazyflie's independent watchdog may take
+DECK = (0xBC, 0xF1, "bcFloaty", "A")  # vendor, product, name, revision of the deck with the servo connectors
 THIEF_PRIORITY = 6  # above every task, like interrupts that do not end
 
 
 class Firmware:
-    """A booted board. `kernel` may be looked at; `signals` are views on the core."""
+    """A booted board. `kernel`, `variables` and `parameters` may be looked at; `signals` are views on the core."""
 
     def __init__(self, config: FirmwareConfig, board: Board) -> None:
         self.kernel = Kernel(preemption=True)
@@ -41,7 +68,9 @@ class Firmware:
         board.write_compare(core.control.fields.count.tolist())  # hover from the first PWM period on
         self._core = core
         self._zero = GyroZero()
-        self._supervisor = Supervisor(config.supervisor.pose_timeout_us, board.debug_write)
+        self.link = CrtpStack(self.kernel, config.cpu, board)
+        self._console = Console(self.link, board)
+        self._supervisor = Supervisor(config.supervisor, core.estimator.fields, self._console.write)
         self._imu_ready = self.kernel.create_binary_semaphore("imuReady")
         data_ready = self.kernel.create_binary_semaphore("dataReady")
         estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
@@ -59,12 +88,38 @@ class Firmware:
             "KALMAN", 2, estimator_task,
             kernel, cost, estimator_run, self.measurements, self._supervisor, core,
         )  # fmt: skip
-        read = telemetry_reader(core.estimator.fields, core.control.fields, lambda: self._supervisor.state)
-        self.link = CrtpStack(kernel, cost, board, self.measurements, read)
+        kernel.create_task("PWRMGNT", 0, power_task, kernel, board, self._supervisor)
+        self._start_services()
         self.signals = Signals.of(core.estimator, core.control, self._supervisor)
         self.deadlines_us = DEADLINES_US
         self.statistics = Statistics(self.kernel, DEADLINES_US)
         self.kernel.start()
+
+    def _start_services(self) -> None:
+        """Create the services of the link."""
+        board, core, link, supervisor = self._board, self._core, self.link, self._supervisor
+        settings = _radio_settings(board)
+        if all(byte == 0xFF for byte in board.deck_memory):
+            board.deck_memory[:] = encode_one_wire(*DECK)
+        tester = Tester()
+        read = telemetry_reader(core.estimator.fields, core.control.fields, lambda: supervisor.state)
+        running = Running(
+            board=board,
+            core=core,
+            supervisor=supervisor,
+            manual=ManualFlaps(supervisor, core.parameters.fields, core.data.fields),
+            measurements=self.measurements,
+            stack=link,
+            localisation=LocalisationService(link, self.measurements, supervisor, settings.address & 0xFF),
+            platform=PlatformService(link, supervisor),
+            tester=tester,
+            stream=TelemetryStream(link, read),
+        )
+        self.variables = log_variables(running)
+        self.parameters = parameters(running)
+        LogService(link, self.variables)
+        ParameterService(link, self.parameters, ParameterStorage(board.eeprom))
+        MemoryService(link, memories(board.eeprom, board.deck_memory, tester))
 
     @property
     def next_wake_us(self) -> int | None:
@@ -103,4 +158,13 @@ class Firmware:
         assert bias is not None
         self._core.data.fields.gyro_bias[:] = bias
         self._supervisor.calibrated = True
-        self._board.debug_write("imu: gyro zero found, {:.1f} {:.1f} {:.1f} counts".format(*bias))
+        self._console.write("imu: gyro zero found, {:.1f} {:.1f} {:.1f} counts".format(*bias))
+
+
+def _radio_settings(board: Board) -> RadioSettings:
+    """Return what the EEPROM says; a new or spoilt EEPROM gets the defaults first."""
+    try:
+        return decode_config(bytes(board.eeprom[:CONFIG_SIZE]))
+    except WireError:
+        board.eeprom[:CONFIG_SIZE] = encode_config(RadioSettings())
+        return RadioSettings()

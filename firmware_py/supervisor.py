@@ -1,9 +1,31 @@
-"""The supervisor decides, before every controller step, whether the loop may be closed."""
+"""The supervisor decides, before every controller step, whether the loop may be closed.
+
+Whatever forbids it leads to the same defined flap state, the hover angles, and is announced once on the console. State
+and cause are log variables (`supervisor.state`, `supervisor.cause`). The way back depends on the cause:
+
+    silence         no accepted pose for 500 ms (parameter): the next accepted pose ends it
+    out of bounds   the estimator was held at its bounds for 200 ms: ends after 500 ms inside them
+    disarmed        by request: ends with the request to arm
+    emergency stop  by request, or because a started emergency stop watchdog was not fed for 1 s: ends only with a
+                    recovery request (or a reboot)
+    low battery     below the limit for 5 s: ends only with a recovery request when the voltage is back above it
+
+The board arms itself at boot. One outlier pose is refused by the estimator's gate and is no reason for anything here.
+"""
 
 from collections.abc import Callable
 from enum import IntEnum
+from typing import Any
 
-from firmware_py.core.structs import MODE_FLY, MODE_HOVER
+from firmware_py.config import SupervisorConfig
+from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
+
+WATCHDOG_US = 1_000_000  # Crazyflie firmware
+BATTERY_LOW_US = 5_000_000  # original firmware
+EPISODE_GAP_US = 50_000  # two bounded steps closer than this belong to one episode
+EPISODE_LIMIT_US = 200_000
+BOUNDS_RECOVERY_US = 500_000
+NEVER_US = -(1 << 40)
 
 
 class State(IntEnum):
@@ -12,40 +34,133 @@ class State(IntEnum):
     CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
     WAITING = 1  # no pose has come yet: flaps at hover
     FLYING = 2  # loop closed
-    FAILSAFE = 3  # poses have stopped: flaps at hover until one comes
+    FAILSAFE = 3  # flaps at hover, see the cause
 
 
-MODE_OF = {
-    State.CALIBRATING: MODE_HOVER,
-    State.WAITING: MODE_HOVER,
-    State.FLYING: MODE_FLY,
-    State.FAILSAFE: MODE_HOVER,
-}
+class Cause(IntEnum):
+    """Why the robot is in failsafe."""
+
+    NONE = 0
+    SILENCE = 1
+    OUT_OF_BOUNDS = 2
+    EMERGENCY_STOP = 3
+    LOW_BATTERY = 4
+    DISARMED = 5
+
+
+class Manual(IntEnum):
+    """Who moves the flaps: the original's parameter `extCtrl.manual`."""
+
+    OFF = 0  # the controller, when the state allows it
+    ANGLES = 1  # angles from outside, whether poses come or not
+    HOVER = 2  # hover angles
 
 
 class Supervisor:
-    """State machine over two facts: is the gyro's zero known, and when did the last pose arrive."""
+    """State machine over the facts in its attributes; `estimator` is the core's fields, read for its bounds."""
 
-    def __init__(self, pose_timeout_us: int, announce: Callable[[str], None]) -> None:
+    def __init__(self, config: SupervisorConfig, estimator: Any, announce: Callable[[str], None]) -> None:
         self.state = State.CALIBRATING
+        self.cause = Cause.NONE
         self.calibrated = False
+        self.armed = True
+        self.manual = Manual.OFF
         self.last_pose_us: int | None = None
-        self._pose_timeout_us = pose_timeout_us
+        self.pose_timeout_us = config.pose_timeout_us
+        self.low_battery_mv = config.low_battery_mv
+        self.battery_mv = 0
+        self._estimator = estimator
         self._announce = announce
+        self._stopped = False
+        self._battery_empty = False
+        self._battery_good_us = 0
+        self._watchdog_us: int | None = None  # instant at which it bites, None until it is fed once
+        self._bounded = 0
+        self._episode_start_us = self._bounded_us = self._outside_until_us = NEVER_US
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the emergency stop is latched."""
+        return self._stopped
+
+    @property
+    def can_fly(self) -> bool:
+        """Whether poses are all that is needed."""
+        return self.calibrated and self.armed and not self._stopped and not self._battery_empty
 
     def mode(self, now_us: int) -> int:
-        """Return the controller's mode at this instant and announce a change of state."""
-        state = self._state(now_us)
-        if state is not self.state:
-            self.state = state
-            self._announce(f"supervisor: {state.name.lower()}")
-        return MODE_OF[state]
+        """Return the controller's mode at this instant and announce a change of state; called every 10 ms."""
+        self._watch_bounds(now_us)
+        if self._watchdog_us is not None and now_us >= self._watchdog_us:
+            self._stopped = True
+        state, cause = self._state(now_us)
+        if state is not self.state or cause is not self.cause:
+            self.state, self.cause = state, cause
+            reason = "" if cause is Cause.NONE else f", {cause.name.lower().replace('_', ' ')}"
+            self._announce(f"supervisor: {state.name.lower()}{reason}")
+        if cause > Cause.OUT_OF_BOUNDS or self.manual is Manual.HOVER:
+            return MODE_HOVER
+        if self.manual is Manual.ANGLES:
+            return MODE_MANUAL
+        return MODE_FLY if state is State.FLYING else MODE_HOVER
 
-    def _state(self, now_us: int) -> State:
+    def emergency_stop(self) -> None:
+        """Stop until `recover`."""
+        self._stopped = True
+
+    def feed_watchdog(self, now_us: int) -> None:
+        """Start the emergency stop watchdog, or keep it from biting for another second."""
+        self._watchdog_us = now_us + WATCHDOG_US
+
+    def arm(self, armed: bool) -> bool:
+        """Arm or disarm; False when the request to arm was refused, because a stop or the battery is in its way."""
+        if armed and (self._stopped or self._battery_empty):
+            return False
+        self.armed = armed
+        return True
+
+    def recover(self, now_us: int) -> bool:
+        """Leave the emergency stop and, with a good voltage, the low battery; False when something remains."""
+        self._stopped = False
+        self._watchdog_us = None
+        if self.battery_mv >= self.low_battery_mv:
+            self._battery_empty = False
+            self._battery_good_us = now_us
+        return not self._battery_empty
+
+    def see_battery(self, now_us: int, battery_mv: int) -> None:
+        """Take in the supply voltage [mV]."""
+        self.battery_mv = battery_mv
+        if battery_mv >= self.low_battery_mv:
+            self._battery_good_us = now_us
+        elif now_us - self._battery_good_us >= BATTERY_LOW_US:
+            self._battery_empty = True
+
+    def _state(self, now_us: int) -> tuple[State, Cause]:
+        if self._stopped:
+            return State.FAILSAFE, Cause.EMERGENCY_STOP
+        if self._battery_empty:
+            return State.FAILSAFE, Cause.LOW_BATTERY
+        if not self.armed:
+            return State.FAILSAFE, Cause.DISARMED
         if not self.calibrated:
-            return State.CALIBRATING
+            return State.CALIBRATING, Cause.NONE
         if self.last_pose_us is None:
-            return State.WAITING
-        if now_us - self.last_pose_us >= self._pose_timeout_us:
-            return State.FAILSAFE
-        return State.FLYING
+            return State.WAITING, Cause.NONE
+        if now_us - self.last_pose_us >= self.pose_timeout_us:
+            return State.FAILSAFE, Cause.SILENCE
+        if now_us < self._outside_until_us:
+            return State.FAILSAFE, Cause.OUT_OF_BOUNDS
+        return State.FLYING, Cause.NONE
+
+    def _watch_bounds(self, now_us: int) -> None:
+        """Notice how long the estimator has been held at its bounds."""
+        bounded = int(self._estimator.bounded)
+        if bounded == self._bounded:
+            return
+        self._bounded = bounded
+        if now_us - self._bounded_us > EPISODE_GAP_US:
+            self._episode_start_us = now_us
+        self._bounded_us = now_us
+        if now_us - self._episode_start_us >= EPISODE_LIMIT_US or now_us < self._outside_until_us:
+            self._outside_until_us = now_us + BOUNDS_RECOVERY_US

@@ -22,6 +22,7 @@ Task = Generator[int, None, None]
 
 TICKS_PER_STEP = 10  # 100 Hz
 CONTROL_PHASE = 0  # the controller runs in ticks 0, 10, 20 …
+POWER_PERIOD = 100  # original firmware
 ESTIMATOR_PHASE = 9  # and the estimator in the ticks before
 DATA_TIMEOUT = 1  # tick edge without a sample at which the stabilizer goes on without the IMU
 
@@ -105,6 +106,15 @@ def estimator_task(
             data.gyro_samples = samples
             samples = x = y = z = 0
             entry.estimate(core.parameters.arg, core.data.arg, core.estimator.arg, core.control.arg)
+
+
+def power_task(kernel: Kernel, board: Board, supervisor: Supervisor) -> Task:
+    """Look at the supply voltage at 10 Hz."""
+    wake_tick = kernel.tick_count
+    while True:
+        supervisor.see_battery(kernel.now_us, board.read_battery_mv())
+        wake_tick += POWER_PERIOD
+        yield from kernel.delay_until(wake_tick)
 
 
 class Thief:

@@ -1,17 +1,206 @@
-"""The log variables of the firmware: names as on the Crazyflie and on the original Floaty, values from the running core."""
+"""The log variables of the firmware: names as on the Crazyflie and on the original Floaty, values from the running core.
 
-from collections.abc import Callable, Sequence
+Units are Floaty's (angles in rad) except in the groups `stabilizer`, `gyro` and `acc`, which are Crazyflie's own and keep
+deg, deg/s and g. Position, velocity and yaw are those of the goal frame: what the board knows is its error.
+"""
 
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from math import degrees, pi, sqrt
+from typing import Any
+
+from firmware_py.board import Board
+from firmware_py.config import GYRO_SCALE
 from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, Control, Estimator
-from firmware_py.wire.telemetry import Block
+from firmware_py.geometry import from_euler_zyx
+from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.links.localisation import LocalisationService
+from firmware_py.links.log import LogVariable
+from firmware_py.links.memories import Tester
+from firmware_py.links.platform import PlatformService, supervisor_bits
+from firmware_py.links.stream import TelemetryStream
+from firmware_py.manual import ManualFlaps
+from firmware_py.measurements import Measurement
+from firmware_py.rtos import Queue
+from firmware_py.supervisor import State, Supervisor
+from firmware_py.tasks import CoreBlocks
+from firmware_py.wire.scalars import Scalar
+from firmware_py.wire.telemetry import FIRST_ID, Block
 
 AGE_UNIT_US = 100  # locSrv.age counts tenths of a millisecond
+ACCELERATION_SCALE = 24 / 32768  # [g per count] BMI088 at +-24 g
+BATTERY_FULL_MV = 4200
+PM_BATTERY, PM_LOW = 0, 3  # pm.state
+SQRT_HALF = sqrt(0.5)
+
+F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """The parts of a running board that variables and parameters look into."""
+
+    board: Board
+    core: CoreBlocks
+    supervisor: Supervisor
+    manual: ManualFlaps
+    measurements: Queue[Measurement]
+    stack: CrtpStack
+    localisation: LocalisationService
+    platform: PlatformService
+    tester: Tester
+    stream: TelemetryStream
+
+
+def log_variables(running: Running) -> tuple[LogVariable, ...]:
+    """Return the table, in the order of the log TOC."""
+    estimator, control, supervisor = (
+        running.core.estimator.fields,
+        running.core.control.fields,
+        running.supervisor,
+    )
+    return (
+        *_state_estimate(estimator, control),
+        *_crazyflie(running, estimator),
+        *_each("motor", "m1 m2 m3 m4", U16, "counts", control.count),
+        *_each("controller", "u1 u2 u3 u4", F32, "rad", control.u),
+        *_each("controller", "m1 m2 m3 m4", F32, "rad", control.command),  # deviation from the hover angle
+        *_each("motors_ctrp", "m1 m2 m3 m4", F32, "rad", control.flap),
+        LogVariable("motors_ctrp.min_angle", F32, "rad", lambda: control.flap.min()),
+        LogVariable("motors_ctrp.max_angle", F32, "rad", lambda: control.flap.max()),
+        LogVariable("Error.int_z_err", F32, "m s", partial(getattr, control, "integral_z")),
+        LogVariable("supervisor.info", U16, "", partial(supervisor_bits, supervisor)),
+        LogVariable("supervisor.state", U8, "", partial(getattr, supervisor, "state")),
+        LogVariable("supervisor.cause", U8, "", partial(getattr, supervisor, "cause")),
+        LogVariable("sys.canfly", U8, "", partial(getattr, supervisor, "can_fly")),
+        LogVariable("sys.armed", U8, "", partial(getattr, supervisor, "armed")),
+        LogVariable("sys.isFlying", U8, "", lambda: supervisor.state is State.FLYING),
+        LogVariable("sys.isTumbled", U8, "", lambda: 0),
+        *_localisation(running.localisation, estimator),
+        *_kalman(estimator),
+        *_counters(running),
+    )
+
+
+def _each(
+    group: str, names: str, scalar: Scalar, unit: str, array: Any, first: int = 0
+) -> Iterator[LogVariable]:
+    """Name elements of an array, from `first` on."""
+    for index, name in enumerate(names.split(), first):
+        yield LogVariable(f"{group}.{name}", scalar, unit, partial(array.item, index))
+
+
+def _fields(group: str, names: str, scalar: Scalar, unit: str, fields: Any) -> Iterator[LogVariable]:
+    """Name attributes by their own names."""
+    for name in names.split():
+        yield LogVariable(f"{group}.{name}", scalar, unit, partial(getattr, fields, name))
+
+
+def _parts(group: str, names: str, unit: str, read: Callable[[], Sequence[float]]) -> Iterator[LogVariable]:
+    """Name the parts of a vector that is computed when it is asked for."""
+    for index, name in enumerate(names.split()):
+        yield LogVariable(f"{group}.{name}", F32, unit, lambda index=index: read()[index])  # type: ignore[misc]
+
+
+def _state_estimate(estimator: Any, control: Any) -> Iterator[LogVariable]:
+    now = estimator.now
+    yield from _each("stateEstimate", "x y z", F32, "m", now, POSITION)
+    yield from _each("stateEstimate", "vx vy vz", F32, "m/s", now, VELOCITY)
+    yield from _each("stateEstimate", "roll pitch yaw", F32, "rad", now, ATTITUDE)
+    yield from _each("stateEstimate", "roll_rate pitch_rate yaw_rate", F32, "rad/s", now, RATE)
+    yield from _parts(
+        "stateEstimate",
+        "flap_1 flap_2 flap_3 flap_4",
+        "rad",
+        lambda: now[FLAP:] + (control.flap - control.command),
+    )
+    yield from _parts(
+        "stateEstimate", "qw qx qy qz", "", lambda: from_euler_zyx(*now[ATTITUDE : ATTITUDE + 3].tolist())
+    )
+
+
+def _crazyflie(running: Running, estimator: Any) -> Iterator[LogVariable]:
+    """What only Crazyflie's own programs look at."""
+    now, board, bias = estimator.now, running.board, running.core.data.fields.gyro_bias
+
+    def gyro() -> Sequence[float]:
+        x, y, z = (
+            degrees((counts - zero) * GYRO_SCALE)
+            for counts, zero in zip(board.read_imu()[:3], bias.tolist(), strict=True)
+        )
+        return SQRT_HALF * (x + y), SQRT_HALF * (y - x), z
+
+    def acceleration() -> Sequence[float]:
+        x, y, z = (counts * ACCELERATION_SCALE for counts in board.read_imu()[3:])
+        return SQRT_HALF * (x + y), SQRT_HALF * (y - x), z
+
+    def battery_level() -> float:
+        low = running.supervisor.low_battery_mv
+        share = (board.read_battery_mv() - low) / max(1, BATTERY_FULL_MV - low)
+        return 100 * min(1.0, max(0.0, share))
+
+    def battery_state() -> float:
+        return PM_LOW if board.read_battery_mv() < running.supervisor.low_battery_mv else PM_BATTERY
+
+    yield from _parts(
+        "stabilizer", "roll pitch yaw", "deg", lambda: (now[ATTITUDE : ATTITUDE + 3] * (180 / pi)).tolist()
+    )
+    yield LogVariable("stabilizer.thrust", F32, "", lambda: 0.0)
+    yield from _parts("gyro", "x y z", "deg/s", gyro)
+    yield from _parts("acc", "x y z", "g", acceleration)
+    yield LogVariable("pm.vbat", F32, "V", lambda: board.read_battery_mv() * 1e-3)
+    yield LogVariable("pm.vbatMV", U16, "mV", board.read_battery_mv)
+    yield LogVariable("pm.state", I8, "", battery_state)
+    yield LogVariable("pm.batteryLevel", U8, "%", battery_level)
+
+
+def _localisation(service: LocalisationService, estimator: Any) -> Iterator[LogVariable]:
+    yield from _parts("locSrv", "x y z", "m", lambda: service.last.p_GB)
+    yield from _parts("locSrv", "qw qx qy qz", "", lambda: service.last.q_GB)
+    yield LogVariable("locSrv.age", U16, "0.1 ms", lambda: int(estimator.pose_age_us) // AGE_UNIT_US)
+    yield LogVariable("locSrv.poses", U16, "", lambda: _received(estimator))
+    yield LogVariable("locSrv.rejected", U16, "", lambda: _rejected(estimator))
+    yield LogVariable("locSrv.positions", U32, "", partial(getattr, service, "positions"))
+
+
+def _kalman(estimator: Any) -> Iterator[LogVariable]:
+    covariance = estimator.P.reshape(-1)
+    variances = estimator.P.diagonal()
+    yield from _each("kalman", "stateX stateY stateZ", F32, "m", estimator.now, POSITION)
+    yield from _each("kalman", "statePX statePY statePZ", F32, "m/s", estimator.now, VELOCITY)
+    yield from _each("kalman", "varX varY varZ", F32, "m^2", variances, POSITION)
+    yield from _each("kalman", "varPX varPY varPZ", F32, "m^2/s^2", variances, VELOCITY)
+    yield from _fields("kalman", "fused refused jumps too_old invalid bounded resets", U32, "", estimator)
+    yield from _each("Uncertainty", "P_x_x", F32, "m^2", covariance, POSITION)
+    yield from _each("Uncertainty", "P_x_vx", F32, "m^2/s", covariance, VELOCITY)
+    yield from _each("Uncertainty", "P_vx_vx", F32, "m^2/s^2", variances, VELOCITY)
+    yield LogVariable("delayComp.horizon", U8, "10 ms", partial(getattr, estimator, "horizon"))
+
+
+def _counters(running: Running) -> Iterator[LogVariable]:
+    """What was lost, and where."""
+    yield from _fields("crtp", "malformed unserved dropped", U32, "", running.stack)
+    yield LogVariable("sensors.dropped", U32, "", partial(getattr, running.measurements, "dropped"))
+    yield LogVariable("app.overflows", U32, "", partial(getattr, running.platform, "app_overflows"))
+    yield LogVariable("memTst.errCntW", U32, "", partial(getattr, running.tester, "errors"))
+
+
+def _rejected(estimator: Any) -> int:
+    return int(estimator.refused + estimator.too_old + estimator.invalid)
+
+
+def _received(estimator: Any) -> int:
+    return int(estimator.fused + estimator.jumps) + _rejected(estimator)
 
 
 def telemetry_reader(
     estimator: Estimator, control: Control, supervisor_state: Callable[[], int]
 ) -> Callable[[Block], Sequence[float]]:
-    """Return the function that reads a telemetry block; estimator and control are the core's fields."""
+    """Return the function that reads a telemetry block; estimator and control are the core's fields.
+
+    The same values as in the table, but whole blocks at a time: this runs in every flight.
+    """
 
     def motion() -> Sequence[float]:
         return list(estimator.now[POSITION : VELOCITY + 3].tolist())
@@ -24,10 +213,9 @@ def telemetry_reader(
         return [*(estimator.now[FLAP:] + hover).tolist(), *control.count.tolist()]
 
     def health() -> Sequence[float]:
-        refused = int(estimator.refused + estimator.too_old + estimator.invalid)
-        received = int(estimator.fused + estimator.jumps) + refused
         age = int(estimator.pose_age_us) // AGE_UNIT_US
-        return [*control.u.tolist(), supervisor_state(), age, received & 0xFFFF, refused & 0xFFFF]
+        received, rejected = _received(estimator) & 0xFFFF, _rejected(estimator) & 0xFFFF
+        return [*control.u.tolist(), supervisor_state(), age, received, rejected]
 
-    readers = {1: motion, 2: attitude, 3: flaps, 4: health}
-    return lambda block: readers[block.id]()
+    readers = (motion, attitude, flaps, health)
+    return lambda block: readers[block.id - FIRST_ID]()

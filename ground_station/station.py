@@ -17,6 +17,8 @@ from ground_station.mocap import MocapFrame
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Trajectory
 
+TELEMETRY_TIMEOUT_US = 500_000  # of silence, after which the board is asked again
+
 
 class StationConfig(BaseModel):
     """What the ground station does with frames."""
@@ -36,6 +38,10 @@ class StationConfig(BaseModel):
 
 class Link(Protocol):
     """One way to the board and its protocol."""
+
+    def start_telemetry(self, now_us: int) -> None:
+        """Ask the board for its telemetry."""
+        ...
 
     def send(self, now_us: int, correction: Correction) -> None:
         """Send `correction`, older by what the link needs; `WireError` for a pose that cannot be sent."""
@@ -70,11 +76,15 @@ class GroundStation:
         self._send_every = config.send_every
         self._frames_until_due = 0
         self._last_frame: MocapFrame | None = None
+        self._ask_for_telemetry_us = 0  # put off by every sample that comes
 
     def on_frame(self, frame: MocapFrame, now_us: int) -> None:
         """Send the correction of every `send_every`-th frame, or of the first usable one after it."""
         counters = self.counters
         counters.frames += 1
+        if now_us >= self._ask_for_telemetry_us:
+            self._link.start_telemetry(now_us)
+            self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
         due = self._frames_until_due <= 0
         self._frames_until_due -= 1
         if not frame.valid:
@@ -100,5 +110,8 @@ class GroundStation:
         except WireError:
             self.counters.malformed += 1
             return
-        if sample is not None and self._log is not None:
+        if sample is None:
+            return
+        self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
+        if self._log is not None:
             self._log.write(now_us, sample, self._trajectory.at(now_us), self._last_frame)

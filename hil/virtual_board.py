@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from firmware_py.board import ImuCounts
+from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.firmware import Kernel
 from hil.events import EventQueue
 
@@ -22,6 +22,9 @@ class VirtualBoard:
         console: Callable[[int, str], None],
     ) -> None:
         self.imu: ImuCounts = STILL
+        self.battery_mv = 3900
+        self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
+        self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
         self._servo = servo
         self._radio = radio
         self._console = console
@@ -40,6 +43,10 @@ class VirtualBoard:
     def read_imu(self) -> ImuCounts:
         """Return the last sample."""
         return self.imu
+
+    def read_battery_mv(self) -> int:
+        """Return the supply voltage."""
+        return self.battery_mv
 
     def write_compare(self, counts: Sequence[int]) -> None:
         """Hand the compare counts to the servo timers."""

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.wire import WireError, crtp, telemetry
+from firmware_py.wire.scalars import Scalar
 
 metres = st.floats(-100.0, 100.0, width=32)
 Q = (0.5, -0.5, 0.5, 0.5)
@@ -138,9 +139,9 @@ def test_block_fits_a_packet_and_comes_back(block):
 @pytest.mark.parametrize("block", telemetry.BLOCKS, ids=lambda block: f"block{block.id}")
 def test_cflib_reads_the_block(block):
     names = {
-        telemetry.LogType.U8: "uint8_t",
-        telemetry.LogType.U16: "uint16_t",
-        telemetry.LogType.F32: "float",
+        Scalar.U8: "uint8_t",
+        Scalar.U16: "uint16_t",
+        Scalar.F32: "float",
     }
     config = LogConfig("theirs", telemetry.PERIOD_MS)
     for variable in block.variables:
@@ -165,7 +166,7 @@ def test_counter_wraps_as_on_the_board():
 
 
 def test_block_that_does_not_fit_or_match_is_refused():
-    variable = telemetry.Variable("a.b", telemetry.LogType.F32, "")
+    variable = telemetry.Variable("a.b", Scalar.F32, "")
     with pytest.raises(WireError):
         telemetry.Block(9, (variable,) * 7)
     with pytest.raises(WireError, match="5 values"):

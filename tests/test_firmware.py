@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from firmware_py.board import ImuCounts
+from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.drivers.imu import SAMPLES, GyroZero
 from firmware_py.errors import FirmwareError
 from firmware_py.firmware import MEASUREMENT_QUEUE, Firmware
@@ -33,11 +33,17 @@ class Bench:
         self.sent: list[tuple[int, bytes]] = []
         self.console: list[str] = []
         self.now_us = 0
+        self.battery_mv = 3900
+        self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
+        self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
         self.firmware = Firmware(load_config(), self)
         self.events.at(1000, self._sample)
 
     def read_imu(self) -> ImuCounts:
         return self.imu
+
+    def read_battery_mv(self) -> int:
+        return self.battery_mv
 
     def write_compare(self, counts: Sequence[int]) -> None:
         self.writes.append((self.now_us, list(counts)))
@@ -64,6 +70,10 @@ class Bench:
     def poses(self, start_us: int, end_us: int, p: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         for at_us in range(start_us, end_us, 20_000):
             self.pose(at_us, p)
+
+    def stream(self, at_us: int) -> None:
+        data = telemetry.encode_stream_request(True)
+        self.events.at(at_us, lambda now_us: self.firmware.radio_received(data))
 
     def run(self, end_us: int) -> None:
         while self.now_us < end_us:
@@ -156,6 +166,7 @@ def test_garbage_on_the_radio_is_counted_and_flies_on(bench: Bench) -> None:
 
 def test_a_radio_that_takes_nothing_fills_the_queue_and_counts(bench: Bench) -> None:
     bench.radio_open = False
+    bench.stream(0)
     bench.run(3_000_000)
     queue = next(queue for queue in bench.firmware.kernel.queues if queue.name == "crtpTx")
     assert len(queue) == queue.high_water == 120
@@ -167,14 +178,22 @@ def test_a_radio_that_takes_nothing_fills_the_queue_and_counts(bench: Bench) -> 
 
 def test_telemetry_leaves_at_fifty_hertz_with_the_running_values(bench: Bench) -> None:
     bench.poses(605_000, 1_000_000, (0.01, 0.02, -0.03))
+    bench.run(500_000)
+    assert [data for _, data in bench.sent if data[0] >> 4 == crtp.PORT_LOG] == []  # nothing comes unasked
+    bench.stream(507_000)
     bench.run(1_000_000)
-    samples = [telemetry.decode_sample(crtp.decode(data).data) for _, data in bench.sent]
-    assert len(samples) == 49 * len(telemetry.BLOCKS)  # those of the last tick are still being packed
-    motion = [sample for sample in samples if sample.block.id == 1][-1]
+    samples = [
+        telemetry.decode_sample(packet.data)
+        for packet in (crtp.decode(data) for _, data in bench.sent)
+        if packet.port == crtp.PORT_LOG
+    ]
+    assert len(samples) == 24 * len(telemetry.BLOCKS)  # those of the last tick are still being packed
+    assert [sample.timestamp_ms for sample in samples[::4]] == list(range(520, 1000, 20))
+    motion = [sample for sample in samples if sample.block is telemetry.BLOCKS[0]][-1]
     assert motion.values[:3] == pytest.approx((0.01, 0.02, -0.03), abs=2e-3)
-    flaps = [sample for sample in samples if sample.block.id == 3][-1]
+    flaps = [sample for sample in samples if sample.block is telemetry.BLOCKS[2]][-1]
     assert list(flaps.values[4:]) == pytest.approx(bench.writes[-2][1], abs=600)
-    health = [sample for sample in samples if sample.block.id == 4][-1]
+    health = [sample for sample in samples if sample.block is telemetry.BLOCKS[3]][-1]
     assert health.values[4] == State.FLYING
 
 

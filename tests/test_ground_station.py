@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import crtp, telemetry
+from firmware_py.wire.scalars import Scalar
 from ground_station.corrections import correct
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
@@ -29,11 +30,15 @@ class Bench:
     """A ground station whose packets end in a list."""
 
     def __init__(self, send_every=4, latency_us=1000, log=None, trajectory=None):
-        self.sent = []
-        link = LoopbackLink(lambda now_us, data: self.sent.append((now_us, data)), latency_us)
+        self.sent = []  # corrections
+        self.requests = []  # for telemetry
+        link = LoopbackLink(self._transmit, latency_us)
         self.station = GroundStation(
             link, trajectory or Hold(HOME), log, StationConfig(send_every=send_every)
         )
+
+    def _transmit(self, now_us, data):
+        (self.sent if data[0] >> 4 == crtp.PORT_LOCALISATION else self.requests).append((now_us, data))
 
     def frames(self, count, valid=lambda number: True, p=lambda number: (0.001 * number, 0.0, 1.15)):
         for number in range(count):
@@ -121,6 +126,18 @@ def test_bad_configuration_is_refused(change):
         StationConfig(**change)
 
 
+def test_telemetry_is_asked_for_at_the_first_frame_and_after_half_a_second_without_it():
+    bench = Bench()
+    bench.frames(300)
+    assert [now_us for now_us, _ in bench.requests] == [38_000, 538_000, 1_038_000]
+    assert {data for _, data in bench.requests} == {b"\x2f\0telemetry\0stream\0\x08\x01"}
+    bench.requests.clear()
+    for now_us in range(1_540_000, 3_000_000, 400_000):
+        bench.station.on_packet(now_us, next(telemetry_packets(now_us // 1000)))
+        bench.station.on_frame(MocapFrame(now_us, HOME.p_WG, UPRIGHT, True), now_us + 399_000)
+    assert bench.requests == []
+
+
 def telemetry_packets(timestamp_ms, blocks=telemetry.BLOCKS):
     for block in blocks:
         yield telemetry.encode_sample(block, timestamp_ms, [0.5 + block.id] * len(block.variables))
@@ -147,7 +164,7 @@ def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
     assert float(first["mocap.x [m]"]) == 0.25
     for block in telemetry.BLOCKS:
         for variable in block.variables:
-            expected = 0.5 + block.id if variable.type is telemetry.LogType.F32 else block.id
+            expected = 0.5 + block.id if variable.type is Scalar.F32 else block.id
             assert float(first[f"{variable.name} [{variable.unit}]"]) == expected
 
 
@@ -159,9 +176,9 @@ def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
             bench.station.on_packet(0, data)
     log.close()
     first, second = rows(tmp_path / "telemetry.csv")
-    assert float(first["stateEstimate.x [m]"]) == 1.5
+    assert float(first["stateEstimate.x [m]"]) == 0.5 + telemetry.BLOCKS[0].id
     assert isnan(float(second["stateEstimate.x [m]"]))
-    assert float(second["stateEstimate.roll [rad]"]) == 2.5
+    assert float(second["stateEstimate.roll [rad]"]) == 0.5 + telemetry.BLOCKS[1].id
     assert isnan(float(second["mocap.x [m]"]))
 
 

@@ -148,7 +148,7 @@ def test_perfetto_has_a_track_per_task_and_the_slices_of_the_schedule(tmp_path: 
         for p in trace.packet
         if p.HasField("track_descriptor")
     }
-    assert {"SENSORS", "STABILIZER", "KALMAN", "LOG"} <= set(tracks.values())
+    assert {"SENSORS", "STABILIZER", "KALMAN", "CRTP-TX"} <= set(tracks.values())
     opened = [p for p in trace.packet if p.track_event.type == TrackEvent.TYPE_SLICE_BEGIN]
     closed = [p for p in trace.packet if p.track_event.type == TrackEvent.TYPE_SLICE_END]
     stretches = [run for run in runs(load_schedule(tmp_path / "traced")) if run.task != "IDLE"]

@@ -14,11 +14,19 @@ from firmware_py.wire import WireError
 
 MAX_DATA = 30
 
+PORT_CONSOLE = 0
+PORT_PARAMETERS = 2
+PORT_COMMANDER = 3
+PORT_MEMORIES = 4
 PORT_LOG = 5
 CHANNEL_LOG_DATA = 2
 PORT_LOCALISATION = 6
 CHANNEL_GENERIC = 1
 EXT_POSE = 8  # type byte of the generic localisation channel
+PORT_GENERIC_SETPOINT = 7
+PORT_SUPERVISOR = 9
+PORT_PLATFORM = 13
+PORT_LINK = 15
 
 MAX_LOG_VALUES = 26  # 30 less the block's id and the time stamp
 LOG_TIME_MODULUS_MS = 1 << 24
@@ -83,7 +91,7 @@ def encode_ext_pose(
     Stock firmware reads the pose and ignores the byte behind it. Raises `WireError` for a pose that the
     receiver would refuse.
     """
-    _check_pose(p_GB, q_GB)
+    check_pose(p_GB, q_GB)
     x, y, z = p_GB
     qw, qx, qy, qz = q_GB
     try:
@@ -98,7 +106,7 @@ def decode_ext_pose(data: bytes) -> PoseMessage:
         raise WireError(f"not an external pose: {data.hex()}")
     _, x, y, z, qx, qy, qz, qw = _POSE.unpack_from(data)
     p_GB, q_GB = (x, y, z), (qw, qx, qy, qz)
-    _check_pose(p_GB, q_GB)
+    check_pose(p_GB, q_GB)
     code = data[_POSE.size] if len(data) > _POSE.size else AGE_UNKNOWN_CODE
     return PoseMessage(p_GB, q_GB, None if code == AGE_UNKNOWN_CODE else code * AGE_UNIT_US)
 
@@ -128,8 +136,8 @@ def _age_code(age_us: int | None) -> int:
     return max(0, min(AGE_MAX_CODE, (age_us + AGE_UNIT_US // 2) // AGE_UNIT_US))
 
 
-def _check_pose(p_GB: tuple[float, float, float], q_GB: tuple[float, float, float, float]) -> None:
-    """Both ends refuse the same poses. The comparison is false for NaN and infinity, too."""
+def check_pose(p_GB: tuple[float, float, float], q_GB: tuple[float, float, float, float]) -> None:
+    """Raise `WireError` for a pose that both ends refuse. The comparison is false for NaN and infinity, too."""
     w, x, y, z = q_GB
     if not _MIN_NORM2 <= w * w + x * x + y * y + z * z <= _MAX_NORM2:
         raise WireError(f"quaternion {q_GB}: its length must be 0.9..1.1")

@@ -3,29 +3,30 @@
 Names, types and numbers are the Crazyflie's log variables and log types, units are Floaty's (angles in rad).
 Each block is one CRTP log data packet. The four blocks of one period carry the same time stamp, so that the
 receiver can join them into one row.
+
+The board sends them while its parameter `telemetry.stream` is 1. Their numbers lie above those that clients give to
+blocks of their own.
 """
 
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import MAX_LOG_VALUES, decode_log_data, encode_log_data
+from firmware_py.wire.parameters import SetByName, encode_set_by_name
+from firmware_py.wire.scalars import Scalar
 
 PERIOD_MS = 20  # of the original ground station's log blocks
 
 
-class LogType(IntEnum):
-    """The Crazyflie's numbers for the types of log variables (the ones in use)."""
-
-    U8 = 1
-    U16 = 2
-    F32 = 7
+STREAM = "telemetry.stream"  # uint8 parameter: 1 switches the stream on
+FIRST_ID = 0xF1
 
 
-_FORMAT = {LogType.U8: "B", LogType.U16: "H", LogType.F32: "f"}
-_MODULUS = {LogType.U8: 1 << 8, LogType.U16: 1 << 16}
+def encode_stream_request(on: bool) -> bytes:
+    """The complete packet that switches the stream on or off."""
+    return encode_set_by_name(SetByName(STREAM, Scalar.U8, int(on)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,7 @@ class Variable:
     """One log variable: `group.name`, its type on the wire and its unit (empty for a pure number)."""
 
     name: str
-    type: LogType
+    type: Scalar
     unit: str
 
 
@@ -46,7 +47,7 @@ class Block:
     layout: struct.Struct = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        layout = struct.Struct("<" + "".join(_FORMAT[variable.type] for variable in self.variables))
+        layout = struct.Struct("<" + "".join(variable.type.format for variable in self.variables))
         if layout.size > MAX_LOG_VALUES:
             raise WireError(f"log block {self.id}: {layout.size} bytes, at most {MAX_LOG_VALUES} fit")
         object.__setattr__(self, "layout", layout)
@@ -61,33 +62,33 @@ class Sample:
     values: tuple[float, ...]  # in the order of block.variables
 
 
-def _variables(group: str, names: str, type: LogType, unit: str) -> tuple[Variable, ...]:
+def _variables(group: str, names: str, type: Scalar, unit: str) -> tuple[Variable, ...]:
     return tuple(Variable(f"{group}.{name}", type, unit) for name in names.split())
 
 
 # Position and yaw are those of the goal frame: what the board knows is its error.
 BLOCKS = (
     Block(
-        1,
-        _variables("stateEstimate", "x y z", LogType.F32, "m")
-        + _variables("stateEstimate", "vx vy vz", LogType.F32, "m/s"),
+        FIRST_ID,
+        _variables("stateEstimate", "x y z", Scalar.F32, "m")
+        + _variables("stateEstimate", "vx vy vz", Scalar.F32, "m/s"),
     ),
     Block(
-        2,
-        _variables("stateEstimate", "roll pitch yaw", LogType.F32, "rad")
-        + _variables("stateEstimate", "roll_rate pitch_rate yaw_rate", LogType.F32, "rad/s"),
+        FIRST_ID + 1,
+        _variables("stateEstimate", "roll pitch yaw", Scalar.F32, "rad")
+        + _variables("stateEstimate", "roll_rate pitch_rate yaw_rate", Scalar.F32, "rad/s"),
     ),
     Block(
-        3,
-        _variables("stateEstimate", "flap_1 flap_2 flap_3 flap_4", LogType.F32, "rad")
-        + _variables("motor", "m1 m2 m3 m4", LogType.U16, "counts"),
+        FIRST_ID + 2,
+        _variables("stateEstimate", "flap_1 flap_2 flap_3 flap_4", Scalar.F32, "rad")
+        + _variables("motor", "m1 m2 m3 m4", Scalar.U16, "counts"),
     ),
     Block(
-        4,
-        _variables("controller", "u1 u2 u3 u4", LogType.F32, "rad")
-        + _variables("supervisor", "state", LogType.U8, "")
-        + _variables("locSrv", "age", LogType.U16, "0.1 ms")  # of the last pose when it arrived
-        + _variables("locSrv", "poses rejected", LogType.U16, ""),  # received, refused; modulo 65536
+        FIRST_ID + 3,
+        _variables("controller", "u1 u2 u3 u4", Scalar.F32, "rad")
+        + _variables("supervisor", "state", Scalar.U8, "")
+        + _variables("locSrv", "age", Scalar.U16, "0.1 ms")  # of the last pose when it arrived
+        + _variables("locSrv", "poses rejected", Scalar.U16, ""),  # received, refused; modulo 65536
     ),
 )
 
@@ -101,7 +102,9 @@ def encode_sample(block: Block, timestamp_ms: int, values: Sequence[float]) -> b
     try:
         packed = block.layout.pack(*values)
     except struct.error:
-        packed = block.layout.pack(*map(_cast, block.variables, values))
+        packed = block.layout.pack(
+            *(variable.type.cast(value) for variable, value in zip(block.variables, values, strict=True))
+        )
     return encode_log_data(block.id, timestamp_ms, packed)
 
 
@@ -114,9 +117,3 @@ def decode_sample(data: bytes) -> Sample:
     if len(packed) != block.layout.size:
         raise WireError(f"log block {block_id}: {len(packed)} bytes of values instead of {block.layout.size}")
     return Sample(block, timestamp_ms, block.layout.unpack(packed))
-
-
-def _cast(variable: Variable, value: float) -> float:
-    """What a C cast makes of an integer that does not fit."""
-    modulus = _MODULUS.get(variable.type)
-    return value if modulus is None else int(value) % modulus

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, encode_ext_pose
-from firmware_py.wire.telemetry import Sample, decode_sample
+from firmware_py.wire.telemetry import Sample, decode_sample, encode_stream_request
 from ground_station.corrections import Correction
 
 
@@ -13,6 +13,10 @@ class LoopbackLink:
     def __init__(self, transmit: Callable[[int, bytes], object], latency_us: int) -> None:
         self._transmit = transmit
         self._latency_us = latency_us
+
+    def start_telemetry(self, now_us: int) -> None:
+        """Ask the board for its telemetry."""
+        self._transmit(now_us, encode_stream_request(True))
 
     def send(self, now_us: int, correction: Correction) -> None:
         """Hand the correction to the carrier, with the age that it will have on arrival."""

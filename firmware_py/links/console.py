@@ -1,0 +1,45 @@
+"""The console: lines of text to whoever listens, on port 0 in pieces of at most 30 bytes, and to the debug pins."""
+
+from collections.abc import Iterator
+
+from firmware_py.board import Board
+from firmware_py.links.crtp_stack import CrtpStack, Task
+from firmware_py.rtos import Queue
+from firmware_py.wire.crtp import MAX_DATA, PORT_CONSOLE, Packet, encode
+
+LINE_QUEUE = 16
+LINE_LIMIT = 200  # letters
+
+
+class Console:
+    """Takes lines from anywhere on board; its task sends them when nothing else has to be done."""
+
+    def __init__(self, stack: CrtpStack, board: Board) -> None:
+        self._stack = stack
+        self._board = board
+        self._lines: Queue[str] = stack.kernel.create_queue(LINE_QUEUE, "console")
+        stack.kernel.create_task("CONSOLE", 0, self._task)
+
+    def write(self, line: str) -> None:
+        """Take a line without its end. A plain call: also code that cannot wait has something to say."""
+        self._board.debug_write(line)
+        self._lines.send_from_isr(line)
+
+    def _task(self) -> Task:
+        while True:
+            line = yield from self._lines.receive()
+            for piece in pieces((line or "")[:LINE_LIMIT] + "\n"):
+                yield from self._stack.kernel.work(self._stack.cost.crtp_us)
+                yield from self._stack.deliver(encode(Packet(PORT_CONSOLE, 0, piece)))
+
+
+def pieces(text: str) -> Iterator[bytes]:
+    """Yield the UTF-8 bytes of `text` in pieces of at most 30, cut only between characters."""
+    piece = b""
+    for character in text:
+        encoded = character.encode("utf-8", "replace")
+        if len(piece) + len(encoded) > MAX_DATA:
+            yield piece
+            piece = b""
+        piece += encoded
+    yield piece

@@ -1,0 +1,170 @@
+"""The log service: clients put variables together to blocks, the board sends each block at its period.
+
+Port 5: channel 0 is the TOC, 1 makes, starts and stops blocks (version 2), 2 carries the data. Periods count in 10 ms,
+or with the newer command in 1 ms; 0 sends a block once. A refused request leaves everything as it was.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from firmware_py.links.crtp_stack import CrtpStack, Task
+from firmware_py.rtos import FOREVER
+from firmware_py.wire import WireError, toc
+from firmware_py.wire.crtp import MAX_LOG_VALUES, PORT_LOG, Packet, encode_log_data
+from firmware_py.wire.scalars import LOG_SCALARS, Scalar
+
+CHANNEL_CONTROL = 1
+MAX_BLOCKS = 16
+MAX_VARIABLES = 128  # in all blocks together
+PERIOD_UNIT_MS = 10
+
+OK, ENOENT, E2BIG, ENOEXEC, ENOMEM, EEXIST = 0, 2, 7, 8, 12, 17  # status bytes are errno's
+
+_ITEM = struct.Struct("<BH")  # type and id
+
+
+class Command(IntEnum):
+    """The first byte on channel 1; versions 0 and 1 of the protocol are not spoken."""
+
+    DELETE = 2
+    START = 3
+    STOP = 4
+    RESET = 5
+    CREATE = 6
+    APPEND = 7
+    START_MS = 8
+
+
+COMMANDS = frozenset(Command)
+
+
+@dataclass(frozen=True, slots=True)
+class LogVariable:
+    """What can be logged: `group.name`, type and unit (empty for a pure number), and how to read it now."""
+
+    name: str
+    scalar: Scalar
+    unit: str
+    read: Callable[[], float]
+
+
+Item = tuple[Scalar, Callable[[], float]]
+
+
+@dataclass(slots=True)
+class Block:
+    """Variables that travel together. `due_tick` is None while the block is stopped."""
+
+    items: list[Item] = field(default_factory=list)
+    size: int = 0
+    period_ms: int = 0
+    due_tick: int | None = None
+
+    def values(self) -> bytes:
+        """Return the present values as they travel."""
+        return b"".join([scalar.pack(read()) for scalar, read in self.items])
+
+
+class LogService:
+    """Owns the blocks; its task waits for requests and for the next block that falls due."""
+
+    def __init__(self, stack: CrtpStack, variables: Sequence[LogVariable]) -> None:
+        self.toc = toc.Toc.of(PORT_LOG, ((item.scalar.log_number, item.name) for item in variables))
+        self.blocks: dict[int, Block] = {}
+        self._variables = variables
+        self._stack = stack
+        self._requests = stack.open_port(PORT_LOG)
+        stack.kernel.create_task("LOG", 1, self._task)
+
+    def answer(self, packet: Packet) -> tuple[bytes, ...]:
+        """Return the reply to one request; raises `WireError` for what is none."""
+        data = packet.data
+        if packet.channel == toc.CHANNEL:
+            return (self.toc.answer(data, bytes((MAX_BLOCKS, MAX_VARIABLES))),)
+        if packet.channel != CHANNEL_CONTROL or not data:
+            raise WireError(f"log request on channel {packet.channel}: {data.hex()}")
+        number = data[1] if len(data) > 1 else 0
+        return (bytes((data[0], number, self._control(data[0], number, data[2:]))),)
+
+    def _control(self, command: int, number: int, rest: bytes) -> int:
+        """Do what the command says; return the status."""
+        if command == Command.RESET:
+            self.blocks.clear()
+            return OK
+        if command == Command.CREATE:
+            return self._create(number, rest)
+        if command not in COMMANDS:
+            return ENOEXEC
+        block = self.blocks.get(number)
+        if block is None:
+            return ENOENT
+        if command == Command.APPEND:
+            return self._append(block, rest)
+        if command == Command.DELETE:
+            del self.blocks[number]
+        elif command == Command.STOP:
+            block.due_tick = None
+        else:
+            self._start(block, command, rest)
+        return OK
+
+    def _create(self, number: int, rest: bytes) -> int:
+        if number in self.blocks:
+            return EEXIST
+        if len(self.blocks) >= MAX_BLOCKS:
+            return ENOMEM
+        block = Block()
+        status = self._append(block, rest)
+        if status == OK:
+            self.blocks[number] = block
+        return status
+
+    def _append(self, block: Block, rest: bytes) -> int:
+        """Add the complete items in `rest`: a full packet of cflib's ends with the type byte of one more."""
+        items: list[Item] = []
+        for offset in range(0, len(rest) - _ITEM.size + 1, _ITEM.size):
+            kind, number = _ITEM.unpack_from(rest, offset)
+            scalar = LOG_SCALARS.get(kind & 0x0F)
+            if scalar is None or number >= len(self._variables):
+                return ENOENT
+            items.append((scalar, self._variables[number].read))
+        size = block.size + sum(scalar.size for scalar, _ in items)
+        if size > MAX_LOG_VALUES:
+            return E2BIG
+        if sum(len(other.items) for other in self.blocks.values()) + len(items) > MAX_VARIABLES:
+            return ENOMEM
+        block.items += items
+        block.size = size
+        return OK
+
+    def _start(self, block: Block, command: int, rest: bytes) -> None:
+        width = 2 if command == Command.START_MS else 1
+        if len(rest) < width:
+            raise WireError("a log block started without a period")
+        period = int.from_bytes(rest[:width], "little")
+        block.period_ms = period if command == Command.START_MS else period * PERIOD_UNIT_MS
+        block.due_tick = self._stack.kernel.tick_count + block.period_ms
+
+    def _task(self) -> Task:
+        kernel = self._stack.kernel
+        while True:
+            due = [block.due_tick for block in self.blocks.values() if block.due_tick is not None]
+            packet = yield from self._requests.receive(
+                max(0, min(due) - kernel.tick_count) if due else FOREVER
+            )
+            if packet is not None:
+                yield from self._stack.answer(packet, self.answer)
+            for number, block in self.blocks.items():
+                if block.due_tick is not None and block.due_tick <= kernel.tick_count:
+                    yield from self._send(number, block, kernel.tick_count)
+
+    def _send(self, number: int, block: Block, tick: int) -> Task:
+        """Send a block that is due; the next time is planned from this one, missed ones are left out."""
+        yield from self._stack.kernel.work(self._stack.cost.log_us)
+        yield from self._stack.offer(encode_log_data(number, tick, block.values()))
+        assert block.due_tick is not None
+        late = tick - block.due_tick
+        period = block.period_ms
+        block.due_tick = tick + period - late % period if period else None

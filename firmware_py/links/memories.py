@@ -1,0 +1,129 @@
+"""Memories on port 4: the EEPROM, a deck's one-wire memory, and the memory tester.
+
+Channel 0 tells which there are, 1 reads, 2 writes. The tester's byte at any address is the address modulo 256: reading
+gives it, writing compares with it and counts what differs.
+"""
+
+import struct
+from collections.abc import Sequence
+from typing import Protocol
+
+from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.wire import WireError
+from firmware_py.wire.crtp import PORT_MEMORIES, Packet
+from firmware_py.wire.memories import TYPE_EEPROM, TYPE_ONE_WIRE, TYPE_TESTER
+
+INFO, READ, WRITE = 0, 1, 2  # channels
+GET_COUNT, GET_INFO = 1, 2
+MAX_READ = 24
+TESTER_SIZE = 0x1000
+OK, EIO = 0, 5
+
+_INFO = struct.Struct("<BBBI8s")
+_ADDRESS = struct.Struct("<BI")
+_NO_SERIAL = bytes(8)
+_DECK_SERIAL = bytes((0x0D, 0xF1, 0x0A, 0x7B, 0, 0, 0, 1))  # of the one-wire chip
+
+
+class Memory(Protocol):
+    """A memory as clients see it; addresses are checked by the service."""
+
+    type: int
+    size: int
+    serial: bytes
+
+    def read(self, address: int, length: int) -> bytes:
+        """Return `length` bytes."""
+        ...
+
+    def write(self, address: int, data: bytes) -> None:
+        """Store bytes."""
+        ...
+
+
+class Storage:
+    """A memory of real bytes."""
+
+    def __init__(self, type: int, content: bytearray, serial: bytes = _NO_SERIAL) -> None:
+        self.type = type
+        self.size = len(content)
+        self.serial = serial
+        self._content = content
+
+    def read(self, address: int, length: int) -> bytes:
+        """Return `length` bytes."""
+        return bytes(self._content[address : address + length])
+
+    def write(self, address: int, data: bytes) -> None:
+        """Store bytes."""
+        self._content[address : address + len(data)] = data
+
+
+class Tester:
+    """The memory tester; `errors` counts wrong bytes."""
+
+    type = TYPE_TESTER
+    size = TESTER_SIZE
+    serial = _NO_SERIAL
+
+    def __init__(self) -> None:
+        self.errors = 0
+
+    def read(self, address: int, length: int) -> bytes:
+        """Return the bytes that have to be there."""
+        return bytes(index & 0xFF for index in range(address, address + length))
+
+    def write(self, address: int, data: bytes) -> None:
+        """Compare."""
+        expected = self.read(address, len(data))
+        self.errors += sum(a != b for a, b in zip(data, expected, strict=True))
+
+
+class MemoryService:
+    """Serves memories; their number is their place."""
+
+    def __init__(self, stack: CrtpStack, memories: Sequence[Memory]) -> None:
+        self._memories = memories
+        stack.serve("MEM", 1, PORT_MEMORIES, self.answer)
+
+    def answer(self, packet: Packet) -> tuple[bytes, ...]:
+        """Return the reply to one request; raises `WireError` for what is none."""
+        data = packet.data
+        if packet.channel == INFO:
+            return (self._info(data),)
+        if packet.channel not in (READ, WRITE) or len(data) < _ADDRESS.size:
+            raise WireError(f"memory request on channel {packet.channel}: {data.hex()}")
+        number, address = _ADDRESS.unpack_from(data)
+        head, rest = data[: _ADDRESS.size], data[_ADDRESS.size :]
+        if packet.channel == READ:
+            if not rest:
+                raise WireError("a memory read without a length")
+            if rest[0] > MAX_READ or not self._covers(number, address, rest[0]):
+                return (head + bytes((EIO,)),)
+            return (head + bytes((OK,)) + self._memories[number].read(address, rest[0]),)
+        if not self._covers(number, address, len(rest)):
+            return (head + bytes((EIO,)),)
+        self._memories[number].write(address, rest)
+        return (head + bytes((OK,)),)
+
+    def _info(self, data: bytes) -> bytes:
+        if data[:1] == bytes((GET_COUNT,)):
+            return bytes((GET_COUNT, len(self._memories)))
+        if data[:1] != bytes((GET_INFO,)) or len(data) < 2:
+            raise WireError(f"memory information {data.hex()}: unknown")
+        if data[1] >= len(self._memories):
+            return data[:2]
+        memory = self._memories[data[1]]
+        return _INFO.pack(GET_INFO, data[1], memory.type, memory.size, memory.serial)
+
+    def _covers(self, number: int, address: int, length: int) -> bool:
+        return number < len(self._memories) and address + length <= self._memories[number].size
+
+
+def memories(eeprom: bytearray, deck_memory: bytearray, tester: Tester) -> tuple[Memory, ...]:
+    """Return the memories of a Floaty board."""
+    return (
+        Storage(TYPE_EEPROM, eeprom),
+        Storage(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
+        tester,
+    )

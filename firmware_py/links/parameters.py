@@ -1,0 +1,153 @@
+"""The parameter service: read, write and keep the values that may be changed while the board runs.
+
+A write is refused when the value is not a number or out of range; whatever happened, the reply carries the value that is
+in force. Persistent parameters can be stored in the EEPROM and are applied at the next boot.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.links.storage import ParameterStorage
+from firmware_py.wire import WireError, toc
+from firmware_py.wire.crtp import PORT_PARAMETERS, Packet
+from firmware_py.wire.parameters import (
+    CHANNEL_MISC,
+    CHANNEL_READ,
+    CHANNEL_WRITE,
+    EACCES,
+    EINVAL,
+    ENOENT,
+    EXTENDED_PERSISTENT,
+    OK,
+    TYPE_EXTENDED,
+    TYPE_READ_ONLY,
+    Misc,
+    decode_ident,
+    decode_set_by_name,
+    encode_ident,
+    encode_set_by_name_reply,
+)
+from firmware_py.wire.scalars import Scalar
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """What can be set: `group.name`, type and unit, how to read and write it, and what it may be.
+
+    Without `write` it is read only. `minimum` and `maximum` are inclusive.
+    """
+
+    name: str
+    scalar: Scalar
+    unit: str
+    read: Callable[[], float]
+    write: Callable[[float], object] | None = None
+    minimum: float = 0.0
+    maximum: float = 0.0
+    persistent: bool = False
+
+    @property
+    def type_byte(self) -> int:
+        """The type with its flags as the TOC tells it."""
+        flags = TYPE_READ_ONLY if self.write is None else 0
+        return self.scalar.parameter_number | flags | (TYPE_EXTENDED if self.persistent else 0)
+
+    def value(self) -> bytes:
+        """Return the value in force as it travels."""
+        return self.scalar.pack(self.read())
+
+    def set(self, value: float) -> int:
+        """Set the value; return a status. NaN fails the comparison."""
+        if self.write is None:
+            return EACCES
+        if not self.minimum <= value <= self.maximum:
+            return EINVAL
+        self.write(value)
+        return OK
+
+
+class ParameterService:
+    """Answers on port 2; the values at boot, before stored ones are applied, are the defaults."""
+
+    def __init__(self, stack: CrtpStack, parameters: Sequence[Parameter], storage: ParameterStorage) -> None:
+        self.toc = toc.Toc.of(PORT_PARAMETERS, ((item.type_byte, item.name) for item in parameters))
+        self.refused = 0  # writes of values that are not allowed
+        self._parameters = parameters
+        self._numbers = {parameter.name: number for number, parameter in enumerate(parameters)}
+        self._defaults = [parameter.value() for parameter in parameters]
+        self._storage = storage
+        for name, value in storage.load().items():
+            parameter = parameters[self._numbers[name]] if name in self._numbers else None
+            if parameter is not None and parameter.persistent and len(value) == parameter.scalar.size:
+                parameter.set(parameter.scalar.unpack(value))
+        stack.serve("PARAM", 1, PORT_PARAMETERS, self.answer)
+
+    def answer(self, packet: Packet) -> tuple[bytes, ...]:
+        """Return the replies to one request; raises `WireError` for what is none."""
+        data = packet.data
+        if packet.channel == toc.CHANNEL:
+            return (self.toc.answer(data),)
+        if packet.channel == CHANNEL_MISC:
+            return self._misc(data)
+        number = decode_ident(data)
+        ident = encode_ident(number)
+        if number >= len(self._parameters):
+            return (ident + bytes((ENOENT,)),)
+        parameter = self._parameters[number]
+        if packet.channel == CHANNEL_READ:
+            return (ident + bytes((OK,)) + parameter.value(),)
+        assert packet.channel == CHANNEL_WRITE
+        if parameter.write is None:
+            return ()
+        self._set(parameter, parameter.scalar.unpack(data[2:]))
+        return (ident + parameter.value(),)
+
+    def _set(self, parameter: Parameter, value: float) -> int:
+        status = parameter.set(value)
+        self.refused += status != OK
+        return status
+
+    def _set_by_name(self, data: bytes) -> tuple[bytes, ...]:
+        """Set, reply, and tell everybody who read the value before."""
+        request = decode_set_by_name(data)
+        number = self._numbers.get(request.name)
+        if number is None:
+            return (encode_set_by_name_reply(request.name, ENOENT),)
+        parameter = self._parameters[number]
+        if request.scalar is not parameter.scalar:
+            return (encode_set_by_name_reply(request.name, EINVAL),)
+        status = self._set(parameter, request.value)
+        reply = encode_set_by_name_reply(request.name, status)
+        if status != OK:
+            return (reply,)
+        return reply, bytes((Misc.VALUE_UPDATED,)) + encode_ident(number) + parameter.value()
+
+    def _misc(self, data: bytes) -> tuple[bytes, ...]:
+        if data[:1] == bytes((Misc.SET_BY_NAME,)):
+            return self._set_by_name(data)
+        number = decode_ident(data, 1)
+        command, head = data[0], data[:3]
+        known = number < len(self._parameters)
+        parameter = self._parameters[number] if known else self._parameters[0]
+        persistent = known and parameter.persistent
+        if command == Misc.EXTENDED_TYPE:
+            return (head + bytes((EXTENDED_PERSISTENT if persistent else 0,)),)
+        if command == Misc.EXTENDED_TYPE_V2:
+            return (head + (bytes((OK, EXTENDED_PERSISTENT)) if persistent else bytes((ENOENT,))),)
+        if command in (Misc.DEFAULT, Misc.DEFAULT_V2):
+            if not known or parameter.write is None:
+                return (head + bytes((ENOENT,)),)
+            return (head + (b"" if command == Misc.DEFAULT else bytes((OK,))) + self._defaults[number],)
+        if command not in (Misc.STORE, Misc.STATE, Misc.CLEAR):
+            raise WireError(f"parameter command {command} is unknown")
+        if not persistent:
+            return (head + bytes((ENOENT,)),)
+        if command == Misc.STATE:
+            stored = self._storage.load().get(parameter.name)
+            return (head + bytes((stored is not None,)) + self._defaults[number] + (stored or b""),)
+        if command == Misc.STORE:
+            done = self._storage.store(parameter.name, parameter.value())
+        else:
+            done = self._storage.clear(parameter.name)
+        return (head + bytes((OK if done else ENOENT,)),)

@@ -1,0 +1,149 @@
+"""Who the board is, and what it may do: link, platform and supervisor services, and the application channel."""
+
+from firmware_py.links.crtp_stack import CrtpStack, Task
+from firmware_py.rtos import Queue
+from firmware_py.supervisor import State, Supervisor
+from firmware_py.wire import WireError
+from firmware_py.wire.crtp import (
+    MAX_DATA,
+    PORT_COMMANDER,
+    PORT_GENERIC_SETPOINT,
+    PORT_LINK,
+    PORT_PLATFORM,
+    PORT_SUPERVISOR,
+    Packet,
+    encode,
+)
+
+PROTOCOL_VERSION = 12
+FIRMWARE_VERSION = "2026.11 Floaty"
+DEVICE_TYPE = "C21F"  # Crazyflie 2.1, Floaty
+APP_QUEUE = 10
+
+LINK_ECHO, LINK_SOURCE = 0, 1
+SOURCE_TEXT = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")  # by which clients know the protocol
+
+PLATFORM_COMMAND, PLATFORM_VERSION, PLATFORM_APP = 0, 1, 2
+VERSION_PROTOCOL, VERSION_FIRMWARE, VERSION_DEVICE = 0, 1, 2
+COMMAND_ARM, COMMAND_RECOVER, COMMAND_NOTIFY = 1, 2, 3
+
+SUPERVISOR_INFO, SUPERVISOR_COMMAND = 0, 1
+GET_BITS = 0x0C
+ARM, RECOVER, STOP, STOP_WATCHDOG = 1, 2, 3, 4
+REPLY = 0x80
+
+
+class PlatformService:
+    """Answers on the ports of link, platform and supervisor; set-points are accepted and change nothing.
+
+    The application echoes what comes on its channel.
+    """
+
+    def __init__(self, stack: CrtpStack, supervisor: Supervisor) -> None:
+        self._stack = stack
+        self._supervisor = supervisor
+        kernel = stack.kernel
+        self._app: Queue[bytes] = kernel.create_queue(APP_QUEUE, "app")
+        self._requests = stack.open_port(PORT_PLATFORM)
+        stack.serve("CRTP-SRV", 0, PORT_LINK, answer_link)
+        stack.handle(PORT_SUPERVISOR, lambda packet: stack.answer(packet, self.answer_supervisor, 0))
+        for port in (PORT_COMMANDER, PORT_GENERIC_SETPOINT):
+            stack.handle(port, _accept)
+        kernel.create_task("PLATFORM-SRV", 0, self._platform_task)
+        kernel.create_task("APP", 0, self._app_task)
+
+    @property
+    def app_overflows(self) -> int:
+        """Packets that the application lost because it was too slow."""
+        return self._app.dropped
+
+    def answer_platform(self, packet: Packet) -> tuple[bytes, ...]:
+        """Return the reply to a platform command (answered with itself) or to a question for a version."""
+        data = packet.data
+        if not data:
+            raise WireError("an empty platform request")
+        if packet.channel == PLATFORM_VERSION:
+            return (data[:1] + _version(data[0]),)
+        if packet.channel == PLATFORM_COMMAND:
+            if data[0] in (COMMAND_ARM, COMMAND_RECOVER):
+                return (data[:1] + self._command(data),)
+            if data[0] == COMMAND_NOTIFY:
+                return (data,)
+        raise WireError(f"platform channel {packet.channel}: {data.hex()} is unknown")
+
+    def answer_supervisor(self, packet: Packet) -> tuple[bytes, ...]:
+        """Return the state, or the outcome of a command; the emergency stops are not answered."""
+        supervisor, data = self._supervisor, packet.data
+        command = data[0] if data else 0
+        if packet.channel == SUPERVISOR_INFO and command == GET_BITS:
+            return (bytes((REPLY | command,)) + supervisor_bits(supervisor).to_bytes(2, "little"),)
+        if packet.channel == SUPERVISOR_COMMAND:
+            if command in (ARM, RECOVER):
+                return (bytes((REPLY | command,)) + self._command(data),)
+            if command == STOP:
+                supervisor.emergency_stop()
+                return ()
+            if command == STOP_WATCHDOG:
+                supervisor.feed_watchdog(self._stack.kernel.now_us)
+                return ()
+        raise WireError(f"supervisor channel {packet.channel}: {data.hex()} is unknown")
+
+    def _command(self, data: bytes) -> bytes:
+        """Arm, disarm or recover; return whether it succeeded and what is now true."""
+        if data[0] == COMMAND_RECOVER:
+            recovered = self._supervisor.recover(self._stack.kernel.now_us)
+            return bytes((recovered, recovered))
+        if len(data) < 2:
+            raise WireError("a request to arm that does not say whether")
+        return bytes((self._supervisor.arm(bool(data[1])), self._supervisor.armed))
+
+    def _platform_task(self) -> Task:
+        while True:
+            packet = yield from self._requests.receive()
+            if packet is None:
+                continue
+            if packet.channel == PLATFORM_APP:
+                yield from self._app.send(packet.data, 0)
+            else:
+                yield from self._stack.answer(packet, self.answer_platform)
+
+    def _app_task(self) -> Task:
+        while True:
+            data = yield from self._app.receive()
+            if data is not None:
+                yield from self._stack.deliver(encode(Packet(PORT_PLATFORM, PLATFORM_APP, data)))
+
+
+def answer_link(packet: Packet) -> tuple[bytes, ...]:
+    """Echo on channel 0, say who we are on channel 1, swallow the rest."""
+    if packet.channel == LINK_ECHO:
+        return (packet.data,)
+    return (SOURCE_TEXT,) if packet.channel == LINK_SOURCE else ()
+
+
+def supervisor_bits(supervisor: Supervisor) -> int:
+    """Return the Crazyflie's bit field: can be armed, armed, arms itself, can fly, flies, tumbled, locked."""
+    flags = (
+        not supervisor.armed and supervisor.calibrated and not supervisor.stopped,
+        supervisor.armed,
+        True,
+        supervisor.can_fly,
+        supervisor.state is State.FLYING,
+        False,
+        supervisor.stopped,
+    )
+    return sum(1 << bit for bit, flag in enumerate(flags) if flag)
+
+
+def _version(command: int) -> bytes:
+    if command == VERSION_PROTOCOL:
+        return PROTOCOL_VERSION.to_bytes(4, "little")
+    texts = {VERSION_FIRMWARE: FIRMWARE_VERSION, VERSION_DEVICE: DEVICE_TYPE}
+    if command not in texts:
+        raise WireError(f"version {command} is unknown")
+    return texts[command].encode("ascii") + b"\0"
+
+
+def _accept(packet: Packet) -> Task:
+    """Take a set-point: Floaty follows poses, so that there is nothing to do."""
+    yield from ()

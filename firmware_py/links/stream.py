@@ -1,0 +1,42 @@
+"""The telemetry of a flight: four fixed log blocks at 50 Hz, all with the same time stamp, while they are wanted."""
+
+from collections.abc import Callable, Sequence
+
+from firmware_py.links.crtp_stack import CrtpStack, Task
+from firmware_py.wire import telemetry
+
+
+class TelemetryStream:
+    """`read_block` returns the present values of a telemetry block, in the order of its variables."""
+
+    def __init__(self, stack: CrtpStack, read_block: Callable[[telemetry.Block], Sequence[float]]) -> None:
+        self._on = False
+        self._stack = stack
+        self._read_block = read_block
+        self._switched = stack.kernel.create_binary_semaphore("telemetry")
+        stack.kernel.create_task("TELEMETRY", 1, self._task)
+
+    @property
+    def on(self) -> bool:
+        """Whether the blocks are being sent."""
+        return self._on
+
+    def switch(self, on: bool) -> None:
+        """Begin or end."""
+        if on and not self._on:
+            self._switched.give_from_isr()
+        self._on = on
+
+    def _task(self) -> Task:
+        kernel, cost = self._stack.kernel, self._stack.cost
+        period = telemetry.PERIOD_MS
+        while True:
+            if not self._on:
+                yield from self._switched.take()
+                continue
+            yield from kernel.delay_until(kernel.tick_count // period * period + period)
+            stamp_ms = kernel.tick_count
+            yield from kernel.work(cost.log_us * len(telemetry.BLOCKS))
+            for block in telemetry.BLOCKS:
+                packet = telemetry.encode_sample(block, stamp_ms, self._read_block(block))
+                yield from self._stack.offer(packet)

@@ -1,0 +1,236 @@
+"""The parameters of the firmware: what may be changed on the running board, with its limits.
+
+Names are the Crazyflie's and the original Floaty's. Limits are those of the configuration, where there is one. The gains
+`extCtrl.*_P` keep the signs of the original, which counted roll and pitch inputs the other way (u1 = -c1, u2 = -c0).
+"""
+
+from collections.abc import Iterator
+from math import pi
+from typing import Any
+
+from pydantic import BaseModel
+
+from firmware_py.config import (
+    AllocationConfig,
+    ControllerConfig,
+    EstimatorConfig,
+    ModelConfig,
+    PredictorConfig,
+    SupervisorConfig,
+)
+from firmware_py.core import entry
+from firmware_py.links.parameters import Parameter
+from firmware_py.supervisor import Manual
+from firmware_py.variables import F32, I16, U8, U16, U32, Running
+from firmware_py.wire.scalars import Scalar
+from firmware_py.wire.telemetry import STREAM
+
+GAINS = {  # name in the original: name in the core, sign
+    "x_P": ("gain_x", -1), "y_P": ("gain_y", -1), "z_P": ("gain_z", 1),
+    "vx_P": ("gain_vx", -1), "vy_P": ("gain_vy", -1), "vz_P": ("gain_vz", 1),
+    "roll_P": ("gain_roll", -1), "pitch_P": ("gain_pitch", -1), "yaw_P": ("gain_yaw", 1),
+    "roll_rate_P": ("gain_p", -1), "pitch_rate_P": ("gain_q", -1), "yaw_rate_P": ("gain_r", 1),
+    "z_I": ("gain_iz", 1),
+}  # fmt: skip
+FLAPS = ("m1", "m2", "m3", "m4")
+TRIM_LIMIT = 12_000  # as in ServoConfig
+SETPOINT_LIMIT = 5.0  # [m]
+STD_LIMITS = (1e-4, 1.0)  # [m], [rad]
+
+
+def parameters(running: Running) -> tuple[Parameter, ...]:
+    """Return the table, in the order of the parameter TOC."""
+    core = running.core.parameters.fields
+    return (
+        *(
+            _field(f"extCtrl.{name}", "", core, field, ControllerConfig, sign=sign)
+            for name, (field, sign) in GAINS.items()
+        ),
+        *_manual(running),
+        _element("extCtrl.target_yaw", "rad", core.target, 3, pi),
+        _element("setpoint.X", "m", core.target, 0, SETPOINT_LIMIT),
+        _element("setpoint.Y", "m", core.target, 1, SETPOINT_LIMIT),
+        _element("setpoint.Z", "m", core.target, 2, SETPOINT_LIMIT),
+        _element("setpoint.Yaw", "rad", core.target, 3, pi),
+        _field("RandConsts.flapHoverAng", "rad", core, "hover_angle", AllocationConfig),
+        _field("RandConsts.flapTimeConst", "1/s", core, "flap_rate", ModelConfig),
+        Parameter(
+            "delayComp.activate", U8, "", lambda: int(core.predict),
+            lambda value: setattr(core, "predict", int(value)), 0, 1, persistent=True,
+        ),
+        _field("delayComp.horizon", "10 ms", core, "horizon", PredictorConfig, U8),
+        *_kalman(running),
+        *_supervision(running),
+        *_test_subjects(running),
+        *_identity(),
+    )  # fmt: skip
+
+
+def _limits(section: type[BaseModel], field: str) -> tuple[float, float]:
+    """Return the inclusive limits of a configuration field; an exclusive lower one excludes only itself here."""
+    low = high = 0.0
+    for limit in section.model_fields[field].metadata:
+        low = getattr(limit, "ge", getattr(limit, "gt", low))
+        high = getattr(limit, "le", high)
+    return low, high
+
+
+def _field(
+    name: str,
+    unit: str,
+    fields: Any,
+    field: str,
+    section: type[BaseModel],
+    scalar: Scalar = F32,
+    sign: int = 1,
+) -> Parameter:
+    """A persistent parameter that is a number in the core, with the limits of its configuration."""
+    low, high = sorted(sign * limit for limit in _limits(section, field))
+    return Parameter(
+        name, scalar, unit,
+        lambda: sign * getattr(fields, field).item(), lambda value: setattr(fields, field, sign * value),
+        low, high, persistent=True,
+    )  # fmt: skip
+
+
+def _element(name: str, unit: str, array: Any, index: int, limit: float) -> Parameter:
+    """An element of an array, between -limit and limit."""
+    return Parameter(
+        name,
+        F32,
+        unit,
+        lambda: array.item(index),
+        lambda value: array.__setitem__(index, value),
+        -limit,
+        limit,
+    )
+
+
+def _attribute(
+    name: str,
+    scalar: Scalar,
+    unit: str,
+    owner: Any,
+    attribute: str,
+    low: float,
+    high: float,
+    persistent: bool,
+) -> Parameter:
+    """A whole number that is an attribute of an object."""
+    return Parameter(
+        name, scalar, unit,
+        lambda: getattr(owner, attribute), lambda value: setattr(owner, attribute, int(value)),
+        low, high, persistent,
+    )  # fmt: skip
+
+
+def _manual(running: Running) -> Iterator[Parameter]:
+    """Flap angles, words and trims from outside."""
+    manual, trim = running.manual, running.core.parameters.fields.trim
+
+    def element(
+        name: str, scalar: Scalar, unit: str, array: Any, index: int, low: float, high: float
+    ) -> Parameter:
+        def write(value: float) -> None:
+            array[index] = value
+            manual.apply()
+
+        return Parameter(name, scalar, unit, lambda: array.item(index), write, low, high, array is trim)
+
+    def set_mode(value: float) -> None:
+        manual.mode = Manual(int(value))
+        manual.apply()
+
+    def set_words(value: float) -> None:
+        manual.use_words = value == 1
+        manual.apply()
+
+    yield Parameter("extCtrl.manual", U8, "", lambda: manual.mode, set_mode, 0, len(Manual) - 1)
+    yield Parameter("motorPowerSet.enable", U8, "", lambda: manual.use_words, set_words, 0, 1)
+    for index, name in enumerate(FLAPS):
+        yield element(f"extCtrl.{name}", F32, "rad", manual.angles, index, -pi / 2, pi / 2)
+        yield element(f"motorPowerSet.{name}", U16, "words", manual.words, index, 0, 0xFFFF)
+        yield element(f"motorShifts.{name}", I16, "words", trim, index, -TRIM_LIMIT, TRIM_LIMIT)
+
+
+def _kalman(running: Running) -> Iterator[Parameter]:
+    """Bounds and noise of the estimator, and its reset, which reads 0 again at once."""
+    core = running.core
+
+    def reset(value: float) -> None:
+        if value:
+            entry.reset(core.parameters.arg, core.estimator.arg)
+
+    def deviation(name: str, unit: str, field: str) -> Parameter:
+        fields = core.parameters.fields
+        low, high = STD_LIMITS
+        return Parameter(
+            name, F32, unit,
+            lambda: getattr(fields, field).item() ** 0.5, lambda value: setattr(fields, field, value**2), low, high,
+        )  # fmt: skip
+
+    yield _field("kalman.maxPos", "m", core.parameters.fields, "bound_position", EstimatorConfig)
+    yield _field("kalman.maxVel", "m/s", core.parameters.fields, "bound_velocity", EstimatorConfig)
+    yield Parameter("kalman.resetEstimation", U8, "", lambda: 0, reset, 0, 1)
+    yield Parameter("FloatyKalm.resetKalman", U8, "", lambda: 0, reset, 0, 1)
+    yield deviation("locSrv.extPosStdDev", "m", "measured_position")
+    yield deviation("locSrv.extQuatStdDev", "rad", "measured_attitude")
+
+
+def _supervision(running: Running) -> Iterator[Parameter]:
+    """Failsafe and telemetry."""
+    supervisor, stream, kernel = running.supervisor, running.stream, running.stack.kernel
+
+    def stop(value: float) -> None:
+        if value:
+            supervisor.emergency_stop()
+        else:
+            supervisor.recover(kernel.now_us)
+
+    low_us, high_us = _limits(SupervisorConfig, "pose_timeout_us")
+    low_mv, high_mv = _limits(SupervisorConfig, "low_battery_mv")
+    yield Parameter("stabilizer.stop", U8, "", lambda: supervisor.stopped, stop, 0, 1)
+    yield Parameter(
+        "supervisor.poseTimeout", U16, "ms", lambda: supervisor.pose_timeout_us // 1000,
+        lambda value: setattr(supervisor, "pose_timeout_us", int(value) * 1000),
+        low_us / 1000, high_us / 1000, persistent=True,
+    )  # fmt: skip
+    yield _attribute("supervisor.lowBattery", U16, "mV", supervisor, "low_battery_mv", low_mv, high_mv, True)
+    yield Parameter(STREAM, U8, "", lambda: stream.on, lambda value: stream.switch(value == 1), 0, 1)
+
+
+class _Effects:
+    """What the Crazyflie's test suites set, store and find again; Floaty neither sounds nor glows."""
+
+    def __init__(self) -> None:
+        self.sound = 0
+        self.ring = 0
+
+
+def _test_subjects(running: Running) -> Iterator[Parameter]:
+    effects, tester = _Effects(), running.tester
+    yield _attribute("sound.effect", U8, "", effects, "sound", 0, 255, True)
+    yield _attribute("ring.effect", U8, "", effects, "ring", 0, 255, True)
+    yield Parameter("memTst.resetW", U8, "", lambda: 0, lambda value: setattr(tester, "errors", 0), 0, 255)
+
+
+def _identity() -> Iterator[Parameter]:
+    """What the board is; read only."""
+    for name, scalar, value in (
+        ("system.selftestPassed", U8, 1),
+        ("stabilizer.estimator", U8, 2),  # Kalman
+        ("stabilizer.controller", U8, 0),  # the only one
+        ("deck.bcFloaty", U8, 1),
+        ("imu_sensors.BMI088", U8, 1),
+        ("imu_sensors.BMP3XX", U8, 0),
+        ("imu_sensors.HMC5883L", U8, 0),
+        ("imu_sensors.MS5611", U8, 0),
+        ("firmware.revision0", U32, 0x0F10A717),
+        ("firmware.revision1", U16, 0x0001),
+        ("firmware.modified", U8, 0),
+        ("cpu.flash", U16, 1024),  # [KiB]
+        ("cpu.id0", U32, 0x00F10A71),
+        ("cpu.id1", U32, 0),
+        ("cpu.id2", U32, 1),
+    ):
+        yield Parameter(name, scalar, "", lambda value=value: value)  # type: ignore[misc]
