@@ -251,6 +251,7 @@ def test_power_cycle_is_noticed_and_stored_parameters_come_back(board: UdpBoard,
     assert first.ask(first.cf.param.persistent_store, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
     board.power_off()
     assert first.gone.wait(PATIENCE_S)
+    first.close()  # so that nothing of it answers in place of the second
     board.power_on()
     begin = time.monotonic()
     second = Session(board.uri, cache)
