@@ -81,12 +81,12 @@ def reduced(x: f32, turns: Integer) -> f32:
 
 
 @kernel
-def sin(angle: f32) -> f32:
-    """Sine of an angle [rad]; angles beyond +-1000 rad saturate, NaN counts as -1000."""
+def sine_ahead(angle: f32, quarters: Integer) -> f32:
+    """Sine of an angle [rad] plus that many quarter turns, 0 or 1."""
     x = clamp(angle, -ANGLE_LIMIT, ANGLE_LIMIT)
     turns = quarter_turns(x)
     rest = reduced(x, turns)
-    quadrant = (turns + 4000) % 4
+    quadrant = (turns + quarters + 4000) % 4
     if quadrant == 0:
         return sin_quarter(rest)
     if quadrant == 1:
@@ -97,19 +97,15 @@ def sin(angle: f32) -> f32:
 
 
 @kernel
+def sin(angle: f32) -> f32:
+    """Sine of an angle [rad]; angles beyond +-1000 rad saturate, NaN counts as -1000."""
+    return sine_ahead(angle, 0)
+
+
+@kernel
 def cos(angle: f32) -> f32:
     """Cosine of an angle [rad]; angles beyond +-1000 rad saturate, NaN counts as -1000."""
-    x = clamp(angle, -ANGLE_LIMIT, ANGLE_LIMIT)
-    turns = quarter_turns(x)
-    rest = reduced(x, turns)
-    quadrant = (turns + 4000) % 4
-    if quadrant == 0:
-        return cos_quarter(rest)
-    if quadrant == 1:
-        return -sin_quarter(rest)
-    if quadrant == 2:
-        return -cos_quarter(rest)
-    return sin_quarter(rest)
+    return sine_ahead(angle, 1)
 
 
 @kernel
