@@ -23,6 +23,7 @@ from hil.config import LabConfig
 from hil.errors import LabError
 from hil.experiments import Experiment
 from hil.harness import Flight
+from hil.linked_flight import LinkedFlight
 from hil.metrics import METRICS, Verdict, judge, measure
 from hil.recorder import Recorder, load_log
 
@@ -64,18 +65,18 @@ def fly(
     request: Request,
     folder: Path,
     clock: Clock | None = None,
-    progress: Callable[[int, Flight], None] | None = None,
+    progress: Callable[[int, Flight | LinkedFlight], None] | None = None,
     on_batch: Callable[[pa.RecordBatch], None] | None = None,
+    link: str | None = None,
 ) -> Result:
     """Fly once and write everything but the pictures into `folder`, which `prepare` has made.
 
-    An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
+    With `link`, a URI, station and board talk over cflib and the wall clock paces the flight. An error of the
+    firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
     limits = request.config.limits.get(request.experiment.name, request.experiment.limits)
     judge(dict.fromkeys(METRICS, 0.0), limits)  # refuse unknown metrics before the flight
-    flight = Flight(
-        request.config, request.experiment, request.duration_s, request.seed, folder / "telemetry.csv", clock
-    )
+    flight = _flight(request, folder / "telemetry.csv", clock, link)
     recorder = Recorder(folder, flight.channels(), metadata_of(request), on_batch)
     flight.recorder = recorder
     outcome, cause = "error", None
@@ -97,6 +98,17 @@ def fly(
     result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor)
     write_result(result)
     return result
+
+
+def _flight(
+    request: Request, telemetry: Path, clock: Clock | None, link: str | None
+) -> Flight | LinkedFlight:
+    if link is None:
+        return Flight(request.config, request.experiment, request.duration_s, request.seed, telemetry, clock)
+    profile = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
+    return LinkedFlight(
+        request.config, request.experiment, request.duration_s, request.seed, telemetry, link, profile
+    )
 
 
 def prepare(folder: Path) -> None:
