@@ -19,7 +19,7 @@ bench: .venv/test.stamp
 	@touch $@
 
 .venv/fly.stamp: .venv/pip.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable '.[view]'
+	$(BIN)/python -m pip install --quiet --editable '.[radio,view]'
 	@touch $@
 
 .venv/test.stamp: .venv/fly.stamp

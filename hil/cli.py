@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
+from hil.board_cli import board, station
 from hil.errors import LabError
 
 if TYPE_CHECKING:
+    from hil.harness import Flight
+    from hil.linked_flight import LinkedFlight
     from hil.run import Request, Result
     from hil.viewer import LiveViewer
 
@@ -63,6 +66,10 @@ run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path
 @click.option("--view", "watch", is_flag=True, help="Watch live in the rerun viewer.")
 @click.option("--perfetto", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace.")
 @click.option(
+    "--link", metavar="URI",
+    help="Fly over cflib, in real time: radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:PORT.",
+)  # fmt: skip
+@click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
 )
 def fly(
@@ -75,6 +82,7 @@ def fly(
     realtime: bool,
     watch: bool,
     perfetto: bool,
+    link: str | None,
     out: Path | None,
 ) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
@@ -88,8 +96,10 @@ def fly(
     flown_s = chosen.duration_s if duration is None else duration
     if not 0.0 < flown_s <= DURATION_MAX_S:
         raise LabError(f"--duration {flown_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}")
-    if seeds > 1 and (realtime or watch or perfetto):
-        raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
+    if seeds > 1 and (realtime or watch or perfetto or link):
+        raise LabError(f"--seeds {seeds}: --realtime, --view, --perfetto and --link are for one seed")
+    if perfetto and link:
+        raise LabError("--perfetto: the scheduler is traced in lockstep only, not with --link")
     if perfetto:
         import hil.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
     config = load_config(profile, overrides)
@@ -99,7 +109,8 @@ def fly(
     requests = [Request(chosen, config, profile, overrides, seed + index, flown_s) for index in range(seeds)]
     if seeds > 1:
         return _fly_many(requests, out or Path("runs"))
-    return _fly_one(requests[0], out or Path("runs") / f"{chosen.name}-{seed}", realtime, watch, perfetto)
+    folder = out or Path("runs") / f"{chosen.name}-{seed}"
+    return _fly_one(requests[0], folder, realtime, watch, perfetto, link)
 
 
 @app.command("list")
@@ -140,12 +151,13 @@ def announce_compilation() -> None:
         notices.print("first run on this machine: compiling flight core and plant, once, some ten seconds")
 
 
-def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool, perfetto: bool) -> int:
+def _fly_one(
+    request: "Request", folder: Path, realtime: bool, watch: bool, perfetto: bool, link: str | None
+) -> int:
     """Fly one seed with all its pictures; returns the exit code."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from hil.clock import FreeRunning, Paced
-    from hil.harness import Flight
     from hil.run import fly, prepare
 
     prepare(folder)
@@ -160,10 +172,10 @@ def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool, perf
     with Progress(*columns, console=notices, transient=True) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
 
-        def show(now_us: int, flight: Flight) -> None:
+        def show(now_us: int, flight: "Flight | LinkedFlight") -> None:
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
-        result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto)
+        result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto, link)
         progress.update(bar, description="writing recording and report", total=None, now="")
         _write_pictures(folder)
         if perfetto:
@@ -318,6 +330,9 @@ def _refuse(text: str) -> int:
     print("floaty:", " ".join(text.split()), file=sys.stderr)
     return 2
 
+
+app.add_command(board)
+app.add_command(station)
 
 if __name__ == "__main__":
     main()

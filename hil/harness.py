@@ -201,6 +201,11 @@ class Flight:
         if self.recorder is not None:
             self.recorder.note(self.board.now_us, source, text)
 
+    def write_schedule(self, folder: Path) -> None:
+        """Write what was traced of the scheduler."""
+        self.schedule.end(self.now_us)
+        self.schedule.write(folder)
+
     def close(self) -> None:
         """Close what the flight itself opened."""
         if self.telemetry is not None:

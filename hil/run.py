@@ -24,6 +24,7 @@ from hil.config import LabConfig
 from hil.errors import LabError
 from hil.experiments import Experiment
 from hil.harness import Flight
+from hil.linked_flight import LinkedFlight
 from hil.metrics import METRICS, Verdict, judge, measure
 from hil.recorder import Recorder, load_log
 
@@ -77,20 +78,19 @@ def fly(
     request: Request,
     folder: Path,
     clock: Clock | None = None,
-    progress: Callable[[int, Flight], None] | None = None,
+    progress: Callable[[int, Flight | LinkedFlight], None] | None = None,
     on_batch: Callable[[pa.RecordBatch], None] | None = None,
     trace_all: bool = False,
+    link: str | None = None,
 ) -> Result:
     """Fly once and write everything but the pictures into `folder`, which `prepare` has made.
 
-    An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
+    With `link`, a URI, station and board talk over cflib and the wall clock paces the flight. An error of the
+    firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
     limits = request.config.limits.get(request.experiment.name, request.experiment.limits)
     judge(dict.fromkeys(METRICS, 0.0), limits)  # refuse unknown metrics before the flight
-    flight = Flight(
-        request.config, request.experiment, request.duration_s, request.seed, folder / "telemetry.csv", clock,
-        trace_all,
-    )  # fmt: skip
+    flight = _flight(request, folder / "telemetry.csv", clock, trace_all, link)
     recorder = Recorder(folder, flight.channels(), metadata_of(request), on_batch)
     flight.recorder = recorder
     outcome, cause = "error", None
@@ -109,8 +109,7 @@ def fly(
         wall_s = (time.monotonic_ns() - start_ns) * 1e-9
         digest = recorder.close()
         flight.close()
-        flight.schedule.end(flight.now_us)
-        flight.schedule.write(folder)
+        flight.write_schedule(folder)
     metrics = measure(load_log(folder), outcome == "lost")
     verdicts = tuple(judge(metrics, limits))
     factor = flight.now_us * 1e-6 / wall_s
@@ -123,6 +122,19 @@ def fly(
     result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues)
     write_result(result)
     return result
+
+
+def _flight(
+    request: Request, telemetry: Path, clock: Clock | None, trace_all: bool, link: str | None
+) -> Flight | LinkedFlight:
+    if link is None:
+        return Flight(
+            request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all
+        )
+    profile = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
+    return LinkedFlight(
+        request.config, request.experiment, request.duration_s, request.seed, telemetry, link, profile
+    )
 
 
 def prepare(folder: Path) -> None:

@@ -11,10 +11,11 @@ STEP_S = 0.001
 
 
 class UdpBoard(Client):
-    """Runs in a thread of its own from creation to `close`; the last client that spoke gets the answers."""
+    """Runs in a thread of its own from creation to `close`; the newest client has the board."""
 
     def __init__(self) -> None:
         self.peer: tuple[str, int] | None = None
+        self._left: set[tuple[str, int] | None] = set()
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         super().__init__()
         self.imu = (3, -2, 1, 0, 0, 1365)  # 1 g
@@ -58,5 +59,13 @@ class UdpBoard(Client):
             ready, _, _ = select.select((self.socket,), (), (), STEP_S)
             self.run(max(self.now_us, int((time.monotonic() - start_s) * 1e6)))
             if ready:
-                data, self.peer = self.socket.recvfrom(64)
-                self.firmware.radio_received(data)
+                self._take(*self.socket.recvfrom(64))
+
+    def _take(self, data: bytes, sender: tuple[str, int]) -> None:
+        """Pass a datagram on; the newest client has the board, and what older ones still say is not heard."""
+        if sender in self._left:
+            return
+        if self.peer not in (None, sender):
+            self._left.add(self.peer)
+        self.peer = sender
+        self.firmware.radio_received(data)

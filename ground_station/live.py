@@ -1,0 +1,123 @@
+"""The ground station with real hardware: poses from a source, a link to a board, until told to stop.
+
+It connects again when the link is lost, shows how the link does, and leaves the board with its flaps at hover: the
+corrections stop first, and the link is closed when the board has noticed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from firmware_py.wire import WireError
+from ground_station.clock import clock_us
+from ground_station.links.crazyradio import CrazyradioLink, LinkError
+from ground_station.mocap_udp import decode_frame
+from ground_station.station import GroundStation
+
+POSE_TIMEOUT_US = 5_000_000
+RECONNECT_TIMEOUT_US = 30_000_000
+STATUS_PERIOD_US = 5_000_000
+FAILSAFE_TIMEOUT_US = 2_000_000
+FAILSAFE = 3  # supervisor.state
+
+
+class PoseSource(Protocol):
+    """Where datagrams with poses come from."""
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """The next datagram, None when none comes in time."""
+        ...
+
+
+@dataclass(slots=True)
+class LiveStation:
+    """Runs a ground station; `say` gets lines for the user, `stopping` tells when to end."""
+
+    link: CrazyradioLink
+    station: GroundStation
+    source: PoseSource
+    say: Callable[[str], None]
+    stopping: Callable[[], bool]
+    malformed: int = 0  # datagrams that were not poses
+
+    def run(self) -> None:
+        """Fly until told to stop; raises `LinkError` when there are no poses or no board."""
+        self._connect()
+        try:
+            while not self.stopping():
+                try:
+                    self._fly()
+                except LinkError as error:
+                    self.say(f"{error}; connecting again")
+                    self._reconnect(error)
+        finally:
+            self._leave()
+
+    def _connect(self) -> None:
+        self.link.open(self.stopping)
+        self.say(f"connected to {self.link.uri}")
+        if self.link.missing:
+            self.say(f"the board has no {', '.join(self.link.missing)}: without these blocks of telemetry")
+
+    def _reconnect(self, cause: LinkError) -> None:
+        """Try until it works or takes too long."""
+        deadline_us = clock_us() + RECONNECT_TIMEOUT_US
+        self.link.close()
+        while not self.stopping():
+            try:
+                self._connect()
+                return
+            except LinkError:
+                if clock_us() > deadline_us:
+                    raise cause from None
+                self.source.receive(0.5)
+
+    def _fly(self) -> None:
+        """Forward poses and telemetry while the link holds."""
+        pose_us = status_us = clock_us()
+        while not self.stopping():
+            data = self.source.receive(0.02)
+            now_us = clock_us()
+            if data is not None and self._on_pose(data, now_us):
+                pose_us = now_us
+            elif now_us - pose_us > POSE_TIMEOUT_US:
+                self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
+                pose_us = now_us
+            self._take_telemetry()
+            self.link.check()
+            if now_us - status_us >= STATUS_PERIOD_US:
+                status_us = now_us
+                self._show()
+
+    def _on_pose(self, data: bytes, now_us: int) -> bool:
+        try:
+            frame = decode_frame(data)
+        except WireError:
+            self.malformed += 1
+            return False
+        self.station.on_frame(frame, now_us)
+        return True
+
+    def _take_telemetry(self) -> None:
+        for t_us, packet in self.link.received():
+            self.station.on_packet(t_us, packet)
+
+    def _show(self) -> None:
+        link, counters = self.link.statistics, self.station.counters
+        self.say(
+            f"poses {counters.frames} ({counters.invalid} unusable)  corrections {link.sent} sent, "
+            f"{link.replaced + link.too_old} late  telemetry {counters.received}  quality {link.quality:.0f} %  "
+            f"round trip {link.latency_ms:.1f} ms  {link.rate:.0f} exchanges/s"
+        )
+
+    def _leave(self) -> None:
+        """Stop correcting, wait until the board has put its flaps to hover, disconnect."""
+        self.link.mute()
+        self.link.supervisor_state = None
+        deadline_us = clock_us() + FAILSAFE_TIMEOUT_US
+        while clock_us() < deadline_us and self.link.supervisor_state != FAILSAFE:
+            self.source.receive(0.02)
+            self._take_telemetry()
+        if self.link.supervisor_state == FAILSAFE:
+            self.say("the board is in failsafe, flaps at hover")
+        self.link.close()

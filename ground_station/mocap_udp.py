@@ -1,0 +1,78 @@
+"""Poses as datagrams on the loopback interface: the stand-in for a motion capture network (`--mocap virtual`).
+
+A datagram carries the pose and the instant of its exposure by `clock.clock_us`, which sender and receiver share.
+"""
+
+import socket
+import struct
+from dataclasses import replace
+
+from firmware_py.wire import WireError
+from ground_station.clock import clock_us
+from ground_station.mocap import MocapFrame
+
+HOST = "127.0.0.1"
+DEFAULT_PORT = 19870
+
+_MAGIC = b"FPO1"
+_FRAME = struct.Struct("<4sqB7d")  # magic, exposure [us], valid, p_WB x y z [m], q_WB w x y z
+
+
+def encode_frame(frame: MocapFrame) -> bytes:
+    """The datagram for a frame."""
+    return _FRAME.pack(_MAGIC, frame.t_us, frame.valid, *frame.p_WB, *frame.q_WB)
+
+
+def decode_frame(data: bytes) -> MocapFrame:
+    """The frame in a datagram; `WireError` for anything else."""
+    if len(data) != _FRAME.size or data[:4] != _MAGIC:
+        raise WireError(f"not a pose: {len(data)} bytes")
+    _, t_us, valid, px, py, pz, qw, qx, qy, qz = _FRAME.unpack(data)
+    return MocapFrame(t_us, (px, py, pz), (qw, qx, qy, qz), bool(valid))
+
+
+class PoseReceiver:
+    """Listens for poses on a port; `OSError` when it is taken."""
+
+    def __init__(self, port: int = DEFAULT_PORT) -> None:
+        self.malformed = 0
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind((HOST, port))
+        except OSError:
+            self._socket.close()
+            raise
+        self.port: int = self._socket.getsockname()[1]
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """The next datagram, None when none comes in time."""
+        self._socket.settimeout(timeout_s)
+        try:
+            return self._socket.recv(2048)
+        except TimeoutError:
+            return None
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.close()
+
+
+class PosePublisher:
+    """Sends poses to a port, whether anybody listens or not."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._receiver = (HOST, port)
+
+    def send(self, frame: MocapFrame, now_us: int) -> None:
+        """Send a frame of another clock, on which it is `now_us`; what cannot be sent is lost."""
+        shared = replace(frame, t_us=clock_us() - (now_us - frame.t_us))
+        try:
+            self._socket.sendto(encode_frame(shared), self._receiver)
+        except OSError:
+            return
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._socket.close()

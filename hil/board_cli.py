@@ -1,0 +1,209 @@
+"""`floaty board serve`: boards in virtual tunnels for any Crazyflie program. `floaty station`: fly a board over cflib."""
+
+import shlex
+import signal
+import sys
+from pathlib import Path
+
+import click
+
+from hil.errors import LabError
+
+UDP_PORT = 19850  # where cflib looks for boards
+RADIO_PORT = 19840
+POSE_PORT = 19870
+BOARDS_MAX = 10
+
+
+@click.group()
+def board() -> None:
+    """Serve boards to other programs."""
+
+
+@board.command()
+@click.option(
+    "--udp", type=click.IntRange(0, 65535), metavar="PORT", help="UDP port of the first board; 0: any."
+)
+@click.option("--radio", is_flag=True, help="Offer a virtual Crazyradio.")
+@click.option(
+    "--radio-port", type=click.IntRange(0, 65535), default=RADIO_PORT, show_default=True, metavar="PORT",
+    help="Where the Crazyradio's server listens; 0: any.",
+)  # fmt: skip
+@click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
+@click.option(
+    "--loss", metavar="UP,DOWN", help="Share of packets lost per direction, 0..1 [default: profile]."
+)
+@click.option("--station", is_flag=True, help="Fly with the built-in ground station.")
+@click.option(
+    "--poses", type=click.IntRange(0, 65535), default=POSE_PORT, show_default=True, metavar="PORT",
+    help="UDP port for the poses of the first board; 0: none.",
+)  # fmt: skip
+@click.option(
+    "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Of everything random."
+)
+@click.option("--profile", default="floaty", show_default=True, metavar="NAME|FILE")
+@click.option(
+    "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE", help="Override a value; repeatable."
+)
+def serve(
+    udp: int | None,
+    radio: bool,
+    radio_port: int,
+    boards: int,
+    loss: str | None,
+    station: bool,
+    poses: int,
+    seed: int,
+    profile: str,
+    overrides: tuple[str, ...],
+) -> int:
+    """Serve boards in virtual tunnels, in real time, until Ctrl-C.
+
+    Without --udp or --radio the first board is on UDP. A board is held until it flies: corrections come from clients
+    or, with --station, from within.
+    """
+    if udp is None and not radio:
+        udp = UDP_PORT
+    for option, first in (("--udp", udp), ("--poses", poses)):
+        if first is not None and first + boards - 1 > 65535:
+            raise LabError(f"{option} {first}: there are no {boards} ports from there on")
+    from hil.config import load_config
+
+    config = load_config(profile, (*overrides, *_losses(loss)))
+    from ground_station.mocap_udp import PosePublisher
+    from hil.board_server import BoardServer
+    from hil.cli import announce_compilation
+
+    announce_compilation()
+    server = BoardServer(config, boards, seed, _say)
+    if radio:
+        _say(radio_hint(server.serve_radio(radio_port), [board.uri for board in server.boards]))
+    if udp is not None:
+        _say(f"udp    {' '.join(server.serve_udp(udp))}")
+    for number, served in enumerate(server.boards):
+        if poses:
+            served.publish(PosePublisher(poses + number).send)
+        if station:
+            served.fly()
+    stops = _stop_signals()
+    _say("serving; Ctrl-C ends")
+    server.run(lambda: bool(stops))
+    server.close()
+    _say(f"stopped; never more than {server.worst_lag_us / 1000:.1f} ms late")
+    return 0
+
+
+@click.command()
+@click.option(
+    "--link", "uri", required=True, metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850"
+)
+@click.option(
+    "--mocap", default="virtual", show_default=True, metavar="virtual[:PORT]",
+    help="Where poses come from: those that `floaty board serve` sends.",
+)  # fmt: skip
+@click.option(
+    "--trajectory", default="hover", show_default=True, metavar="NAME", help="An experiment of `floaty list`."
+)
+@click.option(
+    "--duration", type=click.FloatRange(min=0, min_open=True), metavar="S", help="[default: until Ctrl-C]"
+)
+@click.option(
+    "--log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Telemetry as CSV."
+)
+@click.option("--profile", default="floaty", show_default=True, metavar="NAME|FILE")
+@click.option(
+    "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE", help="Override a value; repeatable."
+)
+def station(
+    uri: str,
+    mocap: str,
+    trajectory: str,
+    duration: float | None,
+    log: Path | None,
+    profile: str,
+    overrides: tuple[str, ...],
+) -> int:
+    """Fly a board, real or virtual: poses in, corrections out at 50 Hz, telemetry shown and logged.
+
+    Ctrl-C ends the flight: corrections stop, the board puts its flaps to hover, the link is closed.
+    """
+    from hil.config import load_config
+    from hil.experiments import find_experiment
+
+    config = load_config(profile, overrides)
+    experiment = find_experiment(trajectory)
+    try:
+        from ground_station.links.crazyradio import CrazyradioLink, LinkError
+    except ImportError as error:
+        raise LabError(f"--link needs cflib ({error}): pip install cflib") from None
+    from ground_station.clock import clock_us
+    from ground_station.live import LiveStation
+    from ground_station.mocap_udp import PoseReceiver
+    from ground_station.station import GroundStation
+    from ground_station.telemetry_log import TelemetryLog
+    from ground_station.trajectory import Goal
+
+    port = _virtual_port(mocap)
+    try:
+        source = PoseReceiver(port)
+    except OSError as error:
+        raise LabError(f"--mocap {mocap}: port {port}: {error.strerror or error}") from None
+    try:
+        telemetry = TelemetryLog(log) if log else None
+    except OSError as error:
+        raise LabError(f"--log {log}: {error.strerror or error}") from None
+    stops = _stop_signals()
+    start_us = clock_us()
+    link = CrazyradioLink(uri, config.station.link_latency_us)
+    goal = Goal(config.flight.home, 0.0)
+    ground = GroundStation(link, experiment.trajectory(goal, start_us), telemetry, config.station)
+
+    def stopping() -> bool:
+        return bool(stops) or (duration is not None and clock_us() - start_us > duration * 1e6)
+
+    try:
+        LiveStation(link, ground, source, _say, stopping).run()
+    except LinkError as error:
+        raise LabError(str(error)) from None
+    finally:
+        source.close()
+        if telemetry is not None:
+            telemetry.close()
+    return 0
+
+
+def _virtual_port(mocap: str) -> int:
+    """Return the port of a pose source."""
+    name, colon, port = mocap.partition(":")
+    if name != "virtual" or (colon and not (port.isdigit() and 0 < int(port) < 65536)):
+        raise LabError(f"--mocap {mocap}: expected virtual or virtual:PORT")
+    return int(port) if colon else POSE_PORT
+
+
+def _stop_signals() -> list[int]:
+    """Return a list that gets the signals which ask for an orderly end."""
+    stops: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _: stops.append(received))
+    return stops
+
+
+def radio_hint(address: str, uris: list[str]) -> str:
+    """Return what to type before a program's name so that it sees the dongle, and where the boards are."""
+    folder = Path(__file__).parent / "dongle_site"
+    return f"radio  {' '.join(uris)}\nuse    env PYTHONPATH={shlex.quote(str(folder))} FLOATY_DONGLE={address} PROGRAM"
+
+
+def _losses(loss: str | None) -> tuple[str, ...]:
+    """Return the overrides for --loss."""
+    if loss is None:
+        return ()
+    parts = loss.split(",")
+    if len(parts) != 2:
+        raise LabError(f"--loss {loss}: expected UP,DOWN, for example 0.1,0.1")
+    return f"radio.uplink_loss={parts[0].strip()}", f"radio.downlink_loss={parts[1].strip()}"
+
+
+def _say(text: str) -> None:
+    print(text)
+    sys.stdout.flush()

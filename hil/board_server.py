@@ -1,0 +1,89 @@
+"""Boards for real clients: one thread that lets simulated time follow the wall clock and answers sockets in between.
+
+Nothing blocks but the wait for the next instant or the next packet, whichever comes first. When the machine is too
+slow simulated time falls behind and catches up later; nothing is skipped, and the worst lag is remembered.
+"""
+
+import select
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from hil.config import LabConfig
+from hil.dongle_server import DongleServer, Readers
+from hil.events import EventQueue
+from hil.harness import Streams
+from hil.served_board import ServedBoard
+from hil.virtual_dongle import VirtualDongle
+
+WARM_UP_US = 20_000  # run before anybody looks: the first run on a machine compiles
+DONGLE_SEED = 10_000  # random streams of dongles: apart from those of the boards
+
+
+class BoardServer:
+    """`count` boards; open `serve_radio` or `serve_udp`, then `run`."""
+
+    def __init__(self, config: LabConfig, count: int, seed: int, say: Callable[[str], None]) -> None:
+        self.events = EventQueue()
+        self.readers: Readers = {}
+        self.worst_lag_us = 0
+        self.boards = [
+            ServedBoard(number, config, self.events, Streams.of_seed(seed + number - 1), say)
+            for number in range(1, count + 1)
+        ]
+        self._config = config
+        self._seed = seed + DONGLE_SEED
+        self._dongles: DongleServer | None = None
+        while self.events.now_us < WARM_UP_US:
+            self._step()
+
+    def serve_radio(self, port: int) -> str:
+        """Offer Crazyradios on a port (0: any); returns the address for FLOATY_DONGLE."""
+        self._dongles = DongleServer(port, self.readers, self._new_dongle)
+        return self._dongles.address
+
+    def serve_udp(self, port: int) -> list[str]:
+        """Offer every board on UDP, from this port on; returns their URIs."""
+        uris = []
+        for board in self.boards:
+            board.serve_udp(port + board.number - 1 if port else 0, self.readers)
+            assert board.udp is not None
+            uris.append(f"udp://127.0.0.1:{board.udp.port}")
+        return uris
+
+    def run(self, stopping: Callable[[], bool]) -> None:
+        """Go on until told to stop; may be called again."""
+        events, readers = self.events, self.readers
+        start_ns = time.monotonic_ns() - events.now_us * 1000
+        while not stopping():
+            next_us = events.next_us or 0
+            wall_us = (time.monotonic_ns() - start_ns) // 1000
+            ready, _, _ = select.select(readers, (), (), max(0, next_us - wall_us) * 1e-6)
+            wall_us = (time.monotonic_ns() - start_ns) // 1000
+            if ready:
+                now_us = max(events.now_us, min(wall_us, next_us))
+                for reader in ready:
+                    with suppress(KeyError):  # closed by one of the others
+                        readers[reader](now_us)
+            elif wall_us >= next_us:
+                self.worst_lag_us = max(self.worst_lag_us, wall_us - next_us)
+            if wall_us >= (events.next_us or 0):
+                self._step()
+
+    def _step(self) -> None:
+        """Do everything that hardware does at the next instant."""
+        assert self.events.next_us is not None  # the IMUs never rest
+        self.events.run(self.events.next_us)
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for board in self.boards:
+            if board.udp is not None:
+                board.udp.close()
+        if self._dongles is not None:
+            self._dongles.close()
+
+    def _new_dongle(self) -> VirtualDongle:
+        self._seed += 1
+        rng = Streams.of_seed(self._seed).radio
+        return VirtualDongle(self._config.radio, self.events, rng, [board.nrf51 for board in self.boards])

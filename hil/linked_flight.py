@@ -1,0 +1,170 @@
+"""A flight over a real link, in real time: the board in its tunnel here, `floaty station` with cflib in another process.
+
+The station is the one that flies a real board. It sees the virtual dongle or the UDP port, and gets poses over the
+loopback interface. The robot is released when the board has flown in its holder for a second.
+"""
+
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from firmware_py.firmware import Firmware
+from ground_station.mocap_udp import PosePublisher
+from ground_station.trajectory import Goal
+from hil.board_server import BoardServer
+from hil.channels import flight_channels
+from hil.config import LabConfig
+from hil.dongle_plugin import VARIABLE
+from hil.errors import LabError
+from hil.experiments import Experiment
+from hil.harness import RECORD_PERIOD_US, RECORD_PHASE_US, Outcome, Streams
+from hil.recorder import Channel, Recorder
+from hil.virtual_radio import VirtualRadio
+
+SITE = Path(__file__).parent / "dongle_site"
+RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder
+STATION_EXIT_TIMEOUT_US = 15_000_000
+PROGRESS_ROWS = 25
+STANDING = "hover"  # other goals move by the clock of the release, which the station does not know
+
+
+class LinkedFlight:
+    """Like `hil.harness.Flight`, for `radio://…` (as the board's own URI) or `udp://127.0.0.1:PORT`.
+
+    `arguments` are those of the station's command line that say which profile it has.
+    """
+
+    def __init__(
+        self,
+        config: LabConfig,
+        experiment: Experiment,
+        duration_s: float,
+        seed: int,
+        telemetry_path: Path,
+        uri: str,
+        arguments: Sequence[str],
+    ) -> None:
+        if experiment.name != STANDING:
+            raise LabError(f"--link {uri}: only {STANDING} can be flown over a link")
+        self.recorder: Recorder | None = None
+        self.lost: str | None = None
+        self.end_us = RELEASE_TIMEOUT_US + round(duration_s * 1e6)
+        self._duration_us = round(duration_s * 1e6)
+        self._server = BoardServer(config, 1, seed, self._note)
+        self._board = self._server.boards[0]
+        self._released = self._gave_up = self._over = False
+        self._progress: Callable[[int], None] | None = None
+        self._trajectory = experiment.trajectory(Goal(config.flight.home, 0.0), 0)
+        self._no_radio = VirtualRadio(config.radio, self._server.events, Streams.of_seed(seed).radio)
+        self._environment = self._serve(uri)
+        port = _free_port()
+        self._poses = PosePublisher(port)
+        self._board.publish(self._poses.send)
+        self._command = [
+            sys.executable, "-m", "hil.cli", "station", "--link", uri, "--mocap", f"virtual:{port}",
+            "--trajectory", experiment.name, "--log", str(telemetry_path), *arguments,
+        ]  # fmt: skip
+
+    def _serve(self, uri: str) -> dict[str, str]:
+        """Open the side of the board that a URI means; returns what the station's environment needs."""
+        if uri == self._board.uri:
+            paths = [str(SITE), os.environ.get("PYTHONPATH", "")]
+            return {"PYTHONPATH": os.pathsep.join(filter(None, paths)), VARIABLE: self._server.serve_radio(0)}
+        prefix, _, port = uri.rpartition(":")
+        if prefix == "udp://127.0.0.1" and port.isdigit() and 0 < int(port) < 65536:
+            self._server.serve_udp(int(port))
+            return {}
+        raise LabError(f"--link {uri}: the virtual board is at {self._board.uri} or udp://127.0.0.1:PORT")
+
+    @property
+    def now_us(self) -> int:
+        """The present instant of the simulation."""
+        return self._server.events.now_us
+
+    @property
+    def firmware(self) -> Firmware:
+        """The firmware that runs now: a reboot brings another one."""
+        return self._board.parts()[2]
+
+    def write_schedule(self, folder: Path) -> None:
+        """Write nothing: the scheduler is traced in lockstep only."""
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return what there is to record; the columns of the simulated radio stay zero."""
+        plant, board, firmware = self._board.parts()
+        return flight_channels(
+            plant, board, firmware, self._no_radio, self._trajectory, lambda: self._board.free
+        )
+
+    def run(self, progress: Callable[[int], None] | None = None) -> Outcome:
+        """Fly to the end, the crash, or Ctrl-C; raises `LabError` when the station gives up."""
+        self._progress = progress
+        first_us = self.now_us // RECORD_PERIOD_US * RECORD_PERIOD_US + RECORD_PERIOD_US
+        self._server.events.at(first_us + RECORD_PHASE_US, self._record)
+        with tempfile.TemporaryFile("w+") as output:
+            self._station = subprocess.Popen(
+                self._command, env={**os.environ, **self._environment}, stdout=output, stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )  # fmt: skip
+            interrupted = False
+            try:
+                self._server.run(lambda: self._over)
+            except KeyboardInterrupt:
+                interrupted = True
+            end_us, gave_up = self.now_us, self._gave_up
+            code = self._end_station()
+            output.seek(0)
+            lines = output.read().splitlines()
+        for line in lines:
+            self._note(f"station: {line}")
+        if gave_up and not interrupted:
+            raise LabError(f"the station ended with {code}: {lines[-1] if lines else 'no output'}")
+        return Outcome(end_us, self.lost, interrupted)
+
+    def _record(self, now_us: int) -> None:
+        """Take a row, and notice the release and the end."""
+        if self._over:
+            return
+        self._server.events.at(now_us + RECORD_PERIOD_US, self._record)
+        self.lost = self._board.look(now_us)
+        if self.recorder is not None:
+            self.recorder.row(now_us)
+        if self._progress is not None and now_us // RECORD_PERIOD_US % PROGRESS_ROWS == 0:
+            self._progress(now_us)
+        if not self._released and self._board.free:
+            self._released = True
+            self.end_us = now_us + self._duration_us
+        self._gave_up = self._station.poll() is not None or (
+            not self._released and now_us >= RELEASE_TIMEOUT_US
+        )
+        self._over = self._gave_up or self.lost is not None or now_us >= self.end_us
+
+    def _end_station(self) -> int:
+        """Let the station leave in order, with the board still there, or kill it."""
+        self._station.terminate()
+        deadline_us = self.now_us + STATION_EXIT_TIMEOUT_US
+        try:
+            self._server.run(lambda: self._station.poll() is not None or self.now_us >= deadline_us)
+        finally:
+            self._station.kill()
+        return self._station.wait()
+
+    def _note(self, text: str) -> None:
+        if self.recorder is not None:
+            self.recorder.note(self.now_us, "lab", text)
+
+    def close(self) -> None:
+        """Close what the flight itself opened."""
+        self._poses.close()
+        self._server.close()
+
+
+def _free_port() -> int:
+    """Return a UDP port of the loopback interface that nobody uses now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,78 @@
+"""`floaty board serve` as a process of its own, for the tests of what talks to it."""
+
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+START_TIMEOUT_S = 60.0
+
+
+@dataclass
+class Served:
+    """A running server and what it said so far."""
+
+    process: "subprocess.Popen[bytes]"
+    lines: list[str] = field(default_factory=list)
+    _rest: bytes = b""
+
+    @property
+    def radio_uris(self) -> list[str]:
+        return self._line("radio ")
+
+    @property
+    def udp_uris(self) -> list[str]:
+        return self._line("udp ")
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What the printed line says to put before a program's name."""
+        words = self._line("use ")
+        return {**os.environ, **dict(word.split("=", 1) for word in words if "=" in word)}
+
+    def _line(self, start: str) -> list[str]:
+        return next(line for line in self.lines if line.startswith(start)).split()[1:]
+
+    def wait_for(self, pattern: str, timeout_s: float) -> str:
+        """The first line, from now or before, that matches."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            for line in self.lines:
+                if re.search(pattern, line):
+                    return line
+            ready, _, _ = select.select([self.process.stdout], [], [], max(0.0, deadline - time.monotonic()))
+            assert ready, f"no line {pattern!r} within {timeout_s} s: {self.lines}"
+            data = os.read(self.process.stdout.fileno(), 65536)
+            assert data, f"the server ended: {self.lines}"
+            *lines, self._rest = (self._rest + data).split(b"\n")
+            self.lines += [line.decode() for line in lines]
+
+    def forget(self) -> None:
+        """Let `wait_for` look only at what comes from now on."""
+        self.lines = [line for line in self.lines if line.split()[:1] in (["radio"], ["udp"], ["use"])]
+
+    def interrupt(self) -> int:
+        """Press Ctrl-C and return the exit code."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(timeout=20)
+
+
+@contextmanager
+def serve(*arguments: str) -> Iterator[Served]:
+    """A server on free ports."""
+    command = [sys.executable, "-m", "hil.cli", "board", "serve", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    served = Served(process)
+    try:
+        served.wait_for("^serving", START_TIMEOUT_S)
+        yield served
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()

@@ -1,0 +1,393 @@
+"""`floaty board serve` and unmodified cflib: by radio with and without losses, by UDP, in this and in other processes."""
+
+import gc
+import random
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import cflib.crtp
+import libusb_package
+import pytest
+from cflib.bootloader import Bootloader, FlashArtifact, Target
+from cflib.bootloader.boottypes import TargetTypes
+from cflib.crazyflie import Crazyflie
+from cflib.crazyflie.log import LogConfig
+from cflib.crazyflie.mem import MemoryElement
+from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
+from cflib.crtp.radiodriver import RadioManager
+from cflib.utils.encoding import compress_quaternion
+from cflib.utils.power_switch import PowerSwitch
+from serving import Served, serve
+
+from hil.dongle_plugin import VARIABLE, Backend
+
+PATIENCE_S = 30.0
+
+
+class Client:
+    """A program with cflib: connected, in the end disconnected."""
+
+    def __init__(self, uri: str, cache: Path) -> None:
+        self.cf = Crazyflie(rw_cache=str(cache))
+        self.fully, self.gone, self.problem = threading.Event(), threading.Event(), ""
+        self.console, self._spoken = "", threading.Condition()
+        self.cf.fully_connected.add_callback(lambda _: self.fully.set())
+        self.cf.disconnected.add_callback(lambda _: self.gone.set())
+        self.cf.connection_failed.add_callback(lambda _, text: self._fail(text))
+        self.cf.console.receivedChar.add_callback(self._hear)
+        self.cf.open_link(uri)
+
+    def ready(self) -> "Client":
+        assert self.fully.wait(PATIENCE_S), "not fully connected"
+        assert self.problem == ""
+        return self
+
+    def _fail(self, text: str) -> None:
+        self.problem = text
+        self.fully.set()
+
+    def _hear(self, text: str) -> None:
+        with self._spoken:
+            self.console += text
+            self._spoken.notify()
+
+    def heard(self, text: str) -> bool:
+        """Whether the console says it, or has said it."""
+        with self._spoken:
+            return self._spoken.wait_for(lambda: text in self.console, PATIENCE_S)
+
+    def answer(self, ask: Callable[..., object], *arguments: object) -> tuple[object, ...]:
+        """What a callback of cflib is called with."""
+        done, answers = threading.Event(), []
+
+        def called(*values: object) -> None:
+            answers.append(values)
+            done.set()
+
+        ask(*arguments, called)
+        assert done.wait(PATIENCE_S)
+        return answers[0]
+
+    def set(self, name: str, value: float) -> float:
+        """Set a parameter and return what the board says it is now."""
+        done, answers = threading.Event(), []
+
+        def updated(_: str, text: str) -> None:
+            answers.append(float(text))
+            done.set()
+
+        self.cf.param.add_update_callback(*name.split("."), updated)
+        self.cf.param.set_value(name, value)
+        assert done.wait(PATIENCE_S)
+        self.cf.param.remove_update_callback(*name.split("."), updated)
+        return answers[0]
+
+    def rows(self, count: int, period_ms: int, *names: str) -> list[tuple[int, dict[str, float]]]:
+        block, rows, done = LogConfig("rows", period_ms), [], threading.Event()
+        for name in names:
+            block.add_variable(name)
+
+        def received(t_ms: int, values: dict[str, float], _: LogConfig) -> None:
+            rows.append((t_ms, values))
+            if len(rows) >= count:
+                done.set()
+
+        self.cf.log.add_config(block)
+        block.data_received_cb.add_callback(received)
+        block.start()
+        assert done.wait(PATIENCE_S), f"{len(rows)} of {count} rows"
+        block.stop()
+        return rows[:count]
+
+    def close(self) -> None:
+        self.cf.close_link()
+        assert self.gone.wait(PATIENCE_S)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("toc")
+
+
+def plug(served: Served) -> None:
+    """Put the dongle of a server into this process."""
+    backend = Backend(served.environment[VARIABLE])
+    libusb_package.get_libusb1_backend = lambda: backend
+    RadioManager._radios.clear()
+    if not cflib.crtp.CLASSES:
+        cflib.crtp.init_drivers()
+
+
+@pytest.fixture(scope="module", params=["0,0", "0.1,0.1"], ids=["no loss", "10 % loss"])
+def served(request: pytest.FixtureRequest) -> Iterator[Served]:
+    with serve(
+        "--radio", "--radio-port", "0", "--udp", "0", "--poses", "0", "--loss", request.param
+    ) as served:
+        plug(served)
+        yield served
+
+
+@pytest.fixture(params=["radio", "udp"])
+def uri(request: pytest.FixtureRequest, served: Served) -> str:
+    return getattr(served, f"{request.param}_uris")[0]
+
+
+def test_scanning_finds_the_board(served: Served) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # cflib leaves sockets of its UDP scan open
+        found = cflib.crtp.scan_interfaces()
+        gc.collect()
+    assert ["radio://0/80/2M", ""] in found
+
+
+def test_a_client_does_what_clients_do(uri: str, cache: Path) -> None:
+    client = Client(uri, cache).ready()
+    cf = client.cf
+    assert cf.platform.get_protocol_version() == 12
+
+    rows = client.rows(100, 10, "stateEstimate.x", "pm.vbat", "motor.m1")
+    steps = [later[0] - earlier[0] for earlier, later in pairwise(rows)]
+    assert steps == [10] * 99
+    assert all(values["pm.vbat"] == pytest.approx(3.9, abs=0.1) for _, values in rows)
+
+    assert client.set("extCtrl.z_P", 2.5) == 2.5
+    assert client.set("extCtrl.z_P", 99) == 2.5  # outside its range
+    assert client.set("extCtrl.z_P", 3.0) == 3.0
+
+    assert client.answer(app_echo, cf, bytes(range(30))) == (bytes(range(30)),)
+
+    (tester,) = cf.mem.get_mems(MemoryElement.TYPE_MEMORY_TESTER)
+    client.answer(tester.read_data, 5, 500)
+    assert tester.readValidationSuccess
+    client.answer(tester.write_data, 5, 500)
+    (eeprom,) = cf.mem.get_mems(MemoryElement.TYPE_I2C)
+    client.answer(eeprom.update)
+    assert (eeprom.valid, eeprom.elements["radio_address"]) == (True, 0xE7E7E7E7E7)
+    client.close()
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["extpose", "packed"])
+def test_poses_are_flown_and_their_end_is_announced(uri: str, cache: Path, packed: bool) -> None:
+    client = Client(uri, cache).ready()
+    goal, stop = (0.01, -0.02, 0.03), threading.Event()
+
+    def send() -> None:
+        while not stop.wait(0.02):
+            if packed:
+                packet = CRTPPacket()
+                packet.set_header(CRTPPort.LOCALIZATION, 1)
+                mm = (round(1000 * value) for value in goal)
+                packet.data = struct.pack("<BBhhhI", 9, 0xE7, *mm, compress_quaternion((0, 0, 0, 1)))
+                client.cf.send_packet(packet)
+            else:
+                client.cf.extpos.send_extpose(*goal, 0, 0, 0, 1)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "locSrv.poses")
+        rows = [values for _, values in client.rows(100, 10, *names)]
+    finally:
+        stop.set()
+        sender.join()
+    assert [rows[-1][name] for name in names[:3]] == pytest.approx(goal, abs=0.01)
+    assert 25 <= rows[-1]["locSrv.poses"] - rows[0]["locSrv.poses"] <= 50
+    assert client.heard("supervisor: failsafe, silence\n")
+    assert "supervisor: flying\n" in client.console
+    client.close()
+
+
+def app_echo(cf: Crazyflie, data: bytes, callback: Callable[[bytes], None]) -> None:
+    cf.appchannel.packet_received.add_callback(lambda packet: callback(bytes(packet)))
+    cf.appchannel.send_packet(data)
+
+
+def test_a_stored_parameter_survives_a_reboot_by_radio(served: Served, cache: Path) -> None:
+    uri = served.radio_uris[0]
+    client = Client(uri, cache).ready()
+    client.set("extCtrl.vz_P", 0.75)
+    client.set("extCtrl.yaw_P", 0.75)
+    assert client.answer(client.cf.param.persistent_store, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
+    client.close()
+    switch = PowerSwitch(uri)
+    switch.stm_power_down()
+    switch.stm_power_up()
+    switch.close()
+    again = Client(uri, cache).ready()
+    assert again.cf.param.get_value("extCtrl.vz_P") == "0.75"
+    assert float(again.cf.param.get_value("extCtrl.yaw_P")) != 0.75
+    assert again.answer(again.cf.param.persistent_clear, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
+    again.close()
+
+
+def test_flashing_is_byte_identical_and_the_board_comes_back(
+    served: Served, tmp_path: Path, cache: Path
+) -> None:
+    image = random.Random(7).randbytes(2 * 1024 + 77)
+    (tmp_path / "image.bin").write_bytes(image)
+    tool = Bootloader(served.radio_uris[0])
+    assert tool.start_bootloader(warm_boot=True)
+    for target, name, start in ((TargetTypes.STM32, "stm32", 16), (TargetTypes.NRF51, "nrf51", 88)):
+        tool._internal_flash(FlashArtifact(image, Target("cf2", name, "fw", [], []), None))
+        while tool._cload.link.receive_packet(1) is not None:  # cflib trips over a late answer
+            pass
+        assert b"".join(tool._cload.read_flash(target, start + n) for n in range(3))[: len(image)] == image
+    assert tool.reset_to_firmware()
+    tool.close()
+    Client(served.radio_uris[0], cache).ready().close()
+
+
+def test_a_board_that_is_off_or_left_in_its_bootloader_gets_its_button_pressed(
+    served: Served, cache: Path
+) -> None:
+    tool = Bootloader(served.radio_uris[0])
+    switch = PowerSwitch(served.radio_uris[0])
+    for leave in (lambda: tool.start_bootloader(warm_boot=True), switch.platform_power_down):
+        served.forget()
+        leave()
+        tool.close()
+        served.wait_for("board 1: power button pressed", PATIENCE_S)
+        served.wait_for("gyro zero", PATIENCE_S)
+    switch.close()
+    Client(served.radio_uris[0], cache).ready().close()
+
+
+def probe_for_ever(prober: socket.socket) -> None:
+    while True:
+        prober.send(b"\xff")
+        prober.recv(64)
+
+
+def test_the_board_can_be_switched_off_and_on_by_radio(served: Served, cache: Path) -> None:
+    switch = PowerSwitch(served.radio_uris[0])
+    host, port = served.udp_uris[0].removeprefix("udp://").split(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as prober:
+        prober.connect((host, int(port)))
+        prober.settimeout(PATIENCE_S)
+        prober.send(b"\xff")
+        assert prober.recv(64) == b"\xff"
+        served.forget()
+        switch.stm_power_down()
+        with pytest.raises(ConnectionRefusedError):  # a closed port
+            probe_for_ever(prober)
+        switch.stm_power_up()
+        served.wait_for("gyro zero", PATIENCE_S)
+        prober.send(b"\xff")
+        assert prober.recv(64) == b"\xff"
+    switch.close()
+    Client(served.radio_uris[0], cache).ready().close()
+
+
+def test_the_newest_udp_client_wins_and_a_prober_changes_nothing(served: Served) -> None:
+    host, port = served.udp_uris[0].removeprefix("udp://").split(":")
+    echo = b"\xf0" + bytes(9)  # a ping of cflib's
+    with (
+        socket.create_server(("127.0.0.1", 0)),
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as old,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as new,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as prober,
+    ):
+        for client in (old, new, prober):
+            client.connect((host, int(port)))
+            client.settimeout(PATIENCE_S)
+        old.send(echo)
+        assert old.recv(64)[1:] == bytes(9)
+        prober.send(b"\xff")
+        assert prober.recv(64) == b"\xff"
+        old.send(echo)
+        assert old.recv(64)[1:] == bytes(9)
+        new.send(echo)
+        assert new.recv(64)[1:] == bytes(9)
+        old.send(echo)  # displaced: ignored
+        new.send(echo)
+        assert new.recv(64)[1:] == bytes(9)
+        old.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            old.recv(64)
+
+
+def test_a_program_in_another_process_needs_only_the_printed_line(served: Served) -> None:
+    program = "import cflib.crtp as c; c.init_drivers(); print(c.get_interfaces_status()['radio'])"
+    shown = subprocess.run(
+        [sys.executable, "-c", program],
+        env=served.environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert shown.stdout == "Crazyradio version 5.4\n"
+
+
+def test_the_pytest_plugin_does_the_same(served: Served, tmp_path: Path) -> None:
+    (tmp_path / "test_it.py").write_text(
+        "from cflib.drivers.crazyradio import get_serials\ndef test_it(): assert get_serials() == ('F10A7Y0001',)\n"
+    )
+    environment = {**served.environment, "PYTHONPATH": ""}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "hil.dongle_plugin", str(tmp_path)]
+    shown = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert shown.returncode == 0, shown.stdout
+
+
+def test_without_a_server_there_is_no_dongle() -> None:
+    assert list(Backend("127.0.0.1:9").enumerate_devices()) == []
+
+
+def test_ten_boards_on_one_dongle(cache: Path) -> None:
+    with serve("--radio", "--radio-port", "0", "--boards", "10", "--poses", "0") as served:
+        plug(served)
+        Client(served.radio_uris[0], cache).ready().close()  # fills the cache
+        clients = [Client(uri, cache) for uri in served.radio_uris]
+        assert len(clients) == 10
+        for client in clients:
+            client.ready()
+        for client in clients:
+            assert len(client.rows(10, 20, "stateEstimate.z", "pm.vbat")) == 10
+        closing = [threading.Thread(target=client.close) for client in clients]
+        for thread in closing:
+            thread.start()
+        for thread in closing:
+            thread.join(PATIENCE_S)
+        assert all(client.gone.is_set() for client in clients)
+
+
+def test_the_built_in_station_flies_and_ctrl_c_ends_in_order() -> None:
+    with serve("--udp", "0", "--poses", "0", "--station") as served:
+        served.wait_for("board 1: released", PATIENCE_S)
+        assert served.interrupt() == 0
+        served.wait_for("^stopped", PATIENCE_S)
+        assert not any("lost" in line for line in served.lines)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--loss", "0.1"], "--loss 0.1: expected UP,DOWN"),
+        (["--loss", "2,0"], "radio.uplink_loss = 2"),
+        (["--boards", "11"], "11"),
+        (["--udp", "65530", "--boards", "10"], "--udp 65530"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_two(arguments: list[str], message: str) -> None:
+    command = [sys.executable, "-m", "hil.cli", "board", "serve", *arguments]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert shown.returncode == 2
+    assert message in shown.stderr
+    assert shown.stderr.count("\n") == 1
+
+
+def test_a_taken_port_is_one_line_and_exit_code_two() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        command = [sys.executable, "-m", "hil.cli", "board", "serve", "--udp", str(port)]
+        shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert shown.returncode == 2
+    assert shown.stderr == f"floaty: udp port {port}: Address already in use\n"

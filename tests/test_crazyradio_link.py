@@ -1,0 +1,198 @@
+"""The ground station over cflib: `floaty station` and `floaty fly --link` as a user starts them."""
+
+import csv
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cflib.crtp
+import libusb_package
+import pytest
+from cflib.crtp.radiodriver import RadioManager
+from cflib.utils.power_switch import PowerSwitch
+from serving import Served, serve
+
+from ground_station.mocap import MocapFrame
+from ground_station.mocap_udp import PoseReceiver, decode_frame, encode_frame
+from hil.dongle_plugin import VARIABLE, Backend
+
+FLOATY = (sys.executable, "-m", "hil.cli")
+URI = "radio://0/80/2M/E7E7E7E7E7"
+PATIENCE_S = 40.0
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def station(environment: dict[str, str], *arguments: str) -> "subprocess.CompletedProcess[str]":
+    command = [*FLOATY, "station", *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+
+
+def without_dongle() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": "", VARIABLE: "127.0.0.1:9"}
+
+
+def with_absent_dongle() -> dict[str, str]:
+    from hil.linked_flight import SITE
+
+    return {**without_dongle(), "PYTHONPATH": str(SITE)}
+
+
+def refused(shown: "subprocess.CompletedProcess[str]", begin_s: float, message: str) -> None:
+    assert time.monotonic() - begin_s < 10.0
+    assert shown.returncode == 2
+    assert message in shown.stderr
+    assert shown.stderr.startswith("floaty: ")
+    assert (shown.stdout, shown.stderr.count("\n")) == ("", 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--link", URI], "Cannot find a Crazyradio Dongle"),
+        (["--link", "radio://0/80/3M/E7E7E7E7E7"], "radio://0/80/3M/E7E7E7E7E7: expected radio://"),
+        (["--link", "udp://127.0.0.1"], "udp://127.0.0.1: expected radio://"),
+        (["--link", "carrier-pigeon://coop"], "expected radio://"),
+        (["--link", URI, "--mocap", "optitrack"], "--mocap optitrack: expected virtual"),
+        (["--link", URI, "--trajectory", "loop"], "experiment 'loop': unknown"),
+        (["--link", URI, "--log", "/nowhere/log.csv"], "--log /nowhere/log.csv: No such file"),
+    ],
+)
+def test_what_cannot_work_is_one_line_within_ten_seconds(arguments: list[str], message: str) -> None:
+    begin_s = time.monotonic()
+    if "--mocap" not in arguments:
+        arguments = [*arguments, "--mocap", f"virtual:{free_port()}"]
+    refused(station(with_absent_dongle(), *arguments), begin_s, message)
+
+
+@pytest.mark.parametrize(
+    "answer", [None, b"\xf1" + b"Something else    ".ljust(30, b"\0")], ids=["silent", "alien"]
+)
+def test_a_peer_that_is_no_board_is_one_line_within_ten_seconds(answer: bytes | None) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        peer.settimeout(PATIENCE_S)
+        uri = f"udp://127.0.0.1:{peer.getsockname()[1]}"
+        begin_s = time.monotonic()
+        command = [*FLOATY, "station", "--link", uri, "--mocap", f"virtual:{free_port()}"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        _, client = peer.recvfrom(64)
+        if answer is not None:
+            peer.sendto(answer, client)
+        out, error = process.communicate(timeout=60)
+    shown = subprocess.CompletedProcess(command, process.returncode, out, error)
+    refused(shown, begin_s, f"{uri}: {'no answer within 4 s' if answer is None else 'wrong protocol'}")
+
+
+def test_a_port_without_a_board_is_one_line_within_ten_seconds() -> None:
+    begin_s = time.monotonic()
+    uri = f"udp://127.0.0.1:{free_port()}"
+    refused(station(without_dongle(), "--link", uri, "--mocap", f"virtual:{free_port()}"), begin_s, uri)
+
+
+def test_a_pose_survives_its_datagram() -> None:
+    frame = MocapFrame(123_456_789, (1.0, -2.0, 3.0), (0.5, -0.5, 0.5, -0.5), True)
+    assert decode_frame(encode_frame(frame)) == frame
+
+
+def test_no_pose_is_no_datagram() -> None:
+    receiver = PoseReceiver(0)
+    assert receiver.receive(0.01) is None
+    receiver.close()
+
+
+def start_station(served: Served, uri: str, poses: int, *arguments: str) -> Served:
+    command = [*FLOATY, "station", "--link", uri, "--mocap", f"virtual:{poses}", *arguments]
+    return Served(
+        subprocess.Popen(command, env=served.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    )
+
+
+def finish(station: Served) -> int:
+    """Press Ctrl-C and read to the end."""
+    station.process.send_signal(signal.SIGINT)
+    out, _ = station.process.communicate(timeout=30)
+    station.lines += out.decode().splitlines()
+    return station.process.returncode
+
+
+def test_it_flies_reconnects_after_a_reboot_and_leaves_the_board_in_failsafe(tmp_path: Path) -> None:
+    poses = free_port()
+    with serve("--radio", "--radio-port", "0", "--poses", str(poses), "--loss", "0.1,0.1") as served:
+        log = tmp_path / "telemetry.csv"
+        station = start_station(served, URI, poses, "--log", str(log))
+        try:
+            served.wait_for("board 1: released", PATIENCE_S)
+            backend = Backend(served.environment[VARIABLE])
+            libusb_package.get_libusb1_backend = lambda: backend
+            RadioManager._radios.clear()
+            if not cflib.crtp.CLASSES:
+                cflib.crtp.init_drivers()
+            served.forget()
+            switch = PowerSwitch(URI)
+            switch.stm_power_down()
+            switch.stm_power_up()
+            switch.close()
+            station.wait_for("lost: .*connecting again", PATIENCE_S)
+            served.wait_for("board 1: released", PATIENCE_S)
+            served.forget()
+            assert finish(station) == 0
+            served.wait_for("failsafe, silence", PATIENCE_S)
+        finally:
+            station.process.kill()
+            station.process.wait()
+    assert station.lines[-1] == "the board is in failsafe, flaps at hover"
+    assert sum(line.startswith("connected to ") for line in station.lines) == 2
+    with log.open() as file:
+        rows = list(csv.DictReader(file))
+    flown = [row for row in rows if row["supervisor.state []"] == "2"]
+    assert len(flown) > 100
+    errors = [abs(float(row["stateEstimate.x [m]"])) for row in flown]
+    assert max(errors) < 0.2
+    complete = [row for row in flown if "nan" not in row.values()]
+    assert len(complete) / len(flown) > 0.9
+
+
+def fly(folder: Path, *arguments: str) -> dict[str, object]:
+    command = [*FLOATY, "fly", "hover", "--duration", "8", "--out", str(folder), *arguments]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert shown.returncode == 0, shown.stdout + shown.stderr
+    return json.loads((folder / "result.json").read_text())
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_hover_over_the_virtual_dongle_holds_its_limits_in_real_time(tmp_path: Path, loss: float) -> None:
+    losses = (f"--set=radio.uplink_loss={loss}", f"--set=radio.downlink_loss={loss}")
+    result = fly(tmp_path / "run", "--link", URI, *losses)
+    assert result["passed"]
+    assert result["metrics"]["flown"] == pytest.approx(8.0, abs=0.1)
+    assert 0.1 < result["real_time_factor"] < 1.1
+    assert len((tmp_path / "run" / "telemetry.csv").read_text().splitlines()) > 300
+
+
+def test_hover_over_udp_holds_its_limits_in_real_time(tmp_path: Path) -> None:
+    assert fly(tmp_path / "run", "--link", f"udp://127.0.0.1:{free_port()}")["passed"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--link", "radio://0/81/2M/E7E7E7E7E7"], "the virtual board is at radio://0/80/2M/E7E7E7E7E7"),
+        (["--link", URI, "--seeds", "2"], "--seeds 2"),
+    ],
+)
+def test_fly_refuses_a_link_that_leads_nowhere(tmp_path: Path, arguments: list[str], message: str) -> None:
+    command = [*FLOATY, "fly", "hover", "--out", str(tmp_path / "run"), *arguments]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert shown.returncode == 2
+    assert message in shown.stderr
+    assert len(shown.stderr.strip().splitlines()) == 1
