@@ -214,6 +214,13 @@ def _test_subjects(running: Running) -> Iterator[Parameter]:
     yield Parameter("memTst.resetW", U8, "", lambda: 0, lambda value: setattr(tester, "errors", 0), 0, 255)
 
 
+# Decks that clients look for; a Crazyflie's firmware has a parameter for every deck that it knows.
+ABSENT_DECKS = (
+    "bcAI", "bcBuzzer", "bcColorLedBot", "bcColorLedTop", "bcDWM1000", "bcFlow", "bcFlow2", "bcLedRing",
+    "bcLighthouse4", "bcLoco", "bcMultiranger", "bcUSD", "bcZRanger", "bcZRanger2",
+)  # fmt: skip
+
+
 def _identity() -> Iterator[Parameter]:
     """What the board is; read only."""
     for name, scalar, value in (
@@ -221,6 +228,7 @@ def _identity() -> Iterator[Parameter]:
         ("stabilizer.estimator", U8, 2),  # Kalman
         ("stabilizer.controller", U8, 0),  # the only one
         ("deck.bcFloaty", U8, 1),
+        *((f"deck.{name}", U8, 0) for name in ABSENT_DECKS),
         ("imu_sensors.BMI088", U8, 1),
         ("imu_sensors.BMP3XX", U8, 0),
         ("imu_sensors.HMC5883L", U8, 0),

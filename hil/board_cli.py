@@ -31,8 +31,9 @@ def board() -> None:
 )  # fmt: skip
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option(
-    "--loss", metavar="UP,DOWN", help="Share of packets lost per direction, 0..1 [default: profile]."
-)
+    "--faults", metavar="NAME=VALUE,...",
+    help="Faults of the radio: loss, uplink_loss, downlink_loss, bit_error_rate (0..1), jitter_us.",
+)  # fmt: skip
 @click.option("--station", is_flag=True, help="Fly with the built-in ground station.")
 @click.option(
     "--poses", type=click.IntRange(0, 65535), default=POSE_PORT, show_default=True, metavar="PORT",
@@ -50,7 +51,7 @@ def serve(
     radio: bool,
     radio_port: int,
     boards: int,
-    loss: str | None,
+    faults: str | None,
     station: bool,
     poses: int,
     seed: int,
@@ -69,7 +70,7 @@ def serve(
             raise LabError(f"{option} {first}: there are no {boards} ports from there on")
     from hil.config import load_config
 
-    config = load_config(profile, (*overrides, *_losses(loss)))
+    config = load_config(profile, (*overrides, *_fault_overrides(faults)))
     from ground_station.mocap_udp import PosePublisher
     from hil.board_server import BoardServer
     from hil.cli import announce_compilation
@@ -194,14 +195,24 @@ def radio_hint(address: str, uris: list[str]) -> str:
     return f"radio  {' '.join(uris)}\nuse    env PYTHONPATH={shlex.quote(str(folder))} FLOATY_DONGLE={address} PROGRAM"
 
 
-def _losses(loss: str | None) -> tuple[str, ...]:
-    """Return the overrides for --loss."""
-    if loss is None:
-        return ()
-    parts = loss.split(",")
-    if len(parts) != 2:
-        raise LabError(f"--loss {loss}: expected UP,DOWN, for example 0.1,0.1")
-    return f"radio.uplink_loss={parts[0].strip()}", f"radio.downlink_loss={parts[1].strip()}"
+FAULTS = {
+    "loss": ("uplink_loss", "downlink_loss"),
+    "uplink_loss": ("uplink_loss",),
+    "downlink_loss": ("downlink_loss",),
+    "bit_error_rate": ("bit_error_rate",),
+    "jitter_us": ("usb_jitter_us",),
+}
+
+
+def _fault_overrides(faults: str | None) -> tuple[str, ...]:
+    """Return the overrides of the profile for --faults."""
+    overrides: list[str] = []
+    for fault in faults.split(",") if faults else ():
+        name, equals, value = (part.strip() for part in fault.partition("="))
+        if not equals or name not in FAULTS:
+            raise LabError(f"--faults {fault}: expected NAME=VALUE with a name out of {', '.join(FAULTS)}")
+        overrides += [f"radio.{key}={value}" for key in FAULTS[name]]
+    return tuple(overrides)
 
 
 def _say(text: str) -> None:

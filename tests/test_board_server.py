@@ -125,10 +125,10 @@ def plug(served: Served) -> None:
         cflib.crtp.init_drivers()
 
 
-@pytest.fixture(scope="module", params=["0,0", "0.1,0.1"], ids=["no loss", "10 % loss"])
+@pytest.fixture(scope="module", params=["loss=0", "loss=0.1"], ids=["no loss", "10 % loss"])
 def served(request: pytest.FixtureRequest) -> Iterator[Served]:
     with serve(
-        "--radio", "--radio-port", "0", "--udp", "0", "--poses", "0", "--loss", request.param
+        "--radio", "--radio-port", "0", "--udp", "0", "--poses", "0", "--faults", request.param
     ) as served:
         plug(served)
         yield served
@@ -369,8 +369,9 @@ def test_the_built_in_station_flies_and_ctrl_c_ends_in_order() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--loss", "0.1"], "--loss 0.1: expected UP,DOWN"),
-        (["--loss", "2,0"], "radio.uplink_loss = 2"),
+        (["--faults", "loss"], "--faults loss: expected NAME=VALUE"),
+        (["--faults", "los=0.1"], "out of loss, uplink_loss"),
+        (["--faults", "uplink_loss=2,downlink_loss=0"], "radio.uplink_loss = 2"),
         (["--boards", "11"], "11"),
         (["--udp", "65530", "--boards", "10"], "--udp 65530"),
     ],

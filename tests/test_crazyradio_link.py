@@ -127,7 +127,9 @@ def finish(station: Served) -> int:
 
 def test_it_flies_reconnects_after_a_reboot_and_leaves_the_board_in_failsafe(tmp_path: Path) -> None:
     poses = free_port()
-    with serve("--radio", "--radio-port", "0", "--poses", str(poses), "--loss", "0.1,0.1") as served:
+    with serve(
+        "--radio", "--radio-port", "0", "--poses", str(poses), "--faults", "uplink_loss=0.1,downlink_loss=0.1"
+    ) as served:
         log = tmp_path / "telemetry.csv"
         station = start_station(served, URI, poses, "--log", str(log))
         try:
