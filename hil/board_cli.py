@@ -32,7 +32,7 @@ def board() -> None:
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option(
     "--faults", metavar="NAME=VALUE,...",
-    help="Faults of the radio: loss, uplink_loss, downlink_loss, bit_error_rate (0..1), jitter_us.",
+    help="Faults of the radio: loss, bit_error_rate (0..1), jitter_us; with uplink_ or downlink_ for one direction.",
 )  # fmt: skip
 @click.option("--station", is_flag=True, help="Fly with the built-in ground station.")
 @click.option(
@@ -196,11 +196,10 @@ def radio_hint(address: str, uris: list[str]) -> str:
 
 
 FAULTS = {
-    "loss": ("uplink_loss", "downlink_loss"),
-    "uplink_loss": ("uplink_loss",),
-    "downlink_loss": ("downlink_loss",),
-    "bit_error_rate": ("bit_error_rate",),
-    "jitter_us": ("usb_jitter_us",),
+    name: keys
+    for fault in ("loss", "bit_error_rate", "jitter_us")
+    for up, down in [(f"uplink_{fault}", f"downlink_{fault}")]
+    for name, keys in ((fault, (up, down)), (up, (up,)), (down, (down,)))
 }
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from hil.events import EventQueue
 from hil.nrf51 import Nrf51, RadioSettings
-from hil.virtual_radio import FRAME_BITS, MAX_PACKET, RETRIES, TURN_ROUND_US, RadioConfig, air_us
+from hil.virtual_radio import MAX_PACKET, RETRIES, TURN_ROUND_US, RadioConfig, air_us, packet_loss
 
 Answer = Callable[[int, bytes], None]  # (now_us, what the host reads from the dongle)
 
@@ -84,11 +84,11 @@ class VirtualDongle:
             self._give_up(now_us + 2 * self._config.usb_us + (self._retries + 1) * again_us, answer)
             return
         exchange = _Exchange(packet, board, answer, again_us, self._retries + 1)
-        self._try(now_us + heard_us, exchange)
+        self._try(now_us + heard_us + self._jitter_us(self._config.uplink_jitter_us), exchange)
 
     def _try(self, heard_us: int, exchange: _Exchange) -> None:
         """Repeat the packet until the board hears it."""
-        loss = self._loss(self._config.uplink_loss, len(exchange.packet))
+        loss = packet_loss(self._config.uplink_loss, self._config.uplink_bit_error_rate, len(exchange.packet))
         while exchange.tries_left:
             exchange.tries_left -= 1
             exchange.tries += 1
@@ -106,12 +106,14 @@ class VirtualDongle:
         payload = exchange.board.hear(now_us, exchange.packet)
         if not self._acks:
             return
-        if self._happens(self._loss(self._config.downlink_loss, len(payload))):
+        if self._happens(
+            packet_loss(self._config.downlink_loss, self._config.downlink_bit_error_rate, len(payload))
+        ):
             self._try(now_us + exchange.again_us, exchange)
             return
         retries = exchange.tries - 1
         self.counters.retried += retries
-        jitter_us = int(self._rng.random() * self._config.usb_jitter_us)
+        jitter_us = self._jitter_us(self._config.usb_jitter_us + self._config.downlink_jitter_us)
         back_us = TURN_ROUND_US + air_us(len(payload), self._settings.bits_per_second) + self._config.usb_us
         status = bytes((ACKNOWLEDGED | retries << 4,))
         self._events.at(now_us + back_us + jitter_us, lambda t_us: exchange.answer(t_us, status + payload))
@@ -121,9 +123,8 @@ class VirtualDongle:
         if self._acks:
             self._events.at(at_us, lambda now_us: answer(now_us, NOT_ACKNOWLEDGED))
 
-    def _loss(self, loss: float, size: int) -> float:
-        """The chance that a packet is lost as a whole or by a wrong bit."""
-        return 1.0 - (1.0 - loss) * (1.0 - self._config.bit_error_rate) ** (FRAME_BITS + 8 * size)
+    def _jitter_us(self, limit_us: int) -> int:
+        return int(self._rng.random() * limit_us) if limit_us else 0
 
     def _happens(self, chance: float) -> bool:
         return chance > 0.0 and self._rng.random() < chance

@@ -64,12 +64,24 @@ class RadioConfig(BaseModel):
     downlink_loss: float = Field(
         0.01, ge=0, le=1, description="answers lost on the air, per try [1]; estimate"
     )
-    bit_error_rate: float = Field(0.0, ge=0, le=1, description="wrong bits [1]; the CRC makes them losses")
+    uplink_bit_error_rate: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="wrong bits up, as by interference [1]; the CRC makes them losses; a fault",
+    )
+    downlink_bit_error_rate: float = Field(0.0, ge=0, le=1, description="wrong bits down [1]; a fault")
     uplink_jitter_us: int = Field(
         0,
         ge=0,
         le=1_000_000,
         description="delay ahead of the host's queue, uniform from 0, order kept [us]; a fault",
+    )
+    downlink_jitter_us: int = Field(
+        0,
+        ge=0,
+        le=1_000_000,
+        description="delay of every answer on its way to the host, uniform from 0 [us]; a fault",
     )
 
 
@@ -111,6 +123,13 @@ def exchange_us(up_size: int, down_size: int, bits_per_second: int) -> int:
     return 2 * TURN_ROUND_US + air_us(up_size, bits_per_second) + air_us(down_size, bits_per_second)
 
 
+def packet_loss(loss: float, bit_error_rate: float, size: int) -> float:
+    """The chance that a packet with `size` bytes of payload is lost as a whole or by a wrong bit."""
+    if not bit_error_rate:
+        return loss
+    return 1.0 - (1.0 - loss) * (1.0 - bit_error_rate) ** (FRAME_BITS + 8 * size)
+
+
 @dataclass(slots=True)
 class _Waiting:
     """A packet in a queue; queues are first in, first out."""
@@ -123,14 +142,17 @@ class _Waiting:
 class VirtualRadio:
     """Carries packets of 1..32 bytes both ways; `connect` it before use.
 
-    Faults are plain attributes: `uplink_loss`, `downlink_loss`, `bit_error_rate` (0..1), `uplink_jitter_us`.
+    Faults are plain attributes: `uplink_loss`, `downlink_loss`, `uplink_bit_error_rate`,
+    `downlink_bit_error_rate` (0..1), `uplink_jitter_us`, `downlink_jitter_us`.
     """
 
     def __init__(self, config: RadioConfig, events: EventQueue, rng: np.random.Generator) -> None:
         self.uplink_loss = config.uplink_loss
         self.downlink_loss = config.downlink_loss
-        self.bit_error_rate = config.bit_error_rate
+        self.uplink_bit_error_rate = config.uplink_bit_error_rate
+        self.downlink_bit_error_rate = config.downlink_bit_error_rate
         self.uplink_jitter_us = config.uplink_jitter_us
+        self.downlink_jitter_us = config.downlink_jitter_us
         self.up = DirectionCounters()
         self.down = DirectionCounters()
         self.air = AirCounters()
@@ -225,8 +247,8 @@ class VirtualRadio:
         length_us = host_us + exchange_us(POLL_BYTES, EMPTY_ACK_BYTES, config.bits_per_second)
         since_us, answered = self._idle_since_us, True
         if t_us >= since_us + length_us:
-            heard = 1.0 - self._loss(self.uplink_loss, POLL_BYTES)
-            lost = 1.0 - heard * (1.0 - self._loss(self.downlink_loss, EMPTY_ACK_BYTES))
+            heard = 1.0 - self._up_loss(POLL_BYTES)
+            lost = 1.0 - heard * (1.0 - self._down_loss(EMPTY_ACK_BYTES))
             if lost:
                 lengths, weights, total = _polls_met(lost, length_us, host_us, self._again_us[POLL_BYTES])
                 rest, kind = self._uniform() * total, 0
@@ -243,7 +265,7 @@ class VirtualRadio:
         """Try until the board hears the packet."""
         self.air.exchanges += 1
         size = self._up_size()
-        again_us, loss = self._again_us[size], self._loss(self.uplink_loss, size)
+        again_us, loss = self._again_us[size], self._up_loss(size)
         self._given_up_us = start_us + 2 * self._config.usb_us + (RETRIES + 1) * again_us + self._usb_jitter()
         for failed in range(RETRIES + 1):
             if not self._happens(loss):
@@ -262,7 +284,7 @@ class VirtualRadio:
             self._downloading = True
         size = self._up_size()
         ack_size = len(self._down_queue[0].data) if self._downloading else EMPTY_ACK_BYTES
-        loss, ack_loss = self._loss(self.uplink_loss, size), self._loss(self.downlink_loss, ack_size)
+        loss, ack_loss = self._up_loss(size), self._down_loss(ack_size)
         for failed in range(self._tries_left + 1):
             heard = failed == 0 or not self._happens(loss)
             if heard and not self._happens(ack_loss):
@@ -302,14 +324,14 @@ class VirtualRadio:
         return POLL_BYTES if self._uploading is None else len(self._uploading.data)
 
     def _usb_jitter(self) -> int:
-        jitter_us = self._config.usb_jitter_us
+        jitter_us = self._config.usb_jitter_us + self.downlink_jitter_us
         return int(self._uniform() * jitter_us) if jitter_us else 0
 
-    def _loss(self, loss: float, size: int) -> float:
-        """The chance that a packet is lost as a whole or by a wrong bit."""
-        if not self.bit_error_rate:
-            return loss
-        return 1.0 - (1.0 - loss) * (1.0 - self.bit_error_rate) ** (FRAME_BITS + 8 * size)
+    def _up_loss(self, size: int) -> float:
+        return packet_loss(self.uplink_loss, self.uplink_bit_error_rate, size)
+
+    def _down_loss(self, size: int) -> float:
+        return packet_loss(self.downlink_loss, self.downlink_bit_error_rate, size)
 
     def _happens(self, chance: float) -> bool:
         return chance > 0.0 and self._uniform() < chance

@@ -182,7 +182,7 @@ def cflib_host(bench: Bench) -> Iterator[bytes | None]:
     [(0.0, 0.0, 0.0), (0.1, 0.1, 0.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, 0.3, 1e-3)],
 )
 def test_safelink_brings_everything_once_and_in_order(up: float, down: float, ber: float) -> None:
-    bench = Bench(uplink_loss=up, downlink_loss=down, bit_error_rate=ber)
+    bench = Bench(uplink_loss=up, downlink_loss=down, uplink_bit_error_rate=ber, downlink_bit_error_rate=ber)
     host = cflib_host(bench)
     next(host)
     sent_up = [struct.pack("<BH", 0x10, n) for n in range(300)]
@@ -210,7 +210,7 @@ def test_losses_are_those_that_were_asked_for() -> None:
 
 def test_bit_errors_cost_long_packets_more_than_short_ones() -> None:
     def share(size: int) -> float:
-        bench = Bench(bit_error_rate=2e-3)
+        bench = Bench(uplink_bit_error_rate=2e-3, downlink_bit_error_rate=2e-3)
         bench.dongle.control(0x06, 0, b"")
         return sum(bench.exchange(bytes([0x10] * size)) != b"\x00" for _ in range(2000)) / 2000
 

@@ -134,7 +134,7 @@ def test_loss_follows_the_geometric_law(loss):
 
 
 def test_wrong_bits_are_losses_by_the_length_of_the_packet():
-    bench = Bench(**QUIET | {"bit_error_rate": 1e-3})
+    bench = Bench(**QUIET | {"uplink_bit_error_rate": 1e-3, "downlink_bit_error_rate": 1e-3})
     bench.pose_every(100, 20_000)
     bench.events.run(2_000_000)
     air = bench.radio.air
@@ -276,3 +276,21 @@ def test_packets_that_the_radio_cannot_carry_are_refused(size):
         bench.radio.uplink(0, bytes(size))
     with pytest.raises(ValueError, match=r"1\.\.32"):
         bench.radio.downlink(0, bytes(size))
+
+
+def test_downlink_jitter_delays_answers_and_keeps_their_order() -> None:
+    calm, shaken = Bench(**QUIET), Bench(**QUIET | {"downlink_jitter_us": 20_000})
+    for bench in (calm, shaken):
+        for number in range(4):
+            assert bench.radio.downlink(bench.events.now_us, bytes((number,)))
+        bench.events.run(1_000_000)
+        assert bench.radio.down.delivered == 4
+    assert shaken.radio.down.latency_max_us > calm.radio.down.latency_max_us + 5_000
+
+
+def test_interference_of_one_direction_leaves_the_other_alone() -> None:
+    bench = Bench(**QUIET | {"downlink_bit_error_rate": 1.0})
+    bench.radio.uplink(0, b"pose")
+    bench.events.run(100_000)
+    assert bench.radio.up.delivered == 1  # heard once, though no answer ever arrives
+    assert bench.radio.air.unanswered > 0
