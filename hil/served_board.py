@@ -19,6 +19,7 @@ from ground_station.station import GroundStation
 from ground_station.trajectory import Goal, Hold
 from hil.config import LabConfig
 from hil.dongle_server import Readers
+from hil.errors import LabError
 from hil.events import EventQueue
 from hil.harness import IMU_PERIOD_US, Streams
 from hil.nrf51 import Nrf51, Power, RadioSettings
@@ -35,6 +36,7 @@ HOLD_US = 1_000_000  # flying in the holder before the release
 BUTTON_US = 5_000_000  # off, or in the bootloader with nobody talking to it: then somebody presses the button
 PUT_BACK_US = 1_000_000  # after a loss
 WATCH_PERIOD_US = 100_000
+UDP_RETRY_US = 500_000
 FLYING = "FLYING"  # the supervisor's state
 
 Publish = Callable[[MocapFrame, int], None]  # (frame, now_us)
@@ -61,6 +63,7 @@ class ServedBoard:
         self.number = number
         self.free = False
         self.udp: UdpServer | None = None
+        self._udp_awaited = False  # somebody else has the port
         self._config = config
         self._events = events
         self._say = say
@@ -133,8 +136,23 @@ class ServedBoard:
         self._board = board
         self._firmware = Firmware(self._config, board)
         board.run_on(self._firmware.kernel, EventQueue())
-        if self.udp is not None:
+        self._open_udp(now_us)
+
+    def _open_udp(self, now_us: int) -> None:
+        """Listen again; while the board was off, another program may have taken the port: then try until it is free."""
+        if self.udp is None or self._firmware is None:
+            return
+        try:
             self.udp.open()
+        except LabError as error:
+            if not self._udp_awaited:
+                self._say(f"board {self.number}: {error}; trying again")
+            self._udp_awaited = True
+            self._events.at(now_us + UDP_RETRY_US, self._open_udp)
+            return
+        if self._udp_awaited:
+            self._udp_awaited = False
+            self._say(f"board {self.number}: udp port {self.udp.port} is open again")
 
     def _factory_config(self) -> bytes:
         """Return the configuration block with this board's own address and the profile's data rate."""

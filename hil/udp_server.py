@@ -37,20 +37,21 @@ class UdpServer:
         self.open()
 
     def open(self) -> None:
-        """Listen (the board has power), without a session."""
+        """Listen (the board has power), without a session; `LabError` when somebody else has the port."""
         if self._socket is not None:
             return
         self._session: Address | None = None
         self._heard_us: dict[Address, int] = {}  # when each client spoke last
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        opened.setblocking(False)
         try:
-            self._socket.bind((HOST, self.port))
+            opened.bind((HOST, self.port))
         except OSError as error:
-            self._socket.close()
+            opened.close()
             raise LabError(f"udp port {self.port}: {error.strerror or error}") from None
-        self.port = self._socket.getsockname()[1]
-        self._readers[self._socket] = self._read
+        self._socket = opened
+        self.port = opened.getsockname()[1]
+        self._readers[opened] = self._read
 
     def close(self) -> None:
         """Close the port (power off): clients are refused, which they notice."""

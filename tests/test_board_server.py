@@ -9,6 +9,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -283,6 +284,28 @@ def test_the_board_can_be_switched_off_and_on_by_radio(served: Served, cache: Pa
         assert prober.recv(64) == b"\xff"
     switch.close()
     Client(served.radio_uris[0], cache).ready().close()
+
+
+def test_a_udp_port_that_was_taken_meanwhile_is_waited_for(served: Served) -> None:
+    switch = PowerSwitch(served.radio_uris[0])
+    host, port = served.udp_uris[0].removeprefix("udp://").split(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as prober:
+        prober.connect((host, int(port)))
+        prober.settimeout(PATIENCE_S)
+        served.forget()
+        switch.stm_power_down()
+        with pytest.raises(ConnectionRefusedError):
+            probe_for_ever(prober)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
+            thief.bind((host, int(port)))
+            switch.stm_power_up()
+            served.wait_for(f"udp port {port}.*trying again", PATIENCE_S)
+        served.wait_for(f"udp port {port} is open again", PATIENCE_S)
+        with suppress(ConnectionRefusedError):  # the report of an earlier probe
+            prober.send(b"\xff")
+        prober.send(b"\xff")
+        assert prober.recv(64) == b"\xff"
+    switch.close()
 
 
 def test_the_newest_udp_client_wins_and_a_prober_changes_nothing(served: Served) -> None:
