@@ -43,7 +43,7 @@ from firmware_py.wire.memories import (
     encode_one_wire,
 )
 
-__all__ = ["LATENCY_BOUNDS_US", "Firmware", "Kernel", "TaskReport", "Thief", "WatchdogError"]
+__all__ = ["DEADLINES_US", "LATENCY_BOUNDS_US", "Firmware", "Kernel", "TaskReport", "Thief", "WatchdogError"]
 
 MEASUREMENT_QUEUE = 20  # original firmware
 DEADLINES_US = {  # of each activation: whatever the flight path does in a tick is over before the next one
@@ -91,7 +91,6 @@ class Firmware:
         kernel.create_task("PWRMGNT", 0, power_task, kernel, board, self._supervisor)
         self._start_services()
         self.signals = Signals.of(core.estimator, core.control, self._supervisor)
-        self.deadlines_us = DEADLINES_US
         self.statistics = Statistics(self.kernel, DEADLINES_US)
         self.kernel.start()
 

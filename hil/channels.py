@@ -6,7 +6,7 @@ Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, 
 from collections.abc import Callable
 from typing import Any
 
-from firmware_py.firmware import Firmware
+from firmware_py.firmware import DEADLINES_US, Firmware
 from firmware_py.signals import COUNTERS
 from ground_station.trajectory import Trajectory
 from hil.plant.plant import Plant
@@ -35,7 +35,7 @@ def flight_channels(
     signals, queue = firmware.signals, firmware.measurements
     kernel = firmware.kernel
     tasks = kernel.tasks
-    timed = [task for task in tasks if task.name in firmware.deadlines_us]
+    timed = [task for task in tasks if task.name in DEADLINES_US]
     up, down, air = radio.up, radio.down, radio.air
 
     def goal() -> tuple[float, ...]:

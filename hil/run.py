@@ -191,10 +191,9 @@ def read_result(folder: Path) -> dict[str, Any]:
     if path.is_file():
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         return content
-    metadata = {
-        key.decode(): value.decode() for key, value in (load_log(folder).schema.metadata or {}).items()
-    }
-    metrics = measure(load_log(folder), lost=False)
+    log = load_log(folder)
+    metadata = {key.decode(): value.decode() for key, value in (log.schema.metadata or {}).items()}
+    metrics = measure(log, lost=False)
     return {
         "experiment": metadata.get("experiment", "?"),
         "profile": metadata.get("profile", "?"),

@@ -29,7 +29,6 @@ PORT_PLATFORM = 13
 PORT_LINK = 15
 
 MAX_LOG_VALUES = 26  # 30 less the block's id and the time stamp
-LOG_TIME_MODULUS_MS = 1 << 24
 
 AGE_UNIT_US = 500
 AGE_MAX_CODE = 254  # and everything older: 127 ms
