@@ -7,17 +7,16 @@ import logging
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cflib.crtp
 import numpy as np
 import pytest
-from cflib.crazyflie import Crazyflie
-from cflib.crazyflie.log import LogConfig
 from cflib.crazyflie.mem import MemoryElement
 from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
 from cflib.utils.encoding import compress_quaternion
+from cflib_client import Client
 from udp_pump import UdpBoard
 
 from firmware_py.supervisor import State
@@ -34,73 +33,10 @@ def board() -> Iterator[UdpBoard]:
     board.close()
 
 
-class Session:
-    """A connection of cflib's, as far as `fully_connected`."""
+class Session(Client):
+    """A connection of cflib's over UDP."""
 
-    def __init__(self, uri: str, cache: Path) -> None:
-        self.cf = Crazyflie(rw_cache=str(cache))
-        self.connected, self.fully, self.gone = threading.Event(), threading.Event(), threading.Event()
-        self.console = ""
-        self.cf.connected.add_callback(lambda _: self.connected.set())
-        self.cf.fully_connected.add_callback(lambda _: self.fully.set())
-        self.cf.disconnected.add_callback(lambda _: self.gone.set())
-        self.cf.console.receivedChar.add_callback(self._hear)
-        self.cf.open_link(uri)
-        assert self.connected.wait(PATIENCE_S), "not connected"
-        assert self.fully.wait(PATIENCE_S), "connected, but parameters are missing"
-
-    def _hear(self, text: str) -> None:
-        self.console += text
-
-    def ask(self, request: Callable[..., None], *arguments: object) -> tuple:
-        """What a request's callback is called with."""
-        done, answer = threading.Event(), []
-
-        def called(*values: object) -> None:
-            answer.append(values)
-            done.set()
-
-        request(*arguments, called)
-        assert done.wait(PATIENCE_S)
-        return answer[0]
-
-    def set(self, name: str, value: object) -> float:
-        """Set a parameter and return what the board says it is."""
-        done, answer = threading.Event(), []
-
-        def updated(_: str, text: str) -> None:
-            answer.append(float(text))
-            done.set()
-
-        group, variable = name.split(".")
-        self.cf.param.add_update_callback(group=group, name=variable, cb=updated)
-        self.cf.param.set_value(name, value)
-        assert done.wait(PATIENCE_S)
-        self.cf.param.remove_update_callback(group=group, name=variable, cb=updated)
-        return answer[0]
-
-    def rows(self, period_ms: int, count: int, *names: str) -> list[tuple[int, dict[str, float]]]:
-        """`count` rows of a log block: board time [ms] and values."""
-        block, rows, done = LogConfig("block", period_ms), [], threading.Event()
-        for name in names:
-            block.add_variable(name)
-
-        def received(timestamp_ms: int, values: dict[str, float], _: LogConfig) -> None:
-            rows.append((timestamp_ms, values))
-            if len(rows) >= count:
-                done.set()
-
-        self.cf.log.add_config(block)
-        block.data_received_cb.add_callback(received)
-        block.start()
-        assert done.wait(PATIENCE_S + count * period_ms * 1e-3)
-        block.stop()
-        block.delete()
-        return rows[:count]
-
-    def close(self) -> None:
-        self.cf.close_link()
-        assert self.gone.wait(PATIENCE_S)
+    patience_s = PATIENCE_S
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +46,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def session(board: UdpBoard, cache: Path) -> Iterator[Session]:
-    session = Session(board.uri, cache)
+    session = Session(board.uri, cache).ready()
     yield session
     session.close()
 
@@ -126,7 +62,7 @@ def test_both_tables_are_complete(session: Session) -> None:
 
 
 def test_log_block_comes_at_a_hundred_hertz_with_the_boards_values(board: UdpBoard, session: Session) -> None:
-    rows = session.rows(10, 100, "pm.vbat", "motor.m1", "motor.m2", "supervisor.state", "acc.z")
+    rows = session.rows(100, 10, "pm.vbat", "motor.m1", "motor.m2", "supervisor.state", "acc.z")
     assert set(np.diff([stamp for stamp, _ in rows])) == {10}
     counts = board.firmware.signals.count
     for _, values in rows:
@@ -147,18 +83,18 @@ def test_parameter_is_set_on_the_running_core_and_refused_outside_its_range(
 
 
 def test_defaults_and_states_of_parameters(session: Session) -> None:
-    assert session.ask(session.cf.param.get_default_value, "extCtrl.z_P") == ("extCtrl.z_P", 3.0)
-    assert session.ask(session.cf.param.get_default_value, "cpu.flash") == ("cpu.flash", None)
-    name, state = session.ask(session.cf.param.persistent_get_state, "extCtrl.z_P")
+    assert session.answer(session.cf.param.get_default_value, "extCtrl.z_P") == ("extCtrl.z_P", 3.0)
+    assert session.answer(session.cf.param.get_default_value, "cpu.flash") == ("cpu.flash", None)
+    name, state = session.answer(session.cf.param.persistent_get_state, "extCtrl.z_P")
     assert (name, state.is_stored, state.default_value, state.stored_value) == (
         "extCtrl.z_P",
         False,
         3.0,
         None,
     )
-    assert session.ask(session.cf.param.persistent_store, "sound.effect") == ("sound.effect", True)
-    assert session.ask(session.cf.param.persistent_clear, "sound.effect") == ("sound.effect", True)
-    assert session.ask(session.cf.param.persistent_clear, "sound.effect") == ("sound.effect", False)
+    assert session.answer(session.cf.param.persistent_store, "sound.effect") == ("sound.effect", True)
+    assert session.answer(session.cf.param.persistent_clear, "sound.effect") == ("sound.effect", True)
+    assert session.answer(session.cf.param.persistent_clear, "sound.effect") == ("sound.effect", False)
 
 
 @pytest.mark.parametrize("way", ["extpose", "packed"])
@@ -181,7 +117,7 @@ def test_poses_sent_either_way_are_flown(session: Session, way: str) -> None:
     sender.start()
     try:
         names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "supervisor.state")
-        _, last = session.rows(10, 80, *names)[-1]
+        _, last = session.rows(80, 10, *names)[-1]
     finally:
         stop.set()
         sender.join()
@@ -191,16 +127,16 @@ def test_poses_sent_either_way_are_flown(session: Session, way: str) -> None:
 
 def test_position_alone_arrives(session: Session) -> None:
     session.cf.extpos.send_extpos(0.5, 0.25, -0.125)
-    _, values = session.rows(10, 3, "locSrv.x", "locSrv.y", "locSrv.z")[-1]
+    _, values = session.rows(3, 10, "locSrv.x", "locSrv.y", "locSrv.z")[-1]
     assert list(values.values()) == [0.5, 0.25, -0.125]
 
 
 def test_emergency_stop_and_recovery(session: Session) -> None:
     session.cf.supervisor.send_emergency_stop()
-    assert session.rows(10, 5, "supervisor.cause")[-1][1]["supervisor.cause"] == 3
+    assert session.rows(5, 10, "supervisor.cause")[-1][1]["supervisor.cause"] == 3
     assert session.cf.supervisor.is_locked
     session.cf.supervisor.send_crash_recovery_request()
-    assert session.rows(10, 5, "supervisor.cause")[-1][1]["supervisor.cause"] != 3
+    assert session.rows(5, 10, "supervisor.cause")[-1][1]["supervisor.cause"] != 3
     assert session.cf.supervisor.is_armed
 
 
@@ -227,36 +163,36 @@ def test_console_speaks(board: UdpBoard, session: Session) -> None:
 
 def test_memories_are_read_and_written(session: Session) -> None:
     (eeprom,) = session.cf.mem.get_mems(MemoryElement.TYPE_I2C)
-    session.ask(eeprom.update)
+    session.answer(eeprom.update)
     assert eeprom.valid
     assert eeprom.elements["radio_address"] == 0xE7E7E7E7E7
     eeprom.elements["pitch_trim"] = 0.25
-    session.ask(eeprom.write_data)
+    session.answer(eeprom.write_data)
     eeprom.elements.clear()
-    session.ask(eeprom.update)
+    session.answer(eeprom.update)
     assert (eeprom.valid, eeprom.elements["pitch_trim"]) == (True, 0.25)
     (deck,) = session.cf.mem.get_mems(MemoryElement.TYPE_1W)
     assert (deck.valid, deck.elements["Board name"]) == (True, "bcFloaty")
     (tester,) = session.cf.mem.get_mems(MemoryElement.TYPE_MEMORY_TESTER)
-    session.ask(tester.read_data, 5, 1000)
+    session.answer(tester.read_data, 5, 1000)
     assert tester.readValidationSuccess
-    session.ask(tester.write_data, 5, 1000)
-    assert session.rows(10, 2, "memTst.errCntW")[-1][1]["memTst.errCntW"] == 0
+    session.answer(tester.write_data, 5, 1000)
+    assert session.rows(2, 10, "memTst.errCntW")[-1][1]["memTst.errCntW"] == 0
 
 
 def test_power_cycle_is_noticed_and_stored_parameters_come_back(board: UdpBoard, cache: Path) -> None:
-    first = Session(board.uri, cache)  # the newest client wins
+    first = Session(board.uri, cache).ready()  # the newest client wins
     assert first.set("extCtrl.vz_P", 0.75) == 0.75
     assert first.set("extCtrl.yaw_P", 0.75) == 0.75
-    assert first.ask(first.cf.param.persistent_store, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
+    assert first.answer(first.cf.param.persistent_store, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
     board.power_off()
     assert first.gone.wait(PATIENCE_S)
     first.close()  # so that nothing of it answers in place of the second
     board.power_on()
     begin = time.monotonic()
-    second = Session(board.uri, cache)
+    second = Session(board.uri, cache).ready()
     assert time.monotonic() - begin < PATIENCE_S / 2
     assert second.cf.param.get_value("extCtrl.vz_P") == "0.75"
     assert second.cf.param.get_value("extCtrl.yaw_P") == pytest.approx("1.2000000476837158")
-    assert second.ask(second.cf.param.persistent_clear, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
+    assert second.answer(second.cf.param.persistent_clear, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
     second.close()
