@@ -11,7 +11,7 @@ import re
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cflib.crtp
@@ -23,7 +23,9 @@ from firmware_py.wire import WireError
 from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, decode_log_data, encode_ext_pose
 from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, Block, Sample
 from ground_station.clock import clock_us
-from ground_station.corrections import Correction
+from ground_station.corrections import Correction, correct
+from ground_station.mocap import MocapFrame
+from ground_station.trajectory import Goal
 
 ANSWER_TIMEOUT_US = 4_000_000  # without any answer while connecting
 CONNECT_TIMEOUT_US = 60_000_000  # in all; tables of contents are long and slow with losses
@@ -171,8 +173,9 @@ class CrazyradioLink:
 
     # Uplink
 
-    def send(self, now_us: int, correction: Correction) -> None:
-        """Put a correction into the place for one; `WireError` for a pose that cannot be sent."""
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        """Put the correction into the place for one; `WireError` for a pose that cannot be sent."""
+        correction = correct(frame, goal, now_us)
         encode_ext_pose(correction.p_GB, correction.q_GB, correction.age_us)
         with self._mail:
             self.statistics.replaced += self._mailbox is not None
@@ -204,14 +207,14 @@ class CrazyradioLink:
             packets.append(self._received.popleft())
         return packets
 
-    def decode(self, data: bytes) -> Sample | None:
-        """The telemetry in a packet from the board, None for a packet of another service.
+    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
+        """The telemetry in a packet from the board, empty for a packet of another service.
 
         Blocks of a board are not sampled together; here they get the beginning of their period as common time stamp.
         """
         packet = decode(data)
         if packet.port != PORT_LOG or packet.channel != CHANNEL_LOG_DATA:
-            return None
+            return ()
         number, timestamp_ms, values = decode_log_data(packet.data)
         block = self._blocks.get(number)
         if block is None or len(values) != block.layout.size:
@@ -220,7 +223,7 @@ class CrazyradioLink:
         for variable, value in zip(block.variables, sample.values, strict=True):
             if variable.name == SUPERVISOR_STATE:
                 self.supervisor_state = int(value)
-        return sample
+        return (sample,)
 
     def _on_any_packet(self, packet: CRTPPacket) -> None:
         if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even when nobody is behind it
