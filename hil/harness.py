@@ -16,7 +16,7 @@ from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Goal
-from hil.channels import flight_channels
+from hil.channels import flight_channels, radio_channel
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
 from hil.events import EventQueue
@@ -35,6 +35,8 @@ RECORD_PERIOD_US = 10_000
 RECORD_PHASE_US = 250  # just after the controller
 PROGRESS_PERIOD_US = 250_000
 DROP_NOTE_PERIOD_US = 1_000_000
+RADIO, MAVLINK = "radio", "mavlink"
+LOCKSTEP = (RADIO, MAVLINK)  # links that are simulated whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +56,12 @@ class Streams:
     imu: np.random.Generator
     mocap: np.random.Generator
     radio: np.random.Generator
+    serial: np.random.Generator
 
     @classmethod
     def of_seed(cls, seed: int) -> "Streams":
         """Split a seed."""
-        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(4)))
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(5)))
 
 
 class Flight:
@@ -73,6 +76,7 @@ class Flight:
         telemetry_path: Path | None,
         clock: Clock | None = None,
         trace_all: bool = False,
+        link: str = RADIO,
     ) -> None:
         streams = Streams.of_seed(seed)
         home, offset = config.flight.home, config.flight.start_offset
@@ -120,7 +124,12 @@ class Flight:
     def channels(self) -> tuple[Channel, ...]:
         """Return what there is to record."""
         return flight_channels(
-            self.plant, self.board, self.firmware, self.radio, self.trajectory, lambda: self.free
+            self.plant,
+            self.board,
+            self.firmware,
+            radio_channel(self.radio),
+            self.trajectory,
+            lambda: self.free,
         )
 
     def run(self, progress: Callable[[int], None] | None = None) -> Outcome:

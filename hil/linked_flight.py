@@ -16,7 +16,7 @@ from firmware_py.firmware import Firmware
 from ground_station.mocap_udp import PosePublisher
 from ground_station.trajectory import Goal
 from hil.board_server import BoardServer
-from hil.channels import flight_channels
+from hil.channels import flight_channels, radio_channel
 from hil.config import LabConfig
 from hil.dongle_plugin import VARIABLE
 from hil.errors import LabError
@@ -97,7 +97,7 @@ class LinkedFlight:
         """Return what there is to record; the columns of the simulated radio stay zero."""
         plant, board, firmware = self._board.parts()
         return flight_channels(
-            plant, board, firmware, self._no_radio, self._trajectory, lambda: self._board.free
+            plant, board, firmware, radio_channel(self._no_radio), self._trajectory, lambda: self._board.free
         )
 
     def run(self, progress: Callable[[int], None] | None = None) -> Outcome:
