@@ -167,7 +167,8 @@ class MavlinkConfig(Section):
     component: int = Field(ge=1, le=255, description="component id")
     home: tuple[float, float, float] = Field(description="goal until one arrives, W, yaw 0 [m]")
     signing_key: str = Field(
-        pattern="^([0-9a-fA-F]{64})?$", description="MAVLink 2 signing, 32 bytes in hexadecimal; empty: unsigned"
+        pattern="^([0-9a-fA-F]{64})?$",
+        description="MAVLink 2 signing, 32 bytes in hexadecimal; empty: unsigned",
     )
     rates: StreamRates
 

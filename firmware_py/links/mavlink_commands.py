@@ -77,7 +77,9 @@ class CommandService:
         stack.handle(mavlink.MSG_COMMAND_LONG, self._obey)
         stack.handle(mavlink.MSG_COMMAND_INT, self._obey)
         stack.handle(mavlink.MSG_PING, self._answer_ping)
-        stack.handle(mavlink.MSG_FILE_TRANSFER_PROTOCOL, lambda request: stack.reply(mavlink.ftp_nak(request)))
+        stack.handle(
+            mavlink.MSG_FILE_TRANSFER_PROTOCOL, lambda request: stack.reply(mavlink.ftp_nak(request))
+        )
 
     def _obey(self, command: Message) -> None:
         obey = self._commands.get(command.command)

@@ -10,7 +10,7 @@ from math import isfinite
 from typing import NoReturn
 from zlib import crc32
 
-from firmware_py.links.mavlink_stack import MavlinkStack, Task
+from firmware_py.links.mavlink_stack import WARNING, MavlinkStack, Task
 from firmware_py.links.parameters import Parameter
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.mavlink_frames import Message
@@ -20,7 +20,6 @@ HASH_NAME = "_HASH_CHECK"
 HASH_BITS = 24  # which a REAL32 carries exactly
 NO_INDEX = 0xFFFF
 REAL32 = 9  # MAV_PARAM_TYPE
-WARNING = 4  # MAV_SEVERITY
 
 
 class MavlinkParameters:
@@ -96,7 +95,8 @@ class MavlinkParameters:
     def _hash(self) -> Message:
         """A number that changes with the names and with any value, by which clients know their copy."""
         content = b"".join(
-            name.encode() + parameter.value() for name, parameter in zip(self._names, self._parameters, strict=True)
+            name.encode() + parameter.value()
+            for name, parameter in zip(self._names, self._parameters, strict=True)
         )
         value = crc32(content) >> (32 - HASH_BITS)
         return mavlink.parameter(HASH_NAME, float(value), NO_INDEX, len(self._parameters))

@@ -11,7 +11,8 @@ from collections.abc import Callable, Generator, Iterable
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig, MavlinkConfig
 from firmware_py.rtos import Kernel, Queue
-from firmware_py.wire import WireError
+from firmware_py.rtos.task import GO_ON
+from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
 
 Task = Generator[int, None, None]
@@ -20,7 +21,8 @@ Handler = Callable[[Message], object]
 TRANSMIT_QUEUE = 32
 UNASKED_LIMIT = 24  # messages in the queue beyond which nothing is sent unasked
 SILENCE_TICKS = 50  # after which MAV-RX lets the receiver look through half a frame again
-GO_ON: tuple[int, ...] = ()
+
+INFO, WARNING = 6, 4  # MAV_SEVERITY
 
 
 class MavlinkStack:
@@ -44,6 +46,16 @@ class MavlinkStack:
         self._transmit: Queue[Message] = kernel.create_queue(TRANSMIT_QUEUE, "mavTx")
         kernel.create_task("MAV-RX", 2, self._receive_task)
         kernel.create_task("MAV-TX", 2, self._transmit_task)
+
+    @property
+    def frames(self) -> int:
+        """Frames that came."""
+        return self.counters.frames
+
+    @property
+    def lost(self) -> int:
+        """Frames that did not come."""
+        return self.counters.lost
 
     @property
     def bad(self) -> int:
@@ -79,6 +91,10 @@ class MavlinkStack:
             self.dropped += 1
             return GO_ON
         return self._transmit.send_nowait(message)
+
+    def say(self, line: str) -> None:
+        """Send a line of the console as STATUSTEXT."""
+        self.reply(mavlink.status_text(WARNING if "failsafe" in line else INFO, line))
 
     def _receive_task(self) -> Task:
         kernel, receiver, board = self.kernel, self._receiver, self._board

@@ -8,13 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
-from firmware_py.rtos import FOREVER
+from firmware_py.rtos import FOREVER, TICK_US
 from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import Message
 
 DEFAULT, OFF = 0, -1  # intervals in SET_MESSAGE_INTERVAL
 NONE_SUCH = 0  # interval in MESSAGE_INTERVAL
-TICK_US = 1000
 LONGEST_TICKS = 1_000_000
 
 _STATUS = (mavlink.MSG_SYS_STATUS, mavlink.MSG_BATTERY_STATUS, mavlink.MSG_ESTIMATOR_STATUS)
@@ -114,6 +113,8 @@ class StreamService:
                     messages += stream.make(tick)
             for message in messages:
                 yield from stack.offer(message)
-            due = min((stream.due_tick for stream in streams if stream.interval_ticks is not None), default=None)
+            due = min(
+                (stream.due_tick for stream in streams if stream.interval_ticks is not None), default=None
+            )
             timeout = FOREVER if due is None else max(0, due - kernel.tick_count)
             yield from self._changed.take(timeout)

@@ -3,7 +3,7 @@
 The estimator's state is relative to the goal frame of the last pose; position, velocity and yaw are turned back here.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import sqrt
 from typing import Any
 
@@ -13,6 +13,7 @@ from firmware_py.geometry import from_euler_zyx, rotate, wrap_angle, yaw_quatern
 from firmware_py.links.mavlink_poses import PoseService
 from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
+from firmware_py.links.stream import ReadBlock
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink, telemetry
 from firmware_py.wire.mavlink_frames import Message
@@ -31,7 +32,7 @@ class FlightMessages:
         poses: PoseService,
         estimator: Any,
         control: Any,
-        read_block: Callable[[telemetry.Block], Sequence[float]],
+        read_block: ReadBlock,
     ) -> None:
         self._stack = stack
         self._supervisor = supervisor
