@@ -1,5 +1,6 @@
 """`floaty board serve --mavlink` and a bare pymavlink program: what ground tools rely on, over pty, udp and tcp."""
 
+import itertools
 import math
 import os
 import socket
@@ -102,7 +103,7 @@ def test_a_message_comes_as_often_as_it_was_asked_for(client: Client) -> None:
     number, set_interval = dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAV_CMD_SET_MESSAGE_INTERVAL
     assert client.command(set_interval, number, 20_000) == dialect.MAV_RESULT_ACCEPTED
     stamps = [message.time_boot_ms for message in client.collect(2.0) if message.get_type() == "ATTITUDE"]
-    steps = [later - earlier for earlier, later in zip(stamps, stamps[1:], strict=False)]
+    steps = [later - earlier for earlier, later in itertools.pairwise(stamps)]
     assert 60 < len(stamps) <= 110
     assert sum(steps) / len(steps) == pytest.approx(20, abs=0.5)
     assert client.command(set_interval, number, 0) == dialect.MAV_RESULT_ACCEPTED
