@@ -79,6 +79,16 @@ def to_euler_zyx(q: Quaternion) -> Vector:
     )
 
 
+def in_goal_frame(p_WB: Vector, q_WB: Quaternion, p_WG: Vector, yaw: float) -> tuple[Vector, Quaternion]:
+    """`(p_GB, q_GB)`: a pose seen from the goal frame, which stands upright at `p_WG`, turned by `yaw` about z."""
+    dx = p_WB[0] - p_WG[0]
+    dy = p_WB[1] - p_WG[1]
+    dz = p_WB[2] - p_WG[2]
+    c, s = cos(yaw), sin(yaw)
+    p_GB = (c * dx + s * dy, c * dy - s * dx, dz)  # Rz(-yaw) (p_WB - p_WG)
+    return p_GB, multiply(conjugate(yaw_quaternion(yaw)), q_WB)
+
+
 def euler_zyx_of(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """`to_euler_zyx` for a whole flight: quaternions (N, 4) to roll, pitch, yaw (N, 3) [rad]."""
     w, x, y, z = q.T

@@ -1,0 +1,248 @@
+"""MAVLink 2 frames, sans I/O: bytes that arrive become messages, messages become bytes, counters tell what was lost.
+
+The dialect is pymavlink's `common`: its classes hold the fields, their layout and the CRC seeds. Framing is our own,
+because pymavlink's parser drops whole supposed frames after a bad byte, lets one forged time stamp lock the true sender
+out, and counts a reordered pair as 256 lost frames. Here
+
+- bytes that are no frame are skipped one at a time, so that no good frame behind them is lost;
+- half a frame waits for its rest until 100 ms of silence have passed (call `feed` with no data to let time pass); the
+  bytes are then looked through again;
+- a signature is checked before anything is learnt from the frame; with a key, nothing unsigned is accepted.
+
+Frames of MAVLink 1 are read, never written. Whose message it is for is the reader's business.
+"""
+
+import re
+import struct
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from firmware_py.wire import WireError
+from firmware_py.wire.mavlink_layouts import LAYOUTS, Message, crc16
+from firmware_py.wire.mavlink_signing import SIGNATURE_SIZE, Signing
+
+__all__ = ["SIGNATURE_SIZE", "FrameCounters", "FrameReceiver", "FrameSender", "Message", "Signing"]
+
+HALF_FRAME_US = 100_000  # silence after which half a frame is given up; 280 bytes last 49 ms at 57600 baud
+RESTART = 4  # so many late frames in sequence: their sender has begun anew
+
+_START_2 = b"\xfd"
+_START = re.compile(b"[\xfd\xfe]")  # of version 2 or 1
+_HEAD_2 = struct.Struct("<xBBBBBBHB")  # without the magic byte
+_HEAD_1 = struct.Struct("<xBBBBB")
+_CRC_SIZE = 2
+_SIGNED = 1  # the only incompatibility flag that there is
+_INCOMPLETE, _NO_FRAME = 0, 1  # bytes to go on by
+
+
+@dataclass(slots=True)
+class FrameCounters:
+    """What a receiver has seen."""
+
+    frames: int = 0  # delivered
+    skipped_bytes: int = 0  # that belong to no frame
+    bad_crc: int = 0  # supposed frames
+    unknown: int = 0  # frames, in sequence, of messages that the dialect does not have
+    unsigned: int = 0  # refused because a key is set
+    bad_signature: int = 0
+    replayed: int = 0  # rightly signed, but not newer than the last one of their stream
+    lost: int = 0  # gaps in the sequence numbers
+    late: int = 0  # behind the newest of their sender: reordered (and counted as lost before) or repeated
+
+
+class FrameSender:
+    """Makes the frames of one sender on one link, and counts them."""
+
+    def __init__(self, system: int, component: int, signing: Signing | None = None) -> None:
+        self._system = system
+        self._component = component
+        self._signing = signing
+        self._sequence = 0
+
+    def encode(self, now_us: int, message: Message) -> bytes:
+        """The frame of `message`, which is not changed; `WireError` when a field does not fit its type."""
+        number = message.get_msgId()
+        layout = LAYOUTS.get(number)
+        if layout is None:
+            raise WireError(f"message {number}: not in the dialect")
+        try:
+            full = layout.pack(message)
+        except (struct.error, OverflowError, TypeError, ValueError) as error:
+            raise WireError(f"{message.get_type()}: {error}") from error
+        payload = full.rstrip(b"\0") or full[:1]
+        flags = _SIGNED if self._signing else 0
+        head = _HEAD_2.pack(
+            len(payload),
+            flags,
+            0,
+            self._sequence,
+            self._system,
+            self._component,
+            number & 0xFFFF,
+            number >> 16,
+        )
+        self._sequence = (self._sequence + 1) & 0xFF
+        body = head[1:] + payload
+        frame = _START_2 + body + crc16(body + layout.crc_seed).to_bytes(_CRC_SIZE, "little")
+        return frame + self._signing.sign(now_us, frame) if self._signing else frame
+
+
+class _Sequence:
+    """Sequence numbers of one sender, modulo 256: half of them lie ahead, the others behind."""
+
+    __slots__ = ("after_late", "late_run", "newest")
+
+    def __init__(self, number: int) -> None:
+        self.newest = number
+        self.late_run = 0
+        self.after_late = 0
+
+    def note(self, number: int, counters: FrameCounters) -> None:
+        step = (number - self.newest) & 0xFF
+        if 1 <= step <= 128:
+            counters.lost += step - 1
+            self.newest = number
+            self.late_run = 0
+            return
+        counters.late += 1
+        self.late_run = self.late_run + 1 if number == self.after_late else 1
+        self.after_late = (number + 1) & 0xFF
+        if self.late_run == RESTART:
+            self.newest = number
+
+
+class _Head(NamedTuple):
+    """What the first bytes of a frame say."""
+
+    length: int  # of the payload
+    flags: int  # that must be understood
+    compatible: int  # flags that may be ignored
+    sequence: int
+    system: int
+    component: int
+    number: int  # of the message
+
+
+def _read_head(buffer: bytes, start: int) -> _Head:
+    if buffer[start] == _START_2[0]:
+        length, flags, compatible, sequence, system, component, low, high = _HEAD_2.unpack_from(buffer, start)
+        return _Head(length, flags, compatible, sequence, system, component, low | high << 16)
+    length, sequence, system, component, number = _HEAD_1.unpack_from(buffer, start)
+    return _Head(length, 0, 0, sequence, system, component, number)
+
+
+def _mark(message: Message, head: _Head, frame: bytes, crc: int) -> None:
+    """Tell the message where it came from, as pymavlink's own decoder does."""
+    header = message.get_header()
+    header.mlen, header.seq, header.srcSystem, header.srcComponent = (
+        head.length,
+        head.sequence,
+        head.system,
+        head.component,
+    )
+    header.incompat_flags, header.compat_flags = head.flags, head.compatible
+    message._msgbuf, message._crc = frame, crc
+
+
+class FrameReceiver:
+    """Finds the frames in a stream of bytes; never raises, whatever the bytes."""
+
+    def __init__(self, signing: Signing | None = None) -> None:
+        self.counters = FrameCounters()
+        self._signing = signing
+        self._held = b""  # half a frame
+        self._last_us = 0  # when bytes came last
+        self._senders: dict[tuple[int, int], _Sequence] = {}
+
+    def feed(self, now_us: int, data: bytes) -> list[Message]:
+        """The messages that `data` completes, in order; empty data lets time pass."""
+        silent = now_us - self._last_us > HALF_FRAME_US
+        stale = len(self._held) if silent else 0  # what starts before this byte waits no longer
+        buffer = self._held + data
+        if data:
+            self._last_us = now_us
+        messages: list[Message] = []
+        position = 0
+        while found := _START.search(buffer, position):
+            start = found.start()
+            self.counters.skipped_bytes += start - position
+            position = start
+            size = self._take(now_us, buffer, start, messages)
+            if size == _INCOMPLETE:
+                if start >= stale:
+                    break
+                size = _NO_FRAME
+            if size == _NO_FRAME:
+                self.counters.skipped_bytes += 1
+            position += size
+        else:
+            self.counters.skipped_bytes += len(buffer) - position
+            position = len(buffer)
+        self._held = buffer[position:]
+        return messages
+
+    def _take(self, now_us: int, buffer: bytes, start: int, messages: list[Message]) -> int:
+        """Look at the supposed frame at `start`; return how many bytes it takes, or `_INCOMPLETE` or `_NO_FRAME`."""
+        head_size = _HEAD_2.size if buffer[start] == _START_2[0] else _HEAD_1.size
+        if len(buffer) - start < head_size:
+            return _INCOMPLETE
+        head = _read_head(buffer, start)
+        if head.flags & ~_SIGNED or not head.system:
+            return _NO_FRAME
+        layout = LAYOUTS.get(head.number)
+        if layout is None:
+            self._note_unknown(head)
+            return _NO_FRAME
+        if head_size == _HEAD_1.size and head.length > layout.payload.size:
+            return _NO_FRAME  # version 1 has no extensions
+
+        first = start + head_size
+        crc_at = first + head.length
+        crc_end = crc_at + _CRC_SIZE
+        end = crc_end + SIGNATURE_SIZE if head.flags else crc_end
+        if len(buffer) < end:
+            return _INCOMPLETE
+        crc = int.from_bytes(buffer[crc_at:crc_end], "little")
+        if crc != crc16(buffer[start + 1 : crc_at] + layout.crc_seed):
+            self.counters.bad_crc += 1
+            return _NO_FRAME
+
+        frame = buffer[start:end]
+        if self._signing is not None:
+            refused = self._refuse(self._signing, now_us, head, frame)
+            if refused:
+                return refused
+        message = layout.unpack(buffer[first:crc_at])
+        _mark(message, head, frame, crc)
+        self._note(head)
+        messages.append(message)
+        return end - start
+
+    def _refuse(self, signing: Signing, now_us: int, head: _Head, frame: bytes) -> int:
+        """How many bytes of a frame to pass over that is not signed, not genuine or not new; 0 to accept it."""
+        if not head.flags:
+            self.counters.unsigned += 1
+            return len(frame)
+        if not signing.is_genuine(frame):
+            self.counters.bad_signature += 1
+            return len(frame) - SIGNATURE_SIZE  # it may be cut off: what stands in its place is looked at
+        if not signing.is_new(now_us, head.system, head.component, frame):
+            self.counters.replayed += 1
+            return len(frame)
+        return 0
+
+    def _note(self, head: _Head) -> None:
+        """Count the frame, and what is missing before it."""
+        self.counters.frames += 1
+        sender = self._senders.get((head.system, head.component))
+        if sender is None:
+            self._senders[head.system, head.component] = _Sequence(head.sequence)
+        else:
+            sender.note(head.sequence, self.counters)
+
+    def _note_unknown(self, head: _Head) -> None:
+        """Believe in a frame whose CRC nobody can check when it is the next one of a known sender."""
+        sender = self._senders.get((head.system, head.component))
+        if self._signing is None and sender is not None and head.sequence == (sender.newest + 1) & 0xFF:
+            self.counters.unknown += 1
+            sender.newest = head.sequence
