@@ -34,6 +34,7 @@ class Client:
         self.codec = dialect.MAVLink(self, srcSystem=255, srcComponent=190)
         self.codec.robust_parsing = True
         self.received: list[Any] = []
+        self._seen = 0  # of these, by `wait`
         self.bytes_received = 0
 
     def write(self, data: bytes) -> None:
@@ -45,36 +46,41 @@ class Client:
         else:
             self._socket.sendto(data, self._peer)
 
-    def poll(self, timeout_s: float) -> list[Any]:
-        """The messages that are there, or come first within the time."""
+    def poll(self, timeout_s: float) -> None:
+        """Receive what is there, or comes first within the time."""
         if not select.select([self._file], (), (), max(0.0, timeout_s))[0]:
-            return []
+            return
         if self._serial is not None:
             data = self._serial.read(65536)
         else:
             data, self._peer = self._socket.recvfrom(65536)
         assert data, "the board has closed the line"
         self.bytes_received += len(data)
-        messages = [message for message in self.codec.parse_buffer(data) or () if message.get_msgId() >= 0]
-        self.received += messages
-        return messages
+        self.received += [
+            message for message in self.codec.parse_buffer(data) or () if message.get_msgId() >= 0
+        ]
 
     def wait(
         self, kind: str, wanted: Callable[[Any], bool] = lambda _: True, timeout_s: float = PATIENCE_S
     ) -> Any:
-        """The first message of this kind, from now on, that is wanted."""
+        """The next message of this kind that is wanted."""
         deadline = time.monotonic() + timeout_s
-        while (left_s := deadline - time.monotonic()) > 0:
-            for message in self.poll(left_s):
+        while True:
+            while self._seen < len(self.received):
+                message = self.received[self._seen]
+                self._seen += 1
                 if message.get_type() == kind and wanted(message):
                     return message
-        raise AssertionError(f"no {kind} within {timeout_s} s")
+            left_s = deadline - time.monotonic()
+            assert left_s > 0, f"no {kind} within {timeout_s} s"
+            self.poll(left_s)
 
     def collect(self, duration_s: float) -> list[Any]:
         """All messages of a time."""
         first, deadline = len(self.received), time.monotonic() + duration_s
         while (left_s := deadline - time.monotonic()) > 0:
             self.poll(left_s)
+        self._seen = len(self.received)
         return self.received[first:]
 
     def parameters(self) -> dict[str, Any]:
