@@ -134,10 +134,11 @@ def station(
     config = load_config(profile, overrides)
     experiment = find_experiment(trajectory)
     try:
-        from ground_station.links.crazyradio import CrazyradioLink, LinkError
+        from ground_station.links.crazyradio import CrazyradioLink
     except ImportError as error:
         raise LabError(f"--link needs cflib ({error}): pip install cflib") from None
     from ground_station.clock import clock_us
+    from ground_station.errors import LinkError
     from ground_station.live import LiveStation
     from ground_station.mocap_udp import PoseReceiver
     from ground_station.station import GroundStation
