@@ -152,7 +152,7 @@ class LiveStation:
         counters = self.station.counters
         self.say(
             f"poses {counters.frames} ({counters.invalid} unusable)  {self.link.summary()}  "
-            f"telemetry {counters.received}"
+            f"telemetry {counters.samples}"
         )
 
     def _leave(self) -> None:
