@@ -14,6 +14,7 @@ class Board(Protocol):
 
     eeprom: bytearray  # (8192,) survives power cycles; all 0xFF when new
     deck_memory: bytearray  # (112,) the one-wire memory of the deck that carries the servo connectors
+    uart_overruns: int  # bytes lost because the UART's receive buffer was full
 
     def read_imu(self) -> ImuCounts:
         """Return the registers of the BMI088 as they are now."""
@@ -29,6 +30,14 @@ class Board(Protocol):
 
     def radio_send(self, data: bytes) -> bool:
         """Hand a packet to the radio chip; False when its queue is full."""
+        ...
+
+    def uart_read(self) -> bytes:
+        """Return all that the UART's receiver has gathered, and make room."""
+        ...
+
+    def uart_write(self, data: bytes) -> bool:
+        """Hand bytes to the UART; False when they do not fit into its transmit buffer, which then takes none."""
         ...
 
     def debug_write(self, text: str) -> None:

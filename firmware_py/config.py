@@ -139,6 +139,38 @@ class CpuConfig(Section):
     syslink_us: Cost = Field(description="SYSLINK, per packet [us]")
     crtp_us: Cost = Field(description="CRTP-RX and CRTP-TX, per packet [us]")
     log_us: Cost = Field(description="LOG and STREAM, per packet [us]")
+    mavlink_us: Cost = Field(description="MAV-RX and MAV-TX, per message [us]")
+
+
+Rate = Annotated[float, Field(ge=0, le=1000)]
+
+
+class StreamRates(Section):
+    """How often the board sends each message unasked after boot; 0 switches it off. [Hz]"""
+
+    heartbeat: Rate = Field(description="HEARTBEAT; clients give up after some seconds without")
+    sys_status: Rate = Field(description="SYS_STATUS")
+    battery_status: Rate = Field(description="BATTERY_STATUS")
+    attitude: Rate = Field(description="ATTITUDE")
+    attitude_quaternion: Rate = Field(description="ATTITUDE_QUATERNION")
+    local_position: Rate = Field(description="LOCAL_POSITION_NED")
+    servo_output: Rate = Field(description="SERVO_OUTPUT_RAW")
+    estimator_status: Rate = Field(description="ESTIMATOR_STATUS")
+    named_values: Rate = Field(description="NAMED_VALUE_FLOAT, all of them")
+    flight_array: Rate = Field(description="DEBUG_FLOAT_ARRAY floaty")
+
+
+class MavlinkConfig(Section):
+    """The serial line: who the board is on it, and what it says there."""
+
+    system: int = Field(ge=1, le=255, description="system id")
+    component: int = Field(ge=1, le=255, description="component id")
+    home: tuple[float, float, float] = Field(description="goal until one arrives, W, yaw 0 [m]")
+    signing_key: str = Field(
+        pattern="^([0-9a-fA-F]{64})?$",
+        description="MAVLink 2 signing, 32 bytes in hexadecimal; empty: unsigned",
+    )
+    rates: StreamRates
 
 
 class FirmwareConfig(Section):
@@ -152,6 +184,7 @@ class FirmwareConfig(Section):
     servo: ServoConfig
     supervisor: SupervisorConfig
     cpu: CpuConfig
+    mavlink: MavlinkConfig
 
 
 GYRO_SCALE = 2000.0 / 32768.0 * 3.141592653589793 / 180.0  # [rad/s per count] BMI088 at +-2000 deg/s

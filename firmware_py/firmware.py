@@ -1,10 +1,15 @@
 """The firmware as one object: the only place where its parts are connected.
 
-Hardware calls `imu_ready` and `radio_received` (interrupts), then `run`. Everything else goes through the `Board`.
+Hardware calls `imu_ready`, `radio_received` and `uart_ready` (interrupts), then `run`. Everything else goes through the
+`Board`.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from firmware_py.board import Board
-from firmware_py.config import FirmwareConfig, parameters_of
+from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input
 from firmware_py.drivers.imu import GyroZero
@@ -16,7 +21,7 @@ from firmware_py.links.memories import MemoryService, Tester, memories
 from firmware_py.links.parameters import ParameterService
 from firmware_py.links.platform import PlatformService
 from firmware_py.links.storage import ParameterStorage
-from firmware_py.links.stream import TelemetryStream
+from firmware_py.links.stream import ReadBlock, TelemetryStream
 from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.parameters import parameters
@@ -43,6 +48,9 @@ from firmware_py.wire.memories import (
     encode_one_wire,
 )
 
+if TYPE_CHECKING:
+    from firmware_py.links.mavlink_stack import MavlinkStack
+
 __all__ = ["DEADLINES_US", "LATENCY_BOUNDS_US", "Firmware", "Kernel", "TaskReport", "Thief", "WatchdogError"]
 
 MEASUREMENT_QUEUE = 20  # original firmware
@@ -57,9 +65,12 @@ THIEF_PRIORITY = 6  # above every task, like interrupts that do not end
 
 
 class Firmware:
-    """A booted board. `kernel`, `variables` and `parameters` may be looked at; `signals` are views on the core."""
+    """A booted board. `kernel`, `variables` and `parameters` may be looked at; `signals` are views on the core.
 
-    def __init__(self, config: FirmwareConfig, board: Board) -> None:
+    Only with `mavlink` the UART speaks MAVLink, and pymavlink is needed.
+    """
+
+    def __init__(self, config: FirmwareConfig, board: Board, mavlink: bool = False) -> None:
         self.kernel = Kernel(preemption=True)
         self._board = board
         core = CoreBlocks(parameters_of(config), Input.allocate(), Estimator.allocate(), Control.allocate())
@@ -89,13 +100,14 @@ class Firmware:
             kernel, cost, estimator_run, self.measurements, self._supervisor, core,
         )  # fmt: skip
         kernel.create_task("PWRMGNT", 0, power_task, kernel, board, self._supervisor)
-        self._start_services()
+        self.mavlink = self._mavlink_stack(config) if mavlink else None
+        self._start_services(config)
         self.signals = Signals.of(core.estimator, core.control, self._supervisor)
         self.statistics = Statistics(self.kernel, DEADLINES_US)
         self.kernel.start()
 
-    def _start_services(self) -> None:
-        """Create the services of the link."""
+    def _start_services(self, config: FirmwareConfig) -> None:
+        """Create the services of the links."""
         board, core, link, supervisor = self._board, self._core, self.link, self._supervisor
         settings = _radio_settings(board)
         if all(byte == 0xFF for byte in board.deck_memory):
@@ -113,12 +125,44 @@ class Firmware:
             platform=PlatformService(link, supervisor),
             tester=tester,
             stream=TelemetryStream(link, read),
+            mavlink=self.mavlink,
         )
         self.variables = log_variables(running)
         self.parameters = parameters(running)
         LogService(link, self.variables)
-        ParameterService(link, self.parameters, ParameterStorage(board.eeprom))
+        storage = ParameterStorage(board.eeprom)
+        ParameterService(link, self.parameters, storage)
         MemoryService(link, memories(board.eeprom, board.deck_memory, tester))
+        if self.mavlink is not None:
+            self._start_mavlink_services(self.mavlink, config.mavlink, running, storage, read)
+
+    def _mavlink_stack(self, config: FirmwareConfig) -> MavlinkStack:
+        from firmware_py.links.mavlink_stack import MavlinkStack
+
+        return MavlinkStack(self.kernel, config.cpu, config.mavlink, self._board)
+
+    def _start_mavlink_services(
+        self,
+        stack: MavlinkStack,
+        config: MavlinkConfig,
+        running: Running,
+        storage: ParameterStorage,
+        read: ReadBlock,
+    ) -> None:
+        """Create what MAVLink clients find."""
+        from firmware_py.links.mavlink_commands import CommandService
+        from firmware_py.links.mavlink_parameters import MavlinkParameters
+        from firmware_py.links.mavlink_poses import PoseService
+        from firmware_py.links.mavlink_streams import StreamService
+        from firmware_py.links.mavlink_telemetry import FlightMessages
+
+        core, supervisor = self._core, self._supervisor
+        poses = PoseService(stack, self.measurements, running.localisation, config.home)
+        messages = FlightMessages(stack, supervisor, poses, core.estimator.fields, core.control.fields, read)
+        streams = StreamService(stack, messages.streams(config.rates))
+        MavlinkParameters(stack, self.parameters)
+        CommandService(stack, supervisor, streams, self.parameters, storage, config.home)
+        self._console.listeners.append(stack.say)
 
     @property
     def next_wake_us(self) -> int | None:
@@ -134,6 +178,11 @@ class Firmware:
         """Interrupt: the radio chip has a packet. While interrupts are off, packets are lost."""
         if not self.kernel.interrupts_off:
             self.link.received(data)
+
+    def uart_ready(self) -> None:
+        """Interrupt: the UART has bytes. While interrupts are off, they stay where they are."""
+        if self.mavlink is not None and not self.kernel.interrupts_off:
+            self.mavlink.uart_ready()
 
     def check_watchdog(self) -> None:
         """Raise `WatchdogError` when the stabilizer has not come round for too long; hardware, called now and then."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import degrees, pi, sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from firmware_py.board import Board
 from firmware_py.config import GYRO_SCALE
@@ -27,6 +27,9 @@ from firmware_py.supervisor import State, Supervisor
 from firmware_py.tasks import CoreBlocks
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import FIRST_ID, Block
+
+if TYPE_CHECKING:
+    from firmware_py.links.mavlink_stack import MavlinkStack
 
 AGE_UNIT_US = 100  # locSrv.age counts tenths of a millisecond
 ACCELERATION_SCALE = 24 / 32768  # [g per count] BMI088 at +-24 g
@@ -51,6 +54,7 @@ class Running:
     platform: PlatformService
     tester: Tester
     stream: TelemetryStream
+    mavlink: "MavlinkStack | None"
 
 
 def log_variables(running: Running) -> tuple[LogVariable, ...]:
@@ -181,6 +185,8 @@ def _kalman(estimator: Any) -> Iterator[LogVariable]:
 def _counters(running: Running) -> Iterator[LogVariable]:
     """What was lost, and where."""
     yield from _fields("crtp", "malformed unserved dropped", U32, "", running.stack)
+    if running.mavlink is not None:
+        yield from _fields("mavlink", "frames lost bad refused dropped overruns", U32, "", running.mavlink)
     yield LogVariable("sensors.dropped", U32, "", partial(getattr, running.measurements, "dropped"))
     yield LogVariable("app.overflows", U32, "", partial(getattr, running.platform, "app_overflows"))
     yield LogVariable("memTst.errCntW", U32, "", partial(getattr, running.tester, "errors"))

@@ -29,6 +29,16 @@ def board() -> None:
     "--radio-port", type=click.IntRange(0, 65535), default=RADIO_PORT, show_default=True, metavar="PORT",
     help="Where the Crazyradio's server listens; 0: any.",
 )  # fmt: skip
+@click.option(
+    "--mavlink",
+    metavar="END",
+    help="Lead out a serial line with MAVLink: pty, pty:PATH, udp[:[HOST:]PORT] (talks to a ground station that listens "
+    "there), tcp[:[HOST:]PORT] (listens).",
+)
+@click.option(
+    "--baud", type=click.IntRange(9600, 3_000_000), metavar="N",
+    help="Bits per second of the serial line.  [default: the profile's]",
+)  # fmt: skip
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option(
     "--faults", metavar="NAME=VALUE,...",
@@ -50,6 +60,8 @@ def serve(
     udp: int | None,
     radio: bool,
     radio_port: int,
+    mavlink: str | None,
+    baud: int | None,
     boards: int,
     faults: str | None,
     station: bool,
@@ -60,27 +72,35 @@ def serve(
 ) -> int:
     """Serve boards in virtual tunnels, in real time, until Ctrl-C.
 
-    Without --udp or --radio the first board is on UDP. A board is held until it flies: corrections come from clients
-    or, with --station, from within.
+    Without --udp, --radio or --mavlink the first board is on UDP. A board is held until it flies: corrections come
+    from clients or, with --station, from within.
     """
-    if udp is None and not radio:
+    if udp is None and not radio and mavlink is None:
         udp = UDP_PORT
     for option, first in (("--udp", udp), ("--poses", poses)):
         if first is not None and first + boards - 1 > 65535:
             raise LabError(f"{option} {first}: there are no {boards} ports from there on")
     from hil.config import load_config
 
+    if baud is not None:
+        if mavlink is None:
+            raise LabError(f"--baud {baud}: there is no serial line without --mavlink")
+        overrides = (*overrides, f"serial.baud={baud}")
     config = load_config(profile, (*overrides, *_fault_overrides(faults)))
     from ground_station.mocap_udp import PosePublisher
     from hil.board_server import BoardServer
     from hil.cli import announce_compilation
+    from hil.serial_server import parse_addresses
 
+    ends = parse_addresses(mavlink, boards) if mavlink is not None else []
     announce_compilation()
-    server = BoardServer(config, boards, seed, _say)
+    server = BoardServer(config, boards, seed, _say, mavlink=bool(ends))
     if radio:
         _say(radio_hint(server.serve_radio(radio_port), [board.uri for board in server.boards]))
     if udp is not None:
         _say(f"udp    {' '.join(server.serve_udp(udp))}")
+    if ends:
+        _say(f"mavlink {' '.join(server.serve_mavlink(ends))}")
     for number, served in enumerate(server.boards):
         if poses:
             served.publish(PosePublisher(poses + number).send)
@@ -88,8 +108,10 @@ def serve(
             served.fly()
     stops = _stop_signals()
     _say("serving; Ctrl-C ends")
-    server.run(lambda: bool(stops))
-    server.close()
+    try:
+        server.run(lambda: bool(stops))
+    finally:
+        server.close()
     _say(f"stopped; never more than {server.worst_lag_us / 1000:.1f} ms late")
     return 0
 

@@ -6,13 +6,15 @@ slow simulated time falls behind and catches up later; nothing is skipped, and t
 
 import select
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from hil.config import LabConfig
 from hil.dongle_server import DongleServer, Readers
+from hil.errors import LabError
 from hil.events import EventQueue
 from hil.harness import Streams
+from hil.serial_server import Address
 from hil.served_board import ServedBoard
 from hil.virtual_dongle import VirtualDongle
 
@@ -21,14 +23,16 @@ DONGLE_SEED = 10_000  # random streams of dongles: apart from those of the board
 
 
 class BoardServer:
-    """`count` boards; open `serve_radio` or `serve_udp`, then `run`."""
+    """`count` boards; open `serve_radio`, `serve_udp` or (on boards made with `mavlink`) `serve_mavlink`, then `run`."""
 
-    def __init__(self, config: LabConfig, count: int, seed: int, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, config: LabConfig, count: int, seed: int, say: Callable[[str], None], mavlink: bool = False
+    ) -> None:
         self.events = EventQueue()
         self.readers: Readers = {}
         self.worst_lag_us = 0
         self.boards = [
-            ServedBoard(number, config, self.events, Streams.of_seed(seed + number - 1), say)
+            ServedBoard(number, config, self.events, Streams.of_seed(seed + number - 1), say, mavlink)
             for number in range(1, count + 1)
         ]
         self._config = config
@@ -50,6 +54,17 @@ class BoardServer:
             assert board.udp is not None
             uris.append(f"udp://127.0.0.1:{board.udp.port}")
         return uris
+
+    def serve_mavlink(self, addresses: Sequence[Address]) -> list[str]:
+        """Lead out the serial line of every board; returns what MAVProxy calls their ends."""
+        try:
+            return [
+                board.serve_mavlink(address, self.readers)
+                for board, address in zip(self.boards, addresses, strict=True)
+            ]
+        except LabError:
+            self.close()
+            raise
 
     def run(self, stopping: Callable[[], bool]) -> None:
         """Go on until told to stop; may be called again."""
@@ -78,8 +93,7 @@ class BoardServer:
     def close(self) -> None:
         """Close all sockets."""
         for board in self.boards:
-            if board.udp is not None:
-                board.udp.close()
+            board.close()
         if self._dongles is not None:
             self._dongles.close()
 

@@ -21,6 +21,7 @@ from hil.tunnel import TunnelConfig
 from hil.virtual_imu import ImuConfig
 from hil.virtual_mocap import MocapConfig
 from hil.virtual_radio import RadioConfig
+from hil.virtual_serial import SerialConfig
 
 DEFAULT_PROFILE = "floaty"
 _FOLDERS = (Path(__file__).parent.parent / "profiles", Path(__file__).parent / "profiles")
@@ -54,6 +55,7 @@ class LabConfig(FirmwareConfig):
     imu: ImuConfig = Field(default_factory=ImuConfig)
     mocap: MocapConfig = Field(default_factory=MocapConfig)
     radio: RadioConfig = Field(default_factory=RadioConfig)
+    serial: SerialConfig = Field(default_factory=SerialConfig)
     station: StationConfig = Field(default_factory=StationConfig)
     flight: FlightConfig = Field(default_factory=FlightConfig)
     limits: dict[str, dict[str, float]] = Field(

@@ -11,9 +11,8 @@ from hil.dongle_plugin import CONTROL, HEAD_SIZE, READ, WRITE, frame
 from hil.errors import LabError
 from hil.virtual_dongle import VirtualDongle
 
-Readers = dict[
-    socket.socket, Callable[[int], None]
-]  # who is called, with the time, when a socket is readable
+# Who is called, with the time, when a socket or a file descriptor is readable.
+Readers = dict[socket.socket | int, Callable[[int], None]]
 HOST = "127.0.0.1"
 
 

@@ -24,10 +24,12 @@ from hil.events import EventQueue
 from hil.harness import IMU_PERIOD_US, Streams
 from hil.nrf51 import Nrf51, Power, RadioSettings
 from hil.plant.plant import Plant
+from hil.serial_server import Address, Endpoint
 from hil.udp_server import UdpServer
 from hil.virtual_board import VirtualBoard
 from hil.virtual_imu import VirtualImu
 from hil.virtual_mocap import VirtualMocap
+from hil.virtual_serial import VirtualSerial
 
 CHANNEL = 80
 RATES = (250_000, 1_000_000, 2_000_000)  # by number in the configuration block
@@ -37,6 +39,7 @@ BUTTON_US = 5_000_000  # off, or in the bootloader with nobody talking to it: th
 PUT_BACK_US = 1_000_000  # after a loss
 WATCH_PERIOD_US = 100_000
 UDP_RETRY_US = 500_000
+MAX_SYSTEM = 255  # MAVLink
 FLYING = "FLYING"  # the supervisor's state
 
 Publish = Callable[[MocapFrame, int], None]  # (frame, now_us)
@@ -54,22 +57,50 @@ class _Wire(LoopbackLink):
         """Nothing."""
 
 
+class _Uart:
+    """The board's end of a serial line that lives on the server's clock."""
+
+    def __init__(self, line: VirtualSerial, events: EventQueue) -> None:
+        self._line = line
+        self._events = events
+        self.read = line.read
+        self.read()  # a booted processor begins empty
+
+    @property
+    def overruns(self) -> int:
+        return self._line.overruns
+
+    def write(self, local_us: int, data: bytes) -> bool:
+        """Send bytes, now: a board that catches up is some microseconds behind."""
+        return self._line.write(self._events.now_us, data)
+
+
 class ServedBoard:
     """One robot; it implements `hil.nrf51.Processor` towards its radio chip."""
 
     def __init__(
-        self, number: int, config: LabConfig, events: EventQueue, streams: Streams, say: Callable[[str], None]
+        self,
+        number: int,
+        config: LabConfig,
+        events: EventQueue,
+        streams: Streams,
+        say: Callable[[str], None],
+        mavlink: bool = False,
     ) -> None:
         self.number = number
         self.free = False
         self.udp: UdpServer | None = None
         self._udp_awaited = False  # somebody else has the port
-        self._config = config
+        self._config = _with_system(config, config.mavlink.system + number - 1) if mavlink else config
         self._events = events
         self._say = say
         self._gusts = streams.gusts
         self._imu = VirtualImu(config.imu, streams.imu)
         self._mocap = VirtualMocap(config.mocap, streams.mocap)
+        self._line = VirtualSerial(config.serial, events, streams.radio) if mavlink else None
+        self._line_end: Endpoint | None = None
+        if self._line is not None:
+            self._line.connect(self._uart_ready, self._from_line)
         self._place(events.now_us)
         settings = RadioSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
@@ -94,6 +125,24 @@ class ServedBoard:
     def serve_udp(self, port: int, readers: Readers) -> None:
         """Be reachable over UDP, too."""
         self.udp = UdpServer(port, readers, self._events, self.received)
+
+    def serve_mavlink(self, address: Address, readers: Readers) -> str:
+        """Lead the serial line out; returns what MAVProxy calls its end. Only for a board made with `mavlink`."""
+        assert self._line is not None
+        self._line_end = address.open(readers, self._line.uplink)
+        return self._line_end.master
+
+    def _from_line(self, now_us: int, data: bytes) -> None:
+        if self._line_end is not None:
+            self._line_end.send(data)
+
+    def close(self) -> None:
+        """Close what was opened for clients."""
+        if self.udp is not None:
+            self.udp.close()
+        if self._line_end is not None:
+            self._line_end.close()
+            self._line_end = None
 
     def publish(self, to: Publish) -> None:
         """Hand every mocap frame to `to` when the cameras' computer has it."""
@@ -126,6 +175,7 @@ class ServedBoard:
             lambda t_us, counts: self._plant.set_counts(self._boot_us + t_us - self._placed_us, counts),
             self._radio_send,
             lambda t_us, text: self._say(f"board {self.number}: {text}"),
+            _Uart(self._line, self._events) if self._line is not None else None,
         )
         if self._board is not None:  # memories survive, whatever was in the processor does not
             board.eeprom, board.deck_memory = self._board.eeprom, self._board.deck_memory
@@ -134,7 +184,7 @@ class ServedBoard:
             board.eeprom[:CONFIG_SIZE] = self._factory_config()
         self._tune(board.eeprom)
         self._board = board
-        self._firmware = Firmware(self._config, board)
+        self._firmware = Firmware(self._config, board, mavlink=self._line is not None)
         board.run_on(self._firmware.kernel, EventQueue())
         self._open_udp(now_us)
 
@@ -193,6 +243,13 @@ class ServedBoard:
             return
         self.catch_up(now_us)
         self._firmware.radio_received(data)
+        self._firmware.run(now_us - self._boot_us)
+
+    def _uart_ready(self, now_us: int) -> None:
+        if self._firmware is None:
+            return
+        self.catch_up(now_us)
+        self._firmware.uart_ready()
         self._firmware.run(now_us - self._boot_us)
 
     def _radio_send(self, local_us: int, data: bytes) -> bool:
@@ -270,3 +327,11 @@ class ServedBoard:
         self._placed_us = now_us
         self._plant = Plant(config.plant, config.tunnel, config.actuators, self._gusts, config.flight.home)
         self._plant.hold()
+
+
+def _with_system(config: LabConfig, system: int) -> LabConfig:
+    """Return the configuration with another MAVLink system id."""
+    if system > MAX_SYSTEM:
+        raise LabError(f"mavlink.system = {system}: ids end at {MAX_SYSTEM}")
+    mavlink = config.mavlink.model_copy(update={"system": system})
+    return config.model_copy(update={"mavlink": mavlink})

@@ -1,6 +1,7 @@
-"""The board's pins, joined to the virtual world: IMU registers, servo timers, radio chip, debug console."""
+"""The board's pins, joined to the virtual world: IMU registers, servo timers, radio chip, UART, debug console."""
 
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.firmware import Kernel
@@ -9,8 +10,25 @@ from hil.events import EventQueue
 STILL: ImuCounts = (0, 0, 0, 0, 0, 0)
 
 
+class Uart(Protocol):
+    """The board's end of a serial line."""
+
+    @property
+    def overruns(self) -> int:
+        """Bytes that found the receive buffer full."""
+        ...
+
+    def read(self) -> bytes:
+        """Return what has been received since the last time."""
+        ...
+
+    def write(self, now_us: int, data: bytes) -> bool:
+        """Send bytes; False when they do not fit into the transmit buffer."""
+        ...
+
+
 class VirtualBoard:
-    """Implements `firmware_py.board.Board`; `servo`, `radio` and `console` are where the pins lead to.
+    """Implements `firmware_py.board.Board`; `servo`, `radio`, `console` and `uart` are where the pins lead to.
 
     `run_on(kernel, events)` tells it whose time it is, and which hardware its pins may set going.
     """
@@ -20,6 +38,7 @@ class VirtualBoard:
         servo: Callable[[int, Sequence[int]], None],
         radio: Callable[[int, bytes], bool],
         console: Callable[[int, str], None],
+        uart: Uart | None = None,
     ) -> None:
         self.imu: ImuCounts = STILL
         self.battery_mv = 3900
@@ -28,6 +47,7 @@ class VirtualBoard:
         self._servo = servo
         self._radio = radio
         self._console = console
+        self._uart = uart
         self._kernel: Kernel | None = None
         self._events: EventQueue | None = None
 
@@ -55,11 +75,30 @@ class VirtualBoard:
     def radio_send(self, data: bytes) -> bool:
         """Hand a packet to the radio chip."""
         accepted = self._radio(self.now_us, data)
-        if self._kernel and self._events and self._events.next_us is not None:
-            self._kernel.until_us = min(
-                self._kernel.until_us, self._events.next_us - 1
-            )  # hardware goes first
+        self._let_hardware_go_first()
         return accepted
+
+    @property
+    def uart_overruns(self) -> int:
+        """Bytes that found the UART's receive buffer full."""
+        return self._uart.overruns if self._uart else 0
+
+    def uart_read(self) -> bytes:
+        """Return what the UART has received since the last time."""
+        return self._uart.read() if self._uart else b""
+
+    def uart_write(self, data: bytes) -> bool:
+        """Hand bytes to the UART; where nothing is connected they are gone."""
+        if self._uart is None:
+            return True
+        accepted = self._uart.write(self.now_us, data)
+        self._let_hardware_go_first()
+        return accepted
+
+    def _let_hardware_go_first(self) -> None:
+        """Let the tasks run no further than to the instant before the hardware's next event."""
+        if self._kernel and self._events and self._events.next_us is not None:
+            self._kernel.until_us = min(self._kernel.until_us, self._events.next_us - 1)
 
     def debug_write(self, text: str) -> None:
         """Hand a line to the console."""

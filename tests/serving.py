@@ -24,19 +24,20 @@ class Served:
 
     @property
     def radio_uris(self) -> list[str]:
-        return self._line("radio ")
+        return self.line("radio ")
 
     @property
     def udp_uris(self) -> list[str]:
-        return self._line("udp ")
+        return self.line("udp ")
 
     @property
     def environment(self) -> dict[str, str]:
         """What the printed line says to put before a program's name."""
-        words = self._line("use ")
+        words = self.line("use ")
         return {**os.environ, **dict(word.split("=", 1) for word in words if "=" in word)}
 
-    def _line(self, start: str) -> list[str]:
+    def line(self, start: str) -> list[str]:
+        """The words after the first one of the line that starts so."""
         return next(line for line in self.lines if line.startswith(start)).split()[1:]
 
     def wait_for(self, pattern: str, timeout_s: float) -> str:
@@ -55,7 +56,9 @@ class Served:
 
     def forget(self) -> None:
         """Let `wait_for` look only at what comes from now on."""
-        self.lines = [line for line in self.lines if line.split()[:1] in (["radio"], ["udp"], ["use"])]
+        self.lines = [
+            line for line in self.lines if line.split()[:1] in (["radio"], ["udp"], ["use"], ["mavlink"])
+        ]
 
     def interrupt(self) -> int:
         """Press Ctrl-C and return the exit code."""

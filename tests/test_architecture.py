@@ -37,7 +37,8 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "concurrent": ("hil/sweep.py",),
     "subprocess": ("hil/run.py", "hil/window.py", "hil/linked_flight.py"),
     "socket": (
-        "hil/window.py", "hil/dongle_plugin.py", "hil/dongle_server.py", "hil/udp_server.py", "hil/linked_flight.py",
+        "hil/window.py", "hil/dongle_plugin.py", "hil/dongle_server.py", "hil/udp_server.py", "hil/serial_server.py",
+        "hil/linked_flight.py",
         "ground_station/mocap_udp.py",
     ),
     "random": (),

@@ -1,6 +1,6 @@
 """The console: lines of text to whoever listens, on port 0 in pieces of at most 30 bytes, and to the debug pins."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from firmware_py.board import Board
 from firmware_py.links.crtp_stack import CrtpStack, Task
@@ -17,6 +17,7 @@ class Console:
     def __init__(self, stack: CrtpStack, board: Board) -> None:
         self._stack = stack
         self._board = board
+        self.listeners: list[Callable[[str], object]] = []  # of other links
         self._lines: Queue[str] = stack.kernel.create_queue(LINE_QUEUE, "console")
         stack.kernel.create_task("CONSOLE", 0, self._task)
 
@@ -24,6 +25,8 @@ class Console:
         """Take a line without its end. A plain call: also code that cannot wait has something to say."""
         self._board.debug_write(line)
         self._lines.send_from_isr(line)
+        for listen in self.listeners:
+            listen(line)
 
     def _task(self) -> Task:
         while True:

@@ -5,6 +5,7 @@ its name, the name, the length of its value, the value. Anything that does not c
 """
 
 import struct
+from collections.abc import Mapping
 from zlib import crc32
 
 START = 1024  # below lies the configuration block
@@ -34,7 +35,11 @@ class ParameterStorage:
 
     def store(self, name: str, value: bytes) -> bool:
         """Store a value under a name; False when the memory is full."""
-        return self._write(self.load() | {name: value})
+        return self.store_all({name: value})
+
+    def store_all(self, values: Mapping[str, bytes]) -> bool:
+        """Store values under their names; False, and nothing stored, when the memory is full."""
+        return self._write(self.load() | dict(values))
 
     def clear(self, name: str) -> bool:
         """Forget a value; False when there was none."""

@@ -5,11 +5,13 @@ from collections.abc import Callable, Sequence
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.wire import telemetry
 
+ReadBlock = Callable[[telemetry.Block], Sequence[float]]
+
 
 class TelemetryStream:
     """`read_block` returns the present values of a telemetry block, in the order of its variables."""
 
-    def __init__(self, stack: CrtpStack, read_block: Callable[[telemetry.Block], Sequence[float]]) -> None:
+    def __init__(self, stack: CrtpStack, read_block: ReadBlock) -> None:
         self._on = False
         self._stack = stack
         self._read_block = read_block

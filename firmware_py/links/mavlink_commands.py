@@ -1,0 +1,138 @@
+"""Commands, each acknowledged to its sender, and the small services that clients expect to be answered.
+
+A command that comes again, because its acknowledgement was lost, acts again the same way and is acknowledged again.
+"""
+
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from math import isfinite
+
+from firmware_py.geometry import Vector
+from firmware_py.links.mavlink_stack import MavlinkStack
+from firmware_py.links.mavlink_streams import StreamService
+from firmware_py.links.parameters import Parameter
+from firmware_py.links.storage import ParameterStorage
+from firmware_py.supervisor import Supervisor
+from firmware_py.wire import mavlink
+from firmware_py.wire.mavlink_frames import Message
+
+VERSION = (2026, 11, 0)
+REVISION = bytes.fromhex("0f10a717")  # the parameters firmware.revision0
+SERIAL_NUMBER = 0x00F10A71  # the parameter cpu.id0
+FORCE = 21196  # MAVLink's magic number for disarming in flight
+STORE = 1  # PREFLIGHT_STORAGE: write all
+
+
+class Command(IntEnum):
+    """MAV_CMD of what the board can do."""
+
+    DO_FLIGHTTERMINATION = 185
+    PREFLIGHT_STORAGE = 245
+    COMPONENT_ARM_DISARM = 400
+    GET_HOME_POSITION = 410
+    GET_MESSAGE_INTERVAL = 510
+    SET_MESSAGE_INTERVAL = 511
+    REQUEST_MESSAGE = 512
+    REQUEST_AUTOPILOT_CAPABILITIES = 520
+
+
+class Result(IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+
+
+class CommandService:
+    """Answers COMMAND_LONG and COMMAND_INT, PING and file transfer requests."""
+
+    def __init__(
+        self,
+        stack: MavlinkStack,
+        supervisor: Supervisor,
+        streams: StreamService,
+        parameters: Sequence[Parameter],
+        storage: ParameterStorage,
+        home: Vector,
+    ) -> None:
+        self._stack = stack
+        self._supervisor = supervisor
+        self._streams = streams
+        self._parameters = parameters
+        self._storage = storage
+        self._home = home
+        self._commands: dict[int, Callable[[Message], Result]] = {
+            Command.DO_FLIGHTTERMINATION: self._terminate,
+            Command.PREFLIGHT_STORAGE: self._store,
+            Command.COMPONENT_ARM_DISARM: self._arm,
+            Command.GET_HOME_POSITION: lambda command: self._send(mavlink.MSG_HOME_POSITION),
+            Command.GET_MESSAGE_INTERVAL: self._tell_interval,
+            Command.SET_MESSAGE_INTERVAL: self._set_interval,
+            Command.REQUEST_MESSAGE: lambda command: self._send(_whole(command.param1)),
+            Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda command: self._send(mavlink.MSG_AUTOPILOT_VERSION),
+        }
+        stack.handle(mavlink.MSG_COMMAND_LONG, self._obey)
+        stack.handle(mavlink.MSG_COMMAND_INT, self._obey)
+        stack.handle(mavlink.MSG_PING, self._answer_ping)
+        stack.handle(
+            mavlink.MSG_FILE_TRANSFER_PROTOCOL, lambda request: stack.reply(mavlink.ftp_nak(request))
+        )
+
+    def _obey(self, command: Message) -> None:
+        obey = self._commands.get(command.command)
+        result = Result.UNSUPPORTED if obey is None else obey(command)
+        self._stack.refused += result is not Result.ACCEPTED
+        source = command.get_srcSystem(), command.get_srcComponent()
+        self._stack.reply(mavlink.command_ack(command.command, result, *source))
+
+    def _answer_ping(self, ping: Message) -> None:
+        if ping.target_system == 0:  # otherwise it is an answer
+            self._stack.reply(mavlink.ping_answer(ping))
+
+    def _arm(self, command: Message) -> Result:
+        if command.param1 not in (0, 1):
+            return Result.DENIED
+        if command.param1 == 0 and command.param2 == FORCE:
+            self._supervisor.emergency_stop()
+        return Result.ACCEPTED if self._supervisor.arm(command.param1 == 1) else Result.TEMPORARILY_REJECTED
+
+    def _terminate(self, command: Message) -> Result:
+        if command.param1 != 1:
+            return Result.DENIED
+        self._supervisor.emergency_stop()
+        return Result.ACCEPTED
+
+    def _store(self, command: Message) -> Result:
+        if command.param1 != STORE:
+            return Result.DENIED
+        values = {parameter.name: parameter.value() for parameter in self._parameters if parameter.persistent}
+        return Result.ACCEPTED if self._storage.store_all(values) else Result.FAILED
+
+    def _set_interval(self, command: Message) -> Result:
+        done = self._streams.set_interval(_whole(command.param1), _whole(command.param2))
+        return Result.ACCEPTED if done else Result.DENIED
+
+    def _tell_interval(self, command: Message) -> Result:
+        number = _whole(command.param1)
+        if not 0 <= number <= 0xFFFF:
+            return Result.DENIED
+        self._stack.reply(mavlink.message_interval(number, self._streams.interval_us(number)))
+        return Result.ACCEPTED
+
+    def _send(self, number: int) -> Result:
+        """Send a message once."""
+        if number == mavlink.MSG_AUTOPILOT_VERSION:
+            self._stack.reply(mavlink.autopilot_version(VERSION, REVISION, SERIAL_NUMBER))
+        elif number == mavlink.MSG_HOME_POSITION:
+            self._stack.reply(mavlink.home_position(self._stack.kernel.now_us, self._home))
+        elif not self._streams.send_once(number):
+            return Result.DENIED
+        return Result.ACCEPTED
+
+
+def _whole(value: float) -> int:
+    """A parameter that is a whole number; -2, which none of them may be, for anything else."""
+    return int(value) if isfinite(value) and value == int(value) else -2

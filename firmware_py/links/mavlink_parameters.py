@@ -1,0 +1,102 @@
+"""The parameter protocol: list, read by index or by name, set. Only what can be written is in the list.
+
+Every value travels as REAL32, the one encoding that all ground stations agree on. Whatever becomes of a request to set,
+the answer carries the value that is in force. The list is sent one by one while the line is free; a request for it while
+it is on its way starts it anew.
+"""
+
+from collections.abc import Sequence
+from math import isfinite
+from typing import NoReturn
+from zlib import crc32
+
+from firmware_py.links.mavlink_stack import WARNING, MavlinkStack, Task
+from firmware_py.links.parameters import Parameter
+from firmware_py.wire import WireError, mavlink
+from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.parameters import OK
+
+HASH_NAME = "_HASH_CHECK"
+HASH_BITS = 24  # which a REAL32 carries exactly
+NO_INDEX = 0xFFFF
+REAL32 = 9  # MAV_PARAM_TYPE
+
+
+class MavlinkParameters:
+    """Serves the parameters that have `write`, in the order of the table."""
+
+    def __init__(self, stack: MavlinkStack, parameters: Sequence[Parameter]) -> None:
+        self._stack = stack
+        self._parameters = [parameter for parameter in parameters if parameter.write is not None]
+        self._names = [mavlink.mavlink_name(parameter.name) for parameter in self._parameters]
+        self._numbers = {name: number for number, name in enumerate(self._names)}
+        self._next = len(self._parameters)  # of the list that is being sent
+        self._listing = stack.kernel.create_binary_semaphore("mavList")
+        self._complaint = ""  # the last one, which is not repeated
+        stack.handle(mavlink.MSG_PARAM_REQUEST_LIST, self._start_list)
+        stack.handle(mavlink.MSG_PARAM_REQUEST_READ, self._read)
+        stack.handle(mavlink.MSG_PARAM_SET, self._set)
+        stack.kernel.create_task("MAV-PARAM", 1, self._list_task)
+
+    def _start_list(self, message: Message) -> None:
+        self._next = 0
+        self._listing.give_from_isr()
+
+    def _list_task(self) -> Task:
+        stack, end = self._stack, len(self._parameters)
+        while True:
+            if self._next >= end:
+                yield from self._listing.take()
+            elif stack.idle:
+                self._next += 1
+                yield from stack.offer(self._value(self._next - 1))
+            else:
+                yield from stack.kernel.delay(1)
+
+    def _read(self, message: Message) -> None:
+        number = message.param_index
+        if number < 0:
+            if message.param_id == HASH_NAME:
+                self._stack.reply(self._hash())
+                return
+            number = self._find(message.param_id)
+        elif number >= len(self._parameters):
+            raise WireError(f"parameter {number}: there are {len(self._parameters)}")
+        self._stack.reply(self._value(number))
+
+    def _set(self, message: Message) -> None:
+        name, value = message.param_id, message.param_value
+        number = self._find(name)
+        parameter = self._parameters[number]
+        whole = parameter.scalar.is_float or (isfinite(value) and value == int(value))
+        done = message.param_type == REAL32 and whole and parameter.set(value) == OK
+        self._stack.reply(self._value(number))
+        if not done:
+            limits = f"{parameter.minimum:g}..{parameter.maximum:g}"
+            self._refuse(f"{name} = {value:g}: refused, {limits}")
+
+    def _find(self, name: str) -> int:
+        number = self._numbers.get(name)
+        if number is None:
+            self._refuse(f"no parameter {name}")
+        return number
+
+    def _refuse(self, complaint: str) -> NoReturn:
+        """Say why, but not again and again."""
+        if complaint != self._complaint:
+            self._complaint = complaint
+            self._stack.reply(mavlink.status_text(WARNING, complaint))
+        raise WireError(complaint)
+
+    def _value(self, number: int) -> Message:
+        value = float(self._parameters[number].read())
+        return mavlink.parameter(self._names[number], value, number, len(self._parameters))
+
+    def _hash(self) -> Message:
+        """A number that changes with the names and with any value, by which clients know their copy."""
+        content = b"".join(
+            name.encode() + parameter.value()
+            for name, parameter in zip(self._names, self._parameters, strict=True)
+        )
+        value = crc32(content) >> (32 - HASH_BITS)
+        return mavlink.parameter(HASH_NAME, float(value), NO_INDEX, len(self._parameters))

@@ -1,0 +1,112 @@
+"""Absolute poses and goals from the serial line into the measurement queue; runs in the receiving task.
+
+The board forms the correction itself: the pose as it looks from the goal that is in force when it arrives. How old a
+pose is follows from its time stamp and from the sender's clock, which is asked twice a second, faster at first. Whoever
+sends poses is the partner; before the first pose, whoever sends heartbeats.
+"""
+
+from firmware_py.geometry import Vector, in_goal_frame
+from firmware_py.links.localisation import LocalisationService
+from firmware_py.links.mavlink_stack import MavlinkStack, Task
+from firmware_py.links.timesync import RemoteClock
+from firmware_py.measurements import POSE, Measurement, PoseMeasurement
+from firmware_py.rtos import Queue
+from firmware_py.wire import WireError, mavlink
+from firmware_py.wire.crtp import PoseMessage, check_pose
+from firmware_py.wire.mavlink_frames import Message
+
+OLDEST_US = 500_000  # an age beyond is no age: poses that old are of no use to anybody
+EARLIEST_US = -5_000  # the clocks' offset is not known better than this
+FAR = 1000.0  # [m] farther from the origin is no tunnel
+SYNC_PERIOD = 500  # ticks
+FIRST_SYNC_PERIOD = 100
+FIRST_SYNCS = 5
+PATIENCE = 50  # requests; some partners never answer
+
+
+class PoseService:
+    """`p_WG`, `yaw`: the goal. `frame` is the goal frame of the last pose, in which the estimator's state is."""
+
+    def __init__(
+        self,
+        stack: MavlinkStack,
+        measurements: Queue[Measurement],
+        localisation: LocalisationService,
+        home: Vector,
+    ) -> None:
+        self.p_WG = home
+        self.yaw = 0.0
+        self.frame = (home, 0.0)
+        self.age_us: int | None = None  # of the last pose when it arrived
+        self.unknown_ages = 0  # poses
+        self._stack = stack
+        self._measurements = measurements
+        self._localisation = localisation
+        self._partner: tuple[int, int] | None = None
+        self._clock = RemoteClock()
+        stack.handle(mavlink.MSG_ATT_POS_MOCAP, self._take_pose)
+        stack.handle(mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED, self._take_target)
+        stack.handle(mavlink.MSG_HEARTBEAT, self._see_heartbeat)
+        stack.handle(mavlink.MSG_TIMESYNC, self._take_timesync)
+        stack.kernel.create_task("MAV-SYNC", 1, self._sync_task)
+
+    def _take_pose(self, message: Message) -> None:
+        pose = mavlink.read_pose(message)
+        if not all(abs(coordinate) <= FAR for coordinate in pose.p_WB):
+            raise WireError(f"a pose at {pose.p_WB} m")
+        self._meet(message)
+        now_us = self._stack.kernel.now_us
+        self.frame = (self.p_WG, self.yaw)
+        p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self.frame)
+        check_pose(p_GB, q_GB)
+        self.age_us = self._age_us(now_us, pose.t_us)
+        self.unknown_ages += self.age_us is None
+        self._localisation.last = PoseMessage(p_GB, q_GB, self.age_us)
+        self._measurements.send_from_isr((POSE, PoseMeasurement(now_us, self._localisation.last)))
+
+    def _age_us(self, now_us: int, t_us: int) -> int | None:
+        """How long ago the sender's clock showed `t_us`; None when that is not known."""
+        offset_us = self._clock.offset_us(now_us)
+        if offset_us is None:
+            return None
+        age_us = now_us + offset_us - t_us
+        return max(0, age_us) if EARLIEST_US <= age_us <= OLDEST_US else None
+
+    def _take_target(self, message: Message) -> None:
+        target = mavlink.read_target(message)
+        if target.p_WG is not None:
+            if not all(abs(coordinate) <= FAR for coordinate in target.p_WG):
+                raise WireError(f"a goal at {target.p_WG} m")
+            self.p_WG = target.p_WG
+        if target.yaw is not None:
+            self.yaw = target.yaw
+
+    def _see_heartbeat(self, message: Message) -> None:
+        if self._partner is None:
+            self._meet(message)
+
+    def _meet(self, message: Message) -> None:
+        """Let the sender of the message be the partner."""
+        source = (message.get_srcSystem(), message.get_srcComponent())
+        if source != self._partner:
+            self._partner, self._clock = source, RemoteClock()
+
+    def _take_timesync(self, message: Message) -> None:
+        """Answer a request; use an answer of the partner."""
+        now_us = self._stack.kernel.now_us
+        if message.tc1 == 0:
+            self._stack.reply(mavlink.timesync(now_us * 1000, message.ts1))
+        elif (message.get_srcSystem(), message.get_srcComponent()) == self._partner:
+            self._clock.answer(now_us, message.ts1 // 1000, message.tc1 // 1000)
+
+    def _sync_task(self) -> Task:
+        """Ask the partner for its time, a tick before the telemetry, when the line is free."""
+        kernel = self._stack.kernel
+        while True:
+            clock = self._clock
+            begins = clock.exchanges < FIRST_SYNCS and clock.requests < PATIENCE
+            period = FIRST_SYNC_PERIOD if begins else SYNC_PERIOD
+            yield from kernel.delay_until((kernel.tick_count + 1) // period * period + period - 1)
+            if self._partner is not None:
+                self._clock.request(kernel.now_us)
+                yield from self._stack.offer(mavlink.timesync(0, kernel.now_us * 1000))

@@ -1,0 +1,134 @@
+"""MAVLink on board: from the UART interrupt to the services and back.
+
+Uplink: UART interrupt -> MAV-RX, which finds the frames and runs a handler for each message.
+Downlink: services -> transmit queue (32) -> MAV-TX -> UART. Replies may fill the queue; what is sent unasked leaves
+room for them and is dropped and counted when the line does not keep up. MAV-TX alone makes frames, so that their
+sequence numbers leave in order.
+"""
+
+from collections.abc import Callable, Generator, Iterable
+
+from firmware_py.board import Board
+from firmware_py.config import CpuConfig, MavlinkConfig
+from firmware_py.rtos import Kernel, Queue
+from firmware_py.rtos.task import GO_ON
+from firmware_py.wire import WireError, mavlink
+from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
+
+Task = Generator[int, None, None]
+Handler = Callable[[Message], object]
+
+TRANSMIT_QUEUE = 32
+UNASKED_LIMIT = 24  # messages in the queue beyond which nothing is sent unasked
+SILENCE_TICKS = 50  # after which MAV-RX lets the receiver look through half a frame again
+
+INFO, WARNING = 6, 4  # MAV_SEVERITY
+
+
+class MavlinkStack:
+    """Creates the tasks and the queue of the link on a kernel; services are added before the scheduler starts."""
+
+    def __init__(self, kernel: Kernel, cost: CpuConfig, config: MavlinkConfig, board: Board) -> None:
+        self.kernel = kernel
+        self.system = config.system
+        self.component = config.component
+        self.refused = 0  # messages that no service could use
+        self.unserved = 0  # messages that nobody here reads, or that are for others
+        self.dropped = 0  # messages for which the line had no time
+        self._cost_us = cost.mavlink_us
+        self._board = board
+        signing = Signing(bytes.fromhex(config.signing_key)) if config.signing_key else None
+        self._receiver = FrameReceiver(signing)
+        self._sender = FrameSender(config.system, config.component, signing)
+        self.counters = self._receiver.counters
+        self._handlers: dict[int, Handler] = {}
+        self._received = kernel.create_binary_semaphore("uartReady")
+        self._transmit: Queue[Message] = kernel.create_queue(TRANSMIT_QUEUE, "mavTx")
+        kernel.create_task("MAV-RX", 2, self._receive_task)
+        kernel.create_task("MAV-TX", 2, self._transmit_task)
+
+    @property
+    def frames(self) -> int:
+        """Frames that came."""
+        return self.counters.frames
+
+    @property
+    def lost(self) -> int:
+        """Frames that did not come."""
+        return self.counters.lost
+
+    @property
+    def bad(self) -> int:
+        """Frames that were damaged or not signed as they must be."""
+        counters = self.counters
+        return counters.bad_crc + counters.bad_signature + counters.unsigned + counters.replayed
+
+    @property
+    def overruns(self) -> int:
+        """Bytes that the UART lost because nobody fetched them in time."""
+        return self._board.uart_overruns
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits to be sent."""
+        return len(self._transmit) == 0
+
+    def uart_ready(self) -> None:
+        """Interrupt: the UART has bytes."""
+        self._received.give_from_isr()
+
+    def handle(self, number: int, handler: Handler) -> None:
+        """Let the receiving task call `handler` for each message of this number; `WireError` refuses it."""
+        self._handlers[number] = handler
+
+    def reply(self, message: Message) -> None:
+        """Queue what somebody asked for. A plain call, for handlers; dropped when the queue is full."""
+        self.dropped += not self._transmit.send_from_isr(message)
+
+    def offer(self, message: Message) -> Iterable[int]:
+        """Queue what nobody asked for, if there is time for it."""
+        if len(self._transmit) >= UNASKED_LIMIT:
+            self.dropped += 1
+            return GO_ON
+        return self._transmit.send_nowait(message)
+
+    def say(self, line: str) -> None:
+        """Send a line of the console as STATUSTEXT."""
+        self.reply(mavlink.status_text(WARNING if "failsafe" in line else INFO, line))
+
+    def _receive_task(self) -> Task:
+        kernel, receiver, board = self.kernel, self._receiver, self._board
+        while True:
+            yield from self._received.take(SILENCE_TICKS)
+            for message in receiver.feed(kernel.now_us, board.uart_read()):
+                yield from kernel.work(self._cost_us)
+                self._dispatch(message)
+
+    def _dispatch(self, message: Message) -> None:
+        if (message.get_srcSystem(), message.get_srcComponent()) == (self.system, self.component):
+            return  # an echo of our own
+        handler = self._handlers.get(message.get_msgId())
+        if handler is None or not self._is_ours(message):
+            self.unserved += 1
+            return
+        try:
+            handler(message)
+        except WireError:
+            self.refused += 1
+
+    def _is_ours(self, message: Message) -> bool:
+        """Whether we are among those that it is for; 0 stands for all."""
+        system = getattr(message, "target_system", 0)
+        component = getattr(message, "target_component", 0)
+        return system in (0, self.system) and component in (0, self.component)
+
+    def _transmit_task(self) -> Task:
+        kernel, sender, board = self.kernel, self._sender, self._board
+        while True:
+            message = yield from self._transmit.receive()
+            if message is None:
+                continue
+            yield from kernel.work(self._cost_us)
+            frame = sender.encode(kernel.now_us, message)
+            while not board.uart_write(frame):
+                yield from kernel.delay(1)

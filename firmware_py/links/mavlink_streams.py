@@ -1,0 +1,120 @@
+"""Messages that the board sends by itself, each at its own interval, which clients may change.
+
+Intervals are whole ticks and count from boot: messages of one interval are made in the same tick and carry the same time
+stamp, and a tick that was missed moves nothing.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from firmware_py.links.mavlink_stack import MavlinkStack, Task
+from firmware_py.rtos import FOREVER, TICK_US
+from firmware_py.wire import mavlink
+from firmware_py.wire.mavlink_frames import Message
+
+DEFAULT, OFF = 0, -1  # intervals in SET_MESSAGE_INTERVAL
+NONE_SUCH = 0  # interval in MESSAGE_INTERVAL
+LONGEST_TICKS = 1_000_000
+
+_STATUS = (mavlink.MSG_SYS_STATUS, mavlink.MSG_BATTERY_STATUS, mavlink.MSG_ESTIMATOR_STATUS)
+_ATTITUDE = (mavlink.MSG_ATTITUDE, mavlink.MSG_ATTITUDE_QUATERNION)
+_POSITION = (mavlink.MSG_LOCAL_POSITION_NED,)
+_SERVOS = (mavlink.MSG_SERVO_OUTPUT_RAW,)
+_REST = (mavlink.MSG_NAMED_VALUE_FLOAT,)
+GROUPS = {  # MAV_DATA_STREAM of the older REQUEST_DATA_STREAM
+    0: (*_STATUS, *_ATTITUDE, *_POSITION, *_SERVOS, *_REST),
+    2: _STATUS,
+    3: _SERVOS,
+    6: _POSITION,
+    10: _ATTITUDE,
+    12: _REST,
+}
+
+
+@dataclass(slots=True)
+class Stream:
+    """A kind of message; `make` returns those of one tick. An interval of None means off."""
+
+    number: int
+    default_ticks: int | None
+    make: Callable[[int], Sequence[Message]]
+    interval_ticks: int | None = None
+    due_tick: int = 0
+
+    def start(self, interval_ticks: int | None, tick: int) -> None:
+        """Go on at this interval."""
+        self.interval_ticks = interval_ticks
+        if interval_ticks is not None:
+            self.due_tick = tick // interval_ticks * interval_ticks + interval_ticks
+
+
+def interval_of(rate_hz: float) -> int | None:
+    """Return the ticks between two messages, None for rate 0."""
+    return max(1, round(1000 / rate_hz)) if rate_hz > 0 else None
+
+
+class StreamService:
+    """Sends the streams; `set_interval`, `interval_us` and `send_once` are for commands."""
+
+    def __init__(self, stack: MavlinkStack, streams: Sequence[Stream]) -> None:
+        self._stack = stack
+        self._streams = {stream.number: stream for stream in streams}
+        for stream in streams:
+            stream.start(stream.default_ticks, 0)
+        self._changed = stack.kernel.create_binary_semaphore("mavStreams")
+        stack.handle(mavlink.MSG_REQUEST_DATA_STREAM, self._take_request)
+        stack.kernel.create_task("MAV-STREAM", 1, self._task)
+
+    def set_interval(self, number: int, interval_us: int) -> bool:
+        """Change how often a message is sent; False when there is no such message or no such interval."""
+        stream = self._streams.get(number)
+        if stream is None or interval_us < OFF:
+            return False
+        if interval_us == DEFAULT:
+            ticks = stream.default_ticks
+        elif interval_us == OFF:
+            ticks = None
+        else:
+            ticks = min(LONGEST_TICKS, max(1, round(interval_us / TICK_US)))
+        stream.start(ticks, self._stack.kernel.tick_count)
+        self._changed.give_from_isr()
+        return True
+
+    def interval_us(self, number: int) -> int:
+        """Return how often a message is sent, as MESSAGE_INTERVAL tells it."""
+        stream = self._streams.get(number)
+        if stream is None:
+            return NONE_SUCH
+        return OFF if stream.interval_ticks is None else stream.interval_ticks * TICK_US
+
+    def send_once(self, number: int) -> bool:
+        """Send a message now; False when there is no such message."""
+        stream = self._streams.get(number)
+        if stream is None:
+            return False
+        for message in stream.make(self._stack.kernel.tick_count):
+            self._stack.reply(message)
+        return True
+
+    def _take_request(self, request: Message) -> None:
+        on = request.start_stop == 1 and request.req_message_rate > 0
+        interval_us = 1_000_000 // request.req_message_rate if on else OFF
+        for number in GROUPS.get(request.req_stream_id, ()):
+            self.set_interval(number, interval_us)
+
+    def _task(self) -> Task:
+        kernel, stack, streams = self._stack.kernel, self._stack, tuple(self._streams.values())
+        while True:
+            tick = kernel.tick_count
+            messages: list[Message] = []
+            for stream in streams:
+                if stream.interval_ticks is not None and stream.due_tick <= tick:
+                    stream.start(stream.interval_ticks, tick)
+                    messages += stream.make(tick)
+            for message in messages:
+                yield from stack.offer(message)
+            due = min(
+                (stream.due_tick for stream in streams if stream.interval_ticks is not None), default=None
+            )
+            timeout = FOREVER if due is None else max(0, due - kernel.tick_count)
+            yield from self._changed.take(timeout)

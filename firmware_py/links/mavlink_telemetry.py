@@ -1,0 +1,130 @@
+"""What the streams carry: the running board's values as messages, absolute in W, with the tick as time stamp.
+
+The estimator's state is relative to the goal frame of the last pose; position, velocity and yaw are turned back here.
+"""
+
+from collections.abc import Sequence
+from math import sqrt
+from typing import Any
+
+from firmware_py.config import StreamRates
+from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY
+from firmware_py.geometry import from_euler_zyx, rotate, wrap_angle, yaw_quaternion
+from firmware_py.links.mavlink_poses import PoseService
+from firmware_py.links.mavlink_stack import MavlinkStack
+from firmware_py.links.mavlink_streams import Stream, interval_of
+from firmware_py.links.stream import ReadBlock
+from firmware_py.supervisor import Supervisor
+from firmware_py.wire import mavlink, telemetry
+from firmware_py.wire.mavlink_frames import Message
+
+UNKNOWN_AGE = -1.0
+Messages = Sequence[Message]
+
+
+class FlightMessages:
+    """Makes messages of what is true now; `read_block` returns the values of a telemetry block."""
+
+    def __init__(
+        self,
+        stack: MavlinkStack,
+        supervisor: Supervisor,
+        poses: PoseService,
+        estimator: Any,
+        control: Any,
+        read_block: ReadBlock,
+    ) -> None:
+        self._stack = stack
+        self._supervisor = supervisor
+        self._poses = poses
+        self._estimator = estimator
+        self._control = control
+        self._read_block = read_block
+        self._load_since = (0, 0)  # instant and processor time of the last SYS_STATUS [us]
+
+    def streams(self, rates: StreamRates) -> tuple[Stream, ...]:
+        """Return all streams with their intervals after boot."""
+        return tuple(
+            Stream(number, interval_of(rate_hz), make)
+            for number, rate_hz, make in (
+                (mavlink.MSG_HEARTBEAT, rates.heartbeat, self._heartbeat),
+                (mavlink.MSG_ATTITUDE, rates.attitude, self._attitude),
+                (mavlink.MSG_ATTITUDE_QUATERNION, rates.attitude_quaternion, self._attitude_quaternion),
+                (mavlink.MSG_LOCAL_POSITION_NED, rates.local_position, self._local_position),
+                (mavlink.MSG_DEBUG_FLOAT_ARRAY, rates.flight_array, self._flight_array),
+                (mavlink.MSG_SERVO_OUTPUT_RAW, rates.servo_output, self._servo_outputs),
+                (mavlink.MSG_ESTIMATOR_STATUS, rates.estimator_status, self._estimator_status),
+                (mavlink.MSG_SYS_STATUS, rates.sys_status, self._sys_status),
+                (mavlink.MSG_BATTERY_STATUS, rates.battery_status, self._battery),
+                (mavlink.MSG_NAMED_VALUE_FLOAT, rates.named_values, self._named_values),
+            )
+        )
+
+    def _heartbeat(self, tick: int) -> Messages:
+        return (mavlink.heartbeat(self._supervisor.armed, self._supervisor.state),)
+
+    def _angles(self) -> tuple[float, float, float]:
+        """Roll, pitch, yaw of B in W."""
+        roll, pitch, yaw = self._estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
+        return roll, pitch, wrap_angle(yaw + self._poses.frame[1])
+
+    def _rates(self) -> tuple[float, float, float]:
+        p, q, r = self._estimator.now[RATE : RATE + 3].tolist()
+        return p, q, r
+
+    def _attitude(self, tick: int) -> Messages:
+        return (mavlink.attitude(tick, *self._angles(), *self._rates()),)
+
+    def _attitude_quaternion(self, tick: int) -> Messages:
+        return (mavlink.attitude_quaternion(tick, from_euler_zyx(*self._angles()), *self._rates()),)
+
+    def _local_position(self, tick: int) -> Messages:
+        p_WG, yaw = self._poses.frame
+        q_WG = yaw_quaternion(yaw)
+        now = self._estimator.now
+        x, y, z = rotate(q_WG, tuple(now[POSITION : POSITION + 3].tolist()))
+        v_W = rotate(q_WG, tuple(now[VELOCITY : VELOCITY + 3].tolist()))
+        return (mavlink.local_position(tick, (p_WG[0] + x, p_WG[1] + y, p_WG[2] + z), v_W),)
+
+    def _flight_array(self, tick: int) -> Messages:
+        flaps, health = (self._read_block(block) for block in telemetry.BLOCKS[2:])
+        return (mavlink.flight_array(tick * 1000, (*flaps, *health)),)
+
+    def _servo_outputs(self, tick: int) -> Messages:
+        return (mavlink.servo_outputs(tick * 1000, tuple(self._control.count.tolist())),)
+
+    def _estimator_status(self, tick: int) -> Messages:
+        last_us, timeout_us = self._supervisor.last_pose_us, self._supervisor.pose_timeout_us
+        healthy = last_us is not None and self._stack.kernel.now_us - last_us < timeout_us
+        x, y, z = self._estimator.P.diagonal()[POSITION : POSITION + 3].tolist()
+        return (mavlink.estimator_status(tick * 1000, healthy, sqrt(max(0.0, x, y)), sqrt(max(0.0, z))),)
+
+    def _sys_status(self, tick: int) -> Messages:
+        counters = self._stack.counters
+        drop_rate = counters.lost / max(1, counters.frames + counters.lost)
+        errors = self._stack.bad + self._stack.refused + self._stack.overruns
+        return (mavlink.sys_status(self._supervisor.battery_mv, drop_rate, errors, self._load()),)
+
+    def _load(self) -> float:
+        """Share of the processor's time that was used since this was last asked."""
+        kernel = self._stack.kernel
+        now_us, work_us = kernel.now_us, sum(task.work_us for task in kernel.tasks)
+        last_us, last_work_us = self._load_since
+        self._load_since = (now_us, work_us)
+        return (work_us - last_work_us) / max(1, now_us - last_us)
+
+    def _battery(self, tick: int) -> Messages:
+        return (mavlink.battery(self._supervisor.battery_mv),)
+
+    def _named_values(self, tick: int) -> Messages:
+        age_us = self._poses.age_us
+        return tuple(
+            mavlink.named_value(tick, name, value)
+            for name, value in (
+                ("age_ms", UNKNOWN_AGE if age_us is None else age_us * 1e-3),
+                ("refused", int(self._estimator.refused)),
+                ("up_lost", self._stack.counters.lost),
+                ("tx_dropped", self._stack.dropped),
+                ("overruns", self._stack.overruns),
+            )
+        )
