@@ -56,14 +56,6 @@ def yaw_quaternion(yaw: float) -> Quaternion:
     return (cos(0.5 * yaw), 0.0, 0.0, sin(0.5 * yaw))
 
 
-def in_goal_frame(p_WB: Vector, q_WB: Quaternion, p_WG: Vector, yaw: float) -> tuple[Vector, Quaternion]:
-    """`(p_GB, q_GB)`: the body's pose in the goal frame, which stands at `p_WG`, upright, turned by `yaw`."""
-    dx, dy, dz = p_WB[0] - p_WG[0], p_WB[1] - p_WG[1], p_WB[2] - p_WG[2]
-    c, s = cos(yaw), sin(yaw)
-    # Rz(-yaw) (p_WB - p_WG)
-    return (c * dx + s * dy, c * dy - s * dx, dz), multiply(conjugate(yaw_quaternion(yaw)), q_WB)
-
-
 def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Quaternion:
     """The attitude with these zyx angles."""
     cr, sr = cos(0.5 * roll), sin(0.5 * roll)

@@ -60,6 +60,7 @@ class StationCounters:
     invalid: int = 0  # of these, not tracked or not a pose
     sent: int = 0  # handed to the link
     received: int = 0  # packets, or pieces of a stream, from the board
+    samples: int = 0  # of telemetry in these
     malformed: int = 0  # of these, not decodable
 
 
@@ -110,6 +111,7 @@ class GroundStation:
         except WireError:
             self.counters.malformed += 1
             return
+        self.counters.samples += len(samples)
         for sample in samples:
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
             if self._log is not None:

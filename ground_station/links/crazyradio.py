@@ -24,6 +24,7 @@ from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, decode_log
 from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, Block, Sample
 from ground_station.clock import clock_us
 from ground_station.corrections import Correction, correct
+from ground_station.errors import LinkError
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
@@ -37,10 +38,6 @@ MIN_PROTOCOL = 4  # version from which the tables of contents are as read here
 NULL_HEADER, NULL_MASK = 0xF3, 0xF3
 URIS = (r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?", r"udp://[\w.-]+:\d{1,5}")
 SUPERVISOR_STATE = "supervisor.state"
-
-
-class LinkError(Exception):
-    """The board cannot be reached, or not any more; the text is one line."""
 
 
 @dataclass(slots=True)
@@ -62,8 +59,8 @@ class CrazyradioLink:
     def __init__(self, uri: str, latency_us: int) -> None:
         self.uri = uri
         self.statistics = LinkStatistics()
-        self.missing: list[str] = []  # telemetry variables that the board does not have
-        self.supervisor_state: int | None = None  # as last decoded
+        self.supervisor_state: int | None = None  # as last received
+        self._missing: list[str] = []  # telemetry variables that the board does not have, not told yet
         self._latency_us = latency_us
         self._cache = tempfile.TemporaryDirectory(prefix="floaty-toc-")
         self._crazyflie: Crazyflie | None = None
@@ -148,7 +145,7 @@ class CrazyradioLink:
     def _start_telemetry(self, crazyflie: Crazyflie) -> None:
         """Create the blocks of which the board has all variables."""
         crazyflie.add_port_callback(CRTPPort.LOGGING, self._on_log_packet)
-        self._blocks, self.missing = {}, []
+        self._blocks, self._missing = {}, []
         self._telemetry_us = clock_us()
         for block in BLOCKS:
             absent = [
@@ -156,7 +153,7 @@ class CrazyradioLink:
                 for v in block.variables
                 if crazyflie.log.toc.get_element_by_complete_name(v.name) is None
             ]
-            self.missing += absent
+            self._missing += absent
             if absent:
                 continue
             wanted = LogConfig(block.variables[0].name, PERIOD_MS)
@@ -234,6 +231,21 @@ class CrazyradioLink:
             self._telemetry_us = clock_us()
             self._received.append((self._telemetry_us, bytes((packet.header,)) + bytes(packet.data)))
 
+    def notices(self) -> list[str]:
+        """Return what the user should know and was not told yet."""
+        missing, self._missing = self._missing, []
+        return (
+            [f"the board has no {', '.join(missing)}: without these blocks of telemetry"] if missing else []
+        )
+
+    def summary(self) -> str:
+        """Return one line on how the link does."""
+        link = self.statistics
+        return (
+            f"corrections {link.sent} sent, {link.replaced + link.too_old} late  quality {link.quality:.0f} %  "
+            f"round trip {link.latency_ms:.1f} ms  {link.rate:.0f} exchanges/s"
+        )
+
     def check(self) -> None:
         """Raise `LinkError` when the link is lost."""
         if not self._news.empty():
@@ -250,6 +262,7 @@ class CrazyradioLink:
 
     def mute(self) -> None:
         """Send no more corrections; the board notices the silence and puts its flaps to hover."""
+        self.supervisor_state = None
         with self._mail:
             self._sending, self._mailbox = False, None
             self._mail.notify()
