@@ -5,8 +5,10 @@ and notes when. What was read is understood by who calls `receive`. Every wait h
 wrong is a `LinkError` of one line. The only file that knows pyserial.
 """
 
+import os
 import queue
 import re
+import select
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -28,7 +30,8 @@ ANSWER_TIMEOUT_US = 4_000_000  # for heartbeat and acknowledgement of a board wh
 SILENCE_TIMEOUT_US = 2_000_000  # connected: a heartbeat comes every second, telemetry oftener
 POLL_S = 0.05
 READ_SIZE = 4096
-READ_TIMEOUT_S = 0.005  # how long bytes are gathered
+READ_PERIOD_S = 0.005  # of looking, where one cannot be woken: rfc2217, Windows
+MAX_AGE_US = 120_000  # older poses are not sent: the board could not use them
 WRITE_TIMEOUT_S = 1.0
 CLOSE_TIMEOUT_S = 1.5
 PIECES = 2000  # of received bytes that wait
@@ -62,9 +65,9 @@ class _Port:
         self.received: queue.Queue[tuple[int, bytes]] = queue.Queue(PIECES)
         self._outgoing: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._take_pose = take_pose
-        self._closing = False
+        self._closing = threading.Event()
         self._serial = serial.serial_for_url(
-            device, baud, timeout=READ_TIMEOUT_S, write_timeout=WRITE_TIMEOUT_S, exclusive=True
+            device, baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True
         )
         self._threads = [
             threading.Thread(target=self._guard, args=(loop,), name=f"serial {name}", daemon=True)
@@ -79,7 +82,7 @@ class _Port:
 
     def close(self) -> None:
         """Let reader and writer end, and close, all within some seconds."""
-        self._closing = True
+        self._closing.set()
         self._outgoing.put(None)
         for thread in self._threads:
             thread.join(CLOSE_TIMEOUT_S)
@@ -93,7 +96,15 @@ class _Port:
             self.failure = self.failure or reason(error)
 
     def _read(self) -> None:
-        while not self._closing:
+        try:
+            descriptor = self._serial.fileno() if os.name == "posix" else None
+        except OSError:
+            descriptor = None
+        while not self._closing.is_set():
+            if descriptor is None:
+                self._closing.wait(READ_PERIOD_S)
+            else:
+                select.select((descriptor,), (), (), POLL_S)
             data = self._serial.read(READ_SIZE)
             if data:
                 self.bytes += len(data)
@@ -120,7 +131,7 @@ class MavlinkSerialLink:
         self._link = MavlinkLink(self._carry, self._config)
         self._pose: tuple[MocapFrame, Goal] | None = None
         self._muted = True
-        self._replaced = 0  # poses by newer ones before they could be sent
+        self._late = 0  # poses that were replaced by newer ones, or too old, before they could be sent
         self._notices: list[str] = []
 
     def open(self, give_up: Callable[[], bool]) -> None:
@@ -187,15 +198,20 @@ class MavlinkSerialLink:
             if self._pose is None:
                 self._port.write(POSE_IS_DUE)
             else:
-                self._replaced += 1
+                self._late += 1
             self._pose = (frame, goal)
 
     def _send_pose(self) -> None:
         """Make the frames of what lies in the place for one, when its turn has come."""
         with self._lock:
-            if self._pose is not None:
-                self._link.send(clock_us(), *self._pose)
-                self._pose = None
+            pose, self._pose = self._pose, None
+            if pose is None:
+                return
+            now_us = clock_us()
+            if now_us - pose[0].t_us > MAX_AGE_US:
+                self._late += 1
+            else:
+                self._link.send(now_us, *pose)
 
     def _carry(self, now_us: int, data: bytes) -> None:
         if self._port is not None:
@@ -238,7 +254,7 @@ class MavlinkSerialLink:
         link = self._link.statistics
         round_trip = "?" if link.round_trip_us is None else f"{link.round_trip_us / 1000:.1f}"
         return (
-            f"{link.poses} sent, {self._replaced} late  frames {link.frames}, {link.lost} lost, {link.bad} bad  "
+            f"{link.poses} sent, {self._late} late  frames {link.frames}, {link.lost} lost, {link.bad} bad  "
             f"round trip {round_trip} ms"
         )
 
