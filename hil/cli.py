@@ -170,7 +170,7 @@ def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool, perf
         TextColumn("{task.fields[now]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=notices, transient=True) as progress:
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
 
         def show(now_us: int, flight: "Flight | LinkedFlight") -> None:
