@@ -47,7 +47,9 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "numpy.random.seed": (),
     "cflib": ("ground_station/links/crazyradio.py",),
     "serial": (),
-    "pymavlink": (),
+    "pymavlink": (
+        "firmware_py/wire/mavlink.py", "firmware_py/wire/mavlink_layouts.py", "firmware_py/wire/mavlink_services.py",
+    ),
     "filterpy": (),
     "motioncapture": (),
     "scipy": (),

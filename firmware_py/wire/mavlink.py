@@ -7,15 +7,25 @@ becomes (x, -y, -z), a quaternion (w, x, y, z) becomes (w, x, -y, -z), and pitch
 What goes down saturates where an integer is too narrow and never raises; what comes from outside raises `WireError`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import cos, isfinite, nan, sin
 
 import pymavlink.dialects.v20.common as dialect
 
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.mavlink_frames import Message
-from firmware_py.wire.mavlink_parameters import mavlink_name as mavlink_name
+from firmware_py.wire.mavlink_services import u16, u32
+
+# isort: off
+from firmware_py.wire.mavlink_services import (  # offered here, too
+    autopilot_version as autopilot_version, command as command, command_ack as command_ack, ftp_nak as ftp_nak,
+    heartbeat as heartbeat, mavlink_name as mavlink_name, message_interval as message_interval,
+    named_value as named_value, parameter as parameter, ping_answer as ping_answer,
+    station_heartbeat as station_heartbeat, status_text as status_text, timesync as timesync,
+)  # fmt: skip
+# isort: on
 
 MSG_HEARTBEAT = 0
 MSG_SYS_STATUS = 1
@@ -28,12 +38,12 @@ MSG_ATTITUDE = 30
 MSG_ATTITUDE_QUATERNION = 31
 MSG_LOCAL_POSITION_NED = 32
 MSG_SERVO_OUTPUT_RAW = 36
-MSG_MISSION_REQUEST_LIST = 43
 MSG_REQUEST_DATA_STREAM = 66
 MSG_COMMAND_INT = 75
 MSG_COMMAND_LONG = 76
 MSG_COMMAND_ACK = 77
 MSG_SET_POSITION_TARGET_LOCAL_NED = 84
+MSG_VISION_POSITION_ESTIMATE = 102
 MSG_FILE_TRANSFER_PROTOCOL = 110
 MSG_TIMESYNC = 111
 MSG_ATT_POS_MOCAP = 138
@@ -41,7 +51,6 @@ MSG_BATTERY_STATUS = 147
 MSG_AUTOPILOT_VERSION = 148
 MSG_ESTIMATOR_STATUS = 230
 MSG_HOME_POSITION = 242
-MSG_MESSAGE_INTERVAL = 244
 MSG_NAMED_VALUE_FLOAT = 251
 MSG_STATUSTEXT = 253
 MSG_DEBUG_FLOAT_ARRAY = 350
@@ -51,19 +60,29 @@ FLIGHT_ARRAY_SIZE = 16  # 4 flap angles, 4 counts, 4 u, supervisor state, age, p
 COUNTS_PER_US = 21  # of the servo timer
 
 _U16_MAX = 0xFFFF
-_FRAME_LOCAL_NED = 1
-_IGNORE_POSITION = 0x007
+_FRAME_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
+_IGNORE_POSITION = 0x007  # bits of POSITION_TARGET_TYPEMASK
 _IGNORE_REST = 0x038 | 0x1C0 | 0x800  # velocity, acceleration, yaw rate
 _IS_FORCE = 0x200
 _IGNORE_YAW = 0x400
-# gyro, accelerometer, rate and attitude control, yaw, height and position control, motor outputs
-_SENSORS = 0x01 | 0x02 | 0x400 | 0x800 | 0x1000 | 0x2000 | 0x4000 | 0x8000
-_CAPABILITIES = 0x0002 | 0x0080 | 0x2000  # parameters as REAL32, local position target, MAVLink 2
-_ESTIMATES = 0x3F  # attitude, velocities, positions: all of the estimator's flags that we have
-_FTP_NAK, _FTP_UNKNOWN_COMMAND = 129, 6
-_STATUS_OF_STATE = (2, 3, 4, 5)  # calibrating, standby, active, critical
-_MODE_CUSTOM, _MODE_AUTOMATIC, _MODE_ARMED = 1, 16 | 8, 128
-_STATE_FLYING = 2
+_SENSORS = (
+    dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | dialect.MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL
+    | dialect.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
+    | dialect.MAV_SYS_STATUS_SENSOR_YAW_POSITION
+    | dialect.MAV_SYS_STATUS_SENSOR_Z_ALTITUDE_CONTROL
+    | dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
+    | dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
+)
+_ESTIMATES = (
+    dialect.ESTIMATOR_ATTITUDE
+    | dialect.ESTIMATOR_VELOCITY_HORIZ
+    | dialect.ESTIMATOR_VELOCITY_VERT
+    | dialect.ESTIMATOR_POS_HORIZ_REL
+    | dialect.ESTIMATOR_POS_HORIZ_ABS
+    | dialect.ESTIMATOR_POS_VERT_ABS
+)
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -123,11 +142,14 @@ def pose(t_us: int, p_WB: Vector, q_WB: Quaternion) -> Message:
 
 
 def read_pose(message: Message) -> Pose:
-    """The pose in an ATT_POS_MOCAP."""
-    w, x, y, z = message.q
-    p_WB, q_WB = turn((message.x, message.y, message.z)), turn_quaternion((w, x, y, z))
+    """The pose in an ATT_POS_MOCAP or a VISION_POSITION_ESTIMATE."""
+    if message.get_msgId() == MSG_ATT_POS_MOCAP:
+        t_us, q = message.time_usec, tuple(message.q)
+    else:
+        t_us, q = message.usec, _from_euler(message.roll, message.pitch, message.yaw)
+    p_WB, q_WB = turn((message.x, message.y, message.z)), turn_quaternion(q)
     check_pose(p_WB, q_WB)
-    return Pose(message.time_usec, p_WB, q_WB)
+    return Pose(t_us, p_WB, q_WB)
 
 
 def target(t_ms: int, p_WG: Vector | None, yaw: float | None, system: int = 1, component: int = 1) -> Message:
@@ -135,7 +157,7 @@ def target(t_ms: int, p_WG: Vector | None, yaw: float | None, system: int = 1, c
     mask = _IGNORE_REST | (_IGNORE_POSITION if p_WG is None else 0) | (_IGNORE_YAW if yaw is None else 0)
     x, y, z = turn(p_WG or (0.0, 0.0, 0.0))
     return dialect.MAVLink_set_position_target_local_ned_message(
-        _u32(t_ms), system, component, _FRAME_LOCAL_NED, mask, x, y, z, 0, 0, 0, 0, 0, 0, -(yaw or 0.0), 0
+        u32(t_ms), system, component, _FRAME_LOCAL_NED, mask, x, y, z, 0, 0, 0, 0, 0, 0, -(yaw or 0.0), 0
     )  # fmt: skip
 
 
@@ -158,75 +180,41 @@ def read_target(message: Message) -> Target:
     return Target(p_WG, yaw)
 
 
-def station_heartbeat() -> Message:
-    """A ground station is here."""
-    return dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
-
-
-def command(system: int, component: int, number: int, *params: float) -> Message:
-    """A COMMAND_LONG with at most seven parameters; those left out are zero."""
-    padded = (*params, *(0.0,) * (7 - len(params)))
-    return dialect.MAVLink_command_long_message(system, component, number, 0, *padded)
-
-
-# Both ways
-
-
-def timesync(tc1_ns: int, ts1_ns: int) -> Message:
-    """A request (`tc1_ns` = 0) with the sender's clock, or the answer: own clock, and the request's returned."""
-    return dialect.MAVLink_timesync_message(tc1_ns, ts1_ns)
-
-
-def ping_answer(request: Message) -> Message:
-    """The answer to somebody's PING."""
-    return dialect.MAVLink_ping_message(
-        request.time_usec, request.seq, request.get_srcSystem(), request.get_srcComponent()
-    )
-
-
 # Downlink
-
-
-def heartbeat(armed: bool, state: int) -> Message:
-    """The board is here; `state` is the supervisor's, 0..3, and also the custom mode."""
-    mode = _MODE_CUSTOM | (_MODE_ARMED if armed else 0) | (_MODE_AUTOMATIC if state == _STATE_FLYING else 0)
-    return dialect.MAVLink_heartbeat_message(
-        dialect.MAV_TYPE_GENERIC, dialect.MAV_AUTOPILOT_GENERIC, mode, state, _STATUS_OF_STATE[state], 3
-    )
 
 
 def sys_status(battery_mV: int, drop_rate: float, errors: int, load: float) -> Message:
     """The supply, the share of received frames that were lost, receive errors, and the processor's load, 0..1."""
     return dialect.MAVLink_sys_status_message(
-        _SENSORS, _SENSORS, _SENSORS, round(1000 * min(1.0, max(0.0, load))), _u16(battery_mV), -1, -1,
-        round(10_000 * min(1.0, max(0.0, drop_rate))), _u16(errors), 0, 0, 0, 0,
+        _SENSORS, _SENSORS, _SENSORS, round(1000 * min(1.0, max(0.0, load))), u16(battery_mV), -1, -1,
+        round(10_000 * min(1.0, max(0.0, drop_rate))), u16(errors), 0, 0, 0, 0,
     )  # fmt: skip
 
 
 def attitude(t_ms: int, roll: float, pitch: float, yaw: float, p: float, q: float, r: float) -> Message:
     """zyx angles [rad] of B in W, and body rates [rad/s]."""
-    return dialect.MAVLink_attitude_message(_u32(t_ms), roll, -pitch, -yaw, p, -q, -r)
+    return dialect.MAVLink_attitude_message(u32(t_ms), roll, -pitch, -yaw, p, -q, -r)
 
 
 def attitude_quaternion(t_ms: int, q_WB: Quaternion, p: float, q: float, r: float) -> Message:
     """The attitude as a quaternion, and body rates [rad/s]."""
-    return dialect.MAVLink_attitude_quaternion_message(_u32(t_ms), *turn_quaternion(q_WB), p, -q, -r)
+    return dialect.MAVLink_attitude_quaternion_message(u32(t_ms), *turn_quaternion(q_WB), p, -q, -r)
 
 
 def local_position(t_ms: int, p_WB: Vector, v_W: Vector) -> Message:
     """Position [m] and velocity [m/s] in the world."""
-    return dialect.MAVLink_local_position_ned_message(_u32(t_ms), *turn(p_WB), *turn(v_W))
+    return dialect.MAVLink_local_position_ned_message(u32(t_ms), *turn(p_WB), *turn(v_W))
 
 
-def servo_outputs(t_us: int, counts: tuple[int, int, int, int]) -> Message:
+def servo_outputs(t_us: int, counts: Sequence[int]) -> Message:
     """Pulse lengths of the four servos, from timer counts of 1/21 us."""
-    pulses = (_u16((count + COUNTS_PER_US // 2) // COUNTS_PER_US) for count in counts)
-    return dialect.MAVLink_servo_output_raw_message(_u32(t_us), 0, *pulses, 0, 0, 0, 0)
+    pulses = (u16((count + COUNTS_PER_US // 2) // COUNTS_PER_US) for count in counts)
+    return dialect.MAVLink_servo_output_raw_message(u32(t_us), 0, *pulses, 0, 0, 0, 0)
 
 
 def battery(battery_mV: int) -> Message:
     """The supply as one cell; current and charge are not measured."""
-    voltages = [_u16(battery_mV)] + [_U16_MAX] * 9
+    voltages = [u16(battery_mV)] + [_U16_MAX] * 9
     return dialect.MAVLink_battery_status_message(0, 0, 0, 0x7FFF, voltages, -1, -1, -1, -1)
 
 
@@ -237,38 +225,6 @@ def estimator_status(t_us: int, healthy: bool, std_xy: float, std_z: float) -> M
     )
 
 
-def named_value(t_ms: int, name: str, value: float) -> Message:
-    """Any number; the name is cut at 10 characters."""
-    return dialect.MAVLink_named_value_float_message(_u32(t_ms), _text(name, 10), value)
-
-
-def status_text(severity: int, text: str) -> Message:
-    """A line for people, cut at 50 characters; severity as in syslog, 0 emergency .. 7 debug."""
-    return dialect.MAVLink_statustext_message(severity, _text(text, 50))
-
-
-def parameter(name: str, value: float, index: int, count: int) -> Message:
-    """A parameter's value; the type is always REAL32, the only one that all ground stations read alike."""
-    return dialect.MAVLink_param_value_message(
-        _text(name, 16), value, dialect.MAV_PARAM_TYPE_REAL32, _u16(count), _u16(index)
-    )
-
-
-def command_ack(number: int, result: int, to_system: int, to_component: int) -> Message:
-    """The answer to a command: MAV_RESULT 0 accepted, 1 temporarily rejected, 2 denied, 3 unsupported, 4 failed."""
-    return dialect.MAVLink_command_ack_message(number, result, 0, 0, to_system, to_component)
-
-
-def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) -> Message:
-    """What the board runs: version, up to 8 bytes of the source's revision, the board's serial number."""
-    major, minor, patch = version
-    packed = major << 24 | minor << 16 | patch << 8
-    own, none = list(revision[:8].ljust(8, b"\0")), [0] * 8
-    return dialect.MAVLink_autopilot_version_message(
-        _CAPABILITIES, packed, 0, 0, 0, own, none, none, 0, 0, uid
-    )
-
-
 def home_position(t_us: int, p_WG: Vector) -> Message:
     """The goal as home; there is no geographic position."""
     return dialect.MAVLink_home_position_message(
@@ -276,37 +232,10 @@ def home_position(t_us: int, p_WG: Vector) -> Message:
     )
 
 
-def message_interval(number: int, interval_us: int) -> Message:
-    """How often a message is sent; -1: not at all, 0: there is no such message."""
-    return dialect.MAVLink_message_interval_message(_u16(number), interval_us)
-
-
-def flight_array(t_us: int, values: tuple[float, ...]) -> Message:
+def flight_array(t_us: int, values: Sequence[float]) -> Message:
     """The values of `telemetry.BLOCKS[2]` and `[3]` in their order."""
     data = (*values, *(0.0,) * (58 - len(values)))
     return dialect.MAVLink_debug_float_array_message(max(0, t_us), FLIGHT_ARRAY.encode(), 0, data)
-
-
-def ftp_nak(request: Message) -> Message:
-    """The answer to any file transfer: unknown command."""
-    asked = bytes(request.payload)
-    sequence = (int.from_bytes(asked[:2], "little") + 1) & 0xFFFF
-    answer = bytes(
-        (
-            *sequence.to_bytes(2, "little"),
-            asked[2],
-            _FTP_NAK,
-            1,
-            asked[3],
-            0,
-            0,
-            *asked[8:12],
-            _FTP_UNKNOWN_COMMAND,
-        )
-    )
-    return dialect.MAVLink_file_transfer_protocol_message(
-        0, request.get_srcSystem(), request.get_srcComponent(), answer.ljust(251, b"\0")
-    )
 
 
 # Downlink, at the station
@@ -334,14 +263,15 @@ def read_flight_array(message: Message) -> tuple[float, ...]:
     return tuple(message.data[:FLIGHT_ARRAY_SIZE])
 
 
-def _u16(value: int) -> int:
-    return max(0, min(_U16_MAX, value))
-
-
-def _u32(value: int) -> int:
-    """Clocks wrap."""
-    return value & 0xFFFFFFFF
-
-
-def _text(text: str, size: int) -> bytes:
-    return text.encode("ascii", "replace")[:size]
+def _from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """The quaternion of zyx angles; NaN for angles that are no finite numbers."""
+    if not isfinite(roll + pitch + yaw):
+        return (nan, nan, nan, nan)
+    cr, sr, cp, sp = cos(roll / 2), sin(roll / 2), cos(pitch / 2), sin(pitch / 2)
+    cy, sy = cos(yaw / 2), sin(yaw / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )

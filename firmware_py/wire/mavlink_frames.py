@@ -14,28 +14,22 @@ Frames of MAVLink 1 are read, never written. Whose message it is for is the read
 
 import re
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from hashlib import sha256
-from operator import attrgetter
-from typing import Any
-
-import pymavlink.dialects.v20.common as dialect
-from pymavlink.dialects.v20.common import MAVLink_message as Message
+from typing import NamedTuple
 
 from firmware_py.wire import WireError
+from firmware_py.wire.mavlink_layouts import LAYOUTS, Message, crc16
+from firmware_py.wire.mavlink_signing import SIGNATURE_SIZE, Signing
+
+__all__ = ["SIGNATURE_SIZE", "FrameCounters", "FrameReceiver", "FrameSender", "Message", "Signing"]
 
 HALF_FRAME_US = 100_000  # silence after which half a frame is given up; 280 bytes last 49 ms at 57600 baud
-MINUTE = 6_000_000  # in units of the time stamp, 10 us
-STAMP_MAX = (1 << 48) - 1
-SIGNATURE_SIZE = 13  # link id, time stamp, 6 bytes of SHA-256
 RESTART = 4  # so many late frames in sequence: their sender has begun anew
 
-_MAGIC_2, _MAGIC_1 = 0xFD, 0xFE
-_MAGIC = re.compile(b"[\xfd\xfe]")
-_HEADER_2 = struct.Struct("<BBBBBBBHB")
-_HEADER_1 = struct.Struct("<BBBBBB")
+_START_2 = b"\xfd"
+_START = re.compile(b"[\xfd\xfe]")  # of version 2 or 1
+_HEAD_2 = struct.Struct("<xBBBBBBHB")  # without the magic byte
+_HEAD_1 = struct.Struct("<xBBBBB")
 _CRC_SIZE = 2
 _SIGNED = 1  # the only incompatibility flag that there is
 _INCOMPLETE, _NO_FRAME = 0, 1  # bytes to go on by
@@ -48,116 +42,12 @@ class FrameCounters:
     frames: int = 0  # delivered
     skipped_bytes: int = 0  # that belong to no frame
     bad_crc: int = 0  # supposed frames
-    unknown: int = 0  # frames, in sequence, of messages that the dialect does not have
+    unknown: int = 0  # next in sequence, but the dialect does not have the message (or its number is damaged)
     unsigned: int = 0  # refused because a key is set
     bad_signature: int = 0
     replayed: int = 0  # rightly signed, but not newer than the last one of their stream
     lost: int = 0  # gaps in the sequence numbers
     late: int = 0  # behind the newest of their sender: reordered (and counted as lost before) or repeated
-
-
-class Signing:
-    """The key of a link and the time stamps of both directions; share one among all that use the key.
-
-    `start` is the time stamp at `now_us` = 0, in 10 us since 2015-01-01: the last one known. With 0, a frame recorded
-    before the last boot passes for a new one until the first true frame has been heard.
-    """
-
-    def __init__(self, key: bytes, link_id: int = 0, start: int = 0) -> None:
-        if len(key) != 32:
-            raise WireError(f"a signing key of {len(key)} bytes: 32 are needed")
-        self.link_id = link_id
-        self._key = key
-        self._start = start
-        self._newest = 0  # of all stamps, sent and heard
-        self._streams: dict[tuple[int, int, int], int] = {}  # (system, component, link id): newest stamp
-
-    def sign(self, now_us: int, frame: bytes) -> bytes:
-        """The signature of `frame`, which ends with its CRC."""
-        self._newest = min(STAMP_MAX, max(self._start + now_us // 10, self._newest + 1))
-        head = bytes((self.link_id,)) + self._newest.to_bytes(6, "little")
-        return head + self._digest(frame + head)
-
-    def is_genuine(self, frame: bytes) -> bool:
-        """Whether `frame`, complete with its signature, was made with the key."""
-        return self._digest(frame[:-6]) == frame[-6:]
-
-    def is_new(self, now_us: int, system: int, component: int, frame: bytes) -> bool:
-        """Whether a genuine frame is newer than its stream's last; it is that last one from now on."""
-        stream, stamp = (system, component, frame[-13]), int.from_bytes(frame[-12:-6], "little")
-        last = self._streams.get(stream)
-        if last is None:
-            last = max(self._start + now_us // 10, self._newest) - MINUTE - 1
-        if stamp <= last:
-            return False
-        self._streams[stream] = stamp
-        self._newest = max(self._newest, stamp)
-        return True
-
-    def _digest(self, data: bytes) -> bytes:
-        return sha256(self._key + data).digest()[:6]
-
-
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """How a kind of message lies in its payload."""
-
-    create: Callable[..., Any]
-    payload: struct.Struct
-    crc_seed: bytes
-    read: Callable[[Any], Any]  # the fields of a message in wire order
-    arrays: tuple[
-        int, ...
-    ]  # lengths of the fields in wire order, 1 for a plain one; empty when all are plain
-    order: tuple[int, ...]  # which of the wire's fields is the constructor's first, second, ...
-
-    def pack(self, message: Message) -> bytes:
-        """The payload, its trailing zeros included."""
-        fields = self.read(message)
-        if not self.arrays:
-            return self.payload.pack(*fields)
-        flat: list[Any] = []
-        for field, length in zip(fields, self.arrays, strict=True):
-            if length == 1:
-                flat.append(field)
-            else:
-                flat.extend(field)
-        return self.payload.pack(*flat)
-
-    def unpack(self, payload: bytes) -> Message:
-        """The message; what is missing of the payload is zero, and what is too long belongs to a newer dialect."""
-        size = self.payload.size
-        flat = self.payload.unpack(payload[:size].ljust(size, b"\0"))
-        fields: tuple[Any, ...] | list[Any] = flat
-        if self.arrays:
-            fields, first = [], 0
-            for length in self.arrays:
-                fields.append(flat[first] if length == 1 else list(flat[first : first + length]))
-                first += length
-        return self.create(*[fields[i] for i in self.order])
-
-
-@cache
-def _layout(number: int) -> _Layout | None:
-    """The layout of message `number`, None when the dialect does not have it."""
-    kind = dialect.mavlink_map.get(number)
-    if kind is None:
-        return None
-    texts = {name for name, type in zip(kind.fieldnames, kind.fieldtypes, strict=True) if type == "char"}
-    names = [f"_{name}_raw" if name in texts else name for name in kind.ordered_fieldnames]
-    get = attrgetter(*names)
-    return _Layout(
-        create=kind,
-        payload=kind.unpacker,
-        crc_seed=bytes((kind.crc_extra,)),
-        read=get if len(names) > 1 else lambda message: (get(message),),
-        arrays=tuple(kind.lengths) if max(kind.lengths) > 1 else (),
-        order=tuple(kind.orders),
-    )
-
-
-def _crc(data: bytes) -> int:
-    return int(dialect.x25crc(data).crc)
 
 
 class FrameSender:
@@ -172,7 +62,7 @@ class FrameSender:
     def encode(self, now_us: int, message: Message) -> bytes:
         """The frame of `message`, which is not changed; `WireError` when a field does not fit its type."""
         number = message.get_msgId()
-        layout = _layout(number)
+        layout = LAYOUTS.get(number)
         if layout is None:
             raise WireError(f"message {number}: not in the dialect")
         try:
@@ -181,15 +71,19 @@ class FrameSender:
             raise WireError(f"{message.get_type()}: {error}") from error
         payload = full.rstrip(b"\0") or full[:1]
         flags = _SIGNED if self._signing else 0
-        body = (
-            _HEADER_2.pack(
-                _MAGIC_2, len(payload), flags, 0, self._sequence, self._system, self._component,
-                number & 0xFFFF, number >> 16,
-            )
-            + payload
-        )  # fmt: skip
+        head = _HEAD_2.pack(
+            len(payload),
+            flags,
+            0,
+            self._sequence,
+            self._system,
+            self._component,
+            number & 0xFFFF,
+            number >> 16,
+        )
         self._sequence = (self._sequence + 1) & 0xFF
-        frame = body + _crc(body[1:] + layout.crc_seed).to_bytes(2, "little")
+        body = head[1:] + payload
+        frame = _START_2 + body + crc16(body + layout.crc_seed).to_bytes(_CRC_SIZE, "little")
         return frame + self._signing.sign(now_us, frame) if self._signing else frame
 
 
@@ -217,6 +111,39 @@ class _Sequence:
             self.newest = number
 
 
+class _Head(NamedTuple):
+    """What the first bytes of a frame say."""
+
+    length: int  # of the payload
+    flags: int  # that must be understood
+    compatible: int  # flags that may be ignored
+    sequence: int
+    system: int
+    component: int
+    number: int  # of the message
+
+
+def _read_head(buffer: bytes, start: int) -> _Head:
+    if buffer[start] == _START_2[0]:
+        length, flags, compatible, sequence, system, component, low, high = _HEAD_2.unpack_from(buffer, start)
+        return _Head(length, flags, compatible, sequence, system, component, low | high << 16)
+    length, sequence, system, component, number = _HEAD_1.unpack_from(buffer, start)
+    return _Head(length, 0, 0, sequence, system, component, number)
+
+
+def _mark(message: Message, head: _Head, frame: bytes, crc: int) -> None:
+    """Tell the message where it came from, as pymavlink's own decoder does."""
+    header = message.get_header()
+    header.mlen, header.seq, header.srcSystem, header.srcComponent = (
+        head.length,
+        head.sequence,
+        head.system,
+        head.component,
+    )
+    header.incompat_flags, header.compat_flags = head.flags, head.compatible
+    message._msgbuf, message._crc = frame, crc
+
+
 class FrameReceiver:
     """Finds the frames in a stream of bytes; never raises, whatever the bytes."""
 
@@ -236,7 +163,7 @@ class FrameReceiver:
             self._last_us = now_us
         messages: list[Message] = []
         position = 0
-        while found := _MAGIC.search(buffer, position):
+        while found := _START.search(buffer, position):
             start = found.start()
             self.counters.skipped_bytes += start - position
             position = start
@@ -256,73 +183,66 @@ class FrameReceiver:
 
     def _take(self, now_us: int, buffer: bytes, start: int, messages: list[Message]) -> int:
         """Look at the supposed frame at `start`; return how many bytes it takes, or `_INCOMPLETE` or `_NO_FRAME`."""
-        is_2 = buffer[start] == _MAGIC_2
-        layout_2 = _HEADER_2 if is_2 else _HEADER_1
-        if len(buffer) - start < layout_2.size:
+        head_size = _HEAD_2.size if buffer[start] == _START_2[0] else _HEAD_1.size
+        if len(buffer) - start < head_size:
             return _INCOMPLETE
-        flags = compatible = high = 0
-        if is_2:
-            _, length, flags, compatible, sequence, system, component, low, high = _HEADER_2.unpack_from(
-                buffer, start
-            )
-        else:
-            _, length, sequence, system, component, low = _HEADER_1.unpack_from(buffer, start)
-        if flags & ~_SIGNED or not system:
+        head = _read_head(buffer, start)
+        if head.flags & ~_SIGNED or not head.system:
             return _NO_FRAME
-        layout = _layout(low | high << 16)
+        layout = LAYOUTS.get(head.number)
         if layout is None:
-            self._note_unknown(sequence, system, component)
+            self._note_unknown(head)
             return _NO_FRAME
-        if not is_2 and length > layout.payload.size:
-            return _NO_FRAME
+        if head_size == _HEAD_1.size and head.length > layout.payload.size:
+            return _NO_FRAME  # version 1 has no extensions
 
-        first = start + layout_2.size
-        signed_at = first + length + _CRC_SIZE
-        end = signed_at + SIGNATURE_SIZE if flags else signed_at
+        first = start + head_size
+        crc_at = first + head.length
+        crc_end = crc_at + _CRC_SIZE
+        end = crc_end + SIGNATURE_SIZE if head.flags else crc_end
         if len(buffer) < end:
             return _INCOMPLETE
-        crc = int.from_bytes(buffer[signed_at - _CRC_SIZE : signed_at], "little")
-        if _crc(buffer[start + 1 : signed_at - _CRC_SIZE] + layout.crc_seed) != crc:
+        crc = int.from_bytes(buffer[crc_at:crc_end], "little")
+        if crc != crc16(buffer[start + 1 : crc_at] + layout.crc_seed):
             self.counters.bad_crc += 1
             return _NO_FRAME
 
         frame = buffer[start:end]
-        if self._signing and not self._is_admitted(self._signing, now_us, flags, system, component, frame):
-            return signed_at - start  # the signature may be cut off: what stands in its place is looked at
-        message = layout.unpack(buffer[first : first + length])
-        header = message._header
-        header.mlen, header.seq, header.srcSystem, header.srcComponent = length, sequence, system, component
-        header.incompat_flags, header.compat_flags = flags, compatible
-        message._msgbuf, message._crc = frame, crc
-        self._note(sequence, system, component)
+        if self._signing is not None:
+            refused = self._refuse(self._signing, now_us, head, frame)
+            if refused:
+                return refused
+        message = layout.unpack(buffer[first:crc_at])
+        _mark(message, head, frame, crc)
+        self._note(head)
         messages.append(message)
         return end - start
 
-    def _is_admitted(
-        self, signing: Signing, now_us: int, signed: int, system: int, component: int, frame: bytes
-    ) -> bool:
-        if not signed:
+    def _refuse(self, signing: Signing, now_us: int, head: _Head, frame: bytes) -> int:
+        """How many bytes of a frame to pass over that is not signed, not genuine or not new; 0 to accept it."""
+        if not head.flags:
             self.counters.unsigned += 1
-        elif not signing.is_genuine(frame):
+            return len(frame)
+        if not signing.is_genuine(frame):
             self.counters.bad_signature += 1
-        elif not signing.is_new(now_us, system, component, frame):
+            return len(frame) - SIGNATURE_SIZE  # it may be cut off: what stands in its place is looked at
+        if not signing.is_new(now_us, head.system, head.component, frame):
             self.counters.replayed += 1
-        else:
-            return True
-        return False
+            return len(frame)
+        return 0
 
-    def _note(self, sequence: int, system: int, component: int) -> None:
+    def _note(self, head: _Head) -> None:
         """Count the frame, and what is missing before it."""
         self.counters.frames += 1
-        sender = self._senders.get((system, component))
+        sender = self._senders.get((head.system, head.component))
         if sender is None:
-            self._senders[system, component] = _Sequence(sequence)
+            self._senders[head.system, head.component] = _Sequence(head.sequence)
         else:
-            sender.note(sequence, self.counters)
+            sender.note(head.sequence, self.counters)
 
-    def _note_unknown(self, sequence: int, system: int, component: int) -> None:
+    def _note_unknown(self, head: _Head) -> None:
         """Believe in a frame whose CRC nobody can check when it is the next one of a known sender."""
-        sender = self._senders.get((system, component))
-        if self._signing is None and sender is not None and sequence == (sender.newest + 1) & 0xFF:
+        sender = self._senders.get((head.system, head.component))
+        if self._signing is None and sender is not None and head.sequence == (sender.newest + 1) & 0xFF:
             self.counters.unknown += 1
-            sender.newest = sequence
+            sender.newest = head.sequence

@@ -1,0 +1,158 @@
+"""The messages of the standard's services: who is there, commands, parameters, clocks, texts, files.
+
+Nothing here has an axis; what flies is in `mavlink`, which offers these functions, too.
+"""
+
+import pymavlink.dialects.v20.common as dialect
+
+from firmware_py.wire.mavlink_frames import Message
+
+NAME_SIZE = 16  # of a parameter
+
+PREFIXES = {  # of parameters, by group
+    "extCtrl": "EXT",
+    "motorPowerSet": "PWR",
+    "motorShifts": "TRIM",
+    "setpoint": "SP",
+    "RandConsts": "RND",
+    "delayComp": "DLY",
+    "kalman": "KAL",
+    "FloatyKalm": "FKL",
+    "locSrv": "LOC",
+    "stabilizer": "STAB",
+    "supervisor": "SUP",
+    "telemetry": "TLM",
+    "memTst": "MEM",
+    "deck": "DK",
+    "imu_sensors": "IMU",
+    "firmware": "FW",
+}
+
+
+_VERSION = 3  # the heartbeat's field; MAVLink 1 and 2 both say 3
+_U16_MAX, _U32_MAX, _I32_MAX = 0xFFFF, 0xFFFFFFFF, 0x7FFFFFFF
+_CAPABILITIES = (
+    dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+    | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+)
+_FTP_NAK, _FTP_UNKNOWN_COMMAND = 129, 6
+_STATUS_OF_STATE = (
+    dialect.MAV_STATE_CALIBRATING,
+    dialect.MAV_STATE_STANDBY,
+    dialect.MAV_STATE_ACTIVE,
+    dialect.MAV_STATE_CRITICAL,
+)
+_STATE_FLYING = 2
+_MODE_FLYING = dialect.MAV_MODE_FLAG_STABILIZE_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
+
+
+def u16(value: int) -> int:
+    """The nearest number that 16 bits can hold."""
+    return max(0, min(_U16_MAX, value))
+
+
+def u32(value: int) -> int:
+    """The lower 32 bits: clocks wrap."""
+    return value & _U32_MAX
+
+
+def mavlink_name(name: str) -> str:
+    """The MAVLink name of parameter `group.name`; a group that is not in the table keeps its own name."""
+    group, _, own = name.partition(".")
+    return f"{PREFIXES.get(group, group)}_{own}".upper()[:NAME_SIZE]
+
+
+def station_heartbeat() -> Message:
+    """A ground station is here."""
+    return dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, _VERSION
+    )
+
+
+def command(system: int, component: int, number: int, *params: float) -> Message:
+    """A COMMAND_LONG with at most seven parameters; those left out are zero."""
+    padded = (*params, *(0.0,) * (7 - len(params)))
+    return dialect.MAVLink_command_long_message(system, component, number, 0, *padded)
+
+
+def timesync(tc1_ns: int, ts1_ns: int) -> Message:
+    """A request (`tc1_ns` = 0) with the sender's clock, or the answer: own clock, and the request's returned."""
+    return dialect.MAVLink_timesync_message(tc1_ns, ts1_ns)
+
+
+def ping_answer(request: Message) -> Message:
+    """The answer to somebody's PING."""
+    return dialect.MAVLink_ping_message(
+        request.time_usec, request.seq, request.get_srcSystem(), request.get_srcComponent()
+    )
+
+
+def heartbeat(armed: bool, state: int) -> Message:
+    """The board is here; `state` is the supervisor's, 0..3, and also the custom mode."""
+    mode = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    if armed:
+        mode |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
+    if state == _STATE_FLYING:
+        mode |= _MODE_FLYING
+    return dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_GENERIC,
+        dialect.MAV_AUTOPILOT_GENERIC,
+        mode,
+        state,
+        _STATUS_OF_STATE[state],
+        _VERSION,
+    )
+
+
+def named_value(t_ms: int, name: str, value: float) -> Message:
+    """Any number; the name is cut at 10 characters."""
+    return dialect.MAVLink_named_value_float_message(u32(t_ms), _text(name, 10), value)
+
+
+def status_text(severity: int, text: str) -> Message:
+    """A line for people, cut at 50 characters; severity as in syslog, 0 emergency .. 7 debug."""
+    return dialect.MAVLink_statustext_message(severity, _text(text, 50))
+
+
+def parameter(name: str, value: float, index: int, count: int) -> Message:
+    """A parameter's value; the type is always REAL32, the only one that all ground stations read alike."""
+    return dialect.MAVLink_param_value_message(
+        _text(name, NAME_SIZE), value, dialect.MAV_PARAM_TYPE_REAL32, u16(count), u16(index)
+    )
+
+
+def command_ack(number: int, result: int, to_system: int, to_component: int) -> Message:
+    """The answer to a command: MAV_RESULT 0 accepted, 1 temporarily rejected, 2 denied, 3 unsupported, 4 failed."""
+    return dialect.MAVLink_command_ack_message(number, result, 0, 0, to_system, to_component)
+
+
+def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) -> Message:
+    """What the board runs: version, up to 8 bytes of the source's revision, the board's serial number."""
+    major, minor, patch = version
+    packed = major << 24 | minor << 16 | patch << 8
+    own, none = list(revision[:8].ljust(8, b"\0")), [0] * 8
+    return dialect.MAVLink_autopilot_version_message(
+        _CAPABILITIES, packed, 0, 0, 0, own, none, none, 0, 0, uid
+    )
+
+
+def message_interval(number: int, interval_us: int) -> Message:
+    """How often a message is sent; -1: not at all, 0: there is no such message."""
+    return dialect.MAVLink_message_interval_message(u16(number), max(-1, min(_I32_MAX, interval_us)))
+
+
+def ftp_nak(request: Message) -> Message:
+    """The answer to any file transfer: unknown command."""
+    asked = bytes(request.payload)
+    sequence = (int.from_bytes(asked[:2], "little") + 1) & 0xFFFF
+    session, opcode = asked[2], asked[3]
+    head = sequence.to_bytes(2, "little") + bytes((session, _FTP_NAK, 1, opcode, 0, 0)) + asked[8:12]
+    answer = head + bytes((_FTP_UNKNOWN_COMMAND,))
+    return dialect.MAVLink_file_transfer_protocol_message(
+        0, request.get_srcSystem(), request.get_srcComponent(), answer.ljust(251, b"\0")
+    )
+
+
+def _text(text: str, size: int) -> bytes:
+    return text.encode("ascii", "replace")[:size]
