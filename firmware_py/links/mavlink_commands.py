@@ -16,11 +16,7 @@ from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import Message
 
-<<<<<<< HEAD
-VERSION = (26, 11, 0)  # a byte each on the wire
-=======
 VERSION = (26, 11, 0)
->>>>>>> mavboard
 REVISION = bytes.fromhex("0f10a717")  # the parameters firmware.revision0
 SERIAL_NUMBER = 0x00F10A71  # the parameter cpu.id0
 FORCE = 21196  # MAVLink's magic number for disarming in flight
