@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pymavlink.dialects.v20.common as dialect
 import pytest
-from mavlink_client import Client
+from mavlink_socket import Client
 from serving import Served, serve
 
 from ground_station.mocap_udp import PoseReceiver, decode_frame
