@@ -65,14 +65,22 @@ def test_without_a_goal_the_board_flies_to_its_home(client: Client) -> None:
 
 def test_what_a_goal_masks_out_stays_as_it_was(client: Client) -> None:
     target(client, (1.0, -2.0, -3.0), -math.pi / 2)
-    target(client, (0.0, 0.0, 0.0), 0.0, IGNORE_REST | IGNORE_POSITION)
+    target(client, (0.0, 0.0, 0.0), math.pi / 2, IGNORE_REST | IGNORE_POSITION)
     client.pose(((2.0, 2.0, 3.0), LEVEL))
     client.run(client.now_us + 2000)
-    assert last_pose(client)[0] == pytest.approx((1.0, 0.0, 0.0), abs=1e-6)
+    assert last_pose(client)[0] == pytest.approx((0.0, 1.0, 0.0), abs=1e-6)
     target(client, (2.0, -2.0, -3.0), 1.0, IGNORE_REST | IGNORE_YAW)
     client.pose(((2.0, 2.5, 3.0), LEVEL))
     client.run(client.now_us + 2000)
-    assert last_pose(client)[0] == pytest.approx((0.0, 0.5, 0.0), abs=1e-6)
+    assert last_pose(client)[0] == pytest.approx((-0.5, 0.0, 0.0), abs=1e-6)
+
+
+def test_a_visual_pose_is_a_pose(client: Client) -> None:
+    client.send("vision_position_estimate", 0, 0.1, -0.2, -1.45, 0.3, -0.2, -0.5)
+    client.run(client.now_us + 2000)
+    p_GB, R_GB, _ = last_pose(client)
+    assert p_GB == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
+    assert R_GB.as_euler("ZYX") == pytest.approx((0.5, 0.2, 0.3), abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -262,6 +270,16 @@ def test_position_and_attitude_are_those_in_the_world() -> None:
     assert (attitude.roll, attitude.pitch, attitude.yaw) == pytest.approx((roll, pitch, yaw), abs=0.05)
     sent = Rotation.from_quat((quaternion.q2, quaternion.q3, quaternion.q4, quaternion.q1))
     assert (sent.inv() * expected).magnitude() < 0.05
+
+
+def test_a_new_goal_does_not_move_the_robot() -> None:
+    client = Client()
+    client.poses(100_000, 1_000_000)
+    client.run(1_000_000)
+    target(client, (1.0, 1.0, -2.0), 1.0)
+    position, attitude = client.command(512, 32)[-1], client.command(512, 30)[-1]
+    assert (position.x, position.y, position.z) == pytest.approx((0.0, 0.0, -1.15), abs=1e-3)
+    assert attitude.yaw == pytest.approx(0.0, abs=0.01)
 
 
 def test_the_flight_array_holds_the_telemetry_blocks() -> None:
