@@ -45,6 +45,7 @@ class PoseService:
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
         stack.handle(mavlink.MSG_ATT_POS_MOCAP, self._take_pose)
+        stack.handle(mavlink.MSG_VISION_POSITION_ESTIMATE, self._take_pose)
         stack.handle(mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED, self._take_target)
         stack.handle(mavlink.MSG_HEARTBEAT, self._see_heartbeat)
         stack.handle(mavlink.MSG_TIMESYNC, self._take_timesync)
