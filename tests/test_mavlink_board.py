@@ -412,24 +412,39 @@ def test_the_hash_changes_with_any_value_and_back(client: Client) -> None:
     assert digest() == first != second
 
 
-def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client: Client) -> None:
-    def fill(now_us: int) -> None:  # 57600 baud, a buffer of 120 bytes
+def slow_line(client: Client) -> None:
+    """From now on 57600 baud, with a buffer of 120 bytes."""
+
+    def fill(now_us: int) -> None:
         client.uart_room = min(120, client.uart_room + 6)
         client.events.at(now_us + 1000, fill)
 
     client.uart_room = 0
     fill(client.now_us)
+
+
+def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client: Client) -> None:
+    slow_line(client)
     client.send("param_request_list", 1, 1)
     client.run(client.now_us + 100_000)
-    started = [message.param_index for message in client.of("PARAM_VALUE")]
-    assert 0 < len(started) < 30
+    assert 0 < len(client.of("PARAM_VALUE")) < 30
     client.send("param_request_list", 1, 1)
     client.run(client.now_us + 2_000_000)
     indices = [message.param_index for message in client.of("PARAM_VALUE")]
     assert indices[-1] == max(indices)
     assert indices.count(0) == 2
-    assert set(indices) == set(range(len(set(indices))))
+    assert set(indices) == set(range(client.of("PARAM_VALUE")[0].param_count))
     assert client.stack.dropped == 0
+
+
+def test_a_list_comes_through_on_a_line_full_of_telemetry(client: Client) -> None:
+    slow_line(client)
+    client.command(511, 30, 5000)  # 8 kB/s
+    client.send("param_request_list", 1, 1)
+    client.run(client.now_us + 20_000_000)
+    assert client.stack.dropped > 100
+    indices = {message.param_index for message in client.of("PARAM_VALUE")}
+    assert indices == set(range(client.of("PARAM_VALUE")[0].param_count))
 
 
 # Commands

@@ -12,7 +12,7 @@ from firmware_py.links.timesync import RemoteClock
 from firmware_py.measurements import POSE, Measurement, PoseMeasurement
 from firmware_py.rtos import Queue
 from firmware_py.wire import WireError, mavlink
-from firmware_py.wire.crtp import PoseMessage, check_pose
+from firmware_py.wire.crtp import PoseMessage
 from firmware_py.wire.mavlink_frames import Message
 
 OLDEST_US = 500_000  # an age beyond is no age: poses that old are of no use to anybody
@@ -25,7 +25,7 @@ PATIENCE = 50  # requests; some partners never answer
 
 
 class PoseService:
-    """`p_WG`, `yaw`: the goal. `frame` is the goal frame of the last pose, in which the estimator's state is."""
+    """`goal` is where to fly, position in W and yaw; `last_goal` the one that the last pose was seen from."""
 
     def __init__(
         self,
@@ -34,11 +34,9 @@ class PoseService:
         localisation: LocalisationService,
         home: Vector,
     ) -> None:
-        self.p_WG = home
-        self.yaw = 0.0
-        self.frame = (home, 0.0)
+        self.goal: tuple[Vector, float] = (home, 0.0)
+        self.last_goal = self.goal
         self.age_us: int | None = None  # of the last pose when it arrived
-        self.unknown_ages = 0  # poses
         self._stack = stack
         self._measurements = measurements
         self._localisation = localisation
@@ -53,15 +51,12 @@ class PoseService:
 
     def _take_pose(self, message: Message) -> None:
         pose = mavlink.read_pose(message)
-        if not all(abs(coordinate) <= FAR for coordinate in pose.p_WB):
-            raise WireError(f"a pose at {pose.p_WB} m")
+        _near(pose.p_WB)
         self._meet(message)
         now_us = self._stack.kernel.now_us
-        self.frame = (self.p_WG, self.yaw)
-        p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self.frame)
-        check_pose(p_GB, q_GB)
+        self.last_goal = self.goal
+        p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self.goal)
         self.age_us = self._age_us(now_us, pose.t_us)
-        self.unknown_ages += self.age_us is None
         self._localisation.last = PoseMessage(p_GB, q_GB, self.age_us)
         self._measurements.send_from_isr((POSE, PoseMeasurement(now_us, self._localisation.last)))
 
@@ -75,12 +70,12 @@ class PoseService:
 
     def _take_target(self, message: Message) -> None:
         target = mavlink.read_target(message)
+        p_WG, yaw = self.goal
         if target.p_WG is not None:
-            if not all(abs(coordinate) <= FAR for coordinate in target.p_WG):
-                raise WireError(f"a goal at {target.p_WG} m")
-            self.p_WG = target.p_WG
+            p_WG = _near(target.p_WG)
         if target.yaw is not None:
-            self.yaw = target.yaw
+            yaw = target.yaw
+        self.goal = (p_WG, yaw)
 
     def _see_heartbeat(self, message: Message) -> None:
         if self._partner is None:
@@ -111,3 +106,10 @@ class PoseService:
             if self._partner is not None:
                 self._clock.request(kernel.now_us)
                 yield from self._stack.offer(mavlink.timesync(0, kernel.now_us * 1000))
+
+
+def _near(p_W: Vector) -> Vector:
+    """Return a position that is not out of the world; raise `WireError` otherwise."""
+    if not all(abs(coordinate) <= FAR for coordinate in p_W):
+        raise WireError(f"position {p_W} m: more than {FAR:g} m away")
+    return p_W
