@@ -2,13 +2,18 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: fly test bench clean
+.PHONY: fly test bench clients clean
 
 fly: .venv/fly.stamp
 	$(BIN)/floaty fly hover
 
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto
+
+# Real ground tools for the tests of the serial line. MAVProxy runs headless without what it depends on (1 GB).
+clients: .venv/test.stamp
+	$(BIN)/python -m pip install --quiet --editable '.[clients]'
+	$(BIN)/python -m pip install --quiet --no-deps 'MAVProxy>=1.8.75'
 
 bench: .venv/test.stamp
 	$(BIN)/python tools/bench.py
@@ -19,7 +24,7 @@ bench: .venv/test.stamp
 	@touch $@
 
 .venv/fly.stamp: .venv/pip.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable '.[radio,view]'
+	$(BIN)/python -m pip install --quiet --editable '.[radio,mavlink,view]'
 	@touch $@
 
 .venv/test.stamp: .venv/fly.stamp

@@ -4,6 +4,7 @@ import os
 import re
 import select
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -24,19 +25,20 @@ class Served:
 
     @property
     def radio_uris(self) -> list[str]:
-        return self._line("radio ")
+        return self.line("radio ")
 
     @property
     def udp_uris(self) -> list[str]:
-        return self._line("udp ")
+        return self.line("udp ")
 
     @property
     def environment(self) -> dict[str, str]:
         """What the printed line says to put before a program's name."""
-        words = self._line("use ")
+        words = self.line("use ")
         return {**os.environ, **dict(word.split("=", 1) for word in words if "=" in word)}
 
-    def _line(self, start: str) -> list[str]:
+    def line(self, start: str) -> list[str]:
+        """The words after the first one of the line that starts so."""
         return next(line for line in self.lines if line.startswith(start)).split()[1:]
 
     def wait_for(self, pattern: str, timeout_s: float) -> str:
@@ -55,12 +57,21 @@ class Served:
 
     def forget(self) -> None:
         """Let `wait_for` look only at what comes from now on."""
-        self.lines = [line for line in self.lines if line.split()[:1] in (["radio"], ["udp"], ["use"])]
+        self.lines = [
+            line for line in self.lines if line.split()[:1] in (["radio"], ["udp"], ["use"], ["mavlink"])
+        ]
 
     def interrupt(self) -> int:
         """Press Ctrl-C and return the exit code."""
         self.process.send_signal(signal.SIGINT)
         return self.process.wait(timeout=20)
+
+
+def free_port() -> int:
+    """A UDP port that nobody uses."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 @contextmanager

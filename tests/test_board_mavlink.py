@@ -1,0 +1,231 @@
+"""`floaty board serve --mavlink` and a bare pymavlink program: what ground tools rely on, over pty, udp and tcp."""
+
+import itertools
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pymavlink.dialects.v20.common as dialect
+import pytest
+from cflib.utils.power_switch import PowerSwitch
+from mavlink_socket import GAIN, Client
+from serving import Served, free_port, serve
+from test_board_server import plug
+
+from ground_station.mocap_udp import PoseReceiver, decode_frame
+
+
+def masters(served: Served) -> list[str]:
+    return served.line("mavlink ")
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    with serve("--mavlink", "tcp:0", "--poses", "0") as served:
+        yield served
+
+
+@pytest.fixture
+def client(served: Served) -> Iterator[Client]:
+    client = Client(masters(served)[0])
+    yield client
+    client.close()
+
+
+def test_a_heartbeat_comes_every_second_from_an_autopilot(client: Client) -> None:
+    client.wait("HEARTBEAT")
+    start = time.monotonic()
+    beat = client.wait("HEARTBEAT")
+    client.wait("HEARTBEAT")
+    assert 1.5 < time.monotonic() - start < 2.5
+    assert (beat.get_srcSystem(), beat.get_srcComponent()) == (1, 1)
+    assert beat.autopilot == dialect.MAV_AUTOPILOT_GENERIC
+
+
+@pytest.mark.parametrize("end", ["pty", "udp", "tcp"])
+def test_every_end_carries_the_whole_parameter_table(end: str) -> None:
+    with serve("--mavlink", f"udp:{free_port()}" if end == "udp" else end + ":0" * (end == "tcp")) as served:
+        client = Client(masters(served)[0])
+        client.wait("HEARTBEAT")  # then the board's port is known
+        found = client.parameters()
+        client.close()
+    assert len(found) > 30
+    assert {message.param_index for message in found.values()} == set(range(len(found)))
+    assert {message.param_count for message in found.values()} == {len(found)}
+    assert {message.param_type for message in found.values()} == {dialect.MAV_PARAM_TYPE_REAL32}
+    assert all(math.isfinite(message.param_value) for message in found.values())
+
+
+def test_parameters_are_read_by_name_and_by_index(client: Client) -> None:
+    listed = client.parameters()[GAIN]
+    client.codec.param_request_read_send(1, 1, GAIN.encode(), -1)
+    by_name = client.wait("PARAM_VALUE")
+    client.codec.param_request_read_send(1, 1, b"", listed.param_index)
+    by_index = client.wait("PARAM_VALUE")
+    for message in (by_name, by_index):
+        assert (message.param_id, message.param_index) == (GAIN, listed.param_index)
+        assert message.param_value == listed.param_value
+
+
+def test_a_parameter_is_set_within_its_range_and_kept_otherwise(client: Client) -> None:
+    before = client.parameters()[GAIN].param_value
+    assert client.set(GAIN, 2.5) == 2.5
+    assert client.set(GAIN, 99) == 2.5
+    assert client.set(GAIN, math.nan) == 2.5
+    assert client.set(GAIN, math.inf) == 2.5
+    assert client.set(GAIN, before) == before
+
+
+def test_commands_are_acknowledged_to_their_sender(client: Client) -> None:
+    request = dialect.MAV_CMD_REQUEST_MESSAGE
+    assert client.command(request, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == dialect.MAV_RESULT_ACCEPTED
+    client.codec.command_long_send(1, 1, request, 0, dialect.MAVLINK_MSG_ID_HOME_POSITION, *[math.nan] * 6)
+    client.wait("HOME_POSITION")
+    assert client.command(dialect.MAV_CMD_NAV_LAND) == dialect.MAV_RESULT_UNSUPPORTED
+    acks = [message for message in client.received if message.get_type() == "COMMAND_ACK"]
+    assert {(ack.target_system, ack.target_component) for ack in acks} == {(255, 190)}
+    assert any(message.get_type() == "AUTOPILOT_VERSION" for message in client.received)
+
+
+def test_a_message_comes_as_often_as_it_was_asked_for(client: Client) -> None:
+    number, set_interval = dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+    assert client.command(set_interval, number, 20_000) == dialect.MAV_RESULT_ACCEPTED
+    stamps = [message.time_boot_ms for message in client.collect(2.0) if message.get_type() == "ATTITUDE"]
+    steps = [later - earlier for earlier, later in itertools.pairwise(stamps)]
+    assert 60 < len(stamps) <= 110
+    assert sum(steps) / len(steps) == pytest.approx(20, abs=0.5)
+    assert client.command(set_interval, number, 0) == dialect.MAV_RESULT_ACCEPTED
+
+
+def test_the_baud_rate_limits_what_comes_through() -> None:
+    with serve("--mavlink", "tcp:0", "--poses", "0", "--baud", "9600") as served:
+        client = Client(masters(served)[0])
+        client.wait("HEARTBEAT")
+        for message in (dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
+            client.codec.command_long_send(
+                1, 1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message, 10_000, *[math.nan] * 5
+            )
+        client.collect(1.0)
+        before, start = client.bytes_received, time.monotonic()
+        client.collect(2.0)
+        per_second = (client.bytes_received - before) / (time.monotonic() - start)
+        client.close()
+    assert per_second == pytest.approx(960, rel=0.1)
+
+
+def test_wrong_bits_spoil_frames_and_nothing_else() -> None:
+    with serve(
+        "--mavlink", "tcp:0", "--poses", "0", "--set", "serial.downlink_bit_error_rate=1e-3"
+    ) as served:
+        client = Client(masters(served)[0])
+        client.wait("HEARTBEAT", timeout_s=20)
+        client.codec.command_long_send(
+            1,
+            1,
+            dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
+            0,
+            dialect.MAVLINK_MSG_ID_ATTITUDE,
+            10_000,
+            *[math.nan] * 5,
+        )
+        arrived = [message for message in client.collect(3.0) if message.get_type() == "ATTITUDE"]
+        assert client.codec.total_receive_errors > 0
+        client.close()
+    assert len(arrived) > 100
+
+
+def test_several_boards_have_ends_and_system_ids_of_their_own(tmp_path: Path) -> None:
+    with serve("--mavlink", f"pty:{tmp_path / 'line'}", "--boards", "2", "--poses", "0") as served:
+        assert not any(line.startswith("udp") for line in served.lines)
+        assert masters(served) == [str(tmp_path / "line"), str(tmp_path / "line-2")]
+        for number, master in enumerate(masters(served), 1):
+            client = Client(master)
+            assert client.wait("HEARTBEAT").get_srcSystem() == number
+            client.close()
+        assert served.interrupt() == 0
+    assert os.listdir(tmp_path) == []
+
+
+class Pilot:
+    """Sends a served board's true poses as ATT_POS_MOCAP, every fourth of 200 per second, until stopped."""
+
+    def __init__(self, client: Client, poses: PoseReceiver) -> None:
+        self._client, self._poses = client, poses
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> "Pilot":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopping = True
+        self._thread.join()
+
+    def _run(self) -> None:
+        count = 0
+        while not self._stopping:
+            data = self._poses.receive(0.1)
+            count += 1
+            if data is None or count % 4:
+                continue
+            frame = decode_frame(data)
+            (w, x, y, z), (px, py, pz) = frame.q_WB, frame.p_WB
+            self._client.codec.att_pos_mocap_send(frame.t_us, [w, x, -y, -z], px, -py, -pz)
+
+
+def test_poses_fly_the_board_and_a_pulled_pty_ends_in_failsafe_until_it_is_plugged_in_again() -> None:
+    poses = PoseReceiver(0)
+    with serve("--mavlink", "pty", "--poses", str(poses.port)) as served:
+        client = Client(masters(served)[0])
+        with Pilot(client, poses):
+            served.wait_for("board 1: released", 15)
+            with pytest.raises(AssertionError, match="no line"):  # it flies free
+                served.wait_for("lost|failsafe", 2.0)
+        client.close()  # the cable is pulled
+        served.wait_for("supervisor: failsafe, silence", 5)
+        served.wait_for("it is put back", 15)
+        served.forget()
+        client = Client(masters(served)[0])
+        with Pilot(client, poses):
+            served.wait_for("supervisor: flying", 5)
+            served.wait_for("board 1: released", 5)
+        client.close()
+    poses.close()
+
+
+def test_a_reboot_by_radio_keeps_the_end_and_forgets_what_came_while_the_board_was_off() -> None:
+    with serve("--mavlink", "tcp:0", "--radio", "--radio-port", "0", "--poses", "0") as served:
+        plug(served)
+        client = Client(masters(served)[0])
+        before_ms = client.wait("ATTITUDE", lambda message: message.time_boot_ms > 1000).time_boot_ms
+        switch = PowerSwitch(served.radio_uris[0])
+        switch.stm_power_down()
+        client.codec.param_set_send(1, 1, GAIN.encode(), 2.5, dialect.MAV_PARAM_TYPE_REAL32)
+        switch.stm_power_up()
+        switch.close()
+        client.wait("ATTITUDE", lambda message: message.time_boot_ms < before_ms)
+        assert client.parameters()[GAIN].param_value == 3.0
+        client.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--mavlink", "usb"], "--mavlink usb: expected pty"),
+        (["--mavlink", "udp:70000"], "--mavlink udp:70000: port 70000"),
+        (["--mavlink", "pty:/no/folder"], "mavlink pty /no/folder: No such file"),
+        (["--baud", "57600"], "--baud 57600: there is no serial line without --mavlink"),
+        (["--mavlink", "pty", "--set", "mavlink.system=255", "--boards", "2"], "mavlink.system = 256"),
+    ],
+)
+def test_bad_values_end_in_one_line(arguments: list[str], complaint: str) -> None:
+    command = [sys.executable, "-m", "hil.cli", "board", "serve", *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 2
+    assert complaint in ended.stderr.splitlines()[-1]
