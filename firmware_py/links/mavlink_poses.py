@@ -18,8 +18,8 @@ from firmware_py.wire.mavlink_frames import Message
 OLDEST_US = 500_000  # an age beyond is no age: poses that old are of no use to anybody
 EARLIEST_US = -5_000  # the clocks' offset is not known better than this
 FAR = 1000.0  # [m] farther from the origin is no tunnel
-SYNC_PERIOD = 500  # ticks
-FIRST_SYNC_PERIOD = 100
+SYNC_PERIOD = 487  # ticks; prime, so that the poses' and the telemetry's frames are not always in the way
+FIRST_SYNC_PERIOD = 97
 FIRST_SYNCS = 5
 PATIENCE = 50  # requests; some partners never answer
 
@@ -96,13 +96,13 @@ class PoseService:
             self._clock.answer(now_us, message.ts1 // 1000, message.tc1 // 1000)
 
     def _sync_task(self) -> Task:
-        """Ask the partner for its time, a tick before the telemetry, when the line is free."""
+        """Ask the partner for its time."""
         kernel = self._stack.kernel
+        wake_tick = kernel.tick_count
         while True:
-            clock = self._clock
-            begins = clock.exchanges < FIRST_SYNCS and clock.requests < PATIENCE
-            period = FIRST_SYNC_PERIOD if begins else SYNC_PERIOD
-            yield from kernel.delay_until((kernel.tick_count + 1) // period * period + period - 1)
+            begins = self._clock.exchanges < FIRST_SYNCS and self._clock.requests < PATIENCE
+            wake_tick += FIRST_SYNC_PERIOD if begins else SYNC_PERIOD
+            yield from kernel.delay_until(wake_tick)
             if self._partner is not None:
                 self._clock.request(kernel.now_us)
                 yield from self._stack.offer(mavlink.timesync(0, kernel.now_us * 1000))
