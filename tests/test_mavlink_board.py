@@ -199,7 +199,8 @@ def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us
         firmware.run(now_us)
     assert line.down.busy_us > 0.09 * now_us
     on_line_us = 1000 + 10_000_000 * (48 + 1) / baud  # the adapter, the frame, and the silence that ends it
-    assert ages_ms[-1] == pytest.approx((lag_us + on_line_us) * 1e-3, abs=0.3)
+    age_ms = float(np.median(ages_ms[-5:]))  # now and then a pose has to wait for an answer before it
+    assert age_ms == pytest.approx((lag_us + on_line_us) * 1e-3, abs=0.3)
 
 
 @pytest.mark.parametrize("lag_us", [600_000, -20_000])
