@@ -2,7 +2,14 @@
 
 import time
 
+_YEAR_2015_US = 1_420_070_400_000_000  # 2015-01-01 00:00 UTC since 1970
+
 
 def clock_us() -> int:
     """The time since some instant in the past [us]; it never goes back."""
     return time.monotonic_ns() // 1000
+
+
+def signing_start() -> int:
+    """The time stamp of MAVLink's signatures when `clock_us` was 0 [10 us since 2015-01-01]; may be negative."""
+    return (time.time_ns() // 1000 - _YEAR_2015_US - clock_us()) // 10

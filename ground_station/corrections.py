@@ -1,13 +1,12 @@
 """From a motion capture frame and a goal to the correction: the pose of the body in the goal frame.
 
 The goal frame G stands at the goal's position, upright, turned by the goal's yaw. The board always flies to
-the origin of G; goals and absolute positions never leave the ground.
+the origin of G; over CRTP goals and absolute positions never leave the ground.
 """
 
 from dataclasses import dataclass
-from math import cos, sin
 
-from firmware_py.geometry import conjugate, multiply, yaw_quaternion
+from firmware_py.geometry import in_goal_frame
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
@@ -23,12 +22,5 @@ class Correction:
 
 def correct(frame: MocapFrame, goal: Goal, now_us: int) -> Correction:
     """The correction of `frame` with respect to `goal`, made at `now_us`."""
-    dx = frame.p_WB[0] - goal.p_WG[0]
-    dy = frame.p_WB[1] - goal.p_WG[1]
-    dz = frame.p_WB[2] - goal.p_WG[2]
-    c, s = cos(goal.yaw), sin(goal.yaw)
-    return Correction(
-        p_GB=(c * dx + s * dy, c * dy - s * dx, dz),  # Rz(-yaw) (p_WB - p_WG)
-        q_GB=multiply(conjugate(yaw_quaternion(goal.yaw)), frame.q_WB),
-        age_us=now_us - frame.t_us,
-    )
+    p_GB, q_GB = in_goal_frame(frame.p_WB, frame.q_WB, goal.p_WG, goal.yaw)
+    return Correction(p_GB, q_GB, age_us=now_us - frame.t_us)

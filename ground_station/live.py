@@ -10,7 +10,7 @@ from typing import Protocol
 
 from firmware_py.wire import WireError
 from ground_station.clock import clock_us
-from ground_station.links.crazyradio import CrazyradioLink, LinkError
+from ground_station.errors import LinkError
 from ground_station.mocap_udp import decode_frame
 from ground_station.station import GroundStation
 
@@ -29,11 +29,53 @@ class PoseSource(Protocol):
         ...
 
 
+class LiveLink(Protocol):
+    """A link to a board that is out there; what the ground station needs of it is `ground_station.station.Link`."""
+
+    @property
+    def uri(self) -> str:
+        """Where the board is."""
+        ...
+
+    @property
+    def supervisor_state(self) -> int | None:
+        """The state that the board told last, None before it did, and again from `mute` on."""
+        ...
+
+    def open(self, give_up: Callable[[], bool]) -> None:
+        """Connect and start telemetry; raises `LinkError`, also when told to give up."""
+        ...
+
+    def received(self) -> list[tuple[int, bytes]]:
+        """What came since the last call, with the instants of its arrival [us, `clock_us`]."""
+        ...
+
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call."""
+        ...
+
+    def summary(self) -> str:
+        """One line on how the link does."""
+        ...
+
+    def check(self) -> None:
+        """Raise `LinkError` when the link is lost."""
+        ...
+
+    def mute(self) -> None:
+        """Send no more poses until `open`; the board notices the silence."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect; `open` connects again."""
+        ...
+
+
 @dataclass(slots=True)
 class LiveStation:
     """Runs a ground station; `say` gets lines for the user, `stopping` tells when to end."""
 
-    link: CrazyradioLink
+    link: LiveLink
     station: GroundStation
     source: PoseSource
     say: Callable[[str], None]
@@ -56,8 +98,7 @@ class LiveStation:
     def _connect(self) -> None:
         self.link.open(self.stopping)
         self.say(f"connected to {self.link.uri}")
-        if self.link.missing:
-            self.say(f"the board has no {', '.join(self.link.missing)}: without these blocks of telemetry")
+        self._tell()
 
     def _reconnect(self, cause: LinkError) -> None:
         """Try until it works or takes too long."""
@@ -84,6 +125,7 @@ class LiveStation:
                 self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
                 pose_us = now_us
             self._take_telemetry()
+            self._tell()
             self.link.check()
             if now_us - status_us >= STATUS_PERIOD_US:
                 status_us = now_us
@@ -102,18 +144,20 @@ class LiveStation:
         for t_us, packet in self.link.received():
             self.station.on_packet(t_us, packet)
 
+    def _tell(self) -> None:
+        for notice in self.link.notices():
+            self.say(notice)
+
     def _show(self) -> None:
-        link, counters = self.link.statistics, self.station.counters
+        counters = self.station.counters
         self.say(
-            f"poses {counters.frames} ({counters.invalid} unusable)  corrections {link.sent} sent, "
-            f"{link.replaced + link.too_old} late  telemetry {counters.received}  quality {link.quality:.0f} %  "
-            f"round trip {link.latency_ms:.1f} ms  {link.rate:.0f} exchanges/s"
+            f"poses {counters.frames} ({counters.invalid} unusable)  {self.link.summary()}  "
+            f"telemetry {counters.samples}"
         )
 
     def _leave(self) -> None:
         """Stop correcting, wait until the board has put its flaps to hover, disconnect."""
         self.link.mute()
-        self.link.supervisor_state = None
         deadline_us = clock_us() + FAILSAFE_TIMEOUT_US
         while clock_us() < deadline_us and self.link.supervisor_state != FAILSAFE:
             self.source.receive(0.02)

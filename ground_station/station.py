@@ -1,10 +1,11 @@
-"""The ground station: frames in, corrections out, telemetry into the log. It never looks at a clock: callers
+"""The ground station: frames in, poses and goals out, telemetry into the log. It never looks at a clock: callers
 bring the time.
 
-The tracked pose is compared with the goal of the moment, as in the original: a new goal counts at once, not
-after the camera's latency.
+A tracked pose leaves with the goal of the moment, as in the original: a new goal counts at once, not after the
+camera's latency.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,10 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import Sample
-from ground_station.corrections import Correction, correct
 from ground_station.mocap import MocapFrame
 from ground_station.telemetry_log import TelemetryLog
-from ground_station.trajectory import Trajectory
+from ground_station.trajectory import Goal, Trajectory
 
 TELEMETRY_TIMEOUT_US = 500_000  # of silence, after which the board is asked again
 
@@ -43,12 +43,12 @@ class Link(Protocol):
         """Ask the board for its telemetry."""
         ...
 
-    def send(self, now_us: int, correction: Correction) -> None:
-        """Send `correction`, older by what the link needs; `WireError` for a pose that cannot be sent."""
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        """Send what the board needs of a tracked pose and the goal; `WireError` for a pose that cannot be sent."""
         ...
 
-    def decode(self, data: bytes) -> Sample | None:
-        """The telemetry in `data`, None if it is something else; `WireError` if it is malformed."""
+    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
+        """The telemetry in `data`, empty if it is something else; `WireError` if it is malformed."""
         ...
 
 
@@ -58,13 +58,14 @@ class StationCounters:
 
     frames: int = 0  # from motion capture
     invalid: int = 0  # of these, not tracked or not a pose
-    sent: int = 0  # corrections
-    received: int = 0  # packets from the board
+    sent: int = 0  # handed to the link
+    received: int = 0  # packets, or pieces of a stream, from the board
+    samples: int = 0  # of telemetry in these
     malformed: int = 0  # of these, not decodable
 
 
 class GroundStation:
-    """Passive: `on_frame` for each frame of motion capture, `on_packet` for each packet of the board."""
+    """Passive: `on_frame` for each frame of motion capture, `on_packet` for whatever comes from the board."""
 
     def __init__(
         self, link: Link, trajectory: Trajectory, log: TelemetryLog | None, config: StationConfig
@@ -79,7 +80,7 @@ class GroundStation:
         self._ask_for_telemetry_us = 0  # put off by every sample that comes
 
     def on_frame(self, frame: MocapFrame, now_us: int) -> None:
-        """Send the correction of every `send_every`-th frame, or of the first usable one after it."""
+        """Send every `send_every`-th frame, or the first usable one after it."""
         counters = self.counters
         counters.frames += 1
         if now_us >= self._ask_for_telemetry_us:
@@ -94,24 +95,24 @@ class GroundStation:
         if not due:
             return
         try:
-            self._link.send(now_us, correct(frame, self._trajectory.at(now_us), now_us))
+            self._link.send(now_us, frame, self._trajectory.at(now_us))
         except WireError:
             counters.invalid += 1
             return
         counters.sent += 1
-        # The slots keep their phase: a late correction does not delay the next one.
+        # The slots keep their phase: a late frame does not delay the next one.
         self._frames_until_due %= self._send_every
 
     def on_packet(self, now_us: int, data: bytes) -> None:
-        """Take a packet of the board: telemetry goes to the log, what cannot be read is counted."""
+        """Take bytes of the board: telemetry goes to the log, what cannot be read is counted."""
         self.counters.received += 1
         try:
-            sample = self._link.decode(data)
+            samples = self._link.receive(now_us, data)
         except WireError:
             self.counters.malformed += 1
             return
-        if sample is None:
-            return
-        self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
-        if self._log is not None:
-            self._log.write(now_us, sample, self._trajectory.at(now_us), self._last_frame)
+        self.counters.samples += len(samples)
+        for sample in samples:
+            self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
+            if self._log is not None:
+                self._log.write(now_us, sample, self._trajectory.at(now_us), self._last_frame)

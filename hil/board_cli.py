@@ -4,10 +4,16 @@ import shlex
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from hil.errors import LabError
+
+if TYPE_CHECKING:
+    from ground_station.links.crazyradio import CrazyradioLink
+    from ground_station.links.mavlink_serial import MavlinkSerialLink
+    from hil.config import LabConfig
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
@@ -118,8 +124,10 @@ def serve(
 
 @click.command()
 @click.option(
-    "--link", "uri", required=True, metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850"
-)
+    "--link", "uri", required=True, metavar="URI",
+    help="radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:19850, or mavlink:DEVICE[,BAUD] with a DEVICE like /dev/ttyUSB0, "
+    "COM3, socket://HOST:PORT, rfc2217://HOST:PORT.",
+)  # fmt: skip
 @click.option(
     "--mocap", default="virtual", show_default=True, metavar="virtual[:PORT]",
     help="Where poses come from: those that `floaty board serve` sends.",
@@ -146,26 +154,24 @@ def station(
     profile: str,
     overrides: tuple[str, ...],
 ) -> int:
-    """Fly a board, real or virtual: poses in, corrections out at 50 Hz, telemetry shown and logged.
+    """Fly a board, real or virtual: poses in, poses or corrections out at 50 Hz, telemetry shown and logged.
 
-    Ctrl-C ends the flight: corrections stop, the board puts its flaps to hover, the link is closed.
+    Ctrl-C ends the flight: nothing more goes up, the board puts its flaps to hover, the link is closed.
     """
     from hil.config import load_config
     from hil.experiments import find_experiment
 
     config = load_config(profile, overrides)
     experiment = find_experiment(trajectory)
-    try:
-        from ground_station.links.crazyradio import CrazyradioLink, LinkError
-    except ImportError as error:
-        raise LabError(f"--link needs cflib ({error}): pip install cflib") from None
     from ground_station.clock import clock_us
+    from ground_station.errors import LinkError
     from ground_station.live import LiveStation
     from ground_station.mocap_udp import PoseReceiver
     from ground_station.station import GroundStation
     from ground_station.telemetry_log import TelemetryLog
     from ground_station.trajectory import Goal
 
+    link = _live_link(uri, config)
     port = _virtual_port(mocap)
     try:
         source = PoseReceiver(port)
@@ -177,7 +183,6 @@ def station(
         raise LabError(f"--log {log}: {error.strerror or error}") from None
     stops = _stop_signals()
     start_us = clock_us()
-    link = CrazyradioLink(uri, config.station.link_latency_us)
     goal = Goal(config.flight.home, 0.0)
     ground = GroundStation(link, experiment.trajectory(goal, start_us), telemetry, config.station)
 
@@ -193,6 +198,28 @@ def station(
         if telemetry is not None:
             telemetry.close()
     return 0
+
+
+def _live_link(uri: str, config: "LabConfig") -> "CrazyradioLink | MavlinkSerialLink":
+    """Return the link of a URI, not open yet."""
+    serial = uri.startswith("mavlink")
+    try:
+        if not serial:
+            from ground_station.links.crazyradio import CrazyradioLink
+
+            return CrazyradioLink(uri, config.station.link_latency_us)
+        from ground_station.errors import LinkError
+        from ground_station.links.mavlink import MavlinkLinkConfig
+        from ground_station.links.mavlink_serial import MavlinkSerialLink
+    except ImportError as error:
+        extra = "mavlink" if serial else "radio"
+        raise LabError(f"--link {uri}: {error}: pip install 'floaty-hil[{extra}]'") from None
+    pose_hz = 1e6 / (config.mocap.period_us * config.station.send_every)
+    key = bytes.fromhex(config.mavlink.signing_key)
+    try:
+        return MavlinkSerialLink(uri, MavlinkLinkConfig(config.serial.baud, pose_hz, key))
+    except LinkError as error:
+        raise LabError(str(error)) from None
 
 
 def _virtual_port(mocap: str) -> int:

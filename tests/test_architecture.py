@@ -32,7 +32,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "time": ("hil/clock.py", "hil/run.py", "hil/board_server.py", "ground_station/clock.py"),
     "datetime": (),
     "asyncio": (),
-    "threading": ("hil/window.py", "ground_station/links/crazyradio.py"),
+    "threading": ("hil/window.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py"),
     "multiprocessing": ("hil/sweep.py",),
     "concurrent": ("hil/sweep.py",),
     "subprocess": ("hil/run.py", "hil/window.py", "hil/linked_flight.py"),
@@ -46,7 +46,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "numpy.random.default_rng": ("hil/harness.py",),
     "numpy.random.seed": (),
     "cflib": ("ground_station/links/crazyradio.py",),
-    "serial": (),
+    "serial": ("ground_station/links/mavlink_serial.py",),
     "pymavlink": (
         "firmware_py/wire/mavlink.py", "firmware_py/wire/mavlink_layouts.py", "firmware_py/wire/mavlink_services.py",
     ),

@@ -11,7 +11,7 @@ import re
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cflib.crtp
@@ -23,7 +23,10 @@ from firmware_py.wire import WireError
 from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, decode_log_data, encode_ext_pose
 from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, Block, Sample
 from ground_station.clock import clock_us
-from ground_station.corrections import Correction
+from ground_station.corrections import Correction, correct
+from ground_station.errors import LinkError
+from ground_station.mocap import MocapFrame
+from ground_station.trajectory import Goal
 
 ANSWER_TIMEOUT_US = 4_000_000  # without any answer while connecting
 CONNECT_TIMEOUT_US = 60_000_000  # in all; tables of contents are long and slow with losses
@@ -35,10 +38,6 @@ MIN_PROTOCOL = 4  # version from which the tables of contents are as read here
 NULL_HEADER, NULL_MASK = 0xF3, 0xF3
 URIS = (r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?", r"udp://[\w.-]+:\d{1,5}")
 SUPERVISOR_STATE = "supervisor.state"
-
-
-class LinkError(Exception):
-    """The board cannot be reached, or not any more; the text is one line."""
 
 
 @dataclass(slots=True)
@@ -60,8 +59,8 @@ class CrazyradioLink:
     def __init__(self, uri: str, latency_us: int) -> None:
         self.uri = uri
         self.statistics = LinkStatistics()
-        self.missing: list[str] = []  # telemetry variables that the board does not have
-        self.supervisor_state: int | None = None  # as last decoded
+        self.supervisor_state: int | None = None  # as last received
+        self._missing: list[str] = []  # telemetry variables that the board does not have, not told yet
         self._latency_us = latency_us
         self._cache = tempfile.TemporaryDirectory(prefix="floaty-toc-")
         self._crazyflie: Crazyflie | None = None
@@ -146,7 +145,7 @@ class CrazyradioLink:
     def _start_telemetry(self, crazyflie: Crazyflie) -> None:
         """Create the blocks of which the board has all variables."""
         crazyflie.add_port_callback(CRTPPort.LOGGING, self._on_log_packet)
-        self._blocks, self.missing = {}, []
+        self._blocks, self._missing = {}, []
         self._telemetry_us = clock_us()
         for block in BLOCKS:
             absent = [
@@ -154,7 +153,7 @@ class CrazyradioLink:
                 for v in block.variables
                 if crazyflie.log.toc.get_element_by_complete_name(v.name) is None
             ]
-            self.missing += absent
+            self._missing += absent
             if absent:
                 continue
             wanted = LogConfig(block.variables[0].name, PERIOD_MS)
@@ -171,8 +170,9 @@ class CrazyradioLink:
 
     # Uplink
 
-    def send(self, now_us: int, correction: Correction) -> None:
-        """Put a correction into the place for one; `WireError` for a pose that cannot be sent."""
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        """Put the correction into the place for one; `WireError` for a pose that cannot be sent."""
+        correction = correct(frame, goal, now_us)
         encode_ext_pose(correction.p_GB, correction.q_GB, correction.age_us)
         with self._mail:
             self.statistics.replaced += self._mailbox is not None
@@ -204,14 +204,14 @@ class CrazyradioLink:
             packets.append(self._received.popleft())
         return packets
 
-    def decode(self, data: bytes) -> Sample | None:
-        """The telemetry in a packet from the board, None for a packet of another service.
+    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
+        """The telemetry in a packet from the board, empty for a packet of another service.
 
         Blocks of a board are not sampled together; here they get the beginning of their period as common time stamp.
         """
         packet = decode(data)
         if packet.port != PORT_LOG or packet.channel != CHANNEL_LOG_DATA:
-            return None
+            return ()
         number, timestamp_ms, values = decode_log_data(packet.data)
         block = self._blocks.get(number)
         if block is None or len(values) != block.layout.size:
@@ -220,7 +220,7 @@ class CrazyradioLink:
         for variable, value in zip(block.variables, sample.values, strict=True):
             if variable.name == SUPERVISOR_STATE:
                 self.supervisor_state = int(value)
-        return sample
+        return (sample,)
 
     def _on_any_packet(self, packet: CRTPPacket) -> None:
         if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even when nobody is behind it
@@ -230,6 +230,21 @@ class CrazyradioLink:
         if packet.channel == CHANNEL_LOG_DATA:
             self._telemetry_us = clock_us()
             self._received.append((self._telemetry_us, bytes((packet.header,)) + bytes(packet.data)))
+
+    def notices(self) -> list[str]:
+        """Return what the user should know and was not told yet."""
+        missing, self._missing = self._missing, []
+        return (
+            [f"the board has no {', '.join(missing)}: without these blocks of telemetry"] if missing else []
+        )
+
+    def summary(self) -> str:
+        """Return one line on how the link does."""
+        link = self.statistics
+        return (
+            f"corrections {link.sent} sent, {link.replaced + link.too_old} late  quality {link.quality:.0f} %  "
+            f"round trip {link.latency_ms:.1f} ms  {link.rate:.0f} exchanges/s"
+        )
 
     def check(self) -> None:
         """Raise `LinkError` when the link is lost."""
@@ -247,6 +262,7 @@ class CrazyradioLink:
 
     def mute(self) -> None:
         """Send no more corrections; the board notices the silence and puts its flaps to hover."""
+        self.supervisor_state = None
         with self._mail:
             self._sending, self._mailbox = False, None
             self._mail.notify()

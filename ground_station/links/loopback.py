@@ -1,10 +1,12 @@
 """The link inside one process: the CRTP bytes of a real flight, handed to whatever carries them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, encode_ext_pose
 from firmware_py.wire.telemetry import Sample, decode_sample, encode_stream_request
-from ground_station.corrections import Correction
+from ground_station.corrections import correct
+from ground_station.mocap import MocapFrame
+from ground_station.trajectory import Goal
 
 
 class LoopbackLink:
@@ -18,14 +20,15 @@ class LoopbackLink:
         """Ask the board for its telemetry."""
         self._transmit(now_us, encode_stream_request(True))
 
-    def send(self, now_us: int, correction: Correction) -> None:
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         """Hand the correction to the carrier, with the age that it will have on arrival."""
+        correction = correct(frame, goal, now_us)
         age_us = correction.age_us + self._latency_us
         self._transmit(now_us, encode_ext_pose(correction.p_GB, correction.q_GB, age_us))
 
-    def decode(self, data: bytes) -> Sample | None:
-        """The telemetry in a packet from the board, None for a packet of another service."""
+    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
+        """The telemetry in a packet from the board, empty for a packet of another service."""
         packet = decode(data)
         if packet.port != PORT_LOG or packet.channel != CHANNEL_LOG_DATA:
-            return None
-        return decode_sample(packet.data)
+            return ()
+        return (decode_sample(packet.data),)

@@ -1,0 +1,5 @@
+"""The exceptions of the ground station."""
+
+
+class LinkError(Exception):
+    """The board cannot be reached, or not any more, or not like this; the text is one line."""

@@ -1,0 +1,219 @@
+"""A board over MAVLink, sans I/O: poses and goals go up, telemetry comes down, and the two clocks are compared.
+
+The pose goes up as it was seen, absolute and with its own time stamp; the goal goes apart from it, when it has changed
+and every half second, and the board forms the error. For its true age the board needs the station's clock, so its
+TIMESYNC requests are answered. Telemetry comes down absolute as well, and is turned back into the goal frame with the
+goal that was sent last: while a goal changes, a sample may be told by its neighbour.
+
+A stream of telemetry that comes at less than half of the rate it was asked for is asked for again: the request, or the
+board's memory of it, was lost.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from firmware_py.geometry import rotate, wrap_angle, yaw_quaternion
+from firmware_py.wire import WireError, mavlink
+from firmware_py.wire.crtp import check_pose
+from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
+from firmware_py.wire.telemetry import BLOCKS, Sample
+from ground_station.links.mavlink_budget import STANDING_GOAL_HZ
+from ground_station.links.mavlink_budget import Budget as Budget
+from ground_station.links.mavlink_budget import link_budget as link_budget
+from ground_station.mocap import MocapFrame
+from ground_station.trajectory import Goal
+
+SYSTEM, COMPONENT = 255, 190  # a ground station, as the standard numbers them
+BOARD_COMPONENT = 1  # autopilot
+EVERYBODY = 0  # system to talk to until the board is known
+LOOK_PERIOD_US = 1_000_000
+REPEAT_GOAL_US = round(1e6 / STANDING_GOAL_HZ)
+TEXTS = 100  # that wait for somebody to read them
+SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # a command and its best result
+STREAMS = (mavlink.MSG_LOCAL_POSITION_NED, mavlink.MSG_ATTITUDE, mavlink.MSG_DEBUG_FLOAT_ARRAY)
+MOTION, ATTITUDE, FLAPS, HEALTH = BLOCKS
+SUPERVISOR_STATE = [variable.name for variable in FLAPS.variables + HEALTH.variables].index(
+    "supervisor.state"
+)
+TIMESTAMP_MASK = 0xFFFFFF  # of a sample
+
+
+@dataclass(frozen=True, slots=True)
+class MavlinkLinkConfig:
+    """The line and how it is used. `signing_start`: the time stamp of MAVLink's signatures when the clock is 0."""
+
+    baud: int
+    pose_hz: float
+    signing_key: bytes = b""  # 32 bytes; empty: nothing is signed
+    signing_start: int = 0  # [10 us since 2015-01-01]
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatistics:
+    """What went over the link."""
+
+    poses: int  # sent
+    goals: int  # sent
+    frames: int  # received
+    lost: int  # on the way here, by their sequence numbers
+    bad: int  # wrong CRC or signature
+    round_trip_us: int | None  # of the last time request, None before
+
+
+class MavlinkLink:
+    """One board at the other end of `transmit(now_us, bytes)`; implements `ground_station.station.Link`.
+
+    Raises `LinkError` when the line cannot carry a flight.
+    """
+
+    def __init__(self, transmit: Callable[[int, bytes], object], config: MavlinkLinkConfig) -> None:
+        signing = Signing(config.signing_key, start=config.signing_start) if config.signing_key else None
+        self.budget = link_budget(config.baud, config.pose_hz, signing is not None)
+        self.texts: deque[str] = deque(maxlen=TEXTS)  # the board's, and what it refused
+        self.supervisor_state: int | None = None  # as last received
+        self.board: int | None = None  # its system id, None before the first heartbeat
+        self.answered = False  # it has acknowledged a command
+        self.heard_us = 0  # when its last frame came
+        self._carry = transmit
+        self._sender = FrameSender(SYSTEM, COMPONENT, signing)
+        self._receiver = FrameReceiver(signing)
+        self.counters = self._receiver.counters
+        self._poses = self._goals = 0
+        self._round_trip_us: int | None = None
+        self._goal: Goal | None = None  # as last sent
+        self._goal_us = 0
+        self._asked = False
+        self._streamed: Counter[int] = Counter()  # messages by number since the last look
+        self._look_us = 0  # when to look after the link next
+        self._time_request_ns = 0  # own clock in the last one
+        self._handlers: dict[int, Callable[[int, Message], Sequence[Sample]]] = {
+            mavlink.MSG_HEARTBEAT: self._on_heartbeat,
+            mavlink.MSG_TIMESYNC: self._on_timesync,
+            mavlink.MSG_ATTITUDE: self._on_attitude,
+            mavlink.MSG_LOCAL_POSITION_NED: self._on_position,
+            mavlink.MSG_DEBUG_FLOAT_ARRAY: self._on_flight_array,
+            mavlink.MSG_COMMAND_ACK: self._on_command_ack,
+            mavlink.MSG_STATUSTEXT: self._on_text,
+        }
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """What went over the link so far."""
+        c = self.counters
+        bad = c.bad_crc + c.bad_signature + c.unsigned + c.replayed
+        return LinkStatistics(self._poses, self._goals, c.frames, c.lost, bad, self._round_trip_us)
+
+    # Uplink
+
+    def start_telemetry(self, now_us: int) -> None:
+        """Ask the board for all streams of telemetry."""
+        self._asked = True
+        self._streamed.clear()
+        self._look_after(now_us)
+
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        """Send the pose, after a goal that has changed; what can wait comes behind. `WireError` for an unfit pose."""
+        check_pose(frame.p_WB, frame.q_WB)
+        since_us = now_us - self._goal_us
+        if self._goal is None or (goal != self._goal and since_us >= self.budget.goal_period_us):
+            self._send_goal(now_us, frame, goal)
+        self._send(now_us, mavlink.pose(frame.t_us, frame.p_WB, frame.q_WB))
+        self._poses += 1
+        if goal == self._goal and now_us - self._goal_us >= REPEAT_GOAL_US:
+            self._send_goal(now_us, frame, goal)
+        if now_us >= self._look_us:
+            self._look_after(now_us)
+
+    def _send_goal(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        self._send(now_us, mavlink.target(frame.t_us // 1000, goal.p_WG, goal.yaw, self._addressee))
+        self._goal, self._goal_us = goal, now_us
+        self._goals += 1
+
+    @property
+    def _addressee(self) -> int:
+        return EVERYBODY if self.board is None else self.board
+
+    def _send(self, now_us: int, message: Message) -> None:
+        self._carry(now_us, self._sender.encode(now_us, message))
+
+    def _look_after(self, now_us: int) -> None:
+        """Ask for the time, say that we are here, and ask for the streams that are too slow."""
+        self._look_us = now_us + LOOK_PERIOD_US
+        self._time_request_ns = now_us * 1000
+        self._send(now_us, mavlink.timesync(0, self._time_request_ns))
+        self._send(now_us, mavlink.station_heartbeat())
+        rate_hz, board = self.budget.telemetry_hz, self._addressee
+        for number in STREAMS if self._asked else ():
+            if self._streamed[number] < rate_hz / 2:
+                wanted = (SET_MESSAGE_INTERVAL, number, 1_000_000 // rate_hz)
+                self._send(now_us, mavlink.command(board, BOARD_COMPONENT, *wanted))
+        self._streamed.clear()
+
+    # Downlink
+
+    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
+        """The telemetry in a piece of the stream of bytes, which may be empty; never raises."""
+        samples: list[Sample] = []
+        for message in self._receiver.feed(now_us, data):
+            handler = self._handlers.get(message.get_msgId())
+            if handler is None or not self._is_of_board(message):
+                continue
+            self.heard_us = now_us
+            self._streamed[message.get_msgId()] += 1
+            samples += handler(now_us, message)
+        if now_us >= self._look_us:
+            self._look_after(now_us)
+        return samples
+
+    def _is_of_board(self, message: Message) -> bool:
+        system = message.get_srcSystem()
+        return message.get_srcComponent() == BOARD_COMPONENT and self.board in (None, system)
+
+    def _on_heartbeat(self, now_us: int, message: Message) -> Sequence[Sample]:
+        self.board = message.get_srcSystem()
+        self.supervisor_state = message.custom_mode
+        return ()
+
+    def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:
+        if message.tc1 == 0:
+            self._send(now_us, mavlink.timesync(now_us * 1000, message.ts1))
+        elif message.ts1 == self._time_request_ns:
+            self._round_trip_us = now_us - message.ts1 // 1000
+        return ()
+
+    def _on_command_ack(self, now_us: int, message: Message) -> Sequence[Sample]:
+        self.answered = True
+        if message.result != ACCEPTED:
+            self.texts.append(f"the board refuses command {message.command}: result {message.result}")
+        return ()
+
+    def _on_text(self, now_us: int, message: Message) -> Sequence[Sample]:
+        self.texts.append(f"board: {message.text}")
+        return ()
+
+    def _on_position(self, now_us: int, message: Message) -> Sequence[Sample]:
+        if self._goal is None:
+            return ()
+        position = mavlink.read_local_position(message)
+        (x, y, z), goal = position.p_WB, self._goal.p_WG
+        q_GW = yaw_quaternion(-self._goal.yaw)
+        p_GB = rotate(q_GW, (x - goal[0], y - goal[1], z - goal[2]))
+        return (Sample(MOTION, position.t_ms & TIMESTAMP_MASK, (*p_GB, *rotate(q_GW, position.v_W))),)
+
+    def _on_attitude(self, now_us: int, message: Message) -> Sequence[Sample]:
+        if self._goal is None:
+            return ()
+        sample = mavlink.read_attitude(message)
+        roll, pitch, yaw = sample.attitude
+        angles = (roll, pitch, wrap_angle(yaw - self._goal.yaw))
+        return (Sample(ATTITUDE, sample.t_ms & TIMESTAMP_MASK, (*angles, *sample.rates_B)),)
+
+    def _on_flight_array(self, now_us: int, message: Message) -> Sequence[Sample]:
+        try:
+            values = mavlink.read_flight_array(message)
+        except WireError:
+            return ()  # somebody's array of another name
+        t_ms, flaps = message.time_usec // 1000 & TIMESTAMP_MASK, len(FLAPS.variables)
+        self.supervisor_state = int(values[SUPERVISOR_STATE])
+        return Sample(FLAPS, t_ms, values[:flaps]), Sample(HEALTH, t_ms, values[flaps:])
