@@ -11,6 +11,7 @@ import pymavlink.dialects.v20.common as dialect
 import serial
 
 PATIENCE_S = 10.0
+GAIN = "EXT_Z_P"  # extCtrl.z_P, the parameter that tests tune
 
 
 class Client:

@@ -15,6 +15,9 @@ from firmware_py.firmware import Firmware
 from firmware_py.supervisor import Cause, State
 from firmware_py.wire import telemetry
 from hil.config import load_config
+from hil.events import EventQueue
+from hil.virtual_board import VirtualBoard
+from hil.virtual_serial import SerialConfig, VirtualSerial
 
 DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
 IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
@@ -158,7 +161,46 @@ def test_the_clock_is_asked_ten_times_a_second_until_five_answers_came_then_twic
     client.send("heartbeat", 6, 8, 0, 0, 4, 3)
     client.run(3_000_000)
     asked_ms = [t_us // 1000 for t_us, message in client.messages if message.get_type() == "TIMESYNC"]
-    assert asked_ms == [99, 199, 299, 399, 499, 599, 999, 1499, 1999, 2499, 2999]
+    assert asked_ms == [97, 194, 291, 388, 485, 582, 1069, 1556, 2043, 2530]
+
+
+@pytest.mark.parametrize(("baud", "interval_us"), [(57_600, 50_000), (115_200, 20_000), (921_600, 20_000)])
+def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us: int) -> None:
+    events = EventQueue()
+    line = VirtualSerial(SerialConfig(baud=baud), events, np.random.default_rng(1))
+    board = VirtualBoard(lambda *servo: None, lambda *radio: True, lambda *console: None, line)
+    firmware = Firmware(load_config(), board, mavlink=True)
+    board.run_on(firmware.kernel, events)
+    station, parser, ages_ms = codec(255, 190), codec(0, 0), []
+    lag_us, ahead_us = 20_000, 123_456_789_000
+
+    def on_ground(now_us: int, data: bytes) -> None:
+        for message in parser.parse_buffer(bytearray(data)) or ():
+            if message.get_type() == "TIMESYNC":
+                answer = station.timesync_encode((now_us + ahead_us) * 1000, message.ts1)
+                line.uplink(now_us, answer.pack(station))
+            elif message.get_type() == "NAMED_VALUE_FLOAT" and message.name == "age_ms":
+                ages_ms.append(message.value)
+
+    def pose(now_us: int) -> None:
+        taken_us = now_us + ahead_us - lag_us
+        line.uplink(now_us, station.att_pos_mocap_encode(taken_us, LEVEL, 0, 0, -1.15).pack(station))
+        events.at(now_us + 20_000, pose)
+
+    line.connect(lambda now_us: firmware.uart_ready(), on_ground)
+    for number in (30, 32, 350):
+        request = station.command_long_encode(1, 1, 511, 0, number, interval_us, 0, 0, 0, 0, 0)
+        line.uplink(0, request.pack(station))
+    events.at(103_700, pose)
+    now_us = 0
+    while now_us < 9_050_000:
+        now_us = min(wake for wake in (9_050_000, events.next_us, firmware.next_wake_us) if wake is not None)
+        events.run(now_us)
+        firmware.run(now_us)
+    assert line.down.busy_us > 0.09 * now_us
+    on_line_us = 1000 + 10_000_000 * (48 + 1) / baud  # the adapter, the frame, and the silence that ends it
+    age_ms = float(np.median(ages_ms[-5:]))  # now and then a pose has to wait for an answer before it
+    assert age_ms == pytest.approx((lag_us + on_line_us) * 1e-3, abs=0.3)
 
 
 @pytest.mark.parametrize("lag_us", [600_000, -20_000])
@@ -412,24 +454,39 @@ def test_the_hash_changes_with_any_value_and_back(client: Client) -> None:
     assert digest() == first != second
 
 
-def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client: Client) -> None:
-    def fill(now_us: int) -> None:  # 57600 baud, a buffer of 120 bytes
+def slow_line(client: Client) -> None:
+    """From now on 57600 baud, with a buffer of 120 bytes."""
+
+    def fill(now_us: int) -> None:
         client.uart_room = min(120, client.uart_room + 6)
         client.events.at(now_us + 1000, fill)
 
     client.uart_room = 0
     fill(client.now_us)
+
+
+def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client: Client) -> None:
+    slow_line(client)
     client.send("param_request_list", 1, 1)
     client.run(client.now_us + 100_000)
-    started = [message.param_index for message in client.of("PARAM_VALUE")]
-    assert 0 < len(started) < 30
+    assert 0 < len(client.of("PARAM_VALUE")) < 30
     client.send("param_request_list", 1, 1)
     client.run(client.now_us + 2_000_000)
     indices = [message.param_index for message in client.of("PARAM_VALUE")]
     assert indices[-1] == max(indices)
     assert indices.count(0) == 2
-    assert set(indices) == set(range(len(set(indices))))
+    assert set(indices) == set(range(client.of("PARAM_VALUE")[0].param_count))
     assert client.stack.dropped == 0
+
+
+def test_a_list_comes_through_on_a_line_full_of_telemetry(client: Client) -> None:
+    slow_line(client)
+    client.command(511, 30, 5000)  # 8 kB/s
+    client.send("param_request_list", 1, 1)
+    client.run(client.now_us + 20_000_000)
+    assert client.stack.dropped > 100
+    indices = {message.param_index for message in client.of("PARAM_VALUE")}
+    assert indices == set(range(client.of("PARAM_VALUE")[0].param_count))
 
 
 # Commands

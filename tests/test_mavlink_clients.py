@@ -1,5 +1,6 @@
 """Unmodified ground tools against `floaty board serve --mavlink`: MAVProxy and MAVSDK, each as a program of its own."""
 
+import hashlib
 import importlib.util
 import json
 import os
@@ -13,9 +14,8 @@ from typing import Any
 
 import pymavlink.dialects.v20.common as dialect
 import pytest
-from mavlink_socket import Client
-from serving import Served, serve
-from test_board_mavlink import GAIN, free_port
+from mavlink_socket import GAIN, Client
+from serving import Served, free_port, serve
 
 PATIENCE_S = 15.0
 
@@ -47,7 +47,7 @@ class MavProxy:
         with self.screen.open("w") as screen:
             self.process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=screen, stderr=subprocess.STDOUT, cwd=folder,
-                env={**os.environ, "HOME": str(folder), "PYTHONUNBUFFERED": "1"}, start_new_session=True,
+                env={**os.environ, "HOME": str(folder), "PYTHONUNBUFFERED": "1"},
             )  # fmt: skip
 
     def type(self, line: str) -> None:
@@ -123,6 +123,23 @@ def test_mavproxy_watches_tunes_and_commands(proxied: tuple[Served, MavProxy], t
     again = Client(served.line("mavlink ")[0])  # the board does not care that it has gone
     again.wait("HEARTBEAT")
     again.close()
+
+
+@mavproxy_here
+def test_a_signed_board_obeys_mavproxy_once_it_has_the_key(tmp_path: Path) -> None:
+    key = hashlib.sha256(b"floaty").hexdigest()
+    with serve("--mavlink", address("pty"), "--poses", "0", "--set", f"mavlink.signing_key={key}") as served:
+        proxy = MavProxy(served.line("mavlink ")[0], tmp_path)
+        try:
+            proxy.sees("Detected vehicle 1:1")  # it listens to who signs, and is not listened to
+            proxy.type("long MAV_CMD_NAV_LAND")
+            proxy.type("signing key floaty")
+            proxy.sees("Received ")
+            assert "NAV_LAND" not in proxy.screen.read_text()
+            proxy.type(f"param set {GAIN} 2.0")
+            proxy.hears(lambda message: message.get_type() == "PARAM_VALUE" and message.param_value == 2.0)
+        finally:
+            proxy.kill()
 
 
 @pytest.fixture(params=["udp", "pty", "tcp"])
