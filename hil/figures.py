@@ -22,6 +22,7 @@ from hil.schedule import runs
 
 WIDTH, DPI = 9.2, 115  # [in], 1/in
 TENTH, SECOND = 10, 100  # rows
+BUSY_PERCENT = 0.02  # of the processor, that makes a task worth a colour
 SCHEDULE_US = 20_000  # of the scheduler's picture
 BOX_CM = 100 * BOX
 STYLE: Any = {
@@ -189,10 +190,15 @@ def board(rows: pa.Table) -> Figure:
     """Draw the load of the processor by task, the measurement queue and the states."""
     figure, axes = _stack((1.8, 1.1, 0.8))
     load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
-    axes[0].stackplot(_seconds(tenths)[1:], load.read(tenths).T, labels=load.names, colors=load.colours)
+    shares = load.read(tenths).T
+    busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT]
+    axes[0].stackplot(
+        _seconds(tenths)[1:], shares[busy],
+        labels=[load.names[index] for index in busy], colors=[load.colours[index] for index in busy],
+    )  # fmt: skip
     axes[0].set_ylim(bottom=0.0)
     axes[0].set_ylabel("processor [%]")
-    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.1), labelspacing=0.25)
     _lines(axes[1], _seconds(rows), curves.QUEUE, curves.QUEUE.read(rows), "queue")
     lanes = (curves.SUPERVISOR, curves.RELEASE)
     end = _seconds(rows)[-1:]
@@ -303,8 +309,8 @@ PICTURES = (
     ),
     Picture(
         "Board",
-        "Share of the processor by task, over 0.1 s; fullest state so far of the measurement queue and poses dropped from "
-        "it; states of the supervisor and of the robot.",
+        "Share of the processor by task, over 0.1 s, of tasks with 0.02 % or more; fullest state so far of the measurement "
+        "queue and poses dropped from it; states of the supervisor and of the robot.",
         board,
     ),
     Picture(
