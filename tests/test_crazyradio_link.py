@@ -188,8 +188,8 @@ def test_hover_over_udp_holds_its_limits_in_real_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--link", "radio://0/81/2M/E7E7E7E7E7"], "the virtual board is at radio://0/80/2M/E7E7E7E7E7"),
-        (["--link", URI, "--seeds", "2"], "--seeds 2"),
+        (["--link", "radio://0/81/2M/E7E7E7E7E7"], "expected radio, mavlink, radio://0/80/2M/E7E7E7E7E7"),
+        (["--link", URI, "--seeds", "2"], "--seeds and --perfetto are for flights in lockstep"),
     ],
 )
 def test_fly_refuses_a_link_that_leads_nowhere(tmp_path: Path, arguments: list[str], message: str) -> None:
