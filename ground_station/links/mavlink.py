@@ -26,6 +26,7 @@ from ground_station.trajectory import Goal
 
 SYSTEM, COMPONENT = 255, 190  # a ground station, as the standard numbers them
 BOARD_COMPONENT = 1  # autopilot
+NO_AUTOPILOT = 8  # in a heartbeat: a ground station's, or a camera's
 EVERYBODY = 0  # system to talk to until the board is known
 LOOK_PERIOD_US = 1_000_000
 REPEAT_GOAL_US = round(1e6 / STANDING_GOAL_HZ)
@@ -166,8 +167,9 @@ class MavlinkLink:
         return message.get_srcComponent() == BOARD_COMPONENT and self.board in (None, system)
 
     def _on_heartbeat(self, now_us: int, message: Message) -> Sequence[Sample]:
-        self.board = message.get_srcSystem()
-        self.supervisor_state = message.custom_mode
+        if message.autopilot != NO_AUTOPILOT:
+            self.board = message.get_srcSystem()
+            self.supervisor_state = message.custom_mode
         return ()
 
     def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:

@@ -36,7 +36,7 @@ WRITE_TIMEOUT_S = 1.0
 CLOSE_TIMEOUT_S = 1.5
 PIECES = 2000  # of received bytes that wait
 POSE_IS_DUE = b""  # among what waits to be written
-_DEVICE = re.compile(r"(?:socket|rfc2217)://[^,]+:(\d{1,5})(?:[/?][^,]*)?|(?!\w+://)[^,]+")
+_DEVICE = re.compile(r"(?:socket|rfc2217)://[^,]+:(\d{1,5})(?:[/?][^,]*)?|(?!.*://)[^,]+")
 
 
 def parse_uri(uri: str, default_baud: int) -> tuple[str, int]:
@@ -283,6 +283,8 @@ class MavlinkSerialLink:
 
 def reason(error: Exception) -> str:
     """The sense of one of pyserial's messages."""
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
     text = str(error).splitlines()[0] if str(error) else type(error).__name__
     if "Inappropriate ioctl" in text:
         return "not a serial port"
