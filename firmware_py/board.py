@@ -14,7 +14,6 @@ class Board(Protocol):
 
     eeprom: bytearray  # (8192,) survives power cycles; all 0xFF when new
     deck_memory: bytearray  # (112,) the one-wire memory of the deck that carries the servo connectors
-    uart_overruns: int  # bytes lost because the UART's receive buffer was full
 
     def read_imu(self) -> ImuCounts:
         """Return the registers of the BMI088 as they are now."""
@@ -30,6 +29,11 @@ class Board(Protocol):
 
     def radio_send(self, data: bytes) -> bool:
         """Hand a packet to the radio chip; False when its queue is full."""
+        ...
+
+    @property
+    def uart_overruns(self) -> int:
+        """Bytes lost because the UART's receive buffer was full."""
         ...
 
     def uart_read(self) -> bytes:

@@ -4,8 +4,6 @@ Hardware calls `imu_ready`, `radio_received` and `uart_ready` (interrupts), then
 `Board`.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
@@ -136,14 +134,14 @@ class Firmware:
         if self.mavlink is not None:
             self._start_mavlink_services(self.mavlink, config.mavlink, running, storage, read)
 
-    def _mavlink_stack(self, config: FirmwareConfig) -> MavlinkStack:
+    def _mavlink_stack(self, config: FirmwareConfig) -> "MavlinkStack":
         from firmware_py.links.mavlink_stack import MavlinkStack
 
         return MavlinkStack(self.kernel, config.cpu, config.mavlink, self._board)
 
     def _start_mavlink_services(
         self,
-        stack: MavlinkStack,
+        stack: "MavlinkStack",
         config: MavlinkConfig,
         running: Running,
         storage: ParameterStorage,

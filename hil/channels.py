@@ -15,8 +15,22 @@ from hil.virtual_board import VirtualBoard
 from hil.virtual_radio import VirtualRadio
 
 
-def _of(prefix: str, names: str, unit: str = "", frame: str = "") -> Quantity:
+def quantity(prefix: str, names: str, unit: str = "", frame: str = "") -> Quantity:
     return Quantity(tuple(f"{prefix}.{name}" for name in names.split()), unit, frame)
+
+
+def radio_channel(radio: VirtualRadio) -> Channel:
+    """Return what the radio counts."""
+    up, down, air = radio.up, radio.down, radio.air
+    names = "up_sent up_delivered up_dropped down_sent down_delivered down_dropped retried unanswered"
+    return Channel(
+        "int64",
+        lambda: (
+            up.sent, up.delivered, up.dropped, down.sent, down.delivered, down.dropped,
+            air.retried, air.unanswered, up.latency_sum_us, down.latency_sum_us,
+        ),
+        (quantity("link", names), quantity("link", "up_latency_sum down_latency_sum", "us")),
+    )  # fmt: skip
 
 
 def _view(array: Any) -> Callable[[], Any]:
@@ -27,16 +41,15 @@ def flight_channels(
     plant: Plant,
     board: VirtualBoard,
     firmware: Firmware,
-    radio: VirtualRadio,
+    link: Channel,
     trajectory: Trajectory,
     free: Callable[[], bool],
 ) -> tuple[Channel, ...]:
-    """Return the channels of a flight; the first column, `t`, is the recorder's own."""
+    """Return the channels of a flight, `link` among them; the first column, `t`, is the recorder's own."""
     signals, queue = firmware.signals, firmware.measurements
     kernel = firmware.kernel
     tasks = kernel.tasks
     timed = [task for task in tasks if task.name in DEADLINES_US]
-    up, down, air = radio.up, radio.down, radio.air
 
     def goal() -> tuple[float, ...]:
         at = trajectory.at(board.now_us)
@@ -44,8 +57,7 @@ def flight_channels(
 
     def counts() -> tuple[int, ...]:
         return (
-            up.sent, up.delivered, up.dropped, down.sent, down.delivered, down.dropped,
-            air.retried, air.unanswered, up.latency_sum_us, down.latency_sum_us, queue.high_water, queue.dropped,
+            queue.high_water, queue.dropped,
             *[task.deadline_misses for task in timed], *[kernel.run_time_us(task) for task in tasks],
         )  # fmt: skip
 
@@ -57,53 +69,49 @@ def flight_channels(
         Channel(
             "int8",
             lambda: (free(), signals.supervisor.state),
-            (_of("flight", "free"), _of("supervisor", "state")),
+            (quantity("flight", "free"), quantity("supervisor", "state")),
         ),
         Channel(
             "float64",
             _view(plant.state),
             (
-                _of("truth", "x y z", "m", "W"),
-                _of("truth", "vx vy vz", "m/s", "W"),
-                _of("truth", "qw qx qy qz", "", "W"),
-                _of("truth", "p q r", "rad/s", "B"),
-                _of("truth", flaps, "rad", "B"),
+                quantity("truth", "x y z", "m", "W"),
+                quantity("truth", "vx vy vz", "m/s", "W"),
+                quantity("truth", "qw qx qy qz", "", "W"),
+                quantity("truth", "p q r", "rad/s", "B"),
+                quantity("truth", flaps, "rad", "B"),
             ),
         ),
-        Channel("float32", _view(plant.plate_forces_W.reshape(15)), (_of("force", forces, "N", "W"),)),
-        Channel("float32", _view(plant.flow_W), (_of("flow", "x y z", "m/s", "W"),)),
-        Channel("float64", goal, (_of("goal", "x y z", "m", "W"), _of("goal", "yaw", "rad", "W"))),
+        Channel("float32", _view(plant.plate_forces_W.reshape(15)), (quantity("force", forces, "N", "W"),)),
+        Channel("float32", _view(plant.flow_W), (quantity("flow", "x y z", "m/s", "W"),)),
+        Channel("float64", goal, (quantity("goal", "x y z", "m", "W"), quantity("goal", "yaw", "rad", "W"))),
         Channel(
             "float32",
             _view(signals.estimate),
             (
-                _of("estimate", "x y z", "m", "G"),
-                _of("estimate", "vx vy vz", "m/s", "G"),
-                _of("estimate", "roll pitch yaw", "rad", "G"),
-                _of("estimate", "p q r", "rad/s", "B"),
-                _of("estimate", flaps, "rad", "B"),
+                quantity("estimate", "x y z", "m", "G"),
+                quantity("estimate", "vx vy vz", "m/s", "G"),
+                quantity("estimate", "roll pitch yaw", "rad", "G"),
+                quantity("estimate", "p q r", "rad/s", "B"),
+                quantity("estimate", flaps, "rad", "B"),
             ),
         ),
-        Channel("float32", _view(signals.u), (_of("control", "u1 u2 u3 u4", "rad"),)),
-        Channel("float32", _view(signals.flap), (_of("control", flaps, "rad", "B"),)),
-        Channel("int32", _view(signals.count), (_of("motor", "m1 m2 m3 m4", "counts"),)),
-        Channel("int16", lambda: board.imu, (_of("imu", "gx gy gz ax ay az", "counts", "S"),)),
+        Channel("float32", _view(signals.u), (quantity("control", "u1 u2 u3 u4", "rad"),)),
+        Channel("float32", _view(signals.flap), (quantity("control", flaps, "rad", "B"),)),
+        Channel("int32", _view(signals.count), (quantity("motor", "m1 m2 m3 m4", "counts"),)),
+        Channel("int16", lambda: board.imu, (quantity("imu", "gx gy gz ax ay az", "counts", "S"),)),
         Channel(
             "int32",
             _view(signals.counters),
-            (_of("estimator", " ".join(COUNTERS[:-1])), _of("estimator", COUNTERS[-1], "us")),
+            (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us")),
         ),
+        link,
         Channel(
             "int64",
             counts,
             (
-                _of(
-                    "link",
-                    "up_sent up_delivered up_dropped down_sent down_delivered down_dropped retried unanswered",
-                ),
-                _of("link", "up_latency_sum down_latency_sum", "us"),
-                _of("rtos", "measurements_high_water measurements_dropped"),
-                _of("late", " ".join(task.name for task in timed)),
+                quantity("rtos", "measurements_high_water measurements_dropped"),
+                quantity("late", " ".join(task.name for task in timed)),
                 Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),
             ),
         ),

@@ -66,8 +66,9 @@ run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path
 @click.option("--view", "watch", is_flag=True, help="Watch live in the rerun viewer.")
 @click.option("--perfetto", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace.")
 @click.option(
-    "--link", metavar="URI",
-    help="Fly over cflib, in real time: radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:PORT.",
+    "--link", metavar="LINK", default="radio", show_default=True,
+    help="radio or mavlink: in lockstep; radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:PORT or mavlink:/dev/NAME: over "
+    "cflib or a serial port, in real time, the ground station in a process of its own.",
 )  # fmt: skip
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
@@ -82,7 +83,7 @@ def fly(
     realtime: bool,
     watch: bool,
     perfetto: bool,
-    link: str | None,
+    link: str,
     out: Path | None,
 ) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
@@ -96,21 +97,23 @@ def fly(
     flown_s = chosen.duration_s if duration is None else duration
     if not 0.0 < flown_s <= DURATION_MAX_S:
         raise LabError(f"--duration {flown_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}")
-    if seeds > 1 and (realtime or watch or perfetto or link):
-        raise LabError(f"--seeds {seeds}: --realtime, --view, --perfetto and --link are for one seed")
-    if perfetto and link:
-        raise LabError("--perfetto: the scheduler is traced in lockstep only, not with --link")
+    if seeds > 1 and (realtime or watch or perfetto):
+        raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
     if perfetto:
         import hil.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
     config = load_config(profile, overrides)
     announce_compilation()
     from hil.run import Request
 
-    requests = [Request(chosen, config, profile, overrides, seed + index, flown_s) for index in range(seeds)]
+    requests = [
+        Request(chosen, config, profile, overrides, seed + index, flown_s, link) for index in range(seeds)
+    ]
+    if (seeds > 1 or perfetto) and not requests[0].in_lockstep:
+        raise LabError(f"--link {link}: --seeds and --perfetto are for flights in lockstep")
     if seeds > 1:
         return _fly_many(requests, out or Path("runs"))
     folder = out or Path("runs") / f"{chosen.name}-{seed}"
-    return _fly_one(requests[0], folder, realtime, watch, perfetto, link)
+    return _fly_one(requests[0], folder, realtime, watch, perfetto)
 
 
 @app.command("list")
@@ -151,9 +154,7 @@ def announce_compilation() -> None:
         notices.print("first run on this machine: compiling flight core and plant, once, some ten seconds")
 
 
-def _fly_one(
-    request: "Request", folder: Path, realtime: bool, watch: bool, perfetto: bool, link: str | None
-) -> int:
+def _fly_one(request: "Request", folder: Path, realtime: bool, watch: bool, perfetto: bool) -> int:
     """Fly one seed with all its pictures; returns the exit code."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -169,13 +170,13 @@ def _fly_one(
         TextColumn("{task.fields[now]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=notices, transient=True) as progress:
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
 
         def show(now_us: int, flight: "Flight | LinkedFlight") -> None:
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
-        result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto, link)
+        result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto)
         progress.update(bar, description="writing recording and report", total=None, now="")
         _write_pictures(folder)
         if perfetto:

@@ -33,6 +33,7 @@ class Curves:
     colours: tuple[str, ...]
     unit: str
     read: Read
+    needs: str = "t"  # a column that only some logs have
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +79,12 @@ AGE = Curves(
 PACKETS = Curves(
     ("lost up", "lost down", "sent again"), (RED, ORANGE, BLUE), "packets",
     lambda rows: column(rows, "link.up_dropped", "link.down_dropped", "link.retried"),
+    needs="link.retried",
+)  # fmt: skip
+SERIAL_FAULTS = Curves(
+    ("overrun", "no room", "bad up", "bad down"), (RED, ORANGE, BLUE, SKY), "so far",
+    lambda rows: column(rows, "serial.overrun", "serial.no_room", "serial.up_bad", "serial.down_bad"),
+    needs="serial.overrun",
 )  # fmt: skip
 QUEUE = Curves(
     ("longest so far", "dropped"), (BLUE, RED), "poses",
@@ -106,6 +113,12 @@ def latency(rows: pa.Table) -> NDArray[np.float64]:
     total = np.diff(column(rows, "link.up_latency_sum", "link.down_latency_sum"), axis=0)
     arrived = np.diff(column(rows, "link.up_delivered", "link.down_delivered"), axis=0)
     return np.asarray(1e-3 * total / np.where(arrived > 0, arrived, np.nan))
+
+
+def line_load(rows: pa.Table) -> NDArray[np.float64]:
+    """Return the load of the serial line, up and down [%], between rows: (N - 1, 2) from N rows."""
+    busy = np.diff(column(rows, "serial.up_busy", "serial.down_busy"), axis=0)
+    return np.asarray(100.0 * busy / np.diff(column(rows, "t"))[:, None])
 
 
 def changes(rows: pa.Table, states: States) -> tuple[NDArray[np.float64], list[str]]:

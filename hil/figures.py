@@ -150,23 +150,39 @@ def flaps(rows: pa.Table) -> Figure:
     return figure
 
 
-def link(rows: pa.Table) -> Figure:
+def radio(rows: pa.Table) -> Figure:
     """Draw the age of the poses, the time in the air and the packets that were lost."""
     figure, axes = _stack((1.5, 1.5, 1.5))
     _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
-    seconds = rows.take(np.arange(0, rows.num_rows, SECOND))
-    for index, name in enumerate(("up", "down")):
-        axes[1].plot(
-            _seconds(seconds)[1:],
-            curves.latency(seconds)[:, index],
-            color=curves.FLAP_COLOURS[index],
-            label=name,
-        )
-    axes[1].set_ylabel("mean latency [ms]")
-    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    _up_and_down(axes[1], rows, SECOND, curves.latency, "mean latency [ms]")
     _lines(axes[2], _seconds(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
     _shade_hold(axes, rows)
     return figure
+
+
+def serial_line(rows: pa.Table) -> Figure:
+    """Draw the age of the poses, the load of the line, the time on it and what was lost or spoilt."""
+    figure, axes = _stack((1.5, 1.5, 1.5, 1.5))
+    _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
+    _up_and_down(axes[1], rows, TENTH, curves.line_load, "load of the line [%]")
+    axes[1].set_ylim(0.0, 105.0)
+    _up_and_down(axes[2], rows, SECOND, curves.latency, "mean latency [ms]")
+    _lines(axes[3], _seconds(rows), curves.SERIAL_FAULTS, curves.SERIAL_FAULTS.read(rows), "bytes or frames")
+    _shade_hold(axes, rows)
+    return figure
+
+
+def _up_and_down(
+    axes: Axes, rows: pa.Table, step: int, read: Callable[[pa.Table], NDArray[np.float64]], label: str
+) -> None:
+    """Draw what `read` makes of every `step`-th row, for both directions of the link."""
+    thinned = rows.take(np.arange(0, rows.num_rows, step))
+    for index, name in enumerate(("up", "down")):
+        axes.plot(
+            _seconds(thinned)[1:], read(thinned)[:, index], color=curves.FLAP_COLOURS[index], label=name
+        )
+    axes.set_ylabel(label)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def board(rows: pa.Table) -> Figure:
@@ -271,10 +287,19 @@ PICTURES = (
         flaps,
     ),
     Picture(
-        "Link",
+        "Radio",
         "Age of the pose when the estimator takes it and the horizon of its predictor; mean time of a packet in the air, "
         "per second; packets lost and sent again, since the start.",
-        link,
+        radio,
+        needs="link.retried",
+    ),
+    Picture(
+        "Serial line",
+        "Age of the pose when the estimator takes it and the horizon of its predictor; share of the time in which the line "
+        "carries bytes, over 0.1 s; mean time from sender to receiver, per second; since the start: bytes that overran the "
+        "board's receive buffer or found no room to be sent, frames that neither end could read.",
+        serial_line,
+        needs="serial.up_busy",
     ),
     Picture(
         "Board",

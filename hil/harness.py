@@ -4,21 +4,25 @@ Hardware events own time; at equal time hardware goes first, then the firmware's
 seed, split into one stream per component. The loop is the one of ARCHITECTURE.md.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from firmware_py.firmware import Firmware
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
-from ground_station.station import GroundStation
+from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Goal
-from hil.channels import flight_channels
+from hil.channels import flight_channels, radio_channel
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
+from hil.errors import LabError
 from hil.events import EventQueue
 from hil.experiments import Experiment
 from hil.plant.plant import Plant
@@ -29,12 +33,17 @@ from hil.virtual_imu import VirtualImu
 from hil.virtual_mocap import VirtualMocap
 from hil.virtual_radio import VirtualRadio
 
+if TYPE_CHECKING:
+    from hil.serial_line import SerialLine
+
 IMU_PERIOD_US = 1_000
 MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms before its step
 RECORD_PERIOD_US = 10_000
 RECORD_PHASE_US = 250  # just after the controller
 PROGRESS_PERIOD_US = 250_000
 DROP_NOTE_PERIOD_US = 1_000_000
+RADIO, MAVLINK = "radio", "mavlink"
+LOCKSTEP = (RADIO, MAVLINK)  # links that are simulated whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +63,12 @@ class Streams:
     imu: np.random.Generator
     mocap: np.random.Generator
     radio: np.random.Generator
+    serial: np.random.Generator
 
     @classmethod
-    def of_seed(cls, seed: int) -> "Streams":
+    def of_seed(cls, seed: int) -> Streams:
         """Split a seed."""
-        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(4)))
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(5)))
 
 
 class Flight:
@@ -73,6 +83,7 @@ class Flight:
         telemetry_path: Path | None,
         clock: Clock | None = None,
         trace_all: bool = False,
+        link: str = RADIO,
     ) -> None:
         streams = Streams.of_seed(seed)
         home, offset = config.flight.home, config.flight.start_offset
@@ -94,13 +105,22 @@ class Flight:
         self.imu = VirtualImu(config.imu, streams.imu)
         self.mocap = VirtualMocap(config.mocap, streams.mocap)
         self.radio = VirtualRadio(config.radio, self.events, streams.radio)
-        link = LoopbackLink(self.radio.uplink, config.station.link_latency_us)
+        self.serial = _serial_line(config, self.events, streams.serial) if link == MAVLINK else None
+        end: Link = (
+            self.serial.link
+            if self.serial
+            else LoopbackLink(self.radio.uplink, config.station.link_latency_us)
+        )
         self.telemetry = TelemetryLog(telemetry_path) if telemetry_path else None
-        self.station = GroundStation(link, self.trajectory, self.telemetry, config.station)
-        self.board = VirtualBoard(self.plant.set_counts, self.radio.downlink, self._console)
-        self.firmware = Firmware(config, self.board)
+        self.station = GroundStation(end, self.trajectory, self.telemetry, config.station)
+        uart = self.serial.uart if self.serial else None
+        self.board = VirtualBoard(self.plant.set_counts, self.radio.downlink, self._console, uart)
+        self.firmware = Firmware(config, self.board, mavlink=link == MAVLINK)
         self.board.run_on(self.firmware.kernel, self.events)
         self.radio.connect(self._radio_to_board, self.station.on_packet)
+        if self.serial:
+            self.serial.connect(self.firmware, self.station)
+            self.events.at(0, self._state_budget)
         self.plant.hold()
         self.events.at(self.release_us, self._release)
         experiment.script(self)
@@ -119,8 +139,9 @@ class Flight:
 
     def channels(self) -> tuple[Channel, ...]:
         """Return what there is to record."""
+        link = self.serial.channel(self.firmware) if self.serial else radio_channel(self.radio)
         return flight_channels(
-            self.plant, self.board, self.firmware, self.radio, self.trajectory, lambda: self.free
+            self.plant, self.board, self.firmware, link, self.trajectory, lambda: self.free
         )
 
     def run(self, progress: Callable[[int], None] | None = None) -> Outcome:
@@ -193,6 +214,10 @@ class Flight:
                 self._drops_noted[queue.name] = queue.dropped
                 self._next_drop_note_us = now_us + DROP_NOTE_PERIOD_US
 
+    def _state_budget(self, now_us: int) -> None:
+        assert self.serial is not None
+        self.note("lab", self.serial.link.budget.text)
+
     def _console(self, now_us: int, text: str) -> None:
         self.note("board", text)
 
@@ -210,6 +235,17 @@ class Flight:
         """Close what the flight itself opened."""
         if self.telemetry is not None:
             self.telemetry.close()
+
+
+def _serial_line(config: LabConfig, events: EventQueue, rng: np.random.Generator) -> SerialLine:
+    """Return the serial line, whose packages are an extra."""
+    try:
+        from hil.serial_line import SerialLine
+    except ImportError as error:
+        raise LabError(
+            f"--link mavlink needs pymavlink ({error}): pip install 'floaty-hil[mavlink]'"
+        ) from None
+    return SerialLine(config, events, rng)
 
 
 def _silent(now_us: int) -> None:

@@ -1,7 +1,7 @@
-"""A flight over a real link, in real time: the board in its tunnel here, `floaty station` with cflib in another process.
+"""A flight over a real link, in real time: the board in its tunnel here, `floaty station` in another process.
 
-The station is the one that flies a real board. It sees the virtual dongle or the UDP port, and gets poses over the
-loopback interface. The robot is released when the board has flown in its holder for a second.
+The station is the one that flies a real board. It sees the virtual dongle, the UDP port or a serial port (a pty), and
+gets poses over the loopback interface. The robot is released when the board has flown in its holder for a second.
 """
 
 import os
@@ -16,24 +16,26 @@ from firmware_py.firmware import Firmware
 from ground_station.mocap_udp import PosePublisher
 from ground_station.trajectory import Goal
 from hil.board_server import BoardServer
-from hil.channels import flight_channels
+from hil.channels import flight_channels, radio_channel
 from hil.config import LabConfig
 from hil.dongle_plugin import VARIABLE
 from hil.errors import LabError
 from hil.experiments import Experiment
 from hil.harness import RECORD_PERIOD_US, RECORD_PHASE_US, Outcome, Streams
 from hil.recorder import Channel, Recorder
+from hil.serial_server import Address
 from hil.virtual_radio import VirtualRadio
 
 SITE = Path(__file__).parent / "dongle_site"
 RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder
 STATION_EXIT_TIMEOUT_US = 15_000_000
 PROGRESS_ROWS = 25
+SERIAL = "mavlink:"
 STANDING = "hover"  # other goals move by the clock of the release, which the station does not know
 
 
 class LinkedFlight:
-    """Like `hil.harness.Flight`, for `radio://…` (as the board's own URI) or `udp://127.0.0.1:PORT`.
+    """Like `hil.harness.Flight`, for `radio://…` (as the board's own URI), `udp://127.0.0.1:PORT` or `mavlink:PATH`.
 
     `arguments` are those of the station's command line that say which profile it has.
     """
@@ -54,13 +56,13 @@ class LinkedFlight:
         self.lost: str | None = None
         self.end_us = RELEASE_TIMEOUT_US + round(duration_s * 1e6)
         self._duration_us = round(duration_s * 1e6)
-        self._server = BoardServer(config, 1, seed, self._note)
+        self._server = BoardServer(config, 1, seed, self._note, mavlink=uri.startswith(SERIAL))
         self._board = self._server.boards[0]
         self._released = self._gave_up = self._over = False
         self._progress: Callable[[int], None] | None = None
         self._trajectory = experiment.trajectory(Goal(config.flight.home, 0.0), 0)
         self._no_radio = VirtualRadio(config.radio, self._server.events, Streams.of_seed(seed).radio)
-        self._environment = self._serve(uri)
+        uri, self._environment = self._serve(uri, config.serial.baud)
         port = _free_port()
         self._poses = PosePublisher(port)
         self._board.publish(self._poses.send)
@@ -69,16 +71,22 @@ class LinkedFlight:
             "--trajectory", experiment.name, "--log", str(telemetry_path), *arguments,
         ]  # fmt: skip
 
-    def _serve(self, uri: str) -> dict[str, str]:
-        """Open the side of the board that a URI means; returns what the station's environment needs."""
+    def _serve(self, uri: str, baud: int) -> tuple[str, dict[str, str]]:
+        """Open the side of the board that a URI means; returns the station's URI and what its environment needs."""
         if uri == self._board.uri:
             paths = [str(SITE), os.environ.get("PYTHONPATH", "")]
-            return {"PYTHONPATH": os.pathsep.join(filter(None, paths)), VARIABLE: self._server.serve_radio(0)}
+            server = self._server.serve_radio(0)
+            return uri, {"PYTHONPATH": os.pathsep.join(filter(None, paths)), VARIABLE: server}
+        if uri.startswith(SERIAL):
+            (master,) = self._server.serve_mavlink([_pty(uri)])
+            return f"{SERIAL}{master},{baud}", {}
         prefix, _, port = uri.rpartition(":")
         if prefix == "udp://127.0.0.1" and port.isdigit() and 0 < int(port) < 65536:
             self._server.serve_udp(int(port))
-            return {}
-        raise LabError(f"--link {uri}: the virtual board is at {self._board.uri} or udp://127.0.0.1:PORT")
+            return uri, {}
+        raise LabError(
+            f"--link {uri}: expected radio, mavlink, {self._board.uri}, udp://127.0.0.1:PORT, mavlink:pty or mavlink:PATH"
+        )
 
     @property
     def now_us(self) -> int:
@@ -94,11 +102,14 @@ class LinkedFlight:
         """Write nothing: the scheduler is traced in lockstep only."""
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return what there is to record; the columns of the simulated radio stay zero."""
+        """Return what there is to record; of radio and UDP nothing is counted: those columns stay zero."""
         plant, board, firmware = self._board.parts()
-        return flight_channels(
-            plant, board, firmware, self._no_radio, self._trajectory, lambda: self._board.free
-        )
+        link = radio_channel(self._no_radio)
+        if self._board.line is not None:
+            from hil.serial_line import serial_channel  # needs pymavlink
+
+            link = serial_channel(self._board.line, firmware, None)
+        return flight_channels(plant, board, firmware, link, self._trajectory, lambda: self._board.free)
 
     def run(self, progress: Callable[[int], None] | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C; raises `LabError` when the station gives up."""
@@ -161,6 +172,23 @@ class LinkedFlight:
         """Close what the flight itself opened."""
         self._poses.close()
         self._server.close()
+
+
+def _pty(uri: str) -> Address:
+    """Return the pty of `mavlink:pty` or `mavlink:PATH`, where nothing may be yet: a line needs two ends."""
+    path = uri.removeprefix(SERIAL)
+    if path == "pty":
+        return Address("pty")
+    if not path.startswith(("/", ".")) or "," in path:
+        raise LabError(
+            f"--link {uri}: expected mavlink, mavlink:pty or mavlink:PATH with a name for a new pty"
+        )
+    if Path(path).exists():
+        raise LabError(
+            f"--link {uri}: {path} exists; a new pty gets that name. The board behind a line that is there is flown with "
+            f"floaty station --link {uri}"
+        )
+    return Address("pty", path=Path(path))
 
 
 def _free_port() -> int:

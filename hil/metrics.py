@@ -48,6 +48,9 @@ METRICS: Mapping[str, Metric] = {
     "y_over_x": Metric("", "min", "rms of y over rms of x"),
     "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
+    "line_up": Metric("share", "max", "mean load of the serial line to the board"),
+    "line_down": Metric("share", "max", "mean load of the serial line from the board"),
+    "line_overrun": Metric("bytes", "max", "lost because the board's receive buffer was full"),
     "estimator_late_from": Metric("share", "min", "thief's load at which KALMAN first misses a deadline"),
     "controller_late_from": Metric(
         "share", "min", "thief's load at which STABILIZER first misses a deadline"
@@ -119,6 +122,10 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
     values["attitude_max"] = float(np.abs(attitude_error(flight)).max())
     values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
     values["age_mean"] = float(column(flight, "estimator.pose_age_us").mean()) * 1e-6
+    if "serial.up_busy" in table.schema.names:
+        busy = column(flight, "serial.up_busy", "serial.down_busy")
+        values["line_up"], values["line_down"] = (busy[-1] - busy[0]) * 1e-6 / values["flown"]
+        values["line_overrun"] = float(column(flight, "serial.overrun")[-1])
     if "cpu.THIEF" in table.schema.names:
         values.update(overload_limits(flight, error))
     refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)

@@ -23,7 +23,7 @@ from hil.clock import Clock
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.experiments import Experiment
-from hil.harness import Flight
+from hil.harness import LOCKSTEP, Flight
 from hil.linked_flight import LinkedFlight
 from hil.metrics import METRICS, Verdict, judge, measure
 from hil.recorder import Recorder, load_log
@@ -41,6 +41,12 @@ class Request:
     overrides: tuple[str, ...]
     seed: int
     duration_s: float
+    link: str = "radio"  # radio and mavlink: in lockstep; a URI: a station in a process of its own, paced
+
+    @property
+    def in_lockstep(self) -> bool:
+        """Whether station and board share one time line."""
+        return self.link in LOCKSTEP
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,16 +87,14 @@ def fly(
     progress: Callable[[int, Flight | LinkedFlight], None] | None = None,
     on_batch: Callable[[pa.RecordBatch], None] | None = None,
     trace_all: bool = False,
-    link: str | None = None,
 ) -> Result:
     """Fly once and write everything but the pictures into `folder`, which `prepare` has made.
 
-    With `link`, a URI, station and board talk over cflib and the wall clock paces the flight. An error of the
-    firmware ends in the outcome "error", Ctrl-C in "interrupted".
+    An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
     limits = request.config.limits.get(request.experiment.name, request.experiment.limits)
     judge(dict.fromkeys(METRICS, 0.0), limits)  # refuse unknown metrics before the flight
-    flight = _flight(request, folder / "telemetry.csv", clock, trace_all, link)
+    flight = _flight(request, folder / "telemetry.csv", clock, trace_all)
     recorder = Recorder(folder, flight.channels(), metadata_of(request), on_batch)
     flight.recorder = recorder
     outcome, cause = "error", None
@@ -124,16 +128,15 @@ def fly(
     return result
 
 
-def _flight(
-    request: Request, telemetry: Path, clock: Clock | None, trace_all: bool, link: str | None
-) -> Flight | LinkedFlight:
-    if link is None:
+def _flight(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight | LinkedFlight:
+    if request.in_lockstep:
         return Flight(
-            request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all
-        )
+            request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all,
+            request.link,
+        )  # fmt: skip
     profile = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
     return LinkedFlight(
-        request.config, request.experiment, request.duration_s, request.seed, telemetry, link, profile
+        request.config, request.experiment, request.duration_s, request.seed, telemetry, request.link, profile
     )
 
 
@@ -162,6 +165,7 @@ def write_result(result: Result) -> None:
         "overrides": list(request.overrides),
         "seed": request.seed,
         "duration_s": request.duration_s,
+        "link": request.link,
         "outcome": result.outcome,
         "cause": result.cause,
         "metrics": {name: value if math.isfinite(value) else None for name, value in result.metrics.items()},
@@ -200,6 +204,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         "overrides": json.loads(metadata.get("overrides", "[]")),
         "seed": int(metadata.get("seed", 0)),
         "duration_s": float(metadata.get("duration_s", 0)),
+        "link": metadata.get("link", "radio"),
         "outcome": "error",
         "cause": "the process ended before the flight did",
         "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
@@ -222,6 +227,7 @@ def metadata_of(request: Request) -> dict[str, str]:
         "overrides": json.dumps(request.overrides),
         "seed": str(request.seed),
         "duration_s": str(request.duration_s),
+        "link": request.link,
         "config": request.config.model_dump_json(),
         "versions": json.dumps(versions()),
         "commit": commit(),

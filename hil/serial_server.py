@@ -10,8 +10,9 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 from hil.dongle_server import HOST, Readers
 from hil.errors import LabError
@@ -43,7 +44,7 @@ class Endpoint(Protocol):
 class Address:
     """An end that can be opened."""
 
-    kind: Literal["pty", "udp", "tcp"]
+    kind: str  # pty, udp, tcp
     host: str = HOST
     port: int = 0
     path: Path | None = None  # of a link to the pty
@@ -68,7 +69,7 @@ def parse_addresses(text: str, count: int) -> list[Address]:
         if not rest:
             return [Address("pty")] * count
         return [Address("pty", path=Path(rest + (f"-{n}" if n > 1 else ""))) for n in range(1, count + 1)]
-    if kind != "udp" and kind != "tcp":
+    if kind not in ("udp", "tcp"):
         raise LabError(f"--mavlink {text}: {EXPECTED}")
     host, _, number = rest.rpartition(":")
     default = UDP_PORT if kind == "udp" else TCP_PORT
@@ -87,13 +88,13 @@ class PtyEnd:
         import termios  # not on every system
         import tty
 
-        self._discard = lambda: termios.tcflush(self._slave, termios.TCIFLUSH)
         self._readers = readers
         self._received = received
         self._link = link
         if link is not None and link.is_symlink() and os.readlink(link).startswith(PTYS):
             link.unlink()  # left behind by a server that was killed
         self._master, self._slave = os.openpty()  # the slave stays open, so that clients may come and go
+        self._forget_unread = partial(termios.tcflush, self._slave, termios.TCIFLUSH)
         device = os.ttyname(self._slave)
         self.master = device if link is None else str(link)
         try:
@@ -114,7 +115,7 @@ class PtyEnd:
         except BlockingIOError:
             written = 0
         if written < len(data):
-            self._discard()
+            self._forget_unread()
 
     def _read(self, now_us: int) -> None:
         with suppress(BlockingIOError):

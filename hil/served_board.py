@@ -97,10 +97,10 @@ class ServedBoard:
         self._gusts = streams.gusts
         self._imu = VirtualImu(config.imu, streams.imu)
         self._mocap = VirtualMocap(config.mocap, streams.mocap)
-        self._line = VirtualSerial(config.serial, events, streams.radio) if mavlink else None
+        self.line = VirtualSerial(config.serial, events, streams.radio) if mavlink else None
         self._line_end: Endpoint | None = None
-        if self._line is not None:
-            self._line.connect(self._uart_ready, self._from_line)
+        if self.line is not None:
+            self.line.connect(self._uart_ready, self._from_line)
         self._place(events.now_us)
         settings = RadioSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
@@ -128,8 +128,8 @@ class ServedBoard:
 
     def serve_mavlink(self, address: Address, readers: Readers) -> str:
         """Lead the serial line out; returns what MAVProxy calls its end. Only for a board made with `mavlink`."""
-        assert self._line is not None
-        self._line_end = address.open(readers, self._line.uplink)
+        assert self.line is not None
+        self._line_end = address.open(readers, self.line.uplink)
         return self._line_end.master
 
     def _from_line(self, now_us: int, data: bytes) -> None:
@@ -175,7 +175,7 @@ class ServedBoard:
             lambda t_us, counts: self._plant.set_counts(self._boot_us + t_us - self._placed_us, counts),
             self._radio_send,
             lambda t_us, text: self._say(f"board {self.number}: {text}"),
-            _Uart(self._line, self._events) if self._line is not None else None,
+            _Uart(self.line, self._events) if self.line is not None else None,
         )
         if self._board is not None:  # memories survive, whatever was in the processor does not
             board.eeprom, board.deck_memory = self._board.eeprom, self._board.deck_memory
@@ -184,7 +184,7 @@ class ServedBoard:
             board.eeprom[:CONFIG_SIZE] = self._factory_config()
         self._tune(board.eeprom)
         self._board = board
-        self._firmware = Firmware(self._config, board, mavlink=self._line is not None)
+        self._firmware = Firmware(self._config, board, mavlink=self.line is not None)
         board.run_on(self._firmware.kernel, EventQueue())
         self._open_udp(now_us)
 

@@ -19,7 +19,7 @@ def fly_all(requests: list[Request], parent: Path, notices: Console) -> Iterator
     columns = (TextColumn("flying"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, context, _leave_interrupts_to_the_parent)
-    with Progress(*columns, console=notices, transient=True) as progress:
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
         bar = progress.add_task("", total=len(requests))
         futures = [pool.submit(_fly, request, parent) for request in requests]
         try:

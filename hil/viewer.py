@@ -53,7 +53,8 @@ PLOTS: Mapping[str, Curves] = {
     "miss/position": curves.POSITION_MISS,
     "miss/attitude": curves.ATTITUDE_MISS,
     "age": curves.AGE,
-    "packets": curves.PACKETS,
+    "link/radio": curves.PACKETS,
+    "link/serial": curves.SERIAL_FAULTS,
     "queue": curves.QUEUE,
 }
 PALE = "flaps/command"
@@ -70,6 +71,7 @@ class Stage:
         metadata = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
         self._recording = recording
         self._plant = PlantConfig.model_validate(json.loads(metadata.get("config", "{}")).get("plant", {}))
+        self._plots = {path: plot for path, plot in PLOTS.items() if plot.needs in schema.names}
         self._processor = curves.processor(schema.names)
         self._last: pa.Table | None = None  # the last row so far
         recording.set_log_time_enabled(False)
@@ -88,7 +90,7 @@ class Stage:
         fresh = joined.num_rows - rows.num_rows  # the first row of `joined` that is new
         self._last = rows.slice(rows.num_rows - 1)
         self._move(rows)
-        for path, plot in PLOTS.items():
+        for path, plot in self._plots.items():
             self._send(f"plot/{path}", column(rows, "t"), rr.Scalars.columns(scalars=plot.read(rows)))
         slow = joined.take(np.arange(0, joined.num_rows, SLOW))
         times = column(slow, "t")
@@ -217,7 +219,7 @@ class Stage:
         log("world/trail", rr.LineStrips3D.from_fields(colors=[0xFFFFFFC0], radii=[0.0018]), static=True)
 
     def _name_curves(self) -> None:
-        for path, plot in {**PLOTS, "processor": self._processor}.items():
+        for path, plot in {**self._plots, "processor": self._processor}.items():
             width, opacity = (1.0, 120) if path == PALE else (1.6, 255)
             lines = rr.SeriesLines(
                 names=plot.names,
@@ -269,7 +271,7 @@ def blueprint() -> rrb.Blueprint:
             ("Inputs [deg]", "inputs"),
             ("Estimate - truth [cm, deg]", "miss"),
             ("Age of the pose [ms]", "age"),
-            ("Packets", "packets"),
+            ("Link", "link"),
             ("Queue", "queue"),
             ("Processor [%]", "processor"),
         )

@@ -1,105 +1,117 @@
-"""A bare MAVLink program on pymavlink's own codec: sends, and waits for what it wants to see."""
+"""A ground station that speaks pymavlink's own codec to a board on a bench: requests in, messages out, in simulated time."""
 
-import math
-import select
-import socket
-import time
-from collections.abc import Callable
+from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import pymavlink.dialects.v20.common as dialect
-import serial
+from test_firmware import LEVEL, Bench
 
-PATIENCE_S = 10.0
+from firmware_py.firmware import Firmware
+from hil.config import load_config
+
+STATION = (255, 190)
+STREAMS = (
+    "HEARTBEAT", "SYS_STATUS", "BATTERY_STATUS", "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED",
+    "SERVO_OUTPUT_RAW", "ESTIMATOR_STATUS", "NAMED_VALUE_FLOAT",
+)  # fmt: skip
+GYRO_ZERO_US = 600_000  # the gyro's zero is found by then
+Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+HOME: Pose = ((0.0, 0.0, 1.15), LEVEL)  # W, z up
 
 
-class Client:
-    """A ground station (system 255, component 190) on an end as `floaty board serve --mavlink` prints it."""
+class Client(Bench):
+    """`messages` is what pymavlink found in the board's bytes, with the instant at which they left."""
 
-    def __init__(self, master: str) -> None:
-        kind, _, where = master.partition(":")
-        self._serial: serial.Serial | None = None
-        if kind in ("tcp", "udpin"):
-            host, port = where.split(":")
-            if kind == "tcp":
-                self._socket = socket.create_connection((host, int(port)), PATIENCE_S)
-                self._peer = None
-            else:
-                self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-                self._socket.bind((host, int(port)))
-            self._file = self._socket.fileno()
-        else:
-            self._serial = serial.Serial(master, 57600, timeout=0)
-            self._file = self._serial.fileno()
-        self.codec = dialect.MAVLink(self, srcSystem=255, srcComponent=190)
-        self.codec.robust_parsing = True
-        self.received: list[Any] = []
-        self.bytes_received = 0
+    def __init__(self, *overrides: str, station: tuple[int, int] = STATION) -> None:
+        self.codec = codec(*station)
+        self.parser = codec(0, 0)
+        self.messages: list[tuple[int, Any]] = []
+        self.uplink = bytearray()
+        self.uart_overruns = 0
+        self.uart_room = 1 << 30  # bytes that the transmit buffer still takes
+        self.clock_ahead_us: int | None = None  # of the station; None: it does not answer
+        super().__init__()
+        self.overrides = overrides
+        self.firmware = Firmware(load_config("floaty", overrides), self, mavlink=True)
+        assert self.firmware.mavlink is not None
+        self.stack = self.firmware.mavlink
 
-    def write(self, data: bytes) -> None:
-        """What the codec calls to send."""
-        if self._serial is not None:
-            self._serial.write(data)
-        elif self._socket.type == socket.SOCK_STREAM:
-            self._socket.sendall(data)
-        else:
-            self._socket.sendto(data, self._peer)
+    def uart_read(self) -> bytes:
+        data = bytes(self.uplink)
+        self.uplink.clear()
+        return data
 
-    def poll(self, timeout_s: float) -> list[Any]:
-        """The messages that are there, or come first within the time."""
-        if not select.select([self._file], (), (), max(0.0, timeout_s))[0]:
-            return []
-        if self._serial is not None:
-            data = self._serial.read(65536)
-        else:
-            data, self._peer = self._socket.recvfrom(65536)
-        assert data, "the board has closed the line"
-        self.bytes_received += len(data)
-        messages = [message for message in self.codec.parse_buffer(data) or () if message.get_msgId() >= 0]
-        self.received += messages
-        return messages
+    def uart_write(self, data: bytes) -> bool:
+        if len(data) > self.uart_room:
+            return False
+        self.uart_room -= len(data)
+        for message in self.parser.parse_buffer(bytearray(data)) or ():
+            self.messages.append((self.now_us, message))
+            if message.get_type() == "TIMESYNC" and message.tc1 == 0 and self.clock_ahead_us is not None:
+                self.events.at(self.now_us + 2000, partial(self._tell_time, message.ts1))
+        return True
 
-    def wait(
-        self, kind: str, wanted: Callable[[Any], bool] = lambda _: True, timeout_s: float = PATIENCE_S
-    ) -> Any:
-        """The first message of this kind, from now on, that is wanted."""
-        deadline = time.monotonic() + timeout_s
-        while (left_s := deadline - time.monotonic()) > 0:
-            for message in self.poll(left_s):
-                if message.get_type() == kind and wanted(message):
-                    return message
-        raise AssertionError(f"no {kind} within {timeout_s} s")
+    def _tell_time(self, ts1: int, now_us: int) -> None:
+        """Answer a request that took 2 ms; the answer takes as long."""
+        assert self.clock_ahead_us is not None
+        data = self.codec.timesync_encode((now_us + self.clock_ahead_us) * 1000, ts1).pack(self.codec)
+        self.events.at(now_us + 2000, lambda _: self.receive(data))
 
-    def collect(self, duration_s: float) -> list[Any]:
-        """All messages of a time."""
-        first, deadline = len(self.received), time.monotonic() + duration_s
-        while (left_s := deadline - time.monotonic()) > 0:
-            self.poll(left_s)
-        return self.received[first:]
+    def receive(self, data: bytes) -> None:
+        """Bytes on the line, now."""
+        self.uplink += data
+        self.firmware.uart_ready()
 
-    def parameters(self) -> dict[str, Any]:
-        """Every PARAM_VALUE of one list, by name."""
-        self.codec.param_request_list_send(1, 1)
-        found: dict[str, Any] = {}
-        deadline = time.monotonic() + PATIENCE_S
-        while not found or len(found) < next(iter(found.values())).param_count:
-            message = self.wait("PARAM_VALUE", timeout_s=deadline - time.monotonic())
-            found[message.param_id] = message
-        return found
+    def send(self, name: str, *fields: Any) -> None:
+        """Send a message of pymavlink's own making."""
+        self.receive(getattr(self.codec, f"{name}_encode")(*fields).pack(self.codec))
 
-    def set(self, name: str, value: float) -> float:
-        """Set a parameter; returns what the board says it is now."""
-        self.codec.param_set_send(1, 1, name.encode(), value, dialect.MAV_PARAM_TYPE_REAL32)
-        return float(self.wait("PARAM_VALUE", lambda message: message.param_id == name).param_value)
+    def ask(self, name: str, *fields: Any, wait_us: int = 3000) -> list[Any]:
+        """Send, and return what the board answers within a while."""
+        self.messages.clear()
+        self.send(name, *fields)
+        self.run(self.now_us + wait_us)
+        return [message for _, message in self.messages]
 
-    def command(self, number: int, *params: float, system: int = 1) -> int:
-        """Send COMMAND_LONG; returns the result of its acknowledgement."""
-        values = [*params, *[math.nan] * (7 - len(params))]
-        self.codec.command_long_send(system, 1, number, 0, *values)
-        return int(self.wait("COMMAND_ACK", lambda message: message.command == number).result)
+    def one(self, name: str, *fields: Any) -> Any:
+        """The only answer, whatever the board sent by itself meanwhile."""
+        (answer,) = [answer for answer in self.ask(name, *fields) if answer.get_type() not in STREAMS]
+        return answer
 
-    def close(self) -> None:
-        if self._serial is not None:
-            self._serial.close()
-        else:
-            self._socket.close()
+    def command(self, number: int, *params: float, target: tuple[int, int] = (1, 1)) -> list[Any]:
+        """The answers to a COMMAND_LONG."""
+        return self.ask("command_long", *target, number, 0, *params, *(0.0,) * (7 - len(params)))
+
+    def pose(self, pose: Pose = HOME, t_us: int | None = None) -> None:
+        """A pose given z up, sent as the standard has it."""
+        (x, y, z), (qw, qx, qy, qz) = pose
+        stamp_us = self.now_us if t_us is None else t_us
+        self.send("att_pos_mocap", stamp_us, (qw, qx, -qy, -qz), x, -y, -z)
+
+    def poses(self, start_us: int, end_us: int, p: Any = HOME[0], lag_us: int = 0) -> None:  # type: ignore[override]
+        """Level poses at 50 Hz, each `lag_us` old by the station's clock."""
+        for at_us in range(start_us, end_us, 20_000):
+            stamp_us = at_us - lag_us + (self.clock_ahead_us or 0)
+            self.events.at(at_us, lambda _, t_us=stamp_us: self.pose((p, LEVEL), t_us))
+
+    def of(self, kind: str) -> list[Any]:
+        """The messages of one kind."""
+        return [message for _, message in self.messages if message.get_type() == kind]
+
+    def texts(self) -> list[str]:
+        return [message.text for message in self.of("STATUSTEXT")]
+
+
+def codec(system: int, component: int) -> Any:
+    made = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
+    made.robust_parsing = True
+    return made
+
+
+def count(messages: Iterable[Any]) -> dict[str, int]:
+    """How many of each kind."""
+    counts: dict[str, int] = {}
+    for message in messages:
+        counts[message.get_type()] = counts.get(message.get_type(), 0) + 1
+    return counts

@@ -1,5 +1,6 @@
 """Unmodified ground tools against `floaty board serve --mavlink`: MAVProxy and MAVSDK, each as a program of its own."""
 
+import hashlib
 import importlib.util
 import json
 import os
@@ -7,16 +8,16 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pymavlink.dialects.v20.common as dialect
 import pytest
-from mavlink_client import Client
-from serving import Served, serve
-from test_board_mavlink import GAIN, free_port
+from mavlink_socket import GAIN, Client
+from serving import Served, free_port, serve
 
-PATIENCE_S = 30.0
+PATIENCE_S = 15.0
 
 mavproxy_here = pytest.mark.skipif(
     importlib.util.find_spec("MAVProxy") is None,
@@ -46,7 +47,7 @@ class MavProxy:
         with self.screen.open("w") as screen:
             self.process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=screen, stderr=subprocess.STDOUT, cwd=folder,
-                env={**os.environ, "HOME": str(folder), "PYTHONUNBUFFERED": "1"}, start_new_session=True,
+                env={**os.environ, "HOME": str(folder), "PYTHONUNBUFFERED": "1"},
             )  # fmt: skip
 
     def type(self, line: str) -> None:
@@ -56,13 +57,9 @@ class MavProxy:
 
     def sees(self, text: str) -> None:
         """Wait for a text on the screen."""
-        deadline = time.monotonic() + PATIENCE_S
-        while text not in self.screen.read_text(errors="replace"):
-            assert time.monotonic() < deadline, f"no {text!r} on {self.screen.read_text(errors='replace')!r}"
-            assert self.process.poll() is None, self.screen.read_text(errors="replace")
-            time.sleep(0.05)
+        self._wait(lambda: text in self.screen.read_text(errors="replace"), repr(text))
 
-    def heard(self) -> list[dialect.MAVLink_message]:
+    def heard(self) -> list[Any]:
         """Everything that it wrote into its log: 8 bytes of time ahead of each frame."""
         data, codec, messages = self._tlog.read_bytes(), dialect.MAVLink(None), []
         while len(data) > 8 + 12 and len(data) >= 8 + 12 + data[9]:
@@ -70,6 +67,18 @@ class MavProxy:
             messages.append(codec.decode(bytearray(data[8 : 8 + size])))
             data = data[8 + size :]
         return messages
+
+    def hears(self, wanted: Callable[[Any], bool]) -> None:
+        """Wait for a message."""
+        self._wait(lambda: any(map(wanted, self.heard())), "message")
+
+    def _wait(self, done: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not done():
+            screen = self.screen.read_text(errors="replace")
+            assert time.monotonic() < deadline, f"no {what} on {screen!r}"
+            assert self.process.poll() is None, screen
+            time.sleep(0.05)
 
     def kill(self) -> None:
         assert self.process.stdin is not None
@@ -92,10 +101,13 @@ def test_mavproxy_watches_tunes_and_commands(proxied: tuple[Served, MavProxy], t
     proxy.sees("Detected vehicle 1:1")
     proxy.sees("Received ")
     proxy.type(f"param set {GAIN} 2.5")
+    proxy.hears(lambda message: message.get_type() == "PARAM_VALUE" and message.param_value == 2.5)
     proxy.type(f"param show {GAIN}")
     proxy.sees(f"{GAIN:<16} 2.5")
     proxy.type("long MAV_CMD_REQUEST_MESSAGE 148")
-    proxy.sees("Got COMMAND_ACK: REQUEST_MESSAGE: ACCEPTED")
+    proxy.type("long MAV_CMD_NAV_LAND")
+    proxy.sees("Got COMMAND_ACK: NAV_LAND: UNSUPPORTED")
+    proxy.hears(lambda message: message.get_type() == "AUTOPILOT_VERSION")
 
     messages = proxy.heard()
     kinds = {message.get_type() for message in messages}
@@ -111,6 +123,23 @@ def test_mavproxy_watches_tunes_and_commands(proxied: tuple[Served, MavProxy], t
     again = Client(served.line("mavlink ")[0])  # the board does not care that it has gone
     again.wait("HEARTBEAT")
     again.close()
+
+
+@mavproxy_here
+def test_a_signed_board_obeys_mavproxy_once_it_has_the_key(tmp_path: Path) -> None:
+    key = hashlib.sha256(b"floaty").hexdigest()
+    with serve("--mavlink", address("pty"), "--poses", "0", "--set", f"mavlink.signing_key={key}") as served:
+        proxy = MavProxy(served.line("mavlink ")[0], tmp_path)
+        try:
+            proxy.sees("Detected vehicle 1:1")  # it listens to who signs, and is not listened to
+            proxy.type("long MAV_CMD_NAV_LAND")
+            proxy.type("signing key floaty")
+            proxy.sees("Received ")
+            assert "NAV_LAND" not in proxy.screen.read_text()
+            proxy.type(f"param set {GAIN} 2.0")
+            proxy.hears(lambda message: message.get_type() == "PARAM_VALUE" and message.param_value == 2.0)
+        finally:
+            proxy.kill()
 
 
 @pytest.fixture(params=["udp", "pty", "tcp"])

@@ -7,6 +7,7 @@ import time
 
 import pytest
 import serial
+from serving import free_port
 
 from hil.errors import LabError
 from hil.serial_server import Address, parse_addresses
@@ -80,10 +81,7 @@ class UdpClient:
 def pair(request):
     """An end, and a class whose objects are clients of it."""
     kind, client = request.param
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1] if kind == "udp" else 0
-    bench = Bench(Address(kind, port=port))
+    bench = Bench(Address(kind, port=free_port() if kind == "udp" else 0))
     yield bench, client
     bench.close()
 

@@ -16,7 +16,7 @@ from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import Message
 
-VERSION = (2026, 11, 0)
+VERSION = (26, 11, 0)
 REVISION = bytes.fromhex("0f10a717")  # the parameters firmware.revision0
 SERIAL_NUMBER = 0x00F10A71  # the parameter cpu.id0
 FORCE = 21196  # MAVLink's magic number for disarming in flight
@@ -46,6 +46,11 @@ class Result(IntEnum):
     FAILED = 4
 
 
+Outcome = tuple[Result, Sequence[Message]]  # and what is sent after the acknowledgement
+DONE: Outcome = (Result.ACCEPTED, ())
+DENIED: Outcome = (Result.DENIED, ())
+
+
 class CommandService:
     """Answers COMMAND_LONG and COMMAND_INT, PING and file transfer requests."""
 
@@ -64,15 +69,15 @@ class CommandService:
         self._parameters = parameters
         self._storage = storage
         self._home = home
-        self._commands: dict[int, Callable[[Message], Result]] = {
+        self._commands: dict[int, Callable[[Message], Outcome]] = {
             Command.DO_FLIGHTTERMINATION: self._terminate,
             Command.PREFLIGHT_STORAGE: self._store,
             Command.COMPONENT_ARM_DISARM: self._arm,
-            Command.GET_HOME_POSITION: lambda command: self._send(mavlink.MSG_HOME_POSITION),
+            Command.GET_HOME_POSITION: lambda command: self._once(mavlink.MSG_HOME_POSITION),
             Command.GET_MESSAGE_INTERVAL: self._tell_interval,
             Command.SET_MESSAGE_INTERVAL: self._set_interval,
-            Command.REQUEST_MESSAGE: lambda command: self._send(_whole(command.param1)),
-            Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda command: self._send(mavlink.MSG_AUTOPILOT_VERSION),
+            Command.REQUEST_MESSAGE: lambda command: self._once(_whole(command.param1)),
+            Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda command: self._once(mavlink.MSG_AUTOPILOT_VERSION),
         }
         stack.handle(mavlink.MSG_COMMAND_LONG, self._obey)
         stack.handle(mavlink.MSG_COMMAND_INT, self._obey)
@@ -83,54 +88,56 @@ class CommandService:
 
     def _obey(self, command: Message) -> None:
         obey = self._commands.get(command.command)
-        result = Result.UNSUPPORTED if obey is None else obey(command)
+        result, answers = (Result.UNSUPPORTED, ()) if obey is None else obey(command)
         self._stack.refused += result is not Result.ACCEPTED
         source = command.get_srcSystem(), command.get_srcComponent()
         self._stack.reply(mavlink.command_ack(command.command, result, *source))
+        for answer in answers:
+            self._stack.reply(answer)
 
     def _answer_ping(self, ping: Message) -> None:
         if ping.target_system == 0:  # otherwise it is an answer
             self._stack.reply(mavlink.ping_answer(ping))
 
-    def _arm(self, command: Message) -> Result:
+    def _arm(self, command: Message) -> Outcome:
         if command.param1 not in (0, 1):
-            return Result.DENIED
+            return DENIED
         if command.param1 == 0 and command.param2 == FORCE:
             self._supervisor.emergency_stop()
-        return Result.ACCEPTED if self._supervisor.arm(command.param1 == 1) else Result.TEMPORARILY_REJECTED
+        return DONE if self._supervisor.arm(command.param1 == 1) else (Result.TEMPORARILY_REJECTED, ())
 
-    def _terminate(self, command: Message) -> Result:
+    def _terminate(self, command: Message) -> Outcome:
         if command.param1 != 1:
-            return Result.DENIED
+            return DENIED
         self._supervisor.emergency_stop()
-        return Result.ACCEPTED
+        return DONE
 
-    def _store(self, command: Message) -> Result:
+    def _store(self, command: Message) -> Outcome:
         if command.param1 != STORE:
-            return Result.DENIED
+            return DENIED
         values = {parameter.name: parameter.value() for parameter in self._parameters if parameter.persistent}
-        return Result.ACCEPTED if self._storage.store_all(values) else Result.FAILED
+        return DONE if self._storage.store_all(values) else (Result.FAILED, ())
 
-    def _set_interval(self, command: Message) -> Result:
+    def _set_interval(self, command: Message) -> Outcome:
         done = self._streams.set_interval(_whole(command.param1), _whole(command.param2))
-        return Result.ACCEPTED if done else Result.DENIED
+        return DONE if done else DENIED
 
-    def _tell_interval(self, command: Message) -> Result:
+    def _tell_interval(self, command: Message) -> Outcome:
         number = _whole(command.param1)
         if not 0 <= number <= 0xFFFF:
-            return Result.DENIED
-        self._stack.reply(mavlink.message_interval(number, self._streams.interval_us(number)))
-        return Result.ACCEPTED
+            return DENIED
+        return Result.ACCEPTED, (mavlink.message_interval(number, self._streams.interval_us(number)),)
 
-    def _send(self, number: int) -> Result:
+    def _once(self, number: int) -> Outcome:
         """Send a message once."""
+        messages: Sequence[Message]
         if number == mavlink.MSG_AUTOPILOT_VERSION:
-            self._stack.reply(mavlink.autopilot_version(VERSION, REVISION, SERIAL_NUMBER))
+            messages = (mavlink.autopilot_version(VERSION, REVISION, SERIAL_NUMBER),)
         elif number == mavlink.MSG_HOME_POSITION:
-            self._stack.reply(mavlink.home_position(self._stack.kernel.now_us, self._home))
-        elif not self._streams.send_once(number):
-            return Result.DENIED
-        return Result.ACCEPTED
+            messages = (mavlink.home_position(self._stack.kernel.now_us, self._home),)
+        else:
+            messages = self._streams.make(number)
+        return (Result.ACCEPTED, messages) if messages else DENIED
 
 
 def _whole(value: float) -> int:

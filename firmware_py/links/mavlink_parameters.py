@@ -1,8 +1,8 @@
 """The parameter protocol: list, read by index or by name, set. Only what can be written is in the list.
 
 Every value travels as REAL32, the one encoding that all ground stations agree on. Whatever becomes of a request to set,
-the answer carries the value that is in force. The list is sent one by one while the line is free; a request for it while
-it is on its way starts it anew.
+the answer carries the value that is in force. The list is sent one by one, each when the line has taken the one before; a
+request for the list while it is on its way starts it anew.
 """
 
 from collections.abc import Sequence
@@ -47,11 +47,9 @@ class MavlinkParameters:
         while True:
             if self._next >= end:
                 yield from self._listing.take()
-            elif stack.idle:
-                self._next += 1
-                yield from stack.offer(self._value(self._next - 1))
             else:
-                yield from stack.kernel.delay(1)
+                self._next += 1
+                yield from stack.deliver(self._value(self._next - 1))
 
     def _read(self, message: Message) -> None:
         number = message.param_index

@@ -12,20 +12,20 @@ from firmware_py.links.timesync import RemoteClock
 from firmware_py.measurements import POSE, Measurement, PoseMeasurement
 from firmware_py.rtos import Queue
 from firmware_py.wire import WireError, mavlink
-from firmware_py.wire.crtp import PoseMessage, check_pose
+from firmware_py.wire.crtp import PoseMessage
 from firmware_py.wire.mavlink_frames import Message
 
 OLDEST_US = 500_000  # an age beyond is no age: poses that old are of no use to anybody
 EARLIEST_US = -5_000  # the clocks' offset is not known better than this
 FAR = 1000.0  # [m] farther from the origin is no tunnel
-SYNC_PERIOD = 500  # ticks
-FIRST_SYNC_PERIOD = 100
+SYNC_PERIOD = 487  # ticks; prime, so that the poses' and the telemetry's frames are not always in the way
+FIRST_SYNC_PERIOD = 97
 FIRST_SYNCS = 5
 PATIENCE = 50  # requests; some partners never answer
 
 
 class PoseService:
-    """`p_WG`, `yaw`: the goal. `frame` is the goal frame of the last pose, in which the estimator's state is."""
+    """`goal` is where to fly, position in W and yaw; `last_goal` the one that the last pose was seen from."""
 
     def __init__(
         self,
@@ -34,17 +34,16 @@ class PoseService:
         localisation: LocalisationService,
         home: Vector,
     ) -> None:
-        self.p_WG = home
-        self.yaw = 0.0
-        self.frame = (home, 0.0)
+        self.goal: tuple[Vector, float] = (home, 0.0)
+        self.last_goal = self.goal
         self.age_us: int | None = None  # of the last pose when it arrived
-        self.unknown_ages = 0  # poses
         self._stack = stack
         self._measurements = measurements
         self._localisation = localisation
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
         stack.handle(mavlink.MSG_ATT_POS_MOCAP, self._take_pose)
+        stack.handle(mavlink.MSG_VISION_POSITION_ESTIMATE, self._take_pose)
         stack.handle(mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED, self._take_target)
         stack.handle(mavlink.MSG_HEARTBEAT, self._see_heartbeat)
         stack.handle(mavlink.MSG_TIMESYNC, self._take_timesync)
@@ -52,15 +51,12 @@ class PoseService:
 
     def _take_pose(self, message: Message) -> None:
         pose = mavlink.read_pose(message)
-        if not all(abs(coordinate) <= FAR for coordinate in pose.p_WB):
-            raise WireError(f"a pose at {pose.p_WB} m")
+        _near(pose.p_WB)
         self._meet(message)
         now_us = self._stack.kernel.now_us
-        self.frame = (self.p_WG, self.yaw)
-        p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self.frame)
-        check_pose(p_GB, q_GB)
+        self.last_goal = self.goal
+        p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self.goal)
         self.age_us = self._age_us(now_us, pose.t_us)
-        self.unknown_ages += self.age_us is None
         self._localisation.last = PoseMessage(p_GB, q_GB, self.age_us)
         self._measurements.send_from_isr((POSE, PoseMeasurement(now_us, self._localisation.last)))
 
@@ -74,12 +70,12 @@ class PoseService:
 
     def _take_target(self, message: Message) -> None:
         target = mavlink.read_target(message)
+        p_WG, yaw = self.goal
         if target.p_WG is not None:
-            if not all(abs(coordinate) <= FAR for coordinate in target.p_WG):
-                raise WireError(f"a goal at {target.p_WG} m")
-            self.p_WG = target.p_WG
+            p_WG = _near(target.p_WG)
         if target.yaw is not None:
-            self.yaw = target.yaw
+            yaw = target.yaw
+        self.goal = (p_WG, yaw)
 
     def _see_heartbeat(self, message: Message) -> None:
         if self._partner is None:
@@ -100,13 +96,20 @@ class PoseService:
             self._clock.answer(now_us, message.ts1 // 1000, message.tc1 // 1000)
 
     def _sync_task(self) -> Task:
-        """Ask the partner for its time, a tick before the telemetry, when the line is free."""
+        """Ask the partner for its time."""
         kernel = self._stack.kernel
+        wake_tick = kernel.tick_count
         while True:
-            clock = self._clock
-            begins = clock.exchanges < FIRST_SYNCS and clock.requests < PATIENCE
-            period = FIRST_SYNC_PERIOD if begins else SYNC_PERIOD
-            yield from kernel.delay_until((kernel.tick_count + 1) // period * period + period - 1)
+            begins = self._clock.exchanges < FIRST_SYNCS and self._clock.requests < PATIENCE
+            wake_tick += FIRST_SYNC_PERIOD if begins else SYNC_PERIOD
+            yield from kernel.delay_until(wake_tick)
             if self._partner is not None:
                 self._clock.request(kernel.now_us)
                 yield from self._stack.offer(mavlink.timesync(0, kernel.now_us * 1000))
+
+
+def _near(p_W: Vector) -> Vector:
+    """Return a position that is not out of the world; raise `WireError` otherwise."""
+    if not all(abs(coordinate) <= FAR for coordinate in p_W):
+        raise WireError(f"position {p_W} m: more than {FAR:g} m away")
+    return p_W

@@ -44,6 +44,8 @@ class MavlinkStack:
         self._handlers: dict[int, Handler] = {}
         self._received = kernel.create_binary_semaphore("uartReady")
         self._transmit: Queue[Message] = kernel.create_queue(TRANSMIT_QUEUE, "mavTx")
+        self._paced: Message | None = None
+        self._paced_sent = kernel.create_binary_semaphore("mavPaced")
         kernel.create_task("MAV-RX", 2, self._receive_task)
         kernel.create_task("MAV-TX", 2, self._transmit_task)
 
@@ -68,11 +70,6 @@ class MavlinkStack:
         """Bytes that the UART lost because nobody fetched them in time."""
         return self._board.uart_overruns
 
-    @property
-    def idle(self) -> bool:
-        """Whether nothing waits to be sent."""
-        return len(self._transmit) == 0
-
     def uart_ready(self) -> None:
         """Interrupt: the UART has bytes."""
         self._received.give_from_isr()
@@ -91,6 +88,12 @@ class MavlinkStack:
             self.dropped += 1
             return GO_ON
         return self._transmit.send_nowait(message)
+
+    def deliver(self, message: Message) -> Task:
+        """Queue one of many messages and wait until it is on its way; for one task."""
+        self._paced = message
+        yield from self._transmit.send(message)
+        yield from self._paced_sent.take()
 
     def say(self, line: str) -> None:
         """Send a line of the console as STATUSTEXT."""
@@ -132,3 +135,5 @@ class MavlinkStack:
             frame = sender.encode(kernel.now_us, message)
             while not board.uart_write(frame):
                 yield from kernel.delay(1)
+            if message is self._paced:
+                yield from self._paced_sent.give()

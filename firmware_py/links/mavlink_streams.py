@@ -54,7 +54,7 @@ def interval_of(rate_hz: float) -> int | None:
 
 
 class StreamService:
-    """Sends the streams; `set_interval`, `interval_us` and `send_once` are for commands."""
+    """Sends the streams; `set_interval`, `interval_us` and `make` are for commands."""
 
     def __init__(self, stack: MavlinkStack, streams: Sequence[Stream]) -> None:
         self._stack = stack
@@ -87,14 +87,10 @@ class StreamService:
             return NONE_SUCH
         return OFF if stream.interval_ticks is None else stream.interval_ticks * TICK_US
 
-    def send_once(self, number: int) -> bool:
-        """Send a message now; False when there is no such message."""
+    def make(self, number: int) -> Sequence[Message]:
+        """Return the messages of a stream as they are now; none when there is no such stream."""
         stream = self._streams.get(number)
-        if stream is None:
-            return False
-        for message in stream.make(self._stack.kernel.tick_count):
-            self._stack.reply(message)
-        return True
+        return stream.make(self._stack.kernel.tick_count) if stream else ()
 
     def _take_request(self, request: Message) -> None:
         on = request.start_stop == 1 and request.req_message_rate > 0

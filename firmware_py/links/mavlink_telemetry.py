@@ -1,6 +1,7 @@
 """What the streams carry: the running board's values as messages, absolute in W, with the tick as time stamp.
 
-The estimator's state is relative to the goal frame of the last pose; position, velocity and yaw are turned back here.
+The estimator's state is relative to the goal that the last pose was seen from; position, velocity and yaw are turned back
+here.
 """
 
 from collections.abc import Sequence
@@ -66,7 +67,7 @@ class FlightMessages:
     def _angles(self) -> tuple[float, float, float]:
         """Roll, pitch, yaw of B in W."""
         roll, pitch, yaw = self._estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
-        return roll, pitch, wrap_angle(yaw + self._poses.frame[1])
+        return roll, pitch, wrap_angle(yaw + self._poses.last_goal[1])
 
     def _rates(self) -> tuple[float, float, float]:
         p, q, r = self._estimator.now[RATE : RATE + 3].tolist()
@@ -79,7 +80,7 @@ class FlightMessages:
         return (mavlink.attitude_quaternion(tick, from_euler_zyx(*self._angles()), *self._rates()),)
 
     def _local_position(self, tick: int) -> Messages:
-        p_WG, yaw = self._poses.frame
+        p_WG, yaw = self._poses.last_goal
         q_WG = yaw_quaternion(yaw)
         now = self._estimator.now
         x, y, z = rotate(q_WG, tuple(now[POSITION : POSITION + 3].tolist()))

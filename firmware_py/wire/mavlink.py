@@ -1,7 +1,7 @@
 """MAVLink messages and our values: the only place that knows the standard's units and frames.
 
-Outside: NED and FRD axes, degrees or milliseconds or millivolts as the standard has them. Inside: SI, W and G with z up, B
-forward-left-up, microseconds. All three frames turn into the standard's by half a turn about x, so a vector (x, y, z)
+Outside: north-east-down (NED) for the world, forward-right-down (FRD) for the body, whatever units the standard has.
+Inside: SI, W with z up, B forward-left-up. W and B turn into NED and FRD by half a turn about x, so a vector (x, y, z)
 becomes (x, -y, -z), a quaternion (w, x, y, z) becomes (w, x, -y, -z), and pitch and yaw change their signs.
 
 What goes down saturates where an integer is too narrow and never raises; what comes from outside raises `WireError`.
@@ -243,10 +243,8 @@ def flight_array(t_us: int, values: Sequence[float]) -> Message:
 
 def read_attitude(message: Message) -> AttitudeSample:
     """The contents of an ATTITUDE."""
-    angles, rates = (
-        (message.roll, message.pitch, message.yaw),
-        (message.rollspeed, message.pitchspeed, message.yawspeed),
-    )
+    angles = (message.roll, message.pitch, message.yaw)
+    rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
     return AttitudeSample(message.time_boot_ms, turn(angles), turn(rates))
 
 

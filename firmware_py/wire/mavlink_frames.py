@@ -42,7 +42,7 @@ class FrameCounters:
     frames: int = 0  # delivered
     skipped_bytes: int = 0  # that belong to no frame
     bad_crc: int = 0  # supposed frames
-    unknown: int = 0  # frames, in sequence, of messages that the dialect does not have
+    unknown: int = 0  # next in sequence, but the dialect does not have the message (or its number is damaged)
     unsigned: int = 0  # refused because a key is set
     bad_signature: int = 0
     replayed: int = 0  # rightly signed, but not newer than the last one of their stream

@@ -114,17 +114,22 @@ class MavlinkLink:
         self._look_after(now_us)
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Send the pose, and before it the goal when it is due; `WireError` for a pose that cannot be sent."""
+        """Send the pose, after a goal that has changed; what can wait comes behind. `WireError` for an unfit pose."""
         check_pose(frame.p_WB, frame.q_WB)
-        if now_us >= self._look_us:
-            self._look_after(now_us)
-        wait_us = REPEAT_GOAL_US if goal == self._goal else self.budget.goal_period_us
-        if self._goal is None or now_us - self._goal_us >= wait_us:
-            self._send(now_us, mavlink.target(frame.t_us // 1000, goal.p_WG, goal.yaw, self._addressee))
-            self._goal, self._goal_us = goal, now_us
-            self._goals += 1
+        since_us = now_us - self._goal_us
+        if self._goal is None or (goal != self._goal and since_us >= self.budget.goal_period_us):
+            self._send_goal(now_us, frame, goal)
         self._send(now_us, mavlink.pose(frame.t_us, frame.p_WB, frame.q_WB))
         self._poses += 1
+        if goal == self._goal and now_us - self._goal_us >= REPEAT_GOAL_US:
+            self._send_goal(now_us, frame, goal)
+        if now_us >= self._look_us:
+            self._look_after(now_us)
+
+    def _send_goal(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        self._send(now_us, mavlink.target(frame.t_us // 1000, goal.p_WG, goal.yaw, self._addressee))
+        self._goal, self._goal_us = goal, now_us
+        self._goals += 1
 
     @property
     def _addressee(self) -> int:

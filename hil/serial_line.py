@@ -1,0 +1,65 @@
+"""The serial line of a flight in lockstep, with MAVLink on it: the station's end, the board's UART, and what is logged."""
+
+import numpy as np
+
+from firmware_py.firmware import Firmware
+from ground_station.errors import LinkError
+from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
+from ground_station.station import GroundStation
+from hil.channels import quantity
+from hil.config import LabConfig
+from hil.errors import LabError
+from hil.events import EventQueue
+from hil.recorder import Channel
+from hil.virtual_serial import VirtualSerial
+
+
+class SerialLine:
+    """`link` is the station's end, `uart` the line and the board's end. `LabError` when no flight fits on the line."""
+
+    def __init__(self, config: LabConfig, events: EventQueue, rng: np.random.Generator) -> None:
+        self.uart = VirtualSerial(config.serial, events, rng)
+        poses_hz = 1e6 / (config.mocap.period_us * config.station.send_every)
+        key = bytes.fromhex(config.mavlink.signing_key)
+        try:
+            self.link = MavlinkLink(self.uart.uplink, MavlinkLinkConfig(config.serial.baud, poses_hz, key))
+        except LinkError as error:
+            raise LabError(f"--link mavlink: {error}") from None
+
+    def connect(self, firmware: Firmware, station: GroundStation) -> None:
+        """Name both ends."""
+        self.uart.connect(lambda now_us: firmware.uart_ready(), station.on_packet)
+
+    def channel(self, firmware: Firmware) -> Channel:
+        """Return what line and ends count."""
+        return serial_channel(self.uart, firmware, self.link)
+
+
+def serial_channel(uart: VirtualSerial, firmware: Firmware, link: MavlinkLink | None) -> Channel:
+    """Return what a serial line counts; without a `link` the station's frames are unknown and stay 0.
+
+    `link.*` counts pieces of the stream, `serial.*` bytes, bits and frames.
+    """
+    up, down, board = uart.up, uart.down, firmware.mavlink
+    assert board is not None
+
+    def counts() -> tuple[int, ...]:
+        at_station = link.statistics if link else None
+        return (
+            up.deliveries, down.deliveries, up.latency_sum_us, down.latency_sum_us,
+            up.busy_us, down.busy_us, up.sent_bytes, down.sent_bytes, up.overrun_bytes,
+            up.dropped_bytes + down.dropped_bytes, up.cut_bytes + down.cut_bytes, up.wrong_bits + down.wrong_bits,
+            board.bad, board.lost, at_station.bad if at_station else 0, at_station.lost if at_station else 0,
+        )  # fmt: skip
+
+    return Channel(
+        "int64",
+        counts,
+        (
+            quantity("link", "up_delivered down_delivered"),
+            quantity("link", "up_latency_sum down_latency_sum", "us"),
+            quantity("serial", "up_busy down_busy", "us"),
+            quantity("serial", "up_bytes down_bytes overrun no_room cut", "bytes"),
+            quantity("serial", "wrong_bits up_bad up_lost down_bad down_lost"),
+        ),
+    )

@@ -1,0 +1,464 @@
+"""MAVLink frames: pymavlink's bytes, any chunks, damaged streams, signatures, loss counters, fuzzing."""
+
+import os
+import struct
+from collections.abc import Iterable, Sequence
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+import pymavlink.dialects.v20.common as dialect
+import pytest
+
+from firmware_py.wire import WireError, mavlink
+from firmware_py.wire.mavlink_frames import HALF_FRAME_US, FrameReceiver, FrameSender, Signing
+
+KEY = sha256(b"floaty").digest()
+STAMP = 370_000_000_000_00  # 10 us since 2015: 2026
+DIALECT = sorted(dialect.mavlink_map.items())
+FUZZ = int(os.environ.get("FLOATY_FUZZ", "50000"))
+
+
+def peer(key: bytes | None = None, system: int = 7, component: int = 9, link_id: int = 0) -> Any:
+    """pymavlink's codec: the other end, and the source of golden bytes."""
+    codec = dialect.MAVLink(None, system, component)
+    if key is not None:
+        codec.signing.secret_key = key
+        codec.signing.sign_outgoing = True
+        codec.signing.timestamp = STAMP
+        codec.signing.link_id = link_id
+    return codec
+
+
+def golden(codec: Any, messages: Iterable[Any]) -> list[bytes]:
+    frames = []
+    for message in messages:
+        frames.append(message.pack(codec))
+        codec.seq = (codec.seq + 1) % 256
+    return frames
+
+
+def fields_of(kind: Any) -> list[tuple[str, int]]:
+    """Types and array lengths (0: no array) in the constructor's order."""
+    lengths = [kind.array_lengths[kind.ordered_fieldnames.index(name)] for name in kind.fieldnames]
+    return list(zip(kind.fieldtypes, lengths, strict=True))
+
+
+def any_message(kind: Any, rng: np.random.Generator) -> Any:
+    """A message with random contents in all its fields."""
+    limits = {"uint8_t": "B", "int8_t": "b", "uint16_t": "H", "int16_t": "h", "uint32_t": "I", "int32_t": "i"}
+    limits |= {"uint64_t": "Q", "int64_t": "q", "double": "d"}
+
+    def value(type: str) -> Any:
+        if type == "float":
+            return float(np.float32(rng.normal()))
+        code = limits["uint8_t" if type == "char" else type]
+        return rng.normal() if code == "d" else struct.unpack(code, rng.bytes(struct.calcsize(code)))[0]
+
+    fields: list[Any] = []
+    for type, length in fields_of(kind):
+        if type == "char":
+            fields.append(bytes(rng.integers(65, 91, length).tolist()))
+        else:
+            fields.append([value(type) for _ in range(length)] if length else value(type))
+    return kind(*fields)
+
+
+def conversation(rng: np.random.Generator, count: int) -> list[Any]:
+    """Messages of a flight: poses mostly."""
+    others = (
+        lambda: mavlink.target(int(rng.integers(1 << 31)), tuple(rng.normal(size=3)), rng.normal()),
+        mavlink.station_heartbeat,
+        lambda: mavlink.timesync(0, int(rng.integers(1 << 62))),
+        lambda: mavlink.parameter("EXT_X_P", rng.normal(), int(rng.integers(60)), 60),
+    )
+    return [
+        others[i // 4 % 4]()
+        if i % 4 == 3
+        else mavlink.pose(int(rng.integers(1 << 40)), tuple(rng.normal(size=3)), tuple(rng.normal(size=4)))
+        for i in range(count)
+    ]
+
+
+def received(messages: Sequence[Any]) -> list[bytes]:
+    return [bytes(message.get_msgbuf()) for message in messages]
+
+
+def feed_all(receiver: FrameReceiver, stream: bytes, chunk: int, now_us: int = 0) -> list[bytes]:
+    """Feed in chunks, then let silence pass."""
+    messages = []
+    for start in range(0, len(stream), chunk):
+        messages += receiver.feed(now_us, stream[start : start + chunk])
+    return received(messages + receiver.feed(now_us + HALF_FRAME_US + 1, b""))
+
+
+@pytest.mark.parametrize(("number", "kind"), DIALECT, ids=[kind.msgname for _, kind in DIALECT])
+def test_every_message_of_the_dialect_has_pymavlinks_bytes_and_fields(number: int, kind: Any) -> None:
+    message = any_message(kind, np.random.default_rng(number))
+    frame = golden(peer(), [message])[0]
+    assert FrameSender(7, 9).encode(0, message) == frame
+    (mine,) = FrameReceiver().feed(0, frame)
+    theirs = peer().decode(bytearray(frame))
+    assert mine.to_dict() == theirs.to_dict()
+    assert mine == theirs
+    assert (mine.get_msgId(), mine.get_srcSystem(), mine.get_srcComponent(), mine.get_seq()) == (
+        number,
+        7,
+        9,
+        0,
+    )
+
+
+@pytest.mark.parametrize(("number", "kind"), DIALECT, ids=[kind.msgname for _, kind in DIALECT])
+def test_trailing_zeros_are_cut_and_come_back(number: int, kind: Any) -> None:
+    zero = [b"" if type == "char" else [0] * length if length else 0 for type, length in fields_of(kind)]
+    frame = golden(peer(), [kind(*zero)])[0]
+    assert FrameSender(7, 9).encode(0, kind(*zero)) == frame
+    (mine,) = FrameReceiver().feed(0, frame)
+    assert mine.to_dict() == peer().decode(bytearray(frame)).to_dict()
+
+
+@pytest.mark.parametrize("key", [None, KEY], ids=["unsigned", "signed"])
+def test_frames_count_themselves_and_carry_pymavlinks_signature(key: bytes | None) -> None:
+    messages = conversation(
+        np.random.default_rng(1), 300
+    )  # more than 256, two in each unit of the time stamp
+    sender = FrameSender(7, 9, Signing(key, link_id=3, start=STAMP) if key else None)
+    mine = [sender.encode(5 * i, message) for i, message in enumerate(messages)]
+    assert mine == golden(peer(key, link_id=3), messages)
+
+
+@pytest.mark.parametrize("key", [None, KEY], ids=["unsigned", "signed"])
+def test_chunks_of_any_size_give_the_same_messages(key: bytes | None) -> None:
+    frames = golden(peer(key), conversation(np.random.default_rng(2), 10))
+    stream = b"".join(frames)
+    for size in range(1, len(stream) + 1):
+        receiver = FrameReceiver(Signing(key, start=STAMP) if key else None)
+        assert feed_all(receiver, stream, size) == frames, f"chunks of {size}"
+        assert receiver.counters.skipped_bytes == receiver.counters.lost == 0
+
+
+def test_version_1_is_read() -> None:
+    frames = [
+        message.pack(peer(), force_mavlink1=True)
+        for message in (mavlink.station_heartbeat(), mavlink.timesync(1, 2))
+    ]
+    assert feed_all(FrameReceiver(), b"".join(frames), 7) == frames
+
+
+def test_a_field_that_does_not_fit_is_refused_and_takes_no_sequence_number() -> None:
+    sender = FrameSender(7, 9)
+    with pytest.raises(WireError, match="PARAM_VALUE"):
+        sender.encode(0, dialect.MAVLink_param_value_message(b"X", 1e300, 9, 1, 0))
+    with pytest.raises(WireError, match="12345678"):
+        sender.encode(0, dialect.MAVLink_message(12345678, "NONE"))
+    assert sender.encode(0, mavlink.timesync(0, 1)) == golden(peer(), [mavlink.timesync(0, 1)])[0]
+
+
+# Damage
+
+
+def test_garbage_before_frames_loses_none_of_them() -> None:
+    rng = np.random.default_rng(3)
+    frames = golden(peer(), conversation(rng, 3000))
+    stream = b""
+    for i, frame in enumerate(frames):
+        stream += (rng.bytes(int(rng.integers(1, 41))) if i % 10 == 0 else b"") + frame
+    receiver, theirs = FrameReceiver(), peer()
+    assert feed_all(receiver, stream, 64) == frames
+    assert receiver.counters.lost == 0
+    assert receiver.counters.skipped_bytes == len(stream) - len(b"".join(frames))
+    theirs.robust_parsing = True
+    good = [m for m in theirs.parse_buffer(stream) if m.get_type() != "BAD_DATA"]
+    assert len(good) < len(frames) - 100  # the stream is a hard one
+
+
+@pytest.mark.parametrize("stray", [b"\xfd", b"\xfe", b"\xfd\xfd\xfd", b"\xfe\xfd", b"\xfd\xfe"])
+def test_stray_start_byte_does_not_delay_the_frame_behind_it(stray: bytes) -> None:
+    receiver = FrameReceiver()
+    for frame in golden(peer(), conversation(np.random.default_rng(4), 300)):
+        assert received(receiver.feed(0, stray + frame)) == [frame]
+
+
+def test_a_frame_cut_anywhere_costs_only_itself() -> None:
+    frames = golden(peer(), conversation(np.random.default_rng(5), 8))
+    for cut in range(len(frames[3])):
+        receiver = FrameReceiver()
+        stream = b"".join((*frames[:3], frames[3][:cut], *frames[4:]))
+        assert feed_all(receiver, stream, 50) == frames[:3] + frames[4:], f"cut at {cut}"
+        assert receiver.counters.lost + receiver.counters.unknown == 1  # unknown: cut in the message number
+
+
+@pytest.mark.parametrize("key", [None, KEY], ids=["unsigned", "signed"])
+def test_any_flipped_bit_costs_only_its_frame(key: bytes | None) -> None:
+    frames = golden(peer(key), conversation(np.random.default_rng(6), 5))
+    for bit in range(8 * len(frames[2])):
+        broken = bytearray(frames[2])
+        broken[bit // 8] ^= 1 << bit % 8
+        receiver = FrameReceiver(Signing(key, start=STAMP) if key else None)
+        stream = b"".join((*frames[:2], broken, *frames[3:]))
+        assert feed_all(receiver, stream, 1000) == frames[:2] + frames[3:], f"bit {bit}"
+        counters = receiver.counters
+        assert (counters.bad_crc, counters.bad_signature) != (0, 0) or counters.skipped_bytes >= len(broken)
+
+
+def test_bit_errors_of_1e_4_cost_only_the_frames_they_hit() -> None:
+    rng = np.random.default_rng(7)
+    frames = golden(peer(), conversation(rng, 5000))
+    stream = np.frombuffer(b"".join(frames), np.uint8)
+    errors = np.packbits(rng.random(8 * len(stream)) < 1e-4)
+    ends = np.cumsum([len(frame) for frame in frames])
+    whole = [
+        frame for frame, end in zip(frames, ends, strict=True) if not errors[end - len(frame) : end].any()
+    ]
+    assert 100 < len(frames) - len(whole) < 300
+    receiver = FrameReceiver()
+    assert feed_all(receiver, (stream ^ errors).tobytes(), 100) == whole
+    assert receiver.counters.frames == len(whole)
+    hit_in_the_number = receiver.counters.unknown
+    assert receiver.counters.lost + hit_in_the_number == len(frames) - len(whole)
+    assert hit_in_the_number < 20
+
+
+def test_half_a_frame_is_given_up_after_silence_and_not_before() -> None:
+    receiver = FrameReceiver()
+    half = b"\xfd\xff" + golden(peer(), [mavlink.timesync(0, 1)])[0][2:10]  # promises 255 bytes
+    frame = golden(peer(), [mavlink.station_heartbeat()])[0]
+    assert receiver.feed(1000, half + frame) == []
+    assert receiver.feed(1000 + HALF_FRAME_US, b"") == []
+    assert received(receiver.feed(1001 + HALF_FRAME_US, b"")) == [frame]
+
+
+def test_the_rest_of_a_frame_is_taken_even_after_silence() -> None:
+    receiver = FrameReceiver()
+    frame = golden(peer(), [mavlink.station_heartbeat()])[0]
+    receiver.feed(0, frame[:12])
+    assert received(receiver.feed(10 * HALF_FRAME_US, frame[12:])) == [frame]
+
+
+# Signatures
+
+
+def signed_receiver() -> FrameReceiver:
+    return FrameReceiver(Signing(KEY, start=STAMP))
+
+
+def test_pymavlink_accepts_our_signature() -> None:
+    theirs = peer(KEY)
+    theirs.signing.allow_unsigned_callback = None
+    frame = FrameSender(7, 9, Signing(KEY, start=STAMP)).encode(0, mavlink.timesync(0, 5))
+    assert theirs.decode(bytearray(frame)).ts1 == 5
+    assert theirs.signing.goodsig_count == 1
+
+
+def test_with_a_key_nothing_unsigned_is_accepted() -> None:
+    receiver = signed_receiver()
+    messages = conversation(np.random.default_rng(8), 20)
+    assert feed_all(receiver, b"".join(golden(peer(), messages)), 30) == []
+    assert feed_all(receiver, mavlink.timesync(0, 1).pack(peer(), force_mavlink1=True), 30) == []
+    assert (receiver.counters.unsigned, receiver.counters.frames) == (21, 0)
+
+
+def test_a_wrong_key_is_refused() -> None:
+    receiver = signed_receiver()
+    frames = golden(peer(sha256(b"other").digest()), conversation(np.random.default_rng(9), 20))
+    assert feed_all(receiver, b"".join(frames), 30) == []
+    assert receiver.counters.bad_signature == 20
+
+
+def test_without_a_key_signed_frames_are_read() -> None:
+    frames = golden(peer(KEY), conversation(np.random.default_rng(10), 20))
+    assert feed_all(FrameReceiver(), b"".join(frames), 30) == frames
+
+
+def test_replayed_frames_are_refused() -> None:
+    receiver = signed_receiver()
+    frames = golden(peer(KEY), conversation(np.random.default_rng(11), 20))
+    assert feed_all(receiver, b"".join(frames), 30) == frames
+    assert feed_all(receiver, b"".join(frames), 30) == []
+    assert (receiver.counters.replayed, receiver.counters.skipped_bytes) == (20, 0)
+
+
+def test_a_forged_time_stamp_changes_nothing() -> None:
+    receiver = signed_receiver()
+    first, true = golden(peer(KEY), [mavlink.timesync(0, 1), mavlink.timesync(0, 2)])
+    receiver.feed(0, first)
+    forged = bytearray(first)
+    forged[-12:-6] = b"\xff" * 6
+    assert receiver.feed(0, bytes(forged)) == []
+    other = bytearray(golden(peer(KEY, system=8), [mavlink.timesync(0, 1)])[0])
+    other[-12:-6] = b"\xff" * 6
+    assert receiver.feed(0, bytes(other)) == []
+    assert received(receiver.feed(0, true)) == [true]
+    assert receiver.counters.bad_signature == 2
+
+
+@pytest.mark.parametrize(("behind", "count"), [(6_000_000, 1), (6_000_001, 0)])
+def test_a_new_stream_may_be_a_minute_behind(behind: int, count: int) -> None:
+    receiver = signed_receiver()
+    codec = peer(KEY)
+    codec.signing.timestamp = STAMP + 500_000 - behind
+    frame = golden(codec, [mavlink.timesync(0, 1)])[0]
+    assert len(receiver.feed(5_000_000, frame)) == count
+    assert receiver.counters.replayed == 1 - count
+
+
+def test_a_board_without_a_calendar_learns_the_time_from_a_genuine_frame() -> None:
+    signing = Signing(KEY)
+    receiver, sender = FrameReceiver(signing), FrameSender(1, 1, signing)
+    theirs = peer(KEY)
+    with pytest.raises(dialect.MAVError, match="signature"):
+        theirs.decode(bytearray(sender.encode(0, mavlink.timesync(0, 1))))
+    receiver.feed(0, golden(peer(KEY), [mavlink.timesync(0, 1)])[0])
+    assert theirs.decode(bytearray(sender.encode(0, mavlink.timesync(0, 2)))).ts1 == 2
+
+
+def test_a_cut_signature_costs_only_its_frame() -> None:
+    frames = golden(peer(KEY), conversation(np.random.default_rng(12), 5))
+    for cut in range(1, 14):
+        stream = b"".join((*frames[:2], frames[2][:-cut], *frames[3:]))
+        assert feed_all(signed_receiver(), stream, 1000) == frames[:2] + frames[3:], f"{cut} bytes cut"
+
+
+def test_a_key_has_32_bytes() -> None:
+    with pytest.raises(WireError, match="31 bytes"):
+        Signing(bytes(31))
+
+
+# Loss counters
+
+
+def count(order: Iterable[int]) -> tuple[int, int, int]:
+    """Frames, lost and late after frames with these numbers, modulo 256."""
+    receiver, codec = FrameReceiver(), peer()
+    for number in order:
+        codec.seq = number % 256
+        receiver.feed(0, mavlink.timesync(0, 1).pack(codec))
+    return receiver.counters.frames, receiver.counters.lost, receiver.counters.late
+
+
+def test_gaps_are_counted_over_the_wrap() -> None:
+    assert count(range(1000)) == (1000, 0, 0)
+    assert count(number for number in range(1000) if number % 100 not in (55, 56, 57)) == (970, 30, 0)
+
+
+def test_a_reordered_pair_is_one_lost_and_one_late() -> None:
+    assert count((0, 2, 1, 3, 4)) == (5, 1, 1)
+
+
+def test_a_repeated_frame_is_late() -> None:
+    assert count((0, 1, 1, 2, 3)) == (5, 0, 1)
+
+
+def test_a_sender_that_begins_anew_is_followed() -> None:
+    frames, lost, late = count((*range(100), *range(200)))
+    assert (frames, lost) == (300, 0)
+    assert late <= 4
+
+
+def test_senders_are_counted_apart() -> None:
+    receiver, codecs = FrameReceiver(), [peer(system=system) for system in (1, 2)]
+    codecs[1].seq = 77
+    for _ in range(300):
+        for codec in codecs:
+            receiver.feed(0, golden(codec, [mavlink.timesync(0, 1)])[0])
+    assert (receiver.counters.frames, receiver.counters.lost, receiver.counters.late) == (600, 0, 0)
+
+
+def test_unknown_messages_are_counted_and_not_lost() -> None:
+    receiver, codec = FrameReceiver(), peer()
+    for i in range(50):
+        if i % 5 == 3:
+            stranger = dialect.MAVLink_message(60_000, "STRANGER")
+            frame = stranger._pack(codec, 99, np.random.default_rng(i).bytes(40))
+            codec.seq += 1
+        else:
+            frame = golden(codec, [mavlink.timesync(0, 1)])[0]
+        receiver.feed(0, frame)
+    assert (receiver.counters.frames, receiver.counters.unknown, receiver.counters.lost) == (40, 10, 0)
+
+
+# Fuzzing
+
+
+def sealed(number: int, payload: bytes, rng: np.random.Generator) -> bytes:
+    """A frame with any contents and a good CRC, of version 2."""
+    kind = dialect.mavlink_map[number]
+    head = struct.pack(
+        "<BBBBBBHB", len(payload), 0, *rng.bytes(2), *rng.integers(1, 256, 2), number & 0xFFFF, number >> 16
+    )
+    crc = dialect.x25crc(head + payload + bytes((kind.crc_extra,))).crc
+    return b"\xfd" + head + payload + struct.pack("<H", crc)
+
+
+def disturbed(frame: bytes, rng: np.random.Generator) -> bytes:
+    """The frame with one of many faults, or without."""
+    at = int(rng.integers(len(frame)))
+    fault = int(rng.integers(8))
+    if fault == 0:
+        return frame[:at]
+    if fault == 1:
+        return frame[at:]
+    if fault == 2:
+        return frame[:at] + rng.bytes(int(rng.integers(1, 40))) + frame[at:]
+    if fault == 3:
+        return frame[:at] + bytes((frame[at] ^ 1 << int(rng.integers(8)),)) + frame[at + 1 :]
+    if fault == 4:
+        return rng.bytes(len(frame))
+    if fault == 5:
+        return frame + frame
+    return frame
+
+
+def test_fuzzed_frames_never_raise_and_the_next_good_frame_is_received() -> None:
+    rng = np.random.default_rng(13)
+    signed = golden(peer(KEY), conversation(rng, 200))
+    numbers = [number for number, _ in DIALECT]
+    readers = {
+        mavlink.MSG_ATT_POS_MOCAP: mavlink.read_pose,
+        mavlink.MSG_VISION_POSITION_ESTIMATE: mavlink.read_pose,
+        mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED: mavlink.read_target,
+        mavlink.MSG_ATTITUDE: mavlink.read_attitude,
+        mavlink.MSG_LOCAL_POSITION_NED: mavlink.read_local_position,
+        mavlink.MSG_DEBUG_FLOAT_ARRAY: mavlink.read_flight_array,
+        mavlink.MSG_PING: mavlink.ping_answer,
+        mavlink.MSG_FILE_TRANSFER_PROTOCOL: mavlink.ftp_nak,
+    }
+    read = list(readers)
+    receivers = (FrameReceiver(), signed_receiver())
+    sender, read_well = FrameSender(1, 1), 0
+    done = 0
+    while done < FUZZ:
+        parts = []
+        for choice in rng.integers(4, size=20).tolist():
+            if choice == 0:
+                frame = signed[int(rng.integers(len(signed)))]
+            else:
+                number = int(rng.choice(read if choice == 1 else numbers))
+                frame = sealed(number, rng.bytes(int(rng.integers(1, 256))), rng)
+            parts.append(disturbed(frame, rng))
+        done += len(parts)
+        stream = b"".join(parts)
+        for receiver in receivers:
+            for message in receiver.feed(done, stream):
+                try:
+                    reader = readers.get(message.get_msgId())
+                    if reader is not None:
+                        answer = reader(message)
+                        read_well += 1
+                        if isinstance(answer, dialect.MAVLink_message):
+                            sender.encode(done, answer)
+                except WireError:
+                    pass
+    assert read_well > done / 50
+    last = golden(peer(KEY), [mavlink.timesync(0, 1)])[0]
+    last_for_signed = FrameSender(7, 9, Signing(KEY, start=2 * STAMP)).encode(0, mavlink.timesync(0, 1))
+    for receiver, frame in zip(receivers, (last, last_for_signed), strict=True):
+        messages = receiver.feed(done, frame) + receiver.feed(done + HALF_FRAME_US + 1, b"")
+        assert frame in received(messages)
+    assert receivers[1].counters.frames <= 201  # only the signed frames, each once, and the last
+    assert receivers[1].counters.replayed > 0
+    assert receivers[0].counters.frames > done / 3
+    assert all(
+        getattr(receivers[0].counters, name) > 0 for name in ("skipped_bytes", "bad_crc", "lost", "late")
+    )

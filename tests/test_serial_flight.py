@@ -1,0 +1,144 @@
+"""Whole flights over the serial line: limits at every baud rate, determinism, wrong bits, signatures, what does not fit."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.config import load_config
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.figures import PICTURES
+from hil.harness import MAVLINK
+from hil.metrics import column
+from hil.recorder import load_events, load_log
+from hil.run import Request, Result, fly, prepare
+
+FLOATY = (sys.executable, "-m", "hil.cli")
+KEY = "5a" * 32
+
+
+def fly_over_mavlink(
+    folder: Path, *overrides: str, seed: int = 1, duration_s: float = 10.0, experiment: str = "hover"
+) -> Result:
+    request = Request(
+        EXPERIMENTS[experiment], load_config("floaty", overrides), "floaty", overrides, seed, duration_s, MAVLINK
+    )  # fmt: skip
+    prepare(folder)
+    return fly(request, folder)
+
+
+def explain(result: Result) -> str:
+    return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
+
+
+@pytest.mark.parametrize("baud", [57_600, 115_200, 460_800, 921_600])
+def test_hover_holds_its_limits_at_every_baud_rate(tmp_path: Path, baud: int) -> None:
+    result = fly_over_mavlink(tmp_path / "run", f"serial.baud={baud}", seed=3)
+    assert result.passed, explain(result)
+    log = load_log(result.folder)
+    assert column(log, "serial.overrun")[-1] == 0
+    assert column(log, "serial.up_bad")[-1] == 0
+    seconds = result.metrics["flown"]
+    sent = np.diff(column(log, "serial.up_bytes")[[100, -1]])[0]
+    assert result.metrics["line_up"] == pytest.approx(
+        10 * sent / baud / seconds, rel=0.05
+    )  # 10 bits per byte
+
+
+def test_the_budget_is_stated_before_take_off(tmp_path: Path) -> None:
+    result = fly_over_mavlink(tmp_path / "run", "serial.baud=57600", duration_s=1.0)
+    first = load_events(result.folder)[0]
+    assert first["t_us"] == 0
+    assert first["text"].startswith("57600 baud: uplink ")
+    assert "telemetry 20 Hz" in first["text"]
+
+
+def test_a_line_that_cannot_carry_the_poses_is_refused_before_take_off(tmp_path: Path) -> None:
+    with pytest.raises(
+        LabError, match=r"9600 baud: 50 poses/s need .* raise station\.send_every or serial\.baud"
+    ):
+        fly_over_mavlink(tmp_path / "run", "serial.baud=9600")
+
+
+def test_same_seed_same_hash_over_the_serial_line(tmp_path: Path) -> None:
+    noisy = ("serial.uplink_bit_error_rate=1e-4", "serial.downlink_bit_error_rate=1e-4")
+    first, again, other = (
+        fly_over_mavlink(tmp_path / name, *noisy, seed=seed, duration_s=3.0)
+        for name, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
+    assert first.hash == again.hash != other.hash
+    assert (first.folder / "telemetry.csv").read_bytes() == (again.folder / "telemetry.csv").read_bytes()
+
+
+def test_wrong_bits_cost_frames_and_nothing_else(tmp_path: Path) -> None:
+    noisy = ("serial.uplink_bit_error_rate=1e-4", "serial.downlink_bit_error_rate=1e-4")
+    result = fly_over_mavlink(tmp_path / "run", *noisy)
+    assert result.passed, explain(result)
+    log = load_log(result.folder)
+    assert column(log, "serial.wrong_bits")[-1] > 20
+    for way in ("up", "down"):
+        assert column(log, f"serial.{way}_bad")[-1] > 0
+        assert column(log, f"serial.{way}_lost")[-1] > 0
+
+
+def test_a_signed_line_flies(tmp_path: Path) -> None:
+    result = fly_over_mavlink(tmp_path / "run", f"mavlink.signing_key='{KEY}'", duration_s=4.0)
+    assert result.passed, explain(result)
+    assert column(load_log(result.folder), "serial.up_bad")[-1] == 0
+
+
+def test_telemetry_over_the_line_is_the_estimate(tmp_path: Path) -> None:
+    result = fly_over_mavlink(tmp_path / "run", duration_s=3.0)
+    lines = (result.folder / "telemetry.csv").read_text().splitlines()
+    names = lines[0].split(",")
+    rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    log = load_log(result.folder)
+    for title, name in (
+        ("stateEstimate.x [m]", "estimate.x"),
+        ("stateEstimate.vz [m/s]", "estimate.vz"),
+        ("stateEstimate.yaw [rad]", "estimate.yaw"),
+        ("motor.m3 [counts]", "motor.m3"),
+    ):
+        told = rows[:, names.index(title)]
+        at_us = 1000 * rows[:, names.index("board.t [ms]")]
+        good = np.isfinite(told) & (at_us > 1_200_000)
+        known = np.interp(at_us[good], column(log, "t"), column(log, name))
+        step = np.abs(np.diff(column(log, name)[120:])).max()
+        assert good.sum() > 100
+        assert np.abs(told[good] - known).max() <= 2 * step, title
+
+
+def test_the_report_shows_the_line(tmp_path: Path) -> None:
+    result = fly_over_mavlink(tmp_path / "run", duration_s=2.0)
+    names = load_log(result.folder).column_names
+    shown = [picture.title for picture in PICTURES if picture.needs in names]
+    assert "Serial line" in shown
+    assert "Radio" not in shown
+
+
+def test_the_station_flies_a_board_behind_a_pty_in_real_time(tmp_path: Path) -> None:
+    line = tmp_path / "uart"
+    done = subprocess.run(
+        [*FLOATY, "fly", "hover", "--link", f"mavlink:{line}", "--duration", "3", "--out", str(tmp_path / "run")],
+        capture_output=True, text=True, timeout=90,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    log = load_log(tmp_path / "run")
+    assert column(log, "serial.up_bytes")[-1] > 100 * 48  # poses
+    assert not line.is_symlink()
+
+
+def test_a_line_that_is_there_already_is_left_alone(tmp_path: Path) -> None:
+    line = tmp_path / "uart"
+    line.write_text("not a line")
+    done = subprocess.run(
+        [*FLOATY, "fly", "hover", "--link", f"mavlink:{line}", "--out", str(tmp_path / "run")],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert f"{line} exists" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert line.read_text() == "not a line"
