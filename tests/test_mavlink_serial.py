@@ -12,12 +12,15 @@ import sys
 import threading
 import time
 import tty
+import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pymavlink.dialects.v20.common as dialect
 import pytest
+import serial
+from serial.rfc2217 import PortManager
 from serving import Served, serve
 
 from ground_station.clock import clock_us
@@ -269,6 +272,52 @@ def test_a_stuck_line_makes_nobody_wait_and_is_a_lost_one(peers: Callable[..., P
     assert slowest_s < 0.2  # and not the second for which the writer waited
     assert int(re.search(r"(\d+) late", link.summary())[1]) > 100
     link.close()
+
+
+class Pty(serial.Serial):
+    """A pty has no modem lines; the protocol asks for them."""
+
+    cts = dsr = ri = cd = False
+
+    def _update_rts_state(self) -> None: ...
+    def _update_dtr_state(self) -> None: ...
+
+
+@contextmanager
+def rfc2217_server(device: str) -> Iterator[str]:
+    """pyserial's own server of a serial port for one client."""
+    port = Pty(device, timeout=0)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        stopping = threading.Event()
+
+        def run() -> None:
+            client, _ = listener.accept()
+            with client, suppress(OSError):  # the station leaves first
+                manager = PortManager(port, types.SimpleNamespace(write=client.sendall))
+                while not stopping.is_set():
+                    if select.select((client,), (), (), 0.005)[0]:
+                        port.write(b"".join(manager.filter(client.recv(4096))))
+                    client.sendall(b"".join(manager.escape(port.read(4096))))
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield f"rfc2217://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            stopping.set()
+            thread.join()
+            port.close()
+
+
+@pytest.mark.filterwarnings("ignore:set:DeprecationWarning")  # pyserial's own
+def test_a_port_of_another_computer_works_alike(peers: Callable[..., Peer]) -> None:
+    peer = peers(board)
+    with rfc2217_server(peer.uri.removeprefix("mavlink:")) as url:
+        link = MavlinkSerialLink(f"mavlink:{url}", MavlinkLinkConfig(115_200, 50.0))
+        link.open(lambda: False)
+        link.send(clock_us(), fresh(7), HOME)
+        wait_until(lambda: any(message.get_type() == "ATT_POS_MOCAP" for message in list(peer.heard)))
+        link.close()
 
 
 # Flying

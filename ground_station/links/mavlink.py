@@ -18,9 +18,7 @@ from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
 from firmware_py.wire.telemetry import BLOCKS, Sample
-from ground_station.links.mavlink_budget import STANDING_GOAL_HZ
-from ground_station.links.mavlink_budget import Budget as Budget
-from ground_station.links.mavlink_budget import link_budget as link_budget
+from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 

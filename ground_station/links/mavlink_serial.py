@@ -30,7 +30,7 @@ ANSWER_TIMEOUT_US = 4_000_000  # for heartbeat and acknowledgement of a board wh
 SILENCE_TIMEOUT_US = 2_000_000  # connected: a heartbeat comes every second, telemetry oftener
 POLL_S = 0.05
 READ_SIZE = 4096
-READ_PERIOD_S = 0.005  # of looking, where one cannot be woken: rfc2217, Windows
+GATHER_S = 0.005  # how long bytes are gathered where a port cannot be polled
 MAX_AGE_US = 120_000  # older poses are not sent: the board could not use them
 WRITE_TIMEOUT_S = 1.0
 CLOSE_TIMEOUT_S = 1.5
@@ -65,9 +65,15 @@ class _Port:
         self.received: queue.Queue[tuple[int, bytes]] = queue.Queue(PIECES)
         self._outgoing: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._take_pose = take_pose
-        self._closing = threading.Event()
+        self._closing = False
+        remote = device.startswith("rfc2217:")  # cannot be polled, and has a fixed write timeout of 5 s
+        self._polled = os.name == "posix" and not remote
         self._serial = serial.serial_for_url(
-            device, baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True
+            device,
+            baud,
+            timeout=0 if self._polled else GATHER_S,
+            write_timeout=None if remote else WRITE_TIMEOUT_S,
+            exclusive=True,
         )
         self._threads = [
             threading.Thread(target=self._guard, args=(loop,), name=f"serial {name}", daemon=True)
@@ -82,7 +88,7 @@ class _Port:
 
     def close(self) -> None:
         """Let reader and writer end, and close, all within some seconds."""
-        self._closing.set()
+        self._closing = True
         self._outgoing.put(None)
         for thread in self._threads:
             thread.join(CLOSE_TIMEOUT_S)
@@ -96,15 +102,9 @@ class _Port:
             self.failure = self.failure or reason(error)
 
     def _read(self) -> None:
-        try:
-            descriptor = self._serial.fileno() if os.name == "posix" else None
-        except OSError:
-            descriptor = None
-        while not self._closing.is_set():
-            if descriptor is None:
-                self._closing.wait(READ_PERIOD_S)
-            else:
-                select.select((descriptor,), (), (), POLL_S)
+        while not self._closing:
+            if self._polled:
+                select.select((self._serial.fileno(),), (), (), POLL_S)
             data = self._serial.read(READ_SIZE)
             if data:
                 self.bytes += len(data)
