@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import serial
 
+from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us, signing_start
@@ -131,7 +132,7 @@ class MavlinkSerialLink:
         self._link = MavlinkLink(self._carry, self._config)
         self._pose: tuple[MocapFrame, Goal] | None = None
         self._muted = True
-        self._late = 0  # poses that were replaced by newer ones, or too old, before they could be sent
+        self._late = 0  # poses that were replaced by newer ones, too old, or unfit, when they were to be sent
         self._notices: list[str] = []
 
     def open(self, give_up: Callable[[], bool]) -> None:
@@ -210,8 +211,11 @@ class MavlinkSerialLink:
             now_us = clock_us()
             if now_us - pose[0].t_us > MAX_AGE_US:
                 self._late += 1
-            else:
+                return
+            try:
                 self._link.send(now_us, *pose)
+            except WireError:  # finite, but outside float32
+                self._late += 1
 
     def _carry(self, now_us: int, data: bytes) -> None:
         if self._port is not None:
