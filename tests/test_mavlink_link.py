@@ -20,6 +20,9 @@ from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, StationConfig
 from ground_station.trajectory import Goal, Hold
+from hil.config import load_config
+from hil.experiments import EXPERIMENTS
+from hil.harness import MAVLINK, Flight
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
@@ -313,6 +316,18 @@ def test_the_budget_of_the_uplink_is_what_the_link_sends():
             if now_us % 500_000 == 0:
                 bench.hear(now_us, dialect.MAVLink_timesync_message(0, 10**15 + now_us))
         assert bench.bytes / 10 == pytest.approx(bench.link.budget.up_load * 92_160, rel=0.01)
+
+
+@pytest.mark.parametrize("baud", [57_600, 921_600])
+def test_the_budget_of_the_downlink_is_what_the_board_sends(baud):
+    flight = Flight(
+        load_config("floaty", (f"serial.baud={baud}",)), EXPERIMENTS["hover"], 6.0, 1, None, link=MAVLINK
+    )
+    begun = []
+    flight.events.at(2_000_000, lambda now_us: begun.append(flight.serial.uart.down.sent_bytes))
+    assert flight.run().lost is None
+    sent = flight.serial.uart.down.sent_bytes - begun[0]
+    assert sent / 5.0 == pytest.approx(link_budget(baud, 50.0).down_load * baud / 10, rel=0.04)
 
 
 def test_at_57600_baud_the_loads_are_those_of_frames_counted_by_hand():

@@ -18,14 +18,13 @@ from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
 from firmware_py.wire.telemetry import BLOCKS, Sample
-from ground_station.links.mavlink_budget import STANDING_GOAL_HZ
-from ground_station.links.mavlink_budget import Budget as Budget
-from ground_station.links.mavlink_budget import link_budget as link_budget
+from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
 SYSTEM, COMPONENT = 255, 190  # a ground station, as the standard numbers them
 BOARD_COMPONENT = 1  # autopilot
+NO_AUTOPILOT = 8  # in a heartbeat: a ground station's, or a camera's
 EVERYBODY = 0  # system to talk to until the board is known
 LOOK_PERIOD_US = 1_000_000
 REPEAT_GOAL_US = round(1e6 / STANDING_GOAL_HZ)
@@ -171,8 +170,9 @@ class MavlinkLink:
         return message.get_srcComponent() == BOARD_COMPONENT and self.board in (None, system)
 
     def _on_heartbeat(self, now_us: int, message: Message) -> Sequence[Sample]:
-        self.board = message.get_srcSystem()
-        self.supervisor_state = message.custom_mode
+        if message.autopilot != NO_AUTOPILOT:
+            self.board = message.get_srcSystem()
+            self.supervisor_state = message.custom_mode
         return ()
 
     def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:

@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import serial
 
+from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us, signing_start
@@ -30,13 +31,13 @@ ANSWER_TIMEOUT_US = 4_000_000  # for heartbeat and acknowledgement of a board wh
 SILENCE_TIMEOUT_US = 2_000_000  # connected: a heartbeat comes every second, telemetry oftener
 POLL_S = 0.05
 READ_SIZE = 4096
-READ_PERIOD_S = 0.005  # of looking, where one cannot be woken: rfc2217, Windows
+GATHER_S = 0.005  # how long bytes are gathered where a port cannot be polled
 MAX_AGE_US = 120_000  # older poses are not sent: the board could not use them
 WRITE_TIMEOUT_S = 1.0
 CLOSE_TIMEOUT_S = 1.5
 PIECES = 2000  # of received bytes that wait
 POSE_IS_DUE = b""  # among what waits to be written
-_DEVICE = re.compile(r"(?:socket|rfc2217)://[^,]+:(\d{1,5})(?:[/?][^,]*)?|(?!\w+://)[^,]+")
+_DEVICE = re.compile(r"(?:socket|rfc2217)://[^,]+:(\d{1,5})(?:[/?][^,]*)?|(?!.*://)[^,]+")
 
 
 def parse_uri(uri: str, default_baud: int) -> tuple[str, int]:
@@ -65,9 +66,15 @@ class _Port:
         self.received: queue.Queue[tuple[int, bytes]] = queue.Queue(PIECES)
         self._outgoing: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._take_pose = take_pose
-        self._closing = threading.Event()
+        self._closing = False
+        remote = device.startswith("rfc2217:")  # cannot be polled, and has a fixed write timeout of 5 s
+        self._polled = os.name == "posix" and not remote
         self._serial = serial.serial_for_url(
-            device, baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True
+            device,
+            baud,
+            timeout=0 if self._polled else GATHER_S,
+            write_timeout=None if remote else WRITE_TIMEOUT_S,
+            exclusive=True,
         )
         self._threads = [
             threading.Thread(target=self._guard, args=(loop,), name=f"serial {name}", daemon=True)
@@ -82,7 +89,7 @@ class _Port:
 
     def close(self) -> None:
         """Let reader and writer end, and close, all within some seconds."""
-        self._closing.set()
+        self._closing = True
         self._outgoing.put(None)
         for thread in self._threads:
             thread.join(CLOSE_TIMEOUT_S)
@@ -96,15 +103,9 @@ class _Port:
             self.failure = self.failure or reason(error)
 
     def _read(self) -> None:
-        try:
-            descriptor = self._serial.fileno() if os.name == "posix" else None
-        except OSError:
-            descriptor = None
-        while not self._closing.is_set():
-            if descriptor is None:
-                self._closing.wait(READ_PERIOD_S)
-            else:
-                select.select((descriptor,), (), (), POLL_S)
+        while not self._closing:
+            if self._polled:
+                select.select((self._serial.fileno(),), (), (), POLL_S)
             data = self._serial.read(READ_SIZE)
             if data:
                 self.bytes += len(data)
@@ -131,7 +132,7 @@ class MavlinkSerialLink:
         self._link = MavlinkLink(self._carry, self._config)
         self._pose: tuple[MocapFrame, Goal] | None = None
         self._muted = True
-        self._late = 0  # poses that were replaced by newer ones, or too old, before they could be sent
+        self._late = 0  # poses that were replaced by newer ones, too old, or unfit, when they were to be sent
         self._notices: list[str] = []
 
     def open(self, give_up: Callable[[], bool]) -> None:
@@ -210,8 +211,11 @@ class MavlinkSerialLink:
             now_us = clock_us()
             if now_us - pose[0].t_us > MAX_AGE_US:
                 self._late += 1
-            else:
+                return
+            try:
                 self._link.send(now_us, *pose)
+            except WireError:  # finite, but outside float32
+                self._late += 1
 
     def _carry(self, now_us: int, data: bytes) -> None:
         if self._port is not None:
@@ -283,6 +287,8 @@ class MavlinkSerialLink:
 
 def reason(error: Exception) -> str:
     """The sense of one of pyserial's messages."""
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
     text = str(error).splitlines()[0] if str(error) else type(error).__name__
     if "Inappropriate ioctl" in text:
         return "not a serial port"

@@ -1,0 +1,454 @@
+"""`floaty station` on a serial line: what cannot work is one line, what is pulled out comes back, and it flies."""
+
+import csv
+import hashlib
+import os
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+import types
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pymavlink.dialects.v20.common as dialect
+import pytest
+import serial
+from serial.rfc2217 import PortManager
+from serving import Served, serve
+
+from ground_station.clock import clock_us
+from ground_station.errors import LinkError
+from ground_station.links import mavlink_serial
+from ground_station.links.mavlink import MavlinkLinkConfig
+from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
+from ground_station.mocap import MocapFrame
+from ground_station.trajectory import Goal
+
+FLOATY = (sys.executable, "-m", "hil.cli")
+PATIENCE_S = 40.0
+KEY = hashlib.sha256(b"floaty").hexdigest()
+HOME = Goal((0.0, 0.0, 1.15), 0.0)
+Talk = Callable[["Peer"], None]
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+# A URI
+
+
+@pytest.mark.parametrize(
+    ("uri", "expected"),
+    [
+        ("mavlink:/dev/ttyUSB0", ("/dev/ttyUSB0", 921_600)),
+        ("mavlink:/dev/ttyUSB0,57600", ("/dev/ttyUSB0", 57_600)),
+        ("mavlink:COM3,115200", ("COM3", 115_200)),
+        ("mavlink:socket://127.0.0.1:5760", ("socket://127.0.0.1:5760", 921_600)),
+        ("mavlink:rfc2217://[::1]:4000,9600", ("rfc2217://[::1]:4000", 9600)),
+        ("mavlink:rfc2217://host:4000?logging=debug", ("rfc2217://host:4000?logging=debug", 921_600)),
+    ],
+)
+def test_a_uri_names_device_and_baud_rate(uri: str, expected: tuple[str, int]) -> None:
+    assert parse_uri(uri, 921_600) == expected
+
+
+# What cannot work
+
+
+@pytest.mark.parametrize(
+    ("link", "message"),
+    [
+        ("mavlink:/nowhere/tty", "mavlink:/nowhere/tty: No such file or directory"),
+        ("mavlink:/dev/null", "mavlink:/dev/null: not a serial port"),
+        ("mavlink:/dev/null,fast", "baud rate 'fast': expected 9600..3000000"),
+        ("mavlink:/dev/null,300", "baud rate '300': expected 9600..3000000"),
+        ("mavlink:/dev/null,9600", "9600 baud: 50 poses/s need 2.63 kB/s"),
+        ("mavlink:", "mavlink:: expected mavlink:DEVICE[,BAUD]"),
+        ("mavlink", "mavlink: expected mavlink:DEVICE[,BAUD]"),
+        ("mavlink:carrier-pigeon://coop", "expected mavlink:DEVICE[,BAUD]"),
+        ("mavlink:socket://127.0.0.1", "expected mavlink:DEVICE[,BAUD]"),
+        ("mavlink:socket://127.0.0.1:99999", "expected mavlink:DEVICE[,BAUD]"),
+        ("mavlink:socket://127.0.0.1:9", "mavlink:socket://127.0.0.1:9: Connection refused"),
+        ("mavlink:rfc2217://127.0.0.1:9", "mavlink:rfc2217://127.0.0.1:9: Connection refused"),
+    ],
+)
+def test_what_cannot_work_is_one_line_and_exit_code_two(link: str, message: str) -> None:
+    refused(link, message)
+
+
+def refused(link: str, message: str, *arguments: str) -> None:
+    begin_s = time.monotonic()
+    command = [*FLOATY, "station", "--link", link, "--mocap", f"virtual:{free_port()}", *arguments]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert time.monotonic() - begin_s < 10.0
+    assert shown.returncode == 2
+    assert message in shown.stderr
+    assert shown.stderr.startswith("floaty: ")
+    assert (shown.stdout, shown.stderr.count("\n")) == ("", 1)
+
+
+class Peer:
+    """What is at the other end of a pty, on pymavlink's codec; `talk` is called every 20 ms."""
+
+    def __init__(self, talk: Talk, key: str = "") -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(slave)
+        self.uri = f"mavlink:{os.ttyname(slave)}"
+        self._slave = slave
+        self.heard: list[object] = []
+        self.reads = True
+        self.codec = dialect.MAVLink(self, srcSystem=1, srcComponent=1)
+        self.codec.robust_parsing = True
+        if key:
+            self.codec.signing.secret_key = bytes.fromhex(key)
+            self.codec.signing.sign_outgoing = True
+        self._talk = talk
+        self._stopping = False
+        self._thread = threading.Thread(target=self._loop)
+        self._thread.start()
+
+    def write(self, data: bytes) -> None:
+        os.write(self.master, data)
+
+    def _loop(self) -> None:
+        while not self._stopping:
+            if self.reads and select.select((self.master,), (), (), 0.02)[0]:
+                for message in self.codec.parse_buffer(os.read(self.master, 4096)) or ():
+                    self.heard.append(message)
+                    if self._talk is board and message.get_type() == "COMMAND_LONG":
+                        self.codec.command_ack_send(message.command, 0)
+            self._talk(self)
+
+    def close(self) -> None:
+        self._stopping = True
+        self._thread.join()
+        os.close(self._slave)
+        os.close(self.master)
+
+
+def silent(peer: Peer) -> None:
+    time.sleep(0.02)
+
+
+def noisy(peer: Peer) -> None:
+    peer.write(bytes(range(256)))
+    time.sleep(0.02)
+
+
+def beats(peer: Peer) -> None:
+    peer.codec.heartbeat_send(0, 0, 1, 2, 4, 3)
+    time.sleep(0.02)
+
+
+def board(peer: Peer) -> None:
+    beats(peer)
+
+
+def mute_station(peer: Peer) -> None:
+    peer.codec.heartbeat_send(dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+    time.sleep(0.02)
+
+
+@pytest.fixture
+def peers() -> Iterator[Callable[..., Peer]]:
+    made: list[Peer] = []
+
+    def make(*arguments: object) -> Peer:
+        made.append(Peer(*arguments))
+        return made[-1]
+
+    yield make
+    for peer in made:
+        peer.close()
+
+
+def link_to(peer: Peer, key: str = "") -> MavlinkSerialLink:
+    return MavlinkSerialLink(peer.uri, MavlinkLinkConfig(921_600, 50.0, bytes.fromhex(key)))
+
+
+def test_a_line_on_which_nothing_comes_is_given_up_after_four_seconds(peers: Callable[..., Peer]) -> None:
+    peer = peers(silent)
+    refused(peer.uri, f"{peer.uri}: no heartbeat within 4 s: nothing comes")
+
+
+@pytest.mark.parametrize(
+    ("talk", "station_key", "board_key", "message"),
+    [
+        (noisy, "", "", r"no heartbeat within 1 s: \d+ bytes, not one frame: wrong baud rate\?"),
+        (beats, "", "", r"system 1 answers no command within 1 s: does it want signed frames"),
+        (board, KEY, "", r"no heartbeat within 1 s: \d+ frames not signed with mavlink.signing_key"),
+        (board, KEY, KEY[::-1], r"no heartbeat within 1 s: \d+ frames not signed with mavlink.signing_key"),
+        (mute_station, "", "", r"no heartbeat of an autopilot within 1 s: \d+ frames of others"),
+    ],
+)
+def test_why_there_is_no_connection_is_said(
+    peers: Callable[..., Peer],
+    talk: Talk,
+    station_key: str,
+    board_key: str,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mavlink_serial, "ANSWER_TIMEOUT_US", 1_000_000)
+    with pytest.raises(LinkError, match=message):
+        link_to(peers(talk, board_key), station_key).open(lambda: False)
+
+
+def test_connecting_ends_when_it_is_told_to(peers: Callable[..., Peer]) -> None:
+    begin_s = time.monotonic()
+    with pytest.raises(LinkError, match="stopped while connecting"):
+        link_to(peers(silent)).open(lambda: True)
+    assert time.monotonic() - begin_s < 1.0
+
+
+def test_a_port_has_one_user(peers: Callable[..., Peer]) -> None:
+    peer = peers(board)
+    link = link_to(peer)
+    link.open(lambda: False)
+    with pytest.raises(LinkError, match="Resource temporarily unavailable"):
+        link_to(peer).open(lambda: False)
+    link.close()
+    link.open(lambda: False)
+    link.close()
+
+
+# Sending
+
+
+def fresh(k: int) -> MocapFrame:
+    return MocapFrame(clock_us() - 40_000, (0.001 * k, 0.0, 1.15), (1.0, 0.0, 0.0, 0.0), True)
+
+
+def wait_until(reached: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_poses_go_out_as_they_come_and_stale_ones_do_not(peers: Callable[..., Peer]) -> None:
+    peer = peers(board)
+    link = link_to(peer)
+    link.open(lambda: False)
+    for k in range(20):
+        sent = link.summary()
+        link.send(clock_us(), fresh(k), HOME)
+        wait_until(lambda sent=sent: link.summary() != sent)
+    link.send(clock_us(), MocapFrame(clock_us() - 130_000, HOME.p_WG, (1.0, 0.0, 0.0, 0.0), True), HOME)
+    wait_until(lambda: "20 sent, 1 late" in link.summary())
+    link.send(clock_us(), MocapFrame(clock_us(), (1e39, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), True), HOME)
+    wait_until(lambda: "20 sent, 2 late" in link.summary())
+    link.close()
+    poses = [message for message in peer.heard if message.get_type() == "ATT_POS_MOCAP"]
+    assert [round(1000 * message.x) for message in poses] == list(range(20))
+
+
+def test_a_stuck_line_makes_nobody_wait_and_is_a_lost_one(peers: Callable[..., Peer]) -> None:
+    peer = peers(board)
+    link = link_to(peer)
+    link.open(lambda: False)
+    peer.reads = False
+    slowest_s = 0.0
+
+    def send_until_it_is_lost() -> None:
+        nonlocal slowest_s
+        for k in range(60_000):
+            begin_s = time.monotonic()
+            link.send(clock_us(), fresh(k), HOME)
+            slowest_s = max(slowest_s, time.monotonic() - begin_s)
+            link.check()
+            time.sleep(0.0005)
+
+    with pytest.raises(LinkError, match="lost: Write timeout"):
+        send_until_it_is_lost()
+    assert slowest_s < 0.2  # and not the second for which the writer waited
+    assert int(re.search(r"(\d+) late", link.summary())[1]) > 100
+    link.close()
+
+
+class Pty(serial.Serial):
+    """A pty has no modem lines; the protocol asks for them."""
+
+    cts = dsr = ri = cd = False
+
+    def _update_rts_state(self) -> None: ...
+    def _update_dtr_state(self) -> None: ...
+
+
+@contextmanager
+def rfc2217_server(device: str) -> Iterator[str]:
+    """pyserial's own server of a serial port for one client."""
+    port = Pty(device, timeout=0)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        stopping = threading.Event()
+
+        def run() -> None:
+            client, _ = listener.accept()
+            with client, suppress(OSError):  # the station leaves first
+                manager = PortManager(port, types.SimpleNamespace(write=client.sendall))
+                while not stopping.is_set():
+                    if select.select((client,), (), (), 0.005)[0]:
+                        port.write(b"".join(manager.filter(client.recv(4096))))
+                    client.sendall(b"".join(manager.escape(port.read(4096))))
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield f"rfc2217://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            stopping.set()
+            thread.join()
+            port.close()
+
+
+@pytest.mark.filterwarnings("ignore:set:DeprecationWarning")  # pyserial's own
+def test_a_port_of_another_computer_works_alike(peers: Callable[..., Peer]) -> None:
+    peer = peers(board)
+    with rfc2217_server(peer.uri.removeprefix("mavlink:")) as url:
+        link = MavlinkSerialLink(f"mavlink:{url}", MavlinkLinkConfig(115_200, 50.0))
+        link.open(lambda: False)
+        link.send(clock_us(), fresh(7), HOME)
+        wait_until(lambda: any(message.get_type() == "ATT_POS_MOCAP" for message in list(peer.heard)))
+        link.close()
+
+
+# Flying
+
+
+class Cable:
+    """Between a served board and a device that can be pulled out: then its user gets an error."""
+
+    def __init__(self, board: str, device: Path) -> None:
+        self.device = device
+        self._board = os.open(board, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        self._master: int | None = None
+        self._lock = threading.Lock()
+        self._stopping = False
+        self.plug()
+        self._thread = threading.Thread(target=self._loop)
+        self._thread.start()
+
+    def plug(self) -> None:
+        with self._lock:
+            self._master, slave = os.openpty()
+            tty.setraw(slave)
+            self.device.symlink_to(os.ttyname(slave))
+            self._slave = slave
+
+    def pull(self) -> None:
+        with self._lock:
+            self.device.unlink()
+            os.close(self._master)
+            os.close(self._slave)
+            self._master = None
+
+    def _loop(self) -> None:
+        while not self._stopping:
+            select.select((self._board,) + ((self._master,) if self._master else ()), (), (), 0.002)
+            with self._lock, suppress(BlockingIOError):
+                if self._master is None:
+                    os.read(self._board, 65536)
+                    continue
+                for source, sink in ((self._board, self._master), (self._master, self._board)):
+                    if select.select((source,), (), (), 0)[0]:
+                        os.write(sink, os.read(source, 4096))
+
+    def close(self) -> None:
+        self._stopping = True
+        self._thread.join()
+        os.close(self._board)
+        if self._master is not None:
+            self.pull()
+
+
+@contextmanager
+def station(link: str, poses: int, *arguments: str) -> Iterator[Served]:
+    command = [*FLOATY, "station", "--link", link, "--mocap", f"virtual:{poses}", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    try:
+        yield Served(process)
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def finish(station: Served) -> int:
+    """Press Ctrl-C and read to the end."""
+    station.process.send_signal(signal.SIGINT)
+    out, _ = station.process.communicate(timeout=30)
+    station.lines += out.decode().splitlines()
+    return station.process.returncode
+
+
+def end_of(served: Served) -> str:
+    """What pyserial calls the end of a served line."""
+    (master,) = served.line("mavlink ")
+    return master.replace("tcp:", "socket://")
+
+
+def test_a_pulled_cable_is_failsafe_on_board_and_the_flight_goes_on_when_it_is_back(tmp_path: Path) -> None:
+    poses, log = free_port(), tmp_path / "telemetry.csv"
+    with serve("--mavlink", "pty", "--poses", str(poses)) as served:
+        cable = Cable(end_of(served), tmp_path / "ttyUSB0")
+        try:
+            with station(f"mavlink:{cable.device}", poses, "--log", str(log)) as ground:
+                served.wait_for("board 1: released", PATIENCE_S)
+                served.forget()
+                cable.pull()
+                ground.wait_for(rf"^mavlink:{cable.device}: lost: .*; connecting again$", PATIENCE_S)
+                served.wait_for("supervisor: failsafe, silence", PATIENCE_S)
+                ground.forget()
+                served.forget()
+                cable.plug()
+                ground.wait_for("^connected to ", PATIENCE_S)
+                served.wait_for("supervisor: flying", PATIENCE_S)
+                ground.wait_for(" 0 bad  round trip ", PATIENCE_S)
+                assert finish(ground) == 0
+        finally:
+            cable.close()
+    assert ground.lines[-1] == "the board is in failsafe, flaps at hover"
+    rows = flown(log)
+    times_s = [float(row["ground.t [s]"]) for row in rows]
+    gap = max(range(1, len(rows)), key=lambda k: times_s[k] - times_s[k - 1])
+    assert times_s[gap] - times_s[gap - 1] > 0.5
+    assert_steady(rows[:gap])
+    assert_steady(rows[-100:])
+
+
+def flown(log: Path) -> list[dict[str, str]]:
+    with log.open() as file:
+        return [row for row in csv.DictReader(file) if row["supervisor.state []"] == "2"]
+
+
+def assert_steady(rows: list[dict[str, str]]) -> None:
+    assert len(rows) > 20
+    assert max(abs(float(row["stateEstimate.x [m]"])) for row in rows) < 0.2
+    assert sum("nan" not in row.values() for row in rows) / len(rows) > 0.9
+    ages_ms = sorted(float(row["locSrv.age [0.1 ms]"]) / 10 for row in rows)
+    assert 38.0 < ages_ms[len(ages_ms) // 2] < 60.0  # 38 ms of motion capture and what the line needs
+
+
+def test_it_flies_over_tcp_signed_at_57600_baud(tmp_path: Path) -> None:
+    poses, log = free_port(), tmp_path / "telemetry.csv"
+    profile = (f"--set=mavlink.signing_key={KEY}", "--set=serial.baud=57600")
+    with serve("--mavlink", "tcp:0", "--poses", str(poses), *profile) as served:
+        with station(f"mavlink:{end_of(served)}", poses, "--log", str(log), *profile) as ground:
+            ground.wait_for("^57600 baud: uplink ", PATIENCE_S)
+            served.wait_for("board 1: released", PATIENCE_S)
+            ground.wait_for(" 0 lost, .* round trip ", PATIENCE_S)
+            assert finish(ground) == 0
+        refused(
+            f"mavlink:{end_of(served)}", "system 1 answers no command within 4 s: does it want signed frames"
+        )
+    assert_steady(flown(log))
