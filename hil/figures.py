@@ -191,7 +191,7 @@ def board(rows: pa.Table) -> Figure:
     figure, axes = _stack((1.8, 1.1, 0.8))
     load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
     shares = load.read(tenths).T
-    busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT]
+    busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT] or [0]
     axes[0].stackplot(
         _seconds(tenths)[1:], shares[busy],
         labels=[load.names[index] for index in busy], colors=[load.colours[index] for index in busy],
