@@ -643,3 +643,13 @@ def test_without_mavlink_there_is_no_task_and_no_variable_of_it() -> None:
     assert not [task.name for task in firmware.kernel.tasks if task.name.startswith("MAV")]
     assert not [variable.name for variable in firmware.variables if variable.name.startswith("mavlink")]
     firmware.uart_ready()  # an interrupt that nobody waits for
+
+
+def test_a_message_that_fits_no_frame_is_dropped_and_the_next_one_sent(client: Client) -> None:
+    dropped = client.stack.dropped
+    client.messages.clear()
+    client.stack.reply(dialect.MAVLink_heartbeat_message(999, 0, 0, 0, 0, 3))  # a byte of 999
+    client.stack.reply(dialect.MAVLink_ping_message(1, 77, 255, 190))
+    client.run(client.now_us + 3000)
+    assert client.stack.dropped == dropped + 1
+    assert [message.seq for _, message in client.messages if message.get_type() == "PING"] == [77]

@@ -34,7 +34,7 @@ class MavlinkStack:
         self.component = config.component
         self.refused = 0  # messages that no service could use
         self.unserved = 0  # messages that nobody here reads, or that are for others
-        self.dropped = 0  # messages for which the line had no time
+        self.dropped = 0  # messages for which the line had no time, or that say what no frame can hold
         self._cost_us = cost.mavlink_us
         self._board = board
         signing = Signing(bytes.fromhex(config.signing_key)) if config.signing_key else None
@@ -132,7 +132,11 @@ class MavlinkStack:
             if message is None:
                 continue
             yield from kernel.work(self._cost_us)
-            frame = sender.encode(kernel.now_us, message)
+            try:
+                frame = sender.encode(kernel.now_us, message)
+            except WireError:
+                self.dropped += 1
+                frame = b""
             while not board.uart_write(frame):
                 yield from kernel.delay(1)
             if message is self._paced:
