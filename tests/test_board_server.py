@@ -228,6 +228,14 @@ def test_a_udp_port_that_was_taken_meanwhile_is_waited_for(served: Served) -> No
     switch.close()
 
 
+def answer(client: socket.socket) -> bytes:
+    """The next packet that is not console text: the newest client gets what the board says, too."""
+    while True:
+        data = client.recv(64)
+        if data[0] >> 4:
+            return data
+
+
 def test_the_newest_udp_client_wins_and_a_prober_changes_nothing(served: Served) -> None:
     host, port = served.udp_uris[0].removeprefix("udp://").split(":")
     echo = b"\xf0" + bytes(9)  # a ping of cflib's
@@ -241,19 +249,19 @@ def test_the_newest_udp_client_wins_and_a_prober_changes_nothing(served: Served)
             client.connect((host, int(port)))
             client.settimeout(PATIENCE_S)
         old.send(echo)
-        assert old.recv(64)[1:] == bytes(9)
+        assert answer(old)[1:] == bytes(9)
         prober.send(b"\xff")
         assert prober.recv(64) == b"\xff"
         old.send(echo)
-        assert old.recv(64)[1:] == bytes(9)
+        assert answer(old)[1:] == bytes(9)
         new.send(echo)
-        assert new.recv(64)[1:] == bytes(9)
+        assert answer(new)[1:] == bytes(9)
         old.send(echo)  # displaced: ignored
         new.send(echo)
-        assert new.recv(64)[1:] == bytes(9)
+        assert answer(new)[1:] == bytes(9)
         old.setblocking(False)
         with pytest.raises(BlockingIOError):
-            old.recv(64)
+            answer(old)
 
 
 def test_a_program_in_another_process_needs_only_the_printed_line(served: Served) -> None:
