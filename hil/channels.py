@@ -9,6 +9,7 @@ from typing import Any
 from firmware_py.firmware import DEADLINES_US, Firmware
 from firmware_py.signals import COUNTERS
 from ground_station.trajectory import Trajectory
+from hil.plant.battery import Battery
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Quantity
 from hil.virtual_board import VirtualBoard
@@ -31,6 +32,15 @@ def radio_channel(radio: VirtualRadio) -> Channel:
         ),
         (quantity("link", names), quantity("link", "up_latency_sum down_latency_sum", "us")),
     )  # fmt: skip
+
+
+def battery_channel(battery: Battery) -> Channel:
+    """Return voltage of a cell, power and charge of the battery."""
+    return Channel(
+        "float32",
+        lambda: (battery.voltage, battery.power, battery.charge),
+        (quantity("battery", "voltage", "V"), quantity("battery", "power", "W"), quantity("battery", "charge")),
+    )
 
 
 def _view(array: Any) -> Callable[[], Any]:

@@ -19,12 +19,13 @@ from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Goal
-from hil.channels import flight_channels, radio_channel
+from hil.channels import battery_channel, flight_channels, radio_channel
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.experiments import Experiment
+from hil.plant.battery import Battery
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Recorder
 from hil.schedule import WINDOW_US, ScheduleTrace
@@ -102,6 +103,7 @@ class Flight:
             config.plant, config.tunnel, config.actuators, streams.gusts,
             (home[0] + offset[0], home[1] + offset[1], home[2] + offset[2]),
         )  # fmt: skip
+        self.battery = Battery(config.battery)
         self.imu = VirtualImu(config.imu, streams.imu)
         self.mocap = VirtualMocap(config.mocap, streams.mocap)
         self.radio = VirtualRadio(config.radio, self.events, streams.radio)
@@ -115,6 +117,7 @@ class Flight:
         self.station = GroundStation(end, self.trajectory, self.telemetry, config.station)
         uart = self.serial.uart if self.serial else None
         self.board = VirtualBoard(self.plant.set_counts, self.radio.downlink, self._console, uart)
+        self.board.battery_mv = self.battery.millivolts
         self.firmware = Firmware(config, self.board, mavlink=link == MAVLINK)
         self.board.run_on(self.firmware.kernel, self.events)
         self.radio.connect(self._radio_to_board, self.station.on_packet)
@@ -140,9 +143,10 @@ class Flight:
     def channels(self) -> tuple[Channel, ...]:
         """Return what there is to record."""
         link = self.serial.channel(self.firmware) if self.serial else radio_channel(self.radio)
-        return flight_channels(
+        flight = flight_channels(
             self.plant, self.board, self.firmware, link, self.trajectory, lambda: self.free
         )
+        return (*flight, battery_channel(self.battery))
 
     def run(self, progress: Callable[[int], None] | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C; the log is left open for the caller to close."""
@@ -197,6 +201,8 @@ class Flight:
 
     def _record(self, now_us: int) -> None:
         self.plant.advance(now_us)
+        self.battery.draw(now_us, self.plant.flap_travel)
+        self.board.battery_mv = self.battery.millivolts
         if self.recorder is not None:
             self.recorder.row(now_us)
         self.firmware.check_watchdog()

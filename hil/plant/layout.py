@@ -25,6 +25,7 @@ Q = _take(4)  # q_WB, w x y z
 OMEGA = _take(3)  # [rad/s] of B against W, in B
 FLAPS = _take(4)  # [rad] signed flap angles
 GUSTS = _take(14)  # [m/s] fast u v w, slow u v w, four flaps fast, four flaps slow
+TRAVEL = _take()  # [rad] all flaps together have turned since the start
 NOISE_ROW = _take()  # next row of the block of normal draws
 
 # Computed from the state by `drag`

@@ -81,7 +81,9 @@ def turn_flaps(s: State, duration: float) -> None:
             left -= run
         if left > 0.0:
             error = max(error * math.exp(-left / s[at.SERVO_TAU]), s[at.DEAD_BAND])
-        s[at.FLAPS + i] = target - math.copysign(error, target - s[at.FLAPS + i])
+        before = s[at.FLAPS + i]
+        s[at.FLAPS + i] = target - math.copysign(error, target - before)
+        s[at.TRAVEL] += abs(s[at.FLAPS + i] - before)
 
 
 @compiled

@@ -162,6 +162,11 @@ class Plant:
         """Mount servo 0..3 `trim_error` [rad] off and run it at `speed` times its pace, 0: stuck; defaults heal it."""
         self._s[at.SERVO_TRIM + servo], self._s[at.SERVO_SPEED + servo] = trim_error, speed
 
+    @property
+    def flap_travel(self) -> float:
+        """By how much all flaps together have turned since the start [rad]."""
+        return float(self._s[at.TRAVEL])
+
     def linearise(self) -> Constants:
         """Return the linearised dynamics about the level hover in the uniform flow of the design."""
         return linearise(self._s, self._airspeed)
