@@ -39,7 +39,11 @@ def battery_channel(battery: Battery) -> Channel:
     return Channel(
         "float32",
         lambda: (battery.voltage, battery.power, battery.charge),
-        (quantity("battery", "voltage", "V"), quantity("battery", "power", "W"), quantity("battery", "charge")),
+        (
+            quantity("battery", "voltage", "V"),
+            quantity("battery", "power", "W"),
+            quantity("battery", "charge"),
+        ),
     )
 
 

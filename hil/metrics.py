@@ -56,6 +56,18 @@ METRICS: Mapping[str, Metric] = {
         "share", "min", "thief's load at which STABILIZER first misses a deadline"
     ),
     "held_up_to": Metric("share", "min", "thief's load up to which the robot stays inside the 20 cm box"),
+    "power": Metric("W", "max", "mean power from the battery"),
+    "specific_power": Metric("W/kg", "max", "that power over the robot's mass"),
+    "endurance": Metric("min", "min", "flight until the supervisor finds the battery empty"),
+    "lift_off": Metric("s", "max", "from the controller's start until the robot is 2 cm off the net"),
+    "reached_box": Metric(
+        "s", "max", "from the start of the flight speed until the robot is in the 20 cm box"
+    ),
+    "hover_in_box": Metric("share", "min", "from then to the landing speed: share of the time in that box"),
+    "touch_down_speed": Metric(
+        "m/s", "max", "fastest descent in the last 0.1 s before the feet touch the net"
+    ),
+    "landed_off_axis": Metric("m", "max", "distance from the tunnel's axis at the end"),
 }
 
 

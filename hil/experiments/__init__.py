@@ -6,8 +6,12 @@ from hil.errors import LabError
 from hil.experiments.experiment import Experiment
 from hil.experiments.hover import HOVER
 from hil.experiments.overload import OVERLOAD
+from hil.experiments.power import ENDURANCE, POWER
+from hil.experiments.take_off import TAKE_OFF_LANDING
 
-EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in (HOVER, OVERLOAD)}
+EXPERIMENTS: dict[str, Experiment] = {
+    experiment.name: experiment for experiment in (HOVER, OVERLOAD, POWER, ENDURANCE, TAKE_OFF_LANDING)
+}
 
 __all__ = ["EXPERIMENTS", "Experiment", "find_experiment"]
 

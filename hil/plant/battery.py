@@ -36,7 +36,10 @@ class BatteryConfig(BaseModel):
         0.50, ge=0, le=10, description="of each servo at rest, holding [W]; physics.md section 10, calibrated"
     )
     servo_energy: float = Field(
-        0.33, ge=0, le=10, description="of each servo per angle turned [J/rad]; physics.md section 10, calibrated"
+        0.33,
+        ge=0,
+        le=10,
+        description="of each servo per angle turned [J/rad]; physics.md section 10, calibrated",
     )
 
 
@@ -45,11 +48,7 @@ def open_circuit_voltage(charge: float) -> float:
 
     A lithium polymer cell: Chen and Rincon-Mora, IEEE Transactions on Energy Conversion 21(2), 2006, equation 2.
     """
-    return (
-        3.685
-        + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201))
-        - 1.031 * math.exp(-35.0 * charge)
-    )
+    return 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * math.exp(-35.0 * charge)
 
 
 class Battery:

@@ -63,10 +63,14 @@ class Plant:
         self._airspeed = config.airspeed
         trim_and_correct(s, config)
 
-        tether, limits = config.tether, config.limits
+        tether, ground, limits = config.tether, config.ground, config.limits
         s[at.TETHER_ANCHOR + 2] = tunnel.hover_height + tether.anchor_height
         s[at.TETHER_LENGTH], s[at.TETHER_STIFFNESS] = tether.length, tether.stiffness
         s[at.TETHER_DAMPING] = tether.damping
+        s[at.NET_HEIGHT], s[at.FRICTION] = ground.height, ground.friction
+        s[at.NET_STIFFNESS], s[at.NET_DAMPING] = ground.stiffness, ground.damping
+        s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = ground.foot_spread, ground.foot_below
+        s[at.FOOT_REACH] = math.sqrt(2.0 * ground.foot_spread**2 + ground.foot_below**2)
         s[at.LIMIT_RADIUS], s[at.LIMIT_BELOW], s[at.LIMIT_ABOVE] = limits.radius, limits.below, limits.above
         s[at.LIMIT_COS_TILT] = math.cos(limits.tilt)
 
