@@ -61,7 +61,9 @@ def until_empty(flight: pa.Table) -> Mapping[str, float]:
     """Return power, and the minutes until the failsafe; NaN when the flight ended before it."""
     times = column(flight, "t")
     stopped = column(flight, "supervisor.state")[-1] == FAILSAFE
-    return power(flight) | {"endurance": (times[-1] - times[0]) * 1e-6 / 60.0 if stopped else float("nan")}
+    return power(flight) | {
+        "endurance": float(times[-1] - times[0]) * 1e-6 / 60.0 if stopped else float("nan")
+    }
 
 
 def _configuration(flight: pa.Table) -> dict[str, Any]:

@@ -99,7 +99,7 @@ def measure(flight: pa.Table) -> Mapping[str, float]:
         return values
     first = int(np.argmax(off))
     values["lift_off"] = float(times[first]) - CONTROLLER_ON
-    inside = (np.abs(position_error(flight)) <= BOX).all(axis=1)
+    inside = np.asarray((np.abs(position_error(flight)) <= BOX).all(axis=1))
     hovering = (times >= FLIGHT_FROM) & (times < LANDING_FROM)
     if (inside & hovering).any():
         entered = int(np.argmax(inside & hovering))

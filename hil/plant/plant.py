@@ -40,6 +40,7 @@ class Plant:
     Attributes (read-only numpy views of the present truth, SI):
         state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
         p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
+        wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
         specific_force_B (3,) at the centre of mass; flow_W (3,) air there; plate_forces_W (5, 3) base and four flaps as
         isolated plates (without the identified correction, so they do not add up to the whole force).
     """
@@ -90,6 +91,7 @@ class Plant:
         self.omega_B, self.flaps = self._view(at.OMEGA, 3), self._view(at.FLAPS, 4)
         self.specific_force_B, self.flow_W = self._view(at.SPECIFIC_FORCE, 3), self._view(at.FLOW, 3)
         self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
+        self.wrench_B = self._view(at.DRAG, 6)
         self.plate_forces_W = self._view(at.PLATE_FORCES, 15).reshape(5, 3)
         self.place((0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB, q_WB, flaps=self._commanded)
 
