@@ -54,11 +54,12 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "motioncapture": (),
     "scipy": (),
     "perfetto": ("hil/perfetto.py",),
-    "matplotlib": ("hil/figures.py", "hil/report.py", "hil/picture.py"),
+    "matplotlib": ("hil/figures.py", "hil/report.py", "hil/picture.py", "hil/experiments/pictures.py"),
     "pyarrow": (
         "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
         "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
-        "hil/picture.py", "hil/experiments/experiment.py",
+        "hil/picture.py", "hil/experiments/experiment.py", "hil/experiments/measures.py", "hil/experiments/pictures.py",
+        "hil/experiments/airspeed.py",
     ),
 }  # fmt: skip
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
