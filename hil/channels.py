@@ -3,12 +3,13 @@
 Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, like in the filter's state.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from firmware_py.firmware import DEADLINES_US, Firmware
 from firmware_py.signals import COUNTERS
 from ground_station.trajectory import Trajectory
+from hil.faults import Fault
 from hil.plant.battery import Battery
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Quantity
@@ -45,6 +46,11 @@ def battery_channel(battery: Battery) -> Channel:
             quantity("battery", "charge"),
         ),
     )
+
+
+def fault_channel(active: Sequence[Fault]) -> Channel:
+    """Return how many faults are in force."""
+    return Channel("int8", lambda: len(active), (quantity("fault", "active"),))
 
 
 def _view(array: Any) -> Callable[[], Any]:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
 from hil.experiments import EXPERIMENTS
+from hil.faults import parse
 from hil.metrics import column, free_flight
 from hil.plant.battery import Battery, BatteryConfig, endurance, open_circuit_voltage
 from hil.recorder import load_events, load_log
@@ -48,8 +49,9 @@ def test_power_leaves_the_terminals_and_the_resistance_heats(
     battery.sag_V = sag_V
     battery.spend(power, 1.0)
     current = (charge - battery.charge) * config.capacity
-    drop = open_circuit_voltage(charge) - sag_V - battery.voltage
-    assert cells * battery.voltage * current == pytest.approx(power, rel=1e-6)
+    loaded = battery.voltage + sag_V
+    drop = open_circuit_voltage(charge) - loaded
+    assert cells * loaded * current == pytest.approx(power, rel=1e-6)
     assert drop == pytest.approx(current * config.resistance, rel=1e-6, abs=1e-9)
 
 
@@ -83,6 +85,19 @@ def test_draw_is_the_power_model_of_the_paper_and_the_servos() -> None:
         assert battery.power == pytest.approx(0.3 + 4 * (0.50 + 0.33 * 0.8))
     # physics.md section 10: hover with the author's gains, 3.28 W and 33.8 min of 1.85 Wh
     assert endurance(CONFIG, 3.28, 3.2) / 60 == pytest.approx(33.8, rel=0.03)
+
+
+def test_a_sag_reaches_board_and_log_and_is_gone_afterwards(tmp_path: Path) -> None:
+    prepare(tmp_path / "run")
+    fly(
+        Request.of(EXPERIMENTS["hover"], duration_s=3.0, faults=(parse("battery.sag@1:1=0.5"),)),
+        tmp_path / "run",
+    )
+    log = free_flight(load_log(tmp_path / "run"))
+    times = 1e-6 * (column(log, "t") - column(log, "t")[0])
+    voltage = column(log, "battery.voltage")
+    sagging = (times > 1.02) & (times < 1.98)
+    assert voltage[sagging].max() < 3.6 < 3.9 < voltage[(times < 0.98) | (times > 2.02)].min()
 
 
 def test_a_load_beyond_the_battery_leaves_half_the_voltage() -> None:

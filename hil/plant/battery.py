@@ -54,8 +54,8 @@ def open_circuit_voltage(charge: float) -> float:
 class Battery:
     """Charge and voltage over time; `draw` is called at every row of the log.
 
-    Attributes: charge 0..1; voltage [V] of one cell under load; power [W] of the whole robot since the last call; sag_V [V]
-    missing from each cell, for a fault.
+    Attributes: charge 0..1; voltage [V] of one cell under load, as it reaches the board; power [W] of the whole robot since
+    the last call; sag_V [V] lost between each cell and the board, for a fault.
     """
 
     def __init__(self, config: BatteryConfig) -> None:
@@ -66,7 +66,7 @@ class Battery:
         self._at_rest = self.power
         self._time_us = 0
         self._travel = 0.0
-        self.voltage = self._voltage()
+        self.voltage = self._loaded()
 
     @property
     def millivolts(self) -> int:
@@ -83,13 +83,14 @@ class Battery:
     def spend(self, power: float, duration: float) -> None:
         """Draw `power` [W] for `duration` [s]."""
         self.power = power
-        self.voltage = self._voltage()
-        current = power / (self._config.cells * self.voltage)
+        loaded = self._loaded()
+        self.voltage = max(loaded - self.sag_V, 0.0)
+        current = power / (self._config.cells * loaded)
         self.charge = max(self.charge - current * duration / self._config.capacity, 0.0)
 
-    def _voltage(self) -> float:
+    def _loaded(self) -> float:
         """Return the voltage V at which V (OCV - V) / R is the power of a cell; half of OCV when it cannot give that."""
-        open_circuit = open_circuit_voltage(self.charge) - self.sag_V
+        open_circuit = open_circuit_voltage(self.charge)
         per_cell = self.power / self._config.cells
         return 0.5 * (
             open_circuit + math.sqrt(max(open_circuit**2 - 4.0 * self._config.resistance * per_cell, 0.0))
