@@ -1,4 +1,4 @@
-"""The command line: `floaty fly | list | view | report`.
+"""The command line: `floaty fly | list | view | report | drag-model`.
 
 Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C in 130 with the log kept.
 """
@@ -134,6 +134,8 @@ def list_experiments(faults: bool) -> None:
     for experiment in EXPERIMENTS.values():
         console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
+    bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
+    console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
     console.print(f"\nprofiles: {', '.join(names)}")
 
 
@@ -171,6 +173,45 @@ def report(run: Path) -> None:
     from hil.report import write_report
 
     console.print(f"report  {write_report(run)}")
+
+
+@app.command("drag-model")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=1, show_default=True, help="Of everything random."
+)
+@click.option("--profile", default="floaty", show_default=True, metavar="NAME|FILE", help="As for fly.")
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
+    help="Override a value of the profile; repeatable.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("runs/drag-model"),
+    show_default=True,
+    metavar="DIR",
+)
+def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -> None:
+    """Measure forces and torques on the mounted robot over flap angles, against the paper's simplified model."""
+    from rich.progress import track
+
+    from hil import drag_model, drag_model_report
+    from hil.config import load_config
+
+    config = load_config(profile, overrides)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
+    announce_compilation()
+    measured = drag_model.measure(config, seed)
+    rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))
+    drag_model.write_csv(rows, out / "drag_model.csv")
+    page = drag_model_report.write(rows, math.degrees(config.plant.hover_angle), out)
+    console.print(f"report  {page}")
 
 
 def announce_compilation() -> None:
