@@ -14,6 +14,7 @@ from rich.console import Console
 
 from hil.board_cli import board, station
 from hil.errors import LabError
+from hil.paper_cli import compare
 
 if TYPE_CHECKING:
     from hil.harness import Flight
@@ -334,6 +335,7 @@ def _refuse(text: str) -> int:
 
 app.add_command(board)
 app.add_command(station)
+app.add_command(compare)
 
 if __name__ == "__main__":
     main()

@@ -49,10 +49,15 @@ class Picture:
 
     def png(self, rows: pa.Table) -> bytes:
         """Return the figure of a flight log, or of a schedule."""
-        with matplotlib.rc_context(STYLE):
-            file = io.BytesIO()
-            self.draw(rows).savefig(file, format="png", dpi=DPI)
-        return file.getvalue()
+        return png_of(lambda: self.draw(rows))
+
+
+def png_of(draw: Callable[[], Figure]) -> bytes:
+    """Return what `draw` draws, in the style of every figure."""
+    with matplotlib.rc_context(STYLE):
+        file = io.BytesIO()
+        draw().savefig(file, format="png", dpi=DPI)
+    return file.getvalue()
 
 
 def _stack(heights: Sequence[float]) -> tuple[Figure, list[Axes]]:

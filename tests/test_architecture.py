@@ -54,10 +54,11 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "motioncapture": (),
     "scipy": (),
     "perfetto": ("hil/perfetto.py",),
-    "matplotlib": ("hil/figures.py", "hil/report.py"),
+    "matplotlib": ("hil/figures.py", "hil/overlays.py", "hil/study_figures.py"),
     "pyarrow": (
         "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
         "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
+        "hil/compare.py", "hil/overlays.py", "hil/paper.py",
     ),
 }  # fmt: skip
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
