@@ -91,7 +91,6 @@ def fly(
 
     Exit code 0: all limits hold; 1: a limit fails; 2: bad input; 130: interrupted.
     """
-    from hil.config import load_config
     from hil.experiments import find_experiment
 
     chosen = find_experiment(experiment)
@@ -102,13 +101,10 @@ def fly(
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
     if perfetto:
         import hil.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
-    config = load_config(profile, overrides)
-    announce_compilation()
     from hil.run import Request
 
-    requests = [
-        Request(chosen, config, profile, overrides, seed + index, flown_s, link) for index in range(seeds)
-    ]
+    requests = [Request.of(chosen, profile, overrides, seed + index, flown_s, link) for index in range(seeds)]
+    announce_compilation()
     if (seeds > 1 or perfetto) and not requests[0].in_lockstep:
         raise LabError(f"--link {link}: --seeds and --perfetto are for flights in lockstep")
     if seeds > 1:

@@ -14,8 +14,8 @@ import numpy as np
 import pyarrow as pa
 
 from hil.errors import LabError
-from hil.overlays import pair
 from hil.metrics import METRICS, SHOWN
+from hil.overlays import pair
 from hil.pages import data_uri, write_page
 from hil.recorder import load_log
 from hil.run import read_result
@@ -66,7 +66,9 @@ class Comparison:
     """What two runs have and have not in common."""
 
     first: Difference | None  # None: identical
-    missing: tuple[tuple[str, ...], tuple[str, ...]]  # columns of the other one that the first, the second lacks
+    missing: tuple[
+        tuple[str, ...], tuple[str, ...]
+    ]  # columns of the other one that the first, the second lacks
     metrics: tuple[MetricPair, ...]
     settings: tuple[tuple[str, str, str], ...]  # name, first, second: those that differ
 

@@ -5,7 +5,6 @@ Axes carry cm, degrees, ms and seconds of simulated time. Grey: the robot was st
 
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from hil import curves, scene
 from hil.curves import Curves
 from hil.metrics import BOX, column, free_flight, position_error, thief_load
+from hil.picture import Picture
 from hil.schedule import runs
 
 WIDTH, DPI = 9.2, 115  # [in], 1/in
@@ -38,29 +38,15 @@ STYLE: Any = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A figure of the report."""
-
-    title: str
-    caption: str
-    draw: Callable[[pa.Table], Figure]
-    needs: str = "t"  # a column without which there is nothing to draw
-
-    def png(self, rows: pa.Table) -> bytes:
-        """Return the figure of a flight log, or of a schedule."""
-        return png_of(lambda: self.draw(rows))
-
-
-def png_of(draw: Callable[[], Figure]) -> bytes:
-    """Return what `draw` draws, in the style of every figure."""
+def png(draw: Callable[..., Figure], *flights: pa.Table) -> bytes:
+    """Return the figure that `draw` makes of flight logs, or of a schedule."""
     with matplotlib.rc_context(STYLE):
         file = io.BytesIO()
-        draw().savefig(file, format="png", dpi=DPI)
+        draw(*flights).savefig(file, format="png", dpi=DPI)
     return file.getvalue()
 
 
-def _stack(heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
+def stack(heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
     """Return a figure of axes one above the other [in] that share their time axis."""
     figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
     axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0].tolist()
@@ -128,7 +114,7 @@ def track(rows: pa.Table) -> Figure:
 
 def errors(rows: pa.Table) -> Figure:
     """Draw position and attitude errors over time with the paper's limits."""
-    figure, axes = _stack((2.1, 2.1))
+    figure, axes = stack((2.1, 2.1))
     times = _seconds(rows)
     _lines(axes[0], times, curves.POSITION, curves.POSITION.read(rows), "position error")
     _limits(axes[0], curves.NEAR_CM)
@@ -158,7 +144,7 @@ def flaps(rows: pa.Table) -> Figure:
 
 def radio(rows: pa.Table) -> Figure:
     """Draw the age of the poses, the time in the air and the packets that were lost."""
-    figure, axes = _stack((1.5, 1.5, 1.5))
+    figure, axes = stack((1.5, 1.5, 1.5))
     _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
     _up_and_down(axes[1], rows, SECOND, curves.latency, "mean latency [ms]")
     _lines(axes[2], _seconds(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
@@ -168,7 +154,7 @@ def radio(rows: pa.Table) -> Figure:
 
 def serial_line(rows: pa.Table) -> Figure:
     """Draw the age of the poses, the load of the line, the time on it and what was lost or spoilt."""
-    figure, axes = _stack((1.5, 1.5, 1.5, 1.5))
+    figure, axes = stack((1.5, 1.5, 1.5, 1.5))
     _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
     _up_and_down(axes[1], rows, TENTH, curves.line_load, "load of the line [%]")
     axes[1].set_ylim(0.0, 105.0)
@@ -193,7 +179,7 @@ def _up_and_down(
 
 def board(rows: pa.Table) -> Figure:
     """Draw the load of the processor by task, the measurement queue and the states."""
-    figure, axes = _stack((1.8, 1.1, 0.8))
+    figure, axes = stack((1.8, 1.1, 0.8))
     load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
     shares = load.read(tenths).T
     busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT] or [0]
@@ -223,7 +209,7 @@ def board(rows: pa.Table) -> Figure:
 
 def estimate(rows: pa.Table) -> Figure:
     """Draw what the estimator believed, less the truth, in the goal frame."""
-    figure, axes = _stack((1.8, 1.8))
+    figure, axes = stack((1.8, 1.8))
     _lines(axes[0], _seconds(rows), curves.POSITION_MISS, curves.POSITION_MISS.read(rows), "position")
     _lines(axes[1], _seconds(rows), curves.ATTITUDE_MISS, curves.ATTITUDE_MISS.read(rows), "attitude")
     _shade_hold(axes, rows)

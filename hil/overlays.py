@@ -3,16 +3,15 @@
 Time runs from the release, in seconds. Trials as in the paper's figure experiments_fig: every one light, one dark.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil import curves
-from hil.figures import WIDTH, png_of
+from hil.figures import WIDTH, png
 from hil.metrics import column
 
 LIGHT, DARK = (157 / 255, 186 / 255, 198 / 255), (19 / 255, 129 / 255, 178 / 255)  # the paper's two blues
@@ -21,7 +20,7 @@ PAIR = (DARK, curves.ORANGE)
 
 def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> bytes:
     """Return position, attitude and flap angles of two flights over time as PNG."""
-    return png_of(lambda: _pair(logs, names))
+    return png(lambda a, b: _pair((a, b), names), *logs)
 
 
 def _pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Figure:

@@ -19,7 +19,10 @@ folder_type = click.Path(path_type=Path)
 @click.argument("first", metavar="RUN", type=folder_type)
 @click.argument("second", metavar="RUN", type=folder_type)
 @click.option(
-    "--out", type=folder_type, metavar="DIR", help="For compare.png and compare.html [the second run's folder]."
+    "--out",
+    type=folder_type,
+    metavar="DIR",
+    help="For compare.png and compare.html [the second run's folder].",
 )
 def compare(first: Path, second: Path, out: Path | None) -> int:
     """Compare one flight with another: first difference, metrics, settings, both in one plot.

@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+
 from firmware_py.firmware import LATENCY_BOUNDS_US
-from hil.figures import PICTURES, SCHEDULE, Picture
+from hil.experiments import EXPERIMENTS
+from hil.figures import PICTURES, SCHEDULE
 from hil.metrics import METRICS, SHOWN
 from hil.pages import data_uri, write_page
+from hil.picture import Picture
 from hil.recorder import load_events, load_log
 from hil.run import read_result
 from hil.schedule import load_schedule
@@ -46,7 +49,9 @@ class Shown:
 def write_report(folder: Path) -> Path:
     """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log."""
     log, result = load_log(folder), read_result(folder)
-    shown = [_show(picture, log) for picture in PICTURES if picture.needs in log.column_names]
+    experiment = EXPERIMENTS.get(result["experiment"])
+    own = experiment.pictures if experiment else ()
+    shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
     shown.append(_show(SCHEDULE, load_schedule(folder)))
     config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
     return write_page(

@@ -4,13 +4,15 @@
 `report.html`. Whatever ends the flight (its time, a crash, Ctrl-C, an error in a task), what was flown is kept.
 """
 
+from __future__ import annotations
+
 import json
 import math
 import platform
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,12 +22,12 @@ import pyarrow as pa
 
 from firmware_py.firmware import TaskReport, WatchdogError
 from hil.clock import Clock
-from hil.config import LabConfig
+from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError
 from hil.experiments import Experiment
 from hil.harness import LOCKSTEP, Flight
 from hil.linked_flight import LinkedFlight
-from hil.metrics import METRICS, Verdict, judge, measure
+from hil.metrics import METRICS, Verdict, free_flight, judge, measure
 from hil.recorder import Recorder, load_log
 
 RESULT = "result.json"
@@ -42,6 +44,22 @@ class Request:
     seed: int
     duration_s: float
     link: str = "radio"  # radio and mavlink: in lockstep; a URI: a station in a process of its own, paced
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        profile: str = DEFAULT_PROFILE,
+        overrides: Sequence[str] = (),
+        seed: int = 1,
+        duration_s: float | None = None,
+        link: str = "radio",
+    ) -> Request:
+        """Return the request for an experiment: its settings on the profile, `overrides` on both. Raises `LabError`."""
+        overrides = (*experiment.settings, *overrides)
+        config = load_config(profile, overrides)
+        duration_s = experiment.duration_s if duration_s is None else duration_s
+        return cls(experiment, config, profile, overrides, seed, duration_s, link)
 
     @property
     def in_lockstep(self) -> bool:
@@ -114,7 +132,10 @@ def fly(
         digest = recorder.close()
         flight.close()
         flight.write_schedule(folder)
-    metrics = measure(load_log(folder), outcome == "lost")
+    log = load_log(folder)
+    metrics = measure(log, outcome == "lost")
+    if (free := free_flight(log)).num_rows > 1:
+        metrics.update(request.experiment.measure(free))
     verdicts = tuple(judge(metrics, limits))
     factor = flight.now_us * 1e-6 / wall_s
     firmware = flight.firmware

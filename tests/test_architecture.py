@@ -54,10 +54,11 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "motioncapture": (),
     "scipy": (),
     "perfetto": ("hil/perfetto.py",),
-    "matplotlib": ("hil/figures.py", "hil/overlays.py", "hil/study_figures.py"),
+    "matplotlib": ("hil/figures.py", "hil/picture.py", "hil/overlays.py", "hil/study_figures.py"),
     "pyarrow": (
         "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
         "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
+        "hil/picture.py", "hil/experiments/experiment.py",
         "hil/compare.py", "hil/overlays.py", "hil/paper.py",
     ),
 }  # fmt: skip
