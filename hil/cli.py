@@ -215,11 +215,12 @@ def _write_pictures(folder: Path) -> None:
 
 def _fly_many(requests: "list[Request]", parent: Path) -> int:
     """Fly seeds in parallel processes; one row per seed as they finish, a summary at the end; returns the exit code."""
-    from hil.sweep import fly_all
+    from hil.sweep import Job, fly_all
 
     rows: list[Result] = []
+    jobs = [Job(request, parent / f"{request.experiment.name}-{request.seed}") for request in requests]
     try:
-        for result in fly_all(requests, parent, notices):
+        for result in fly_all(jobs, notices):
             rows.append(result)
     except KeyboardInterrupt:
         notices.print(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")

@@ -81,9 +81,12 @@ class Comparison:
 def load_run(folder: Path) -> Run:
     """Return what a run folder holds. Raises `LabError` when it cannot be read."""
     try:
-        return Run(folder, load_log(folder), read_result(folder))
-    except (pa.ArrowInvalid, OSError, json.JSONDecodeError) as error:
+        run = Run(folder, load_log(folder), read_result(folder))
+    except (ValueError, KeyError, OSError) as error:  # pyarrow's and json's errors are ValueErrors
         raise LabError(f"{folder}: not a readable run ({error})") from None
+    if "flight.free" not in run.log.column_names:
+        raise LabError(f"{folder}: its log is not that of a flight")
+    return run
 
 
 def compare(a: Run, b: Run) -> Comparison:

@@ -47,12 +47,11 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
     table.add_column("metric")
     for heading in ("first", "second", "difference"):
         table.add_column(heading, justify="right")
+    table.add_column("unit")
     for pair in comparison.metrics:
         numbers = (*pair.values, pair.difference)
-        table.add_row(
-            f"{pair.name} [{pair.unit}]" if pair.unit else pair.name,
-            *("–" if math.isnan(number) else f"{number:.4g}" for number in numbers),
-        )
+        shown = ("–" if math.isnan(number) else f"{number:.4g}" for number in numbers)
+        table.add_row(pair.name, *shown, pair.unit)
     console.print(table)
     for name, x, y in comparison.settings:
         console.print(f"{name}: {x} | {y}", soft_wrap=True)
