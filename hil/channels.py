@@ -3,12 +3,13 @@
 Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, like in the filter's state.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from firmware_py.firmware import DEADLINES_US, Firmware
 from firmware_py.signals import COUNTERS
 from ground_station.trajectory import Trajectory
+from hil.faults import Fault
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Quantity
 from hil.virtual_board import VirtualBoard
@@ -31,6 +32,11 @@ def radio_channel(radio: VirtualRadio) -> Channel:
         ),
         (quantity("link", names), quantity("link", "up_latency_sum down_latency_sum", "us")),
     )  # fmt: skip
+
+
+def fault_channel(active: Sequence[Fault]) -> Channel:
+    """Return how many faults are in force."""
+    return Channel("int8", lambda: len(active), (quantity("fault", "active"),))
 
 
 def _view(array: Any) -> Callable[[], Any]:

@@ -63,6 +63,10 @@ run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path
     metavar="SECTION.KEY=VALUE",
     help="Override a value of the profile; repeatable.",
 )
+@click.option(
+    "--fault", "fault_texts", multiple=True, metavar="KIND@START[:DURATION][=SIZE]",
+    help="Let something go wrong, START seconds after the release; repeatable. `floaty list --faults` has the kinds.",
+)  # fmt: skip
 @click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
 @click.option("--view", "watch", is_flag=True, help="Watch live in the rerun viewer.")
 @click.option("--perfetto", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace.")
@@ -81,6 +85,7 @@ def fly(
     duration: float | None,
     profile: str,
     overrides: tuple[str, ...],
+    fault_texts: tuple[str, ...],
     realtime: bool,
     watch: bool,
     perfetto: bool,
@@ -101,9 +106,13 @@ def fly(
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
     if perfetto:
         import hil.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
+    from hil.faults import parse
     from hil.run import Request
 
-    requests = [Request.of(chosen, profile, overrides, seed + index, flown_s, link) for index in range(seeds)]
+    faults = [parse(text) for text in fault_texts]
+    requests = [
+        Request.of(chosen, profile, overrides, seed + index, flown_s, link, faults) for index in range(seeds)
+    ]
     announce_compilation()
     if (seeds > 1 or perfetto) and not requests[0].in_lockstep:
         raise LabError(f"--link {link}: --seeds and --perfetto are for flights in lockstep")
@@ -114,8 +123,11 @@ def fly(
 
 
 @app.command("list")
-def list_experiments() -> None:
-    """List the experiments and the profiles."""
+@click.option("--faults", is_flag=True, help="List the kinds of faults for `floaty fly --fault`.")
+def list_experiments(faults: bool) -> None:
+    """List the experiments and the profiles, or the kinds of faults."""
+    if faults:
+        return _list_faults()
     from hil.config import DEFAULT_PROFILE, profile_names
     from hil.experiments import EXPERIMENTS
 
@@ -124,6 +136,24 @@ def list_experiments() -> None:
         console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
     console.print(f"\nprofiles: {', '.join(names)}")
+
+
+def _list_faults() -> None:
+    from rich.table import Table
+
+    from hil.fault_kinds import KINDS
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("kind", "size", "from..to", "lasts", "hover"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("meaning")
+    for name, kind in KINDS.items():
+        unit = f" {kind.unit}".rstrip()
+        size, bounds = (f"{kind.size:g}{unit}", f"{kind.low:g}..{kind.high:g}") if kind.sized else ("", "")
+        lasts = f"{kind.duration_s:g} s" if math.isfinite(kind.duration_s) else "to the end"
+        only = f" (--link {kind.link})" if kind.link else ""
+        table.add_row(name, size, bounds, lasts, kind.outcome, f"{kind.meaning}{only}")
+    Console(highlight=False, width=max(console.width, 150)).print(table)
 
 
 @app.command()

@@ -6,25 +6,27 @@ seed, split into one stream per component. The loop is the one of ARCHITECTURE.m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from firmware_py.firmware import Firmware
+from firmware_py.firmware import Firmware, Thief
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Goal
-from hil.channels import flight_channels, radio_channel
+from hil.channels import fault_channel, flight_channels, radio_channel
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.experiments import Experiment
+from hil.faults import Fault, plan
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Recorder
 from hil.schedule import WINDOW_US, ScheduleTrace
@@ -72,7 +74,18 @@ class Streams:
 
 
 class Flight:
-    """A board in its virtual tunnel with its ground station, ready to be released."""
+    """A board in its virtual tunnel with its ground station, ready to be released.
+
+    `faults` come on top of the experiment's own.
+    """
+
+    plant: Plant
+    imu: VirtualImu
+    mocap: VirtualMocap
+    radio: VirtualRadio
+    serial: SerialLine | None
+    board: VirtualBoard
+    link: str
 
     def __init__(
         self,
@@ -84,10 +97,12 @@ class Flight:
         clock: Clock | None = None,
         trace_all: bool = False,
         link: str = RADIO,
+        faults: Sequence[Fault] = (),
     ) -> None:
         streams = Streams.of_seed(seed)
         home, offset = config.flight.home, config.flight.start_offset
         self.config = config
+        self.link = link
         self.events = EventQueue()
         self.clock: Clock = clock or FreeRunning()
         self.release_us = config.flight.release_us
@@ -124,6 +139,8 @@ class Flight:
         self.plant.hold()
         self.events.at(self.release_us, self._release)
         experiment.script(self)
+        self.faults = (*experiment.faults, *faults)
+        self.active_faults = plan(self.faults, self)
         self.schedule = ScheduleTrace(self.firmware.kernel)
         start_us = 0 if trace_all else self.release_us
         self.events.at(start_us, self.schedule.begin)
@@ -140,9 +157,15 @@ class Flight:
     def channels(self) -> tuple[Channel, ...]:
         """Return what there is to record."""
         link = self.serial.channel(self.firmware) if self.serial else radio_channel(self.radio)
-        return flight_channels(
+        channels = flight_channels(
             self.plant, self.board, self.firmware, link, self.trajectory, lambda: self.free
         )
+        return (*channels, fault_channel(self.active_faults)) if self.faults else channels
+
+    @cached_property
+    def thief(self) -> Thief:
+        """A task on the board above all others, there from the first use on; it takes nothing until told to."""
+        return self.firmware.add_thief()
 
     def run(self, progress: Callable[[int], None] | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C; the log is left open for the caller to close."""
@@ -182,7 +205,7 @@ class Flight:
     def _expose(self, now_us: int) -> None:
         self.plant.advance(now_us)
         frame = self.mocap.expose(now_us, self.plant)
-        self.events.at(now_us + self.config.mocap.latency_us, self._deliver(frame))
+        self.events.at(self.mocap.arrival_us(now_us), self._deliver(frame))
 
     def _deliver(self, frame: MocapFrame) -> Callable[[int], None]:
         return lambda now_us: self.station.on_frame(frame, now_us)

@@ -25,6 +25,7 @@ from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError
 from hil.experiments import Experiment
+from hil.faults import Fault, check
 from hil.harness import LOCKSTEP, Flight
 from hil.linked_flight import LinkedFlight
 from hil.metrics import METRICS, Verdict, free_flight, judge, measure
@@ -44,6 +45,14 @@ class Request:
     seed: int
     duration_s: float
     link: str = "radio"  # radio and mavlink: in lockstep; a URI: a station in a process of its own, paced
+    faults: tuple[Fault, ...] = ()  # on top of the experiment's own; `LabError` for those that cannot act
+
+    def __post_init__(self) -> None:
+        if self.faults and not self.in_lockstep:
+            raise LabError(
+                f"fault {self.faults[0]}: --link {self.link}: faults act on flights in lockstep only"
+            )
+        check(self.faults, self.duration_s, self.link)
 
     @classmethod
     def of(
@@ -54,17 +63,23 @@ class Request:
         seed: int = 1,
         duration_s: float | None = None,
         link: str = "radio",
+        faults: Sequence[Fault] = (),
     ) -> Request:
         """Return the request for an experiment: its settings on the profile, `overrides` on both. Raises `LabError`."""
         overrides = (*experiment.settings, *overrides)
         config = load_config(profile, overrides)
         duration_s = experiment.duration_s if duration_s is None else duration_s
-        return cls(experiment, config, profile, overrides, seed, duration_s, link)
+        return cls(experiment, config, profile, overrides, seed, duration_s, link, tuple(faults))
 
     @property
     def in_lockstep(self) -> bool:
         """Whether station and board share one time line."""
         return self.link in LOCKSTEP
+
+    @property
+    def all_faults(self) -> tuple[Fault, ...]:
+        """The experiment's faults and those on top."""
+        return (*self.experiment.faults, *self.faults)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +168,7 @@ def _flight(request: Request, telemetry: Path, clock: Clock | None, trace_all: b
     if request.in_lockstep:
         return Flight(
             request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all,
-            request.link,
+            request.link, request.faults,
         )  # fmt: skip
     profile = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
     return LinkedFlight(
@@ -187,6 +202,7 @@ def write_result(result: Result) -> None:
         "seed": request.seed,
         "duration_s": request.duration_s,
         "link": request.link,
+        "faults": [str(fault) for fault in request.all_faults],
         "outcome": result.outcome,
         "cause": result.cause,
         "metrics": {name: value if math.isfinite(value) else None for name, value in result.metrics.items()},
@@ -226,6 +242,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         "seed": int(metadata.get("seed", 0)),
         "duration_s": float(metadata.get("duration_s", 0)),
         "link": metadata.get("link", "radio"),
+        "faults": json.loads(metadata.get("faults", "[]")),
         "outcome": "error",
         "cause": "the process ended before the flight did",
         "metrics": {name: value if math.isfinite(value) else None for name, value in metrics.items()},
@@ -249,6 +266,7 @@ def metadata_of(request: Request) -> dict[str, str]:
         "seed": str(request.seed),
         "duration_s": str(request.duration_s),
         "link": request.link,
+        "faults": json.dumps([str(fault) for fault in request.all_faults]),
         "config": request.config.model_dump_json(),
         "versions": json.dumps(versions()),
         "commit": commit(),

@@ -52,7 +52,10 @@ class TunnelConfig(BaseModel):
 
 
 class Tunnel:
-    """The knobs of the tunnel during a flight; a change acts from the next millisecond on."""
+    """The knobs of the tunnel during a flight; a change acts from the next millisecond on.
+
+    `fan_factor`, `gust_scale`, `side_wind` (x, y, z) and `shadow` (the share that is blocked) are as they were last set.
+    """
 
     def __init__(self, config: TunnelConfig, state: NDArray[np.float64]) -> None:
         self._s = s = state
@@ -71,16 +74,16 @@ class Tunnel:
 
     def set_fan_factor(self, factor: float) -> None:
         """Scale the mean flow and the gusts: 1 as configured, 0 fans off."""
-        self._s[at.FAN] = _inside("fan factor", factor, 0.0, 2.0)
+        self._s[at.FAN] = self.fan_factor = _inside("fan factor", factor, 0.0, 2.0)
 
     def set_gust_scale(self, scale: float) -> None:
         """Scale the gusts of the configured level."""
-        self._s[at.GUST_SCALE] = _inside("gust scale", scale, 0.0, 5.0)
+        self._s[at.GUST_SCALE] = self.gust_scale = _inside("gust scale", scale, 0.0, 5.0)
 
     def set_side_wind(self, x: float, y: float, z: float = 0.0) -> None:
         """Add a wind [m/s, W] everywhere; a fan beside the tunnel."""
-        wind = [_inside("side wind", component, -20.0, 20.0) for component in (x, y, z)]
-        self._s[at.SIDE_WIND : at.SIDE_WIND + 3] = wind
+        wind = tuple(_inside("side wind", component, -20.0, 20.0) for component in (x, y, z))
+        self._s[at.SIDE_WIND : at.SIDE_WIND + 3] = self.side_wind = wind
 
     def block(self, x: float, y: float, radius: float, depth: float) -> None:
         """Take the share `depth` of the flow away around (x, y) [m, W], half of it at `radius` [m]; depth 0 clears."""
@@ -90,6 +93,7 @@ class Tunnel:
             _inside("occlusion radius", radius, 0.01, 5.0),
             _inside("occlusion depth", depth, 0.0, 1.0),
         )
+        self.shadow = depth
 
 
 def _inside(what: str, value: float, low: float, high: float) -> float:

@@ -22,6 +22,7 @@ S_AZIMUTH = -math.pi / 4  # [rad] of S's x axis in B: then p = (gx + gy)/sqrt2, 
 SAMPLE_RATE = 1000.0  # [Hz]
 GYRO_COUNTS = 32768 / math.radians(2000)  # per rad/s; data sheet, range +-2000 deg/s
 ACCEL_COUNTS = 32768 / (24 * GRAVITY)  # per m/s2; data sheet, range +-24 g
+COUNTS = 32768.0  # of int16, one more below zero than above
 NOISE_ROWS = 2048  # samples of noise drawn at once
 
 Counts = tuple[int, int, int, int, int, int]
@@ -58,7 +59,7 @@ class ImuConfig(BaseModel):
 
 
 # Where things lie in the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
-NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, COUNT, FIELDS = range(12)
+NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, FIELDS = range(13)
 COS, SIN = math.cos(S_AZIMUTH), math.sin(S_AZIMUTH)
 
 
@@ -70,7 +71,7 @@ def channel(row: View, truth: float, draw: float) -> int:
     row[NOW_2] = row[B0] * truth - row[A2] * low
     if row[STUCK] == 0.0:
         value = row[SCALE] * (low + row[BIAS] + row[FAULT_BIAS] + row[NOISE] * draw)
-        row[COUNT] = min(max(math.floor(value + 0.5), -32768.0), 32767.0)
+        row[COUNT] = min(max(math.floor(value + 0.5), -row[RANGE]), row[RANGE] - 1.0)
     return int(row[COUNT])
 
 
@@ -95,7 +96,10 @@ def low_pass(bandwidth: float) -> tuple[float, float, float]:
 
 
 class VirtualImu:
-    """One specimen of the sensor: its biases are drawn from `rng` when it is made."""
+    """One specimen of the sensor: its biases are drawn from `rng` when it is made.
+
+    `noise_scale`, `rate_bias` (p, q, r [rad/s] in B), `rate_range` [rad/s] and `frozen` are as they were last set.
+    """
 
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -106,7 +110,11 @@ class VirtualImu:
         rows[:3, [B0, A1, A2]] = low_pass(config.gyro_bandwidth)
         rows[3:, [B0, A1, A2]] = low_pass(config.accel_bandwidth)
         self._draws: list[View] = []
+        rows[:, RANGE] = COUNTS
+        self.rate_range = COUNTS / GYRO_COUNTS
+        self.frozen = False
         self.set_noise_scale(1.0)
+        self.set_rate_bias(0.0, 0.0, 0.0)
 
     def sample(self, plant: Plant) -> Counts:
         """Return gyro x y z and accelerometer x y z counts, in S, of the plant as it is now."""
@@ -118,8 +126,20 @@ class VirtualImu:
         """Scale the white noise of all channels; 1 as configured."""
         if not 0.0 <= scale <= 1000.0:
             raise LabError(f"IMU noise scale = {scale}: outside 0..1000")
+        self.noise_scale = scale
         self._rows[:, NOISE] = scale * self._noise
 
-    def set_fault(self, axis: int, bias: float = 0.0, stuck: bool = False) -> None:
-        """Add `bias` (rad/s, m/s2) to channel 0..5 in S, or freeze its counts; the defaults heal it."""
-        self._rows[axis, FAULT_BIAS], self._rows[axis, STUCK] = bias, float(stuck)
+    def set_rate_bias(self, p: float, q: float, r: float) -> None:
+        """Move the gyro's zero, on top of the specimen's own bias [rad/s, B]."""
+        self.rate_bias = (p, q, r)
+        self._rows[:3, FAULT_BIAS] = COS * p + SIN * q, COS * q - SIN * p, r
+
+    def set_rate_range(self, rate: float) -> None:
+        """Let the gyro saturate at +-`rate` [rad/s, about the axes of S] or, if that is less, at its full scale."""
+        self.rate_range = rate
+        self._rows[:3, RANGE] = min(max(round(rate * GYRO_COUNTS), 1), COUNTS)
+
+    def freeze(self, frozen: bool) -> None:
+        """Repeat the last sample from now on, or end that."""
+        self.frozen = frozen
+        self._rows[:, STUCK] = float(frozen)

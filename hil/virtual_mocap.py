@@ -1,6 +1,6 @@
 """The motion capture cameras: noisy poses of the plant, late, sometimes missing or wrong.
 
-Computes frames only; the harness exposes at `period_us` and delivers `latency_us` later.
+Computes frames and when they arrive; the harness exposes at `period_us` and delivers.
 """
 
 from __future__ import annotations
@@ -11,10 +11,16 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.geometry import multiply, rotate
 from ground_station.mocap import MocapFrame
 from hil.plant.plant import Plant
 
 NOISE_ROWS = 512  # frames of noise drawn at once
+
+Vector = tuple[float, float, float]
+NOWHERE: Vector = (0.0, 0.0, 0.0)
+FORWARD: Vector = (1.0, 0.0, 0.0)
+HALF_TURN = (0.0, 0.0, 0.0, 1.0)  # about z, w x y z
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -49,33 +55,65 @@ class MocapConfig(BaseModel):
 
 
 class VirtualMocap:
-    """The cameras; `dropout` and `outlier` (probabilities) and `blind` may change in flight."""
+    """The cameras. Plain attributes that may change in flight:
+
+    `dropout`, `outlier` (0..1) share of frames; `wrong_by` [m] how far every position is off, in random directions;
+    `swapped_by` [m] markers are swapped: poses turned by 180 degrees about z of B and shifted along its x; 0: they are not;
+    `more_latency_us` on top of the configured one.
+    """
 
     def __init__(self, config: MocapConfig, rng: np.random.Generator) -> None:
         self._config = config
         self._rng = rng
-        (self._rng_faults,) = rng.spawn(1)  # so that faults leave the noise of the other frames as it was
+        # Streams of their own, so that faults leave the noise of the other frames as it was, and one another alone.
+        self._rng_outlier, self._rng_dropout, self._rng_wrong = rng.spawn(3)
         self._draws: list[list[float]] = []
         self.dropout = config.dropout
         self.outlier = config.outlier
-        self.blind = False
+        self.wrong_by = 0.0
+        self.swapped_by = 0.0
+        self.more_latency_us = 0.0
+        self._arrival_us = 0  # of the last frame
 
     def expose(self, now_us: int, plant: Plant) -> MocapFrame:
         """Return what the cameras see at this instant; the harness has advanced the plant to it."""
         if not self._draws:
             self._draws = self._rng.standard_normal((NOISE_ROWS, 6)).tolist()
         x, y, z, a, b, c = self._draws.pop()
-        if self.blind or (self.dropout > 0.0 and self._rng_faults.random() < self.dropout):
-            return MocapFrame(now_us, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), valid=False)
+        outlier = self.outlier > 0.0 and self._rng_outlier.random() < self.outlier
+        offset = _direction(self._rng_outlier) if outlier else NOWHERE
+        if self.dropout > 0.0 and self._rng_dropout.random() < self.dropout:
+            return MocapFrame(now_us, NOWHERE, (1.0, 0.0, 0.0, 0.0), valid=False)
         px, py, pz = plant.p_WB.tolist()
         s = self._config.position_noise
         p_WB = (px + s * x, py + s * y, pz + s * z)
-        if self.outlier > 0.0 and self._rng_faults.random() < self.outlier:
-            dx, dy, dz = self._rng_faults.standard_normal(3).tolist()
-            s = self._config.outlier_size / math.sqrt(dx * dx + dy * dy + dz * dz)
-            p_WB = (p_WB[0] + s * dx, p_WB[1] + s * dy, p_WB[2] + s * dz)
+        if outlier:
+            p_WB = _shifted(p_WB, self._config.outlier_size, offset)
+        if self.wrong_by > 0.0:
+            p_WB = _shifted(p_WB, self.wrong_by, _direction(self._rng_wrong))
         s = 0.5 * self._config.rotation_noise
-        return MocapFrame(now_us, p_WB, turned(plant.q_WB.tolist(), s * a, s * b, s * c), valid=True)
+        q_WB = turned(plant.q_WB.tolist(), s * a, s * b, s * c)
+        if self.swapped_by > 0.0:
+            p_WB = _shifted(p_WB, self.swapped_by, rotate(q_WB, FORWARD))
+            q_WB = multiply(q_WB, HALF_TURN)
+        return MocapFrame(now_us, p_WB, q_WB, valid=True)
+
+    def arrival_us(self, now_us: int) -> int:
+        """Return when the frame exposed now is at the ground station; frames do not overtake one another."""
+        latency_us = self._config.latency_us + round(self.more_latency_us)
+        self._arrival_us = max(self._arrival_us, now_us + latency_us)
+        return self._arrival_us
+
+
+def _direction(rng: np.random.Generator) -> Vector:
+    """Return a random unit vector."""
+    x, y, z = rng.standard_normal(3).tolist()
+    s = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return (s * x, s * y, s * z)
+
+
+def _shifted(p: Vector, distance: float, direction: Vector) -> Vector:
+    return (p[0] + distance * direction[0], p[1] + distance * direction[1], p[2] + distance * direction[2])
 
 
 def turned(q: list[float], a: float, b: float, c: float) -> tuple[float, float, float, float]:

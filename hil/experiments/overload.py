@@ -23,7 +23,7 @@ STEP_US = 1_500_000
 
 def steal_more_and_more(flight: Flight) -> None:
     """Plan the steps of the thief's share."""
-    thief = flight.firmware.add_thief()
+    thief = flight.thief
     for index, percent in enumerate(range(0, 101, STEP_PERCENT)):
         flight.events.at(flight.release_us + index * STEP_US, partial(_take, thief, flight, percent))
 

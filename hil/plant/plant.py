@@ -40,6 +40,7 @@ class Plant:
     Attributes (read-only numpy views of the present truth, SI):
         state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
         p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
+        servo_trim (4,) [rad] and servo_speed (4,), pushes (6,) force [N, W] and torque [N m, B]: as they were last set;
         specific_force_B (3,) at the centre of mass; flow_W (3,) air there; plate_forces_W (5, 3) base and four flaps as
         isolated plates (without the identified correction, so they do not add up to the whole force).
     """
@@ -72,6 +73,8 @@ class Plant:
 
         s[at.SERVO_TAU], s[at.SERVO_RATE], s[at.DEAD_BAND] = servos.tau, servos.rate_limit, servos.dead_band
         self._zero_offset = servos.zero_offset
+        self.servo_trim, self.servo_speed = self._view(at.SERVO_TRIM, 4), self._view(at.SERVO_SPEED, 4)
+        self.pushes = self._view(at.PUSH, 6)
         for servo in range(4):
             self.set_servo_fault(servo, servos.trim_error[servo], servos.speed[servo])
         self._counts: Sequence[int] = ()

@@ -1,0 +1,283 @@
+"""What can go wrong in a flight: for every kind of fault the knob of the world that it turns, its size, and its outcome.
+
+A size is written as people say it (deg, ms); `scale` brings it to SI. Several faults may turn one knob at once: its value
+is then what it was before the first of them, blended with the size of each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from hil.harness import Flight
+    from hil.virtual_serial import VirtualSerial
+
+Outcome = Literal["holds", "degrades", "failsafe", "lost"]
+OCCLUSION_RADIUS = 0.3  # [m] around the axis: the robot is inside the shadow wherever it is in its box
+PUSH_S = 0.1  # physics.md section 8
+
+Read = Callable[["Flight"], float]
+Turn = Callable[["Flight", float], None]
+Blend = Callable[[float, float], float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Knob:
+    """One number of the world. To `read` it builds whatever it needs; `blend` takes its value and a fault's size."""
+
+    read: Read
+    turn: Turn
+    blend: Blend
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of fault. `low` and `high` bound its size; where they are the same, there is nothing to choose.
+
+    `outcome` is that of the hover with the default profile, for the fault in `example`, begun after a second:
+
+        holds     all limits of the hover hold
+        degrades  a limit fails, the robot flies on
+        failsafe  the supervisor opens the loop for a while, the robot flies on
+        lost      the flight ends there
+    """
+
+    meaning: str
+    unit: str  # of the size
+    size: float  # default
+    low: float
+    high: float
+    knobs: tuple[Knob, ...]
+    outcome: Outcome
+    scale: float = 1.0  # from the unit to SI
+    duration_s: float = math.inf  # default; inf: to the end of the flight
+    link: str = ""  # the only one on which it acts
+
+    @property
+    def sized(self) -> bool:
+        """Whether there is a size to choose."""
+        return self.low < self.high
+
+
+def add(value: float, size: float) -> float:
+    """Both act."""
+    return value + size
+
+
+def times(value: float, size: float) -> float:
+    """One factor after the other."""
+    return value * size
+
+
+def either(value: float, size: float) -> float:
+    """The chance of one or the other."""
+    return 1.0 - (1.0 - value) * (1.0 - size)
+
+
+def _knob(owner: Callable[[Flight], object], name: str, blend: Blend) -> Knob:
+    """Return the knob that is a plain attribute."""
+    return Knob(
+        lambda flight: float(getattr(owner(flight), name)),
+        lambda flight, value: setattr(owner(flight), name, value),
+        blend,
+    )
+
+
+def _uart(flight: Flight) -> VirtualSerial:
+    assert flight.serial is not None  # the kind's link says so
+    return flight.serial.uart
+
+
+def _mocap(name: str, blend: Blend) -> Knob:
+    return _knob(lambda flight: flight.mocap, name, blend)
+
+
+def _radio(name: str, blend: Blend = either) -> Knob:
+    return _knob(lambda flight: flight.radio, name, blend)
+
+
+def _bias(axis: int) -> Knob:
+    def turn(flight: Flight, value: float) -> None:
+        bias = list(flight.imu.rate_bias)
+        bias[axis] = value
+        flight.imu.set_rate_bias(*bias)
+
+    return Knob(lambda flight: flight.imu.rate_bias[axis], turn, add)
+
+
+def _trim(servo: int) -> Knob:
+    return Knob(
+        lambda flight: float(flight.plant.servo_trim[servo]),
+        lambda flight, value: flight.plant.set_servo_fault(servo, value, flight.plant.servo_speed[servo]),
+        add,
+    )
+
+
+def _pace(servo: int) -> Knob:
+    return Knob(
+        lambda flight: float(flight.plant.servo_speed[servo]),
+        lambda flight, value: flight.plant.set_servo_fault(servo, flight.plant.servo_trim[servo], value),
+        times,
+    )
+
+
+def _side_wind(axis: int) -> Knob:
+    def turn(flight: Flight, value: float) -> None:
+        wind = list(flight.plant.tunnel.side_wind)
+        wind[axis] = max(-20.0, min(value, 20.0))
+        flight.plant.tunnel.set_side_wind(*wind)
+
+    return Knob(lambda flight: flight.plant.tunnel.side_wind[axis], turn, add)
+
+
+def _push(part: int) -> Knob:
+    def turn(flight: Flight, value: float) -> None:
+        pushes = flight.plant.pushes.tolist()
+        pushes[part] = value
+        flight.plant.push(pushes[:3], pushes[3:])
+
+    return Knob(lambda flight: float(flight.plant.pushes[part]), turn, add)
+
+
+UPLINK_LOSS, DOWNLINK_LOSS = _radio("uplink_loss"), _radio("downlink_loss")
+RADIO_BITS = (_radio("uplink_bit_error_rate"), _radio("downlink_bit_error_rate"))
+SERIAL_BITS = (_knob(_uart, "uplink_bit_error_rate", either), _knob(_uart, "downlink_bit_error_rate", either))
+CABLE = Knob(
+    lambda flight: float(_uart(flight).connected),
+    lambda flight, value: setattr(_uart(flight), "connected", value > 0.5),
+    times,
+)
+GYRO_NOISE = Knob(
+    lambda flight: flight.imu.noise_scale,
+    lambda flight, value: flight.imu.set_noise_scale(min(value, 1000.0)),
+    times,
+)
+GYRO_RANGE = Knob(
+    lambda flight: flight.imu.rate_range, lambda flight, value: flight.imu.set_rate_range(value), min
+)
+FREEZE = Knob(
+    lambda flight: float(flight.imu.frozen), lambda flight, value: flight.imu.freeze(value > 0.5), max
+)
+FANS = Knob(
+    lambda flight: flight.plant.tunnel.fan_factor,
+    lambda flight, value: flight.plant.tunnel.set_fan_factor(min(value, 2.0)),
+    times,
+)
+SHADOW = Knob(
+    lambda flight: flight.plant.tunnel.shadow,
+    lambda flight, value: flight.plant.tunnel.block(0.0, 0.0, OCCLUSION_RADIUS, value),
+    either,
+)
+GUSTS = Knob(
+    lambda flight: flight.plant.tunnel.gust_scale,
+    lambda flight, value: flight.plant.tunnel.set_gust_scale(min(value, 5.0)),
+    times,
+)
+LOAD = _knob(lambda flight: flight.thief, "share", lambda value, size: min(value + size, 1.0))
+SAG = _knob(lambda flight: flight.board, "sag_V", add)
+PACES = tuple(_pace(servo) for servo in range(4))
+
+DEG = math.radians(1.0)
+MS = 1e3  # us: times stay whole microseconds
+
+KINDS: Mapping[str, Kind] = {
+    "mocap.dropout": Kind(
+        "share of the frames in which the body is not tracked", "", 1.0, 0.0, 1.0,
+        (_mocap("dropout", either),), "failsafe",
+    ),
+    "mocap.outlier": Kind(
+        "every frame is this far off, each in a direction of its own", "m", 0.3, 0.0, 5.0,
+        (_mocap("wrong_by", max),), "failsafe",
+    ),
+    "mocap.swap": Kind(
+        "markers swapped: every pose is turned by 180 deg about z and shifted by this along x of B", "m", 0.1, 0.001, 1.0,
+        (_mocap("swapped_by", max),), "lost",
+    ),
+    "mocap.latency": Kind(
+        "the cameras' computer needs this much longer", "ms", 40.0, 0.0, 500.0,
+        (_mocap("more_latency_us", add),), "holds", MS,
+    ),
+    "radio.loss": Kind(
+        "packets lost on the air, per try, both ways", "", 0.5, 0.0, 1.0,
+        (UPLINK_LOSS, DOWNLINK_LOSS), "holds", link="radio",
+    ),
+    "radio.uplink_loss": Kind(
+        "packets to the board lost on the air, per try", "", 0.5, 0.0, 1.0, (UPLINK_LOSS,), "holds", link="radio"
+    ),
+    "radio.downlink_loss": Kind(
+        "answers of the board lost on the air, per try", "", 0.5, 0.0, 1.0, (DOWNLINK_LOSS,), "holds", link="radio"
+    ),
+    "radio.bit_errors": Kind(
+        "wrong bits on the air, both ways; one of them costs the packet", "", 1e-3, 0.0, 0.5, RADIO_BITS, "holds",
+        link="radio",
+    ),
+    "radio.jitter": Kind(
+        "packets to the board wait up to this long at the host", "ms", 15.0, 0.0, 500.0,
+        (_radio("uplink_jitter_us", add),), "holds", MS, link="radio",
+    ),
+    "radio.cut": Kind(
+        "nothing passes, either way", "", 1.0, 1.0, 1.0, (UPLINK_LOSS, DOWNLINK_LOSS), "failsafe", link="radio"
+    ),
+    "serial.bit_errors": Kind(
+        "wrong bits on the line, both ways", "", 1e-4, 0.0, 0.5, SERIAL_BITS, "holds", link="mavlink"
+    ),
+    "serial.cut": Kind("the cable is out", "", 0.0, 0.0, 0.0, (CABLE,), "failsafe", link="mavlink"),
+    **{
+        f"imu.bias.{name}": Kind(
+            f"the gyro's zero about {axis} has moved", "deg/s", 5.0, -200.0, 200.0, (_bias(index),), "holds", DEG
+        )
+        for index, (name, axis) in enumerate(zip("pqr", "xyz", strict=True))
+    },
+    "imu.noise": Kind(
+        "factor on the white noise of gyro and accelerometer", "", 10.0, 0.0, 1000.0, (GYRO_NOISE,), "holds"
+    ),
+    "imu.saturation": Kind(
+        "the gyro's range ends here", "deg/s", 20.0, 1.0, 2000.0, (GYRO_RANGE,), "holds", DEG
+    ),
+    "imu.freeze": Kind("the IMU repeats its last sample", "", 1.0, 1.0, 1.0, (FREEZE,), "holds"),
+    **{
+        f"servo.stuck.{number}": Kind(
+            f"flap {number} stays where it is", "", 0.0, 0.0, 0.0, (PACES[number - 1],), "lost"
+        )
+        for number in (1, 2, 3, 4)
+    },
+    **{
+        f"servo.slow.{number}": Kind(
+            f"factor on the pace of servo {number}", "", 0.5, 0.01, 4.0, (PACES[number - 1],), "holds"
+        )
+        for number in (1, 2, 3, 4)
+    },
+    **{
+        f"servo.trim.{number}": Kind(
+            f"flap {number} stands this far from its command", "deg", 5.0, -45.0, 45.0, (_trim(number - 1),), "holds",
+            DEG,
+        )
+        for number in (1, 2, 3, 4)
+    },
+    "wind.side_x": Kind("side wind along x of W", "m/s", 0.25, -20.0, 20.0, (_side_wind(0),), "holds"),
+    "wind.side_y": Kind("side wind along y of W", "m/s", 2.0, -20.0, 20.0, (_side_wind(1),), "degrades"),
+    "wind.fan": Kind("factor on all that the fans blow", "", 0.95, 0.0, 2.0, (FANS,), "lost"),
+    "wind.occlusion": Kind(
+        "share of the flow that something below the robot takes away", "", 0.2, 0.0, 1.0, (SHADOW,), "lost"
+    ),
+    "wind.gusts": Kind("factor on the gusts", "", 2.0, 0.0, 5.0, (GUSTS,), "degrades"),
+    **{
+        f"push.{axis}": Kind(
+            f"force along {axis} of W", "N", 1.0, -20.0, 20.0, (_push(part),), "holds", duration_s=PUSH_S
+        )
+        for part, axis in enumerate("xyz")
+    },
+    **{
+        f"push.{angle}": Kind(
+            f"torque about {axis} of B", "N m", 0.02, -1.0, 1.0, (_push(3 + part),), "holds", duration_s=PUSH_S
+        )
+        for part, (angle, axis) in enumerate(zip(("roll", "pitch", "yaw"), "xyz", strict=True))
+    },
+    "cpu.load": Kind(
+        "share of every tick that a task above all others takes", "", 0.3, 0.0, 1.0, (LOAD,), "holds"
+    ),
+    "battery.sag": Kind("the supply is this much lower", "V", 1.0, 0.0, 4.0, (SAG,), "failsafe"),
+}  # fmt: skip
