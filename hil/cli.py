@@ -14,7 +14,7 @@ from rich.console import Console
 
 from hil.board_cli import board, station
 from hil.errors import LabError
-from hil.paper_cli import compare
+from hil.paper_cli import compare, paper, study
 
 if TYPE_CHECKING:
     from hil.harness import Flight
@@ -363,6 +363,8 @@ def _refuse(text: str) -> int:
 app.add_command(board)
 app.add_command(station)
 app.add_command(compare)
+app.add_command(paper)
+app.add_command(study)
 
 if __name__ == "__main__":
     main()

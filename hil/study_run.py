@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.experiments import find_experiment
+from hil.faults import parse
 from hil.run import Request, Result
 from hil.studies import Study, Variant
 
@@ -83,14 +84,12 @@ def flights_of(study: Study, seeds: int) -> Iterator[tuple[Variant, float, Reque
     for variant in study.variants:
         for size in study.sizes:
             change = variant.change(size)
-            settings = (*variant.settings, *change.settings)
+            settings, faults = (*variant.settings, *change.settings), tuple(map(parse, change.faults))
             for seed in range(1, seeds + 1):
                 yield (
                     variant,
                     size,
-                    Request.of(
-                        experiment, variant.profile, settings, seed, study.duration_s, faults=change.faults
-                    ),
+                    Request.of(experiment, variant.profile, settings, seed, study.duration_s, faults=faults),
                 )
 
 

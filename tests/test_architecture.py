@@ -59,7 +59,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
         "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
         "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
         "hil/picture.py", "hil/experiments/experiment.py",
-        "hil/compare.py", "hil/overlays.py", "hil/paper.py",
+        "hil/compare.py", "hil/overlays.py",
     ),
 }  # fmt: skip
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library
