@@ -29,7 +29,7 @@ ROWS: Mapping[str, Row] = {
         {
             "in_box": "always",
             "within_6cm_x": "mostly", "within_6cm_y": "mostly", "within_6cm_z": "mostly",
-            "attitude_max": "< 20", "rms_x": "", "rms_y": "", "rms_z": "", "y_over_x": "> 1",
+            "attitude_max": "< 20 deg", "rms_x": "", "rms_y": "", "rms_z": "", "y_over_x": "> 1",
         },
         "y is the worst axis with the author's gains only: they leave the y loop at +0.26 ± 4.9i, a limit cycle of "
         "0.8 Hz. With roll gains that damp it (floaty) y becomes the best axis.",

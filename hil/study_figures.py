@@ -7,14 +7,13 @@ import numpy as np
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from hil import curves
 from hil.figures import WIDTH, png
 from hil.study_run import OUTCOMES, StudyResult
 
-COLOURS = dict(
-    zip(OUTCOMES, (curves.GREEN, curves.YELLOW, curves.ORANGE, curves.RED, curves.GREY), strict=True)
-)
+COLOURS = dict(zip(OUTCOMES, (curves.GREEN, curves.YELLOW, curves.SKY, curves.RED, curves.GREY), strict=True))
 SHORT = {"holds": "holds", "degrades": "degr.", "failsafe": "f-safe", "lost": "lost", "error": "error"}
 STYLES = ("-", "--", ":")
 
@@ -42,6 +41,9 @@ def _draw(result: StudyResult) -> Figure:
             places, [e.min() for e in errors], [e.max() for e in errors], color=colour, alpha=0.12, linewidth=0
         )  # fmt: skip
     above.set_yscale("log")
+    above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    above.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    above.yaxis.set_minor_formatter(NullFormatter())
     above.set_ylabel("rms distance\nfrom the goal [cm]")
     above.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     for row, curve in enumerate(flown):
