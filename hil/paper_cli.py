@@ -68,9 +68,11 @@ def study(name: str, seeds: int, out: Path | None) -> int:
 
 
 def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path) -> int:
+    from hil.cli import announce_compilation
     from hil.paper import fly_paper
     from hil.paper_report import write_paper
 
+    announce_compilation()
     try:
         out.mkdir(parents=True, exist_ok=True)
         flown = fly_paper(rows, studies, seeds, out, notices)

@@ -39,6 +39,9 @@ class Expected:
 
     holds_to: float | None = None  # every seed holds the experiment's limits up to this size
     flies_to: float | None = None  # no seed is lost up to this size
+    failsafe_from: float | None = (
+        None  # the supervisor opens the loop, or the robot is lost, from this size on
+    )
     lost_from: float | None = None  # every seed is lost from this size on
 
     def text(self, unit: str) -> str:
@@ -46,6 +49,7 @@ class Expected:
         parts = (
             ("holds the limits up to", self.holds_to),
             ("is not lost up to", self.flies_to),
+            ("is stopped by the supervisor from", self.failsafe_from),
             ("is lost from", self.lost_from),
         )
         return ", ".join(f"{words} {size:g} {unit}".strip() for words, size in parts if size is not None)

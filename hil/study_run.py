@@ -10,10 +10,10 @@ import numpy as np
 from hil.experiments import find_experiment
 from hil.faults import parse
 from hil.run import Request, Result
-from hil.studies import Study, Variant
+from hil.studies import Expected, Study, Variant
 
 OUTCOMES = ("holds", "degrades", "failsafe", "lost", "error")  # from good to bad
-LOST = OUTCOMES.index("lost")
+HOLDS, FAILSAFE, LOST = (OUTCOMES.index(name) for name in ("holds", "failsafe", "lost"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,18 +57,22 @@ class StudyResult:
 
     def surprises(self, curve: Curve) -> list[str]:
         """Return the cells of a curve that are not what was expected of its variant."""
-        expected, place = curve.variant.expected, self.study.sizes.index
         found = []
         for cell in curve.cells:
-            best, worst = cell.ranks[0], cell.ranks[-1]
-            as_expected = (
-                (expected.holds_to is None or place(cell.size) > place(expected.holds_to) or worst == 0)
-                and (expected.flies_to is None or place(cell.size) > place(expected.flies_to) or worst < LOST)
-                and (expected.lost_from is None or place(cell.size) < place(expected.lost_from) or best == worst == LOST)
-            )  # fmt: skip
-            if not as_expected:
-                found.append(f"{cell.size:g} {self.study.unit}: {cell.text}")
+            if not all(self._bounds(curve.variant.expected, cell)):
+                found.append(f"{cell.size:g} {self.study.unit}".strip() + f": {cell.text}")
         return found
+
+    def _bounds(self, expected: Expected, cell: Cell) -> Iterator[bool]:
+        """Yield whether a cell keeps each bound that concerns it."""
+        sizes, best, worst = self.study.sizes, cell.ranks[0], cell.ranks[-1]
+        place = sizes.index(cell.size)
+        for last, allowed in ((expected.holds_to, HOLDS), (expected.flies_to, FAILSAFE)):
+            if last is not None and place <= sizes.index(last):
+                yield worst <= allowed
+        for first, needed in ((expected.failsafe_from, FAILSAFE), (expected.lost_from, LOST)):
+            if first is not None and place >= sizes.index(first):
+                yield needed <= best and worst <= LOST
 
     @property
     def holds(self) -> bool:

@@ -37,7 +37,7 @@ def test_every_flight_of_every_study_can_be_asked_for(study: Study) -> None:
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
 def test_something_is_expected_of_every_variant_and_only_of_sizes_that_are_flown(study: Study) -> None:
     for variant in study.variants:
-        said = {variant.expected.holds_to, variant.expected.flies_to, variant.expected.lost_from} - {None}
+        said = set(dataclasses.astuple(variant.expected)) - {None}
         assert said, variant.name
         assert said <= set(study.sizes), variant.name
 
@@ -111,6 +111,8 @@ def judged(expected: Expected, *cells: str) -> list[str]:
         (Expected(lost_from=2), ("hh", "ll", "ll"), []),
         (Expected(lost_from=2), ("hh", "ll", "lf"), ["3 m: 1 failsafe, 1 lost"]),
         (Expected(lost_from=2), ("hh", "ee", "ll"), ["2 m: 2 error"]),
+        (Expected(failsafe_from=2), ("hh", "ff", "fl"), []),
+        (Expected(failsafe_from=2), ("hh", "fd", "ll"), ["2 m: 1 degrades, 1 failsafe"]),
         (Expected(holds_to=1, lost_from=3), ("hh", "dl"), []),
     ],
 )
