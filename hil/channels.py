@@ -10,6 +10,7 @@ from firmware_py.firmware import DEADLINES_US, Firmware
 from firmware_py.signals import COUNTERS
 from ground_station.trajectory import Trajectory
 from hil.faults import Fault
+from hil.plant.battery import Battery
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Quantity
 from hil.virtual_board import VirtualBoard
@@ -32,6 +33,19 @@ def radio_channel(radio: VirtualRadio) -> Channel:
         ),
         (quantity("link", names), quantity("link", "up_latency_sum down_latency_sum", "us")),
     )  # fmt: skip
+
+
+def battery_channel(battery: Battery) -> Channel:
+    """Return voltage of a cell, power and charge of the battery."""
+    return Channel(
+        "float32",
+        lambda: (battery.voltage, battery.power, battery.charge),
+        (
+            quantity("battery", "voltage", "V"),
+            quantity("battery", "power", "W"),
+            quantity("battery", "charge"),
+        ),
+    )
 
 
 def fault_channel(active: Sequence[Fault]) -> Channel:

@@ -1,4 +1,4 @@
-"""The command line: `floaty fly | list | view | report`.
+"""The command line: `floaty fly | list | view | report | drag-model`.
 
 Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C in 130 with the log kept.
 """
@@ -139,6 +139,7 @@ def list_experiments(faults: bool) -> None:
     for one in STUDIES.values():
         console.print(f"{one.name:{width}}  {one.question}", soft_wrap=True)
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
+    console.print(f"{'drag-model':{width}}  forces on the mounted robot over flap angles: floaty drag-model")
     console.print(f"\nprofiles: {', '.join(names)}")
 
 
@@ -176,6 +177,45 @@ def report(run: Path) -> None:
     from hil.report import write_report
 
     console.print(f"report  {write_report(run)}")
+
+
+@app.command("drag-model")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=1, show_default=True, help="Of everything random."
+)
+@click.option("--profile", default="floaty", show_default=True, metavar="NAME|FILE", help="As for fly.")
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
+    help="Override a value of the profile; repeatable.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("runs/drag-model"),
+    show_default=True,
+    metavar="DIR",
+)
+def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -> None:
+    """Measure forces and torques on the mounted robot over flap angles, against the paper's simplified model."""
+    from rich.progress import track
+
+    from hil import drag_model, drag_model_report
+    from hil.config import load_config
+
+    config = load_config(profile, overrides)
+    announce_compilation()
+    measured = drag_model.measure(config, seed)
+    rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        drag_model.write_csv(rows, out / "drag_model.csv")
+        page = drag_model_report.write(rows, math.degrees(config.plant.hover_angle), out)
+    except OSError as error:
+        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
+    console.print(f"report  {page}")
 
 
 def announce_compilation() -> None:

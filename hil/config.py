@@ -16,6 +16,7 @@ from pydantic_core import ErrorDetails
 from firmware_py.config import FirmwareConfig
 from ground_station.station import StationConfig
 from hil.errors import LabError
+from hil.plant.battery import BatteryConfig
 from hil.plant.config import PlantConfig, ServoConfig
 from hil.tunnel import TunnelConfig
 from hil.virtual_imu import ImuConfig
@@ -51,6 +52,7 @@ class LabConfig(FirmwareConfig):
 
     plant: PlantConfig = Field(default_factory=PlantConfig)
     actuators: ServoConfig = Field(default_factory=ServoConfig)
+    battery: BatteryConfig = Field(default_factory=BatteryConfig)
     tunnel: TunnelConfig = Field(default_factory=TunnelConfig)
     imu: ImuConfig = Field(default_factory=ImuConfig)
     mocap: MocapConfig = Field(default_factory=MocapConfig)

@@ -178,7 +178,7 @@ GUSTS = Knob(
     times,
 )
 LOAD = _knob(lambda flight: flight.thief, "share", lambda value, size: min(value + size, 1.0))
-SAG = _knob(lambda flight: flight.board, "sag_V", add)
+SAG = _knob(lambda flight: flight.battery, "sag_V", add)
 PACES = tuple(_pace(servo) for servo in range(4))
 
 DEG = math.radians(1.0)

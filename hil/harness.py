@@ -20,13 +20,14 @@ from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Goal
-from hil.channels import fault_channel, flight_channels, radio_channel
+from hil.channels import battery_channel, fault_channel, flight_channels, radio_channel
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.experiments import Experiment
 from hil.faults import Fault, plan
+from hil.plant.battery import Battery
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Recorder
 from hil.schedule import WINDOW_US, ScheduleTrace
@@ -117,6 +118,7 @@ class Flight:
             config.plant, config.tunnel, config.actuators, streams.gusts,
             (home[0] + offset[0], home[1] + offset[1], home[2] + offset[2]),
         )  # fmt: skip
+        self.battery: Battery = Battery(config.battery)
         self.imu = VirtualImu(config.imu, streams.imu)
         self.mocap = VirtualMocap(config.mocap, streams.mocap)
         self.radio = VirtualRadio(config.radio, self.events, streams.radio)
@@ -130,6 +132,7 @@ class Flight:
         self.station = GroundStation(end, self.trajectory, self.telemetry, config.station)
         uart = self.serial.uart if self.serial else None
         self.board = VirtualBoard(self.plant.set_counts, self.radio.downlink, self._console, uart)
+        self.board.battery_mv = self.battery.millivolts
         self.firmware = Firmware(config, self.board, mavlink=link == MAVLINK)
         self.board.run_on(self.firmware.kernel, self.events)
         self.radio.connect(self._radio_to_board, self.station.on_packet)
@@ -160,7 +163,8 @@ class Flight:
         channels = flight_channels(
             self.plant, self.board, self.firmware, link, self.trajectory, lambda: self.free
         )
-        return (*channels, fault_channel(self.active_faults)) if self.faults else channels
+        faults = (fault_channel(self.active_faults),) if self.faults else ()
+        return (*channels, battery_channel(self.battery), *faults)
 
     @cached_property
     def thief(self) -> Thief:
@@ -220,6 +224,8 @@ class Flight:
 
     def _record(self, now_us: int) -> None:
         self.plant.advance(now_us)
+        self.battery.draw(now_us, self.plant.flap_travel)
+        self.board.battery_mv = self.battery.millivolts
         if self.recorder is not None:
             self.recorder.row(now_us)
         self.firmware.check_watchdog()

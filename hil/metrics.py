@@ -30,7 +30,12 @@ class Metric:
         return f"{value * scale:.4g} {unit}".strip()
 
 
-SHOWN = {"m": (100.0, "cm"), "rad": (180.0 / np.pi, "deg"), "share": (100.0, "%")}
+SHOWN = {
+    "m": (100.0, "cm"),
+    "rad": (180.0 / np.pi, "deg"),
+    "rad/s": (180.0 / np.pi, "deg/s"),
+    "share": (100.0, "%"),
+}
 
 METRICS: Mapping[str, Metric] = {
     "lost": Metric("", "max", "1 when the flight ended as a crash"),
@@ -47,6 +52,24 @@ METRICS: Mapping[str, Metric] = {
     "in_box": Metric("share", "min", "share of the time inside the 20 cm box around the goal"),
     "attitude_max": Metric("rad", "max", "largest roll, pitch or yaw error"),
     "y_over_x": Metric("", "min", "rms of y over rms of x"),
+    "settle": Metric("s", "max", "from a step of the goal until the error stays within 5 % of it"),
+    "rise": Metric("s", "max", "from a step of the goal to 90 % of it, the slowest"),
+    "overshoot": Metric("share", "max", "largest way beyond a step of the goal, of the step"),
+    "hold_rms": Metric("m", "max", "root mean square of the y error in the last 3 s before a step"),
+    "peak_rate": Metric("rad/s", "min", "largest yaw rate"),
+    "gain": Metric("", "min", "amplitude of the sine flown over that of the goal"),
+    "lag": Metric("rad", "max", "phase by which the sine flown is behind the goal"),
+    "rms_yaw": Metric("rad", "max", "root mean square of the yaw error"),
+    "recovered": Metric(
+        "", "min", "disturbances after which the robot was back in the 20 cm box before the next"
+    ),
+    "excursion": Metric("m", "max", "largest error on an axis from the first disturbance on"),
+    "back_in_box": Metric(
+        "s", "max", "longest time after a disturbance until the robot stays in the 20 cm box"
+    ),
+    "wind_offset": Metric("m", "max", "mean error along the wind in its last 5 s"),
+    "height_off": Metric("m", "max", "mean error in height over the second half of the flight"),
+    "as_computed": Metric("", "min", "1 when the height is held exactly if the lift of the flaps allows it"),
     "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
     "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
@@ -58,6 +81,18 @@ METRICS: Mapping[str, Metric] = {
         "share", "min", "thief's load at which STABILIZER first misses a deadline"
     ),
     "held_up_to": Metric("share", "min", "thief's load up to which the robot stays inside the 20 cm box"),
+    "power": Metric("W", "max", "mean power from the battery"),
+    "specific_power": Metric("W/kg", "max", "that power over the robot's mass"),
+    "endurance": Metric("min", "min", "flight until the supervisor finds the battery empty"),
+    "lift_off": Metric("s", "max", "from the controller's start until the robot is 2 cm off the net"),
+    "reached_box": Metric(
+        "s", "max", "from the start of the flight speed until the robot is in the 20 cm box"
+    ),
+    "hover_in_box": Metric("share", "min", "from then to the landing speed: share of the time in that box"),
+    "touch_down_speed": Metric(
+        "m/s", "max", "fastest descent in the last 0.1 s before the feet touch the net"
+    ),
+    "landed_off_axis": Metric("m", "max", "distance from the tunnel's axis at the end"),
 }
 
 

@@ -42,7 +42,6 @@ class VirtualBoard:
     ) -> None:
         self.imu: ImuCounts = STILL
         self.battery_mv = 3900
-        self.sag_V = 0.0  # a fault
         self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
         self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
         self._servo = servo
@@ -67,7 +66,7 @@ class VirtualBoard:
 
     def read_battery_mv(self) -> int:
         """Return the supply voltage."""
-        return max(0, self.battery_mv - round(1000.0 * self.sag_V))
+        return self.battery_mv
 
     def write_compare(self, counts: Sequence[int]) -> None:
         """Hand the compare counts to the servo timers."""

@@ -54,12 +54,16 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "motioncapture": (),
     "scipy": (),
     "perfetto": ("hil/perfetto.py",),
-    "matplotlib": ("hil/figures.py", "hil/picture.py", "hil/overlays.py", "hil/study_figures.py"),
+    "matplotlib": (
+        "hil/figures.py", "hil/picture.py", "hil/overlays.py", "hil/study_figures.py", "hil/drag_model_report.py", "hil/power_figures.py",
+        "hil/experiments/pictures.py", "hil/experiments/power.py", "hil/experiments/take_off.py",
+    ),
     "pyarrow": (
-        "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
+        "hil/compare.py", "hil/overlays.py", "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
         "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
-        "hil/picture.py", "hil/experiments/experiment.py",
-        "hil/compare.py", "hil/overlays.py",
+        "hil/picture.py", "hil/power_figures.py", "hil/experiments/experiment.py", "hil/experiments/measures.py",
+        "hil/experiments/pictures.py", "hil/experiments/airspeed.py", "hil/experiments/power.py",
+        "hil/experiments/take_off.py",
     ),
 }  # fmt: skip
 SUBSET = "firmware_py/core/subset.py"  # the border of the subset: it may use the standard library

@@ -8,6 +8,7 @@ written down for flap 2 in the quadrant (+,+); the others are mirror images.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +29,17 @@ def _turning(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([along, vector - along, np.cross(AXIS, vector)])
 
 
-def place_plates(s: State, config: PlantConfig) -> None:
-    """Write the areas, normals and centres of pressure of all plates, and the hover angles."""
+@dataclass(frozen=True, slots=True)
+class Plate:
+    """A part of flap 2 when the flap is level; its flap axis goes through the origin, other flaps are mirror images."""
+
+    area: float  # [m2]
+    normal: NDArray[np.float64]  # (3,) in B
+    centre: NDArray[np.float64]  # (3,) [m] of pressure
+
+
+def flap_plates(config: PlantConfig) -> tuple[Plate, Plate]:
+    """Return the flat part and the kinked strip of flap 2."""
     side, corner = config.footprint / 2, config.base_side / 2
     width, kink = config.strip_width, config.kink_angle
     quadrant, strip = side**2 - corner**2, width * side
@@ -37,19 +47,25 @@ def place_plates(s: State, config: PlantConfig) -> None:
     moment = (side**3 - corner**3) / 2  # of the quadrant without its corner, about either side
     flat_centre = np.array([moment - strip * side / 2, moment - strip * (side - width / 2), 0.0]) / flat
     strip_centre = np.array([side / 2, side - width + width / 2 * math.cos(kink), width / 2 * math.sin(kink)])
-    normals = _turning(np.array([0.0, 0.0, 1.0])), _turning(np.array([0.0, -math.sin(kink), math.cos(kink)]))
-    centres = _turning(flat_centre), _turning(strip_centre)
+    return (
+        Plate(flat, np.array([0.0, 0.0, 1.0]), flat_centre),
+        Plate(strip, np.array([0.0, -math.sin(kink), math.cos(kink)]), strip_centre),
+    )
 
+
+def place_plates(s: State, config: PlantConfig) -> None:
+    """Write the areas, normals and centres of pressure of all plates, and the hover angles."""
     s[at.BASE_AREA] = config.base_side**2
     s[at.AXIS_HEIGHT] = config.axis_height
     s[at.HOVER_FLAPS : at.HOVER_FLAPS + 4] = SIGNS * config.hover_angle
     lift = np.array([[0.0, 0.0, config.axis_height], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    parts = flap_plates(config)
     for flap in range(4):
         s[at.FLOW_POINTS + 2 * flap : at.FLOW_POINTS + 2 * flap + 2] = config.flow_point * MIRRORS[flap, :2]
-        for part in range(2):
-            plate = 2 * flap + part
-            n = MIRRORS[flap] * normals[part]
-            r = MIRRORS[flap] * centres[part] + lift
-            s[at.AREA + plate] = (flat, strip)[part]
+        for index, part in enumerate(parts):
+            plate = 2 * flap + index
+            n = MIRRORS[flap] * _turning(part.normal)
+            r = MIRRORS[flap] * _turning(part.centre) + lift
+            s[at.AREA + plate] = part.area
             s[at.NORMAL + 9 * plate : at.NORMAL + 9 * plate + 9] = n.ravel()
             s[at.CENTRE + 9 * plate : at.CENTRE + 9 * plate + 9] = r.ravel()

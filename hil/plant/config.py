@@ -38,6 +38,25 @@ class TetherConfig(BaseModel):
     )
 
 
+class GroundConfig(BaseModel):
+    """The net over the tunnel's exit and the robot's four feet on it; the paper names neither: all chosen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    height: float = Field(0.0, ge=-2, le=2, description="z of the net in W [m]; the tunnel's exit; chosen")
+    foot_spread: float = Field(
+        0.06, gt=0, le=0.3, description="|x| = |y| of each foot in B [m]; beyond the base plate; chosen"
+    )
+    foot_below: float = Field(
+        0.05, gt=0, le=0.3, description="feet below the centre of mass [m]; under the batteries; chosen"
+    )
+    stiffness: float = Field(
+        800.0, gt=0, le=5000, description="under one foot [N/m]; chosen: 1 mm under the weight"
+    )
+    damping: float = Field(8.0, ge=0, le=50, description="under one foot [N s/m]; chosen: half of critical")
+    friction: float = Field(0.5, ge=0, le=2, description="coefficient [1]; chosen")
+
+
 class LimitsConfig(BaseModel):
     """Where a flight counts as lost."""
 
@@ -47,7 +66,7 @@ class LimitsConfig(BaseModel):
         0.45, gt=0, le=0.6, description="from the tunnel's axis [m]; half the flow is left (section 6)"
     )
     below: float = Field(
-        0.8, gt=0, le=1.1, description="below the hover point [m]; section 8 has recoveries from 0.65"
+        0.8, gt=0, le=1.2, description="below the hover point [m]; section 8 has recoveries from 0.65"
     )
     above: float = Field(
         0.85, gt=0, le=5, description="above the hover point [m]; paper: cameras see 2 m over the tunnel"
@@ -105,6 +124,7 @@ class PlantConfig(BaseModel):
         {}, description="true over tabulated value of single constants of a corrected variant"
     )
     tether: TetherConfig = Field(default_factory=TetherConfig)
+    ground: GroundConfig = Field(default_factory=GroundConfig)
     limits: LimitsConfig = Field(default_factory=LimitsConfig)
 
     @model_validator(mode="after")

@@ -70,6 +70,7 @@ def calm(s: State, speed: float) -> State:
     c[at.SPEED], c[at.PROFILE_RADIUS], c[at.FAN] = speed, math.inf, 1.0
     c[at.HEIGHT_SLOPE] = c[at.GUST_SCALE] = c[at.OCCLUSION + 3] = c[at.HELD] = 0.0
     c[at.TETHER_LENGTH] = math.inf
+    c[at.NET_HEIGHT] = -math.inf
     return c
 
 

@@ -25,6 +25,7 @@ Q = _take(4)  # q_WB, w x y z
 OMEGA = _take(3)  # [rad/s] of B against W, in B
 FLAPS = _take(4)  # [rad] signed flap angles
 GUSTS = _take(14)  # [m/s] fast u v w, slow u v w, four flaps fast, four flaps slow
+TRAVEL = _take()  # [rad] all flaps together have turned since the start
 NOISE_ROW = _take()  # next row of the block of normal draws
 
 # Computed from the state by `drag`
@@ -42,6 +43,7 @@ ACC = _take(3)  # [m/s2] of the centre of mass, in W, gravity included
 ALPHA = _take(3)  # [rad/s2] in B
 SPECIFIC_FORCE = _take(3)  # [m/s2] what an accelerometer at the centre of mass feels, in B
 PULL = _take(3)  # [N] of the tether, in W
+GROUND = _take(6)  # force [N] of the net, in W, and its torque [N m], in B
 
 # Servos
 COMMAND = _take(4)  # [rad] commanded angles in force
@@ -108,11 +110,18 @@ PITCH_RATE = _take()
 YAW_INPUT = _take()
 YAW_RATE = _take()
 
-# Tether and limits
+# Tether, net and limits
 TETHER_ANCHOR = _take(3)  # [m] in W
 TETHER_LENGTH = _take()
 TETHER_STIFFNESS = _take()
 TETHER_DAMPING = _take()
+NET_HEIGHT = _take()  # [m] z of the net in W
+NET_STIFFNESS = _take()  # [N/m] under one foot
+NET_DAMPING = _take()  # [N s/m]
+FRICTION = _take()
+FOOT_SPREAD = _take()  # [m] |x| = |y| of a foot in B
+FOOT_BELOW = _take()  # [m] below the centre of mass
+FOOT_REACH = _take()  # [m] from the centre of mass
 LIMIT_RADIUS = _take()
 LIMIT_BELOW = _take()
 LIMIT_ABOVE = _take()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hil.plant import layout as at
 from hil.plant.compiled import compiled
+from hil.plant.ground import stand
 from hil.plant.plates import State, drag
 
 GRAVITY = 9.81  # [m/s2]
@@ -41,13 +42,14 @@ def evaluate(s: State) -> None:
     """Compute forces and accelerations from state, inputs and constants."""
     drag(s)
     pull(s)
-    r, f, m = at.R, at.DRAG, s[at.MASS]
+    stand(s)
+    r, f, g, m = at.R, at.DRAG, at.GROUND, s[at.MASS]
     if s[at.HELD] != 0.0:  # the clamp carries what is missing
         s[at.ACC] = s[at.ACC + 1] = s[at.ACC + 2] = 0.0
     else:
         for i in range(3):
             force = s[r + 3 * i] * s[f] + s[r + 3 * i + 1] * s[f + 1] + s[r + 3 * i + 2] * s[f + 2]
-            s[at.ACC + i] = (force + s[at.PUSH + i] + s[at.PULL + i]) / m
+            s[at.ACC + i] = (force + s[at.PUSH + i] + s[at.PULL + i] + s[g + i]) / m
         s[at.ACC + 2] -= GRAVITY
     ax, ay, az = s[at.ACC], s[at.ACC + 1], s[at.ACC + 2] + GRAVITY
     for i in range(3):
@@ -55,9 +57,9 @@ def evaluate(s: State) -> None:
 
     px, py, pz = s[at.PULL], s[at.PULL + 1], s[at.PULL + 2]
     lever = s[at.AXIS_HEIGHT]
-    mx = s[f + 3] + s[at.PUSH_TORQUE] - lever * (s[r + 1] * px + s[r + 4] * py + s[r + 7] * pz)
-    my = s[f + 4] + s[at.PUSH_TORQUE + 1] + lever * (s[r] * px + s[r + 3] * py + s[r + 6] * pz)
-    mz = s[f + 5] + s[at.PUSH_TORQUE + 2]
+    mx = s[f + 3] + s[at.PUSH_TORQUE] + s[g + 3] - lever * (s[r + 1] * px + s[r + 4] * py + s[r + 7] * pz)
+    my = s[f + 4] + s[at.PUSH_TORQUE + 1] + s[g + 4] + lever * (s[r] * px + s[r + 3] * py + s[r + 6] * pz)
+    mz = s[f + 5] + s[at.PUSH_TORQUE + 2] + s[g + 5]
     ix, iy, iz = s[at.INERTIA], s[at.INERTIA + 1], s[at.INERTIA + 2]
     ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
     s[at.ALPHA] = (mx - (iz - iy) * oy * oz) / ix  # I domega/dt = M - omega x I omega
@@ -81,7 +83,9 @@ def turn_flaps(s: State, duration: float) -> None:
             left -= run
         if left > 0.0:
             error = max(error * math.exp(-left / s[at.SERVO_TAU]), s[at.DEAD_BAND])
-        s[at.FLAPS + i] = target - math.copysign(error, target - s[at.FLAPS + i])
+        before = s[at.FLAPS + i]
+        s[at.FLAPS + i] = target - math.copysign(error, target - before)
+        s[at.TRAVEL] += abs(s[at.FLAPS + i] - before)
 
 
 @compiled

@@ -40,6 +40,7 @@ class Plant:
     Attributes (read-only numpy views of the present truth, SI):
         state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
         p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
+        wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
         servo_trim (4,) [rad] and servo_speed (4,), pushes (6,) force [N, W] and torque [N m, B]: as they were last set;
         specific_force_B (3,) at the centre of mass; flow_W (3,) air there; plate_forces_W (5, 3) base and four flaps as
         isolated plates (without the identified correction, so they do not add up to the whole force).
@@ -64,10 +65,14 @@ class Plant:
         self._airspeed = config.airspeed
         trim_and_correct(s, config)
 
-        tether, limits = config.tether, config.limits
+        tether, ground, limits = config.tether, config.ground, config.limits
         s[at.TETHER_ANCHOR + 2] = tunnel.hover_height + tether.anchor_height
         s[at.TETHER_LENGTH], s[at.TETHER_STIFFNESS] = tether.length, tether.stiffness
         s[at.TETHER_DAMPING] = tether.damping
+        s[at.NET_HEIGHT], s[at.FRICTION] = ground.height, ground.friction
+        s[at.NET_STIFFNESS], s[at.NET_DAMPING] = ground.stiffness, ground.damping
+        s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = ground.foot_spread, ground.foot_below
+        s[at.FOOT_REACH] = math.sqrt(2.0 * ground.foot_spread**2 + ground.foot_below**2)
         s[at.LIMIT_RADIUS], s[at.LIMIT_BELOW], s[at.LIMIT_ABOVE] = limits.radius, limits.below, limits.above
         s[at.LIMIT_COS_TILT] = math.cos(limits.tilt)
 
@@ -89,6 +94,7 @@ class Plant:
         self.omega_B, self.flaps = self._view(at.OMEGA, 3), self._view(at.FLAPS, 4)
         self.specific_force_B, self.flow_W = self._view(at.SPECIFIC_FORCE, 3), self._view(at.FLOW, 3)
         self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
+        self.wrench_B = self._view(at.DRAG, 6)
         self.plate_forces_W = self._view(at.PLATE_FORCES, 15).reshape(5, 3)
         self.place((0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB, q_WB, flaps=self._commanded)
 
@@ -164,6 +170,11 @@ class Plant:
     def set_servo_fault(self, servo: int, trim_error: float = 0.0, speed: float = 1.0) -> None:
         """Mount servo 0..3 `trim_error` [rad] off and run it at `speed` times its pace, 0: stuck; defaults heal it."""
         self._s[at.SERVO_TRIM + servo], self._s[at.SERVO_SPEED + servo] = trim_error, speed
+
+    @property
+    def flap_travel(self) -> float:
+        """By how much all flaps together have turned since the start [rad]."""
+        return float(self._s[at.TRAVEL])
 
     def linearise(self) -> Constants:
         """Return the linearised dynamics about the level hover in the uniform flow of the design."""

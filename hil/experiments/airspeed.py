@@ -1,0 +1,75 @@
+"""Airspeeds: the paper's 8 to 11 m/s, the hover angle adapted to each, and what this plant's lift allows.
+
+By the Table the lift at speed V and opening theta is m g (V/10)^2 (1 + (2.3/g) (25 deg - theta)): closing a flap further
+gives little more, opening it takes little away. Attitude control takes up to 8 degrees of the opening (95 % of the hover's
+time), so that the flaps can carry the robot between -3 and 44 degrees: 9.5 to 10.4 m/s. Outside it sinks or rises; 8 m/s
+would take 56 % more lift than at 10 m/s, and a flat plate of Floaty's size has 18 % more. Every speed is flown with the
+flaps opened through zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from math import degrees, radians, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hil.experiments import pictures
+from hil.experiments.experiment import Experiment
+from hil.metrics import BOX, column, position_error
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+DESIGN_SPEED, DESIGN_ANGLE = 10.0, radians(25.0)  # [m/s], [rad] paper
+LIFT_PER_RAD = 2.3 / 9.81  # share of the weight; paper, Table: z per u4
+OPENING_MIN, OPENING_MAX = -0.192, 0.9  # [rad] -11 deg; the profile's
+FOR_ATTITUDE = radians(8.0)  # [rad] of the opening
+
+
+def hover_angle(speed: float) -> float:
+    """Return the opening [rad] at which the lift is the weight at `speed` [m/s], whether or not flaps can have it."""
+    return DESIGN_ANGLE - ((DESIGN_SPEED / speed) ** 2 - 1.0) / LIFT_PER_RAD
+
+
+def attainable() -> tuple[float, float]:
+    """Return the least and the greatest speed [m/s] at which the flaps carry the robot and control its attitude."""
+    low, high = (
+        DESIGN_SPEED / sqrt(1.0 + LIFT_PER_RAD * (DESIGN_ANGLE - opening))
+        for opening in (OPENING_MIN + FOR_ATTITUDE, OPENING_MAX - FOR_ATTITUDE)
+    )
+    return low, high
+
+
+def holding(speed: float, flight: pa.Table) -> Mapping[str, float]:
+    """Return the mean error in height over the second half, and whether that is what the lift says."""
+    low, high = attainable()
+    times, height = column(flight, "t"), position_error(flight)[:, 2]
+    off = float(abs(height[times >= times.mean()].mean()))
+    return {"height_off": off, "as_computed": float((off <= BOX) == (low <= speed <= high))}
+
+
+def airspeed(speed: float) -> Experiment:
+    """Return the hover at a speed [m/s]."""
+    low, high = attainable()
+    carried = low <= speed <= high
+    limits = {"as_computed": 1.0} | ({"lost": 0.0, "height_off": 0.06, "in_box": 0.90} if carried else {})
+    wanted = hover_angle(speed)
+    angle = float(np.clip(wanted, 0.0, OPENING_MAX))
+    outcome = "carried" if carried else "beyond the flaps"
+    return Experiment(
+        name=f"airspeed-{speed:g}",
+        summary=f"hover at {speed:g} m/s: takes flaps at {degrees(wanted):.0f} deg, {outcome} (paper: 8 to 11 m/s)",
+        duration_s=10.0,
+        limits=limits,
+        settings=(
+            f"tunnel.speed={speed:g}", f"allocation.hover_angle={angle:.4f}", f"allocation.opening_min={OPENING_MIN}",
+        ),
+        measure=partial(holding, speed),
+        pictures=(pictures.AIRSPEED,),
+    )  # fmt: skip
+
+
+AIRSPEEDS = tuple(airspeed(speed) for speed in (8.0, 8.5, 9.0, 9.5, 9.75, 10.0, 10.25, 10.5, 11.0))

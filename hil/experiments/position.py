@@ -1,0 +1,45 @@
+"""Position: the paper's sine in height, 20 cm at 0.05 Hz, and square in y, 10 cm to either side.
+
+The square's period is that of the author's ground station, 10 s; the amplitude is the flow's: beyond 20 cm from its axis
+no hover lasts (paper, Horizontal tracking performance).
+"""
+
+from functools import partial
+
+from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
+from hil.experiments import pictures
+from hil.experiments.experiment import Experiment
+from hil.experiments.measures import height_sine, y_steps
+
+BEGIN_S = 1.0  # the robot has come to rest after its release
+HEIGHT_HZ, SQUARE_HZ = 0.05, 0.1
+
+
+def rise_and_sink(home: Goal, release_us: int) -> Trajectory:
+    """Swing by 20 cm in height."""
+    return Offsets(home, release_us + round(BEGIN_S * 1e6), z=Sine(0.2, HEIGHT_HZ))
+
+
+def jump_sideways(home: Goal, release_us: int) -> Trajectory:
+    """Jump between 10 cm to the left and 10 cm to the right."""
+    return Offsets(home, release_us + round(BEGIN_S * 1e6), y=Square(0.1, -0.1, SQUARE_HZ))
+
+
+HEIGHT_SINE = Experiment(
+    name="height-sine",
+    summary="rise and sink by 20 cm at 0.05 Hz (paper: follows; height gives way to attitude)",
+    duration_s=BEGIN_S + 2 / HEIGHT_HZ,
+    limits={"lost": 0.0, "gain": 0.90, "lag": 0.20, "rms_z": 0.05, "rms_x": 0.03, "rms_y": 0.02},
+    trajectory=rise_and_sink,
+    measure=partial(height_sine, HEIGHT_HZ),
+    pictures=(pictures.HEIGHT_SINE,),
+)
+Y_SQUARE = Experiment(
+    name="y-square",
+    summary="jump in y by 20 cm every 5 s, 10 cm to either side (paper: follows)",
+    duration_s=BEGIN_S + 2 / SQUARE_HZ,
+    limits={"lost": 0.0, "rise": 1.25, "overshoot": 0.15, "hold_rms": 0.01, "rms_x": 0.03, "rms_z": 0.05},
+    trajectory=jump_sideways,
+    measure=y_steps,
+    pictures=(pictures.Y_SQUARE,),
+)

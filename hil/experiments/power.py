@@ -1,0 +1,123 @@
+"""Power: what the robot draws in hover, how long its battery lasts, and how that compares (paper, figure robustness a, b).
+
+`endurance` hovers until the battery is empty: the supervisor's failsafe for a low battery is its stated end. `power` hovers
+for a minute and computes the rest from the mean power and the same model of the battery.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hil.experiments.experiment import Experiment
+from hil.metrics import column, free_flight
+from hil.picture import Picture
+from hil.plant.battery import BatteryConfig, endurance
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
+    from hil.harness import Flight
+
+WATCH_US = 100_000
+FAILSAFE = 3  # supervisor.state
+LONGEST_S = 3000.0
+
+
+def end_with_the_battery(flight: Flight) -> None:
+    """End the flight when the supervisor has found the battery empty."""
+    flight.events.at(flight.release_us, partial(_watch, flight))
+
+
+def _watch(flight: Flight, now_us: int) -> None:
+    if flight.firmware.signals.supervisor.cause.name == "LOW_BATTERY":
+        flight.note("lab", f"the battery is empty: {flight.battery.charge:.1%} left")
+        flight.end_us = now_us
+        return
+    flight.events.at(now_us + WATCH_US, partial(_watch, flight))
+
+
+def power(flight: pa.Table) -> dict[str, float]:
+    """Return the mean power [W] and that per mass [W/kg]."""
+    mean = float(column(flight, "battery.power").mean())
+    plant = _configuration(flight)["plant"]
+    return {"power": mean, "specific_power": mean / (plant["mass"] * plant["mass_factor"])}
+
+
+def estimate(flight: pa.Table) -> Mapping[str, float]:
+    """Return power, and the minutes for which the model of the battery can give it."""
+    values, config = power(flight), _configuration(flight)
+    empty_V = 1e-3 * config["supervisor"]["low_battery_mv"]
+    battery = BatteryConfig.model_validate(config["battery"])
+    return values | {"endurance": endurance(battery, values["power"], empty_V) / 60.0}
+
+
+def until_empty(flight: pa.Table) -> Mapping[str, float]:
+    """Return power, and the minutes until the failsafe; NaN when the flight ended before it."""
+    times = column(flight, "t")
+    stopped = column(flight, "supervisor.state")[-1] == FAILSAFE
+    return power(flight) | {
+        "endurance": float(times[-1] - times[0]) * 1e-6 / 60.0 if stopped else float("nan")
+    }
+
+
+def _configuration(flight: pa.Table) -> dict[str, Any]:
+    config: dict[str, Any] = json.loads(flight.schema.metadata[b"config"])
+    return config
+
+
+def compare(*flights: pa.Table) -> Figure:
+    """Draw the specific power of Floaty, from the flights, beside that of other vehicles."""
+    from hil.power_figures import compare
+
+    means = [power(free_flight(flight)) for flight in flights]
+    mean, specific = (
+        float(np.mean([values[name] for values in means])) for name in ("power", "specific_power")
+    )
+    return compare(mean, mean / specific)
+
+
+def discharge(*flights: pa.Table) -> Figure:
+    """Draw voltage, power and charge over time."""
+    from hil.power_figures import discharge
+
+    return discharge(*flights)
+
+
+COMPARISON = Picture(
+    "Specific power",
+    "Left: power in hover per mass. Right: power over mass; grey: 100 to 250 W/kg, which the paper calls typical. Stars: in "
+    "an updraft. Bars on helicopters: the paper's range of hover power, as a share of the rated one. Red: this flight.",
+    compare,
+    needs="battery.power",
+)
+DISCHARGE = Picture(
+    "Battery",
+    "Voltage of one cell under load, with the supervisor's limit; power, mean over 1 s, and over the flight; charge left.",
+    discharge,
+    needs="battery.power",
+)
+# The paper: about 33 min, 3.4 W, 10 W/kg
+LIMITS = {"lost": 0.0, "power": 3.6, "specific_power": 10.5, "endurance": 31.0}
+POWER = Experiment(
+    name="power",
+    summary="hover for 60 s: power, W/kg and the minutes a battery would last (paper: 3.4 W, 10 W/kg, 33 min)",
+    duration_s=60.0,
+    limits=LIMITS,
+    measure=estimate,
+    pictures=(COMPARISON, DISCHARGE),
+)
+ENDURANCE = Experiment(
+    name="endurance",
+    summary="hover until the battery is empty and the supervisor says so (paper: 33 min)",
+    duration_s=LONGEST_S,
+    limits=LIMITS,
+    script=end_with_the_battery,
+    measure=until_empty,
+    pictures=(COMPARISON, DISCHARGE),
+)

@@ -1,0 +1,181 @@
+"""Take-off and landing by the speed of the tunnel, as from the original operator's menu, but without an operator.
+
+The robot stands on the net in still air, its flaps at the hover angle. The fans run up to the take-off speed, the controller
+is switched on (a request to arm, over the radio), the robot lifts off; flight speed, then landing speed: it sinks onto
+the net; controller and fans off. The goal is the hover point all the time.
+
+Order and times are the menu's, the speeds are not: it has 75 to 80 % of the flight speed for take-off and landing, where a
+flat plate of the paper's mass has 0.6 to 0.7 times its weight of lift. Here the flow gains 5 % per metre towards the
+net; with flat flaps the robot lifts off from 90 % on and stays at the hover point from 95 % on (physics.md section 8).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from firmware_py.wire.crtp import PORT_PLATFORM, Packet, encode
+from hil.experiments.experiment import Experiment
+from hil.metrics import BOX, column, free_flight, position_error
+from hil.picture import Picture
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
+    from hil.harness import Flight
+
+TAKE_OFF, FLIGHT, LANDING = 0.93, 1.0, 0.88  # of the flight speed
+STANDING_Z = 0.049  # [m] of the centre of mass: feet, less what they sink in
+CLEAR = 0.02  # [m] off the net
+
+# After the release [s]; waits and stages as in the menu
+SPIN_UP = 1.0
+RAMP = 0.9
+CONTROLLER_ON = SPIN_UP + RAMP + 0.3
+FLIGHT_FROM = CONTROLLER_ON + 6.0
+LANDING_FROM = FLIGHT_FROM + 10.0  # the menu: 30 s
+FANS_OFF = LANDING_FROM + 8.0
+END = FANS_OFF + 3.0
+RAMP_STEP_US = 50_000
+BOOTED_US = 500_000
+
+
+def operate(flight: Flight) -> None:
+    """Plan what the operator does."""
+    flight.plant.tunnel.set_fan_factor(0.0)
+    flight.events.at(BOOTED_US, partial(_switch, flight, False))
+    flight.events.at(flight.release_us + _us(CONTROLLER_ON), partial(_switch, flight, True))
+    flight.events.at(flight.release_us + _us(FANS_OFF), partial(_switch, flight, False))
+    speed = 0.0
+    for start, factor in (
+        (SPIN_UP, TAKE_OFF),
+        (FLIGHT_FROM, FLIGHT),
+        (LANDING_FROM, LANDING),
+        (FANS_OFF, 0.0),
+    ):
+        _ramp(flight, flight.release_us + _us(start), speed, factor)
+        speed = factor
+
+
+def _us(seconds: float) -> int:
+    return round(1e6 * seconds)
+
+
+def _switch(flight: Flight, on: bool, now_us: int) -> None:
+    """Ask the board to close or open the loop, as a Crazyflie client arms and disarms."""
+    flight.radio.uplink(now_us, encode(Packet(PORT_PLATFORM, 0, bytes((1, on)))))
+    flight.note("lab", f"controller {'on' if on else 'off'}")
+
+
+def _ramp(flight: Flight, start_us: int, before: float, after: float) -> None:
+    steps = _us(RAMP) // RAMP_STEP_US
+    for step in range(1, steps + 1):
+        set_fans = _setter(flight, before + (after - before) * step / steps)
+        flight.events.at(start_us + step * RAMP_STEP_US, set_fans)
+    flight.events.at(
+        start_us,
+        lambda now_us: flight.note("lab", f"fans from {before:.0%} to {after:.0%} of the flight speed"),
+    )
+
+
+def _setter(flight: Flight, factor: float) -> Callable[[int], None]:
+    return lambda now_us: flight.plant.tunnel.set_fan_factor(factor)
+
+
+def measure(flight: pa.Table) -> Mapping[str, float]:
+    """Return when it lifted off and was in the box, and how it touched down; NaN for what did not happen."""
+    times = column(flight, "t") * 1e-6
+    times = times - times[0]
+    x, y, z, climb = column(flight, "truth.x", "truth.y", "truth.z", "truth.vz").T
+    off = np.asarray(z > STANDING_Z + CLEAR)
+    values = dict.fromkeys(
+        ("lift_off", "reached_box", "touch_down_speed", "landed_off_axis", "hover_in_box"), float("nan")
+    )
+    if not off.any():
+        return values
+    first = int(np.argmax(off))
+    values["lift_off"] = float(times[first]) - CONTROLLER_ON
+    inside = np.asarray((np.abs(position_error(flight)) <= BOX).all(axis=1))
+    hovering = (times >= FLIGHT_FROM) & (times < LANDING_FROM)
+    if (inside & hovering).any():
+        entered = int(np.argmax(inside & hovering))
+        values["reached_box"] = float(times[entered]) - FLIGHT_FROM
+        values["hover_in_box"] = float(inside[entered:][hovering[entered:]].mean())
+    down = np.flatnonzero((times > LANDING_FROM) & ~off)
+    if len(down):
+        touched = int(down[0])
+        before = slice(max(touched - 10, 0), touched + 1)  # 0.1 s
+        values["touch_down_speed"] = float(-climb[before].min())
+        values["landed_off_axis"] = float(np.hypot(x[-1], y[-1]))
+    return values
+
+
+def draw(*flights: pa.Table) -> Figure:
+    """Draw height, vertical speed and the air at the robot over time; the first flight dark, further ones light."""
+    from hil.curves import BLUE, GREY
+    from hil.figures import stack
+
+    figure, axes = stack((2.2, 1.5, 1.5))
+    for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
+        times = 1e-6 * (column(flight, "t") - column(flight, "t")[0])
+        curves = (
+            100 * (column(flight, "truth.z") - STANDING_Z),
+            100 * column(flight, "truth.vz"),
+            column(flight, "flow.z"),
+        )
+        for one, curve in zip(axes, curves, strict=True):
+            one.plot(times, curve, color=BLUE, alpha=0.3 if index else 1.0)
+    goal = 100 * (column(flight, "goal.z") - STANDING_Z)
+    axes[0].plot(times, goal, color="black", linestyle="--", linewidth=0.8, label="goal")
+    axes[0].legend(loc="center right")
+    for one, label in zip(
+        axes, ("height over the net [cm]", "climb [cm/s]", "air, upwards [m/s]"), strict=True
+    ):
+        one.set_ylabel(label)
+        one.axvspan(CONTROLLER_ON, FANS_OFF, color=GREY, alpha=0.12, linewidth=0)
+        for start in (SPIN_UP, FLIGHT_FROM, LANDING_FROM, FANS_OFF):
+            one.axvline(start, color="black", linewidth=0.6)
+        one.margins(x=0)
+    stages = (
+        (SPIN_UP, f"take-off {TAKE_OFF:.0%}"),
+        (FLIGHT_FROM, f"flight {FLIGHT:.0%}"),
+        (LANDING_FROM, f"landing {LANDING:.0%}"),
+        (FANS_OFF, "fans off"),
+    )
+    for start, name in stages:
+        axes[2].text(start + 0.15, 0.3, name, fontsize=8)
+    axes[2].set_xlabel("time after the release [s]")
+    return figure
+
+
+PICTURE = Picture(
+    "Take-off and landing",
+    "Height over the net, vertical speed and the air at the robot. Lines: a new speed of the fans; grey: controller on.",
+    draw,
+)
+TAKE_OFF_LANDING = Experiment(
+    name="take-off-landing",
+    summary="stand on the net, take off, hover and land by the speed of the tunnel (the original's operator menu)",
+    duration_s=END,
+    limits={
+        "lost": 0.0,
+        "lift_off": 1.5,
+        "reached_box": 3.0,
+        "hover_in_box": 0.95,
+        "touch_down_speed": 0.8,  # a fall from 3 cm
+        "landed_off_axis": 0.10,
+        "attitude_max": 0.349066,  # 20 deg
+    },
+    script=operate,
+    settings=(
+        "flight.start_offset=[0.0, 0.0, -1.101]",  # on the net
+        "plant.limits.below=1.15",
+        "plant.tether.length=2.65",  # slack on the net
+    ),
+    measure=measure,
+    pictures=(PICTURE,),
+)
