@@ -14,6 +14,7 @@ from rich.console import Console
 
 from hil.board_cli import board, station
 from hil.errors import LabError
+from hil.paper_cli import compare, paper, study
 
 if TYPE_CHECKING:
     from hil.harness import Flight
@@ -124,15 +125,19 @@ def fly(
 @app.command("list")
 @click.option("--faults", is_flag=True, help="List the kinds of faults for `floaty fly --fault`.")
 def list_experiments(faults: bool) -> None:
-    """List the experiments and the profiles, or the kinds of faults."""
+    """List the experiments, the robustness studies and the profiles, or the kinds of faults."""
     if faults:
         return _list_faults()
     from hil.config import DEFAULT_PROFILE, profile_names
     from hil.experiments import EXPERIMENTS
+    from hil.studies import STUDIES
 
     width = max(map(len, EXPERIMENTS))
     for experiment in EXPERIMENTS.values():
         console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
+    console.print("\nrobustness, for `floaty study`:")
+    for one in STUDIES.values():
+        console.print(f"{one.name:{width}}  {one.question}", soft_wrap=True)
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
     bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
     console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
@@ -285,11 +290,12 @@ def _write_pictures(folder: Path) -> None:
 
 def _fly_many(requests: "list[Request]", parent: Path) -> int:
     """Fly seeds in parallel processes; one row per seed as they finish, a summary at the end; returns the exit code."""
-    from hil.sweep import fly_all
+    from hil.sweep import Job, fly_all
 
     rows: list[Result] = []
+    jobs = [Job(request, parent / f"{request.experiment.name}-{request.seed}") for request in requests]
     try:
-        for result in fly_all(requests, parent, notices):
+        for result in fly_all(jobs, notices):
             rows.append(result)
     except KeyboardInterrupt:
         notices.print(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
@@ -401,6 +407,9 @@ def _refuse(text: str) -> int:
 
 app.add_command(board)
 app.add_command(station)
+app.add_command(compare)
+app.add_command(paper)
+app.add_command(study)
 
 if __name__ == "__main__":
     main()

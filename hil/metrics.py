@@ -13,6 +13,7 @@ from hil.errors import LabError
 
 NEAR = 0.06  # [m] "less than 6 cm over each axis"
 BOX = 0.10  # [m] half of the 20 cm box
+FAILSAFE = 3  # firmware_py.supervisor.State
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,7 @@ METRICS: Mapping[str, Metric] = {
     "as_computed": Metric("", "min", "1 when the height is held exactly if the lift of the flaps allows it"),
     "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
+    "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
     "line_up": Metric("share", "max", "mean load of the serial line to the board"),
     "line_down": Metric("share", "max", "mean load of the serial line from the board"),
     "line_overrun": Metric("bytes", "max", "lost because the board's receive buffer was full"),
@@ -157,6 +159,8 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
     values["attitude_max"] = float(np.abs(attitude_error(flight)).max())
     values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
     values["age_mean"] = float(column(flight, "estimator.pose_age_us").mean()) * 1e-6
+    in_failsafe = column(flight, "supervisor.state") == FAILSAFE
+    values["failsafe"] = float(in_failsafe.mean()) * values["flown"]
     if "serial.up_busy" in table.schema.names:
         busy = column(flight, "serial.up_busy", "serial.down_busy")
         values["line_up"], values["line_down"] = (busy[-1] - busy[0]) * 1e-6 / values["flown"]

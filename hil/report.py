@@ -3,7 +3,6 @@
 From `result.json`, `log.parquet` and `events.jsonl`; a flight that was lost, interrupted or killed has a report as well.
 """
 
-import base64
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -12,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from firmware_py.firmware import LATENCY_BOUNDS_US
 from hil.experiments import EXPERIMENTS
@@ -20,6 +18,7 @@ from hil.fault_kinds import KINDS
 from hil.faults import Span, spans_of
 from hil.figures import PICTURES, SCHEDULE
 from hil.metrics import METRICS, SHOWN
+from hil.pages import data_uri, write_page
 from hil.picture import Picture
 from hil.recorder import load_events, load_log
 from hil.run import read_result
@@ -69,11 +68,9 @@ def write_report(folder: Path) -> Path:
     shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
     shown.append(_show(SCHEDULE, load_schedule(folder)))
     config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    page = environment.get_template(TEMPLATE).render(
+    return write_page(
+        folder / REPORT,
+        TEMPLATE,
         result=result,
         rows=metric_rows(result),
         faults=fault_rows(spans_of(log.schema.metadata)),
@@ -83,9 +80,6 @@ def write_report(folder: Path) -> Path:
         log_rows=log.num_rows,
         config=json.dumps(config, indent=2),
     )
-    path = folder / REPORT
-    path.write_text(page, encoding="utf-8")
-    return path
 
 
 def metric_rows(result: Mapping[str, Any]) -> list[Row]:
@@ -117,8 +111,4 @@ def fault_rows(spans: Iterable[Span]) -> list[FaultRow]:
 
 
 def _show(picture: Picture, rows: pa.Table) -> Shown:
-    return Shown(
-        picture.title,
-        picture.caption,
-        "data:image/png;base64," + base64.b64encode(picture.png(rows)).decode(),
-    )
+    return Shown(picture.title, picture.caption, data_uri(picture.png(rows)))

@@ -1,0 +1,177 @@
+"""The commands about many flights: `floaty paper | study | compare`."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+
+from hil.errors import LabError
+
+if TYPE_CHECKING:
+    from hil.compare import Comparison
+    from hil.paper import Paper
+    from hil.studies import Study
+
+console = Console(highlight=False)
+notices = Console(stderr=True, highlight=False)
+folder_type = click.Path(path_type=Path)
+INTERRUPTED = 130
+seeds_option = click.option(
+    "--seeds",
+    type=click.IntRange(1, 1000),
+    default=5,
+    show_default=True,
+    metavar="N",
+    help="Of every flight.",
+)
+
+
+@click.command()
+@seeds_option
+@click.option(
+    "--out",
+    type=folder_type,
+    metavar="DIR",
+    default=Path("runs/paper"),
+    show_default=True,
+    help="Report and logs.",
+)
+@click.option("--only", metavar="PATTERN", help="Experiments, like hover or yaw-*; leaves the studies out.")
+@click.option("--no-studies", is_flag=True, help="Leave the robustness studies out.")
+def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
+    """Fly the paper's experiments on both profiles, and the robustness studies; write one report.
+
+    Exit code 0: every verdict holds for the default profile; 1: one fails; 2: bad input; 130: interrupted, with a report
+    of what was flown.
+    """
+    from hil.paper import select
+    from hil.studies import STUDIES
+
+    studies = [] if only or no_studies else list(STUDIES.values())
+    return _fly(select(only), studies, seeds, out)
+
+
+@click.command()
+@click.argument("name")
+@seeds_option
+@click.option("--out", type=folder_type, metavar="DIR", help="Report and picture [runs/study-NAME].")
+def study(name: str, seeds: int, out: Path | None) -> int:
+    """Fly one robustness study (see `floaty list`): faults of growing size, several variants, one picture.
+
+    Exit code 0: every outcome is the expected one; 1: one is not; 2: bad input; 130: interrupted.
+    """
+    from hil.studies import find_study
+
+    return _fly([], [find_study(name)], seeds, out or Path("runs") / f"study-{name}")
+
+
+def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path) -> int:
+    from hil.cli import announce_compilation
+    from hil.paper import fly_paper
+    from hil.paper_report import write_paper
+
+    announce_compilation()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        flown = fly_paper(rows, studies, seeds, out, notices)
+        report = write_paper(out, flown)
+    except OSError as error:
+        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
+    _print_rows(flown)
+    _print_studies(flown)
+    console.print(f"  {report}", soft_wrap=True)
+    if flown.interrupted:
+        notices.print("interrupted: the report has the flights that were complete")
+        return INTERRUPTED
+    holds = flown.holds if rows else all(result.holds for result in flown.studies)
+    return 0 if holds else 1
+
+
+def _print_rows(flown: "Paper") -> None:
+    from rich.table import Table
+
+    from hil.paper import Spread
+    from hil.studies import PROFILES
+
+    if not flown.rows:
+        return
+    table = Table(title="paper and laboratory: mean ± deviation over the seeds")
+    for heading in ("result", "figure", "paper", *PROFILES):
+        table.add_column(heading)
+    for _, row, both in flown.rows:
+        table.add_section()
+        for index, (metric, value) in enumerate(row.values.items()):
+            spreads = (str(Spread.of(metric, trials.results)) for trials in both)
+            table.add_row(row.title if index == 0 else "", metric, value, *spreads)
+        verdicts = (f"{'ok' if one.holds else 'FAILS'}: {one.passed} of {len(one.results)}" for one in both)
+        table.add_row("", "verdict", "", *verdicts)
+    Console(highlight=False, width=max(console.width, 150)).print(table)
+    for _, row, both in flown.rows:
+        for trials in both:
+            if trials.failed:
+                reason = f"; {row.why}" if row.why else ""
+                console.print(
+                    f"{row.title}, {trials.profile}: {', '.join(trials.failed)}{reason}", soft_wrap=True
+                )
+
+
+def _print_studies(flown: "Paper") -> None:
+    for result in flown.studies:
+        surprises = [
+            f"{curve.variant.name}: {one}" for curve in result.curves for one in result.surprises(curve)
+        ]
+        verdict = "as expected" if result.holds else "; ".join(surprises) or "not complete"
+        console.print(f"study {result.study.name}: {verdict}", soft_wrap=True)
+
+
+@click.command()
+@click.argument("first", metavar="RUN", type=folder_type)
+@click.argument("second", metavar="RUN", type=folder_type)
+@click.option(
+    "--out",
+    type=folder_type,
+    metavar="DIR",
+    help="For compare.png and compare.html [the second run's folder].",
+)
+def compare(first: Path, second: Path, out: Path | None) -> int:
+    """Compare one flight with another: first difference, metrics, settings, both in one plot.
+
+    Exit code 0: the logs are identical; 1: they differ; 2: bad input.
+    """
+    from hil.compare import compare as compare_runs
+    from hil.compare import load_run, write_comparison
+
+    a, b = load_run(first), load_run(second)
+    comparison = compare_runs(a, b)
+    page = write_comparison(out or second, a, b, comparison)
+    _print_comparison(first, second, comparison)
+    console.print(f"  {page}", soft_wrap=True)
+    return 0 if comparison.identical else 1
+
+
+def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> None:
+    from rich.table import Table
+
+    table = Table(title=f"{first} | {second}")
+    table.add_column("metric")
+    for heading in ("first", "second", "difference"):
+        table.add_column(heading, justify="right")
+    table.add_column("unit")
+    for pair in comparison.metrics:
+        numbers = (*pair.values, pair.difference)
+        shown = ("–" if math.isnan(number) else f"{number:.4g}" for number in numbers)
+        table.add_row(pair.name, *shown, pair.unit)
+    console.print(table)
+    for name, x, y in comparison.settings:
+        console.print(f"{name}: {x} | {y}", soft_wrap=True)
+    for folder, missing in zip((first, second), comparison.missing, strict=True):
+        if missing:
+            console.print(f"not in {folder}: {', '.join(missing)}", soft_wrap=True)
+    if comparison.first is not None:
+        console.print(f"first difference: {comparison.first}", soft_wrap=True)
+    elif comparison.identical:
+        console.print("identical")
+    else:
+        console.print("identical in the columns that both have")

@@ -1,0 +1,131 @@
+"""The report of the paper: `report.html` for people, `result.json` for programs.
+
+Figures as in the paper: every trial light, the one with the median error dark.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hil.figures import PICTURES
+from hil.metrics import METRICS
+from hil.pages import data_uri, write_page
+from hil.paper import Paper, Spread, Trials
+from hil.paper_rows import Row
+from hil.recorder import load_log
+from hil.run import RESULT, commit, versions
+from hil.study_figures import picture
+from hil.study_run import StudyResult
+
+REPORT = "report.html"
+OF_EVERY_FLIGHT = PICTURES[:2]  # for an experiment without pictures of its own
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A picture of one experiment on one profile."""
+
+    profile: str
+    title: str
+    caption: str
+    source: str
+
+
+def write_paper(out: Path, paper: Paper) -> Path:
+    """Write `result.json`, `report.html` and the pictures of the studies; returns the report."""
+    (out / RESULT).write_text(json.dumps(_content(paper), indent=1) + "\n", encoding="utf-8")
+    studies = []
+    for result in paper.studies:
+        if result.curves:
+            png = picture(result)
+            (out / f"study-{result.study.name}.png").write_bytes(png)
+            studies.append((result, data_uri(png)))
+    rows = [(name, row, trials, _figures(trials)) for name, row, trials in paper.rows]
+    return write_page(
+        out / REPORT, "paper.html.j2",
+        paper=paper, rows=rows, studies=studies, metrics=METRICS, spread=Spread.of, commit=commit(), versions=versions(),
+    )  # fmt: skip
+
+
+def _figures(both: Sequence[Trials]) -> list[Figure]:
+    """Return the pictures of a row, those of the default profile first."""
+    figures = []
+    for trials in both:
+        ordered = trials.representative_first()
+        if not ordered:
+            continue
+        logs = [load_log(result.folder) for result in ordered]
+        own = ordered[0].request.experiment.pictures
+        figures += [
+            Figure(
+                trials.profile, one.title, one.caption, data_uri(one.png(*(logs if own else logs[:1])))
+            )
+            for one in own or OF_EVERY_FLIGHT
+        ]  # fmt: skip
+    return figures
+
+
+def _content(paper: Paper) -> dict[str, Any]:
+    return {
+        "holds": paper.holds,
+        "interrupted": paper.interrupted,
+        "rows": [
+            {
+                "experiment": name,
+                **asdict(row),
+                "profiles": {one.profile: _trials(row, one) for one in trials},
+            }
+            for name, row, trials in paper.rows
+        ],
+        "studies": [_study(result) for result in paper.studies],
+        "commit": commit(),
+        "versions": versions(),
+    }
+
+
+def _trials(row: Row, trials: Trials) -> dict[str, Any]:
+    return {
+        "holds": trials.holds,
+        "metrics": {
+            name: {
+                key: value if not isinstance(value, float) or math.isfinite(value) else None
+                for key, value in asdict(Spread.of(name, trials.results)).items()
+            }
+            for name in row.values
+        },
+        "flights": [
+            {
+                "seed": result.request.seed,
+                "outcome": result.outcome,
+                "cause": result.cause,
+                "passed": result.passed,
+                "failed": [verdict.metric for verdict in result.verdicts if not verdict.holds],
+                "hash": result.hash,
+                "folder": result.folder.name,
+            }
+            for result in trials.results
+        ],
+    }
+
+
+def _study(result: StudyResult) -> dict[str, Any]:
+    study = result.study
+    return {
+        "name": study.name,
+        "axis": study.axis,
+        "unit": study.unit,
+        "sizes": study.sizes,
+        "as_expected": result.holds,
+        "variants": [
+            {
+                "name": curve.variant.name,
+                "expected": curve.variant.expected.text(study.unit),
+                "surprises": result.surprises(curve),
+                "cells": [asdict(cell) for cell in curve.cells],
+            }
+            for curve in result.curves
+        ],
+    }

@@ -1,0 +1,228 @@
+"""Robustness beyond the paper, as data: what is made worse, step by step, for whom, and what is expected to come of it.
+
+A study flies its experiment for every variant, size and seed. Sizes go from harmless to harmful in the order in which they
+stand. Faults begin 2 s after the release and last to the end unless the study says otherwise.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from hil.config import DEFAULT_PROFILE, load_config
+from hil.errors import LabError
+
+AS_FLOWN = "as-flown"
+PROFILES = (DEFAULT_PROFILE, AS_FLOWN)
+AIR_US = 2_000  # what radio, USB and the wait for the next step add to the cameras' latency
+NO_PREDICTOR, FIXED_PREDICTOR = ("predictor.enabled=false",), ("predictor.age=fixed",)
+MID = (
+    "controller.gain_y=-2.5",
+    "controller.gain_vy=-0.8",
+    "controller.gain_roll=0.3",
+    "controller.gain_p=0.18",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a size means: settings `section.key=value` and faults, as on the command line."""
+
+    settings: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What is expected of a variant, by size; None: nothing is said."""
+
+    holds_to: float | None = None  # every seed holds the experiment's limits up to this size
+    flies_to: float | None = None  # no seed is lost up to this size
+    failsafe_from: float | None = (
+        None  # the supervisor opens the loop, or the robot is lost, from this size on
+    )
+    lost_from: float | None = None  # every seed is lost from this size on
+
+    def text(self, unit: str) -> str:
+        """Return it as a sentence."""
+        parts = (
+            ("holds the limits up to", self.holds_to),
+            ("is not lost up to", self.flies_to),
+            ("is stopped by the supervisor from", self.failsafe_from),
+            ("is lost from", self.lost_from),
+        )
+        return ", ".join(f"{words} {size:g} {unit}".strip() for words, size in parts if size is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One curve of a study."""
+
+    name: str
+    change: Callable[[float], Change]
+    expected: Expected
+    profile: str = DEFAULT_PROFILE
+    settings: tuple[str, ...] = ()  # besides those of the size
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """One axis, several variants."""
+
+    name: str
+    question: str
+    axis: str  # what the sizes are
+    unit: str
+    sizes: tuple[float, ...]
+    variants: tuple[Variant, ...]
+    duration_s: float = 8.0
+    experiment: str = "hover"
+    remark: str = field(default="", kw_only=True)  # what the picture shows
+
+
+def find_study(name: str) -> Study:
+    """Return a study by name; an unknown one raises `LabError` with the nearest."""
+    if name in STUDIES:
+        return STUDIES[name]
+    near = difflib.get_close_matches(name, STUDIES, 1)
+    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(STUDIES)}"
+    raise LabError(f"study {name!r}: unknown; {hint}")
+
+
+def _both(change: Callable[[float], Change], tuned: Expected, as_flown: Expected) -> tuple[Variant, Variant]:
+    """Return the same change for both profiles."""
+    return Variant(DEFAULT_PROFILE, change, tuned), Variant(AS_FLOWN, change, as_flown, AS_FLOWN)
+
+
+def _latency(size: float) -> Change:
+    return Change((f"mocap.latency_us={max(0, round(1000 * size) - AIR_US)}",))
+
+
+def _fault(kind: str, harmless: float) -> Callable[[float], Change]:
+    """Return the change that makes a fault of each size, and none of the harmless one."""
+    return lambda size: Change() if size == harmless else Change(faults=(f"{kind}@2={size:g}",))
+
+
+def _spell(kind: str) -> Callable[[float], Change]:
+    """Return the change that makes a fault of each duration [s]."""
+    return lambda size: Change() if size == 0.0 else Change(faults=(f"{kind}@2:{size:g}",))
+
+
+def _outliers(size: float) -> Change:
+    return Change((f"mocap.outlier={size / 100:g}",)) if size else Change()
+
+
+INPUTS = ("roll_u1", "y_u1", "pitch_u2", "x_u2", "yaw_u3", "z_u4")
+
+
+def _model_error(sign: int, inputs: bool, rest: bool) -> Callable[[float], Change]:
+    """Return the change that scales constants of the model on board by `sign` times the size in percent."""
+
+    def change(size: float) -> Change:
+        constants = load_config().model.model_dump()
+        chosen = (name for name in constants if (inputs if name in INPUTS else rest))
+        factor = 1.0 + sign * size / 100.0
+        return (
+            Change(tuple(f"model.{name}={constants[name] * factor:.6g}" for name in chosen))
+            if size
+            else Change()
+        )
+
+    return change
+
+
+def _models(profile: str, expected: Expected) -> tuple[Variant, ...]:
+    parts = (("inputs", True, False), ("couplings", False, True), ("all", True, True))
+    return tuple(
+        Variant(
+            f"{profile}, {name} {'+' if sign > 0 else '−'}",
+            _model_error(sign, inputs, rest),
+            expected,
+            profile,
+        )
+        for name, inputs, rest in parts
+        for sign in (1, -1)
+    )
+
+
+_ALL = (
+    Study(
+        "latency",
+        "Does the robot survive late poses, and what does the predictor on board make of them?",
+        "latency from exposure to estimator", "ms", (0, 20, 40, 60, 80, 100, 120),
+        (
+            Variant("floaty, measured age", _latency, Expected()),
+            Variant("floaty, fixed 40 ms", _latency, Expected(), settings=FIXED_PREDICTOR),
+            Variant("floaty, no predictor", _latency, Expected(), settings=NO_PREDICTOR),
+            Variant("mid gains, measured age", _latency, Expected(), settings=MID),
+            Variant("mid gains, fixed 40 ms", _latency, Expected(), settings=(*MID, *FIXED_PREDICTOR)),
+            Variant("mid gains, no predictor", _latency, Expected(), settings=(*MID, *NO_PREDICTOR)),
+            Variant("as-flown, measured age", _latency, Expected(), AS_FLOWN),
+            Variant("as-flown, fixed 40 ms", _latency, Expected(), AS_FLOWN, FIXED_PREDICTOR),
+            Variant("as-flown, no predictor", _latency, Expected(), AS_FLOWN, NO_PREDICTOR),
+        ),
+        duration_s=12.0,
+    ),
+    Study(
+        "loss", "How many packets may the radio lose?", "packets lost in the air, per try of four", "%",
+        (0, 20, 40, 60, 80),
+        _both(lambda size: Change((f"radio.uplink_loss={size / 100:g}",)), Expected(), Expected()),
+    ),
+    Study(
+        "jitter", "How unevenly may poses arrive?", "extra delay, uniform from 0 to", "ms", (0, 5, 10, 15, 20, 30),
+        _both(lambda size: Change((f"radio.uplink_jitter_us={round(1000 * size)}",)), Expected(), Expected()),
+    ),
+    Study(
+        "dropout", "How long may the cameras lose the robot?", "cameras blind for", "s",
+        (0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0),
+        _both(_spell("mocap.dropout"), Expected(), Expected()),
+    ),
+    Study(
+        "outliers", "How many frames may lie 30 cm off?", "frames with a wrong position", "%",
+        (0, 5, 10, 20, 30, 50), _both(_outliers, Expected(), Expected()),
+    ),
+    Study(
+        "swap", "How long may the cameras take the markers for one another?", "pose turned by 180 deg for", "s",
+        (0, 0.02, 0.1, 0.2, 0.3, 0.4, 0.6), _both(_spell("mocap.swap"), Expected(), Expected()),
+    ),
+    Study(
+        "gyro-bias", "How far may the gyro drift after its calibration?", "bias", "deg/s", (0, 1, 2, 5, 10, 20),
+        (
+            *(Variant(f"floaty, {axis}", _fault(f"imu.bias.{axis}", 0), Expected()) for axis in "pqr"),
+            *(Variant(f"as-flown, {axis}", _fault(f"imu.bias.{axis}", 0), Expected(), AS_FLOWN) for axis in "pqr"),
+        ),
+    ),
+    Study(
+        "gyro-noise", "How noisy may the gyro be?", "noise, times the data sheet's", "", (1, 2, 5, 10, 20, 50),
+        _both(_fault("imu.noise", 1), Expected(), Expected()),
+    ),
+    Study(
+        "gyro-range", "How small may the gyro's range be?", "saturates at", "deg/s", (2000, 200, 100, 50, 20, 10),
+        _both(_fault("imu.saturation", 2000), Expected(), Expected()),
+    ),
+    Study(
+        "servo-stuck", "How long may a servo stick?", "servo 1 stuck for", "s", (0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2),
+        _both(_spell("servo.stuck.1"), Expected(), Expected()),
+    ),
+    Study(
+        "servo-slow", "How slow may a servo be?", "pace of servo 1", "%", (100, 70, 50, 30, 20, 10),
+        _both(
+            lambda size: Change() if size == 100 else Change(faults=(f"servo.slow.1@2={size / 100:g}",)),
+            Expected(), Expected(),
+        ),
+    ),
+    Study(
+        "servo-trim", "How wrongly may a servo be mounted?", "servo 1 off by", "deg", (0, 2, 4, 6, 8, 10, 15),
+        _both(_fault("servo.trim.1", 0), Expected(), Expected()),
+    ),
+    Study(
+        "model-error", "How wrong may the model on board be?", "error of the constants", "%", (0, 10, 30, 50),
+        (*_models(DEFAULT_PROFILE, Expected()), *_models(AS_FLOWN, Expected())),
+    ),
+    Study(
+        "battery", "What does a sagging battery do?", "sag", "V", (0, 0.5, 1.0, 1.5, 2.0),
+        _both(_fault("battery.sag", 0), Expected(), Expected()), duration_s=12.0,
+    ),
+)  # fmt: skip
+STUDIES = {study.name: study for study in _ALL}

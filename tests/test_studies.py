@@ -1,0 +1,181 @@
+"""Studies: every one can be flown, outcomes are told apart, expectations are judged, the predictor's cliff is there."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil.cli import main
+from hil.config import load_config
+from hil.experiments import EXPERIMENTS
+from hil.faults import parse
+from hil.run import Request, Result, fly, prepare
+from hil.studies import STUDIES, Change, Expected, Study, Variant
+from hil.study_figures import picture
+from hil.study_run import OUTCOMES, Cell, Curve, StudyResult, flights_of, outcome_of, summarise
+
+
+def flight(
+    folder: Path, profile: str, settings: tuple[str, ...], fault: str, seconds: float, seed: int = 1
+) -> Result:
+    prepare(folder)
+    faults = (parse(fault),) if fault else ()
+    return fly(Request.of(EXPERIMENTS["hover"], profile, settings, seed, seconds, faults=faults), folder)
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+def test_every_flight_of_every_study_can_be_asked_for(study: Study) -> None:
+    flights = list(flights_of(study, 1))
+    assert len(flights) == len(study.variants) * len(study.sizes)
+    for variant, size, request in flights:
+        assert request.config == load_config(variant.profile, request.overrides)
+        assert request.duration_s == study.duration_s, size
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+def test_something_is_expected_of_every_variant_and_only_of_sizes_that_are_flown(study: Study) -> None:
+    for variant in study.variants:
+        said = set(dataclasses.astuple(variant.expected)) - {None}
+        assert said, variant.name
+        assert said <= set(study.sizes), variant.name
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+def test_sizes_of_a_study_change_the_flight(study: Study) -> None:
+    for variant in study.variants:
+        changes = [variant.change(size) for size in study.sizes]
+        assert len(set(changes)) == len(study.sizes), "no two sizes are the same"
+        assert Change() in (changes[0], Change()), "the first is harmless"
+
+
+def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
+    study = STUDIES["model-error"]
+    (variant,) = (v for v in study.variants if v.name == "floaty, inputs +")
+    (request,) = (r for v, size, r in flights_of(study, 1) if v is variant and size == 30)
+    right, wrong = load_config().model.model_dump(), request.config.model.model_dump()
+    ratio = {name: wrong[name] / right[name] for name in right}
+    inputs = {name for name in right if name[-2:] in ("u1", "u2", "u3", "u4")}
+    assert len(inputs) == 6
+    assert {name: ratio[name] for name in inputs} == pytest.approx(dict.fromkeys(inputs, 1.3))
+    assert {ratio[name] for name in right if name not in inputs} == {1.0}
+    assert request.config.plant == load_config().plant, "the world stays right"
+
+
+@pytest.mark.parametrize(
+    ("settings", "fault", "outcome"),
+    [
+        ((), "", "holds"),
+        (("tunnel.gust_scale=3",), "", "degrades"),
+        ((), "radio.cut@0.2:0.52", "failsafe"),
+        (("tunnel.speed=7",), "", "lost"),
+    ],
+)
+def test_outcomes_are_told_apart(tmp_path: Path, settings: tuple[str, ...], fault: str, outcome: str) -> None:
+    result = flight(tmp_path / "run", "floaty", settings, fault, 2.0)
+    assert outcome_of(result) == outcome, result.metrics
+
+
+def test_a_flight_that_stopped_on_an_error_is_no_outcome_of_the_robot(tmp_path: Path) -> None:
+    result = flight(tmp_path / "run", "floaty", (), "", 0.1)
+    assert outcome_of(dataclasses.replace(result, outcome="error")) == "error"
+
+
+def unchanged(size: float) -> Change:
+    return Change()
+
+
+def judged(expected: Expected, *cells: str) -> list[str]:
+    """What surprises in the cells of sizes 1, 2, 3; a letter per seed: Holds, Degrades, Failsafe, Lost."""
+    words = {name[0]: name for name in OUTCOMES}
+    variant = Variant("a", unchanged, expected)
+    study = Study("s", "?", "size", "m", (1.0, 2.0, 3.0), (variant,))
+    flown = [
+        Cell(size, tuple(words[letter] for letter in seeds), ())
+        for size, seeds in zip(study.sizes, cells, strict=False)
+    ]
+    result = StudyResult(study, (Curve(variant, tuple(flown)),))
+    assert result.holds == (len(cells) == 3 and not result.surprises(result.curves[0]))
+    return result.surprises(result.curves[0])
+
+
+@pytest.mark.parametrize(
+    ("expected", "cells", "surprises"),
+    [
+        (Expected(holds_to=2), ("hh", "hh", "ll"), []),
+        (Expected(holds_to=2), ("hh", "hd", "hh"), ["2 m: 1 holds, 1 degrades"]),
+        (Expected(holds_to=1), ("hh", "ll", "ll"), []),
+        (Expected(flies_to=2), ("dd", "fh", "ll"), []),
+        (Expected(flies_to=2), ("dd", "hl", "ll"), ["2 m: 1 holds, 1 lost"]),
+        (Expected(lost_from=2), ("hh", "ll", "ll"), []),
+        (Expected(lost_from=2), ("hh", "ll", "lf"), ["3 m: 1 failsafe, 1 lost"]),
+        (Expected(lost_from=2), ("hh", "ee", "ll"), ["2 m: 2 error"]),
+        (Expected(failsafe_from=2), ("hh", "ff", "fl"), []),
+        (Expected(failsafe_from=2), ("hh", "fd", "ll"), ["2 m: 1 degrades, 1 failsafe"]),
+        (Expected(holds_to=1, lost_from=3), ("hh", "dl"), []),
+    ],
+)
+def test_what_is_not_expected_is_told(
+    expected: Expected, cells: tuple[str, ...], surprises: list[str]
+) -> None:
+    assert judged(expected, *cells) == surprises
+
+
+def test_the_typical_outcome_is_the_median_and_the_worse_of_two() -> None:
+    assert Cell(1.0, ("lost", "holds", "holds"), ()).typical == "holds"
+    assert Cell(1.0, ("lost", "holds"), ()).typical == "lost"
+    assert Cell(1.0, ("failsafe", "degrades", "lost"), ()).typical == "failsafe"
+
+
+def test_the_predictors_cliff(tmp_path: Path) -> None:
+    """The author's gains at 40 ms: lost without the predictor, not with it (physics.md section 8: 20 of 20, 0)."""
+    study = STUDIES["latency"]
+    cells = {
+        (variant.name, request.seed): outcome_of(
+            flight(tmp_path / "run", variant.profile, request.overrides, "", study.duration_s, request.seed)
+        )
+        for variant, size, request in flights_of(study, 3)
+        if variant.name in ("as-flown, no predictor", "as-flown, measured age") and size == 40
+    }
+    assert len(cells) == 6
+    for (name, seed), outcome in cells.items():
+        assert outcome == ("lost" if "no predictor" in name else "holds"), (name, seed)
+
+
+def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold(tmp_path: Path) -> None:
+    study = STUDIES["loss"]
+    variant, size, request = next(flights_of(study, 1))
+    prepare(tmp_path / "run")
+    result = summarise(study, [(variant, size, fly(request, tmp_path / "run"))])
+    assert [len(curve.cells) for curve in result.curves] == [1]
+    assert not result.holds
+    assert picture(result).startswith(b"\x89PNG")
+
+
+def test_a_study_can_be_flown_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(
+        sys, "argv", ["floaty", "study", "loss", "--seeds", "1", "--out", str(tmp_path / "out")]
+    )
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "report.html",
+        "result.json",
+        "study-loss.png",
+    }
+    (told,) = json.loads((tmp_path / "out" / "result.json").read_text())["studies"]
+    assert told["as_expected"] is True
+    assert [len(variant["cells"]) for variant in told["variants"]] == [5, 5]
+    assert told["variants"][0]["cells"][0]["outcomes"] == ["holds"]
+
+
+def test_an_unknown_study_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["floaty", "study", "latensy"])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 2
+    assert capsys.readouterr().err == "floaty: study 'latensy': unknown; did you mean latency?\n"
