@@ -135,13 +135,14 @@ def list_experiments(faults: bool) -> None:
     width = max(map(len, EXPERIMENTS))
     for experiment in EXPERIMENTS.values():
         console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
+    bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
+    console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
     console.print("\nrobustness, for `floaty study`:")
     for one in STUDIES.values():
         console.print(f"{one.name:{width}}  {one.question}", soft_wrap=True)
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
-    bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
-    console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
     console.print(f"\nprofiles: {', '.join(names)}")
+    console.print("faults: floaty list --faults")
 
 
 def _list_faults() -> None:
