@@ -124,7 +124,7 @@ def fly(
 @app.command("list")
 @click.option("--faults", is_flag=True, help="List the kinds of faults for `floaty fly --fault`.")
 def list_experiments(faults: bool) -> None:
-    """List the experiments and the profiles, or the kinds of faults."""
+    """List the experiments, the profiles and where the faults are; or the kinds of faults."""
     if faults:
         return _list_faults()
     from hil.config import DEFAULT_PROFILE, profile_names
@@ -137,6 +137,7 @@ def list_experiments(faults: bool) -> None:
     bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
     console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
     console.print(f"\nprofiles: {', '.join(names)}")
+    console.print("faults: floaty list --faults")
 
 
 def _list_faults() -> None:
