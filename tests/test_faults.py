@@ -305,7 +305,7 @@ def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
 
 def test_every_kind_has_a_sign() -> None:
     known = {sign.fault.partition("=")[0] for sign in SIGNS}
-    assert known | {"battery.sag"} == set(KINDS)  # the log has no voltage: see below
+    assert known | {"battery.sag"} == set(KINDS)  # see below
 
 
 def test_a_sagging_battery_is_what_the_board_reads() -> None:
@@ -314,8 +314,11 @@ def test_a_sagging_battery_is_what_the_board_reads() -> None:
     for moment_us in (1_999_000, 2_001_000, 2_999_000, 3_001_000):
         flight.events.at(moment_us, lambda _: read.append(flight.board.read_battery_mv()))
     flight.run()
-    assert read[1] == read[2] == read[0] - 500
-    assert read[3] == read[0]
+    before, *sagging, after = read
+    assert sagging == pytest.approx(
+        [before - 500] * 2, abs=80
+    )  # the flaps' load comes and goes: 80 mV of one cell
+    assert after == pytest.approx(before, abs=80)
 
 
 # Several faults
