@@ -202,5 +202,5 @@ def judge(values: Mapping[str, float], limits: Mapping[str, float]) -> list[Verd
             raise LabError(f"limit on {name!r}: no such metric, there are {', '.join(METRICS)}")
         value = values[name]
         holds = value <= bound if METRICS[name].bound == "max" else value >= bound
-        verdicts.append(Verdict(name, value, bound, holds))
+        verdicts.append(Verdict(name, value, bound, bool(holds)))
     return verdicts
