@@ -102,19 +102,23 @@ def _print_rows(flown: "Paper") -> None:
         table.add_column(heading)
     for _, row, both in flown.rows:
         table.add_section()
-        for index, (metric, value) in enumerate(row.values.items()):
-            spreads = (str(Spread.of(metric, trials.results)) for trials in both)
-            table.add_row(row.title if index == 0 else "", metric, value, *spreads)
-        verdicts = (f"{'ok' if one.holds else 'FAILS'}: {one.passed} of {len(one.results)}" for one in both)
-        table.add_row("", "verdict", "", *verdicts)
-    Console(highlight=False, width=max(console.width, 150)).print(table)
-    for _, row, both in flown.rows:
-        for trials in both:
-            if trials.failed:
-                reason = f"; {row.why}" if row.why else ""
-                console.print(
-                    f"{row.title}, {trials.profile}: {', '.join(trials.failed)}{reason}", soft_wrap=True
-                )
+        for index, (metric, claim) in enumerate(row.claims.items()):
+            cells = (f"{Spread.of(metric, one.results)} {_marked(one.missed(row, metric))}" for one in both)
+            table.add_row(row.title if index == 0 else "", metric, claim.text, *cells)
+        verdicts = (
+            f"{one.passed} of {len(one.results)}{'' if one.holds else _marked(' FAILS')}" for one in both
+        )
+        table.add_row("", "limits held", "", *verdicts)
+    Console(highlight=False, width=max(console.width, 160)).print(table)
+    for row, profile, what in flown.misses:
+        console.print(f"{row.title}, {profile}: {'; '.join(what)}", soft_wrap=True)
+    whys = dict.fromkeys(row.why for row, _, _ in flown.misses if row.why)
+    for why in whys:
+        console.print(f"\n{why}", soft_wrap=True)
+
+
+def _marked(text: str) -> str:
+    return f"[red]{text}[/red]" if text else ""
 
 
 def _print_studies(flown: "Paper") -> None:

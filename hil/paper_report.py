@@ -89,12 +89,13 @@ def _content(paper: Paper) -> dict[str, Any]:
 def _trials(row: Row, trials: Trials) -> dict[str, Any]:
     return {
         "holds": trials.holds,
+        "missed": {name: gap for name in row.claims if (gap := trials.missed(row, name))},
         "metrics": {
             name: {
                 key: value if not isinstance(value, float) or math.isfinite(value) else None
                 for key, value in asdict(Spread.of(name, trials.results)).items()
             }
-            for name in row.values
+            for name in row.claims
         },
         "flights": [
             {

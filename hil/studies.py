@@ -166,16 +166,16 @@ _ALL = (
     ),
     Study(
         "loss", "How many packets may the radio lose?", "packets lost in the air, per try of four", "%",
-        (0, 20, 40, 60, 80),
+        (0, 20, 40, 60, 80, 90, 95),
         _both(lambda size: Change((f"radio.uplink_loss={size / 100:g}",)), Expected(), Expected()),
     ),
     Study(
-        "jitter", "How unevenly may poses arrive?", "extra delay, uniform from 0 to", "ms", (0, 5, 10, 15, 20, 30),
+        "jitter", "How unevenly may poses arrive?", "extra delay, uniform from 0 to", "ms", (0, 5, 10, 15, 20, 30, 60, 100),
         _both(lambda size: Change((f"radio.uplink_jitter_us={round(1000 * size)}",)), Expected(), Expected()),
     ),
     Study(
         "dropout", "How long may the cameras lose the robot?", "cameras blind for", "s",
-        (0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0),
+        (0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 2.0),
         _both(_spell("mocap.dropout"), Expected(), Expected()),
     ),
     Study(
@@ -187,18 +187,18 @@ _ALL = (
         (0, 0.02, 0.1, 0.2, 0.3, 0.4, 0.6), _both(_spell("mocap.swap"), Expected(), Expected()),
     ),
     Study(
-        "gyro-bias", "How far may the gyro drift after its calibration?", "bias", "deg/s", (0, 1, 2, 5, 10, 20),
+        "gyro-bias", "How far may the gyro drift after its calibration?", "bias", "deg/s", (0, 1, 2, 5, 10, 20, 50, 100),
         (
             *(Variant(f"floaty, {axis}", _fault(f"imu.bias.{axis}", 0), Expected()) for axis in "pqr"),
             *(Variant(f"as-flown, {axis}", _fault(f"imu.bias.{axis}", 0), Expected(), AS_FLOWN) for axis in "pqr"),
         ),
     ),
     Study(
-        "gyro-noise", "How noisy may the gyro be?", "noise, times the data sheet's", "", (1, 2, 5, 10, 20, 50),
+        "gyro-noise", "How noisy may the gyro be?", "noise, times the data sheet's", "", (1, 5, 10, 20, 50, 100, 200),
         _both(_fault("imu.noise", 1), Expected(), Expected()),
     ),
     Study(
-        "gyro-range", "How small may the gyro's range be?", "saturates at", "deg/s", (2000, 200, 100, 50, 20, 10),
+        "gyro-range", "How small may the gyro's range be?", "saturates at", "deg/s", (2000, 100, 50, 20, 10, 5, 2),
         _both(_fault("imu.saturation", 2000), Expected(), Expected()),
     ),
     Study(
