@@ -125,7 +125,7 @@ def fly(
 @app.command("list")
 @click.option("--faults", is_flag=True, help="List the kinds of faults for `floaty fly --fault`.")
 def list_experiments(faults: bool) -> None:
-    """List the experiments, the robustness studies and the profiles, or the kinds of faults."""
+    """List the experiments, the robustness studies and the profiles; or the kinds of faults."""
     if faults:
         return _list_faults()
     from hil.config import DEFAULT_PROFILE, profile_names
@@ -135,12 +135,13 @@ def list_experiments(faults: bool) -> None:
     width = max(map(len, EXPERIMENTS))
     for experiment in EXPERIMENTS.values():
         console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
+    console.print(f"{'drag-model':{width}}  forces on the mounted robot over flap angles: floaty drag-model")
     console.print("\nrobustness, for `floaty study`:")
     for one in STUDIES.values():
         console.print(f"{one.name:{width}}  {one.question}", soft_wrap=True)
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
-    console.print(f"{'drag-model':{width}}  forces on the mounted robot over flap angles: floaty drag-model")
     console.print(f"\nprofiles: {', '.join(names)}")
+    console.print("faults: floaty list --faults")
 
 
 def _list_faults() -> None:

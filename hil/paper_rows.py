@@ -45,9 +45,9 @@ NO_DAMPING = (
     "the hover shows as a limit cycle of 0.8 Hz grows here until the robot leaves the flow (physics.md section 8)."
 )
 LIFT = (
-    "By the Table's z constant the openings 0..52° carry the robot at 9.5 to 10.6 m/s; a flat plate of Floaty's size has "
-    "at most 1.34 times the weight at 10 m/s, so that 8 m/s takes a lighter robot than 0.34 kg or another hover angle than "
-    "25° (physics.md section 8)."
+    "By the Table's z constant the flaps, with 8° kept for attitude, carry 0.34 kg at 9.5 to 10.4 m/s. At 8 m/s the robot "
+    "needs 56 % more lift than the hover at 10 m/s and 25° leaves in reserve: flat plates of its size have 18 %. Mass, "
+    "speed, hover angle and z constant of the paper do not fit 8 to 11 m/s together (physics.md section 8)."
 )
 
 

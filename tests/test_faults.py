@@ -295,8 +295,8 @@ def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
     fault = f"{name}@{BEGIN_S}:{sign.duration_s}" + (f"={size}" if size else "")
     log, without = fly_for_log(link, fault), without_fault(link)
     truth = [name for name in without.column_names if name.startswith(("truth", "flow"))]
-    before = rows_between(log, -RELEASE_S, BEGIN_S).select(truth)
-    assert before.equals(rows_between(without, -RELEASE_S, BEGIN_S).select(truth))
+    before = (-RELEASE_S, BEGIN_S + 0.001)  # with the row at the begin: nothing acts backwards
+    assert rows_between(log, *before).select(truth).equals(rows_between(without, *before).select(truth))
     for start_s, (low, high) in ((BEGIN_S, sign.during), (BEGIN_S + sign.duration_s, sign.after)):
         window = (start_s + sign.window[0], start_s + sign.window[1])
         figure = sign.seen(rows_between(log, *window), rows_between(without, *window))
@@ -343,6 +343,15 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
     assert wind == pytest.approx([0.2, 1.2, 3.2, 3.2, 2.2, 0.2])
     assert pace == pytest.approx([0.8, 0.4, 0.0, 0.4, 0.8, 0.8])
     assert flight.plant.tunnel.side_wind == (0.1, 0.2, 0.3)
+
+
+def test_what_changed_between_two_faults_stays_changed() -> None:
+    flight = Flight(
+        load_config(), HOVER, 1.0, 1, None, faults=[parse("wind.fan@0.1:0.1=0.9"), parse("wind.fan@0.5:0.1=0.9")]
+    )  # fmt: skip
+    flight.events.at(1_300_000, lambda _: flight.plant.tunnel.set_fan_factor(1.1))
+    flight.run()
+    assert flight.plant.tunnel.fan_factor == 1.1
 
 
 def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> None:
