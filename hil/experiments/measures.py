@@ -7,6 +7,7 @@ no limit accepts. The names of the results are those of `hil.metrics.METRICS`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 import pyarrow as pa
@@ -28,7 +29,8 @@ Signal = NDArray[np.float64]  # (N,), one value per row
 def seconds(flight: pa.Table) -> Signal:
     """Return the time since the release [s]."""
     times = column(flight, "t")
-    return 1e-6 * (times - times[0])
+    since: Signal = 1e-6 * (times - times[:1])
+    return since
 
 
 def yaw_and_goal(flight: pa.Table) -> tuple[Signal, Signal]:
@@ -46,7 +48,7 @@ def steps(times: Signal, value: Signal, goal: Signal) -> list[tuple[float, float
     """Return rise [s], settling [s] and overshoot [share of the step] of every jump of the goal."""
     starts = (np.flatnonzero(np.diff(goal)) + 1).tolist()
     found = []
-    for start, end in zip(starts, (*starts[1:], len(goal)), strict=True):
+    for start, end in pairwise((*starts, len(goal))):
         done = (value[start:end] - goal[start - 1]) / (goal[start] - goal[start - 1])  # 0 before, 1 after
         risen = np.flatnonzero(done >= RISEN)
         outside = np.flatnonzero(np.abs(done - 1.0) > BAND)
@@ -120,7 +122,7 @@ def recoveries(faults: tuple[Fault, ...], duration_s: float, flight: pa.Table) -
     times, error = seconds(flight), np.abs(position_error(flight)).max(axis=1)
     starts = [fault.start_s for fault in faults]
     recovered, slowest = 0, 0.0
-    for start, end in zip(starts, (*starts[1:], duration_s), strict=True):
+    for start, end in pairwise((*starts, duration_s)):
         rows = (times >= start) & (times < end)
         if times[-1] < end - 2 * ROW_S:
             break

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hil.curves import AXIS_COLOURS, GREY
 from hil.experiments import measures
+from hil.fault_kinds import KINDS
 from hil.faults import spans_of
 from hil.metrics import BOX, column, free_flight, position_error
 from hil.picture import Picture
@@ -54,12 +55,15 @@ def centimetres(axis: str, flight: pa.Table) -> tuple[Signal, Signal]:
 def openings(flight: pa.Table) -> tuple[Signal, Signal]:
     """Return mean opening of the four flaps, and what the controller asked for, over a tenth of a second [deg]."""
     signs = np.array([1.0, -1.0, 1.0, -1.0])
-    tenth = np.full(10, 0.1)
     value, command = (
         np.degrees(column(flight, *(f"{kind}.flap_{flap}" for flap in (1, 2, 3, 4))) @ signs / 4)
         for kind in ("truth", "control")
     )
-    return np.convolve(value, tenth, "same"), np.convolve(command, tenth, "same")
+    return _tenth(value), _tenth(command)
+
+
+def _tenth(values: Signal) -> Signal:
+    return np.convolve(np.pad(values, (5, 4), "edge"), np.full(10, 0.1), "valid")
 
 
 YAW = Quantity("yaw [deg]", yaw_degrees)
@@ -80,12 +84,14 @@ def follow(quantities: tuple[Quantity, ...], window_s: tuple[float, float], *fli
                 one.plot(times, value, color=LIGHT, label="trials" if index == 1 else None)
             else:
                 one.plot(times, value, color=DARK, linewidth=1.6, label="flight")
-                one.plot(times, goal, color=WANTED, linestyle="--", linewidth=1.1, label="target")
+                one.plot(
+                    times, goal, color=WANTED, linestyle="--", linewidth=1.1, drawstyle="steps-post", label="target"
+                )  # fmt: skip
         one.set_ylabel(quantity.label)
         _shade_faults(one, flights[0])
         one.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    times = measures.seconds(free[0])
-    axes[-1].set_xlim(window_s[0], min(window_s[1], max(times[-1:], default=0.0)) or window_s[1])
+    longest = max(float(measures.seconds(flight).max(initial=0.0)) for flight in free)
+    axes[-1].set_xlim(window_s[0], max(min(window_s[1], longest), window_s[0] + 0.1))
     return figure
 
 
@@ -97,7 +103,8 @@ def disturbed(*flights: pa.Table) -> Figure:
     for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
         times, error = measures.seconds(flight), 100 * position_error(flight)
         for axis, one in enumerate(axes):
-            one.plot(times, error[:, axis], color=LIGHT if index else AXIS_COLOURS[axis])
+            colour, width = (LIGHT, 0.9) if index else (AXIS_COLOURS[axis], 1.4)
+            one.plot(times, error[:, axis], color=colour, linewidth=width)
     for one, name in zip(axes, "xyz", strict=True):
         one.set_ylabel(f"{name} error [cm]")
         one.margins(x=0)
@@ -119,7 +126,7 @@ def _spans(flight: pa.Table) -> list[tuple[float, float, str]]:
     return [
         (
             1e-6 * (span.begin_us - release_us), 1e-6 * (min(span.end_us, end_us) - release_us),
-            f"{span.fault.kind.partition('.')[2]} {span.fault.size:+g}",
+            f"{span.fault.kind.partition('.')[2]} {span.fault.size:+g} {KINDS[span.fault.kind].unit}".rstrip(),
         )
         for span in spans_of(flight.schema.metadata)
         if span.begin_us < end_us

@@ -1,0 +1,216 @@
+"""The paper's flights: what they measure, which limits they hold, what their pictures show."""
+
+import math
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import TransferFunction, lsim, step
+
+from hil.config import load_config, profile_names
+from hil.experiments import EXPERIMENTS
+from hil.experiments.airspeed import LIFT_PER_RAD, attainable, hover_angle
+from hil.experiments.measures import response, steps
+from hil.experiments.pushes import FAULTS, PUSHES
+from hil.metrics import METRICS
+from hil.picture import Picture
+from hil.plant.body import SIGNS
+from hil.plant.correction import TABLE
+from hil.plant.plant import Plant
+from hil.recorder import load_events, load_log
+from hil.run import Request, Result, fly, prepare
+from hil.tunnel import TunnelConfig
+
+FAMILIES = ("yaw-", "height-sine", "y-square", "pushes", "side-wind-", "occlusion", "airspeed-")
+PAPER = [name for name in EXPERIMENTS if name.startswith(FAMILIES)]
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def flown(
+    folder: Path, name: str, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float | None = None
+) -> Result:  # fmt: skip
+    prepare(folder)
+    return fly(Request.of(EXPERIMENTS[name], profile, overrides, seed, duration_s), folder)
+
+
+def explain(result: Result) -> str:
+    return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
+
+
+# Measures against other implementations
+
+
+@pytest.mark.parametrize("damping", [0.3, 0.5, 0.7])
+def test_settling_rise_and_overshoot_are_those_of_the_textbook(damping: float) -> None:
+    natural = 6.0
+    times = np.arange(0.0, 8.0, 0.001)
+    _, after = step(TransferFunction([natural**2], [1, 2 * damping * natural, natural**2]), T=times)
+    lead = np.arange(-1.0, 0.0, 0.001)
+    value = 0.3 + 1.9 * np.concatenate([np.zeros(len(lead)), after])
+    goal = 0.3 + 1.9 * np.concatenate([np.zeros(len(lead)), np.ones(len(times))])
+    ((rise, settle, overshoot),) = steps(np.concatenate([lead, times]), value, goal)
+    assert overshoot == pytest.approx(math.exp(-math.pi * damping / math.sqrt(1 - damping**2)), abs=1e-3)
+    assert rise == pytest.approx(times[np.argmax(after >= 0.9)], abs=0.002)
+    assert np.abs(after[times >= settle] - 1).max() <= 0.05
+    assert np.abs(after[times >= settle - 0.003] - 1).max() > 0.05
+
+
+def test_a_step_that_does_not_stay_settled_is_not_settled() -> None:
+    times = np.arange(0.0, 3.0, 0.01)
+    goal = (times >= 1.0).astype(float)
+    value = goal.copy()
+    value[-1] = 0.9
+    ((_, settle, _),) = steps(times, value, goal)
+    assert math.isnan(settle)
+
+
+def test_gain_and_lag_are_those_of_a_first_order_lag() -> None:
+    frequency, late = 0.15, 0.2
+    times = np.arange(0.0, 41.0, 0.01)
+    goal = np.where(times >= 1.0, np.sin(2 * np.pi * frequency * (times - 1.0)), 0.0)
+    _, value, _ = lsim(TransferFunction([1.0], [late, 1.0]), goal, times)
+    expected = 1 / (1 + 2j * np.pi * frequency * late)
+    gain, lag = response(times, value, goal, frequency)
+    assert gain == pytest.approx(abs(expected), abs=0.005)
+    assert lag == pytest.approx(-np.angle(expected), abs=0.005)
+
+
+@given(
+    st.floats(0.2, 2.0), st.floats(-1.5, 1.5), st.floats(-3.0, 3.0), st.sampled_from([0.02, 0.05, 0.1, 0.15])
+)
+def test_gain_and_lag_know_nothing_of_an_offset(
+    gain: float, lag: float, offset: float, frequency: float
+) -> None:
+    times = np.arange(0.0, 1.0 + 2 / frequency, 0.01)
+    phase = 2 * np.pi * frequency * (times - 1.0)
+    goal = np.where(times >= 1.0, np.sin(phase), 0.0)
+    found = response(times, gain * np.sin(phase - lag) + offset, goal, frequency)
+    assert found == pytest.approx((gain, lag), abs=0.01)
+
+
+def test_less_than_a_period_has_no_gain() -> None:
+    times = np.arange(0.0, 5.0, 0.01)
+    assert all(map(math.isnan, response(times, np.sin(times), np.sin(times), 0.1)))
+    assert all(map(math.isnan, response(times, times, np.zeros(len(times)), 0.1)))
+
+
+# Airspeeds against the plant
+
+
+def lift(speed: float, opening: float, variant: str) -> float:
+    """Lift over weight on the mounted robot with every flap open alike."""
+    config = load_config("floaty", [f"plant.variant={variant}"]).plant
+    plant = Plant(config, TunnelConfig(), load_config().actuators, np.random.default_rng(1))
+    force, _ = plant.mounted_wrench((SIGNS * opening).tolist())
+    return float(force[2]) * (speed / config.airspeed) ** 2 / (config.mass * 9.81)
+
+
+@pytest.mark.parametrize("speed", [9.5, 9.75, 10.0, 10.25, 10.4])
+def test_at_its_hover_angle_the_plant_carries_itself(speed: float) -> None:
+    assert lift(speed, hover_angle(speed), "methods") == pytest.approx(1.0, abs=0.002)
+    assert pytest.approx(TABLE.z_u4 / 9.81) == LIFT_PER_RAD
+
+
+def test_no_flap_angle_carries_the_plant_at_eight_metres_per_second() -> None:
+    assert max(lift(8.0, opening, "plate") for opening in np.linspace(-0.2, 0.9, 23)) < 0.8
+    assert lift(10.0, 0.0, "plate") == pytest.approx(1.18, abs=0.01)  # physics.md section 8
+    low, high = attainable()
+    assert 9.4 < low < 9.5 < 10.25 < high < 10.5
+
+
+# The flights
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str) -> None:
+    result = flown(tmp_path / "run", name, seed=7)
+    assert result.passed, explain(result)
+    assert result.verdicts
+    written = EXPERIMENTS[name].pictures[0].png(load_log(result.folder))
+    assert written.startswith(PNG)
+    assert len(written) > 10_000
+
+
+@pytest.mark.parametrize(
+    "name", ["yaw-step-0", "yaw-sine-0.15", "height-sine", "y-square", "pushes", "side-wind-3"]
+)
+def test_the_authors_gains_hold_their_own_limits(tmp_path: Path, name: str) -> None:
+    result = flown(tmp_path / "run", name, profile="as-flown", seed=7)
+    assert result.passed, explain(result)
+    assert {verdict.metric for verdict in result.verdicts} == set(load_config("as-flown").limits[name])
+
+
+def test_the_step_needs_flaps_that_open_through_zero(tmp_path: Path) -> None:
+    opened, closed = (flown(tmp_path / name, name) for name in ("yaw-step", "yaw-step-0"))
+    assert opened.metrics["settle"] < 0.5 < closed.metrics["settle"]
+    assert opened.metrics["peak_rate"] > closed.metrics["peak_rate"]
+
+
+def test_a_user_overrides_the_settings_of_an_experiment(tmp_path: Path) -> None:
+    request = Request.of(EXPERIMENTS["yaw-step"], overrides=("allocation.opening_min=0",))
+    assert request.config.allocation.opening_min == 0.0
+    assert request.config.controller.gain_r == 0.11
+    assert request.overrides[-1] == "allocation.opening_min=0"
+
+
+def test_pushes_come_one_after_the_other_and_are_counted_until_the_robot_is_lost(tmp_path: Path) -> None:
+    calm = flown(tmp_path / "calm", "pushes")
+    begun = [event["text"] for event in load_events(calm.folder) if "begins" in event["text"]]
+    assert len(begun) == len(PUSHES) == calm.metrics["recovered"]
+    hard = [replace(fault, size=2.5 * fault.size) for fault in FAULTS if fault.kind == "push.y"]
+    stronger = replace(EXPERIMENTS["pushes"], faults=(*FAULTS[:5], *hard))
+    prepare(tmp_path / "lost")
+    lost = fly(Request.of(stronger), tmp_path / "lost")
+    assert lost.outcome == "lost"
+    assert lost.metrics["recovered"] == 5 + 2  # the calm time of x, then the push in y
+    assert math.isnan(lost.metrics["back_in_box"])
+
+
+def test_a_flight_too_short_to_measure_fails_its_limits(tmp_path: Path) -> None:
+    for name in ("yaw-step", "yaw-sine-0.02", "y-square", "pushes", "side-wind-1"):
+        result = flown(tmp_path / name, name, duration_s=0.5)
+        assert result.outcome == "completed"
+        assert not result.passed, name
+        for picture in EXPERIMENTS[name].pictures:
+            assert picture.png(load_log(result.folder)).startswith(PNG)
+
+
+# The list
+
+
+def test_every_limit_of_every_profile_names_an_experiment_and_metrics() -> None:
+    for experiment in EXPERIMENTS.values():
+        assert set(experiment.limits) <= set(METRICS), experiment.name
+    for profile in profile_names():
+        for name, limits in load_config(profile).limits.items():
+            assert name in EXPERIMENTS
+            assert set(limits) <= set(METRICS), name
+
+
+@pytest.mark.parametrize("name", list(EXPERIMENTS))
+def test_an_experiment_goes_to_another_process(name: str) -> None:
+    again = pickle.loads(pickle.dumps(EXPERIMENTS[name]))
+    assert again.name == name
+    Request.of(again)  # its settings are those of a profile
+
+
+def test_listing_experiments_draws_nothing() -> None:
+    check = "import sys, hil.experiments; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
+
+
+def test_trials_are_drawn_behind_the_first_flight(tmp_path: Path) -> None:
+    logs = [load_log(flown(tmp_path / str(seed), "yaw-step", seed=seed).folder) for seed in (1, 2, 3)]
+    picture: Picture = EXPERIMENTS["yaw-step"].pictures[0]
+    figure = picture.draw(*logs)
+    lines = figure.axes[0].get_lines()
+    assert len(lines) == 4  # two trials, the flight, its target
+    first = lines[2].get_ydata()
+    assert np.asarray(first)[-1] == pytest.approx(110.0, abs=3.0)
+    assert lines[2].get_linewidth() > lines[0].get_linewidth()
