@@ -135,7 +135,8 @@ def list_experiments(faults: bool) -> None:
     width = max(map(len, EXPERIMENTS))
     for experiment in EXPERIMENTS.values():
         console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
-    console.print(f"{'drag-model':{width}}  forces on the mounted robot over flap angles: floaty drag-model")
+    bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
+    console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
     console.print("\nrobustness, for `floaty study`:")
     for one in STUDIES.values():
         console.print(f"{one.name:{width}}  {one.question}", soft_wrap=True)
@@ -207,15 +208,15 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
     from hil.config import load_config
 
     config = load_config(profile, overrides)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
     announce_compilation()
     measured = drag_model.measure(config, seed)
     rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        drag_model.write_csv(rows, out / "drag_model.csv")
-        page = drag_model_report.write(rows, math.degrees(config.plant.hover_angle), out)
-    except OSError as error:
-        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
+    drag_model.write_csv(rows, out / "drag_model.csv")
+    page = drag_model_report.write(rows, math.degrees(config.plant.hover_angle), out)
     console.print(f"report  {page}")
 
 
