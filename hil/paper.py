@@ -19,7 +19,8 @@ from hil.experiments import find_experiment
 from hil.metrics import METRICS, SHOWN
 from hil.paper_rows import ROWS, Row
 from hil.run import Request, Result
-from hil.studies import PROFILES, Study
+from hil.studies import PROFILES
+from hil.study import Study
 from hil.study_run import StudyResult, flights_of, summarise
 from hil.sweep import Job, fly_all
 

@@ -12,7 +12,7 @@ from hil.errors import LabError
 if TYPE_CHECKING:
     from hil.compare import Comparison
     from hil.paper import Paper
-    from hil.studies import Study
+    from hil.study import Study
 
 console = Console(highlight=False)
 notices = Console(stderr=True, highlight=False)
@@ -38,7 +38,7 @@ seeds_option = click.option(
     show_default=True,
     help="Report and logs.",
 )
-@click.option("--only", metavar="PATTERN", help="Experiments, like hover or yaw-*; leaves the studies out.")
+@click.option("--only", metavar="PATTERN", help="Experiments, like hover or yaw-*, and nothing else.")
 @click.option("--no-studies", is_flag=True, help="Leave the robustness studies out.")
 def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
     """Fly the paper's experiments on both profiles, and the robustness studies; write one report.
@@ -50,7 +50,7 @@ def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
     from hil.studies import STUDIES
 
     studies = [] if only or no_studies else list(STUDIES.values())
-    return _fly(select(only), studies, seeds, out)
+    return _fly(select(only), studies, seeds, out, mounted=not only)
 
 
 @click.command()
@@ -67,8 +67,10 @@ def study(name: str, seeds: int, out: Path | None) -> int:
     return _fly([], [find_study(name)], seeds, out or Path("runs") / f"study-{name}")
 
 
-def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path) -> int:
+def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted: bool = False) -> int:
+    from hil import drag_model
     from hil.cli import announce_compilation
+    from hil.config import load_config
     from hil.paper import fly_paper
     from hil.paper_report import write_paper
 
@@ -76,7 +78,8 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path) -> int:
     try:
         out.mkdir(parents=True, exist_ok=True)
         flown = fly_paper(rows, studies, seeds, out, notices)
-        report = write_paper(out, flown)
+        bench = list(drag_model.measure(load_config(), 1)) if mounted and not flown.interrupted else []
+        report = write_paper(out, flown, bench)
     except OSError as error:
         raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
     _print_rows(flown)
