@@ -19,7 +19,8 @@ from hil.experiments import find_experiment
 from hil.metrics import METRICS, SHOWN
 from hil.paper_rows import ROWS, Row
 from hil.run import Request, Result
-from hil.studies import PROFILES, Study
+from hil.studies import PROFILES
+from hil.study import Study
 from hil.study_run import StudyResult, flights_of, summarise
 from hil.sweep import Job, fly_all
 
@@ -85,6 +86,17 @@ class Trials:
         """How many were lost."""
         return sum(result.outcome == "lost" for result in self.results)
 
+    def missed(self, row: Row, metric: str) -> str:
+        """Return by how much the mean misses the paper's value; empty when it does not, or the paper has none."""
+        bound, spread = row.claims[metric].bound, Spread.of(metric, self.results)
+        if bound is None or not spread.count:
+            return ""
+        scale, unit = SHOWN.get(METRICS[metric].unit, (1.0, METRICS[metric].unit))
+        beyond = (
+            spread.mean - bound * scale if METRICS[metric].bound == "max" else bound * scale - spread.mean
+        )
+        return f"misses by {beyond:.2g} {unit}".strip() if beyond > 1e-9 else ""
+
     def representative_first(self) -> list[Result]:
         """Return the flights, the one with the median error first."""
         ranked = sorted(self.results, key=_error)
@@ -98,6 +110,18 @@ class Paper:
     rows: tuple[tuple[str, Row, tuple[Trials, ...]], ...]  # experiment, row, per profile
     studies: tuple[StudyResult, ...]
     interrupted: bool
+
+    @property
+    def misses(self) -> list[tuple[Row, str, list[str]]]:
+        """Rows and profiles that miss a value of the paper, or hold not every limit, and what."""
+        found = []
+        for _, row, both in self.rows:
+            for trials in both:
+                gaps = [f"{metric} {gap}" for metric in row.claims if (gap := trials.missed(row, metric))]
+                if gaps or trials.failed:
+                    failed = [f"limits fail: {', '.join(trials.failed)}"] if trials.failed else []
+                    found.append((row, trials.profile, [*gaps, *failed]))
+        return found
 
     @property
     def holds(self) -> bool:

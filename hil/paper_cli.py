@@ -12,7 +12,7 @@ from hil.errors import LabError
 if TYPE_CHECKING:
     from hil.compare import Comparison
     from hil.paper import Paper
-    from hil.studies import Study
+    from hil.study import Study
 
 console = Console(highlight=False)
 notices = Console(stderr=True, highlight=False)
@@ -38,7 +38,7 @@ seeds_option = click.option(
     show_default=True,
     help="Report and logs.",
 )
-@click.option("--only", metavar="PATTERN", help="Experiments, like hover or yaw-*; leaves the studies out.")
+@click.option("--only", metavar="PATTERN", help="Experiments, like hover or yaw-*, and nothing else.")
 @click.option("--no-studies", is_flag=True, help="Leave the robustness studies out.")
 def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
     """Fly the paper's experiments on both profiles, and the robustness studies; write one report.
@@ -50,7 +50,7 @@ def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
     from hil.studies import STUDIES
 
     studies = [] if only or no_studies else list(STUDIES.values())
-    return _fly(select(only), studies, seeds, out)
+    return _fly(select(only), studies, seeds, out, mounted=not only)
 
 
 @click.command()
@@ -67,8 +67,10 @@ def study(name: str, seeds: int, out: Path | None) -> int:
     return _fly([], [find_study(name)], seeds, out or Path("runs") / f"study-{name}")
 
 
-def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path) -> int:
+def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted: bool = False) -> int:
+    from hil import drag_model
     from hil.cli import announce_compilation
+    from hil.config import load_config
     from hil.paper import fly_paper
     from hil.paper_report import write_paper
 
@@ -76,7 +78,8 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path) -> int:
     try:
         out.mkdir(parents=True, exist_ok=True)
         flown = fly_paper(rows, studies, seeds, out, notices)
-        report = write_paper(out, flown)
+        bench = list(drag_model.measure(load_config(), 1)) if mounted and not flown.interrupted else []
+        report = write_paper(out, flown, bench)
     except OSError as error:
         raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
     _print_rows(flown)
@@ -102,19 +105,23 @@ def _print_rows(flown: "Paper") -> None:
         table.add_column(heading)
     for _, row, both in flown.rows:
         table.add_section()
-        for index, (metric, value) in enumerate(row.values.items()):
-            spreads = (str(Spread.of(metric, trials.results)) for trials in both)
-            table.add_row(row.title if index == 0 else "", metric, value, *spreads)
-        verdicts = (f"{'ok' if one.holds else 'FAILS'}: {one.passed} of {len(one.results)}" for one in both)
-        table.add_row("", "verdict", "", *verdicts)
-    Console(highlight=False, width=max(console.width, 150)).print(table)
-    for _, row, both in flown.rows:
-        for trials in both:
-            if trials.failed:
-                reason = f"; {row.why}" if row.why else ""
-                console.print(
-                    f"{row.title}, {trials.profile}: {', '.join(trials.failed)}{reason}", soft_wrap=True
-                )
+        for index, (metric, claim) in enumerate(row.claims.items()):
+            cells = (f"{Spread.of(metric, one.results)} {_marked(one.missed(row, metric))}" for one in both)
+            table.add_row(row.title if index == 0 else "", metric, claim.text, *cells)
+        verdicts = (
+            f"{one.passed} of {len(one.results)}{'' if one.holds else _marked(' FAILS')}" for one in both
+        )
+        table.add_row("", "limits held", "", *verdicts)
+    Console(highlight=False, width=max(console.width, 160)).print(table)
+    for row, profile, what in flown.misses:
+        console.print(f"{row.title}, {profile}: {'; '.join(what)}", soft_wrap=True)
+    whys = dict.fromkeys(row.why for row, _, _ in flown.misses if row.why)
+    for why in whys:
+        console.print(f"\n{why}", soft_wrap=True)
+
+
+def _marked(text: str) -> str:
+    return f"[red]{text}[/red]" if text else ""
 
 
 def _print_studies(flown: "Paper") -> None:

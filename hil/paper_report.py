@@ -7,9 +7,14 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from math import degrees
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from hil import drag_model, drag_model_report
+from hil.config import load_config
 from hil.figures import PICTURES
 from hil.metrics import METRICS
 from hil.pages import data_uri, write_page
@@ -21,6 +26,7 @@ from hil.study_figures import picture
 from hil.study_run import StudyResult
 
 REPORT = "report.html"
+OPERATIONAL_DEG = 50  # flap angles of flight, in the steps of the test
 OF_EVERY_FLIGHT = PICTURES[:2]  # for an experiment without pictures of its own
 
 
@@ -34,8 +40,11 @@ class Figure:
     source: str
 
 
-def write_paper(out: Path, paper: Paper) -> Path:
-    """Write `result.json`, `report.html` and the pictures of the studies; returns the report."""
+def write_paper(out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = ()) -> Path:
+    """Write `result.json`, `report.html` and the pictures of the studies; returns the report.
+
+    `mounted` is the test of the drag model: with it, its files are written into `drag-model` as well.
+    """
     (out / RESULT).write_text(json.dumps(_content(paper), indent=1) + "\n", encoding="utf-8")
     studies = []
     for result in paper.studies:
@@ -44,10 +53,31 @@ def write_paper(out: Path, paper: Paper) -> Path:
             (out / f"study-{result.study.name}.png").write_bytes(png)
             studies.append((result, data_uri(png)))
     rows = [(name, row, trials, _figures(trials)) for name, row, trials in paper.rows]
+    bench = _mounted(out / "drag-model", list(mounted)) if mounted else []
     return write_page(
-        out / REPORT, "paper.html.j2",
+        out / REPORT, "paper.html.j2", bench=bench, missing=[row for row, _, _ in paper.misses],
         paper=paper, rows=rows, studies=studies, metrics=METRICS, spread=Spread.of, commit=commit(), versions=versions(),
     )  # fmt: skip
+
+
+def _mounted(folder: Path, rows: list[drag_model.Row]) -> list[Figure]:
+    """Write the test of the drag model into a folder; returns its figures."""
+    folder.mkdir(exist_ok=True)
+    drag_model.write_csv(rows, folder / "drag_model.csv")
+    drag_model_report.write(rows, degrees(load_config().plant.hover_angle), folder)
+    figures = []
+    for robot, text in drag_model_report.ROBOTS.items():
+        for sweep in drag_model.SWEEPS:
+            png = (folder / f"drag_model_{robot}_{sweep.name}.png").read_bytes()
+            chosen = [row for row in rows if (row.robot, row.sweep) == (robot, sweep.name)]
+            misses = [np.abs(row.model - row.mean) for row in chosen if 0 <= row.angle_deg <= OPERATIONAL_DEG]
+            force, torque = (float(np.max(misses, axis=0)[part].max()) for part in (slice(0, 3), slice(3, 6)))
+            caption = (
+                f"{sweep.title}. From 0 to {OPERATIONAL_DEG} degrees model and measurement differ by at most "
+                f"{force:.2f} N and {torque:.3f} N m."
+            )
+            figures.append(Figure(text, f"Drag model, {text}", caption, data_uri(png)))
+    return figures
 
 
 def _figures(both: Sequence[Trials]) -> list[Figure]:
@@ -89,12 +119,13 @@ def _content(paper: Paper) -> dict[str, Any]:
 def _trials(row: Row, trials: Trials) -> dict[str, Any]:
     return {
         "holds": trials.holds,
+        "missed": {name: gap for name in row.claims if (gap := trials.missed(row, name))},
         "metrics": {
             name: {
                 key: value if not isinstance(value, float) or math.isfinite(value) else None
                 for key, value in asdict(Spread.of(name, trials.results)).items()
             }
-            for name in row.values
+            for name in row.claims
         },
         "flights": [
             {

@@ -10,7 +10,7 @@ import numpy as np
 from hil.experiments import find_experiment
 from hil.faults import parse
 from hil.run import Request, Result
-from hil.studies import Expected, Study, Variant
+from hil.study import Expected, Study, Variant
 
 OUTCOMES = ("holds", "degrades", "failsafe", "lost", "error")  # from good to bad
 HOLDS, FAILSAFE, LOST = (OUTCOMES.index(name) for name in ("holds", "failsafe", "lost"))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import signal
 import statistics
 import subprocess
@@ -16,7 +17,7 @@ from hil.cli import main
 from hil.experiments import EXPERIMENTS
 from hil.metrics import METRICS, Verdict
 from hil.paper import Paper, Spread, Trials
-from hil.paper_rows import OUTSIDE, ROWS
+from hil.paper_rows import OUTSIDE, ROWS, Claim, Row
 from hil.run import Request, Result, fly, prepare
 from hil.studies import PROFILES
 
@@ -57,7 +58,7 @@ def test_every_experiment_is_a_row_or_known_not_to_be_the_papers() -> None:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_a_row_shows_metrics_that_exist_and_says_where_the_paper_claims_them(name: str) -> None:
-    assert set(ROWS[name].values) <= set(METRICS)
+    assert set(ROWS[name].claims) <= set(METRICS)
     assert ROWS[name].claim
     assert ROWS[name].place
 
@@ -105,7 +106,7 @@ def test_the_report_tells_the_papers_value_and_ours(flown: Path) -> None:
     rows = {row[0]: row[1:] for row in page.tables["paper"]}
     told = content(flown)["rows"][0]["profiles"]
     cells = rows[METRICS["attitude_max"].meaning]
-    assert cells[0] == ROWS["hover"].values["attitude_max"]
+    assert cells[0] == ROWS["hover"].claims["attitude_max"].text
     for cell, profile in zip(cells[1:], PROFILES, strict=True):
         assert float(cell.split()[0]) == pytest.approx(
             told[profile]["metrics"]["attitude_max"]["mean"], rel=0.01
@@ -135,6 +136,28 @@ def test_every_seed_of_the_default_profile_must_hold(result: Result) -> None:
     assert not Paper((("hover", row, (good, good)),), (), True).holds, "interrupted"
     assert not Paper((("hover", row, (Trials("floaty", ()), good)),), (), False).holds, "nothing was flown"
     assert bad.failed == ["max_x 1×"]
+
+
+def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -> None:
+    row = Row(
+        "t",
+        "c",
+        "p",
+        {"settle": Claim("< 0.5 s", 0.5), "peak_rate": Claim("> 80 deg/s", math.radians(80))},
+        "why",
+    )
+    slow, fast = (
+        dataclasses.replace(result, verdicts=(), metrics={"settle": settle, "peak_rate": rate})
+        for settle, rate in ((0.75, math.radians(70)), (0.45, math.radians(90)))
+    )
+    good, bad = Trials("floaty", (fast, fast)), Trials("as-flown", (slow, fast))  # the mean: 0.6 s, 80 deg/s
+    assert bad.holds
+    assert [good.missed(row, metric) for metric in row.claims] == ["", ""]
+    assert bad.missed(row, "settle") == "misses by 0.1 s"
+    assert Trials("floaty", (slow,)).missed(row, "peak_rate") == "misses by 10 deg/s"
+    assert [(profile, what) for _, profile, what in Paper((("x", row, (good, bad)),), (), False).misses] == [
+        ("as-flown", ["settle misses by 0.1 s"])
+    ]
 
 
 def test_the_representative_trial_has_the_median_error(result: Result) -> None:

@@ -1,0 +1,65 @@
+"""What a robustness study is: one axis of sizes, several variants, and what is expected of each.
+
+Sizes go from harmless to harmful, in the order in which they stand; "up to" and "from" mean that order.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from hil.config import DEFAULT_PROFILE
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a size means: settings `section.key=value` and faults, as on the command line."""
+
+    settings: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What is expected of a variant, by size; None: nothing is said."""
+
+    holds_to: float | None = None  # every seed holds the experiment's limits up to this size
+    flies_to: float | None = None  # no seed is lost up to this size
+    failsafe_from: float | None = (
+        None  # the supervisor opens the loop, or the robot is lost, from this size on
+    )
+    lost_from: float | None = None  # every seed is lost from this size on
+
+    def text(self, unit: str) -> str:
+        """Return it as a sentence."""
+        parts = (
+            ("holds the limits up to", self.holds_to),
+            ("is not lost up to", self.flies_to),
+            ("is stopped by the supervisor from", self.failsafe_from),
+            ("is lost from", self.lost_from),
+        )
+        return ", ".join(f"{words} {size:g} {unit}".strip() for words, size in parts if size is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One curve of a study."""
+
+    name: str
+    change: Callable[[float], Change]
+    expected: Expected
+    profile: str = DEFAULT_PROFILE
+    settings: tuple[str, ...] = ()  # besides those of the size
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """One axis, several variants."""
+
+    name: str
+    question: str
+    axis: str  # what the sizes are
+    unit: str
+    sizes: tuple[float, ...]
+    variants: tuple[Variant, ...]
+    duration_s: float = 8.0
+    experiment: str = "hover"
+    remark: str = ""  # what the picture shows
