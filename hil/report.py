@@ -83,13 +83,15 @@ def write_report(folder: Path) -> Path:
 
 
 def metric_rows(result: Mapping[str, Any]) -> list[Row]:
-    """Return one row per metric of a `result.json`, those with a limit first."""
+    """Return one row per metric of a `result.json` that has a value or a limit, those with a limit first."""
     verdicts = {verdict["metric"]: verdict for verdict in result["verdicts"]}
     rows = []
     for name, metric in METRICS.items():
         value = result["metrics"].get(name)
         scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
         verdict = verdicts.get(name)
+        if value is None and verdict is None:
+            continue
         sign = "≤" if metric.bound == "max" else "≥"
         limit = "" if verdict is None else f"{sign} {verdict['bound'] * scale:.4g}"
         text = "–" if value is None else f"{value * scale:.4g}"

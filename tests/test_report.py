@@ -105,7 +105,8 @@ def keep_rows(folder: Path, count: int) -> None:
 
 def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
     result, rows = read_result(folder), report(folder).tables["metrics"][1:]
-    assert {row[0] for row in rows} == set(METRICS)
+    assert {row[0] for row in rows} == {name for name, value in result["metrics"].items() if value is not None}
+    assert {verdict["metric"] for verdict in result["verdicts"]} <= {row[0] for row in rows} <= set(METRICS)
     told = {row[0]: row for row in rows}
     for verdict in result["verdicts"]:
         name, value, _, limit, holds, _ = told[verdict["metric"]]
@@ -152,7 +153,7 @@ def test_a_flight_that_never_began_has_a_report(folder: Path, rows: int) -> None
     keep_rows(folder, rows)
     change_result(folder, metrics=dict.fromkeys(METRICS, None), verdicts=[], passed=False)
     told = report(folder).tables["metrics"][1:]
-    assert [row[1] for row in told] == ["–"] * len(METRICS)
+    assert told == []
 
 
 @pytest.mark.usefixtures("few_pictures")
@@ -161,7 +162,7 @@ def test_a_killed_flight_has_a_report(folder: Path) -> None:
     (folder / "events.jsonl").unlink()
     page = report(folder)
     assert page.tables["events"][1:] == []
-    assert len(page.tables["metrics"]) == 1 + len(METRICS)
+    assert {"rms_x", "flown"} <= {row[0] for row in page.tables["metrics"][1:]}
 
 
 @pytest.mark.usefixtures("few_pictures")
@@ -181,4 +182,4 @@ def test_a_metric_without_a_value_is_a_dash_and_fails() -> None:
     verdict = {"metric": "rms_x", "value": None, "bound": 0.1, "holds": False}
     rows = {row.name: row for row in metric_rows({"metrics": {"rms_x": None}, "verdicts": [verdict]})}
     assert (rows["rms_x"].value, rows["rms_x"].holds) == ("–", False)
-    assert rows["rms_y"].holds is None
+    assert "rms_y" not in rows  # neither a value nor a limit
