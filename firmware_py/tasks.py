@@ -128,8 +128,10 @@ class Thief:
 
 def thief_task(kernel: Kernel, thief: Thief) -> Task:
     """Take a share of every tick: a load to test the others with."""
+    wake_tick = kernel.tick_count
     while True:
-        yield from kernel.delay_until(kernel.tick_count + 1)
+        wake_tick += 1
+        yield from kernel.delay_until(wake_tick)
         yield from kernel.work(round(thief.share * TICK_US))
 
 

@@ -124,7 +124,7 @@ def fly(
 @app.command("list")
 @click.option("--faults", is_flag=True, help="List the kinds of faults for `floaty fly --fault`.")
 def list_experiments(faults: bool) -> None:
-    """List the experiments and the profiles, or the kinds of faults."""
+    """List the experiments, the profiles and where the faults are; or the kinds of faults."""
     if faults:
         return _list_faults()
     from hil.config import DEFAULT_PROFILE, profile_names
@@ -135,6 +135,7 @@ def list_experiments(faults: bool) -> None:
         console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
     console.print(f"\nprofiles: {', '.join(names)}")
+    console.print("faults: floaty list --faults")
 
 
 def _list_faults() -> None:

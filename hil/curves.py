@@ -3,13 +3,14 @@
 Lengths in cm, angles in degrees, times in ms. Colours are those of Okabe and Ito, told apart with every colour vision.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from hil.faults import Span
 from hil.metrics import attitude_error, column, position_error
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
@@ -93,6 +94,7 @@ QUEUE = Curves(
 SUPERVISOR = States(
     "supervisor.state", ("calibrating", "waiting", "flying", "failsafe"), (ORANGE, SKY, GREEN, RED)
 )  # firmware_py.supervisor.State
+FAULT_STATES, FAULT_COLOURS = ("-", "acts"), (GREY, RED)
 RELEASE = States("flight.free", ("held", "free"), (GREY, BLUE))
 
 
@@ -123,6 +125,20 @@ def line_load(rows: pa.Table) -> NDArray[np.float64]:
 
 def changes(rows: pa.Table, states: States) -> tuple[NDArray[np.float64], list[str]]:
     """Return when [us] which state began; the first row begins one."""
-    codes = column(rows, states.column).astype(np.int64)
+    return _changes(rows, column(rows, states.column).astype(np.int64), states.names)
+
+
+def fault_changes(rows: pa.Table, spans: Iterable[Span]) -> tuple[NDArray[np.float64], list[str]]:
+    """Return when [us] any of some faults began or ceased to act; the first row begins one."""
+    times = column(rows, "t")
+    acts = np.zeros(len(times), np.int64)
+    for span in spans:
+        acts[(times >= span.begin_us) & (times < span.end_us)] = 1
+    return _changes(rows, acts, FAULT_STATES)
+
+
+def _changes(
+    rows: pa.Table, codes: NDArray[np.int64], names: Sequence[str]
+) -> tuple[NDArray[np.float64], list[str]]:
     begins = np.flatnonzero(np.diff(codes, prepend=-1)) if len(codes) else np.empty(0, np.int64)
-    return column(rows, "t")[begins], [states.names[code] for code in codes[begins]]
+    return column(rows, "t")[begins], [names[code] for code in codes[begins]]

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 Outcome = Literal["holds", "degrades", "failsafe", "lost"]
 OCCLUSION_RADIUS = 0.3  # [m] around the axis: the robot is inside the shadow wherever it is in its box
-PUSH_S = 0.1  # physics.md section 8
+PUSH_S = 0.1  # physics.md section 8, and the sizes of pushes and shadow
+GLIMPSE_S = 0.3  # shorter than the supervisor's patience of 0.5 s
 
 Read = Callable[["Flight"], float]
 Turn = Callable[["Flight", float], None]
@@ -37,11 +38,11 @@ class Knob:
 class Kind:
     """A kind of fault. `low` and `high` bound its size; where they are the same, there is nothing to choose.
 
-    `outcome` is that of the hover with the default profile, for the fault in `example`, begun after a second:
+    `outcome` is that of the hover with the default profile, for the default size and duration, 6 s after the begin:
 
         holds     all limits of the hover hold
         degrades  a limit fails, the robot flies on
-        failsafe  the supervisor opens the loop for a while, the robot flies on
+        failsafe  the supervisor opens the loop, the robot flies on
         lost      the flight ends there
     """
 
@@ -186,15 +187,15 @@ MS = 1e3  # us: times stay whole microseconds
 KINDS: Mapping[str, Kind] = {
     "mocap.dropout": Kind(
         "share of the frames in which the body is not tracked", "", 1.0, 0.0, 1.0,
-        (_mocap("dropout", either),), "failsafe",
+        (_mocap("dropout", either),), "holds", duration_s=GLIMPSE_S,
     ),
     "mocap.outlier": Kind(
         "every frame is this far off, each in a direction of its own", "m", 0.3, 0.0, 5.0,
-        (_mocap("wrong_by", max),), "failsafe",
+        (_mocap("wrong_by", max),), "holds", duration_s=0.1,
     ),
     "mocap.swap": Kind(
         "markers swapped: every pose is turned by 180 deg about z and shifted by this along x of B", "m", 0.1, 0.001, 1.0,
-        (_mocap("swapped_by", max),), "lost",
+        (_mocap("swapped_by", max),), "degrades", duration_s=GLIMPSE_S,
     ),
     "mocap.latency": Kind(
         "the cameras' computer needs this much longer", "ms", 40.0, 0.0, 500.0,
@@ -219,12 +220,15 @@ KINDS: Mapping[str, Kind] = {
         (_radio("uplink_jitter_us", add),), "holds", MS, link="radio",
     ),
     "radio.cut": Kind(
-        "nothing passes, either way", "", 1.0, 1.0, 1.0, (UPLINK_LOSS, DOWNLINK_LOSS), "failsafe", link="radio"
+        "nothing passes, either way", "", 1.0, 1.0, 1.0, (UPLINK_LOSS, DOWNLINK_LOSS), "holds",
+        duration_s=GLIMPSE_S, link="radio",
     ),
     "serial.bit_errors": Kind(
         "wrong bits on the line, both ways", "", 1e-4, 0.0, 0.5, SERIAL_BITS, "holds", link="mavlink"
     ),
-    "serial.cut": Kind("the cable is out", "", 0.0, 0.0, 0.0, (CABLE,), "failsafe", link="mavlink"),
+    "serial.cut": Kind(
+        "the cable is out", "", 0.0, 0.0, 0.0, (CABLE,), "holds", duration_s=GLIMPSE_S, link="mavlink"
+    ),
     **{
         f"imu.bias.{name}": Kind(
             f"the gyro's zero about {axis} has moved", "deg/s", 5.0, -200.0, 200.0, (_bias(index),), "holds", DEG
@@ -237,10 +241,10 @@ KINDS: Mapping[str, Kind] = {
     "imu.saturation": Kind(
         "the gyro's range ends here", "deg/s", 20.0, 1.0, 2000.0, (GYRO_RANGE,), "holds", DEG
     ),
-    "imu.freeze": Kind("the IMU repeats its last sample", "", 1.0, 1.0, 1.0, (FREEZE,), "holds"),
+    "imu.freeze": Kind("the IMU repeats its last sample", "", 1.0, 1.0, 1.0, (FREEZE,), "holds", duration_s=GLIMPSE_S),
     **{
         f"servo.stuck.{number}": Kind(
-            f"flap {number} stays where it is", "", 0.0, 0.0, 0.0, (PACES[number - 1],), "lost"
+            f"flap {number} stays where it is", "", 0.0, 0.0, 0.0, (PACES[number - 1],), "degrades"
         )
         for number in (1, 2, 3, 4)
     },
@@ -257,18 +261,19 @@ KINDS: Mapping[str, Kind] = {
         )
         for number in (1, 2, 3, 4)
     },
-    "wind.side_x": Kind("side wind along x of W", "m/s", 0.25, -20.0, 20.0, (_side_wind(0),), "holds"),
+    "wind.side_x": Kind("side wind along x of W", "m/s", 0.25, -20.0, 20.0, (_side_wind(0),), "degrades"),
     "wind.side_y": Kind("side wind along y of W", "m/s", 2.0, -20.0, 20.0, (_side_wind(1),), "degrades"),
-    "wind.fan": Kind("factor on all that the fans blow", "", 0.95, 0.0, 2.0, (FANS,), "lost"),
+    "wind.fan": Kind("factor on all that the fans blow", "", 0.95, 0.0, 2.0, (FANS,), "degrades"),
     "wind.occlusion": Kind(
-        "share of the flow that something below the robot takes away", "", 0.2, 0.0, 1.0, (SHADOW,), "lost"
+        "share of the flow that something below the robot takes away", "", 0.2, 0.0, 1.0, (SHADOW,), "degrades",
+        duration_s=0.4,
     ),
     "wind.gusts": Kind("factor on the gusts", "", 2.0, 0.0, 5.0, (GUSTS,), "degrades"),
     **{
         f"push.{axis}": Kind(
-            f"force along {axis} of W", "N", 1.0, -20.0, 20.0, (_push(part),), "holds", duration_s=PUSH_S
+            f"force along {axis} of W", "N", size, -20.0, 20.0, (_push(part),), "degrades", duration_s=PUSH_S
         )
-        for part, axis in enumerate("xyz")
+        for part, (axis, size) in enumerate((("x", 1.0), ("y", 2.0), ("z", 2.0)))
     },
     **{
         f"push.{angle}": Kind(

@@ -127,7 +127,7 @@ def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
 
 
 class _Switchboard:
-    """Turns the knobs of one flight as faults begin and end."""
+    """Turns the knobs of one flight as faults begin and end; nobody else may turn a knob while a fault does."""
 
     def __init__(self, flight: Flight) -> None:
         self.active: list[Fault] = []
@@ -149,11 +149,11 @@ class _Switchboard:
         self._flight.plant.advance(now_us)
         self.active[:] = active
         for knob in KINDS[fault.kind].knobs:
-            before = value = self._before.setdefault(knob, knob.read(self._flight))
+            value = self._before.setdefault(knob, knob.read(self._flight))
             turning = [other for other in active if knob in KINDS[other.kind].knobs]
             for other in turning:
                 value = knob.blend(value, KINDS[other.kind].scale * other.size)
-            knob.turn(self._flight, value if turning else before)
+            knob.turn(self._flight, value)
             if not turning:
                 del self._before[knob]
 

@@ -1,6 +1,6 @@
 """The figures of a flight as PNG, after the paper's figure Hover_figure; also of a flight that was lost or never began.
 
-Axes carry cm, degrees, ms and seconds of simulated time. Grey: the robot was still held.
+Axes carry cm, degrees, ms and seconds of simulated time. Grey: the robot was still held; red: a fault was in force.
 """
 
 import io
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hil import curves, scene
 from hil.curves import Curves
+from hil.faults import spans_of
 from hil.metrics import BOX, column, free_flight, position_error, thief_load
 from hil.picture import Picture
 from hil.schedule import runs
@@ -72,12 +73,27 @@ def _limits(axes: Axes, limit: float) -> None:
         axes.axhline(value, color="black", linestyle="--", linewidth=0.8)
 
 
-def _shade_hold(axes: Sequence[Axes], rows: pa.Table) -> None:
-    held = _seconds(rows)[column(rows, "flight.free") < 0.5]
+def shade(axes: Sequence[Axes], rows: pa.Table) -> None:
+    """Shade when the robot was held and when a fault was in force, which the first of the axes names."""
+    times = _seconds(rows)
+    held = times[column(rows, "flight.free") < 0.5]
     for one in axes:
         one.margins(x=0)
         if len(held) > 1:
             one.axvspan(held[0], held[-1], color=curves.GREY, alpha=0.2, linewidth=0)
+    names: dict[float, list[str]] = {}  # by begin
+    for span in spans_of(rows.schema.metadata):
+        begin, end = 1e-6 * span.begin_us, min(1e-6 * span.end_us, times[-1] if len(times) else 0.0)
+        if begin >= end:
+            continue
+        for one in axes:
+            one.axvspan(begin, end, color=curves.RED, alpha=0.15, linewidth=0.5)
+        names.setdefault(begin, []).append(span.fault.kind)
+    for begin, kinds in names.items():
+        axes[0].text(
+            begin, 0.98, ", ".join(kinds), transform=axes[0].get_xaxis_transform(), color=curves.RED, fontsize=6.5,
+            rotation=90, ha="left", va="top", clip_on=True,
+        )  # fmt: skip
 
 
 def track(rows: pa.Table) -> Figure:
@@ -120,7 +136,7 @@ def errors(rows: pa.Table) -> Figure:
     _limits(axes[0], curves.NEAR_CM)
     _lines(axes[1], times, curves.ATTITUDE, curves.ATTITUDE.read(rows), "attitude error")
     _limits(axes[1], curves.ATTITUDE_DEG)
-    _shade_hold(axes, rows)
+    shade(axes, rows)
     return figure
 
 
@@ -138,7 +154,7 @@ def flaps(rows: pa.Table) -> Figure:
         axes.set_ylabel("angle [deg]")
     for axes in grid[1]:
         axes.set_xlabel("time [s]")
-    _shade_hold(list(grid.flat), rows)
+    shade(list(grid.flat), rows)
     return figure
 
 
@@ -148,7 +164,7 @@ def radio(rows: pa.Table) -> Figure:
     _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
     _up_and_down(axes[1], rows, SECOND, curves.latency, "mean latency [ms]")
     _lines(axes[2], _seconds(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
-    _shade_hold(axes, rows)
+    shade(axes, rows)
     return figure
 
 
@@ -160,7 +176,7 @@ def serial_line(rows: pa.Table) -> Figure:
     axes[1].set_ylim(0.0, 105.0)
     _up_and_down(axes[2], rows, SECOND, curves.latency, "mean latency [ms]")
     _lines(axes[3], _seconds(rows), curves.SERIAL_FAULTS, curves.SERIAL_FAULTS.read(rows), "bytes or frames")
-    _shade_hold(axes, rows)
+    shade(axes, rows)
     return figure
 
 
@@ -203,7 +219,7 @@ def board(rows: pa.Table) -> Figure:
     axes[2].grid(visible=False)
     named = dict(zip(*reversed(axes[2].get_legend_handles_labels()), strict=True))  # one entry per name
     axes[2].legend(named.values(), named.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.2))
-    _shade_hold(axes, rows)
+    shade(axes, rows)
     return figure
 
 
@@ -212,7 +228,7 @@ def estimate(rows: pa.Table) -> Figure:
     figure, axes = stack((1.8, 1.8))
     _lines(axes[0], _seconds(rows), curves.POSITION_MISS, curves.POSITION_MISS.read(rows), "position")
     _lines(axes[1], _seconds(rows), curves.ATTITUDE_MISS, curves.ATTITUDE_MISS.read(rows), "attitude")
-    _shade_hold(axes, rows)
+    shade(axes, rows)
     return figure
 
 

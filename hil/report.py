@@ -5,7 +5,8 @@ From `result.json`, `log.parquet` and `events.jsonl`; a flight that was lost, in
 
 import base64
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from firmware_py.firmware import LATENCY_BOUNDS_US
 from hil.experiments import EXPERIMENTS
+from hil.fault_kinds import KINDS
+from hil.faults import Span, spans_of
 from hil.figures import PICTURES, SCHEDULE
 from hil.metrics import METRICS, SHOWN
 from hil.picture import Picture
@@ -36,6 +39,17 @@ class Row:
     unit: str
     limit: str
     holds: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class FaultRow:
+    """One line of the table of faults, ready to print; times in simulated seconds."""
+
+    kind: str
+    begin_s: str
+    end_s: str
+    size: str
+    meaning: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +76,7 @@ def write_report(folder: Path) -> Path:
     page = environment.get_template(TEMPLATE).render(
         result=result,
         rows=metric_rows(result),
+        faults=fault_rows(spans_of(log.schema.metadata)),
         events=load_events(folder),
         pictures=shown,
         latency_bounds=LATENCY_BOUNDS_US,
@@ -86,6 +101,19 @@ def metric_rows(result: Mapping[str, Any]) -> list[Row]:
         text = "–" if value is None else f"{value * scale:.4g}"
         rows.append(Row(name, metric.meaning, text, unit, limit, verdict and verdict["holds"]))
     return sorted(rows, key=lambda row: row.holds is None)
+
+
+def fault_rows(spans: Iterable[Span]) -> list[FaultRow]:
+    """Return one row per fault."""
+    rows = []
+    for span in spans:
+        kind = KINDS[span.fault.kind]
+        size = f"{span.fault.size:g} {kind.unit}".strip() if kind.sized else ""
+        begin, end = f"{1e-6 * span.begin_us:.3f}", f"{1e-6 * span.end_us:.3f}"
+        if span.end_us == math.inf:
+            end = "with the flight"
+        rows.append(FaultRow(span.fault.kind, begin, end, size, kind.meaning))
+    return rows
 
 
 def _show(picture: Picture, rows: pa.Table) -> Shown:

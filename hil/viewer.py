@@ -20,6 +20,7 @@ from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil import curves, scene
 from hil.curves import Curves, States
 from hil.errors import LabError
+from hil.faults import Span, spans_of
 from hil.metrics import BOX, column
 from hil.plant.config import PlantConfig
 from hil.recorder import load_events, load_log
@@ -73,6 +74,9 @@ class Stage:
         self._plant = PlantConfig.model_validate(json.loads(metadata.get("config", "{}")).get("plant", {}))
         self._plots = {path: plot for path, plot in PLOTS.items() if plot.needs in schema.names}
         self._processor = curves.processor(schema.names)
+        self._faults: dict[str, list[Span]] = {}  # by kind
+        for span in spans_of(schema.metadata):
+            self._faults.setdefault(span.fault.kind, []).append(span)
         self._last: pa.Table | None = None  # the last row so far
         recording.set_log_time_enabled(False)
         recording.send_recording_name(
@@ -101,6 +105,9 @@ class Stage:
         for path, states in STATES.items():
             begins, names = curves.changes(joined, states)
             self._send(f"state/{path}", begins[fresh:], rr.StateChange.columns(state=names[fresh:]))
+        for kind, spans in self._faults.items():
+            begins, names = curves.fault_changes(joined, spans)
+            self._send(f"state/fault/{kind}", begins[fresh:], rr.StateChange.columns(state=names[fresh:]))
         track = column(joined, "truth.x", "truth.y", "truth.z")
         steps = np.stack((track[:-1], track[1:]), axis=1).astype(np.float32)
         self._send("world/trail", column(joined, "t")[1:], rr.LineStrips3D.columns(strips=steps))
@@ -235,6 +242,11 @@ class Stage:
         for path, states in STATES.items():
             lanes = rr.StateConfiguration(values=states.names, colors=_rgba_array(states.colours))
             self._recording.log(f"state/{path}", lanes, static=True)
+        for kind in self._faults:
+            lanes = rr.StateConfiguration(
+                values=curves.FAULT_STATES, colors=_rgba_array(curves.FAULT_COLOURS)
+            )
+            self._recording.log(f"state/fault/{kind}", lanes, static=True)
 
 
 def _rgba(colour: str, opacity: int = 255) -> int:

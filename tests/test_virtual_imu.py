@@ -90,20 +90,40 @@ def test_counts_saturate() -> None:
     assert settled(imu, plant)[2] == -32768
 
 
-def test_faults_act_on_their_channel_and_heal() -> None:
+def test_a_moved_zero_is_a_rate_in_the_body_frame_and_heals() -> None:
+    plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
+    before = np.array(settled(imu, plant))
+    imu.set_rate_bias(1.0, 2.0, 3.0)
+    gx, gy, gz = (np.array(settled(imu, plant)) - before)[:3] * GYRO_LSB
+    assert [0.7071 * (gx + gy), 0.7071 * (gy - gx), gz] == pytest.approx([1, 2, 3], abs=1.5 * GYRO_LSB)
+    imu.set_rate_bias(0.0, 0.0, 0.0)
+    assert settled(imu, plant) == tuple(before)
+
+
+def test_a_smaller_range_bounds_the_gyro_alone() -> None:
+    plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
+    plant.place(HOME, LEVEL, omega_B=(0, 0, -2))
+    free = settled(imu, plant)
+    imu.set_rate_range(1.0)
+    bounded = settled(imu, plant)
+    assert bounded[2] * GYRO_LSB == pytest.approx(-1.0, abs=1.5 * GYRO_LSB)
+    assert bounded[3:] == free[3:]
+    imu.set_rate_range(1e6)  # beyond full scale: full scale
+    assert settled(imu, plant) == free
+    plant.place(HOME, LEVEL, omega_B=(0, 0, 60))
+    assert settled(imu, plant)[2] == 32767
+
+
+def test_a_frozen_sensor_repeats_itself_until_it_thaws() -> None:
     plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     before = settled(imu, plant)
-    imu.set_fault(1, bias=0.5)
-    imu.set_fault(5, stuck=True)
-    plant.place(HOME, (0.0, 1.0, 0.0, 0.0))
-    during = settled(imu, plant)
-    assert (during[1] - before[1]) * GYRO_LSB == pytest.approx(0.5, abs=GYRO_LSB)
-    assert during[5] == before[5]
-    for channel in range(6):
-        imu.set_fault(channel)
+    imu.freeze(True)
+    plant.place(HOME, (0.0, 1.0, 0.0, 0.0), omega_B=(1, 2, 3))
+    assert settled(imu, plant) == before
+    imu.freeze(False)
     after = settled(imu, plant)
-    assert after[1] == before[1]
     assert after[5] == pytest.approx(-before[5], abs=1)
+    assert after[2] * GYRO_LSB == pytest.approx(3, abs=1.5 * GYRO_LSB)
 
 
 def test_noise_can_be_scaled_but_not_to_nonsense() -> None:

@@ -59,12 +59,42 @@ def test_faults_leave_the_other_frames_as_they_were() -> None:
     assert 0.5 < np.mean(untouched) < 0.75
 
 
-def test_blind_cameras_see_nothing_until_they_see_again() -> None:
+def test_lost_frames_leave_the_wrong_ones_as_they_were() -> None:
+    wrong = frames(500, MocapConfig(outlier=0.2))
+    both = frames(500, MocapConfig(outlier=0.2, dropout=0.3))
+    seen = [(a, b) for a, b in zip(wrong, both, strict=True) if b.valid]
+    assert 300 < len(seen) < 400
+    assert all(a == b for a, b in seen)
+
+
+def test_wrong_positions_lie_off_by_their_size_in_all_directions() -> None:
     plant, mocap = make_plant(), VirtualMocap(MocapConfig(), np.random.default_rng(1))
-    mocap.blind = True
-    assert not mocap.expose(0, plant).valid
-    mocap.blind = False
-    assert mocap.expose(5000, plant).valid
+    mocap.wrong_by = 0.3
+    off = np.array([mocap.expose(5000 * i, plant).p_WB for i in range(500)]) - PLACE
+    assert np.linalg.norm(off, axis=1) == pytest.approx(np.full(500, 0.3), abs=0.004)
+    assert np.abs(off.mean(axis=0)).max() < 0.03
+    mocap.wrong_by = 0.0
+    assert math.dist(mocap.expose(2_500_000, plant).p_WB, PLACE) < 0.004
+
+
+def test_swapped_markers_turn_the_pose_about_its_own_z_and_shift_it_along_its_x() -> None:
+    plant = make_plant()
+    plain, swapped = (VirtualMocap(MocapConfig(), np.random.default_rng(1)) for _ in range(2))
+    swapped.swapped_by = 0.1
+    right, wrong = plain.expose(0, plant), swapped.expose(0, plant)
+    q_WB, q_WS = (Rotation.from_quat(frame.q_WB, scalar_first=True) for frame in (right, wrong))
+    between = (q_WB.inv() * q_WS).as_rotvec()
+    assert np.abs(between) == pytest.approx([0, 0, math.pi], abs=1e-7)
+    assert q_WB.inv().apply(np.subtract(wrong.p_WB, right.p_WB)) == pytest.approx([0.1, 0, 0], abs=1e-9)
+
+
+def test_frames_arrive_later_and_never_out_of_order() -> None:
+    mocap = VirtualMocap(MocapConfig(latency_us=38_000), np.random.default_rng(1))
+    assert mocap.arrival_us(0) == 38_000
+    mocap.more_latency_us = 20_000.0
+    assert mocap.arrival_us(5_000) == 63_000
+    mocap.more_latency_us = 0.0
+    assert [mocap.arrival_us(t) for t in (10_000, 20_000, 30_000)] == [63_000, 63_000, 68_000]
 
 
 def test_same_seed_same_frames() -> None:

@@ -1,0 +1,480 @@
+"""Faults: what a text means, that every kind acts from its begin to its end, and what the hover makes of it."""
+
+import json
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hil.cli import main
+from hil.config import load_config
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS, Experiment
+from hil.fault_kinds import KINDS
+from hil.faults import Fault, check, parse, spans_of
+from hil.harness import MAVLINK, RADIO, Flight
+from hil.metrics import column
+from hil.recorder import load_events, load_log
+from hil.report import write_report
+from hil.run import Request, Result, fly, prepare, read_result
+
+HOVER = EXPERIMENTS["hover"]
+RELEASE_S = load_config().flight.release_us * 1e-6
+
+
+def go(folder: Path, *faults: str, seed: int = 1, duration_s: float = 3.0, link: str = RADIO) -> Result:
+    prepare(folder)
+    request = Request.of(HOVER, "floaty", (), seed, duration_s, link, [parse(text) for text in faults])
+    return fly(request, folder)
+
+
+# What a text means
+
+
+def test_a_text_says_kind_start_duration_and_size() -> None:
+    assert parse("mocap.dropout@10:0.5") == Fault("mocap.dropout", 10.0, 0.5, 1.0)
+    assert parse("mocap.outlier@10:0.5=0.3") == Fault("mocap.outlier", 10.0, 0.5, 0.3)
+    assert parse(" servo.stuck.2@5 ") == Fault("servo.stuck.2", 5.0, math.inf, 0.0)
+    assert parse("push.y@1e1=-2") == Fault("push.y", 10.0, 0.1, -2.0)
+    assert parse("push.y@1:inf") == Fault("push.y", 1.0, math.inf, 2.0)
+
+
+@given(st.data())
+def test_a_fault_reads_back_from_its_text(data: st.DataObject) -> None:
+    name = data.draw(st.sampled_from(sorted(KINDS)))
+    kind = KINDS[name]
+    fault = Fault(
+        name,
+        data.draw(st.floats(0, 1e6)),
+        data.draw(st.floats(1e-6, 1e6) | st.just(math.inf)),
+        data.draw(st.floats(kind.low, kind.high)),
+    )
+    assert parse(str(fault)) == fault
+
+
+def test_every_default_is_a_size_that_its_kind_allows() -> None:
+    for name in KINDS:
+        assert str(parse(f"{name}@1")).startswith(f"{name}@1")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("mocap.dropot@3", "unknown kind 'mocap.dropot'; did you mean mocap.dropout?"),
+        ("servo.stuck.5@3", "did you mean servo.stuck."),
+        ("flood@3", "unknown kind 'flood'; floaty list --faults"),
+        ("mocap.dropout", "expected KIND@START"),
+        ("mocap.dropout@", "expected KIND@START"),
+        ("mocap.dropout@1=1:2", "expected KIND@START"),
+        ("mocap.dropout@soon", "start, duration and size are numbers"),
+        ("mocap.dropout@-1", "begins 0 or more seconds after"),
+        ("mocap.dropout@inf", "begins 0 or more seconds after"),
+        ("mocap.dropout@nan", "begins 0 or more seconds after"),
+        ("mocap.dropout@1:0", "lasts more than 0 seconds"),
+        ("mocap.dropout@1:nan", "lasts more than 0 seconds"),
+        ("mocap.dropout@1=1.5", "size 1.5: expected 0..1"),
+        ("push.x@1=nan", "size nan: expected -20..20 N"),
+        ("servo.stuck.1@1=0.5", "this kind has no size to choose"),
+        ("push.x@30", "the flight ends 30 s after the release, before it begins"),
+        ("serial.cut@1", "acts with --link mavlink only; this flight has --link radio"),
+    ],
+)
+def test_a_wrong_fault_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    text: str,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["floaty", "fly", "hover", "--fault", text])
+    with pytest.raises(SystemExit) as left:
+        main()
+    shown = capsys.readouterr().err
+    assert left.value.code == 2
+    assert message in shown
+    assert shown.count("\n") == 1
+    assert os.listdir() == []
+
+
+@pytest.mark.parametrize("link", ["udp://127.0.0.1:19850", "mavlink:pty", "radio://0/80/2M/E7E7E7E7E7"])
+def test_a_paced_link_refuses_faults(link: str) -> None:
+    with pytest.raises(LabError, match="in lockstep only"):
+        Request.of(HOVER, link=link, faults=[parse("push.x@1")])
+
+
+def test_a_radio_fault_is_refused_on_the_serial_line() -> None:
+    with pytest.raises(LabError, match="--link radio only"):
+        check([parse("radio.loss@1")], 30.0, MAVLINK)
+
+
+# Every kind acts from its begin to its end and no longer
+
+BEGIN_S = 0.5  # after the release
+GYRO_LSB = 2000 / 32768  # [deg/s], data sheet
+Seen = Callable[[pa.Table, pa.Table], float]  # (rows with the fault, the same rows of a flight without)
+
+
+def _grown(*names: str) -> Seen:
+    """How much counters have grown."""
+    return lambda rows, _: float(sum(column(rows, name)[-1] - column(rows, name)[0] for name in names))
+
+
+def _mean_of(name: str, scale: float = 1.0) -> Seen:
+    """The mean of a quantity less that of the flight without the fault."""
+    return lambda rows, without: scale * float(np.mean(column(rows, name)) - np.mean(column(without, name)))
+
+
+def _gyro(rows: pa.Table) -> NDArray[np.float64]:
+    """What the gyro says less the truth, p q r [deg/s]; S lies as in original-firmware.md (c)."""
+    gx, gy, gz = (GYRO_LSB * column(rows, f"imu.{name}") for name in ("gx", "gy", "gz"))
+    told = np.stack((0.7071 * (gx + gy), 0.7071 * (gy - gx), gz), axis=1)
+    return np.asarray(told - np.degrees(column(rows, "truth.p", "truth.q", "truth.r")))
+
+
+def _gyro_bias(axis: int) -> Seen:
+    return lambda rows, without: float((_gyro(rows) - _gyro(without)).mean(axis=0)[axis])
+
+
+def _gyro_noise(rows: pa.Table, _: pa.Table) -> float:
+    return float(_gyro(rows).std())
+
+
+def _gyro_reach(rows: pa.Table, _: pa.Table) -> float:
+    return float(np.abs(GYRO_LSB * column(rows, "imu.gx", "imu.gy", "imu.gz")).max())
+
+
+def _imu_changes(rows: pa.Table, _: pa.Table) -> float:
+    names = ("gx", "gy", "gz", "ax", "ay", "az")
+    return float(np.ptp(column(rows, *(f"imu.{name}" for name in names)), axis=0).min())
+
+
+def _flap_moves(number: int) -> Seen:
+    return lambda rows, _: math.degrees(np.ptp(column(rows, f"truth.flap_{number}")))
+
+
+def _flap_off(number: int) -> Seen:
+    return lambda rows, _: math.degrees(
+        np.mean(column(rows, f"truth.flap_{number}") - column(rows, f"control.flap_{number}"))
+    )
+
+
+def _flap_speed(number: int) -> Seen:
+    """Pace of a servo: flap rate over the error that it follows, relative to that without the fault."""
+
+    def pace(rows: pa.Table) -> float:
+        flap, told = column(rows, f"truth.flap_{number}"), column(rows, f"control.flap_{number}")
+        error = (told - flap)[:-1]
+        return float(error @ np.diff(flap) / (error @ error))
+
+    return lambda rows, without: pace(rows) / pace(without)
+
+
+def _flow_ratio(rows: pa.Table, without: pa.Table) -> float:
+    return float(column(rows, "flow.z").mean() / column(without, "flow.z").mean())
+
+
+def _gust_ratio(rows: pa.Table, without: pa.Table) -> float:
+    fast, plain = (np.diff(column(table, "flow.x")).std() for table in (rows, without))
+    return float(fast / plain)
+
+
+def _heading(rows: pa.Table, _: pa.Table) -> float:
+    """The smallest error of the estimated heading [deg]."""
+    w, z = column(rows, "truth.qw"), column(rows, "truth.qz")
+    wrong = column(rows, "estimate.yaw") - 2 * np.arctan2(z, w)
+    return float(np.degrees(np.abs(np.angle(np.exp(1j * wrong)))).min())
+
+
+def _impulse(name: str) -> Seen:
+    """What was gained over the window, against the flight without the fault."""
+
+    def gained(rows: pa.Table) -> float:
+        return float(column(rows, name)[-1] - column(rows, name)[0])
+
+    return lambda rows, without: gained(rows) - gained(without)
+
+
+def _latency(rows: pa.Table, without: pa.Table) -> float:
+    """Mean time in the air upwards [ms], less that without."""
+
+    def mean(table: pa.Table) -> float:
+        return _grown("link.up_latency_sum")(table, table) / _grown("link.up_delivered")(table, table)
+
+    return (mean(rows) - mean(without)) * 1e-3
+
+
+@dataclass(frozen=True)
+class Sign:
+    """By what a fault is known: bounds of a figure in a window [s] after its begin, and in the same after its end."""
+
+    fault: str
+    seen: Seen
+    during: tuple[float, float]
+    after: tuple[float, float]
+    window: tuple[float, float] = (0.15, 0.95)
+
+    @property
+    def duration_s(self) -> float:
+        """How long the fault acts."""
+        return round(self.window[1] + 0.05, 2)
+
+
+NONE = (-0.5, 0.5)
+WHITE = math.degrees(0.02) * math.sqrt(10)  # [deg/s] of one gyro sample, physics.md section 6
+MASS, INERTIA = 0.340, (1.30e-3, 1.30e-3, 1.47e-3)  # physics.md section 3
+FIRST = (-0.005, 0.015)  # the first 10 ms
+SIGNS = [
+    Sign("mocap.dropout", _grown("link.up_sent"), (0, 0), (38, 41)),
+    Sign("mocap.outlier", _grown("estimator.refused"), (20, 41), (0, 0)),
+    Sign("mocap.swap", _heading, (165, 180), (0, 20), (0.1, 0.25)),
+    Sign("mocap.latency=20", _mean_of("estimator.pose_age_us", 1e-3), (19.5, 20.5), (-1.5, 1.5)),
+    Sign("radio.loss", _grown("link.retried"), (60, 1000), (0, 20)),
+    Sign("radio.uplink_loss", _latency, (1.0, 2.5), (-0.3, 0.3)),
+    Sign("radio.downlink_loss", _latency, (0.3, 0.95), (-0.3, 0.3)),
+    Sign("radio.bit_errors", _grown("link.retried"), (30, 1000), (0, 20)),
+    Sign("radio.jitter", _latency, (6.0, 9.0), (-0.5, 0.5)),
+    Sign("radio.cut", _grown("link.up_delivered", "link.down_delivered"), (0, 0), (60, 500)),
+    Sign("serial.bit_errors", _grown("serial.wrong_bits"), (3, 60), (0, 0)),
+    Sign("serial.cut", _grown("serial.cut"), (2000, 1e5), (0, 0)),
+    *(Sign(f"imu.bias.{name}", _gyro_bias(axis), (4.5, 5.5), NONE) for axis, name in enumerate("pqr")),
+    Sign("imu.noise", _gyro_noise, (0.9 * 10 * WHITE, 1.1 * 10 * WHITE), (WHITE, 1.8 * WHITE)),
+    Sign("imu.saturation=3", _gyro_reach, (2.9, 3.1), (6, 200)),
+    Sign("imu.freeze", _imu_changes, (0, 0), (10, 10_000)),
+    *(Sign(f"servo.stuck.{n}", _flap_moves(n), (0, 1e-9), (2, 60)) for n in (1, 2, 3, 4)),
+    *(Sign(f"servo.slow.{n}=0.2", _flap_speed(n), (0.15, 0.25), (0.9, 1.1)) for n in (1, 2, 3, 4)),
+    *(Sign(f"servo.trim.{n}", _flap_off(n), (3.5, 6.5), (-1.5, 1.5)) for n in (1, 2, 3, 4)),
+    Sign("wind.side_x", _mean_of("flow.x"), (0.2, 0.3), (-0.1, 0.1)),
+    Sign("wind.side_y", _mean_of("flow.y"), (1.9, 2.1), (-0.1, 0.1)),
+    Sign("wind.fan=0.97", _flow_ratio, (0.965, 0.98), (0.99, 1.02)),
+    Sign("wind.occlusion=0.05", _flow_ratio, (0.94, 0.965), (0.985, 1.03)),
+    Sign("wind.gusts", _gust_ratio, (1.8, 2.2), (0.85, 1.15)),
+    Sign("push.x=1", _impulse("truth.vx"), (0.009 / MASS, 0.011 / MASS), (-0.01, 0.01), FIRST),
+    Sign("push.y=-1", _impulse("truth.vy"), (-0.011 / MASS, -0.009 / MASS), (-0.01, 0.01), FIRST),
+    Sign("push.z=1", _impulse("truth.vz"), (0.009 / MASS, 0.011 / MASS), (-0.01, 0.01), FIRST),
+    *(
+        Sign(f"push.{name}=0.005", _impulse(f"truth.{rate}"), (3e-5 / inertia, 6e-5 / inertia), (-9, 9), FIRST)
+        for name, rate, inertia in zip(("roll", "pitch", "yaw"), "pqr", INERTIA, strict=True)
+    ),
+    Sign("cpu.load", _grown("cpu.THIEF"), (236_000, 244_000), (0, 0)),
+]  # fmt: skip
+
+
+@cache
+def without_fault(link: str) -> pa.Table:
+    """The log of the flight to compare with; in memory only, as are those with a fault."""
+    return fly_for_log(link)
+
+
+def fly_for_log(link: str, *faults: str) -> pa.Table:
+    with tempfile.TemporaryDirectory() as folder:
+        go(Path(folder) / "run", *faults, duration_s=2.6, link=link)
+        return load_log(Path(folder) / "run").combine_chunks()
+
+
+def rows_between(table: pa.Table, begin_s: float, end_s: float) -> pa.Table:
+    times = column(table, "t") * 1e-6 - RELEASE_S
+    return table.filter((times >= begin_s) & (times < end_s))
+
+
+@pytest.mark.parametrize("sign", SIGNS, ids=lambda sign: sign.fault)
+def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
+    name, _, size = sign.fault.partition("=")
+    link = KINDS[name].link or RADIO
+    fault = f"{name}@{BEGIN_S}:{sign.duration_s}" + (f"={size}" if size else "")
+    log, without = fly_for_log(link, fault), without_fault(link)
+    truth = [name for name in without.column_names if name.startswith(("truth", "flow"))]
+    before = (-RELEASE_S, BEGIN_S + 0.001)  # with the row at the begin: nothing acts backwards
+    assert rows_between(log, *before).select(truth).equals(rows_between(without, *before).select(truth))
+    for start_s, (low, high) in ((BEGIN_S, sign.during), (BEGIN_S + sign.duration_s, sign.after)):
+        window = (start_s + sign.window[0], start_s + sign.window[1])
+        figure = sign.seen(rows_between(log, *window), rows_between(without, *window))
+        assert low <= figure <= high, f"{figure}, from {start_s} s on"
+
+
+def test_every_kind_has_a_sign() -> None:
+    known = {sign.fault.partition("=")[0] for sign in SIGNS}
+    assert known | {"battery.sag"} == set(KINDS)  # the log has no voltage: see below
+
+
+def test_a_sagging_battery_is_what_the_board_reads() -> None:
+    flight = Flight(load_config(), HOVER, 3.0, 1, None, faults=[parse("battery.sag@1:1=0.5")])
+    read: list[int] = []
+    for moment_us in (1_999_000, 2_050_000, 2_999_000, 3_050_000):
+        flight.events.at(moment_us, lambda _: read.append(flight.board.read_battery_mv()))
+    flight.run()
+    sagged = [read[0] - millivolts for millivolts in read[1:]]
+    assert sagged == pytest.approx([500, 500, 0], abs=60)  # what the servos draw makes the rest
+
+
+# Several faults
+
+
+def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
+    texts = [
+        "wind.side_y@0.2:0.6=1",
+        "wind.side_y@0.4:0.6=2",
+        "servo.slow.1@0.2:0.6",
+        "servo.stuck.1@0.4:0.1",
+    ]
+    config = load_config("floaty", ["tunnel.side_wind=[0.1, 0.2, 0.3]", "actuators.speed=[0.8, 1, 1, 1]"])
+    flight = Flight(config, HOVER, 2.0, 1, None, faults=[parse(text) for text in texts])
+    wind: list[float] = []
+    pace: list[float] = []
+
+    def look(_: int) -> None:
+        wind.append(flight.plant.tunnel.side_wind[1])
+        pace.append(float(flight.plant.servo_speed[0]))
+
+    for moment in (0.1, 0.3, 0.45, 0.7, 0.9, 1.1):
+        flight.events.at(flight.release_us + round(moment * 1e6), look)
+    flight.run()
+    assert wind == pytest.approx([0.2, 1.2, 3.2, 3.2, 2.2, 0.2])
+    assert pace == pytest.approx([0.8, 0.4, 0.0, 0.4, 0.8, 0.8])
+    assert flight.plant.tunnel.side_wind == (0.1, 0.2, 0.3)
+
+
+def test_what_changed_between_two_faults_stays_changed() -> None:
+    flight = Flight(
+        load_config(), HOVER, 1.0, 1, None, faults=[parse("wind.fan@0.1:0.1=0.9"), parse("wind.fan@0.5:0.1=0.9")]
+    )  # fmt: skip
+    flight.events.at(1_300_000, lambda _: flight.plant.tunnel.set_fan_factor(1.1))
+    flight.run()
+    assert flight.plant.tunnel.fan_factor == 1.1
+
+
+def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> None:
+    result = go(tmp_path / "run", "push.x@0.5=0.1", "imu.noise@0.2:1=2", "push.x@9=1", duration_s=10.0)
+    log = load_log(result.folder)
+    assert log.schema.field("fault.active").type == pa.int8()
+    expected = np.zeros(log.num_rows)
+    for span in spans_of(log.schema.metadata):
+        expected += (column(log, "t") >= span.begin_us) & (column(log, "t") < span.end_us)
+    assert column(log, "fault.active").tolist() == expected.tolist()
+    assert [str(span.fault) for span in spans_of(log.schema.metadata)] == result_faults(result)
+    texts = [event["text"] for event in load_events(result.folder) if "fault" in event["text"]]
+    assert texts[:3] == [
+        "fault imu.noise@0.2:1=2 begins", "fault push.x@0.5=0.1 begins", "fault push.x@0.5=0.1 ends"
+    ]  # fmt: skip
+    assert len(texts) == 6
+
+
+def result_faults(result: Result) -> list[str]:
+    faults: list[str] = read_result(result.folder)["faults"]
+    return faults
+
+
+def test_without_faults_the_log_has_no_column_of_them(tmp_path: Path) -> None:
+    assert "fault.active" not in load_log(go(tmp_path / "run", duration_s=0.3).folder).column_names
+
+
+def test_same_seed_same_hash_with_faults(tmp_path: Path) -> None:
+    texts = ("mocap.outlier@0.2:0.5=0.3", "radio.loss@0.5", "wind.gusts@0.4", "cpu.load@0.3")
+    first, again, other = (
+        go(tmp_path / name, *texts, seed=seed, duration_s=1.0)
+        for name, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
+    assert first.hash == again.hash != other.hash
+
+
+def test_an_experiments_faults_outside_a_shortened_flight_are_left_out(tmp_path: Path) -> None:
+    own = (parse("push.x@0.2=0.1"), parse("push.x@5=0.1"), parse("serial.cut@0.1"))
+    experiment = Experiment("hover", "", 10.0, {}, faults=own)
+    prepare(tmp_path / "run")
+    fly(Request.of(experiment, duration_s=1.0, faults=[parse("push.y@0.5")]), tmp_path / "run")
+    begun = [event["text"] for event in load_events(tmp_path / "run") if event["text"].startswith("fault")]
+    assert begun[::2] == ["fault push.x@0.2=0.1 begins", "fault push.y@0.5=2 begins"]
+
+
+# What becomes of the hover
+
+LONGER = {
+    "mocap.dropout@1:0.7": "failsafe",
+    "mocap.dropout@1:inf=0.5": "holds",
+    "mocap.swap@1:0.02": "holds",  # one pose that the gate refuses
+    "mocap.latency@1=100": "lost",  # 140 ms; the predictor's buffer ends before
+    "radio.cut@1:0.7": "failsafe",
+    "serial.cut@1:0.7": "failsafe",
+    "imu.noise@1=100": "degrades",
+    "servo.slow.1@1=0.2": "holds",
+    "wind.fan@1=0.9": "lost",
+    "wind.side_x@1=1": "lost",  # physics.md section 8
+    "push.x@1=2": "lost",
+    "cpu.load@1=0.6": "holds",
+    "cpu.load@1=0.95": "lost",
+    "cpu.load@1=1": "lost",
+}  # fmt: skip
+STATED = {**{f"{name}@1": kind.outcome for name, kind in KINDS.items()}, **LONGER}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("text", STATED)
+def test_the_hover_has_the_stated_outcome(tmp_path: Path, text: str, seed: int) -> None:
+    link = KINDS[parse(text).kind].link or RADIO
+    result = go(tmp_path / "run", text, seed=seed, duration_s=7.0, link=link)
+    opened = (column(load_log(result.folder), "supervisor.state") == 3)[round(100 * RELEASE_S) :].any()
+    flown = "failsafe" if opened else "holds" if result.passed else "degrades"
+    outcome = "lost" if result.outcome == "lost" else flown
+    failed = [str(verdict) for verdict in result.verdicts if not verdict.holds]
+    assert outcome == STATED[text], f"{result.cause} {failed}"
+
+
+def test_the_watchdog_ends_a_flight_whose_processor_is_taken(tmp_path: Path) -> None:
+    result = go(tmp_path / "run", "cpu.load@0.2=1")
+    assert "watchdog" in str(result.cause)
+
+
+# Where they are shown
+
+
+def test_report_and_recording_show_the_faults(tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    from hil.viewer import write_run_rrd
+
+    folder = go(tmp_path / "run", "push.x@0.3=0.5", "servo.slow.2@0.5", duration_s=1.0).folder
+    page = write_report(folder).read_text(encoding="utf-8")
+    table = page[page.index('<table id="faults">') :].partition("</table>")[0]
+    for cell in ("push.x", "1.300", "1.400", "0.5 N", "servo.slow.2", "1.500", "with the flight"):
+        assert f">{cell}<" in table, cell
+    lanes: dict[str, list[tuple[int, str]]] = {}
+    for chunk in RrdReader(write_run_rrd(folder)).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path.startswith("/state/fault/") and "sim_time" in batch.schema.names:
+            times = [moment.value // 1000 for moment in batch.column("sim_time")]
+            states = [row[0] for row in batch.column("StateChange:state").to_pylist()]
+            lanes.setdefault(chunk.entity_path.removeprefix("/state/fault/"), []).extend(
+                zip(times, states, strict=True)
+            )
+    assert lanes == {
+        "push.x": [(250, "-"), (1_300_250, "acts"), (1_400_250, "-")],
+        "servo.slow.2": [(250, "-"), (1_500_250, "acts")],
+    }
+
+
+def test_a_flight_without_faults_has_no_table_of_them(tmp_path: Path) -> None:
+    folder = go(tmp_path / "run", duration_s=0.3).folder
+    assert 'id="faults"' not in write_report(folder).read_text(encoding="utf-8")
+    assert json.loads((folder / "result.json").read_text())["faults"] == []
+
+
+def test_the_list_tells_every_kind(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["floaty", "list", "--faults"])
+    with pytest.raises(SystemExit):
+        main()
+    shown = capsys.readouterr().out
+    first = [line.split()[0] for line in shown.splitlines() if line and not line.startswith(" ")]
+    assert first == ["kind", *KINDS]
