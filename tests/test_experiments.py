@@ -155,7 +155,7 @@ def test_the_step_needs_flaps_that_open_through_zero(tmp_path: Path) -> None:
 def test_a_user_overrides_the_settings_of_an_experiment(tmp_path: Path) -> None:
     request = Request.of(EXPERIMENTS["yaw-step"], overrides=("allocation.opening_min=0",))
     assert request.config.allocation.opening_min == 0.0
-    assert request.config.controller.gain_r == 0.11
+    assert request.config.controller.gain_r == 0.09
     assert request.overrides[-1] == "allocation.opening_min=0"
 
 
