@@ -311,11 +311,11 @@ def test_every_kind_has_a_sign() -> None:
 def test_a_sagging_battery_is_what_the_board_reads() -> None:
     flight = Flight(load_config(), HOVER, 3.0, 1, None, faults=[parse("battery.sag@1:1=0.5")])
     read: list[int] = []
-    for moment_us in (1_999_000, 2_001_000, 2_999_000, 3_001_000):
+    for moment_us in (1_999_000, 2_050_000, 2_999_000, 3_050_000):
         flight.events.at(moment_us, lambda _: read.append(flight.board.read_battery_mv()))
     flight.run()
-    assert read[1] == read[2] == read[0] - 500
-    assert read[3] == read[0]
+    sagged = [read[0] - millivolts for millivolts in read[1:]]
+    assert sagged == pytest.approx([500, 500, 0], abs=60)  # what the servos draw makes the rest
 
 
 # Several faults
