@@ -5,7 +5,8 @@ is switched on (a request to arm, over the radio), the robot lifts off; flight s
 the net; controller and fans off. The goal is the hover point all the time.
 
 Order and times are the menu's, the speeds are not: it has 75 to 80 % of the flight speed for take-off and landing, where
-this plant has 0.6 to 0.7 times its weight of lift. Here the flow gains 5 % per metre towards the net; with flat flaps the robot lifts off from 90 % on and stays at the hover point from 95 % on (physics.md section 8).
+this plant has 0.6 to 0.7 times its weight of lift. Here the flow gains 5 % per metre towards the net; with flat flaps the
+robot lifts off from 90 % on and stays at the hover point from 95 % on (physics.md section 8).
 """
 
 from __future__ import annotations
