@@ -94,8 +94,8 @@ ROWS: Mapping[str, Row] = {
             "settle": Claim("< 0.5 s", 0.5), "overshoot": SILENT, "peak_rate": SILENT,
             "max_x": SILENT, "max_y": SILENT, "max_z": SILENT,
         },
-        note="Within 5 % of the step. It takes flaps opened through zero: from 0 to 52° the best switching takes 0.47 s, "
-        "without a controller, a filter or a delay.",
+        note="Within 5 % of the step. It takes flaps opened through zero: between 0 and 52° the time-optimal bound is "
+        "0.47 s, without a controller, a filter or a delay.",
     ),
     "yaw-step-0": Row(
         "Yaw step of 110°, flaps 0..52°", "settles in less than 0.5 s; steps up to 110°", YAW,
@@ -124,7 +124,7 @@ ROWS: Mapping[str, Row] = {
     "side-wind-3": _side_wind(3),
     "side-wind-4": _side_wind(
         4,
-        why="The flaps that lean the robot into the wind lack for lift from 0 to 52°: about every second flight is lost.",
+        why="The flaps that lean the robot into the wind lack for lift between 0 and 52°: about every second is lost.",
     ),
     "side-wind-4-open": _side_wind(
         4, ", flaps -11..52°", note="Opened through zero, with a hover angle of 15°, the flaps have more lift in reserve."

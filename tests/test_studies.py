@@ -167,7 +167,7 @@ def test_a_study_can_be_flown_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     }
     (told,) = json.loads((tmp_path / "out" / "result.json").read_text())["studies"]
     assert told["as_expected"] is True
-    assert [len(variant["cells"]) for variant in told["variants"]] == [5, 5]
+    assert [len(variant["cells"]) for variant in told["variants"]] == [7, 7]
     assert told["variants"][0]["cells"][0]["outcomes"] == ["holds"]
 
 
