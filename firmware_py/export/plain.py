@@ -1,0 +1,107 @@
+"""The flight core as plain Python, in a process of its own: numba is switched on or off for a whole process.
+
+`PlainRunner` is the parent's end, `serve` the child's. A call goes over the pipe as one byte, its index in `CALLS`, and the
+memory of the four blocks; the result, an int32, and the memory come back.
+"""
+
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from firmware_py.core.structs import Control, Estimator, Input, Parameters
+from firmware_py.core.subset import PLAIN, Block
+from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.export.errors import ExportError
+
+CALLS = ("reset", "file_pose", "estimate", "control")
+STRUCTS = (Parameters, Input, Estimator, Control)
+SIZES = tuple(kind.dtype.itemsize for kind in STRUCTS)
+RESULT = struct.Struct("<i")
+
+
+class PlainRunner:
+    """Runs the core's Python sources without numba; `ExportError` when the child process has ended."""
+
+    def __init__(self, blocks: CoreBlocks) -> None:
+        root = str(Path(__file__).parents[2])
+        path = os.pathsep.join((root, *filter(None, (os.environ.get("PYTHONPATH"),))))
+        self._memories = [block.memory for block in blocks_of(blocks)]
+        self._child = subprocess.Popen(
+            [sys.executable, "-m", "firmware_py.export.plain"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": path},
+        )
+
+    def reset(self) -> None:
+        """Start the estimator."""
+        self._call("reset")
+
+    def file_pose(self) -> int:
+        """File the input's pose."""
+        return self._call("file_pose")
+
+    def estimate(self) -> None:
+        """Run one tick of the estimator."""
+        self._call("estimate")
+
+    def control(self) -> None:
+        """Run one tick of the controller."""
+        self._call("control")
+
+    def close(self) -> None:
+        """End the child process."""
+        assert self._child.stdin is not None and self._child.stdout is not None
+        self._child.stdin.close()
+        self._child.wait()
+        self._child.stdout.close()
+
+    def _call(self, name: str) -> int:
+        up, down = self._child.stdin, self._child.stdout
+        assert up is not None and down is not None
+        try:
+            up.write(bytes((CALLS.index(name),)) + b"".join(memory.tobytes() for memory in self._memories))
+            up.flush()
+        except BrokenPipeError:
+            raise ExportError("plain Python: the child process has ended") from None
+        answer = down.read(RESULT.size + sum(SIZES))
+        if len(answer) < RESULT.size + sum(SIZES):
+            raise ExportError("plain Python: the child process has ended in the middle of a call")
+        _spread(answer[RESULT.size :], self._memories)
+        result: int = RESULT.unpack_from(answer)[0]
+        return result
+
+
+def blocks_of(blocks: CoreBlocks) -> tuple[Block, Block, Block, Block]:
+    """Return the blocks in the order of `STRUCTS`."""
+    return blocks.parameters, blocks.data, blocks.estimator, blocks.control
+
+
+def _spread(data: bytes, memories: list[np.ndarray]) -> None:
+    """Write one memory after another."""
+    offset = 0
+    for memory in memories:
+        memory.view(np.uint8)[:] = np.frombuffer(data, np.uint8, memory.nbytes, offset)
+        offset += memory.nbytes
+
+
+def serve(calls: BinaryIO, answers: BinaryIO) -> None:
+    """Execute calls until the other end closes."""
+    blocks = CoreBlocks(Parameters.allocate(), PythonRunner)
+    memories = [block.memory for block in blocks_of(blocks)]
+    while len(call := calls.read(1 + sum(SIZES))) == 1 + sum(SIZES):
+        _spread(call[1:], memories)
+        with np.errstate(all="ignore"):  # infinities and NaN are the comparison's business
+            result = getattr(blocks.run, CALLS[call[0]])()
+        answers.write(RESULT.pack(result or 0) + b"".join(memory.tobytes() for memory in memories))
+        answers.flush()
+
+
+if __name__ == "__main__":
+    assert PLAIN
+    serve(sys.stdin.buffer, sys.stdout.buffer)

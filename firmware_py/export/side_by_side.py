@@ -1,0 +1,111 @@
+"""Several implementations of the flight core in one flight: the same inputs, the whole memory compared after every call.
+
+The reference flies; the others, the targets, run on memory of their own that starts as the reference's does and gets
+nothing from it but what the tasks write: parameters and inputs. A target that has differed once is not run again, because
+everything that follows would differ too.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from firmware_py.core.structs import Control, Estimator, Input, Parameters
+from firmware_py.core.subset import Block
+from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
+from firmware_py.export.compare import Difference, differing_bits
+
+STRUCTS = (Parameters, Input, Estimator, Control)
+RESULT = "result"
+
+
+def blocks_of(blocks: CoreBlocks) -> tuple[Block, Block, Block, Block]:
+    """Return the blocks in the order of `STRUCTS`."""
+    return blocks.parameters, blocks.data, blocks.estimator, blocks.control
+
+
+@dataclass(frozen=True, slots=True)
+class Divergence:
+    """The first difference between the reference and a target."""
+
+    tick: int  # of the estimator; 0: before its first
+    call: str  # the entry point after which it showed
+    struct: str
+    differences: tuple[Difference, ...]  # all of that struct
+
+    def __str__(self) -> str:
+        more = f", and {len(self.differences) - 1} more words" if len(self.differences) > 1 else ""
+        return f"tick {self.tick}, after {self.call}: {self.struct}.{self.differences[0]}{more}"
+
+
+class Target:
+    """One implementation beside the reference."""
+
+    __slots__ = ("blocks", "calls", "divergence", "name", "ticks")
+
+    def __init__(self, name: str, parameters: Block, factory: RunnerFactory) -> None:
+        self.name = name
+        self.blocks = CoreBlocks(parameters, factory)
+        self.divergence: Divergence | None = None
+        self.calls = 0  # that were compared
+        self.ticks = 0  # of the estimator, likewise
+
+
+class SideBySide:
+    """A `CoreRunner` that runs Python on the flight's memory and every target beside it."""
+
+    def __init__(self, blocks: CoreBlocks, targets: Mapping[str, RunnerFactory]) -> None:
+        self.targets = [
+            Target(name, _copy_of(blocks.parameters), factory) for name, factory in targets.items()
+        ]
+        self._reference = PythonRunner(blocks)
+        self._blocks = blocks_of(blocks)
+        self._tick = 0
+
+    def reset(self) -> None:
+        """Start the estimator."""
+        self._call("reset")
+
+    def file_pose(self) -> int:
+        """File the input's pose."""
+        return self._call("file_pose")
+
+    def estimate(self) -> None:
+        """Run one tick of the estimator."""
+        self._tick += 1
+        self._call("estimate")
+        for target in self.targets:
+            target.ticks += target.divergence is None
+
+    def control(self) -> None:
+        """Run one tick of the controller."""
+        self._call("control")
+
+    def _call(self, name: str) -> int:
+        inputs = self._blocks[:2]
+        running = [target for target in self.targets if target.divergence is None]
+        for target in running:
+            for source, copy in zip(inputs, blocks_of(target.blocks), strict=False):
+                copy.memory[:] = source.memory
+        result: int = getattr(self._reference, name)() or 0
+        memories = [block.bytes() for block in self._blocks]
+        for target in running:
+            answer: int = getattr(target.blocks.run, name)() or 0
+            target.calls += 1
+            target.divergence = self._compare(name, memories, result, target.blocks, answer)
+        return result
+
+    def _compare(
+        self, call: str, memories: list[bytes], result: int, blocks: CoreBlocks, answer: int
+    ) -> Divergence | None:
+        if answer != result:
+            patterns = (result & 0xFFFFFFFF, answer & 0xFFFFFFFF)
+            return Divergence(self._tick, call, "return value", (Difference("", (result, answer), patterns),))
+        for kind, memory, block in zip(STRUCTS, memories, blocks_of(blocks), strict=True):
+            if found := differing_bits(memory, block.bytes(), kind.dtype):
+                return Divergence(self._tick, call, kind.__name__, found)
+        return None
+
+
+def _copy_of(parameters: Block) -> Block:
+    copy = Parameters.allocate()
+    copy.memory[:] = parameters.memory
+    return copy
