@@ -13,6 +13,7 @@ import click
 from rich.console import Console
 
 from hil.board_cli import board, station
+from hil.deploy_cli import deploy
 from hil.errors import LabError
 from hil.paper_cli import compare, paper, study
 
@@ -409,6 +410,7 @@ def _refuse(text: str) -> int:
 app.add_command(board)
 app.add_command(station)
 app.add_command(compare)
+app.add_command(deploy)
 app.add_command(paper)
 app.add_command(study)
 

@@ -13,13 +13,13 @@ from typing import BinaryIO
 
 import numpy as np
 
-from firmware_py.core.structs import Control, Estimator, Input, Parameters
-from firmware_py.core.subset import PLAIN, Block
+from firmware_py.core.structs import Parameters
+from firmware_py.core.subset import PLAIN
 from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.export.compare import STRUCTS, blocks_of
 from firmware_py.export.errors import ExportError
 
 CALLS = ("reset", "file_pose", "estimate", "control")
-STRUCTS = (Parameters, Input, Estimator, Control)
 SIZES = tuple(kind.dtype.itemsize for kind in STRUCTS)
 RESULT = struct.Struct("<i")
 
@@ -56,14 +56,16 @@ class PlainRunner:
 
     def close(self) -> None:
         """End the child process."""
-        assert self._child.stdin is not None and self._child.stdout is not None
+        assert self._child.stdin is not None
+        assert self._child.stdout is not None
         self._child.stdin.close()
         self._child.wait()
         self._child.stdout.close()
 
     def _call(self, name: str) -> int:
         up, down = self._child.stdin, self._child.stdout
-        assert up is not None and down is not None
+        assert up is not None
+        assert down is not None
         try:
             up.write(bytes((CALLS.index(name),)) + b"".join(memory.tobytes() for memory in self._memories))
             up.flush()
@@ -75,11 +77,6 @@ class PlainRunner:
         _spread(answer[RESULT.size :], self._memories)
         result: int = RESULT.unpack_from(answer)[0]
         return result
-
-
-def blocks_of(blocks: CoreBlocks) -> tuple[Block, Block, Block, Block]:
-    """Return the blocks in the order of `STRUCTS`."""
-    return blocks.parameters, blocks.data, blocks.estimator, blocks.control
 
 
 def _spread(data: bytes, memories: list[np.ndarray]) -> None:

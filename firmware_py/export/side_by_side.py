@@ -8,18 +8,10 @@ everything that follows would differ too.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from firmware_py.core.structs import Control, Estimator, Input, Parameters
+from firmware_py.core.structs import Parameters
 from firmware_py.core.subset import Block
 from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
-from firmware_py.export.compare import Difference, differing_bits
-
-STRUCTS = (Parameters, Input, Estimator, Control)
-RESULT = "result"
-
-
-def blocks_of(blocks: CoreBlocks) -> tuple[Block, Block, Block, Block]:
-    """Return the blocks in the order of `STRUCTS`."""
-    return blocks.parameters, blocks.data, blocks.estimator, blocks.control
+from firmware_py.export.compare import STRUCTS, Difference, blocks_of, differing_bits
 
 
 @dataclass(frozen=True, slots=True)

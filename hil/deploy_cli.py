@@ -1,0 +1,144 @@
+"""`floaty deploy export | check | flash`: the flight core as C for a Crazyflie, proof that it is the one that flew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from hil.deploy_check import Checked
+    from hil.harness import Flight
+
+console = Console(highlight=False)
+notices = Console(stderr=True, highlight=False)
+INTERRUPTED = 130
+profile_option = click.option(
+    "--profile", default="floaty", show_default=True, metavar="NAME|FILE", help="As for fly."
+)
+set_option = click.option(
+    "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE",
+    help="Override a value of the profile; repeatable.",
+)  # fmt: skip
+
+
+@click.group()
+def deploy() -> None:
+    """Bring the flight core to a Crazyflie-class board."""
+
+
+@deploy.command()
+@click.argument("experiment", required=False)
+@click.option("--all", "every", is_flag=True, help="Every experiment, the first minute of each.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=1, show_default=True, help="Of everything random."
+)
+@click.option(
+    "--duration",
+    type=click.FloatRange(0, 86_400, min_open=True),
+    metavar="S",
+    help="Free flight [s]; default: the experiment's.",
+)
+@profile_option
+@set_option
+@click.option(
+    "--fault", "fault_texts", multiple=True, metavar="KIND@START[:DURATION][=SIZE]", help="As for fly; repeatable.",
+)  # fmt: skip
+@click.option(
+    "--targets", "target_text", metavar="NAME,...",
+    help="What to compare with numba: plain, c-O0, c-O2, cortex-m4.  [default: all]",
+)  # fmt: skip
+@click.option(
+    "--source", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Check this floaty_core.c, as exported before, instead of what would be exported now.",
+)  # fmt: skip
+def check(
+    experiment: str | None,
+    every: bool,
+    seed: int,
+    duration: float | None,
+    profile: str,
+    overrides: tuple[str, ...],
+    fault_texts: tuple[str, ...],
+    target_text: str | None,
+    source: Path | None,
+) -> int:
+    """Fly with numba, plain Python, C and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
+
+    Without EXPERIMENT: hover, yaw step and a hover with faults, 10 000 ticks of 10 ms. Exit code 0: no bit differs; 1: one
+    does; 2: bad input; 130: interrupted.
+    """
+    from hil.cli import announce_compilation
+    from hil.deploy_check import check_flight, plan
+    from hil.deploy_targets import Toolbox, target_names
+    from hil.faults import parse
+
+    names = target_names(target_text)
+    flights = plan(
+        experiment, every, profile, overrides, seed, duration, [parse(text) for text in fault_texts]
+    )
+    toolbox = Toolbox(names, source)
+    announce_compilation()
+    checked: list[Checked] = []
+    for request in flights:
+        with _progress(str(request.experiment.name)) as show:
+            checked.append(check_flight(request, toolbox.factories, show))
+        _print_flight(checked[-1])
+        if checked[-1].outcome == "interrupted":
+            break
+    _print_sum(checked, names)
+    if checked[-1].outcome == "interrupted":
+        return INTERRUPTED
+    return 0 if all(one.equal for one in checked) else 1
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Callable[[int, Flight], None]]:
+    """Show how far a flight is."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+        bar = progress.add_task(name, total=None)
+        yield lambda now_us, flight: progress.update(bar, completed=now_us, total=flight.end_us)
+
+
+def _print_flight(checked: Checked) -> None:
+    request = checked.request
+    faults = f", {len(request.faults)} faults" if request.faults else ""
+    console.print(
+        f"{request.experiment.name}, seed {request.seed}{faults}: {checked.outcome}", soft_wrap=True
+    )
+    for target in checked.targets:
+        verdict = "equal" if target.divergence is None else f"DIFFERS first in {target.divergence}"
+        console.print(
+            f"  {target.name:<10}{target.ticks:>7} ticks {target.calls:>7} calls  {verdict}", soft_wrap=True
+        )
+
+
+def _print_sum(checked: list[Checked], names: Sequence[str]) -> None:
+    ticks = min(sum(one.targets[index].ticks for one in checked) for index in range(len(names)))
+    different = [
+        name for index, name in enumerate(names) if any(one.targets[index].divergence for one in checked)
+    ]
+    verdict = f"{', '.join(different)} DIFFER" if different else "no bit differs"
+    console.print(f"{ticks} ticks, numba beside {', '.join(names)}: {verdict}", soft_wrap=True)
+
+
+@deploy.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
+@profile_option
+@set_option
+def export(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
+    """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the new folder DIR."""
+
+
+@deploy.command()
+@click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path, dir_okay=False))
+@click.option("--uri", required=True, metavar="radio://…", help="The board, as in `floaty station`.")
+def flash(image: Path, uri: str) -> None:
+    """Flash IMAGE, the .bin of a Crazyflie build, over the radio, and read it back."""
