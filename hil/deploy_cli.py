@@ -12,6 +12,7 @@ from rich.console import Console
 
 if TYPE_CHECKING:
     from hil.deploy_check import Checked
+    from hil.deploy_targets import MachineCode
     from hil.harness import Flight
 
 console = Console(highlight=False)
@@ -81,7 +82,7 @@ def check(
     flights = plan(
         experiment, every, profile, overrides, seed, duration, [parse(text) for text in fault_texts]
     )
-    toolbox = Toolbox(names, source)
+    toolbox = Toolbox(names, _read(source) if source else None)
     announce_compilation()
     checked: list[Checked] = []
     for request in flights:
@@ -90,7 +91,9 @@ def check(
         _print_flight(checked[-1])
         if checked[-1].outcome == "interrupted":
             break
-    _print_sum(checked, names)
+    _print_sum(checked)
+    if toolbox.machine_code is not None:
+        _print_machine_code(toolbox.machine_code)
     if checked[-1].outcome == "interrupted":
         return INTERRUPTED
     return 0 if all(one.equal for one in checked) else 1
@@ -120,13 +123,35 @@ def _print_flight(checked: Checked) -> None:
         )
 
 
-def _print_sum(checked: list[Checked], names: Sequence[str]) -> None:
-    ticks = min(sum(one.targets[index].ticks for one in checked) for index in range(len(names)))
+def _print_sum(checked: list[Checked]) -> None:
+    every = [target for one in checked for target in one.targets]
+    names = list(dict.fromkeys(target.name for target in every))
+    ticks = min(sum(target.ticks for target in every if target.name == name) for name in names)
     different = [
-        name for index, name in enumerate(names) if any(one.targets[index].divergence for one in checked)
+        name for name in names if any(target.divergence for target in every if target.name == name)
     ]
-    verdict = f"{', '.join(different)} DIFFER" if different else "no bit differs"
+    verdict = f"{', '.join(different)} DIFFERS" if different else "no bit differs"
     console.print(f"{ticks} ticks, numba beside {', '.join(names)}: {verdict}", soft_wrap=True)
+
+
+def _print_machine_code(code: MachineCode) -> None:
+    ticks = code.ticks
+    console.print(
+        f"Cortex-M4 code: flash {code.flash_bytes} B, RAM {code.ram_bytes} B, stack {code.stack_bytes} B", soft_wrap=True
+    )
+    mean, worst = code.loads
+    console.print(
+        f"instructions per tick: mean {ticks.instructions / max(ticks.calls, 1):.0f}, worst {ticks.worst_instructions}; "
+        f"load at {CLOCK_MHZ} MHz: mean {mean:.1%}, worst tick {worst:.1%} ({ticks.worst_us:.0f} us of 10 ms)",
+        soft_wrap=True,
+    )
+
+
+def _read(source: Path) -> str:
+    try:
+        return source.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise LabError(f"--source {source}: {getattr(error, 'strerror', None) or error}") from None
 
 
 @deploy.command()

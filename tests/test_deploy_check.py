@@ -1,0 +1,144 @@
+"""`floaty deploy check`: equal targets are called equal, a bit that differs is found where and when it differs."""
+
+import os
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
+from hil.cli import main
+from hil.deploy_check import Checked, check_flight, plan
+from hil.deploy_targets import TARGETS
+from hil.run import Request
+
+LONG = bool(os.environ.get("FLOATY_LONG"))
+
+
+def floaty(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["floaty", *arguments])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert isinstance(left.value.code, int)
+    return left.value.code
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+class Spoilt(PythonRunner):
+    """Python with one word that is wrong from one call on."""
+
+    def __init__(self, blocks: CoreBlocks, call: str, tick: int, spoil: Callable[[CoreBlocks], None]) -> None:
+        super().__init__(blocks)
+        self._spoilt = (call, tick, lambda: spoil(blocks))
+        self._tick = 0
+
+    def _done(self, name: str) -> None:
+        call, tick, spoil = self._spoilt
+        if (call, tick) == (name, self._tick):
+            spoil()
+
+    def estimate(self) -> None:
+        super().estimate()
+        self._tick += 1
+        self._done("estimate")
+
+    def control(self) -> None:
+        super().control()
+        self._done("control")
+
+
+def fly_beside(factory: RunnerFactory) -> Checked:
+    [request] = plan("hover", False, "floaty", (), 3, 0.5, ())
+    return check_flight(request, lambda stack: {"spoilt": factory}, lambda now_us, flight: None)
+
+
+def one_ulp(values: np.ndarray, index: tuple[int, ...]) -> None:
+    values[index] = np.nextafter(values[index], np.float32(np.inf))
+
+
+@pytest.mark.parametrize(
+    ("call", "tick", "spoil", "struct", "field", "bits"),
+    [
+        ("estimate", 37, lambda blocks: one_ulp(blocks.estimator.fields.P, (3, 4)), "Estimator", "P[3,4]", None),
+        ("control", 101, lambda blocks: one_ulp(blocks.control.fields.u, (2,)), "Control", "u[2]", None),
+        ("control", 0, lambda blocks: blocks.control.fields.count.__setitem__(1, 0), "Control", "count[1]", None),
+        ("estimate", 1, lambda blocks: blocks.estimator.fields.x.__setitem__(5, -0.0), "Estimator", "x[5]", 1),
+        ("estimate", 64, lambda blocks: setattr(blocks.estimator.fields, "fused", -1), "Estimator", "fused", None),
+        ("control", 9, lambda blocks: setattr(blocks.parameters.fields, "gain_z", 0.0), "Parameters", "gain_z", None),
+    ],
+)  # fmt: skip
+def test_the_first_difference_is_reported_with_its_tick_call_and_word(
+    call: str, tick: int, spoil: Callable[[CoreBlocks], None], struct: str, field: str, bits: int | None
+) -> None:
+    [target] = fly_beside(lambda blocks: Spoilt(blocks, call, tick, spoil)).targets
+    found = target.divergence
+    assert found is not None
+    assert (found.tick, found.call, found.struct) == (tick, call, struct)
+    assert [one.field for one in found.differences] == [field]
+    if bits is not None:
+        assert found.differences[0].bits == bits
+
+
+def test_a_target_that_answers_otherwise_is_found() -> None:
+    class Late(PythonRunner):
+        def file_pose(self) -> int:
+            return super().file_pose() + 1
+
+    found = fly_beside(Late).targets[0].divergence
+    assert found is not None
+    assert (found.call, found.struct) == ("file_pose", "return value")
+    assert found.differences[0].values == (0, 1)
+
+
+def test_a_target_that_has_differed_does_not_hide_the_others() -> None:
+    def factories(stack: ExitStack) -> dict[str, RunnerFactory]:
+        def spoil(blocks: CoreBlocks) -> None:
+            blocks.control.fields.count[0] += 1
+
+        def spoilt(blocks: CoreBlocks) -> CoreRunner:
+            return Spoilt(blocks, "control", 20, spoil)
+
+        return {"spoilt": spoilt, "python": PythonRunner}
+
+    [request] = plan("hover", False, "floaty", (), 3, 0.5, ())
+    checked = check_flight(request, factories, lambda now_us, flight: None)
+    assert [target.ticks for target in checked.targets] == [20, 150]
+    assert not checked.equal
+    assert checked.targets[1].divergence is None
+
+
+def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> None:
+    flights: list[Request] = plan(None, False, "floaty", (), 1, None, ())
+    assert [(one.experiment.name, bool(one.faults)) for one in flights] == [
+        ("hover", False), ("yaw-step", False), ("hover", True),
+    ]  # fmt: skip
+    assert sum(one.duration_s + one.config.flight.release_us * 1e-6 for one in flights) >= 100.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["hovver"], "did you mean hover?"),
+        (["hover", "--all"], "hover and --all: one or the other"),
+        (["--fault", "push.y@1=2"], "for which EXPERIMENT?"),
+        (["hover", "--targets", "plain,c"], "'c' is none of plain, c-O0, c-O2, cortex-m4"),
+        (["hover", "--duration", "0"], "--duration"),
+        (["hover", "--profile", "flaoty"], "did you mean floaty?"),
+        (["hover", "--source", "nowhere.c"], "nowhere.c"),
+    ],
+)
+def test_bad_input_of_check_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert floaty(monkeypatch, "deploy", "check", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("floaty: ")
+    assert error.count("\n") == 1
