@@ -1,0 +1,225 @@
+"""The flight core as ARM machine code, executed instruction by instruction by the emulator unicorn.
+
+An emulated Cortex-M4F has the image in flash and the four structs with a stack in RAM. A call copies the structs in,
+runs one entry point to its end and copies them out: what comes back is what the board would compute. On the way,
+`arm/meter.c` counts instructions and cycles, which become the processor time of the tasks: upper figures of ARM's manual
+for every instruction, flash read through a cache that is empty when the call begins, 168 MHz.
+"""
+
+import ctypes
+import mmap
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.export.arm_image import FLASH, FLASH_SIZE, NEEDS_EXTRA, Image
+from firmware_py.export.cycles import count
+from firmware_py.export.errors import ExportError
+
+CLOCK_MHZ = 168
+RAM = 0x2000_0000
+RAM_SIZE = 0x8000
+STACK_TOP = RAM + RAM_SIZE  # full descending
+STACK_PATTERN = 0xA5
+ALIGNMENT = 16
+LANDING = FLASH + FLASH_SIZE - 16  # where a call returns to, and stops
+
+
+@dataclass(slots=True)
+class Load:
+    """What an entry point has taken so far, over all calls."""
+
+    calls: int = 0
+    instructions: int = 0
+    cycles: int = 0
+    worst_instructions: int = 0
+    worst_cycles: int = 0
+
+    def add(self, instructions: int, cycles: int) -> None:
+        """Take in one call."""
+        self.calls += 1
+        self.instructions += instructions
+        self.cycles += cycles
+        self.worst_instructions = max(self.worst_instructions, instructions)
+        self.worst_cycles = max(self.worst_cycles, cycles)
+
+    @property
+    def mean_us(self) -> float:
+        """Processor time of a mean call."""
+        return self.cycles / max(self.calls, 1) / CLOCK_MHZ
+
+    @property
+    def worst_us(self) -> float:
+        """Processor time of the longest call."""
+        return self.worst_cycles / CLOCK_MHZ
+
+
+class CortexM4Runner:
+    """A `CoreRunner` and a `CoreCosts`; `load` counts by entry point, `instructions` is that of the last call.
+
+    `blocks` must have the layout for which the image was exported; `meter` is what `build_meter` returned.
+    Raises `ExportError` when unicorn is missing.
+    """
+
+    def __init__(self, blocks: CoreBlocks, image: Image, meter: Path) -> None:
+        try:
+            import unicorn
+            from unicorn import arm_const
+        except ImportError:
+            raise ExportError(f"board cortex-m4: unicorn is missing: {NEEDS_EXTRA}") from None
+        self.image = image
+        self.load = {name: Load() for name in image.entries}
+        self._fault = unicorn.UcError
+        self._result, self._pc = arm_const.UC_ARM_REG_R0, arm_const.UC_ARM_REG_PC
+        self._cpu = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
+        self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
+        self._cpu.mem_map(FLASH, FLASH_SIZE, unicorn.UC_PROT_READ | unicorn.UC_PROT_EXEC)
+        self._cpu.mem_write(FLASH, image.code)
+        self._ram = np.frombuffer(mmap.mmap(-1, RAM_SIZE), np.uint8)
+        self._ram[:] = STACK_PATTERN
+        ram = self._ram.ctypes.data
+        self._cpu.mem_map_ptr(RAM, RAM_SIZE, unicorn.UC_PROT_READ | unicorn.UC_PROT_WRITE, ram)
+        shared = (blocks.parameters, blocks.data, blocks.estimator, blocks.control)
+        self._here = tuple(block.memory.view(np.uint8) for block in shared)
+        sizes = [-(-memory.size // ALIGNMENT) * ALIGNMENT for memory in self._here]
+        places = [sum(sizes[:index]) for index in range(len(sizes) + 1)]
+        self._stack_end = places[-1]
+        self._there = tuple(
+            self._ram[place : place + memory.size]
+            for place, memory in zip(places[:-1], self._here, strict=True)
+        )
+        p, d, e, c = (RAM + place for place in places[:-1])
+        arguments = {"reset": (p, e), "file_pose": (p, d, e), "estimate": (p, d, e, c), "control": (p, d, e, c)}
+        r0, sp, lr = self._result, arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_LR
+        self._registers = {
+            name: ((sp, STACK_TOP), (lr, LANDING | 1), *((r0 + i, place) for i, place in enumerate(given)))
+            for name, given in arguments.items()
+        }
+        self._meter = Meter(image, meter, self._cpu)
+        self._filed_cycles = 0  # for poses since the last step of the estimator
+        self._ahead: tuple[str, bytes] | None = None  # the call that RAM holds the results of, and its inputs
+
+    def reset(self) -> None:
+        """Start the estimator."""
+        self._call("reset")
+
+    def file_pose(self) -> int:
+        """File the input's pose."""
+        result = self._call("file_pose")
+        self._filed_cycles += self._meter.cycles
+        return result
+
+    def estimate(self) -> None:
+        """Run one tick of the estimator."""
+        self._call("estimate")
+        self._filed_cycles = 0
+
+    def control(self) -> None:
+        """Run one tick of the controller."""
+        self._call("control")
+
+    def estimate_us(self) -> int:
+        """Return the processor time of the estimator's next call, with that of the poses filed since the last one."""
+        return _microseconds(self._filed_cycles + self._look_ahead("estimate"))
+
+    def control_us(self) -> int:
+        """Return the processor time of the controller's next call."""
+        return _microseconds(self._look_ahead("control"))
+
+    @property
+    def instructions(self) -> int:
+        """How many instructions the last call took."""
+        return self._meter.instructions
+
+    @property
+    def stack_bytes(self) -> int:
+        """The deepest that the stack has been."""
+        touched = self._ram[self._stack_end :] != STACK_PATTERN
+        return int(touched.size - touched.argmax()) if touched.any() else 0
+
+    @property
+    def ram_bytes(self) -> int:
+        """The memory of the four structs."""
+        return sum(memory.size for memory in self._here)
+
+    def _call(self, name: str) -> int:
+        """Run an entry point and let its results out; what was computed ahead from the same inputs is taken."""
+        if self._ahead is None or self._ahead != (name, self._inputs()):
+            self._execute(name)
+        self._ahead = None
+        for here, there in zip(self._here, self._there, strict=True):
+            here[:] = there
+        self.load[name].add(self._meter.instructions, self._meter.cycles)
+        return ctypes.c_int32(self._cpu.reg_read(self._result)).value
+
+    def _look_ahead(self, name: str) -> int:
+        """Run an entry point without letting its results out; returns its cycles."""
+        self._execute(name)
+        self._ahead = name, self._inputs()
+        return self._meter.cycles
+
+    def _inputs(self) -> bytes:
+        return b"".join([memory.tobytes() for memory in self._here])
+
+    def _execute(self, name: str) -> None:
+        self._ahead = None
+        for here, there in zip(self._here, self._there, strict=True):
+            there[:] = here
+        self._cpu.reg_write_batch(self._registers[name])
+        self._meter.start()
+        try:
+            self._cpu.emu_start(self.image.entries[name], LANDING)
+        except self._fault as error:
+            place = self._cpu.reg_read(self._pc)
+            raise ExportError(f"{self.image.path}: {name} stopped at 0x{place:08x}: {error}") from None
+
+
+class Meter:
+    """Counts the instructions and cycles of a call; see arm/meter.c."""
+
+    def __init__(self, image: Image, library: Path, cpu: Any) -> None:
+        self._library = ctypes.CDLL(str(library))
+        self._library.meter_size.restype = ctypes.c_uint64
+        half_words = FLASH_SIZE // 2
+        code = count(image.code, image.constants)
+        self._sums = [  # to the end of flash, because the landing counts as a block
+            np.pad(sums, (0, half_words + 1 - sums.size), "edge") for sums in (code.instructions, code.cycles)
+        ]
+        size = self._library.meter_size()
+        self._state = np.zeros(size // 8, np.uint64)
+        self._state[:3] = *(sums.ctypes.data for sums in self._sums), FLASH
+        self._address = ctypes.c_void_p(self._state.ctypes.data)
+        self._library.meter_start.argtypes = (ctypes.c_void_p,)
+        self._attach(cpu)
+
+    def start(self) -> None:
+        """Begin a call with an empty cache."""
+        self._library.meter_start(self._address)
+
+    @property
+    def instructions(self) -> int:
+        """Instructions since the start."""
+        return int(self._state[4])
+
+    @property
+    def cycles(self) -> int:
+        """Cycles since the start."""
+        return int(self._state[5])
+
+    def _attach(self, cpu: Any) -> None:
+        """Have the library called for every block; unicorn's Python would come between and cost a hundred times more."""
+        from unicorn import UC_HOOK_BLOCK
+        from unicorn.unicorn_py3.unicorn import uclib
+
+        hook = ctypes.c_size_t()
+        block = ctypes.cast(self._library.meter_block, ctypes.c_void_p)
+        everywhere = ctypes.c_uint64(1), ctypes.c_uint64(0)
+        if uclib.uc_hook_add(cpu._uch, ctypes.byref(hook), UC_HOOK_BLOCK, block, self._address, *everywhere):
+            raise ExportError("board cortex-m4: unicorn refuses to count")
+
+
+def _microseconds(cycles: int) -> int:
+    return -(-cycles // CLOCK_MHZ)
