@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
+
+from hil.errors import LabError
 
 if TYPE_CHECKING:
     from hil.deploy_check import Checked
@@ -127,17 +129,18 @@ def _print_sum(checked: list[Checked]) -> None:
     every = [target for one in checked for target in one.targets]
     names = list(dict.fromkeys(target.name for target in every))
     ticks = min(sum(target.ticks for target in every if target.name == name) for name in names)
-    different = [
-        name for name in names if any(target.divergence for target in every if target.name == name)
-    ]
+    different = [name for name in names if any(target.divergence for target in every if target.name == name)]
     verdict = f"{', '.join(different)} DIFFERS" if different else "no bit differs"
     console.print(f"{ticks} ticks, numba beside {', '.join(names)}: {verdict}", soft_wrap=True)
 
 
 def _print_machine_code(code: MachineCode) -> None:
+    from firmware_py.export.cortex_m4 import CLOCK_MHZ
+
     ticks = code.ticks
     console.print(
-        f"Cortex-M4 code: flash {code.flash_bytes} B, RAM {code.ram_bytes} B, stack {code.stack_bytes} B", soft_wrap=True
+        f"Cortex-M4 code: flash {code.flash_bytes} B, RAM {code.ram_bytes} B, stack {code.stack_bytes} B",
+        soft_wrap=True,
     )
     mean, worst = code.loads
     console.print(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -40,7 +40,9 @@ class Metered(CortexM4Runner):
     def __init__(self, blocks: CoreBlocks, image: Image, meter: Path, ticks: Load) -> None:
         super().__init__(blocks, image, meter)
         self._ticks = ticks
-        self._so_far: tuple[int, int] | None = None  # instructions and cycles at the last tick's end; None: at boot
+        self._so_far: tuple[int, int] | None = (
+            None  # instructions and cycles at the last tick's end; None: at boot
+        )
 
     def control(self) -> None:
         """Run the controller, with which a tick ends."""
@@ -79,13 +81,13 @@ class Toolbox:
         self._names = names
         try:
             c = translate()
-            source = c.source if source is None else source
+            c = c if source is None else replace(c, source=source)
             for name in names:
                 if name in (C_O0, C_O2):
-                    library = build(source, c.header, BUILD_FOLDER, OPTIMISATION[name])
+                    library = build(c, BUILD_FOLDER, OPTIMISATION[name])
                     self._native[name] = partial(NativeRunner, library=library)
                 elif name == CORTEX_M4:
-                    self._image = build_image(source, c.header, BUILD_FOLDER, OPTIMISATION[name])
+                    self._image = build_image(c.source, c.header, BUILD_FOLDER, OPTIMISATION[name])
                     self._meter = build_meter(BUILD_FOLDER)
                     self.machine_code = MachineCode(len(self._image.code), Load())
         except ExportError as error:

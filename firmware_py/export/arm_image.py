@@ -69,7 +69,9 @@ def read_image(path: Path) -> Image:
                 raise ExportError(f"{path}: section {section.name} is variable memory outside the structs")
             end = section["sh_addr"] - FLASH + section["sh_size"]
             if not 0 < end <= FLASH_SIZE - 16:
-                raise ExportError(f"{path}: section {section.name} does not lie in the {FLASH_SIZE} bytes of flash")
+                raise ExportError(
+                    f"{path}: section {section.name} does not lie in the {FLASH_SIZE} bytes of flash"
+                )
             code.extend(bytes(max(0, end - len(code))))
             code[end - section["sh_size"] : end] = section.data()
         symbols = [

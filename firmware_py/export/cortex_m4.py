@@ -92,7 +92,12 @@ class CortexM4Runner:
             for place, memory in zip(places[:-1], self._here, strict=True)
         )
         p, d, e, c = (RAM + place for place in places[:-1])
-        arguments = {"reset": (p, e), "file_pose": (p, d, e), "estimate": (p, d, e, c), "control": (p, d, e, c)}
+        arguments = {
+            "reset": (p, e),
+            "file_pose": (p, d, e),
+            "estimate": (p, d, e, c),
+            "control": (p, d, e, c),
+        }
         r0, sp, lr = self._result, arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_LR
         self._registers = {
             name: ((sp, STACK_TOP), (lr, LANDING | 1), *((r0 + i, place) for i, place in enumerate(given)))
