@@ -162,7 +162,19 @@ def _read(source: Path) -> str:
 @profile_option
 @set_option
 def export(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
-    """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the new folder DIR."""
+    """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the folder DIR."""
+    from firmware_py.export.crazyflie import write_app
+
+    from firmware_py.export.errors import ExportError
+    from hil.config import load_config
+
+    config = load_config(profile, overrides)
+    try:
+        files = write_app(config, " ".join((profile, *overrides)), folder)
+    except ExportError as error:
+        raise LabError(str(error)) from None
+    for file in files:
+        console.print(file, soft_wrap=True)
 
 
 @deploy.command()

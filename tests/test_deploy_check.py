@@ -1,18 +1,23 @@
 """`floaty deploy check`: equal targets are called equal, a bit that differs is found where and when it differs."""
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
+from firmware_py.export.c99 import translate
 from hil.cli import main
 from hil.deploy_check import Checked, check_flight, plan
 from hil.deploy_targets import TARGETS
+from hil.faults import parse
+from hil.harness import Flight
 from hil.run import Request
 
 LONG = bool(os.environ.get("FLOATY_LONG"))
@@ -29,6 +34,12 @@ def floaty(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose builds the tests share."""
+    return tmp_path_factory.mktemp("built")
 
 
 class Spoilt(PythonRunner):
@@ -120,6 +131,85 @@ def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> No
         ("hover", False), ("yaw-step", False), ("hover", True),
     ]  # fmt: skip
     assert sum(one.duration_s + one.config.flight.release_us * 1e-6 for one in flights) >= 100.0
+
+
+SOMETHING_OF_EACH = ("--duration", "0.8", "--fault", "mocap.latency@0.2:0.4=150", "--fault", "push.y@0.4=2")
+
+
+def test_all_targets_are_equal_in_a_short_flight_with_faults(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+) -> None:
+    monkeypatch.chdir(built)
+    assert floaty(monkeypatch, "deploy", "check", "yaw-step", *SOMETHING_OF_EACH) == 0
+    shown = capsys.readouterr().out
+    assert [line.split()[0] for line in shown.splitlines() if line.endswith("equal")] == list(TARGETS)
+    assert "180 ticks, numba beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
+    assert re.search(r"flash \d+ B, RAM 4820 B, stack \d+ B\n", shown)
+    mean, worst = map(int, re.search(r"per tick: mean (\d+), worst (\d+)", shown).groups())
+    assert 10_000 < mean <= worst < 200_000
+
+
+@pytest.mark.skipif(not LONG, reason="two minutes: FLOATY_LONG=1")
+def test_ten_thousand_ticks_of_hover_yaw_step_and_faults_do_not_differ_in_a_bit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+) -> None:
+    monkeypatch.chdir(built)
+    assert floaty(monkeypatch, "deploy", "check") == 0
+    sums = re.search(r"^(\d+) ticks, .*: no bit differs$", capsys.readouterr().out, re.MULTILINE)
+    assert int(sums[1]) >= 10_000
+
+
+class Watch(PythonRunner):
+    """Python that notes the tick in which the counter of late poses first moves."""
+
+    first: ClassVar[list[int]] = []
+
+    def __init__(self, blocks: CoreBlocks) -> None:
+        super().__init__(blocks)
+        self._fields = blocks.estimator.fields
+
+    def file_pose(self) -> int:
+        answer = super().file_pose()
+        if self._fields.too_old == 1 and not self.first:
+            self.first.append(int(self._fields.tick))
+        return answer
+
+
+@pytest.mark.parametrize("target", ["c-O2", "cortex-m4"])
+def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path, target: str
+) -> None:
+    monkeypatch.chdir(built)
+    text = translate().source
+    right, wrong = (
+        "estimator->too_old = estimator->too_old + 1;",
+        "estimator->too_old = estimator->too_old - 1;",
+    )
+    assert text.count(right) == 1
+    Path("changed.c").write_text(text.replace(right, wrong), encoding="utf-8")
+    options = ("--targets", target, "--source", "changed.c")
+    assert floaty(monkeypatch, "deploy", "check", "hover", *SOMETHING_OF_EACH, *options) == 1
+    shown = capsys.readouterr().out
+    [request] = plan("hover", False, "floaty", (), 1, 0.8, [parse(text) for text in SOMETHING_OF_EACH[3::2]])
+    Watch.first.clear()
+    flight = Flight(
+        request.config, request.experiment, request.duration_s, 1, None, faults=request.faults, runner=Watch
+    )
+    flight.run()
+    [tick] = Watch.first
+    assert tick > 100
+    assert f"tick {tick}, after file_pose: Estimator.too_old: 1 00000001 | -1 ffffffff (31 bits)" in shown
+    assert f"{target} DIFFERS" in shown
+
+
+def test_c_that_does_not_compile_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("broken.c").write_text("int x = ;\n", encoding="utf-8")
+    assert floaty(monkeypatch, "deploy", "check", "hover", "--targets", "c-O2", "--source", "broken.c") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("floaty: ")
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
