@@ -1,14 +1,18 @@
-# `make fly` flies the hover experiment, `make test` runs every test; both set up .venv by themselves.
+# `make fly` flies the hover experiment, `make test` runs every test, `make check` compares the C and the machine code with
+# the Python that flies; all set up .venv by themselves.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: fly test bench clients clean
+.PHONY: fly test check bench clients clean
 
 fly: .venv/fly.stamp
 	$(BIN)/floaty fly hover
 
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto
+
+check: .venv/test.stamp
+	$(BIN)/floaty deploy check
 
 # Real ground tools for the tests of the serial line. MAVProxy runs headless without what it depends on (1 GB).
 clients: .venv/test.stamp

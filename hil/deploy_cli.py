@@ -181,4 +181,30 @@ def export(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
 @click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--uri", required=True, metavar="radio://…", help="The board, as in `floaty station`.")
 def flash(image: Path, uri: str) -> None:
-    """Flash IMAGE, the .bin of a Crazyflie build, over the radio, and read it back."""
+    """Flash IMAGE, the .bin of a Crazyflie build, over the radio, read it back and start it."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    try:
+        from ground_station.flashing import flash as flash_board
+    except ImportError as error:
+        raise LabError(f"deploy flash: {error}: pip install 'floaty-hil[radio]'") from None
+    from ground_station.errors import LinkError
+
+    try:
+        content = image.read_bytes()
+    except OSError as error:
+        raise LabError(f"{image}: {error.strerror or error}") from None
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+        bar = progress.add_task("", total=None)
+
+        def show(what: str, done: int, pages: int) -> None:
+            progress.update(bar, description=what, completed=done, total=pages)
+
+        try:
+            checksum = flash_board(uri, content, show)
+        except LinkError as error:
+            raise LabError(f"{image}: {error}") from None
+    console.print(
+        f"{len(content)} bytes written and read back, CRC-32 {checksum:08x}; the board starts", soft_wrap=True
+    )

@@ -13,6 +13,7 @@ import pytest
 
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
 from firmware_py.export.c99 import translate
+from firmware_py.export.plain import PlainRunner
 from hil.cli import main
 from hil.deploy_check import Checked, check_flight, plan
 from hil.deploy_targets import TARGETS
@@ -91,7 +92,7 @@ def test_the_first_difference_is_reported_with_its_tick_call_and_word(
     [target] = fly_beside(lambda blocks: Spoilt(blocks, call, tick, spoil)).targets
     found = target.divergence
     assert found is not None
-    assert (found.tick, found.call, found.struct) == (tick, call, struct)
+    assert (found.tick, found.call, found.where) == (tick, call, struct)
     assert [one.field for one in found.differences] == [field]
     if bits is not None:
         assert found.differences[0].bits == bits
@@ -104,7 +105,7 @@ def test_a_target_that_answers_otherwise_is_found() -> None:
 
     found = fly_beside(Late).targets[0].divergence
     assert found is not None
-    assert (found.call, found.struct) == ("file_pose", "return value")
+    assert (found.call, found.where) == ("file_pose", "answer")
     assert found.differences[0].values == (0, 1)
 
 
@@ -200,6 +201,34 @@ def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
     assert tick > 100
     assert f"tick {tick}, after file_pose: Estimator.too_old: 1 00000001 | -1 ffffffff (31 bits)" in shown
     assert f"{target} DIFFERS" in shown
+
+
+def test_machine_code_that_leaves_its_memory_is_exit_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+) -> None:
+    monkeypatch.chdir(built)
+    text, right = translate().source, "const int32_t row = estimator->tick % FLOATY_HISTORY;"
+    assert text.count(right) == 1
+    wild = "const int32_t row = estimator->tick == 23 ? 0x8000000 : estimator->tick % FLOATY_HISTORY;"
+    Path("wild.c").write_text(text.replace(right, wild), encoding="utf-8")
+    options = ("--duration", "0.1", "--targets", "cortex-m4", "--source", "wild.c")
+    assert floaty(monkeypatch, "deploy", "check", "hover", *options) == 1
+    assert "tick 23, in estimate: " in capsys.readouterr().out
+
+
+def test_a_plain_python_that_has_ended_is_a_difference() -> None:
+    runners: list[PlainRunner] = []
+
+    def factory(blocks: CoreBlocks) -> CoreRunner:
+        runners.append(PlainRunner(blocks))
+        runners[0]._child.kill()
+        runners[0]._child.wait()
+        return runners[0]
+
+    found = fly_beside(factory).targets[0].divergence
+    assert found is not None
+    assert (found.tick, found.call) == (0, "reset")
+    runners[0].close()
 
 
 def test_c_that_does_not_compile_is_one_line_and_exit_code_two(

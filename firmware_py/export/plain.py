@@ -5,9 +5,11 @@ memory of the four blocks; the result, an int32, and the memory come back.
 """
 
 import os
+import signal
 import struct
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,7 +27,7 @@ RESULT = struct.Struct("<i")
 
 
 class PlainRunner:
-    """Runs the core's Python sources without numba; `ExportError` when the child process has ended."""
+    """Runs the core's Python sources without numba; a call raises `ExportError` when the child process has ended."""
 
     def __init__(self, blocks: CoreBlocks) -> None:
         root = str(Path(__file__).parents[2])
@@ -58,7 +60,8 @@ class PlainRunner:
         """End the child process."""
         assert self._child.stdin is not None
         assert self._child.stdout is not None
-        self._child.stdin.close()
+        with suppress(BrokenPipeError):  # it ended before
+            self._child.stdin.close()
         self._child.wait()
         self._child.stdout.close()
 
@@ -101,4 +104,5 @@ def serve(calls: BinaryIO, answers: BinaryIO) -> None:
 
 if __name__ == "__main__":
     assert PLAIN
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
     serve(sys.stdin.buffer, sys.stdout.buffer)

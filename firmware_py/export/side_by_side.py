@@ -12,6 +12,7 @@ from firmware_py.core.structs import Parameters
 from firmware_py.core.subset import Block
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
 from firmware_py.export.compare import STRUCTS, Difference, blocks_of, differing_bits
+from firmware_py.export.errors import ExportError
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +21,14 @@ class Divergence:
 
     tick: int  # of the estimator; 0: before its first
     call: str  # the entry point after which it showed
-    struct: str
-    differences: tuple[Difference, ...]  # all of that struct
+    where: str  # struct, `answer`, or what stopped the target
+    differences: tuple[Difference, ...]  # all of that struct; none when the target was stopped
 
     def __str__(self) -> str:
+        if not self.differences:
+            return f"tick {self.tick}, in {self.call}: {self.where}"
         more = f", and {len(self.differences) - 1} more words" if len(self.differences) > 1 else ""
-        return f"tick {self.tick}, after {self.call}: {self.struct}.{self.differences[0]}{more}"
+        return f"tick {self.tick}, after {self.call}: {self.where}.{self.differences[0]}{more}"
 
 
 class Target:
@@ -80,9 +83,13 @@ class SideBySide:
         result = _answer(self._reference, name)
         memories = [block.bytes() for block in self._blocks]
         for target in running:
-            answer = _answer(target.blocks.run, name)
             target.calls += 1
-            target.divergence = self._compare(name, memories, result, target.blocks, answer)
+            try:
+                answer = _answer(target.blocks.run, name)
+            except ExportError as error:
+                target.divergence = Divergence(self._tick, name, str(error), ())
+            else:
+                target.divergence = self._compare(name, memories, result, target.blocks, answer)
         return result
 
     def _compare(
@@ -90,7 +97,7 @@ class SideBySide:
     ) -> Divergence | None:
         if answer != result:
             patterns = (result & 0xFFFFFFFF, answer & 0xFFFFFFFF)
-            return Divergence(self._tick, call, "return value", (Difference("", (result, answer), patterns),))
+            return Divergence(self._tick, call, "answer", (Difference("value", (result, answer), patterns),))
         for kind, memory, block in zip(STRUCTS, memories, blocks_of(blocks), strict=True):
             if found := differing_bits(memory, block.bytes(), kind.dtype):
                 return Divergence(self._tick, call, kind.__name__, found)
