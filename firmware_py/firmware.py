@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
-from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory, costs_of
+from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory, costs_of
 from firmware_py.drivers.imu import GyroZero
 from firmware_py.links.console import Console
 from firmware_py.links.crtp_stack import CrtpStack
@@ -165,6 +165,11 @@ class Firmware:
         MavlinkParameters(stack, self.parameters)
         CommandService(stack, supervisor, streams, self.parameters, storage, config.home)
         self._console.listeners.append(stack.say)
+
+    @property
+    def runner(self) -> CoreRunner:
+        """What executes the flight core."""
+        return self._core.run
 
     @property
     def next_wake_us(self) -> int | None:

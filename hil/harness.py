@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from firmware_py.core_runner import PythonRunner, RunnerFactory
 from firmware_py.firmware import Firmware, Thief
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
@@ -77,7 +78,7 @@ class Streams:
 class Flight:
     """A board in its virtual tunnel with its ground station, ready to be released.
 
-    `faults` come on top of the experiment's own.
+    `faults` come on top of the experiment's own; `runner` executes the flight core.
     """
 
     plant: Plant
@@ -99,6 +100,7 @@ class Flight:
         trace_all: bool = False,
         link: str = RADIO,
         faults: Sequence[Fault] = (),
+        runner: RunnerFactory = PythonRunner,
     ) -> None:
         streams = Streams.of_seed(seed)
         home, offset = config.flight.home, config.flight.start_offset
@@ -133,7 +135,7 @@ class Flight:
         uart = self.serial.uart if self.serial else None
         self.board = VirtualBoard(self.plant.set_counts, self.radio.downlink, self._console, uart)
         self.board.battery_mv = self.battery.millivolts
-        self.firmware = Firmware(config, self.board, mavlink=link == MAVLINK)
+        self.firmware = Firmware(config, self.board, mavlink=link == MAVLINK, runner=runner)
         self.board.run_on(self.firmware.kernel, self.events)
         self.radio.connect(self._radio_to_board, self.station.on_packet)
         if self.serial:

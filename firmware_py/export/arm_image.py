@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from firmware_py.export.errors import ExportError
 
@@ -40,7 +41,7 @@ class Image:
 
 
 def build_image(source: str, header: str, folder: Path, optimisation: str = "-Os") -> Image:
-    """Compile and link floaty_core.c; `folder` keeps what is built. Raises `ExportError`."""
+    """Compile and link the core, as small as the Crazyflie's firmware is; `folder` keeps it. Raises `ExportError`."""
     texts = {"floaty_core.c": source, "floaty_core.h": header}
     texts.update({name: (SOURCES / name).read_text(encoding="utf-8") for name in ("rt.c", "flash.ld")})
     flags = (*TARGET_FLAGS, optimisation, "-fno-builtin", "-T", "flash.ld")
@@ -58,9 +59,9 @@ def read_image(path: Path) -> Image:
     try:
         from elftools.elf.elffile import ELFFile
     except ImportError:
-        raise ExportError(f"board cortex-m4: pyelftools is missing: {NEEDS_EXTRA}") from None
+        raise ExportError(f"pyelftools is missing: {NEEDS_EXTRA}") from None
     with path.open("rb") as stream:
-        elf = ELFFile(stream)
+        elf: Any = ELFFile(stream)
         code = bytearray()
         for section in elf.iter_sections():
             if not section["sh_flags"] & 2 or not section["sh_size"]:  # SHF_ALLOC
@@ -69,7 +70,9 @@ def read_image(path: Path) -> Image:
                 raise ExportError(f"{path}: section {section.name} is variable memory outside the structs")
             end = section["sh_addr"] - FLASH + section["sh_size"]
             if not 0 < end <= FLASH_SIZE - 16:
-                raise ExportError(f"{path}: section {section.name} does not lie in the {FLASH_SIZE} bytes of flash")
+                raise ExportError(
+                    f"{path}: section {section.name} does not lie in the {FLASH_SIZE} bytes of flash"
+                )
             code.extend(bytes(max(0, end - len(code))))
             code[end - section["sh_size"] : end] = section.data()
         symbols = [
@@ -100,7 +103,7 @@ def _compile(
     try:
         compiler = version("ziglang")
     except PackageNotFoundError:
-        raise ExportError(f"board cortex-m4: the compiler ziglang is missing: {NEEDS_EXTRA}") from None
+        raise ExportError(f"the compiler ziglang is missing: {NEEDS_EXTRA}") from None
     folder = folder.absolute()
     digest = hashlib.sha256(repr((compiler, sys.platform, sorted(texts.items()), inputs, flags)).encode())
     place = folder / digest.hexdigest()[:16]
