@@ -135,7 +135,12 @@ class CpuConfig(Section):
     stabilizer_us: Cost = Field(description="STABILIZER, per tick without the controller [us]")
     controller_us: Cost = Field(description="STABILIZER, controller and servo mapping, per 100 Hz step [us]")
     kalman_us: Cost = Field(description="KALMAN, per tick without a step [us]")
-    estimator_us: Cost = Field(description="KALMAN, per 100 Hz step [us]")
+    estimator_us: Cost = Field(
+        description="KALMAN, per 100 Hz step, with the poses filed since the last [us]"
+    )
+    measured: bool = Field(
+        description="a board that counts cycles (cortex-m4) takes them instead of controller_us and estimator_us"
+    )
     syslink_us: Cost = Field(description="SYSLINK, per packet [us]")
     crtp_us: Cost = Field(description="CRTP-RX and CRTP-TX, per packet [us]")
     log_us: Cost = Field(description="LOG and STREAM, per packet [us]")

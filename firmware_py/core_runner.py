@@ -5,8 +5,9 @@ under `firmware_py.export` the same core as C on this machine and as machine cod
 """
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+from firmware_py.config import CpuConfig
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input
 from firmware_py.core.subset import Block
@@ -26,6 +27,17 @@ class CoreRunner(Protocol):
 
     def control(self) -> None:
         """Run one tick of the controller, down to the timer counts."""
+
+
+@runtime_checkable
+class CoreCosts(Protocol):
+    """Tells how long the core's next call takes on the board's processor, on the memory as it is now."""
+
+    def estimate_us(self) -> int:
+        """Return the processor time of the estimator's tick."""
+
+    def control_us(self) -> int:
+        """Return the processor time of the controller's tick."""
 
 
 RunnerFactory = Callable[["CoreBlocks"], CoreRunner]
@@ -69,3 +81,25 @@ class PythonRunner:
     def control(self) -> None:
         """Run one tick of the controller."""
         entry.control(self._parameters, self._data, self._estimator, self._control)
+
+
+class ConfiguredCosts:
+    """What the profile states."""
+
+    __slots__ = ("_cpu",)
+
+    def __init__(self, cpu: CpuConfig) -> None:
+        self._cpu = cpu
+
+    def estimate_us(self) -> int:
+        """Return the estimator's figure."""
+        return self._cpu.estimator_us
+
+    def control_us(self) -> int:
+        """Return the controller's figure."""
+        return self._cpu.controller_us
+
+
+def costs_of(runner: CoreRunner, cpu: CpuConfig) -> CoreCosts:
+    """Return what tells the costs: the runner itself where it can and may."""
+    return runner if cpu.measured and isinstance(runner, CoreCosts) else ConfiguredCosts(cpu)

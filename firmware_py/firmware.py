@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
-from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory, costs_of
 from firmware_py.drivers.imu import GyroZero
 from firmware_py.links.console import Console
 from firmware_py.links.crtp_stack import CrtpStack
@@ -88,18 +88,18 @@ class Firmware:
         data_ready = self.kernel.create_binary_semaphore("dataReady")
         estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
         self.measurements: Queue[Measurement] = self.kernel.create_queue(MEASUREMENT_QUEUE, "measurements")
-        kernel, cost = self.kernel, config.cpu
+        kernel, cost, costs = self.kernel, config.cpu, costs_of(core.run, config.cpu)
         kernel.create_task(
             "SENSORS", 4, sensors_task,
             kernel, cost, board, self._imu_ready, self.measurements, data_ready, self._zero, self._zero_found,
         )  # fmt: skip
         kernel.create_task(
             "STABILIZER", 5, stabilizer_task,
-            kernel, cost, board, data_ready, estimator_run, self._supervisor, core,
+            kernel, cost, board, data_ready, estimator_run, self._supervisor, core, costs,
         )  # fmt: skip
         kernel.create_task(
             "KALMAN", 2, estimator_task,
-            kernel, cost, estimator_run, self.measurements, self._supervisor, core,
+            kernel, cost, estimator_run, self.measurements, self._supervisor, core, costs,
         )  # fmt: skip
         kernel.create_task("PWRMGNT", 0, power_task, kernel, board, self._supervisor)
         self.mavlink = self._mavlink_stack(config) if mavlink else None
@@ -165,6 +165,11 @@ class Firmware:
         MavlinkParameters(stack, self.parameters)
         CommandService(stack, supervisor, streams, self.parameters, storage, config.home)
         self._console.listeners.append(stack.say)
+
+    @property
+    def runner(self) -> CoreRunner:
+        """What executes the flight core."""
+        return self._core.run
 
     @property
     def next_wake_us(self) -> int | None:

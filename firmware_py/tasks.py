@@ -11,7 +11,7 @@ from typing import Any
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig
 from firmware_py.core.structs import POSE_ON_TIME
-from firmware_py.core_runner import CoreBlocks
+from firmware_py.core_runner import CoreBlocks, CoreCosts
 from firmware_py.drivers.imu import GyroZero
 from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement
 from firmware_py.rtos import TICK_US, Kernel, Queue, Semaphore
@@ -57,6 +57,7 @@ def stabilizer_task(
     estimator_run: Semaphore,
     supervisor: Supervisor,
     core: CoreBlocks,
+    costs: CoreCosts,
 ) -> Task:
     """Run at 1 kHz on the tick edge after each IMU sample; control at 100 Hz."""
     control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
@@ -68,7 +69,7 @@ def stabilizer_task(
         yield from estimator_run.give()
         if kernel.tick_count >= control_tick:
             control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
-            yield from kernel.work(cost.controller_us)
+            yield from kernel.work(costs.control_us())
             core.data.fields.mode = supervisor.mode(kernel.now_us)
             core.run.control()
             board.write_compare(core.control.fields.count.tolist())
@@ -81,6 +82,7 @@ def estimator_task(
     measurements: Queue[Measurement],
     supervisor: Supervisor,
     core: CoreBlocks,
+    costs: CoreCosts,
 ) -> Task:
     """Take in measurements at 1 kHz, estimate at 100 Hz."""
     data = core.data.fields
@@ -100,10 +102,10 @@ def estimator_task(
                 file_pose(kernel, value, supervisor, core)
         if kernel.tick_count >= step_tick:
             step_tick = next_step(kernel.tick_count, ESTIMATOR_PHASE)
-            yield from kernel.work(cost.estimator_us)
             data.gyro_sum[:] = x, y, z
             data.gyro_samples = samples
             samples = x = y = z = 0
+            yield from kernel.work(costs.estimate_us())
             core.run.estimate()
 
 

@@ -77,6 +77,10 @@ run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path
     "cflib or a serial port, in real time, the ground station in a process of its own.",
 )  # fmt: skip
 @click.option(
+    "--board", metavar="BOARD", default="python", show_default=True,
+    help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated).",
+)  # fmt: skip
+@click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
 )
 def fly(
@@ -91,6 +95,7 @@ def fly(
     watch: bool,
     perfetto: bool,
     link: str,
+    board: str,
     out: Path | None,
 ) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
@@ -112,7 +117,8 @@ def fly(
 
     faults = [parse(text) for text in fault_texts]
     requests = [
-        Request.of(chosen, profile, overrides, seed + index, flown_s, link, faults) for index in range(seeds)
+        Request.of(chosen, profile, overrides, seed + index, flown_s, link, faults, board)
+        for index in range(seeds)
     ]
     announce_compilation()
     if (seeds > 1 or perfetto) and not requests[0].in_lockstep:
@@ -380,6 +386,9 @@ def _print_result(result: "Result") -> None:
     console.print(
         f"{result.outcome}{cause}; {result.real_time_factor:.0f} times real time; hash {result.hash[:16]}"
     )
+    if result.usage is not None:
+        for name, load in result.usage.entries.items():
+            console.print(f"  {request.board} {name:9} {load}", soft_wrap=True)
     for name in ("report.html", "flight.rrd", "flight.perfetto-trace", "log.parquet"):
         if (result.folder / name).is_file():
             hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""

@@ -16,11 +16,11 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.native import NativeRunner, build
 from firmware_py.export.plain import PlainRunner
 from hil.errors import LabError
+from hil.run import BUILD
 
 PLAIN, C_O0, C_O2, CORTEX_M4 = TARGETS = ("plain", "c-O0", "c-O2", "cortex-m4")
-OPTIMISATION = {C_O0: "-O0", C_O2: "-O2", CORTEX_M4: "-O2"}
+OPTIMISATION = {C_O0: "-O0", C_O2: "-O2"}
 TICK_HZ = 100
-BUILD_FOLDER = Path("runs/build")
 
 
 def target_names(text: str | None) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ class Metered(CortexM4Runner):
 
 @dataclass(slots=True)
 class MachineCode:
-    """What the machine code takes of the board, over all flights of a check."""
+    """What the machine code takes of the board, over all flights of a check: memory, and processor time per tick."""
 
     flash_bytes: int
     ticks: Load
@@ -83,12 +83,12 @@ class Toolbox:
             c = translate()
             c = c if source is None else replace(c, source=source)
             for name in names:
-                if name in (C_O0, C_O2):
-                    library = build(c, BUILD_FOLDER, OPTIMISATION[name])
+                if name in OPTIMISATION:
+                    library = build(c, BUILD, OPTIMISATION[name])
                     self._native[name] = partial(NativeRunner, library=library)
                 elif name == CORTEX_M4:
-                    self._image = build_image(c.source, c.header, BUILD_FOLDER, OPTIMISATION[name])
-                    self._meter = build_meter(BUILD_FOLDER)
+                    self._image = build_image(c.source, c.header, BUILD)
+                    self._meter = build_meter(BUILD)
                     self.machine_code = MachineCode(len(self._image.code), Load())
         except ExportError as error:
             raise LabError(str(error)) from None

@@ -20,6 +20,9 @@ from typing import Any
 
 import pyarrow as pa
 
+from firmware_py.export.boards import BOARDS, PYTHON, runner_of
+from firmware_py.export.cortex_m4 import CortexM4Runner, Usage
+from firmware_py.export.errors import ExportError
 from firmware_py.firmware import TaskReport, WatchdogError
 from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
@@ -32,6 +35,7 @@ from hil.metrics import METRICS, Verdict, free_flight, judge, measure
 from hil.recorder import Recorder, load_log
 
 RESULT = "result.json"
+BUILD = Path("runs/build")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +50,13 @@ class Request:
     duration_s: float
     link: str = "radio"  # radio and mavlink: in lockstep; a URI: a station in a process of its own, paced
     faults: tuple[Fault, ...] = ()  # on top of the experiment's own; `LabError` for those that cannot act
+    board: str = PYTHON  # what executes the flight core
 
     def __post_init__(self) -> None:
+        if self.board not in BOARDS:
+            raise LabError(f"--board {self.board}: expected {', '.join(BOARDS[:-1])} or {BOARDS[-1]}")
+        if self.board != PYTHON and not self.in_lockstep:
+            raise LabError(f"--board {self.board}: --link {self.link}: only python flies over a link")
         if self.faults and not self.in_lockstep:
             raise LabError(
                 f"fault {self.faults[0]}: --link {self.link}: faults act on flights in lockstep only"
@@ -64,12 +73,13 @@ class Request:
         duration_s: float | None = None,
         link: str = "radio",
         faults: Sequence[Fault] = (),
+        board: str = PYTHON,
     ) -> Request:
         """Return the request for an experiment: its settings on the profile, `overrides` on both. Raises `LabError`."""
         overrides = (*experiment.settings, *overrides)
         config = load_config(profile, overrides)
         duration_s = experiment.duration_s if duration_s is None else duration_s
-        return cls(experiment, config, profile, overrides, seed, duration_s, link, tuple(faults))
+        return cls(experiment, config, profile, overrides, seed, duration_s, link, tuple(faults), board)
 
     @property
     def in_lockstep(self) -> bool:
@@ -106,6 +116,7 @@ class Result:
     real_time_factor: float
     tasks: tuple[TaskReport, ...]
     queues: tuple[QueueReport, ...]
+    usage: Usage | None  # of the board, where it was measured
 
     @property
     def passed(self) -> bool:
@@ -159,16 +170,21 @@ def fly(
         for queue in firmware.kernel.queues
     )
     tasks = tuple(firmware.statistics.reports())
-    result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues)
+    usage = firmware.runner.usage if isinstance(firmware.runner, CortexM4Runner) else None
+    result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues, usage)
     write_result(result)
     return result
 
 
 def _flight(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight | LinkedFlight:
     if request.in_lockstep:
+        try:
+            runner = runner_of(request.board, BUILD)
+        except ExportError as error:
+            raise LabError(f"--board {request.board}: {error}") from None
         return Flight(
             request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all,
-            request.link, request.faults,
+            request.link, request.faults, runner,
         )  # fmt: skip
     profile = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
     return LinkedFlight(
@@ -202,6 +218,7 @@ def write_result(result: Result) -> None:
         "seed": request.seed,
         "duration_s": request.duration_s,
         "link": request.link,
+        "board": request.board,
         "faults": [str(fault) for fault in request.all_faults],
         "outcome": result.outcome,
         "cause": result.cause,
@@ -218,6 +235,7 @@ def write_result(result: Result) -> None:
         "passed": result.passed,
         "tasks": [asdict(task) for task in result.tasks],
         "queues": [asdict(queue) for queue in result.queues],
+        "usage": asdict(result.usage) if result.usage else None,
         "hash": result.hash,
         "versions": versions(),
         "commit": commit(),
@@ -242,6 +260,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         "seed": int(metadata.get("seed", 0)),
         "duration_s": float(metadata.get("duration_s", 0)),
         "link": metadata.get("link", "radio"),
+        "board": metadata.get("board", PYTHON),
         "faults": json.loads(metadata.get("faults", "[]")),
         "outcome": "error",
         "cause": "the process ended before the flight did",
@@ -249,6 +268,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         "verdicts": [],
         "tasks": [],
         "queues": [],
+        "usage": None,
         "passed": False,
         "hash": "",
         "versions": json.loads(metadata.get("versions", "{}")),
@@ -266,6 +286,7 @@ def metadata_of(request: Request) -> dict[str, str]:
         "seed": str(request.seed),
         "duration_s": str(request.duration_s),
         "link": request.link,
+        "board": request.board,
         "faults": json.dumps([str(fault) for fault in request.all_faults]),
         "config": request.config.model_dump_json(),
         "versions": json.dumps(versions()),

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from firmware_py.export.errors import ExportError
 
@@ -39,8 +40,8 @@ class Image:
     constants: frozenset[int]  # half words of `code` that are not instructions
 
 
-def build_image(source: str, header: str, folder: Path, optimisation: str = "-O2") -> Image:
-    """Compile and link floaty_core.c; `folder` keeps what is built. Raises `ExportError`."""
+def build_image(source: str, header: str, folder: Path, optimisation: str = "-Os") -> Image:
+    """Compile and link the core, as small as the Crazyflie's firmware is; `folder` keeps it. Raises `ExportError`."""
     texts = {"floaty_core.c": source, "floaty_core.h": header}
     texts.update({name: (SOURCES / name).read_text(encoding="utf-8") for name in ("rt.c", "flash.ld")})
     flags = (*TARGET_FLAGS, optimisation, "-fno-builtin", "-T", "flash.ld")
@@ -58,9 +59,9 @@ def read_image(path: Path) -> Image:
     try:
         from elftools.elf.elffile import ELFFile
     except ImportError:
-        raise ExportError(f"board cortex-m4: pyelftools is missing: {NEEDS_EXTRA}") from None
+        raise ExportError(f"pyelftools is missing: {NEEDS_EXTRA}") from None
     with path.open("rb") as stream:
-        elf = ELFFile(stream)
+        elf: Any = ELFFile(stream)
         code = bytearray()
         for section in elf.iter_sections():
             if not section["sh_flags"] & 2 or not section["sh_size"]:  # SHF_ALLOC
@@ -102,9 +103,10 @@ def _compile(
     try:
         compiler = version("ziglang")
     except PackageNotFoundError:
-        raise ExportError(f"board cortex-m4: the compiler ziglang is missing: {NEEDS_EXTRA}") from None
+        raise ExportError(f"the compiler ziglang is missing: {NEEDS_EXTRA}") from None
+    folder = folder.absolute()
     digest = hashlib.sha256(repr((compiler, sys.platform, sorted(texts.items()), inputs, flags)).encode())
-    place = folder.absolute() / digest.hexdigest()[:16]
+    place = folder / digest.hexdigest()[:16]
     result = place / output
     if result.is_file():
         return result
@@ -115,10 +117,11 @@ def _compile(
             (place / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise ExportError(f"{place}: cannot be written ({error.strerror or error})") from None
+    cache = str(folder / "zig")
     done = subprocess.run(
         [sys.executable, "-m", "ziglang", "cc", *flags, "-o", partial, *inputs],
         cwd=place, capture_output=True, text=True, check=False,
-        env={**os.environ, "ZIG_LOCAL_CACHE_DIR": str(folder / "zig"), "ZIG_GLOBAL_CACHE_DIR": str(folder / "zig")},
+        env={**os.environ, "ZIG_LOCAL_CACHE_DIR": cache, "ZIG_GLOBAL_CACHE_DIR": cache},
     )  # fmt: skip
     if done.returncode:
         raise ExportError(f"{place}: {' '.join(done.stderr.split()[:60])}")

@@ -46,6 +46,13 @@ class Load:
         self.worst_instructions = max(self.worst_instructions, instructions)
         self.worst_cycles = max(self.worst_cycles, cycles)
 
+    def __str__(self) -> str:
+        mean = self.instructions / max(self.calls, 1)
+        return (
+            f"{self.calls:6} calls, {mean:8.0f} instructions ({self.worst_instructions} at most), "
+            f"{self.mean_us:6.1f} us ({self.worst_us:.1f})"
+        )
+
     @property
     def mean_us(self) -> float:
         """Processor time of a mean call."""
@@ -57,6 +64,16 @@ class Load:
         return self.worst_cycles / CLOCK_MHZ
 
 
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What the core takes of the board: memory, and by entry point processor time."""
+
+    flash_bytes: int
+    ram_bytes: int  # the four structs
+    stack_bytes: int  # the deepest that it has been
+    entries: dict[str, Load]
+
+
 class CortexM4Runner:
     """A `CoreRunner` and a `CoreCosts`; `load` counts by entry point, `instructions` is that of the last call.
 
@@ -66,22 +83,25 @@ class CortexM4Runner:
 
     def __init__(self, blocks: CoreBlocks, image: Image, meter: Path) -> None:
         try:
-            import unicorn
-            from unicorn import arm_const
+            from unicorn import arm_const, unicorn_const
+            from unicorn.unicorn_py3 import unicorn
         except ImportError:
-            raise ExportError(f"board cortex-m4: unicorn is missing: {NEEDS_EXTRA}") from None
+            raise ExportError(f"unicorn is missing: {NEEDS_EXTRA}") from None
         self.image = image
         self.load = {name: Load() for name in image.entries}
         self._fault = unicorn.UcError
         self._result, self._pc = arm_const.UC_ARM_REG_R0, arm_const.UC_ARM_REG_PC
-        self._cpu = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
+        emulator: Any = unicorn.Uc  # has no types
+        self._cpu = emulator(
+            unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB | unicorn_const.UC_MODE_MCLASS
+        )
         self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
-        self._cpu.mem_map(FLASH, FLASH_SIZE, unicorn.UC_PROT_READ | unicorn.UC_PROT_EXEC)
+        self._cpu.mem_map(FLASH, FLASH_SIZE, unicorn_const.UC_PROT_READ | unicorn_const.UC_PROT_EXEC)
         self._cpu.mem_write(FLASH, image.code)
         self._ram = np.frombuffer(mmap.mmap(-1, RAM_SIZE), np.uint8)
         self._ram[:] = STACK_PATTERN
         ram = self._ram.ctypes.data
-        self._cpu.mem_map_ptr(RAM, RAM_SIZE, unicorn.UC_PROT_READ | unicorn.UC_PROT_WRITE, ram)
+        self._cpu.mem_map_ptr(RAM, RAM_SIZE, unicorn_const.UC_PROT_READ | unicorn_const.UC_PROT_WRITE, ram)
         shared = (blocks.parameters, blocks.data, blocks.estimator, blocks.control)
         self._here = tuple(block.memory.view(np.uint8) for block in shared)
         sizes = [-(-memory.size // ALIGNMENT) * ALIGNMENT for memory in self._here]
@@ -149,6 +169,11 @@ class CortexM4Runner:
     def ram_bytes(self) -> int:
         """The memory of the four structs."""
         return sum(memory.size for memory in self._here)
+
+    @property
+    def usage(self) -> Usage:
+        """What the core has taken so far."""
+        return Usage(len(self.image.code), self.ram_bytes, self.stack_bytes, self.load)
 
     def _call(self, name: str) -> int:
         """Run an entry point and let its results out; what was computed ahead from the same inputs is taken."""
@@ -223,7 +248,7 @@ class Meter:
         block = ctypes.cast(self._library.meter_block, ctypes.c_void_p)
         everywhere = ctypes.c_uint64(1), ctypes.c_uint64(0)
         if uclib.uc_hook_add(cpu._uch, ctypes.byref(hook), UC_HOOK_BLOCK, block, self._address, *everywhere):
-            raise ExportError("board cortex-m4: unicorn refuses to count")
+            raise ExportError("unicorn refuses to count")
 
 
 def _microseconds(cycles: int) -> int:

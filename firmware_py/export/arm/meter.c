@@ -3,10 +3,16 @@
 Instructions and cycles of a block come from prefix sums over the image, one entry per half word. A block that does not
 follow the last one was jumped to: the pipeline is refilled. Flash is read in lines of 16 bytes through a cache of 64
 lines, least recently used first out (STM32F405, RM0090 chapter 3); every miss waits, as if nothing were prefetched. */
+#include <stddef.h>
 #include <stdint.h>
 #include <string.h>
 
-enum { CACHE_LINES = 64, FLASH_LINES = 4096, REFILL = 3, WAIT_STATES = 5 };
+enum { CACHE_LINES = 64, FLASH_LINES = 4096, END = FLASH_LINES, REFILL = 3, WAIT_STATES = 5 };
+
+struct line {
+    uint16_t newer, older; /* neighbours in the order of their last use; END on both sides of all lines */
+    uint32_t cached;
+};
 
 struct meter {
     const uint32_t *instructions_before; /* of every half word of the image */
@@ -15,10 +21,8 @@ struct meter {
     uint64_t next;  /* where the last block ended */
     uint64_t instructions;
     uint64_t cycles;
-    uint32_t time;
-    uint32_t used[FLASH_LINES]; /* time of the last access to a line in the cache, 0: not in the cache */
-    int32_t cached[CACHE_LINES];
-    int32_t filled;
+    uint64_t filled;
+    struct line lines[FLASH_LINES + 1];
 };
 
 uint64_t meter_size(void)
@@ -28,26 +32,34 @@ uint64_t meter_size(void)
 
 void meter_start(struct meter *meter)
 {
-    memset(&meter->next, 0, sizeof *meter - ((char *)&meter->next - (char *)meter));
+    memset(&meter->next, 0, sizeof *meter - offsetof(struct meter, next));
+    meter->lines[END].newer = meter->lines[END].older = END;
 }
 
-static void read_line(struct meter *meter, int32_t line)
+static void read_line(struct meter *meter, uint16_t number)
 {
-    meter->time++;
-    if (meter->used[line] == 0) {
-        int32_t place = 0;
+    struct line *lines = meter->lines, *line = &lines[number], *end = &lines[END];
+    if (end->older == number) /* the line that was used last */
+        return;
+    if (!line->cached) {
         meter->cycles += WAIT_STATES;
         if (meter->filled < CACHE_LINES) {
-            place = meter->filled++;
+            meter->filled++;
         } else {
-            for (int32_t i = 1; i < CACHE_LINES; i++)
-                if (meter->used[meter->cached[i]] < meter->used[meter->cached[place]])
-                    place = i;
-            meter->used[meter->cached[place]] = 0;
+            struct line *oldest = &lines[end->newer];
+            oldest->cached = 0;
+            lines[oldest->newer].older = END;
+            end->newer = oldest->newer;
         }
-        meter->cached[place] = line;
+        line->cached = 1;
+    } else {
+        lines[line->newer].older = line->older;
+        lines[line->older].newer = line->newer;
     }
-    meter->used[line] = meter->time;
+    line->newer = END;
+    line->older = end->older;
+    lines[end->older].newer = number;
+    end->older = number;
 }
 
 void meter_block(void *engine, uint64_t address, uint32_t size, void *user)
@@ -61,5 +73,5 @@ void meter_block(void *engine, uint64_t address, uint32_t size, void *user)
         meter->cycles += REFILL;
     meter->next = address + size;
     for (uint64_t line = begin / 16; line * 16 < end; line++)
-        read_line(meter, (int32_t)line);
+        read_line(meter, (uint16_t)line);
 }
