@@ -24,6 +24,7 @@ from hil.faults import parse
 from hil.harness import Flight
 
 CONFIG = load_config()
+BUILD = Path(__file__).parent.parent / "runs" / "build" / "core"
 ONE_NAN = 0x7FC00000
 SPECIAL_FLOATS = np.array(
     [0.0, -0.0, 1.0, -1.0, 1e-45, -1e-42, 1.1754942e-38, 3.4028235e38, -3.4028235e38, 1e30, -1e20, 16777216.0,
@@ -148,7 +149,9 @@ def wild_words(rng: np.random.Generator, block: Block) -> bytes:
         rng.choice(SPECIAL_FLOATS.view(np.uint32), words.size),
         rng.choice(SPECIAL_INTEGERS.view(np.uint32), words.size),
     )
-    words = np.where(fate == 0, words, np.where(fate == 1, special, rng.integers(0, 2**32, words.size, np.uint32)))
+    words = np.where(
+        fate == 0, words, np.where(fate == 1, special, rng.integers(0, 2**32, words.size, np.uint32))
+    )
     return words.astype(np.uint32).tobytes()
 
 
@@ -167,6 +170,47 @@ def record_wild(seed: int, count: int) -> Recording:
         second = wild_words(rng, data) if rng.random() < 0.7 else sane[1]
         floats = wild_words(rng, estimator) if rng.random() < 0.15 else b""
         recording.steps.append(Step(str(call), first, second, floats))
+    recording.after = list(replay(recording, None))
+    return recording
+
+
+def record_plausible(seed: int, ticks: int) -> Recording:
+    """Return ticks with poses, outliers, ages and rates of a flight, under profiles that are varied now and then."""
+    rng = np.random.default_rng(seed)
+    parameters, data = parameters_of(CONFIG), Input.allocate()
+    sane = parameters.memory.view(np.uint32).copy()
+    floats = FLOATS[Parameters.dtype]
+    recording = Recording(
+        [block.bytes() for block in (parameters, data, Estimator.allocate(), Control.allocate())]
+    )
+    recording.steps.append(Step("reset", parameters.bytes(), data.bytes()))
+    fields = data.fields
+    for tick in range(ticks):
+        if tick % 125 == 0:
+            ages = [5_000] if tick % 2 else [-1, 5_000, 37_777, 41_234, 83_000, 140_000]
+            words = np.where(floats, sane.view(np.float32) * rng.lognormal(0, 0.4, sane.size), 0).astype(
+                np.float32
+            )
+            parameters.memory.view(np.uint32)[floats] = words.view(np.uint32)[floats]
+            parameters.fields.target[:] = rng.normal(0, 0.3, 4)
+            parameters.fields.predict, parameters.fields.age_measured = rng.random(2) < 0.8
+            parameters.fields.horizon, parameters.fields.default_age_us = (
+                rng.integers(1, 13),
+                rng.integers(120_000),
+            )
+        for _ in range(rng.choice(3, p=[0.4, 0.5, 0.1])):
+            spread = 1.0 if rng.random() < 0.2 else 0.1
+            turn = rng.normal(0, spread, 3)
+            fields.pose_position[:] = rng.normal(0, spread, 3)
+            fields.pose_quaternion[:] = np.array([1, *(turn / 2)]) / np.sqrt(1 + turn @ turn / 4)
+            fields.pose_age_us = rng.choice(ages)
+            recording.steps.append(Step("file_pose", parameters.bytes(), data.bytes()))
+        fields.gyro_sum[:] = rng.normal(0, 3000, 3)
+        fields.gyro_bias[:] = (1.5, -2.25, 0.3)
+        fields.gyro_samples = rng.choice([0, 9, 10])
+        fields.mode = rng.choice(3, p=[0.1, 0.8, 0.1])
+        fields.manual[:] = rng.normal(0, 1, 4)
+        recording.steps += [Step(call, parameters.bytes(), data.bytes()) for call in ("estimate", "control")]
     recording.after = list(replay(recording, None))
     return recording
 
