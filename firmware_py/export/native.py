@@ -104,6 +104,8 @@ class NativeRunner:
     def __init__(self, blocks: CoreBlocks, library: Path) -> None:
         self._blocks = blocks  # keeps the memory alive
         code = ctypes.CDLL(str(library.absolute()))
+        for function in (code.floaty_core_reset, code.floaty_core_estimate, code.floaty_core_control):
+            function.restype = None
         everything = (blocks.parameters, blocks.data, blocks.estimator, blocks.control)
         parameters, data, estimator, control = map(_address, everything)
         self.reset: Callable[[], None] = partial(code.floaty_core_reset, parameters, estimator)
