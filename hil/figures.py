@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hil import curves, scene
 from hil.curves import Curves
 from hil.faults import spans_of
-from hil.metrics import BOX, column, free_flight, position_error, thief_load
+from hil.metrics import BOX, column, free_flight
 from hil.picture import Picture
 from hil.schedule import runs
 
@@ -232,33 +232,6 @@ def estimate(rows: pa.Table) -> Figure:
     return figure
 
 
-def overload(rows: pa.Table) -> Figure:
-    """Draw what a thief of processor time does: late tasks and position error over its share."""
-    flight = free_flight(rows)
-    load = 5 * np.round(20 * thief_load(flight)).astype(int)  # the steps of the experiment
-    shares = np.unique(load)
-    figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
-    axes = figure.subplots(2, 1, sharex=True)
-    late = [name for name in flight.column_names if name.startswith("late.")]
-    for name in late:
-        misses = np.diff(column(flight, name), prepend=0.0)
-        per_second = [misses[load == share].mean() * SECOND for share in shares]
-        axes[0].plot(shares, per_second, "o-", label=name.removeprefix("late."))
-    axes[0].set_ylabel("missed deadlines [1/s]")
-    axes[0].set_yscale("symlog", linthresh=1.0)
-    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    error = 100 * np.abs(position_error(flight))
-    for axis, name, colour in zip(range(3), "xyz", curves.POSITION.colours, strict=True):
-        worst = [error[load == share, axis].max() for share in shares]
-        axes[1].plot(shares, worst, "o-", color=colour, label=name)
-    axes[1].axhline(BOX_CM, color="black", linestyle="--", linewidth=0.8)
-    axes[1].set_ylabel("largest error [cm]")
-    axes[1].set_yscale("log")
-    axes[1].set_xlabel("share of every tick that the thief takes [%]")
-    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
-
-
 def schedule(table: pa.Table) -> Figure:
     """Draw which task has the processor, over the first 20 ms of a schedule."""
     figure = Figure(figsize=(WIDTH, 2.4), layout="constrained")
@@ -324,13 +297,6 @@ PICTURES = (
         "Estimate",
         "What the estimator believed, less the truth, in the goal frame.",
         estimate,
-    ),
-    Picture(
-        "Overload",
-        "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
-        "Dashed: the 20 cm box. A task that starves completes nothing, late or not.",
-        overload,
-        needs="cpu.THIEF",
     ),
 )
 SCHEDULE = Picture("Scheduler", "Which task had the processor, for 20 ms.", schedule)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -165,33 +165,9 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
         busy = column(flight, "serial.up_busy", "serial.down_busy")
         values["line_up"], values["line_down"] = (busy[-1] - busy[0]) * 1e-6 / values["flown"]
         values["line_overrun"] = float(column(flight, "serial.overrun")[-1])
-    if "cpu.THIEF" in table.schema.names:
-        values.update(overload_limits(flight, error))
     refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
     values["poses_refused"] = float(refused[-1])
     return values
-
-
-def thief_load(flight: pa.Table) -> NDArray[np.float64]:
-    """Return the thief's share of the processor in every row, (N,), since the row before."""
-    taken_us, times_us = column(flight, "cpu.THIEF"), column(flight, "t")
-    share: NDArray[np.float64] = np.zeros(len(times_us))
-    share[1:] = np.diff(taken_us) / np.diff(times_us)
-    return share
-
-
-def overload_limits(flight: pa.Table, error: NDArray[np.float64]) -> dict[str, float]:
-    """Return the loads at which things begin to go wrong; 1 when they never do. `error` is (N, 3) [m], absolute."""
-    load = thief_load(flight)
-
-    def first(wrong: Any) -> float:
-        return float(np.round(load[np.argmax(wrong)], 2)) if wrong.any() else 1.0
-
-    return {
-        "estimator_late_from": first(np.diff(column(flight, "late.KALMAN"), prepend=0.0) > 0),
-        "controller_late_from": first(np.diff(column(flight, "late.STABILIZER"), prepend=0.0) > 0),
-        "held_up_to": first((error > BOX).any(axis=1)),
-    }
 
 
 def judge(values: Mapping[str, float], limits: Mapping[str, float]) -> list[Verdict]:

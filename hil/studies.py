@@ -188,10 +188,10 @@ _ALL = (
         remark="The author's limits are wider: they allow for the swinging of the hover in y.",
     ),
     Study(
-        "model-error", "How wrong may the model on board be?", "error of the constants", "%", (0, 10, 30, 50),
+        "model-error", "How wrong may the model on board be?", "error of the constants", "%", (0, 10, 30),
         (
-            *_models(DEFAULT_PROFILE, Expected(holds_to=30, flies_to=50)),
-            *_models(AS_FLOWN, Expected(holds_to=30, flies_to=50)),
+            *_models(DEFAULT_PROFILE, Expected(holds_to=30)),
+            *_models(AS_FLOWN, Expected(holds_to=30)),
         ),
         remark="The model is only in the estimator and its predictor; the gains stay. inputs: constants of u1..u4; "
         "couplings: the others.",

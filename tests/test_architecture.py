@@ -62,13 +62,13 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "perfetto": ("hil/perfetto.py",),
     "matplotlib": (
         "hil/figures.py", "hil/picture.py", "hil/drag_model_report.py", "hil/power_figures.py",
-        "hil/overlays.py", "hil/study_figures.py",
+        "hil/experiments/overload.py", "hil/overlays.py", "hil/study_figures.py",
         "hil/experiments/pictures.py", "hil/experiments/power.py", "hil/experiments/take_off.py",
     ),
     "pyarrow": (
         "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
         "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
-        "hil/compare.py", "hil/overlays.py",
+        "hil/compare.py", "hil/experiments/overload.py", "hil/overlays.py",
         "hil/picture.py", "hil/power_figures.py", "hil/experiments/experiment.py", "hil/experiments/measures.py",
         "hil/experiments/pictures.py", "hil/experiments/airspeed.py", "hil/experiments/power.py",
         "hil/experiments/take_off.py",

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,8 +17,9 @@ from scipy.signal import TransferFunction, lsim, step
 from hil.config import load_config, profile_names
 from hil.experiments import EXPERIMENTS
 from hil.experiments.airspeed import LIFT_PER_RAD, attainable, hover_angle
-from hil.experiments.measures import response, steps
+from hil.experiments.measures import recoveries, response, steps
 from hil.experiments.pushes import FAULTS, PUSHES
+from hil.faults import Fault
 from hil.metrics import METRICS
 from hil.picture import Picture
 from hil.plant.body import SIGNS
@@ -98,6 +100,23 @@ def test_less_than_a_period_has_no_gain() -> None:
     times = np.arange(0.0, 5.0, 0.01)
     assert all(map(math.isnan, response(times, np.sin(times), np.sin(times), 0.1)))
     assert all(map(math.isnan, response(times, times, np.zeros(len(times)), 0.1)))
+
+
+def test_a_robot_is_recovered_when_it_is_back_in_the_box_before_the_next_disturbance() -> None:
+    times = np.arange(0.0, 10.0, 0.01)
+    away = ((times >= 2.0) & (times < 3.7)) | ((times >= 6.0) & (times < 9.8))
+    zeros = np.zeros(len(times))
+    columns = {"t": 1e6 + 1e6 * times, "truth.x": zeros, "truth.y": -0.2 * away, "truth.z": zeros + 1.15}
+    goal = {"goal.x": zeros, "goal.y": zeros, "goal.z": zeros + 1.15, "goal.yaw": zeros + 0.3}
+    flight = pyarrow.table(columns | goal)
+    kicks = tuple(Fault("push.y", start_s, 0.1, 1.0) for start_s in (2.0, 6.0))
+    first, both = recoveries(kicks[:1], 6.0, flight.slice(0, 600)), recoveries(kicks, 10.0, flight)
+    assert first["recovered"] == 1.0
+    assert first["back_in_box"] == pytest.approx(1.7, abs=0.011)
+    assert first["excursion"] == pytest.approx(0.2 * math.cos(0.3))
+    assert both["recovered"] == 1.0
+    assert math.isnan(both["back_in_box"])
+    assert recoveries(kicks, 10.0, flight.slice(0, 800))["recovered"] == 1.0  # lost at 8 s
 
 
 # Airspeeds against the plant

@@ -8,17 +8,28 @@ the flight has to hold.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from hil import curves
 from hil.experiments.experiment import Experiment
+from hil.metrics import BOX, column, free_flight, position_error
+from hil.picture import Picture
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
     from firmware_py.firmware import Thief
     from hil.harness import Flight
 
 STEP_PERCENT = 5
 STEP_US = 1_500_000
+ROWS_PER_SECOND = 100  # of the log
 
 
 def steal_more_and_more(flight: Flight) -> None:
@@ -33,10 +44,68 @@ def _take(thief: Thief, flight: Flight, percent: int, now_us: int) -> None:
     flight.note("lab", f"the thief takes {percent} % of the processor")
 
 
+def thief_load(flight: pa.Table) -> NDArray[np.float64]:
+    """Return the thief's share of the processor in every row, (N,), since the row before."""
+    taken_us, times_us = column(flight, "cpu.THIEF"), column(flight, "t")
+    share: NDArray[np.float64] = np.zeros(len(times_us))
+    share[1:] = np.diff(taken_us) / np.diff(times_us)
+    return share
+
+
+def loads_that_hurt(flight: pa.Table) -> Mapping[str, float]:
+    """Return the loads at which things begin to go wrong; 1 when they never do."""
+    load, error = thief_load(flight), np.abs(position_error(flight))
+
+    def first(wrong: Any) -> float:
+        return float(np.round(load[np.argmax(wrong)], 2)) if wrong.any() else 1.0
+
+    return {
+        "estimator_late_from": first(np.diff(column(flight, "late.KALMAN"), prepend=0.0) > 0),
+        "controller_late_from": first(np.diff(column(flight, "late.STABILIZER"), prepend=0.0) > 0),
+        "held_up_to": first((error > BOX).any(axis=1)),
+    }
+
+
+def draw(rows: pa.Table, *trials: pa.Table) -> Figure:
+    """Draw late tasks and position error over the thief's share, of the first flight."""
+    from hil.figures import stack
+
+    flight = free_flight(rows)
+    load = 5 * np.round(20 * thief_load(flight)).astype(int)  # the steps of the experiment
+    shares = np.unique(load)
+    figure, axes = stack((2.1, 2.1))
+    late = [name for name in flight.column_names if name.startswith("late.")]
+    for name in late:
+        misses = np.diff(column(flight, name), prepend=0.0)
+        per_second = [misses[load == share].mean() * ROWS_PER_SECOND for share in shares]
+        axes[0].plot(shares, per_second, "o-", label=name.removeprefix("late."))
+    axes[0].set_ylabel("missed deadlines [1/s]")
+    axes[0].set_yscale("symlog", linthresh=1.0)
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    error = 100 * np.abs(position_error(flight))
+    for axis, name, colour in zip(range(3), "xyz", curves.POSITION.colours, strict=True):
+        worst = [error[load == share, axis].max() for share in shares]
+        axes[1].plot(shares, worst, "o-", color=colour, label=name)
+    axes[1].axhline(100 * BOX, color="black", linestyle="--", linewidth=0.8)
+    axes[1].set_ylabel("largest error [cm]")
+    axes[1].set_yscale("log")
+    axes[1].set_xlabel("share of every tick that the thief takes [%]")
+    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+PICTURE = Picture(
+    "Overload",
+    "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
+    "Dashed: the 20 cm box. A task that starves completes nothing, late or not.",
+    draw,
+)
 OVERLOAD = Experiment(
     name="overload",
     summary="hover while a task above all others takes 0 to 100 % of the processor",
     duration_s=21 * STEP_US * 1e-6,
     limits={"estimator_late_from": 0.10, "controller_late_from": 0.60, "held_up_to": 0.60},
     script=steal_more_and_more,
+    measure=loads_that_hurt,
+    pictures=(PICTURE,),
 )
