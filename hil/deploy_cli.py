@@ -59,6 +59,10 @@ def deploy() -> None:
     "--source", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help="Check this floaty_core.c, as exported before, instead of what would be exported now.",
 )  # fmt: skip
+@click.option(
+    "--elf", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Check the core inside this linked firmware, like the build/cf2.elf that is flashed, as cortex-m4.",
+)  # fmt: skip
 def check(
     experiment: str | None,
     every: bool,
@@ -69,6 +73,7 @@ def check(
     fault_texts: tuple[str, ...],
     target_text: str | None,
     source: Path | None,
+    elf: Path | None,
 ) -> int:
     """Fly with numba, plain Python, C and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
 
@@ -80,11 +85,13 @@ def check(
     from hil.deploy_targets import Toolbox, target_names
     from hil.faults import parse
 
+    if source and elf:
+        raise LabError("--source and --elf: one or the other")
     names = target_names(target_text)
     flights = plan(
         experiment, every, profile, overrides, seed, duration, [parse(text) for text in fault_texts]
     )
-    toolbox = Toolbox(names, _read(source) if source else None)
+    toolbox = Toolbox(names, _read(source) if source else None, elf)
     announce_compilation()
     checked: list[Checked] = []
     for request in flights:
@@ -138,8 +145,9 @@ def _print_machine_code(code: MachineCode) -> None:
     from firmware_py.export.cortex_m4 import CLOCK_MHZ
 
     ticks = code.ticks
+    flash = "" if code.flash_bytes is None else f"flash {code.flash_bytes} B, "
     console.print(
-        f"Cortex-M4 code: flash {code.flash_bytes} B, RAM {code.ram_bytes} B, stack {code.stack_bytes} B",
+        f"Cortex-M4 code: {flash}RAM {code.ram_bytes} B, stack {code.stack_bytes} B",
         soft_wrap=True,
     )
     mean, worst = code.loads

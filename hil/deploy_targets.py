@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
-from firmware_py.export.arm_image import Image, build_image, build_meter
+from firmware_py.export.arm_image import Image, build_image, build_meter, read_image
 from firmware_py.export.c99 import translate
 from firmware_py.export.cortex_m4 import CortexM4Runner, Load
 from firmware_py.export.errors import ExportError
@@ -58,7 +58,7 @@ class Metered(CortexM4Runner):
 class MachineCode:
     """What the machine code takes of the board, over all flights of a check: memory, and processor time per tick."""
 
-    flash_bytes: int
+    flash_bytes: int | None  # None: with a firmware around it
     ticks: Load
     ram_bytes: int = 0
     stack_bytes: int = 0
@@ -70,15 +70,20 @@ class MachineCode:
 
 
 class Toolbox:
-    """Builds what the targets need, once; `source` is the text of a floaty_core.c in place of the exported one.
+    """Builds what the targets need, once.
+
+    `source` is the text of a floaty_core.c in place of the exported one, `elf` a linked firmware whose core is the
+    machine code.
 
     Raises `LabError` for a compiler or package that is missing and for C that cannot be compiled.
     """
 
-    def __init__(self, names: Sequence[str], source: str | None = None) -> None:
+    def __init__(self, names: Sequence[str], source: str | None = None, elf: Path | None = None) -> None:
         self.machine_code: MachineCode | None = None
         self._native: dict[str, RunnerFactory] = {}
         self._names = names
+        if elf and CORTEX_M4 not in names:
+            raise LabError(f"--elf {elf}: nothing to check it with: --targets has no {CORTEX_M4}")
         try:
             c = translate()
             c = c if source is None else replace(c, source=source)
@@ -87,9 +92,10 @@ class Toolbox:
                     library = build(c, BUILD, OPTIMISATION[name])
                     self._native[name] = partial(NativeRunner, library=library)
                 elif name == CORTEX_M4:
-                    self._image = build_image(c.source, c.header, BUILD)
+                    self._image = read_image(elf, False) if elf else build_image(c.source, c.header, BUILD)
                     self._meter = build_meter(BUILD)
-                    self.machine_code = MachineCode(len(self._image.code), Load())
+                    flash = None if elf else len(self._image.code)
+                    self.machine_code = MachineCode(flash, Load())
         except ExportError as error:
             raise LabError(str(error)) from None
 

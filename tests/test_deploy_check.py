@@ -2,6 +2,8 @@
 
 import os
 import re
+import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -231,6 +233,71 @@ def test_a_plain_python_that_has_ended_is_a_difference() -> None:
     runners[0].close()
 
 
+FIRMWARE = """
+#include "floaty_core.h"
+int main(void);
+__attribute__((section(".vectors"), used)) const void *vectors[] = {(void *)0x20020000, (void *)main};
+static FloatyParameters parameters;
+static FloatyInput data;
+static FloatyEstimator estimator;
+static FloatyControl control;
+int calls = 7;
+int main(void) {
+    floaty_core_reset(&parameters, &estimator);
+    for (;;) {
+        calls += floaty_core_file_pose(&parameters, &data, &estimator);
+        floaty_core_estimate(&parameters, &data, &estimator, &control);
+        floaty_core_control(&parameters, &data, &estimator, &control);
+    }
+}
+"""
+MAP = """
+ENTRY(main)
+SECTIONS {
+    . = 0x08004000;
+    .text : { KEEP(*(.vectors)) *(.text*) *(.rodata*) }
+    . = 0x20000000;
+    .data : { *(.data*) *(.bss*) *(COMMON) }
+    /DISCARD/ : { *(.ARM.exidx*) *(.ARM.attributes) *(.comment) }
+}
+"""
+# Those of the Crazyflie's firmware; they would let gcc fuse multiplications with additions.
+CRAZYFLIE_FLAGS = (
+    "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-std=gnu11", "-Os", "-g", "-Wall", "-Werror",
+    "-Wdouble-promotion", "-fno-math-errno", "-fno-strict-aliasing", "-ffunction-sections", "-fdata-sections",
+)  # fmt: skip
+
+
+@pytest.mark.skipif(shutil.which("arm-none-eabi-gcc") is None, reason="needs Debian's gcc-arm-none-eabi")
+@pytest.mark.parametrize(
+    ("right", "wrong", "code"), [("", "", 0), ("word * COUNT_1MS", "word + COUNT_1MS", 1)]
+)
+def test_the_core_inside_a_linked_firmware_is_checked(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    built: Path,
+    right: str,
+    wrong: str,
+    code: int,
+) -> None:
+    monkeypatch.chdir(built)
+    core = translate()
+    assert right in core.source
+    texts = {"main.c": FIRMWARE, "map.ld": MAP, "floaty_core.h": core.header}
+    texts["floaty_core.c"] = core.source.replace(right, wrong) if right else core.source
+    for name, text in texts.items():
+        Path(name).write_text(text, encoding="utf-8")
+    link = ("-nostartfiles", "-Wl,--gc-sections", "-T", "map.ld", "-o", "cf2.elf", "main.c", "floaty_core.c")
+    subprocess.run(["arm-none-eabi-gcc", *CRAZYFLIE_FLAGS, *link], check=True, timeout=60)
+    options = ("--duration", "0.5", "--targets", "cortex-m4", "--elf", "cf2.elf")
+    assert floaty(monkeypatch, "deploy", "check", "yaw-step", *options) == code
+    shown = capsys.readouterr().out
+    if code:
+        assert "tick 0, after control: Control.count[0]" in shown
+    else:
+        assert "150 ticks, numba beside cortex-m4: no bit differs" in shown
+
+
 def test_c_that_does_not_compile_is_one_line_and_exit_code_two(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -251,6 +318,11 @@ def test_c_that_does_not_compile_is_one_line_and_exit_code_two(
         (["hover", "--duration", "0"], "--duration"),
         (["hover", "--profile", "flaoty"], "did you mean floaty?"),
         (["hover", "--source", "nowhere.c"], "nowhere.c"),
+        (["hover", "--elf", "nowhere.elf"], "nowhere.elf: No such file"),
+        (["hover", "--source", "a.c", "--elf", "a.elf"], "one or the other"),
+        (["hover", "--elf", __file__], "not an ELF file"),
+        (["hover", "--elf", os.path.realpath(sys.executable)], "flash"),
+        (["hover", "--targets", "plain", "--elf", "cf2.elf"], "--elf cf2.elf: nothing to check it with"),
     ],
 )
 def test_bad_input_of_check_is_one_line_and_exit_code_two(

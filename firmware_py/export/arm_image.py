@@ -17,7 +17,7 @@ from typing import Any
 from firmware_py.export.errors import ExportError
 
 FLASH = 0x0800_0000
-FLASH_SIZE = 0x1_0000
+FLASH_SIZE = 0x10_0000
 ENTRIES = ("reset", "file_pose", "estimate", "control")
 SOURCES = Path(__file__).parent / "arm"
 TARGET_FLAGS = (
@@ -54,19 +54,32 @@ def build_meter(folder: Path) -> Path:
     return _compile({"meter.c": text}, ("meter.c",), HOST_FLAGS, "meter.so", folder)
 
 
-def read_image(path: Path) -> Image:
-    """Read a linked image. Raises `ExportError` for one that has variables of its own or lacks an entry point."""
+def read_image(path: Path, alone: bool = True) -> Image:
+    """Read a linked image, the core `alone` or in a firmware around it.
+
+    Raises `ExportError` when an entry point is missing, or when the core alone has variables.
+    """
     try:
+        from elftools.common.exceptions import ELFError
         from elftools.elf.elffile import ELFFile
     except ImportError:
         raise ExportError(f"pyelftools is missing: {NEEDS_EXTRA}") from None
-    with path.open("rb") as stream:
-        elf: Any = ELFFile(stream)
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise ExportError(f"{path}: {error.strerror or error}") from None
+    with stream:
+        try:
+            elf: Any = ELFFile(stream)
+        except ELFError as error:
+            raise ExportError(f"{path}: not an ELF file: {error}") from None
         code = bytearray()
         for section in elf.iter_sections():
             if not section["sh_flags"] & 2 or not section["sh_size"]:  # SHF_ALLOC
                 continue
             if section["sh_flags"] & 1:  # SHF_WRITE
+                if not alone:
+                    continue
                 raise ExportError(f"{path}: section {section.name} is variable memory outside the structs")
             end = section["sh_addr"] - FLASH + section["sh_size"]
             if not 0 < end <= FLASH_SIZE - 16:
@@ -75,9 +88,10 @@ def read_image(path: Path) -> Image:
                 )
             code.extend(bytes(max(0, end - len(code))))
             code[end - section["sh_size"] : end] = section.data()
-        symbols = [
-            (symbol["st_value"], symbol.name) for symbol in elf.get_section_by_name(".symtab").iter_symbols()
-        ]
+        table = elf.get_section_by_name(".symtab")
+        if table is None:
+            raise ExportError(f"{path}: it has no symbols")
+        symbols = [(symbol["st_value"], symbol.name) for symbol in table.iter_symbols()]
     addresses = {name: address for address, name in symbols}
     try:
         entries = {name: addresses[f"floaty_core_{name}"] | 1 for name in ENTRIES}
@@ -88,7 +102,11 @@ def read_image(path: Path) -> Image:
 
 def _constants(symbols: Sequence[tuple[int, str]], size: int) -> frozenset[int]:
     """Return the half words between the mapping symbols $d and $t."""
-    marks = sorted((address, name[:2]) for address, name in symbols if name[:2] in ("$d", "$t"))
+    marks = sorted(
+        (address, name[:2])
+        for address, name in symbols
+        if name[:2] in ("$d", "$t") and FLASH <= address < FLASH + size
+    )
     found: set[int] = set()
     for (begin, kind), (end, _) in zip(marks, [*marks[1:], (FLASH + size, "$t")], strict=True):
         if kind == "$d":

@@ -3,14 +3,12 @@
 Instructions and cycles of a block come from prefix sums over the image, one entry per half word. A block that does not
 follow the last one was jumped to: the pipeline is refilled. Flash is read in lines of 16 bytes through a cache of 64
 lines, least recently used first out (STM32F405, RM0090 chapter 3); every miss waits, as if nothing were prefetched. */
-#include <stddef.h>
 #include <stdint.h>
-#include <string.h>
 
-enum { CACHE_LINES = 64, FLASH_LINES = 4096, END = FLASH_LINES, REFILL = 3, WAIT_STATES = 5 };
+enum { CACHE_LINES = 64, FLASH_LINES = 65536, END = FLASH_LINES, REFILL = 3, WAIT_STATES = 5 };
 
 struct line {
-    uint16_t newer, older; /* neighbours in the order of their last use; END on both sides of all lines */
+    uint32_t newer, older; /* neighbours in the order of their last use; END on both sides of all lines */
     uint32_t cached;
 };
 
@@ -32,11 +30,13 @@ uint64_t meter_size(void)
 
 void meter_start(struct meter *meter)
 {
-    memset(&meter->next, 0, sizeof *meter - offsetof(struct meter, next));
+    for (uint32_t i = meter->lines[END].newer; meter->lines[i].cached; i = meter->lines[i].newer)
+        meter->lines[i].cached = 0;
+    meter->next = meter->instructions = meter->cycles = meter->filled = 0;
     meter->lines[END].newer = meter->lines[END].older = END;
 }
 
-static void read_line(struct meter *meter, uint16_t number)
+static void read_line(struct meter *meter, uint32_t number)
 {
     struct line *lines = meter->lines, *line = &lines[number], *end = &lines[END];
     if (end->older == number) /* the line that was used last */
@@ -73,5 +73,5 @@ void meter_block(void *engine, uint64_t address, uint32_t size, void *user)
         meter->cycles += REFILL;
     meter->next = address + size;
     for (uint64_t line = begin / 16; line * 16 < end; line++)
-        read_line(meter, (uint16_t)line);
+        read_line(meter, (uint32_t)line);
 }
