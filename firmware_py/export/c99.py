@@ -1,0 +1,154 @@
+"""The flight core as C99: one header and one source, written from the text of `firmware_py/core`.
+
+    header, source = translate().header, translate().source
+
+The C has the names, structs, docstrings and comments of the Python, static memory only, float32 only, and no library. It
+forbids the fusing of multiplications with additions, so that every compiler gives the bits that flew in the emulator.
+Kernels and constants that the entry points do not reach are left out.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from firmware_py import core
+from firmware_py.core import structs
+from firmware_py.export.errors import ExportError
+from firmware_py.export.functions import C_TYPES, FunctionPrinter, block_comment, constant_definition
+from firmware_py.export.locals import find_writes
+from firmware_py.export.reading import SHARED, Constant, Kernel, Module, StructType, read_modules
+
+__all__ = ["ExportError", "Translation", "core_texts", "translate"]
+
+GENERATED = "Written by `floaty deploy` from firmware_py/core; edit that, not this file."
+COMPILER = """\
+/* The bits of the emulator need IEEE single precision, each operation rounded by itself. */
+#if defined(__FAST_MATH__)
+#error "floaty_core.c must not be compiled with -ffast-math"
+#endif
+#if FLT_EVAL_METHOD != 0
+#error "floaty_core.c needs arithmetic in float"
+#endif
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+#pragma GCC optimize("fp-contract=off", "no-math-errno")
+#endif
+"""
+CHECK = "#define LAYOUT(name, holds) typedef char layout_##name[(holds) ? 1 : -1]\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Translation:
+    """The C of the core; `functions` are the C names of all functions in their order."""
+
+    header: str
+    source: str
+    functions: tuple[str, ...]
+
+
+def core_texts() -> dict[str, str]:
+    """Return the sources of the core by module name, without the subset's own module."""
+    folder = Path(core.__file__).parent
+    paths = sorted(folder.glob("*.py"))
+    return {path.stem: path.read_text("utf-8") for path in paths if path.stem not in ("__init__", "subset")}
+
+
+def translate(texts: Mapping[str, str] | None = None) -> Translation:
+    """Return the core as C; `texts` replaces its sources. Raises `ExportError` for anything outside the subset."""
+    texts = core_texts() if texts is None else texts
+    modules = read_modules(texts)
+    kernels = [thing for module in modules for thing in module.own if isinstance(thing, Kernel)]
+    _tell_constants_apart(modules)
+    for kernel in kernels:
+        find_writes(kernel)
+    public = [kernel for kernel in kernels if kernel.public]
+    reached = {kernel.c_name for kernel in public}.union(*(kernel.calls for kernel in public))
+    kernels = [kernel for kernel in kernels if kernel.c_name in reached]
+    printers, printed = {}, {}
+    for kernel in reversed(kernels):  # callers first: they show the shapes of array arguments
+        printers[kernel.c_name] = FunctionPrinter(kernel)
+        printed[kernel.c_name] = printers[kernel.c_name].text()
+    used = {id(constant) for printer in printers.values() for constant in printer.constants}
+    version = hashlib.sha256("\0".join(texts[module.name] for module in modules).encode()).hexdigest()[:12]
+    header = _header(modules, [printers[kernel.c_name] for kernel in public], version)
+    return Translation(header, _source(modules, printed, used), tuple(kernel.c_name for kernel in kernels))
+
+
+def _tell_constants_apart(modules: list[Module]) -> None:
+    """Put the module's name before the constants that several modules define."""
+    owned = [(module, thing) for module in modules for thing in module.own if isinstance(thing, Constant)]
+    counts = Counter(constant.c_name for _, constant in owned)
+    for module, constant in owned:
+        if counts[constant.c_name] > 1:
+            constant.c_name = f"{module.name.upper()}_{constant.c_name}"
+
+
+def _header(modules: list[Module], public: list[FunctionPrinter], version: str) -> str:
+    shared = next((module for module in modules if module.name == SHARED), None)
+    own = shared.own if shared else []
+    parts = [
+        block_comment(f"The flight core of Floaty.\n\n{shared.doc if shared else ''}\n\n{GENERATED}"),
+        "#ifndef FLOATY_CORE_H\n#define FLOATY_CORE_H\n\n#include <stdint.h>\n\n",
+        f'#define FLOATY_CORE_VERSION "{version}"  // hash of the Python sources\n\n',
+        "".join(constant_definition(thing) + "\n" for thing in own if isinstance(thing, Constant)),
+        *(f"\n{_struct(thing)}" for thing in own if isinstance(thing, StructType)),
+        "\n/* Writes a profile's parameters; in floaty_profile.c. */\n",
+        "void floaty_core_init(FloatyParameters *parameters);\n",
+    ]
+    for printer in public:
+        kernel = printer.kernel
+        parts.append(f"\n{block_comment(kernel.node.body[0].value.value)}{printer.signature()};\n")  # type: ignore[attr-defined]
+    parts.append("\n#endif\n")
+    return "".join(parts)
+
+
+def _struct(struct: StructType) -> str:
+    lines = []
+    for member in struct.fields.values():
+        if member.above:
+            lines.append(f"    // {member.above}")
+        sizes = "".join(f"[{size}]" for size in member.kind.shape)
+        comment = f"  // {member.comment}" if member.comment else ""
+        lines.append(f"    {C_TYPES[member.kind.base]} {member.name}{sizes};{comment}")
+    body = "\n".join(lines)
+    return f"{block_comment(struct.doc)}typedef struct {{\n{body}\n}} Floaty{struct.name};\n"
+
+
+def _source(modules: list[Module], printed: Mapping[str, str], used: set[int]) -> str:
+    parts = [
+        block_comment(f"The flight core of Floaty. {GENERATED}"),
+        '#include "floaty_core.h"\n\n#include <float.h>\n#include <stdbool.h>\n#include <stddef.h>\n\n',
+        f"{COMPILER}\n{_layout(modules)}",
+    ]
+    for module in modules:
+        own = [
+            thing
+            for thing in module.own
+            if isinstance(thing, Constant) and not thing.shared and id(thing) in used
+        ]
+        functions = [
+            printed[thing.c_name]
+            for thing in module.own
+            if isinstance(thing, Kernel) and thing.c_name in printed
+        ]
+        if own or functions:
+            parts.append("\n" + block_comment(f"{module.path}\n\n{module.doc}"))
+        if own:
+            parts.append("\n" + "".join(f"{constant_definition(thing)}\n" for thing in own))
+        parts += [f"\n{function}" for function in functions]
+    return "".join(parts)
+
+
+def _layout(modules: list[Module]) -> str:
+    """Return checks that the structs lie in memory as numpy lays them out."""
+    lines = [CHECK]
+    for struct in (thing for module in modules for thing in module.own if isinstance(thing, StructType)):
+        dtype = getattr(structs, struct.name).dtype
+        name = f"Floaty{struct.name}"
+        lines.append(f"LAYOUT({name}, sizeof({name}) == {dtype.itemsize});\n")
+        for column, (_, offset) in ((column, dtype.fields[column][:2]) for column in dtype.names):
+            lines.append(f"LAYOUT({name}_{column}, offsetof({name}, {column}) == {offset});\n")
+    return "".join(lines)

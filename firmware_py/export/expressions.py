@@ -1,0 +1,241 @@
+"""Types and prints the expressions of a kernel; whatever is not in the subset is refused.
+
+An expression keeps its order of evaluation: C's precedences of the operators used are Python's, and parentheses go where
+the tree needs them. A call that writes through an argument stands alone in its statement, because C leaves the order of
+calls inside an expression open.
+"""
+
+import ast
+from dataclasses import dataclass
+
+from firmware_py.export.errors import ExportError, refusal
+from firmware_py.export.reading import (
+    BOOL,
+    F32,
+    I32,
+    Constant,
+    Kernel,
+    Kind,
+    Module,
+    StructType,
+    constant_literal,
+)
+
+PRIMARY, UNARY, PRODUCT, SUM, COMPARISON, AND, OR = 9, 8, 7, 6, 5, 3, 2
+
+FLOAT_OPERATORS = {
+    ast.Add: ("+", SUM),
+    ast.Sub: ("-", SUM),
+    ast.Mult: ("*", PRODUCT),
+    ast.Div: ("/", PRODUCT),
+}
+INTEGER_OPERATORS = {
+    ast.Add: ("+", SUM),
+    ast.Sub: ("-", SUM),
+    ast.Mult: ("*", PRODUCT),
+    ast.FloorDiv: ("/", PRODUCT),  # the same for non-negative numbers
+    ast.Mod: ("%", PRODUCT),
+}
+COMPARISONS = {ast.Eq: "==", ast.NotEq: "!=", ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">="}
+CASTS = {"f32": F32, "i32": I32, "bool": BOOL}
+FLOAT_FUNCTIONS = {"abs": "__builtin_fabsf", "sqrt": "__builtin_sqrtf"}
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A printed expression with its type; `strength` says how tightly its outermost operator binds."""
+
+    text: str
+    kind: Kind
+    strength: int = PRIMARY
+
+    def within(self, strength: int) -> str:
+        """Return the text for a place that needs at least this strength."""
+        return self.text if self.strength >= strength else f"({self.text})"
+
+
+class Expressions:
+    """Prints the expressions of one kernel; `names` holds the types of what is in scope."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        self.kernel = kernel
+        self.module: Module = kernel.scope
+        self.names: dict[str, Kind] = dict(kernel.arguments)
+        self.constants: list[Constant] = []  # used
+        self.read: set[str] = set()
+
+    def refuse(self, node: ast.AST, reason: str) -> ExportError:
+        """Return the error for a construct of this kernel."""
+        return refusal(self.kernel.path, node, f"{reason} (in {self.kernel.node.name})")
+
+    def scalar(self, node: ast.expr, kind: Kind, what: str) -> Value:
+        """Return an expression that has to be of this type."""
+        value = self.value(node)
+        if value.kind != kind:
+            raise self.refuse(node, f"{what} is {describe(value.kind)}, not {describe(kind)}")
+        return value
+
+    def value(self, node: ast.expr, alone: bool = False) -> Value:
+        """Return a printed expression; `alone`: it is its whole statement, so that calls may write."""
+        match node:
+            case ast.Constant():
+                return self._literal(node)
+            case ast.Name():
+                return self._name(node)
+            case ast.Attribute():
+                return self._field(node)
+            case ast.Subscript():
+                return self._element(node)
+            case ast.BinOp():
+                return self._binary(node)
+            case ast.UnaryOp():
+                return self._unary(node)
+            case ast.Compare():
+                return self._comparison(node)
+            case ast.BoolOp():
+                return self._boolean(node)
+            case ast.Call():
+                return self._call(node, alone)
+        raise self.refuse(node, f"{type(node).__name__} expression")
+
+    def _literal(self, node: ast.Constant) -> Value:
+        if isinstance(node.value, bool):
+            return Value("true" if node.value else "false", BOOL)
+        if isinstance(node.value, float):
+            raise self.refuse(node, f"float literal {node.value} without f32(..): a double in numba")
+        literal = constant_literal(node)
+        if literal is None:
+            raise self.refuse(node, f"literal {node.value!r}")
+        return Value(literal[1], I32)
+
+    def _name(self, node: ast.Name) -> Value:
+        if node.id in self.names:
+            self.read.add(node.id)
+            return Value(node.id, self.names[node.id])
+        thing = self.module.names.get(node.id)
+        if not isinstance(thing, Constant):
+            raise self.refuse(node, f"{node.id} is no value here")
+        self.constants.append(thing)
+        return Value(thing.c_name, thing.kind)
+
+    def _field(self, node: ast.Attribute) -> Value:
+        if not isinstance(node.value, ast.Name) or node.value.id not in self.names:
+            raise self.refuse(node, f"{ast.unparse(node)} is no field of a struct")
+        struct = self.module.names.get(self.names[node.value.id].base)
+        if not isinstance(struct, StructType) or node.attr not in struct.fields:
+            raise self.refuse(node, f"{ast.unparse(node)} is no field of a struct")
+        self.read.add(node.value.id)
+        return Value(f"{node.value.id}->{node.attr}", struct.fields[node.attr].kind)
+
+    def _element(self, node: ast.Subscript) -> Value:
+        array = self.value(node.value)
+        indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        if array.kind.memory:
+            return Value(array.text, array.kind)
+        if any(isinstance(index, ast.Slice) for index in indices):
+            raise self.refuse(node, "slice")
+        rank = array.kind.rank
+        if rank == 0 or len(indices) != rank:
+            raise self.refuse(node, f"{ast.unparse(node)}: {len(indices)} indices on {describe(array.kind)}")
+        text = array.text
+        for axis, index in enumerate(indices):
+            text += f"[{self.scalar(index, I32, 'an index').text}]"
+            literal = constant_literal(index)
+            size = array.kind.shape[axis] if array.kind.shape else 2**31
+            if literal is not None and not 0 <= int(literal[1]) < size:
+                raise self.refuse(index, f"index {literal[1]} is negative or beyond {size - 1}")
+        return Value(text, Kind(array.kind.base))
+
+    def _binary(self, node: ast.BinOp) -> Value:
+        left, right = self.value(node.left), self.value(node.right)
+        name = type(node.op).__name__
+        if left.kind != right.kind or left.kind not in (F32, I32):
+            raise self.refuse(node, f"{name} of {describe(left.kind)} and {describe(right.kind)}")
+        operators = FLOAT_OPERATORS if left.kind == F32 else INTEGER_OPERATORS
+        if type(node.op) not in operators:
+            raise self.refuse(node, f"{name} of {describe(left.kind)}")
+        sign, strength = operators[type(node.op)]
+        return Value(f"{left.within(strength)} {sign} {right.within(strength + 1)}", left.kind, strength)
+
+    def _unary(self, node: ast.UnaryOp) -> Value:
+        operand = self.value(node.operand)
+        if isinstance(node.op, ast.Not) and operand.kind == BOOL:
+            return Value(f"!{operand.within(PRIMARY)}", BOOL, UNARY)
+        if isinstance(node.op, ast.USub) and operand.kind in (F32, I32):
+            return Value(f"-{operand.within(PRIMARY)}", operand.kind, UNARY)
+        raise self.refuse(node, f"{type(node.op).__name__} of {describe(operand.kind)}")
+
+    def _comparison(self, node: ast.Compare) -> Value:
+        if len(node.ops) != 1 or type(node.ops[0]) not in COMPARISONS:
+            raise self.refuse(node, f"comparison {ast.unparse(node)}")
+        left, right = self.value(node.left), self.value(node.comparators[0])
+        if left.kind != right.kind or left.kind not in (F32, I32):
+            raise self.refuse(node, f"comparison of {describe(left.kind)} and {describe(right.kind)}")
+        sign = COMPARISONS[type(node.ops[0])]
+        return Value(f"{left.within(COMPARISON + 1)} {sign} {right.within(COMPARISON + 1)}", BOOL, COMPARISON)
+
+    def _boolean(self, node: ast.BoolOp) -> Value:
+        strength, sign = (AND, " && ") if isinstance(node.op, ast.And) else (OR, " || ")
+        operands = [self.scalar(operand, BOOL, "an operand of and/or") for operand in node.values]
+        least = COMPARISON  # `and` inside `or` gets parentheses too: compilers ask for them
+        return Value(sign.join(operand.within(least) for operand in operands), BOOL, strength)
+
+    def _call(self, node: ast.Call, alone: bool) -> Value:
+        if not isinstance(node.func, ast.Name) or node.keywords:
+            raise self.refuse(node, f"call {ast.unparse(node.func)}(..) is no plain call of a kernel")
+        name = node.func.id
+        if name in CASTS and len(node.args) == 1 and (name == "bool" or name in self.module.builtins):
+            return self._cast(node, CASTS[name], alone)
+        if (
+            name in FLOAT_FUNCTIONS
+            and len(node.args) == 1
+            and (name == "abs" or name in self.module.builtins)
+        ):
+            return Value(f"{FLOAT_FUNCTIONS[name]}({self.scalar(node.args[0], F32, f'{name} of').text})", F32)
+        kernel = self.module.names.get(name)
+        if not isinstance(kernel, Kernel):
+            raise self.refuse(node, f"call of {name}, which is no kernel")
+        if kernel.writes and not alone:
+            raise self.refuse(
+                node, f"{name} writes through its arguments: its call stands alone in a statement"
+            )
+        if len(node.args) != len(kernel.arguments):
+            raise self.refuse(node, f"{name} takes {len(kernel.arguments)} arguments")
+        pairs = zip(node.args, kernel.arguments, strict=True)
+        texts = [self._argument(argument, kernel, wanted) for argument, wanted in pairs]
+        return Value(f"{kernel.c_name}({', '.join(texts)})", kernel.result)
+
+    def _cast(self, node: ast.Call, target: Kind, alone: bool) -> Value:
+        literal = constant_literal(node)
+        if literal is not None:
+            return Value(literal[1], literal[0], UNARY if literal[1].startswith("-") else PRIMARY)
+        if isinstance(node.args[0], ast.Constant | ast.UnaryOp) and constant_literal(node.args[0]) is None:
+            for constant in ast.walk(node.args[0]):
+                if isinstance(constant, ast.Constant):
+                    raise self.refuse(node, f"{ast.unparse(node)} is no finite 32-bit number")
+        value = self.value(node.args[0], alone)
+        if value.kind == target:
+            return value
+        if {value.kind, target} != {F32, I32}:
+            raise self.refuse(node, f"{ast.unparse(node.func)}(..) of {describe(value.kind)}")
+        c_type = "float" if target == F32 else "int32_t"
+        return Value(f"({c_type}){value.within(UNARY)}", target, UNARY)
+
+    def _argument(self, node: ast.expr, kernel: Kernel, wanted: str) -> str:
+        """Return an argument of a call; array arguments take their shape from here."""
+        value, kind = self.value(node), kernel.arguments[wanted]
+        if kind.rank and value.kind.rank and kind.base == value.kind.base:
+            if kind.shape[1:] != value.kind.shape[1:] and kind.shape:
+                raise self.refuse(node, f"{wanted} of {kernel.node.name} gets arrays of different shapes")
+            if not kind.shape:
+                kernel.arguments[wanted] = value.kind
+            elif value.kind.shape[:1] < kind.shape[:1]:
+                kernel.arguments[wanted] = value.kind  # the shortest array bounds the literal indices
+        elif kind.base != value.kind.base or kind.rank != value.kind.rank:
+            raise self.refuse(node, f"{wanted} of {kernel.node.name} gets {describe(value.kind)}")
+        return value.text
+
+
+def describe(kind: Kind) -> str:
+    """Return a type in words."""
+    return kind.base + ("", " array", " matrix")[kind.rank]

@@ -1,0 +1,128 @@
+"""Looks at a kernel's statements before they are printed: where each local lives, and through what it writes.
+
+A local of Python belongs to the function, one of C to a block. A local may be declared at its first assignment when that
+assignment stands in the innermost block that holds all uses; everything else is refused.
+"""
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from firmware_py.export.errors import refusal
+from firmware_py.export.reading import Kernel
+
+Block = tuple[int, ...]
+
+
+@dataclass(slots=True)
+class Local:
+    """A local of a kernel: where it is first assigned and how often; `home` is the block of all its uses."""
+
+    first: ast.AST
+    block: Block
+    home: Block
+    assignments: int
+
+
+def find_locals(kernel: Kernel) -> tuple[dict[str, Local], set[str]]:
+    """Return the locals by name, and the names of the loop variables."""
+    found: dict[str, Local] = {}
+    targets = [node.target for node in ast.walk(kernel.node) if isinstance(node, ast.For)]
+    loops = {target.id for target in targets if isinstance(target, ast.Name)}
+    own = set(kernel.arguments) | loops
+    stored = {node.id for node in _stores(kernel.node)}
+    for name, block, node in _uses(kernel.node.body, ()):
+        if name not in stored or name in own:
+            if name in own and isinstance(node.ctx, ast.Store):
+                raise refusal(kernel.path, node, f"{name} is an argument or a loop variable and is assigned")
+            continue
+        assigned = isinstance(node.ctx, ast.Store)
+        if name not in found:
+            if not assigned:
+                raise refusal(kernel.path, node, f"{name} is read before it has a value")
+            found[name] = Local(node, block, block, 0)
+        local = found[name]
+        local.assignments += assigned
+        local.home = _common(local.home, block)
+    for name, local in found.items():
+        if local.home != local.block:
+            raise refusal(
+                kernel.path, local.first, f"{name} gets its first value inside a block: give it one before"
+            )
+    return found, loops
+
+
+def find_writes(kernel: Kernel) -> None:
+    """Find the kernels that a kernel calls, and the names through which it writes; those called come first."""
+    aliases: dict[str, str] = {}
+    for node in ast.walk(kernel.node):
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Attribute) and _alias_of(node):
+            aliases[_alias_of(node)] = _root(node.value)
+    roots: set[str] = set()
+    for node in ast.walk(kernel.node):
+        if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store):
+            roots.add(_root(node))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            callee = kernel.scope.names.get(node.func.id)
+            if isinstance(callee, Kernel):
+                _check_above(kernel, callee, node)
+                kernel.calls |= {callee.c_name} | callee.calls
+                pairs = zip(node.args, callee.arguments, strict=False)
+                roots |= {_root(argument) for argument, name in pairs if name in callee.writes}
+    kernel.writes = roots | {aliases[root] for root in roots if root in aliases}
+
+
+def _check_above(kernel: Kernel, callee: Kernel, node: ast.Call) -> None:
+    if callee is kernel:
+        raise refusal(kernel.path, node, f"{kernel.node.name} calls itself: recursion")
+    if callee.path == kernel.path and callee.node.lineno > kernel.node.lineno:
+        raise refusal(kernel.path, node, f"{callee.node.name} is defined below its caller (no recursion)")
+
+
+def _alias_of(node: ast.Assign) -> str:
+    return node.targets[0].id if isinstance(node.targets[0], ast.Name) else ""
+
+
+def _root(node: ast.expr) -> str:
+    """Return the name at the bottom of a chain of fields and indices; empty for anything else."""
+    while isinstance(node, ast.Attribute | ast.Subscript):
+        node = node.value
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def _stores(function: ast.FunctionDef) -> Iterator[ast.Name]:
+    for node in ast.walk(function):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node
+
+
+def _common(one: Block, other: Block) -> Block:
+    length = 0
+    while length < min(len(one), len(other)) and one[length] == other[length]:
+        length += 1
+    return one[:length]
+
+
+def _uses(body: list[ast.stmt], block: Block) -> Iterator[tuple[str, Block, ast.Name]]:
+    """Yield name, block and node of every use of a name in the order of evaluation."""
+    for node in body:
+        match node:
+            case ast.If():
+                yield from _names(node.test, block)
+                yield from _uses(node.body, (*block, id(node), 0))
+                yield from _uses(node.orelse, (*block, id(node), 1))
+            case ast.For():
+                yield from _names(node.iter, block)
+                yield from _uses(node.body, (*block, id(node), 0))
+            case ast.Assign():
+                yield from _names(node.value, block)
+                for target in node.targets:
+                    yield from _names(target, block)
+            case _:
+                yield from _names(node, block)
+
+
+def _names(node: ast.AST, block: Block) -> Iterator[tuple[str, Block, ast.Name]]:
+    for name in ast.walk(node):
+        if isinstance(name, ast.Name):
+            yield name.id, block, name
