@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
-from firmware_py.core import entry
-from firmware_py.core.structs import Control, Estimator, Input
+from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
 from firmware_py.drivers.imu import GyroZero
 from firmware_py.links.console import Console
 from firmware_py.links.crtp_stack import CrtpStack
@@ -28,7 +27,6 @@ from firmware_py.rtos.statistics import LATENCY_BOUNDS_US, Statistics, TaskRepor
 from firmware_py.signals import Signals
 from firmware_py.supervisor import Supervisor
 from firmware_py.tasks import (
-    CoreBlocks,
     Thief,
     estimator_task,
     power_task,
@@ -65,15 +63,21 @@ THIEF_PRIORITY = 6  # above every task, like interrupts that do not end
 class Firmware:
     """A booted board. `kernel`, `variables` and `parameters` may be looked at; `signals` are views on the core.
 
-    Only with `mavlink` the UART speaks MAVLink, and pymavlink is needed.
+    Only with `mavlink` the UART speaks MAVLink, and pymavlink is needed. `runner` executes the flight core.
     """
 
-    def __init__(self, config: FirmwareConfig, board: Board, mavlink: bool = False) -> None:
+    def __init__(
+        self,
+        config: FirmwareConfig,
+        board: Board,
+        mavlink: bool = False,
+        runner: RunnerFactory = PythonRunner,
+    ) -> None:
         self.kernel = Kernel(preemption=True)
         self._board = board
-        core = CoreBlocks(parameters_of(config), Input.allocate(), Estimator.allocate(), Control.allocate())
-        entry.reset(core.parameters.arg, core.estimator.arg)
-        entry.control(core.parameters.arg, core.data.arg, core.estimator.arg, core.control.arg)
+        core = CoreBlocks(parameters_of(config), runner)
+        core.run.reset()
+        core.run.control()
         board.write_compare(core.control.fields.count.tolist())  # hover from the first PWM period on
         self._core = core
         self._zero = GyroZero()

@@ -18,7 +18,6 @@ from firmware_py.config import (
     PredictorConfig,
     SupervisorConfig,
 )
-from firmware_py.core import entry
 from firmware_py.links.parameters import Parameter
 from firmware_py.supervisor import Manual
 from firmware_py.variables import F32, I16, U8, U16, U32, Running
@@ -159,7 +158,7 @@ def _kalman(running: Running) -> Iterator[Parameter]:
 
     def reset(value: float) -> None:
         if value:
-            entry.reset(core.parameters.arg, core.estimator.arg)
+            core.run.reset()
 
     def deviation(name: str, unit: str, field: str) -> Parameter:
         fields = core.parameters.fields

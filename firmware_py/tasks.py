@@ -10,9 +10,8 @@ from typing import Any
 
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig
-from firmware_py.core import entry
 from firmware_py.core.structs import POSE_ON_TIME
-from firmware_py.core.subset import Block
+from firmware_py.core_runner import CoreBlocks
 from firmware_py.drivers.imu import GyroZero
 from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement
 from firmware_py.rtos import TICK_US, Kernel, Queue, Semaphore
@@ -57,7 +56,7 @@ def stabilizer_task(
     data_ready: Semaphore,
     estimator_run: Semaphore,
     supervisor: Supervisor,
-    core: "CoreBlocks",
+    core: CoreBlocks,
 ) -> Task:
     """Run at 1 kHz on the tick edge after each IMU sample; control at 100 Hz."""
     control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
@@ -71,7 +70,7 @@ def stabilizer_task(
             control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
             yield from kernel.work(cost.controller_us)
             core.data.fields.mode = supervisor.mode(kernel.now_us)
-            entry.control(core.parameters.arg, core.data.arg, core.estimator.arg, core.control.arg)
+            core.run.control()
             board.write_compare(core.control.fields.count.tolist())
 
 
@@ -81,7 +80,7 @@ def estimator_task(
     estimator_run: Semaphore,
     measurements: Queue[Measurement],
     supervisor: Supervisor,
-    core: "CoreBlocks",
+    core: CoreBlocks,
 ) -> Task:
     """Take in measurements at 1 kHz, estimate at 100 Hz."""
     data = core.data.fields
@@ -105,7 +104,7 @@ def estimator_task(
             data.gyro_sum[:] = x, y, z
             data.gyro_samples = samples
             samples = x = y = z = 0
-            entry.estimate(core.parameters.arg, core.data.arg, core.estimator.arg, core.control.arg)
+            core.run.estimate()
 
 
 def power_task(kernel: Kernel, board: Board, supervisor: Supervisor) -> Task:
@@ -140,7 +139,7 @@ def next_step(tick: int, phase: int) -> int:
     return tick + 1 + (phase - tick - 1) % TICKS_PER_STEP
 
 
-def file_pose(kernel: Kernel, measurement: Any, supervisor: Supervisor, core: "CoreBlocks") -> None:
+def file_pose(kernel: Kernel, measurement: Any, supervisor: Supervisor, core: CoreBlocks) -> None:
     """Hand a pose to the core with the age that it will have at the estimator's next step."""
     data = core.data.fields
     message = measurement.message
@@ -151,18 +150,5 @@ def file_pose(kernel: Kernel, measurement: Any, supervisor: Supervisor, core: "C
     else:
         ticks_to_step = (ESTIMATOR_PHASE - kernel.tick_count) % TICKS_PER_STEP
         data.pose_age_us = kernel.now_us - measurement.t_us + message.age_us + ticks_to_step * TICK_US
-    if entry.file_pose(core.parameters.arg, core.data.arg, core.estimator.arg) == POSE_ON_TIME:
+    if core.run.file_pose() == POSE_ON_TIME:
         supervisor.last_pose_us = measurement.t_us
-
-
-class CoreBlocks:
-    """The memory of the flight core, as the tasks share it: each block has one writer but the parameters."""
-
-    __slots__ = ("control", "data", "estimator", "parameters", "watchdog_fed_us")
-
-    def __init__(self, parameters: Block, data: Block, estimator: Block, control: Block) -> None:
-        self.parameters = parameters
-        self.data = data  # written by the estimator task, but for the mode: the stabilizer
-        self.estimator = estimator  # written by the estimator task; its `now` is the stabilizer's mailbox
-        self.control = control  # written by the stabilizer task
-        self.watchdog_fed_us = 0  # by the stabilizer task

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from firmware_py.board import Board
 from firmware_py.config import GYRO_SCALE
 from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, Control, Estimator
+from firmware_py.core_runner import CoreBlocks
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.links.localisation import LocalisationService
@@ -24,7 +25,6 @@ from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import State, Supervisor
-from firmware_py.tasks import CoreBlocks
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import FIRST_ID, Block
 

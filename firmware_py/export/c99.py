@@ -34,7 +34,7 @@ COMPILER = """\
 #if defined(__clang__)
 #pragma STDC FP_CONTRACT OFF
 #elif defined(__GNUC__)
-#pragma GCC optimize("fp-contract=off", "no-math-errno")
+#pragma GCC optimize("fp-contract=off")
 #endif
 """
 CHECK = "#define LAYOUT(name, holds) typedef char layout_##name[(holds) ? 1 : -1]\n"

@@ -43,11 +43,15 @@ class FunctionPrinter:
     def signature(self) -> str:
         """Return the declaration without its semicolon; known after the callers have been printed."""
         kernel = self.kernel
-        listed = ", ".join(
-            declare(name, kind, name in kernel.writes) for name, kind in kernel.arguments.items()
-        )
-        line = f"{'' if kernel.public else 'static '}{C_TYPES[kernel.result.base]} {kernel.c_name}({listed or 'void'})"
-        return "\n".join(textwrap.wrap(line, WIDTH, subsequent_indent="        ", break_long_words=False))
+        listed = [declare(name, kind, name in kernel.writes) for name, kind in kernel.arguments.items()]
+        lines = [f"{'' if kernel.public else 'static '}{C_TYPES[kernel.result.base]} {kernel.c_name}("]
+        for position, argument in enumerate(listed or ["void"]):
+            piece = argument + (", " if position + 1 < len(listed) else ")")
+            if len(lines[-1] + piece) > WIDTH:
+                lines[-1] = lines[-1].rstrip()
+                lines.append("        ")
+            lines[-1] += piece
+        return "\n".join(lines)
 
     def _block(self, body: list[ast.stmt], depth: int) -> None:
         for node in body:
@@ -195,7 +199,9 @@ def block_comment(text: str, indent: str = "") -> str:
     """Return a text as a C comment block, empty for no text."""
     if not text:
         return ""
-    lines = [line for part in text.splitlines() for line in textwrap.wrap(part, WIDTH - 6) or [""]]
+    lines: list[str] = []
+    for paragraph in text.split("\n\n"):
+        lines += ["", *textwrap.wrap(paragraph, WIDTH - 6)] if lines else textwrap.wrap(paragraph, WIDTH - 6)
     body = "\n".join(f"{indent} * {line}".rstrip() for line in lines[1:])
     return f"{indent}/* {lines[0]}" + (f"\n{body}\n{indent} */\n" if body else " */\n")
 

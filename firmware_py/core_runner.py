@@ -1,0 +1,71 @@
+"""The memory of the flight core and what executes it.
+
+The tasks call the core through a `CoreRunner` on the memory of `CoreBlocks`: Python (compiled by numba or plain), and
+under `firmware_py.export` the same core as C on this machine and as machine code of a Cortex-M4.
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+from firmware_py.core import entry
+from firmware_py.core.structs import Control, Estimator, Input
+from firmware_py.core.subset import Block
+
+
+class CoreRunner(Protocol):
+    """Executes the core's entry points on the memory of `CoreBlocks`."""
+
+    def reset(self) -> None:
+        """Start the estimator."""
+
+    def file_pose(self) -> int:
+        """File the input's pose; returns POSE_ON_TIME, POSE_TOO_OLD or POSE_INVALID."""
+
+    def estimate(self) -> None:
+        """Run one tick of the estimator."""
+
+    def control(self) -> None:
+        """Run one tick of the controller, down to the timer counts."""
+
+
+RunnerFactory = Callable[["CoreBlocks"], CoreRunner]
+
+
+class CoreBlocks:
+    """The memory of the flight core, as the tasks share it: each block has one writer but the parameters."""
+
+    __slots__ = ("control", "data", "estimator", "parameters", "run", "watchdog_fed_us")
+
+    def __init__(self, parameters: Block, runner: RunnerFactory) -> None:
+        self.parameters = parameters
+        self.data = Input.allocate()  # written by the estimator task, but for the mode: the stabilizer
+        self.estimator = Estimator.allocate()  # by the estimator task; its `now` is the stabilizer's mailbox
+        self.control = Control.allocate()  # written by the stabilizer task
+        self.watchdog_fed_us = 0  # by the stabilizer task
+        self.run: CoreRunner = runner(self)
+
+
+class PythonRunner:
+    """Runs the Python sources: compiled by numba, or plain with NUMBA_DISABLE_JIT=1."""
+
+    __slots__ = ("_control", "_data", "_estimator", "_parameters")
+
+    def __init__(self, blocks: CoreBlocks) -> None:
+        self._parameters, self._data = blocks.parameters.arg, blocks.data.arg
+        self._estimator, self._control = blocks.estimator.arg, blocks.control.arg
+
+    def reset(self) -> None:
+        """Start the estimator."""
+        entry.reset(self._parameters, self._estimator)
+
+    def file_pose(self) -> int:
+        """File the input's pose."""
+        return int(entry.file_pose(self._parameters, self._data, self._estimator))
+
+    def estimate(self) -> None:
+        """Run one tick of the estimator."""
+        entry.estimate(self._parameters, self._data, self._estimator, self._control)
+
+    def control(self) -> None:
+        """Run one tick of the controller."""
+        entry.control(self._parameters, self._data, self._estimator, self._control)

@@ -1,0 +1,120 @@
+"""The exported C on this machine: compiled into a shared library and called on the memory of the core's blocks.
+
+Libraries are kept in a folder by what they were made from; one that is there is not compiled again. The compiler is
+`ziglang` from PyPI (extra `deploy`) or the system's.
+"""
+
+import ctypes
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from firmware_py.core.subset import Block
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.export.c99 import Translation
+from firmware_py.export.errors import ExportError
+
+SYSTEM_COMPILERS = ("gcc", "clang", "cc")
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror", "-fno-math-errno")
+LIBRARY_FLAGS = ("-shared", "-fPIC", "-nostdlib")
+ZIG_FLAGS = ("-fno-sanitize=all",)  # zig checks for undefined behaviour by default and traps
+
+
+@dataclass(frozen=True, slots=True)
+class Compiler:
+    """A C compiler: its short name, the words of its command, and what it says about its version."""
+
+    name: str
+    command: tuple[str, ...]
+    version: str
+
+
+def compilers() -> Iterator[Compiler]:
+    """Yield the C compilers of this machine, ziglang first."""
+    if importlib.util.find_spec("ziglang"):
+        python = (sys.executable, "-m", "ziglang")
+        yield Compiler("zig", (*python, "cc"), _output((*python, "version"), {}))
+    for name in SYSTEM_COMPILERS:
+        path = shutil.which(name)
+        if path:
+            yield Compiler(name, (path,), _output((path, "--version"), {}))
+
+
+def find_compiler(name: str = "") -> Compiler:
+    """Return the compiler of that name, or the first one; raises `ExportError` if there is none."""
+    for compiler in compilers():
+        if name in ("", compiler.name):
+            return compiler
+    raise ExportError(
+        f"no C compiler{' ' + name if name else ''} on this machine: pip install 'floaty-hil[deploy]'"
+    )
+
+
+def build(
+    translation: Translation,
+    folder: Path,
+    optimisation: str = "-O2",
+    compiler: Compiler | None = None,
+    flags: tuple[str, ...] = (),
+) -> Path:
+    """Return the shared library of the core, compiled now unless it is in the folder already."""
+    compiler = compiler or find_compiler()
+    zig = ZIG_FLAGS if compiler.name == "zig" else ()
+    command = (*compiler.command, optimisation, *FLAGS, *LIBRARY_FLAGS, *zig, *flags)
+    made_from = "\0".join((translation.header, translation.source, compiler.version, *command))
+    home = folder / hashlib.sha256(made_from.encode()).hexdigest()[:16]
+    library = home / "floaty_core.so"
+    if library.is_file():
+        return library
+    home.mkdir(parents=True, exist_ok=True)
+    (home / "floaty_core.h").write_text(translation.header, "utf-8")
+    (home / "floaty_core.c").write_text(translation.source, "utf-8")
+    unfinished = home / f"floaty_core.{os.getpid()}.so"
+    caches = {
+        name: str(folder.absolute() / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")
+    }
+    _output((*command, "-o", str(unfinished), str(home / "floaty_core.c")), caches)
+    unfinished.replace(library)
+    return library
+
+
+def _output(command: tuple[str, ...], environment: dict[str, str]) -> str:
+    """Return what a command says; its first complaint becomes an `ExportError`."""
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | environment, check=False)
+    if done.returncode != 0:
+        complaints = [line for line in done.stderr.splitlines() if "error" in line] or [
+            f"exit {done.returncode}"
+        ]
+        raise ExportError(f"{Path(command[0]).name}: {complaints[0]}")
+    return done.stdout.strip()
+
+
+class NativeRunner:
+    """Runs the compiled C on the blocks' own memory."""
+
+    __slots__ = ("_blocks", "control", "estimate", "file_pose", "reset")
+
+    def __init__(self, blocks: CoreBlocks, library: Path) -> None:
+        self._blocks = blocks  # keeps the memory alive
+        code = ctypes.CDLL(str(library.absolute()))
+        everything = (blocks.parameters, blocks.data, blocks.estimator, blocks.control)
+        parameters, data, estimator, control = map(_address, everything)
+        self.reset: Callable[[], None] = partial(code.floaty_core_reset, parameters, estimator)
+        self.file_pose: Callable[[], int] = partial(code.floaty_core_file_pose, parameters, data, estimator)
+        self.estimate: Callable[[], None] = partial(
+            code.floaty_core_estimate, parameters, data, estimator, control
+        )
+        self.control: Callable[[], None] = partial(
+            code.floaty_core_control, parameters, data, estimator, control
+        )
+
+
+def _address(block: Block) -> ctypes.c_void_p:
+    return ctypes.c_void_p(block.memory.ctypes.data)
