@@ -57,7 +57,7 @@ FloatyEstimator floaty_estimator;
 FloatyControl floaty_control;
 FloatySupervisor floaty_supervisor;
 FloatyObserved floaty_observed;
-volatile bool floaty_reset_requested;
+FloatyRequests floaty_requests;
 
 static FloatyGyroZero gyro_zero;
 static logVarId_t gyro_raw[3];
@@ -100,15 +100,21 @@ static void receive_localisation(CRTPPacket *packet) {
     return; /* a position without attitude is no pose */
   }
   if (packet->data[0] == EMERGENCY_STOP) {
-    floaty_supervisor.stopped = true;
+    floaty_requests.stop = true;
   } else if (packet->data[0] == EMERGENCY_STOP_WATCHDOG) {
-    floaty_supervisor_feed_watchdog(&floaty_supervisor, now_us());
+    floaty_requests.feed_watchdog = true;
   } else {
     receive_pose(packet->data, packet->size);
   }
 }
 
 /* The estimator, in the stabilizer task */
+
+static bool asked(volatile bool *request) {
+  const bool was = *request;
+  *request = false;
+  return was;
+}
 
 static void file_pose(const FloatyPose *pose, stabilizerStep_t step) {
   for (int i = 0; i < 3; i++) {
@@ -186,7 +192,7 @@ static void observe(void) {
 
 void estimatorOutOfTreeInit(void) {
   start();
-  floaty_reset_requested = true;
+  floaty_requests.reset = true;
   gyro_raw[0] = logGetVarId("gyro", "xRaw");
   gyro_raw[1] = logGetVarId("gyro", "yRaw");
   gyro_raw[2] = logGetVarId("gyro", "zRaw");
@@ -197,8 +203,7 @@ bool estimatorOutOfTreeTest(void) {
 }
 
 void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
-  if (floaty_reset_requested) {
-    floaty_reset_requested = false;
+  if (asked(&floaty_requests.reset)) {
     floaty_core_reset(&floaty_parameters, &floaty_estimator);
   }
   take_measurements(stabilizerStep);
@@ -213,6 +218,24 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
 }
 
 /* The controller, in the stabilizer task */
+
+static void serve_requests(int64_t now) {
+  if (asked(&floaty_requests.recover)) {
+    floaty_supervisor_recover(&floaty_supervisor, now);
+  }
+  if (asked(&floaty_requests.arm)) {
+    floaty_supervisor_arm(&floaty_supervisor, true);
+  }
+  if (asked(&floaty_requests.disarm)) {
+    floaty_supervisor_arm(&floaty_supervisor, false);
+  }
+  if (asked(&floaty_requests.feed_watchdog)) {
+    floaty_supervisor_feed_watchdog(&floaty_supervisor, now);
+  }
+  if (asked(&floaty_requests.stop) || supervisorIsLocked()) { /* or the firmware's own emergency stop */
+    floaty_supervisor.stopped = true;
+  }
+}
 
 void controllerOutOfTreeInit(void) {
   start();
@@ -229,14 +252,12 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
   (void)sensors;
   (void)state;
   memset(control, 0, sizeof *control); /* no motors */
+  serve_requests(now);
   if (stabilizerStep % BATTERY_STEPS == 0) {
     floaty_supervisor_see_battery(&floaty_supervisor, now, (int32_t)(1000.0f * pmGetBatteryVoltage()));
   }
   if (stabilizerStep % STEPS != CONTROL_PHASE) {
     return;
-  }
-  if (supervisorIsLocked()) { /* the firmware's own emergency stop */
-    floaty_supervisor.stopped = true;
   }
   floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
   floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control);

@@ -24,7 +24,18 @@ extern FloatyEstimator floaty_estimator;
 extern FloatyControl floaty_control;
 extern FloatySupervisor floaty_supervisor;
 extern FloatyObserved floaty_observed;
-extern volatile bool floaty_reset_requested; /* the estimator starts afresh with its next step */
+
+/* What other tasks ask of the stabilizer task, which alone touches the supervisor's instants and the estimator. */
+typedef struct {
+  volatile bool stop;          /* emergency stop */
+  volatile bool recover;       /* leave it */
+  volatile bool feed_watchdog; /* of the emergency stop */
+  volatile bool arm;
+  volatile bool disarm;
+  volatile bool reset; /* start the estimator afresh */
+} FloatyRequests;
+
+extern FloatyRequests floaty_requests;
 
 /* Brings parameters that were read from the memory at start into force (floaty_toc.c). */
 void floaty_toc_apply(void);
