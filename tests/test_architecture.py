@@ -35,7 +35,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "threading": ("hil/window.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py"),
     "multiprocessing": ("hil/sweep.py",),
     "concurrent": ("hil/sweep.py",),
-    "subprocess": ("hil/run.py", "hil/window.py", "hil/linked_flight.py"),
+    "subprocess": ("hil/run.py", "hil/window.py", "hil/linked_flight.py", "firmware_py/export/native.py"),
     "socket": (
         "hil/window.py", "hil/dongle_plugin.py", "hil/dongle_server.py", "hil/udp_server.py", "hil/serial_server.py",
         "hil/linked_flight.py",

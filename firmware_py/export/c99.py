@@ -95,7 +95,8 @@ def _header(modules: list[Module], public: list[FunctionPrinter], version: str) 
         f'#define FLOATY_CORE_VERSION "{version}"  // hash of the Python sources\n\n',
         "".join(constant_definition(thing) + "\n" for thing in own if isinstance(thing, Constant)),
         *(f"\n{_struct(thing)}" for thing in own if isinstance(thing, StructType)),
-        "\n/* Writes a profile's parameters; in floaty_profile.c. */\n",
+        "\n/* A profile as written by profile_c.py: a hash of its values, and the call that writes them. */\n",
+        "extern const char floaty_profile_hash[];\n",
         "void floaty_core_init(FloatyParameters *parameters);\n",
     ]
     for printer in public:
