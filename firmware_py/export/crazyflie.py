@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from math import pi
 from pathlib import Path
 
-import numpy as np
-
 from firmware_py.config import (
     AllocationConfig,
     ControllerConfig,
@@ -22,7 +20,9 @@ from firmware_py.config import (
 )
 from firmware_py.export.c99 import translate
 from firmware_py.export.errors import ExportError
+from firmware_py.core.subset import f32
 from firmware_py.export.profile_c import profile_source
+from firmware_py.export.reading import float_literal
 from firmware_py.parameters import FLAPS, GAINS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits
 
 TEMPLATES = Path(__file__).parent / "app"
@@ -160,7 +160,7 @@ def _settings(config: FirmwareConfig, profile: str) -> str:
 
 def _number(value: float) -> str:
     """Return a float32 constant of C."""
-    return f"{np.float32(value)!s}f"
+    return float_literal(f32(value))
 
 
 def _value(parameter: AppParameter) -> str:

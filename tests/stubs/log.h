@@ -22,7 +22,7 @@ struct log_s {
 #define LOG_ADD(TYPE, NAME, ADDRESS) {.type = TYPE, .name = #NAME, .address = (void *)(ADDRESS)},
 #define LOG_ADD_GROUP(TYPE, NAME, ADDRESS) LOG_ADD(TYPE, NAME, ADDRESS)
 #define LOG_GROUP_START(NAME)                                                                   \
-  static const struct log_s __logs_##NAME[] __attribute__((section(LOG_SECTION(NAME)), used)) = { \
+  static const struct log_s __logs_##NAME[] __attribute__((section(LOG_SECTION(NAME)), used, aligned(sizeof(void *)))) = { \
       LOG_ADD_GROUP(LOG_GROUP | LOG_START, NAME, 0x0)
 #define LOG_GROUP_STOP(NAME) LOG_ADD_GROUP(LOG_GROUP | LOG_STOP, stop_##NAME, 0x0) };
 #ifdef __arm__

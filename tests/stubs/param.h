@@ -29,7 +29,7 @@ struct param_s {
 #define PARAM_ADD_WITH_CALLBACK(TYPE, NAME, ADDRESS, CALLBACK) PARAM_ADD_FULL(TYPE, NAME, ADDRESS, CALLBACK, 0)
 #define PARAM_ADD_GROUP(TYPE, NAME, ADDRESS) PARAM_ADD_FULL(TYPE, NAME, ADDRESS, 0, 0)
 #define PARAM_GROUP_START(NAME)                                                                         \
-  static struct param_s __params_##NAME[] __attribute__((section(PARAM_SECTION(NAME)), used)) = { \
+  static struct param_s __params_##NAME[] __attribute__((section(PARAM_SECTION(NAME)), used, aligned(sizeof(void *)))) = { \
       PARAM_ADD_GROUP(PARAM_GROUP | PARAM_START, NAME, 0x0)
 #define PARAM_GROUP_STOP(NAME) PARAM_ADD_GROUP(PARAM_GROUP | PARAM_STOP, stop_##NAME, 0x0) };
 #ifdef __arm__

@@ -1,7 +1,7 @@
 /* Floaty as out-of-tree estimator and controller of the Crazyflie firmware.
  *
  * The stabilizer task calls both 1000 times per second, after each IMU sample. As in firmware_py/tasks.py the estimator
- * runs in steps 9, 19, 29 ..., the controller in steps 10, 20, 30 ...; poses are filed in every step. All of the core is
+ * runs in steps 9, 19, 29 ..., the controller in steps 10, 20, 30 ...; poses are filed as they come. All of the core is
  * called from this one task. Everything is float32 and int32 except time, which is int64 microseconds.
  *
  * Gyro: the core takes raw counts. The BMI088 driver shows them as the log variables gyro.xRaw, yRaw, zRaw, of which
@@ -150,6 +150,9 @@ static void take_measurements(stabilizerStep_t step) {
   if (floaty_gyro_zero_add(&gyro_zero, counts, floaty_input.gyro_bias)) {
     floaty_supervisor.calibrated = true;
   }
+  if (step % STEPS == CONTROL_PHASE) {
+    return; /* poses wait until the controller has run, as they do in the laboratory: it may see them in 1 to 11 ms */
+  }
   while (xQueueReceive(pose_queue, &pose, 0) == pdTRUE) {
     file_pose(&pose, step);
   }
@@ -253,16 +256,15 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
   (void)state;
   memset(control, 0, sizeof *control); /* no motors */
   serve_requests(now);
+  if (stabilizerStep % STEPS == CONTROL_PHASE) {
+    floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
+    floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control);
+    floaty_servos_write(floaty_control.count);
+    controlled_tick = xTaskGetTickCount();
+  }
   if (stabilizerStep % BATTERY_STEPS == 0) {
     floaty_supervisor_see_battery(&floaty_supervisor, now, (int32_t)(1000.0f * pmGetBatteryVoltage()));
   }
-  if (stabilizerStep % STEPS != CONTROL_PHASE) {
-    return;
-  }
-  floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
-  floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control);
-  floaty_servos_write(floaty_control.count);
-  controlled_tick = xTaskGetTickCount();
 }
 
 /* The app's own task: poses from the app channel, the console, and a loop that stands still */
@@ -294,7 +296,7 @@ void appMain(void) {
 
   floaty_toc_apply();
   crtpRegisterPortCB(CRTP_PORT_LOCALIZATION, receive_localisation);
-  DEBUG_PRINT("core %s, profile %s\n", FLOATY_CORE_VERSION, FLOATY_PROFILE_NAME);
+  DEBUG_PRINT("core %s, profile %s %s\n", FLOATY_CORE_VERSION, FLOATY_PROFILE_NAME, floaty_profile_hash);
   while (true) {
     const size_t length = appchannelReceiveDataPacket(data, sizeof data, LOOK_MS);
     if (length > 0) {
