@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
+from firmware_py.export.errors import ExportError
 from firmware_py.export.side_by_side import SideBySide, Target
 from firmware_py.firmware import WatchdogError
 from hil.errors import LabError
@@ -48,13 +49,19 @@ def check_flight(
     factories: Callable[[ExitStack], dict[str, RunnerFactory]],
     progress: Callable[[int, Flight], None],
 ) -> Checked:
-    """Fly once with all targets beside the board; Ctrl-C ends the flight early with the outcome "interrupted"."""
+    """Fly once with all targets beside the board; Ctrl-C ends the flight early with the outcome "interrupted".
+
+    Raises `LabError` when a target cannot be started.
+    """
     made: list[SideBySide] = []
     with ExitStack() as stack:
         targets = factories(stack)
 
         def side_by_side(blocks: CoreBlocks) -> CoreRunner:
-            made.append(SideBySide(blocks, targets))
+            try:
+                made.append(SideBySide(blocks, targets))
+            except ExportError as error:
+                raise LabError(str(error)) from None
             return made[0]
 
         flight = Flight(

@@ -233,6 +233,18 @@ def test_a_plain_python_that_has_ended_is_a_difference() -> None:
     runners[0].close()
 
 
+@pytest.mark.parametrize("package", ["unicorn", "elftools.elf.elffile"])
+def test_a_missing_package_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path, package: str
+) -> None:
+    monkeypatch.chdir(built)
+    monkeypatch.setitem(sys.modules, package, None)
+    assert floaty(monkeypatch, "deploy", "check", "hover", "--targets", "cortex-m4") == 2
+    error = capsys.readouterr().err
+    assert error.endswith("is missing: pip install 'floaty-hil[deploy]'\n")
+    assert error.count("\n") == 1
+
+
 FIRMWARE = """
 #include "floaty_core.h"
 int main(void);
@@ -333,3 +345,35 @@ def test_bad_input_of_check_is_one_line_and_exit_code_two(
     assert message in error
     assert error.startswith("floaty: ")
     assert error.count("\n") == 1
+
+
+def test_the_exported_app_holds_the_c_that_is_checked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "deploy", "export", "app", "--profile", "as-flown") == 0
+    shown = [Path(line) for line in capsys.readouterr().out.splitlines()]
+    assert {path for path in Path("app").rglob("*") if path.is_file()} == set(shown)
+    assert Path("app/src/floaty_core.c").read_text(encoding="utf-8") == translate().source
+    assert Path("app/Makefile") in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["app", "--profile", "flaoty"], "did you mean floaty?"),
+        (["app", "--set", "controller.gain_z=nan"], "controller.gain_z = nan"),
+        (["other"], "other: "),
+        ([], "Missing argument"),
+    ],
+)
+def test_bad_input_of_export_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    Path("other").mkdir()
+    Path("other/thesis.tex").write_text("mine", encoding="utf-8")
+    assert floaty(monkeypatch, "deploy", "export", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert [path.name for path in Path("other").iterdir()] == ["thesis.tex"]
+    assert not Path("app").exists()
