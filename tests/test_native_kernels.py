@@ -113,7 +113,7 @@ def test_every_kernel_gives_the_same_bits_in_c(c_name: str) -> None:
         if c_name in INSIDE_1000 and not abs(ours[0]) <= 1000:
             continue
         theirs = [copied(argument) for argument in ours]
-        expected = kernel(*(a.memory[0] if hasattr(a, "memory") else a for a in ours))
+        expected = kernel(*(a.arg[0] if hasattr(a, "memory") else a for a in ours))
         got = function(*map(to_c, theirs))
         if function.restype is ctypes.c_float:
             got, expected = (bits(np.float32(value)) for value in (got, expected))

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from firmware_py.export.errors import refusal
-from firmware_py.export.reading import C_KEYWORDS, Kernel
+from firmware_py.export.syntax import C_KEYWORDS, Kernel
 
 Block = tuple[int, ...]
 
