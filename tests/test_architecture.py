@@ -17,7 +17,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ground_station": ("ground_station", "firmware_py.wire", "firmware_py.geometry"),
     "hil": (
         "hil", "ground_station",
-        "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board", "firmware_py.config", "firmware_py.signals",
+        "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
+        "firmware_py.config", "firmware_py.signals",
         "firmware_py.wire", "firmware_py.geometry", "firmware_py.errors",
     ),
 }  # fmt: skip

@@ -6,7 +6,7 @@ from pathlib import Path
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from firmware_py.export.arm_image import build_image, build_meter
 from firmware_py.export.c99 import translate
-from firmware_py.export.cortex_m4 import CortexM4Runner
+from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
 from firmware_py.export.native import NativeRunner, build
 
 PYTHON, C, CORTEX_M4 = "python", "c", "cortex-m4"
@@ -17,6 +17,8 @@ def runner_of(board: str, folder: Path) -> RunnerFactory:
     """Return what executes the core on a board; `folder` keeps what is compiled. Raises `ExportError`."""
     if board == PYTHON:
         return PythonRunner
+    if board == CORTEX_M4:
+        find_emulator()
     core = translate()
     if board == C:
         return partial(NativeRunner, library=build(core, folder))

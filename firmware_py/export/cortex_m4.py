@@ -74,6 +74,15 @@ class Usage:
     entries: dict[str, Load]
 
 
+def find_emulator() -> Any:
+    """Return the package unicorn. Raises `ExportError` when it is missing."""
+    try:
+        import unicorn
+    except ImportError:
+        raise ExportError(f"unicorn is missing: {NEEDS_EXTRA}") from None
+    return unicorn
+
+
 class CortexM4Runner:
     """A `CoreRunner` and a `CoreCosts`; `load` counts by entry point, `instructions` is that of the last call.
 
@@ -82,17 +91,14 @@ class CortexM4Runner:
     """
 
     def __init__(self, blocks: CoreBlocks, image: Image, meter: Path) -> None:
-        try:
-            from unicorn import arm_const, unicorn_const
-            from unicorn.unicorn_py3 import unicorn
-        except ImportError:
-            raise ExportError(f"unicorn is missing: {NEEDS_EXTRA}") from None
+        unicorn = find_emulator()
+        from unicorn import arm_const, unicorn_const
+
         self.image = image
         self.load = {name: Load() for name in image.entries}
         self._fault = unicorn.UcError
         self._result, self._pc = arm_const.UC_ARM_REG_R0, arm_const.UC_ARM_REG_PC
-        emulator: Any = unicorn.Uc  # has no types
-        self._cpu = emulator(
+        self._cpu = unicorn.Uc(
             unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB | unicorn_const.UC_MODE_MCLASS
         )
         self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)

@@ -1,7 +1,7 @@
 """Where the instructions of a Thumb-2 image begin, and how many cycles each takes on a Cortex-M4F.
 
 Cycles are those of ARM's Cortex-M4 Technical Reference Manual (DDI 0439), instruction set summary and FPU instruction set,
-with the upper figure where it gives a range, plus one where a floating-point result is used by the next instruction. The
+with the upper figure where it gives a range, plus one where a sum, product or quotient of floats goes into the next one. The
 refill after a jump and the flash's wait states depend on the way through the code: `arm/meter.c` adds them.
 """
 
@@ -92,15 +92,17 @@ def _is_float_arithmetic(first: int, second: int) -> bool:
     return first & 0xFF00 == 0xEE00 and _is_float(second) and second & 0x0010 == 0
 
 
+def _is_three_operand(first: int, second: int) -> bool:
+    return _is_float_arithmetic(first, second) and first & 0xB0 != 0xB0
+
+
 def _written_register(first: int, second: int) -> int:
-    """Return the single register that a floating-point operation writes, -1 for others."""
-    if not _is_float_arithmetic(first, second):
-        return -1
-    return (second >> 12) << 1 | first >> 6 & 1
+    """Return the single register that a sum, product or quotient is written to, -1 for others."""
+    return (second >> 12) << 1 | first >> 6 & 1 if _is_three_operand(first, second) else -1
 
 
 def _read_registers(first: int, second: int) -> tuple[int, ...]:
-    """Return the single registers that a floating-point operation reads, none for others."""
-    if not _is_float_arithmetic(first, second):
+    """Return the single registers that a sum, product or quotient is made of, none for others."""
+    if not _is_three_operand(first, second):
         return ()
     return ((first & 0xF) << 1 | second >> 7 & 1, (second & 0xF) << 1 | second >> 5 & 1)

@@ -1,0 +1,105 @@
+"""Flights on the other boards: the exported C, and its machine code on the emulated Cortex-M4, against Python's."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil.cli import main
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.recorder import load_log
+from hil.run import Request, Result, fly, prepare
+
+HOVER = EXPERIMENTS["hover"]
+DURATION_S = 30.0 if os.environ.get("FLOATY_LONG") else 1.5
+
+
+def go(folder: Path, board: str, *overrides: str) -> Result:
+    prepare(folder)
+    return fly(Request.of(HOVER, overrides=overrides, duration_s=DURATION_S, board=board), folder)
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    return go(tmp_path_factory.mktemp("python"), "python")
+
+
+@pytest.mark.parametrize("board", ["c", "cortex-m4"])
+def test_a_flight_on_another_board_is_recorded_alike_to_the_last_bit(
+    tmp_path: Path, python: Result, board: str
+) -> None:
+    result = go(tmp_path, board)
+    assert result.passed
+    assert load_log(tmp_path).equals(load_log(python.folder))  # truth, estimate, counts and all the rest
+    assert result.hash == python.hash
+    assert json.loads((tmp_path / "result.json").read_text())["board"] == board
+
+
+def test_the_costs_of_the_profile_are_what_the_machine_code_takes(tmp_path: Path, python: Result) -> None:
+    result = go(tmp_path, "cortex-m4")
+    assert python.usage is None
+    assert result.usage is not None
+    cpu, entries = result.request.config.cpu, result.usage.entries
+    assert entries["estimate"].worst_us + entries["file_pose"].worst_us <= cpu.estimator_us
+    assert entries["estimate"].worst_us > 0.95 * cpu.estimator_us
+    assert cpu.controller_us - 1 < entries["control"].worst_us <= cpu.controller_us
+    steps = entries["estimate"].calls
+    assert steps == entries["control"].calls == round((DURATION_S + 1) * 100)
+    assert (
+        json.loads((tmp_path / "result.json").read_text())["usage"]["entries"]["estimate"]["calls"] == steps
+    )
+
+
+def test_measured_costs_are_the_processor_time_of_the_tasks(tmp_path: Path) -> None:
+    result = go(tmp_path, "cortex-m4", "cpu.measured=true", "cpu.estimator_us=0", "cpu.controller_us=0")
+    assert result.passed
+    assert result.usage is not None
+    entries = result.usage.entries
+    spent = {task.name: task.run_time_us for task in result.tasks}
+    steps = entries["estimate"].calls
+    estimator_us = (entries["estimate"].cycles + entries["file_pose"].cycles) / 168
+    assert estimator_us <= spent["KALMAN"] <= estimator_us + steps  # each call is rounded up
+    assert (
+        entries["control"].cycles / 168 - 100
+        <= spent["STABILIZER"]
+        <= entries["control"].cycles / 168 + steps
+    )
+
+
+def test_the_report_shows_what_the_board_takes(tmp_path: Path) -> None:
+    from hil.report import write_report
+
+    go(tmp_path, "cortex-m4")
+    page = write_report(tmp_path).read_text(encoding="utf-8")
+    assert "<td>cortex-m4</td>" in page
+    assert "instructions" in page
+
+
+def test_an_unknown_board_is_refused() -> None:
+    with pytest.raises(LabError, match="--board stm8: expected python, c or cortex-m4"):
+        Request.of(HOVER, board="stm8")
+
+
+@pytest.mark.parametrize("link", ["udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"])
+def test_over_a_link_only_python_flies(link: str) -> None:
+    with pytest.raises(LabError, match="only python flies over a link"):
+        Request.of(HOVER, link=link, board="c")
+
+
+@pytest.mark.parametrize("missing", ["unicorn", "elftools.elf.elffile"])
+def test_a_missing_package_is_said_in_one_line(
+    missing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    out = str(tmp_path / "run")
+    monkeypatch.setattr(sys, "argv", ["floaty", "fly", "hover", "--board", "cortex-m4", "--out", out])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().err.strip()
+    assert end.value.code == 2
+    assert said.count("\n") == 0
+    assert said.startswith("floaty: --board cortex-m4: ")
+    assert said.endswith("pip install 'floaty-hil[deploy]'")
