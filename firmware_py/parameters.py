@@ -65,7 +65,7 @@ def parameters(running: Running) -> tuple[Parameter, ...]:
     )  # fmt: skip
 
 
-def _limits(section: type[BaseModel], field: str) -> tuple[float, float]:
+def configured_limits(section: type[BaseModel], field: str) -> tuple[float, float]:
     """Return the inclusive limits of a configuration field; an exclusive lower one excludes only itself here."""
     low = high = 0.0
     for limit in section.model_fields[field].metadata:
@@ -84,7 +84,7 @@ def _field(
     sign: int = 1,
 ) -> Parameter:
     """A persistent parameter that is a number in the core, with the limits of its configuration."""
-    low, high = sorted(sign * limit for limit in _limits(section, field))
+    low, high = sorted(sign * limit for limit in configured_limits(section, field))
     return Parameter(
         name, scalar, unit,
         lambda: sign * getattr(fields, field).item(), lambda value: setattr(fields, field, sign * value),
@@ -186,8 +186,8 @@ def _supervision(running: Running) -> Iterator[Parameter]:
         else:
             supervisor.recover(kernel.now_us)
 
-    low_us, high_us = _limits(SupervisorConfig, "pose_timeout_us")
-    low_mv, high_mv = _limits(SupervisorConfig, "low_battery_mv")
+    low_us, high_us = configured_limits(SupervisorConfig, "pose_timeout_us")
+    low_mv, high_mv = configured_limits(SupervisorConfig, "low_battery_mv")
     yield Parameter("stabilizer.stop", U8, "", lambda: supervisor.stopped, stop, 0, 1)
     yield Parameter(
         "supervisor.poseTimeout", U16, "ms", lambda: supervisor.pose_timeout_us // 1000,

@@ -1,0 +1,314 @@
+/* Floaty as out-of-tree estimator and controller of the Crazyflie firmware.
+ *
+ * The stabilizer task calls both 1000 times per second, after each IMU sample. As in firmware_py/tasks.py the estimator
+ * runs in steps 9, 19, 29 ..., the controller in steps 10, 20, 30 ...; poses are filed as they come. All of the core is
+ * called from this one task. Everything is float32 and int32 except time, which is int64 microseconds.
+ *
+ * Gyro: the core takes raw counts. The BMI088 driver shows them as the log variables gyro.xRaw, yRaw, zRaw, of which
+ * there is a new one in each step; neither the firmware's low-pass nor its bias is in between, so that the core computes
+ * what it computes in the laboratory, bit for bit, from the same counts, poses and instants.
+ *
+ * Poses: packets of port 6 come here instead of to the firmware's own localisation service, because that does not look
+ * at the age behind an external pose. The same bytes are taken from the app channel.
+ */
+#define DEBUG_MODULE "FLOATY"
+
+#include "floaty_app.h"
+
+#include <math.h>
+#include <string.h>
+
+#include "FreeRTOS.h"
+#include "queue.h"
+#include "task.h"
+
+#include "app.h"
+#include "app_channel.h"
+#include "controller.h"
+#include "crtp.h"
+#include "debug.h"
+#include "estimator.h"
+#include "log.h"
+#include "pm.h"
+#include "supervisor.h"
+#include "usec_time.h"
+
+#include "floaty_gyro_zero.h"
+#include "floaty_poses.h"
+#include "floaty_servos.h"
+#include "floaty_settings.h"
+
+#define STEPS 10 /* of the stabilizer per step of the core */
+#define ESTIMATOR_PHASE 9
+#define CONTROL_PHASE 0
+#define STEP_US 1000
+#define BATTERY_STEPS 100
+#define POSE_QUEUE 8
+#define CHANNEL_GENERIC 1
+#define EMERGENCY_STOP 3
+#define EMERGENCY_STOP_WATCHDOG 4
+#define STALE_MS 50 /* without a controller step: servos to hover */
+#define LOOK_MS 20  /* how often the app's task looks at that */
+#define POSE_ON_TIME 0
+
+FloatyParameters floaty_parameters;
+FloatyInput floaty_input;
+FloatyEstimator floaty_estimator;
+FloatyControl floaty_control;
+FloatySupervisor floaty_supervisor;
+FloatyObserved floaty_observed;
+FloatyRequests floaty_requests;
+
+static FloatyGyroZero gyro_zero;
+static logVarId_t gyro_raw[3];
+static volatile TickType_t controlled_tick;
+
+/* In ordinary memory: the macros of static_mem.h would put it into CCM, which is full. */
+static StaticQueue_t pose_queue_buffer;
+static uint8_t pose_queue_storage[POSE_QUEUE * sizeof(FloatyPose)];
+static QueueHandle_t pose_queue;
+
+static int64_t now_us(void) {
+  return (int64_t)usecTimestamp();
+}
+
+static void start(void) {
+  if (pose_queue) {
+    return;
+  }
+  pose_queue = xQueueCreateStatic(POSE_QUEUE, sizeof(FloatyPose), pose_queue_storage, &pose_queue_buffer);
+  floaty_core_init(&floaty_parameters);
+  floaty_core_reset(&floaty_parameters, &floaty_estimator);
+  floaty_supervisor_init(&floaty_supervisor, FLOATY_POSE_TIMEOUT_US, FLOATY_LOW_BATTERY_MV);
+  floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control); /* mode 0: hover */
+  floaty_servos_init(floaty_control.count);
+}
+
+/* Poses, in the tasks that receive them */
+
+static void receive_pose(const uint8_t *data, uint32_t length) {
+  FloatyPose pose;
+  if (!floaty_pose_decode(data, length, now_us(), &pose)) {
+    floaty_observed.malformed += 1;
+  } else if (xQueueSend(pose_queue, &pose, 0) != pdTRUE) {
+    floaty_observed.overflows += 1;
+  }
+}
+
+static void receive_localisation(CRTPPacket *packet) {
+  if (packet->channel != CHANNEL_GENERIC || packet->size < 1) {
+    return; /* a position without attitude is no pose */
+  }
+  if (packet->data[0] == EMERGENCY_STOP) {
+    floaty_requests.stop = true;
+  } else if (packet->data[0] == EMERGENCY_STOP_WATCHDOG) {
+    floaty_requests.feed_watchdog = true;
+  } else {
+    receive_pose(packet->data, packet->size);
+  }
+}
+
+/* The estimator, in the stabilizer task */
+
+static bool asked(volatile bool *request) {
+  const bool was = *request;
+  *request = false;
+  return was;
+}
+
+static void file_pose(const FloatyPose *pose, stabilizerStep_t step) {
+  for (int i = 0; i < 3; i++) {
+    floaty_input.pose_position[i] = pose->position[i];
+  }
+  for (int i = 0; i < 4; i++) {
+    floaty_input.pose_quaternion[i] = pose->quaternion[i];
+  }
+  floaty_input.pose_age_us = FLOATY_AGE_UNKNOWN;
+  if (pose->age_us != FLOATY_AGE_UNKNOWN) {
+    const int32_t steps_to_go = (int32_t)((ESTIMATOR_PHASE + STEPS - step % STEPS) % STEPS);
+    floaty_input.pose_age_us = (int32_t)(now_us() - pose->arrival_us) + pose->age_us + steps_to_go * STEP_US;
+  }
+  if (floaty_core_file_pose(&floaty_parameters, &floaty_input, &floaty_estimator) == POSE_ON_TIME) {
+    floaty_supervisor.last_pose_us = pose->arrival_us;
+    floaty_supervisor.pose_seen = true;
+  }
+}
+
+static void take_measurements(stabilizerStep_t step) {
+  measurement_t measurement;
+  FloatyPose pose;
+  int32_t counts[3];
+
+  while (estimatorDequeue(&measurement)) {
+    /* Gyro and accelerometer as the firmware filters them, and whatever a deck measures: not needed here. */
+  }
+  for (int axis = 0; axis < 3; axis++) {
+    counts[axis] = logGetInt(gyro_raw[axis]);
+    floaty_input.gyro_sum[axis] += counts[axis];
+  }
+  floaty_input.gyro_samples += 1;
+  if (floaty_gyro_zero_add(&gyro_zero, counts, floaty_input.gyro_bias)) {
+    floaty_supervisor.calibrated = true;
+  }
+  if (step % STEPS == CONTROL_PHASE) {
+    return; /* poses wait until the controller has run, as they do in the laboratory: it may see them in 1 to 11 ms */
+  }
+  while (xQueueReceive(pose_queue, &pose, 0) == pdTRUE) {
+    file_pose(&pose, step);
+  }
+}
+
+/* Angles in radians and pitch nose down positive, as everywhere in Floaty; the firmware only logs them. */
+static void tell_state(state_t *state, stabilizerStep_t step) {
+  const float *now = floaty_estimator.now;
+  const float cr = cosf(0.5f * now[6]), sr = sinf(0.5f * now[6]);
+  const float cp = cosf(0.5f * now[7]), sp = sinf(0.5f * now[7]);
+  const float cy = cosf(0.5f * now[8]), sy = sinf(0.5f * now[8]);
+  state->position.timestamp = step;
+  state->position.x = now[0];
+  state->position.y = now[1];
+  state->position.z = now[2];
+  state->velocity.timestamp = step;
+  state->velocity.x = now[3];
+  state->velocity.y = now[4];
+  state->velocity.z = now[5];
+  state->attitude.timestamp = step;
+  state->attitude.roll = now[6];
+  state->attitude.pitch = now[7];
+  state->attitude.yaw = now[8];
+  state->attitudeQuaternion.w = cr * cp * cy + sr * sp * sy;
+  state->attitudeQuaternion.x = sr * cp * cy - cr * sp * sy;
+  state->attitudeQuaternion.y = cr * sp * cy + sr * cp * sy;
+  state->attitudeQuaternion.z = cr * cp * sy - sr * sp * cy;
+}
+
+static void observe(void) {
+  const FloatyEstimator *e = &floaty_estimator;
+  const int32_t rejected = e->refused + e->too_old + e->invalid;
+  for (int i = 0; i < 4; i++) {
+    floaty_observed.flap[i] = e->now[12 + i] + (floaty_control.flap[i] - floaty_control.command[i]);
+  }
+  floaty_observed.age = (uint16_t)(e->pose_age_us / 100);
+  floaty_observed.rejected = (uint16_t)rejected;
+  floaty_observed.poses = (uint16_t)(e->fused + e->jumps + rejected);
+}
+
+void estimatorOutOfTreeInit(void) {
+  start();
+  floaty_requests.reset = true;
+  gyro_raw[0] = logGetVarId("gyro", "xRaw");
+  gyro_raw[1] = logGetVarId("gyro", "yRaw");
+  gyro_raw[2] = logGetVarId("gyro", "zRaw");
+}
+
+bool estimatorOutOfTreeTest(void) {
+  return LOG_VARID_IS_VALID(gyro_raw[0]) && LOG_VARID_IS_VALID(gyro_raw[1]) && LOG_VARID_IS_VALID(gyro_raw[2]);
+}
+
+void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
+  if (asked(&floaty_requests.reset)) {
+    floaty_core_reset(&floaty_parameters, &floaty_estimator);
+  }
+  take_measurements(stabilizerStep);
+  if (stabilizerStep % STEPS != ESTIMATOR_PHASE) {
+    return;
+  }
+  floaty_core_estimate(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control);
+  memset(floaty_input.gyro_sum, 0, sizeof floaty_input.gyro_sum);
+  floaty_input.gyro_samples = 0;
+  tell_state(state, stabilizerStep);
+  observe();
+}
+
+/* The controller, in the stabilizer task */
+
+static void serve_requests(int64_t now) {
+  if (asked(&floaty_requests.recover)) {
+    floaty_supervisor_recover(&floaty_supervisor, now);
+  }
+  if (asked(&floaty_requests.arm)) {
+    floaty_supervisor_arm(&floaty_supervisor, true);
+  }
+  if (asked(&floaty_requests.disarm)) {
+    floaty_supervisor_arm(&floaty_supervisor, false);
+  }
+  if (asked(&floaty_requests.feed_watchdog)) {
+    floaty_supervisor_feed_watchdog(&floaty_supervisor, now);
+  }
+  if (asked(&floaty_requests.stop) || supervisorIsLocked()) { /* or the firmware's own emergency stop */
+    floaty_supervisor.stopped = true;
+  }
+}
+
+void controllerOutOfTreeInit(void) {
+  start();
+}
+
+bool controllerOutOfTreeTest(void) {
+  return true;
+}
+
+void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const sensorData_t *sensors,
+                         const state_t *state, const stabilizerStep_t stabilizerStep) {
+  const int64_t now = now_us();
+  (void)setpoint;
+  (void)sensors;
+  (void)state;
+  memset(control, 0, sizeof *control); /* no motors */
+  serve_requests(now);
+  if (stabilizerStep % STEPS == CONTROL_PHASE) {
+    floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
+    floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control);
+    floaty_servos_write(floaty_control.count);
+    controlled_tick = xTaskGetTickCount();
+  }
+  if (stabilizerStep % BATTERY_STEPS == 0) {
+    floaty_supervisor_see_battery(&floaty_supervisor, now, (int32_t)(1000.0f * pmGetBatteryVoltage()));
+  }
+}
+
+/* The app's own task: poses from the app channel, the console, and a loop that stands still */
+
+static void hover(void) {
+  static const FloatyInput input; /* mode 0 */
+  FloatyControl control;
+  memset(&control, 0, sizeof control);
+  floaty_core_control(&floaty_parameters, &input, &floaty_estimator, &control);
+  floaty_servos_write(control.count);
+}
+
+static void announce(void) {
+  static const char *const STATES[] = {"calibrating", "waiting", "flying", "failsafe"};
+  static const char *const CAUSES[] = {"",           ", silence",     ", out of bounds", ", emergency stop",
+                                       ", low battery", ", disarmed"};
+  static uint8_t state = FLOATY_CALIBRATING, cause = FLOATY_NONE;
+  const uint8_t new_state = floaty_supervisor.state, new_cause = floaty_supervisor.cause;
+  if (new_state != state || new_cause != cause) {
+    state = new_state;
+    cause = new_cause;
+    DEBUG_PRINT("supervisor: %s%s\n", STATES[state], CAUSES[cause]);
+  }
+}
+
+void appMain(void) {
+  uint8_t data[APPCHANNEL_MTU];
+  bool stale = false;
+
+  floaty_toc_apply();
+  crtpRegisterPortCB(CRTP_PORT_LOCALIZATION, receive_localisation);
+  DEBUG_PRINT("core %s, profile %s %s\n", FLOATY_CORE_VERSION, FLOATY_PROFILE_NAME, floaty_profile_hash);
+  while (true) {
+    const size_t length = appchannelReceiveDataPacket(data, sizeof data, LOOK_MS);
+    if (length > 0) {
+      receive_pose(data, (uint32_t)length);
+    }
+    if (xTaskGetTickCount() - controlled_tick < M2T(STALE_MS)) {
+      stale = false;
+    } else if (!stale) {
+      stale = true;
+      floaty_observed.stale_hovers += 1;
+      hover();
+    }
+    announce();
+  }
+}

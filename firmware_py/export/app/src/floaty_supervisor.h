@@ -1,0 +1,70 @@
+/* Decides, before every controller step, whether the loop may be closed; the same machine as firmware_py/supervisor.py.
+ *
+ * Pure: no firmware API. Time is int64 microseconds and arrives as an argument.
+ */
+#pragma once
+
+#include <stdbool.h>
+#include <stdint.h>
+
+typedef enum {
+  FLOATY_CALIBRATING = 0, /* the gyro's zero is unknown: flaps at hover */
+  FLOATY_WAITING = 1,     /* no pose has come yet: flaps at hover */
+  FLOATY_FLYING = 2,      /* loop closed */
+  FLOATY_FAILSAFE = 3,    /* flaps at hover, see the cause */
+} FloatyState;
+
+typedef enum {
+  FLOATY_NONE = 0,
+  FLOATY_SILENCE = 1,
+  FLOATY_OUT_OF_BOUNDS = 2,
+  FLOATY_EMERGENCY_STOP = 3,
+  FLOATY_LOW_BATTERY = 4,
+  FLOATY_DISARMED = 5,
+} FloatyCause;
+
+typedef enum {
+  FLOATY_MANUAL_OFF = 0,
+  FLOATY_MANUAL_ANGLES = 1, /* angles from outside, whether poses come or not */
+  FLOATY_MANUAL_HOVER = 2,
+} FloatyManual;
+
+typedef struct {
+  int64_t last_pose_us; /* meaningless until `pose_seen` */
+  int64_t battery_good_us;
+  int64_t watchdog_us; /* instant at which the emergency stop watchdog bites; meaningless until `watchdog_fed` */
+  int64_t episode_start_us;
+  int64_t bounded_us;
+  int64_t outside_until_us;
+  int32_t pose_timeout_us;
+  int32_t low_battery_mv;
+  int32_t battery_mv;
+  int32_t bounded; /* the estimator's counter when it was last looked at */
+  uint8_t state;   /* FloatyState */
+  uint8_t cause;   /* FloatyCause */
+  uint8_t manual;  /* FloatyManual */
+  bool calibrated;
+  bool armed;
+  bool pose_seen;
+  bool stopped;
+  bool battery_empty;
+  bool watchdog_fed;
+} FloatySupervisor;
+
+/* Starts calibrating and armed. */
+void floaty_supervisor_init(FloatySupervisor *self, int32_t pose_timeout_us, int32_t low_battery_mv);
+
+/* Returns the core's mode: 0 hover, 1 fly, 2 manual. `bounded` counts how often the estimator was held at a bound. */
+int32_t floaty_supervisor_mode(FloatySupervisor *self, int64_t now_us, int32_t bounded);
+
+/* Starts the emergency stop watchdog, or keeps it from biting for another second. */
+void floaty_supervisor_feed_watchdog(FloatySupervisor *self, int64_t now_us);
+
+/* Arms or disarms; false when the request to arm was refused. */
+bool floaty_supervisor_arm(FloatySupervisor *self, bool armed);
+
+/* Leaves the emergency stop and, with a good voltage, the low battery; false when something remains. */
+bool floaty_supervisor_recover(FloatySupervisor *self, int64_t now_us);
+
+/* Takes in the supply voltage. */
+void floaty_supervisor_see_battery(FloatySupervisor *self, int64_t now_us, int32_t battery_mv);

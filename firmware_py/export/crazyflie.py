@@ -1,0 +1,191 @@
+"""The Crazyflie app around the flight core: a folder that an unmodified crazyflie-firmware checkout builds.
+
+`app/` beside this file holds the sources that are the same for every profile; the core, the profile's constants and the
+table of parameters are written into their places here. `app/README.md` says how the app is built and how it behaves.
+"""
+
+from dataclasses import dataclass
+from math import pi
+from pathlib import Path
+
+from firmware_py.config import (
+    AllocationConfig,
+    ControllerConfig,
+    EstimatorConfig,
+    FirmwareConfig,
+    ModelConfig,
+    PredictorConfig,
+    SupervisorConfig,
+    parameters_of,
+)
+from firmware_py.export.c99 import translate
+from firmware_py.export.errors import ExportError
+from firmware_py.core.subset import f32
+from firmware_py.export.profile_c import profile_source
+from firmware_py.export.reading import float_literal
+from firmware_py.parameters import FLAPS, GAINS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits
+
+TEMPLATES = Path(__file__).parent / "app"
+MARKER = Path("src") / "floaty_app.c"  # a folder with this file is an app and may be written over
+PARAM_TYPES = {"F32": "PARAM_FLOAT", "U16": "PARAM_UINT16", "I16": "PARAM_INT16", "U8": "PARAM_UINT8"}
+C_TYPES = {"F32": "float", "U16": "uint16_t", "I16": "int16_t", "U8": "uint8_t"}
+
+
+@dataclass(frozen=True, slots=True)
+class AppParameter:
+    """A parameter of the TOC: `target` = `scale` times the value that a client sees."""
+
+    name: str  # group.name
+    kind: str  # of the client's value, a key of PARAM_TYPES
+    target: str  # in C
+    target_kind: str
+    initial: float  # as the client sees it
+    low: float
+    high: float
+    scale: float = 1.0
+    persistent: bool = True
+
+    @property
+    def variable(self) -> str:
+        """The C variable that the client writes."""
+        return "seen_" + self.name.replace(".", "_")
+
+
+def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
+    """Return the table of parameters with a profile's values, in the order of the groups."""
+    core = parameters_of(config).fields
+
+    def field(
+        name: str, field: str, section: type, kind: str = "F32", target_kind: str = "F32", sign: int = 1
+    ) -> AppParameter:
+        low, high = sorted(sign * limit for limit in configured_limits(section, field))
+        value = sign * getattr(core, field).item()
+        return AppParameter(
+            name, kind, f"floaty_parameters.{field}", target_kind, value, low, high, scale=sign
+        )
+
+    def target(name: str, index: int, limit: float) -> AppParameter:
+        c = f"floaty_parameters.target[{index}]"
+        return AppParameter(name, "F32", c, "F32", core.target.item(index), -limit, limit, persistent=False)
+
+    def supervision(name: str, key: str, scale: int) -> AppParameter:
+        low, high = configured_limits(SupervisorConfig, key)
+        value = getattr(config.supervisor, key)
+        c = f"floaty_supervisor.{key}"
+        return AppParameter(name, "U16", c, "I32", value // scale, low / scale, high / scale, scale)
+
+    manual = AppParameter(
+        "extCtrl.manual", "U8", "floaty_supervisor.manual", "U8", 0, 0, 2, persistent=False
+    )
+    return (
+        *(
+            field(f"extCtrl.{name}", gain, ControllerConfig, sign=sign)
+            for name, (gain, sign) in GAINS.items()
+        ),
+        manual,
+        *(
+            AppParameter(
+                f"extCtrl.{name}", "F32", f"floaty_input.manual[{i}]", "F32", 0.0, -pi / 2, pi / 2,
+                persistent=False,
+            )
+            for i, name in enumerate(FLAPS)
+        ),
+        target("extCtrl.target_yaw", 3, pi),
+        target("setpoint.X", 0, SETPOINT_LIMIT),
+        target("setpoint.Y", 1, SETPOINT_LIMIT),
+        target("setpoint.Z", 2, SETPOINT_LIMIT),
+        target("setpoint.Yaw", 3, pi),
+        *(
+            AppParameter(
+                f"motorShifts.{name}", "I16", f"floaty_parameters.trim[{i}]", "F32",
+                int(core.trim.item(i)), -TRIM_LIMIT, TRIM_LIMIT,
+            )
+            for i, name in enumerate(FLAPS)
+        ),
+        field("RandConsts.flapHoverAng", "hover_angle", AllocationConfig),
+        field("RandConsts.flapTimeConst", "flap_rate", ModelConfig),
+        AppParameter(
+            "delayComp.activate", "U8", "floaty_parameters.predict", "I32", core.predict.item(), 0, 1
+        ),
+        field("delayComp.horizon", "horizon", PredictorConfig, "U8", "I32"),
+        field("FloatyKalm.maxPos", "bound_position", EstimatorConfig),
+        field("FloatyKalm.maxVel", "bound_velocity", EstimatorConfig),
+        supervision("supervisor.poseTimeout", "pose_timeout_us", 1000),
+        supervision("supervisor.lowBattery", "low_battery_mv", 1),
+    )  # fmt: skip
+
+
+def app_files(config: FirmwareConfig, profile: str) -> dict[str, str]:
+    """Return the texts of the app's files by their paths in it; `profile` is the name that the board shows."""
+    files = {
+        path.relative_to(TEMPLATES).as_posix(): path.read_text("utf-8")
+        for path in sorted(TEMPLATES.rglob("*"))
+        if path.is_file()
+    }
+    core = translate()
+    files["src/floaty_core.h"] = core.header
+    files["src/floaty_core.c"] = core.source
+    files["src/floaty_profile.c"] = profile_source(config)
+    files["src/floaty_settings.h"] = _settings(config, profile)
+    files["src/floaty_toc.c"] = _toc(files["src/floaty_toc.c"], app_parameters(config))
+    return files
+
+
+def write_app(config: FirmwareConfig, profile: str, folder: Path) -> tuple[Path, ...]:
+    """Write the app and return its files; `ExportError` when the folder holds something else, or cannot be written."""
+    files = app_files(config, profile)
+    try:
+        if folder.exists() and any(folder.iterdir()) and not (folder / MARKER).is_file():
+            raise ExportError(f"{folder}: neither empty nor an app of Floaty: nothing is written there")
+        for name, text in files.items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, "utf-8")
+    except OSError as error:
+        raise ExportError(f"{folder}: {error.strerror or error}") from None
+    return tuple(folder / name for name in files)
+
+
+def _settings(config: FirmwareConfig, profile: str) -> str:
+    """Return the header with what the profile says beyond the core's parameters."""
+    name = profile.replace("\\", "/").replace('"', "'")
+    return (
+        "/* What the profile says beyond the parameters of the core. */\n"
+        "#pragma once\n\n"
+        f'#define FLOATY_PROFILE_NAME "{name}"\n'
+        f"#define FLOATY_POSE_TIMEOUT_US {config.supervisor.pose_timeout_us}\n"
+        f"#define FLOATY_LOW_BATTERY_MV {config.supervisor.low_battery_mv}\n"
+    )
+
+
+def _number(value: float) -> str:
+    """Return a float32 constant of C."""
+    return float_literal(f32(value))
+
+
+def _value(parameter: AppParameter) -> str:
+    return _number(parameter.initial) if parameter.kind == "F32" else str(int(parameter.initial))
+
+
+def _toc(template: str, parameters: tuple[AppParameter, ...]) -> str:
+    """Return the table of parameters in C."""
+    variables = [f"static {C_TYPES[p.kind]} {p.variable} = {_value(p)};" for p in parameters]
+    table = [
+        f"  {{&{p.variable}, &{p.target}, {_number(p.scale)}, {_number(p.low)}, {_number(p.high)}, "
+        f"{_number(p.initial)}, KIND_{p.kind}, KIND_{p.target_kind}}},"
+        for p in parameters
+    ]
+    groups: dict[str, list[str]] = {}
+    for p in parameters:
+        group, name = p.name.split(".")
+        flags = PARAM_TYPES[p.kind] + (" | PARAM_PERSISTENT" if p.persistent else "")
+        line = f"PARAM_ADD_WITH_CALLBACK({flags}, {name}, &{p.variable}, floaty_toc_apply)"
+        groups.setdefault(group, []).append(line)
+    blocks = [
+        "\n".join((f"PARAM_GROUP_START({group})", *lines, f"PARAM_GROUP_STOP({group})"))
+        for group, lines in groups.items()
+    ]
+    texts = {"variables": "\n".join(variables), "table": "\n".join(table), "groups": "\n\n".join(blocks)}
+    for marker, text in texts.items():
+        template = template.replace(f"/* @{marker} */", text)
+    return template
