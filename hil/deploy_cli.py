@@ -164,7 +164,6 @@ def _read(source: Path) -> str:
 def export(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
     """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the folder DIR."""
     from firmware_py.export.crazyflie import write_app
-
     from firmware_py.export.errors import ExportError
     from hil.config import load_config
 
