@@ -67,7 +67,7 @@ class Laboratory:
         self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
         self.counts: list[int] = []
         config = load_config()
-        costs = {name: 0 for name in type(config.cpu).model_fields}
+        costs = dict.fromkeys(type(config.cpu).model_fields, 0)
         self.firmware = Firmware(config.model_copy(update={"cpu": config.cpu.model_copy(update=costs)}), self)
         self.parameters = {parameter.name: parameter for parameter in self.firmware.parameters}
 
@@ -132,7 +132,12 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
     events[5603] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
     events[6009] += [pose(header + b"\x04")]  # emergency stop watchdog, not fed again
     events[7301] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
-    for name, value in (("extCtrl.x_P", 3.5), ("extCtrl.y_P", 99.0), ("setpoint.Z", 0.2), ("motorShifts.m2", -4000)):
+    for name, value in (
+        ("extCtrl.x_P", 3.5),
+        ("extCtrl.y_P", 99.0),
+        ("setpoint.Z", 0.2),
+        ("motorShifts.m2", -4000),
+    ):
         events[2505].append(
             lambda app, lab, name=name, value=value: (app.set(name, value), lab.parameters[name].set(value))
         )  # type: ignore[list-item]
@@ -274,7 +279,9 @@ def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App
 
 
 @given(data=st.data())
-def test_the_board_takes_just_the_parameter_values_that_the_laboratory_takes(functions: App, data: st.DataObject) -> None:
+def test_the_board_takes_just_the_parameter_values_that_the_laboratory_takes(
+    functions: App, data: st.DataObject
+) -> None:
     laboratory = LABORATORY
     names = sorted(name for name in functions.params if name in laboratory.parameters)
     name = data.draw(st.sampled_from(names))
@@ -328,7 +335,9 @@ OPERATIONS = st.one_of(
 
 
 @given(st.lists(OPERATIONS, max_size=60))
-def test_supervisor_decides_as_the_laboratorys(functions: App, operations: list[tuple[str, int, int]]) -> None:
+def test_supervisor_decides_as_the_laboratorys(
+    functions: App, operations: list[tuple[str, int, int]]
+) -> None:
     config = SupervisorConfig(pose_timeout_us=500_000, low_battery_mv=3200)
     estimator = SimpleNamespace(bounded=0)
     python = reference.Supervisor(config, estimator, lambda text: None)
@@ -369,7 +378,11 @@ FLOATS = st.floats(width=32) | st.floats(-1.25, 1.25, width=32)
 
 @given(
     st.binary(max_size=31)
-    | st.builds(lambda floats, rest: struct.pack("<B7f", 8, *floats) + rest, st.lists(FLOATS, min_size=7, max_size=7), st.binary(max_size=2))
+    | st.builds(
+        lambda floats, rest: struct.pack("<B7f", 8, *floats) + rest,
+        st.lists(FLOATS, min_size=7, max_size=7),
+        st.binary(max_size=2),
+    )
 )
 def test_poses_are_read_as_the_laboratory_reads_them(functions: App, data: bytes) -> None:
     here = Pose()
@@ -395,7 +408,10 @@ def test_the_gyros_zero_is_that_of_the_laboratory(functions: App, noise: float) 
     for _ in range(1600):
         sample = [int(v) for v in np.clip(rng.normal((40, -3, 7), noise + 1e-9), -32768, 32767)]
         expected = there.bias is None and there.add((*sample, 0, 0, 0))  # type: ignore[arg-type]
-        assert functions.c.floaty_gyro_zero_add(ctypes.byref(here), (ctypes.c_int32 * 3)(*sample), bias) == expected
+        assert (
+            functions.c.floaty_gyro_zero_add(ctypes.byref(here), (ctypes.c_int32 * 3)(*sample), bias)
+            == expected
+        )
     assert tuple(bias) == (there.bias or (0.0, 0.0, 0.0))
     assert here.windows_refused == there.windows_refused
 
@@ -405,7 +421,9 @@ def test_the_gyros_zero_is_that_of_the_laboratory(functions: App, noise: float) 
 
 def test_only_an_empty_folder_or_an_app_is_written_to(tmp_path: Path) -> None:
     config = load_config()
-    assert len(write_app(config, "floaty", tmp_path / "new")) == len(write_app(config, "floaty", tmp_path / "new"))
+    assert len(write_app(config, "floaty", tmp_path / "new")) == len(
+        write_app(config, "floaty", tmp_path / "new")
+    )
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     with pytest.raises(ExportError, match="neither empty nor an app"):
@@ -431,15 +449,21 @@ def arm_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("arm")
     write_app(load_config(), "floaty", folder)
     sources = sorted(path.name for path in (folder / "src").glob("*.c"))
-    subprocess.run((ARM, *ARM_FLAGS, "-fcallgraph-info=su", f"-I{STUBS}", "-c", *sources), cwd=folder / "src", check=True)
+    subprocess.run(
+        (ARM, *ARM_FLAGS, "-fcallgraph-info=su", f"-I{STUBS}", "-c", *sources), cwd=folder / "src", check=True
+    )
     return folder / "src"
 
 
 def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) -> None:
     objects = sorted(map(str, arm_build.glob("*.o")))
-    lines = subprocess.run(("arm-none-eabi-size", "-t", *objects), capture_output=True, text=True, check=True).stdout
+    lines = subprocess.run(
+        ("arm-none-eabi-size", "-t", *objects), capture_output=True, text=True, check=True
+    ).stdout
     text, data, bss = map(int, lines.splitlines()[-1].split()[:3])
-    sections = subprocess.run(("arm-none-eabi-objdump", "-h", *objects), capture_output=True, text=True, check=True).stdout
+    sections = subprocess.run(
+        ("arm-none-eabi-objdump", "-h", *objects), capture_output=True, text=True, check=True
+    ).stdout
     print(f"flash {text + data} B, RAM {data + bss} B, deepest stack {deepest_stack(arm_build)} B")
     assert text + data < 20_000
     assert data + bss < 10_000
@@ -455,8 +479,12 @@ def test_the_core_on_arm_neither_fuses_nor_computes_in_double(arm_build: Path) -
     assert "vsqrt.f32" in code
     assert not re.findall(r"vfn?m[as]\.", code)
     everything = sorted(map(str, arm_build.glob("*.o")))
-    symbols = subprocess.run(("arm-none-eabi-nm", "-u", *everything), capture_output=True, text=True, check=True).stdout
-    assert not re.findall(r"__aeabi_[dfl]?2?d\w*", symbols.replace("__aeabi_ldivmod", "").replace("__aeabi_idiv", ""))
+    symbols = subprocess.run(
+        ("arm-none-eabi-nm", "-u", *everything), capture_output=True, text=True, check=True
+    ).stdout
+    assert not re.findall(
+        r"__aeabi_[dfl]?2?d\w*", symbols.replace("__aeabi_ldivmod", "").replace("__aeabi_idiv", "")
+    )
 
 
 def deepest_stack(folder: Path) -> dict[str, int]:
@@ -473,7 +501,9 @@ def deepest_stack(folder: Path) -> dict[str, int]:
             calls[caller].add(callee)
 
     def depth(name: str) -> int:
-        return frames.get(name, 0) + max((depth(callee) for callee in calls[name] if callee in frames), default=0)
+        return frames.get(name, 0) + max(
+            (depth(callee) for callee in calls[name] if callee in frames), default=0
+        )
 
     return {name.split(":")[-1]: depth(name) for name in frames}
 
