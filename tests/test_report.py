@@ -105,7 +105,9 @@ def keep_rows(folder: Path, count: int) -> None:
 
 def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
     result, rows = read_result(folder), report(folder).tables["metrics"][1:]
-    assert {row[0] for row in rows} == {name for name, value in result["metrics"].items() if value is not None}
+    assert {row[0] for row in rows} == {
+        name for name, value in result["metrics"].items() if value is not None
+    }
     assert {verdict["metric"] for verdict in result["verdicts"]} <= {row[0] for row in rows} <= set(METRICS)
     told = {row[0]: row for row in rows}
     for verdict in result["verdicts"]:
