@@ -18,7 +18,8 @@ from firmware_py.core import structs
 from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import C_TYPES, FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.locals import find_writes
-from firmware_py.export.reading import SHARED, Constant, Kernel, Module, StructType, read_modules
+from firmware_py.export.reading import read_modules
+from firmware_py.export.syntax import SHARED, Constant, Kernel, Module, StructType
 
 __all__ = ["ExportError", "Translation", "core_texts", "translate"]
 
