@@ -201,7 +201,6 @@ class CortexM4Runner:
         return b"".join([memory.tobytes() for memory in self._here])
 
     def _execute(self, name: str) -> None:
-        self._ahead = None
         for here, there in zip(self._here, self._there, strict=True):
             there[:] = here
         self._cpu.reg_write_batch(self._registers[name])
