@@ -21,7 +21,7 @@ from hil.recorder import load_log
 from hil.run import read_result
 
 PICTURE, PAGE = "compare.png", "compare.html"
-ORIGIN = ("experiment", "profile", "seed", "duration_s", "link", "outcome", "commit")  # of a result
+ORIGIN = ("experiment", "profile", "seed", "duration_s", "link", "board", "outcome", "commit")  # of a result
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,9 +43,9 @@ def test_the_costs_of_the_profile_are_what_the_machine_code_takes(tmp_path: Path
     assert python.usage is None
     assert result.usage is not None
     cpu, entries = result.request.config.cpu, result.usage.entries
-    assert entries["estimate"].worst_us + entries["file_pose"].worst_us <= cpu.estimator_us
-    assert entries["estimate"].worst_us > 0.95 * cpu.estimator_us
-    assert cpu.controller_us - 1 < entries["control"].worst_us <= cpu.controller_us
+    estimator_us = entries["estimate"].worst_us + entries["file_pose"].worst_us
+    assert estimator_us == pytest.approx(cpu.estimator_us, rel=0.1)  # another version of ziglang may differ
+    assert entries["control"].worst_us == pytest.approx(cpu.controller_us, rel=0.2)
     steps = entries["estimate"].calls
     assert steps == entries["control"].calls == round((DURATION_S + 1) * 100)
     assert (
@@ -63,9 +63,7 @@ def test_measured_costs_are_the_processor_time_of_the_tasks(tmp_path: Path) -> N
     estimator_us = (entries["estimate"].cycles + entries["file_pose"].cycles) / 168
     assert estimator_us <= spent["KALMAN"] <= estimator_us + steps  # each call is rounded up
     assert (
-        entries["control"].cycles / 168 - 100
-        <= spent["STABILIZER"]
-        <= entries["control"].cycles / 168 + steps
+        entries["control"].cycles / 168 - 10 <= spent["STABILIZER"] <= entries["control"].cycles / 168 + steps
     )
 
 

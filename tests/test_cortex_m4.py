@@ -6,7 +6,7 @@ Bits are compared with Python; instructions and cycles with capstone's reading o
 import re
 from collections import Counter, OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import capstone
@@ -237,6 +237,14 @@ def test_what_was_seen_ahead_is_forgotten_when_the_inputs_change(image: Image) -
     runner.estimate()
     other.estimate()
     assert memory(blocks) == memory(direct)
+
+
+def test_code_that_goes_astray_is_stopped(image: Image) -> None:
+    _, runner = started(
+        replace(image, entries={**image.entries, "control": (FLASH + len(image.code) + 2) | 1})
+    )
+    with pytest.raises(ExportError, match="control stopped at 0x0800"):
+        runner.control()
 
 
 def test_the_core_leaves_room_on_the_board(image: Image) -> None:

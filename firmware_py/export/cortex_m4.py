@@ -25,6 +25,7 @@ RAM_SIZE = 0x8000
 STACK_TOP = RAM + RAM_SIZE  # full descending
 STACK_PATTERN = 0xA5
 ALIGNMENT = 16
+UNDEFINED = b"\xde"  # two of them are UDF: whoever goes astray in empty flash is stopped
 LANDING = FLASH + FLASH_SIZE - 16  # where a call returns to, and stops
 
 
@@ -103,7 +104,7 @@ class CortexM4Runner:
         )
         self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
         self._cpu.mem_map(FLASH, FLASH_SIZE, unicorn_const.UC_PROT_READ | unicorn_const.UC_PROT_EXEC)
-        self._cpu.mem_write(FLASH, image.code)
+        self._cpu.mem_write(FLASH, image.code.ljust(FLASH_SIZE, UNDEFINED))
         self._ram = np.frombuffer(mmap.mmap(-1, RAM_SIZE), np.uint8)
         self._ram[:] = STACK_PATTERN
         ram = self._ram.ctypes.data
@@ -201,7 +202,6 @@ class CortexM4Runner:
         return b"".join([memory.tobytes() for memory in self._here])
 
     def _execute(self, name: str) -> None:
-        self._ahead = None
         for here, there in zip(self._here, self._there, strict=True):
             there[:] = here
         self._cpu.reg_write_batch(self._registers[name])
