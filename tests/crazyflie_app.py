@@ -12,6 +12,8 @@ from firmware_py.export.native import compilers
 from hil.config import load_config
 
 STUBS = Path(__file__).parent / "stubs"
+TIMER_REGISTERS = "CR1 CR2 SMCR DIER SR EGR CCMR1 CCMR2 CCER CNT PSC ARR RCR CCR1 CCR2 CCR3 CCR4"
+PIN_REGISTERS = "MODER OTYPER OSPEEDR PUPDR IDR ODR BSRR LCKR"
 LOCALISATION = 6
 GENERIC = 1
 
@@ -56,17 +58,14 @@ class GyroZero(ctypes.Structure):
 class Timer(ctypes.Structure):
     """TIM_TypeDef, its registers in their order."""
 
-    _fields_ = tuple(
-        (name, ctypes.c_uint32)
-        for name in "CR1 CR2 SMCR DIER SR EGR CCMR1 CCMR2 CCER CNT PSC ARR RCR CCR1 CCR2 CCR3 CCR4".split()
-    )
+    _fields_ = tuple((name, ctypes.c_uint32) for name in TIMER_REGISTERS.split())
 
 
 class Pins(ctypes.Structure):
     """GPIO_TypeDef."""
 
     _fields_ = (
-        *((name, ctypes.c_uint32) for name in "MODER OTYPER OSPEEDR PUPDR IDR ODR BSRR LCKR".split()),
+        *((name, ctypes.c_uint32) for name in PIN_REGISTERS.split()),
         ("AFR", ctypes.c_uint32 * 2),
     )
 
@@ -74,14 +73,28 @@ class Pins(ctypes.Structure):
 def build_app(folder: Path) -> Path:
     """Export the app of the default profile and return it as a shared library."""
     write_app(load_config(), "floaty", folder)
-    compiler = min(compilers(), key=lambda one: one.name == "zig")  # the system's, if there is one: it is faster
+    compiler = min(
+        compilers(), key=lambda one: one.name == "zig"
+    )  # the system's, if there is one: it is faster
     sources = sorted((folder / "src").glob("*.c"))
     library = folder / "app.so"
-    flags = ("-std=gnu11", "-O1", "-Wall", "-Werror", "-Wdouble-promotion", "-fno-math-errno", "-shared", "-fPIC")
+    flags = (
+        "-std=gnu11",
+        "-O1",
+        "-Wall",
+        "-Werror",
+        "-Wdouble-promotion",
+        "-fno-math-errno",
+        "-shared",
+        "-fPIC",
+    )
     zig = ("-fno-sanitize=all", "-Wl,--no-gc-sections") if compiler.name == "zig" else ()
     caches = {name: str(folder / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
     subprocess.run(
-        (*compiler.command, *flags, *zig, "-I", str(STUBS), "-o", str(library), *map(str, sources), str(STUBS / "board.c"), "-lm"),
+        (
+            *compiler.command, *flags, *zig, "-I", str(STUBS), "-o", str(library),
+            *map(str, sources), str(STUBS / "board.c"), "-lm",
+        ),
         check=True, env=os.environ | caches,
     )  # fmt: skip
     return library

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from crazyflie_app import STUBS, App, GyroZero, Pose, Supervisor, build_app
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from firmware_py import supervisor as reference
@@ -30,10 +30,11 @@ from hil.config import load_config
 
 ARM = "arm-none-eabi-gcc"
 ARM_FLAGS = (  # of the Crazyflie firmware
-    "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -std=gnu11 -Os -g3 -Wall -Wmissing-braces "
-    "-fno-strict-aliasing -ffunction-sections -fdata-sections -Wdouble-promotion -Werror -fno-math-errno "
-    "-fno-delete-null-pointer-checks"
-).split()
+    "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-std=gnu11", "-Os", "-g3", "-Wall",
+    "-Wmissing-braces", "-fno-strict-aliasing", "-ffunction-sections", "-fdata-sections", "-Wdouble-promotion",
+    "-Werror", "-fno-math-errno", "-fno-delete-null-pointer-checks",
+)  # fmt: skip
+BIAS = np.array((12, -7, 3))  # [counts]
 STABILIZER_STACK = 3 * 150 * 4  # [B] of the task that calls the hooks, in an unmodified firmware
 
 
@@ -67,7 +68,7 @@ class Laboratory:
         self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
         self.counts: list[int] = []
         config = load_config()
-        costs = {name: 0 for name in type(config.cpu).model_fields}
+        costs = dict.fromkeys(type(config.cpu).model_fields, 0)
         self.firmware = Firmware(config.model_copy(update={"cpu": config.cpu.model_copy(update=costs)}), self)
         self.parameters = {parameter.name: parameter for parameter in self.firmware.parameters}
 
@@ -112,7 +113,7 @@ def pose(data: bytes) -> Event:
 
 
 def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
-    """Poses at 50 Hz along a walk with ages, without, too old, garbage and jumps of the goal, one out of bounds; silence and stops."""
+    """Poses at 50 Hz along a walk: with ages, without, too old, garbage, jumps, out of bounds; silence and stops."""
     events: dict[int, list[Event]] = defaultdict(list)
     p = np.zeros(3)
     for step in range(600, steps, 20):
@@ -126,13 +127,19 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
         data = crtp.encode_ext_pose(tuple(p), q, None if rng.random() < 0.1 else age_us)
         if rng.random() < 0.03:
             data = data[:2] + bytes(29)
-        events[step + int(rng.integers(0, 20))].append(pose(data))
+        just_before_control = step in (600, 3800)  # the first one, and the one that ends the silence
+        events[step + (0 if just_before_control else int(rng.integers(0, 20)))].append(pose(data))
     header = bytes((crtp.header(6, 1),))
     events[5207] = [pose(header + b"\x03")]  # emergency stop
     events[5603] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
     events[6009] += [pose(header + b"\x04")]  # emergency stop watchdog, not fed again
     events[7301] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
-    for name, value in (("extCtrl.x_P", 3.5), ("extCtrl.y_P", 99.0), ("setpoint.Z", 0.2), ("motorShifts.m2", -4000)):
+    for name, value in (
+        ("extCtrl.x_P", 3.5),
+        ("extCtrl.y_P", 99.0),
+        ("setpoint.Z", 0.2),
+        ("motorShifts.m2", -4000),
+    ):
         events[2505].append(
             lambda app, lab, name=name, value=value: (app.set(name, value), lab.parameters[name].set(value))
         )  # type: ignore[list-item]
@@ -150,7 +157,7 @@ def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -
         before_us = (step - 1) * 1000
         if step > 700:
             rates = 0.98 * rates + rng.normal(0, 30, 3)
-        sample = [int(v) for v in np.rint(rates + (12, -7, 3) + rng.normal(0, 2, 3))]
+        sample = [int(v) for v in np.rint(rates + BIAS + rng.normal(0, 2, 3))]
         laboratory.imu = (*sample, 0, 0, 1365)  # type: ignore[assignment]
         app.gyro[:] = sample
         laboratory.battery_mv = 3000 if step > 3500 else 3900
@@ -274,7 +281,9 @@ def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App
 
 
 @given(data=st.data())
-def test_the_board_takes_just_the_parameter_values_that_the_laboratory_takes(functions: App, data: st.DataObject) -> None:
+def test_the_board_takes_just_the_parameter_values_that_the_laboratory_takes(
+    functions: App, data: st.DataObject
+) -> None:
     laboratory = LABORATORY
     names = sorted(name for name in functions.params if name in laboratory.parameters)
     name = data.draw(st.sampled_from(names))
@@ -315,7 +324,8 @@ def test_log_variables_have_names_of_the_laboratory(app: App) -> None:
 # The pure parts against their Python originals
 
 OPERATIONS = st.one_of(
-    st.tuples(st.just("mode"), st.integers(0, 300_000), st.integers(0, 3)),
+    st.tuples(st.just("mode"), st.integers(0, 600_000), st.integers(0, 1)),
+    st.tuples(st.just("bounded"), st.sampled_from([10_000, 49_000, 50_000, 51_000]), st.integers(1, 24)),
     st.tuples(st.just("pose"), st.integers(0, 300_000), st.just(0)),
     st.tuples(st.just("calibrated"), st.just(0), st.just(0)),
     st.tuples(st.just("stop"), st.just(0), st.just(0)),
@@ -327,19 +337,32 @@ OPERATIONS = st.one_of(
 )
 
 
+FLIGHT = [("calibrated", 0, 0), ("pose", 0, 0)]
+
+
+@example([*FLIGHT, ("bounded", 10_000, 24), ("pose", 0, 0), *[("mode", 50_000, 0)] * 11])
+@example([*FLIGHT, ("bounded", 50_000, 7), *[("mode", 50_000, 0)] * 2])
+@example([*FLIGHT, ("bounded", 51_000, 7), *[("mode", 50_000, 0)] * 2])
 @given(st.lists(OPERATIONS, max_size=60))
-def test_supervisor_decides_as_the_laboratorys(functions: App, operations: list[tuple[str, int, int]]) -> None:
+def test_supervisor_decides_as_the_laboratorys(
+    functions: App, operations: list[tuple[str, int, int]]
+) -> None:
     config = SupervisorConfig(pose_timeout_us=500_000, low_battery_mv=3200)
     estimator = SimpleNamespace(bounded=0)
     python = reference.Supervisor(config, estimator, lambda text: None)
     c, here = functions.c, Supervisor()
     c.floaty_supervisor_init(ctypes.byref(here), config.pose_timeout_us, config.low_battery_mv)
     now = 0
-    for name, wait_us, value in operations:
+    steps = (
+        step
+        for name, wait_us, value in operations
+        for step in ([("mode", wait_us, 1)] * value if name == "bounded" else [(name, wait_us, value)])
+    )
+    for name, wait_us, value in steps:
         now += wait_us
         this = ctypes.byref(here)
         if name == "mode":
-            estimator.bounded += value // 2
+            estimator.bounded += value
             assert c.floaty_supervisor_mode(this, now, estimator.bounded) == python.mode(now)
             assert (here.state, here.cause) == (python.state, python.cause)
         elif name == "pose":
@@ -369,7 +392,11 @@ FLOATS = st.floats(width=32) | st.floats(-1.25, 1.25, width=32)
 
 @given(
     st.binary(max_size=31)
-    | st.builds(lambda floats, rest: struct.pack("<B7f", 8, *floats) + rest, st.lists(FLOATS, min_size=7, max_size=7), st.binary(max_size=2))
+    | st.builds(
+        lambda floats, rest: struct.pack("<B7f", 8, *floats) + rest,
+        st.lists(FLOATS, min_size=7, max_size=7),
+        st.binary(max_size=2),
+    )
 )
 def test_poses_are_read_as_the_laboratory_reads_them(functions: App, data: bytes) -> None:
     here = Pose()
@@ -395,7 +422,10 @@ def test_the_gyros_zero_is_that_of_the_laboratory(functions: App, noise: float) 
     for _ in range(1600):
         sample = [int(v) for v in np.clip(rng.normal((40, -3, 7), noise + 1e-9), -32768, 32767)]
         expected = there.bias is None and there.add((*sample, 0, 0, 0))  # type: ignore[arg-type]
-        assert functions.c.floaty_gyro_zero_add(ctypes.byref(here), (ctypes.c_int32 * 3)(*sample), bias) == expected
+        assert (
+            functions.c.floaty_gyro_zero_add(ctypes.byref(here), (ctypes.c_int32 * 3)(*sample), bias)
+            == expected
+        )
     assert tuple(bias) == (there.bias or (0.0, 0.0, 0.0))
     assert here.windows_refused == there.windows_refused
 
@@ -405,12 +435,14 @@ def test_the_gyros_zero_is_that_of_the_laboratory(functions: App, noise: float) 
 
 def test_only_an_empty_folder_or_an_app_is_written_to(tmp_path: Path) -> None:
     config = load_config()
-    assert len(write_app(config, "floaty", tmp_path / "new")) == len(write_app(config, "floaty", tmp_path / "new"))
+    assert len(write_app(config, "floaty", tmp_path / "new")) == len(
+        write_app(config, "floaty", tmp_path / "new")
+    )
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     with pytest.raises(ExportError, match="neither empty nor an app"):
         write_app(config, "floaty", tmp_path / "full")
-    with pytest.raises(ExportError, match="thesis.tex"):
+    with pytest.raises(ExportError, match=r"thesis\.tex"):
         write_app(config, "floaty", tmp_path / "full" / "thesis.tex")
 
 
@@ -431,15 +463,21 @@ def arm_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("arm")
     write_app(load_config(), "floaty", folder)
     sources = sorted(path.name for path in (folder / "src").glob("*.c"))
-    subprocess.run((ARM, *ARM_FLAGS, "-fcallgraph-info=su", f"-I{STUBS}", "-c", *sources), cwd=folder / "src", check=True)
+    subprocess.run(
+        (ARM, *ARM_FLAGS, "-fcallgraph-info=su", f"-I{STUBS}", "-c", *sources), cwd=folder / "src", check=True
+    )
     return folder / "src"
 
 
 def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) -> None:
     objects = sorted(map(str, arm_build.glob("*.o")))
-    lines = subprocess.run(("arm-none-eabi-size", "-t", *objects), capture_output=True, text=True, check=True).stdout
+    lines = subprocess.run(
+        ("arm-none-eabi-size", "-t", *objects), capture_output=True, text=True, check=True
+    ).stdout
     text, data, bss = map(int, lines.splitlines()[-1].split()[:3])
-    sections = subprocess.run(("arm-none-eabi-objdump", "-h", *objects), capture_output=True, text=True, check=True).stdout
+    sections = subprocess.run(
+        ("arm-none-eabi-objdump", "-h", *objects), capture_output=True, text=True, check=True
+    ).stdout
     print(f"flash {text + data} B, RAM {data + bss} B, deepest stack {deepest_stack(arm_build)} B")
     assert text + data < 20_000
     assert data + bss < 10_000
@@ -455,8 +493,12 @@ def test_the_core_on_arm_neither_fuses_nor_computes_in_double(arm_build: Path) -
     assert "vsqrt.f32" in code
     assert not re.findall(r"vfn?m[as]\.", code)
     everything = sorted(map(str, arm_build.glob("*.o")))
-    symbols = subprocess.run(("arm-none-eabi-nm", "-u", *everything), capture_output=True, text=True, check=True).stdout
-    assert not re.findall(r"__aeabi_[dfl]?2?d\w*", symbols.replace("__aeabi_ldivmod", "").replace("__aeabi_idiv", ""))
+    symbols = subprocess.run(
+        ("arm-none-eabi-nm", "-u", *everything), capture_output=True, text=True, check=True
+    ).stdout
+    assert not re.findall(
+        r"__aeabi_[dfl]?2?d\w*", symbols.replace("__aeabi_ldivmod", "").replace("__aeabi_idiv", "")
+    )
 
 
 def deepest_stack(folder: Path) -> dict[str, int]:
@@ -473,7 +515,9 @@ def deepest_stack(folder: Path) -> dict[str, int]:
             calls[caller].add(callee)
 
     def depth(name: str) -> int:
-        return frames.get(name, 0) + max((depth(callee) for callee in calls[name] if callee in frames), default=0)
+        return frames.get(name, 0) + max(
+            (depth(callee) for callee in calls[name] if callee in frames), default=0
+        )
 
     return {name.split(":")[-1]: depth(name) for name in frames}
 

@@ -18,9 +18,9 @@ from firmware_py.config import (
     SupervisorConfig,
     parameters_of,
 )
+from firmware_py.core.subset import f32
 from firmware_py.export.c99 import translate
 from firmware_py.export.errors import ExportError
-from firmware_py.core.subset import f32
 from firmware_py.export.profile_c import profile_source
 from firmware_py.export.reading import float_literal
 from firmware_py.parameters import FLAPS, GAINS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits
@@ -74,9 +74,7 @@ def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
         c = f"floaty_supervisor.{key}"
         return AppParameter(name, "U16", c, "I32", value // scale, low / scale, high / scale, scale)
 
-    manual = AppParameter(
-        "extCtrl.manual", "U8", "floaty_supervisor.manual", "U8", 0, 0, 2, persistent=False
-    )
+    manual = AppParameter("extCtrl.manual", "U8", "floaty_supervisor.manual", "U8", 0, 0, 2, persistent=False)
     return (
         *(
             field(f"extCtrl.{name}", gain, ControllerConfig, sign=sign)

@@ -1,0 +1,119 @@
+"""A firmware image into the board's flash, by radio, through the bootloader that every Crazyflie carries.
+
+The board restarts into its bootloader, takes the image in pages, is read back, and starts only what is there byte for
+byte. The bootloader listens to radio alone: neither USB nor UDP can flash. Besides the link the only file that knows cflib.
+"""
+
+import re
+import struct
+from collections.abc import Callable
+
+import cflib.crtp
+from cflib.bootloader.boottypes import TargetTypes
+from cflib.bootloader.cloader import Cloader
+
+from ground_station.errors import LinkError
+from ground_station.links.crazyradio import quiet_cflib
+
+Progress = Callable[[str, int, int], None]  # "writing" or "checking", bytes done, bytes in all
+
+URI = r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?"
+START = 0x0800_4000  # of the firmware in the flash of the STM32F405; the bootloader lies below
+FLASH_END = 0x0810_0000
+MEMORIES = ((0x2000_0000, 0x2002_0000), (0x1000_0000, 0x1001_0000))  # where the stack may begin
+QUIET_S = 0.2  # without an answer nothing is on the way any more
+READ_TRIES = 3
+
+
+def check_image(image: bytes) -> None:
+    """Raise `LinkError` for what cannot be firmware for the board: its first words are the stack and the start."""
+    if len(image) > FLASH_END - START:
+        raise LinkError(f"an image of {len(image)} bytes: {FLASH_END - START} fit")
+    if len(image) >= 8:
+        stack, entry = struct.unpack_from("<II", image)
+        on_stack = any(low < stack <= high for low, high in MEMORIES)
+        if on_stack and entry & 1 and START <= entry < START + len(image):
+            return
+    raise LinkError("not an image for the board: build/cf2.bin of the app is one")
+
+
+def flash(uri: str, image: bytes, progress: Progress) -> None:
+    """Write an image, compare what is there, and start it; `LinkError` says in one line why not.
+
+    When that happens after the first page was written, the board stays in its bootloader until it is flashed again or
+    its button is pressed.
+    """
+    if not re.fullmatch(URI, uri):
+        raise LinkError(f"{uri}: expected radio://0/80/2M/E7E7E7E7E7: the bootloader listens only to radio")
+    check_image(image)
+    quiet_cflib()
+    if not cflib.crtp.CLASSES:
+        cflib.crtp.init_drivers()
+    loader = Cloader(uri)
+    try:
+        _enter(loader, uri)
+        _write(loader, image, progress)
+        _verify(loader, image, progress)
+        if not loader.reset_to_firmware(TargetTypes.NRF51):
+            raise LinkError(f"{uri}: flashed and verified, but it does not restart: press its button")
+    except LinkError:
+        raise
+    except Exception as error:  # cflib raises bare exceptions
+        text = str(error).strip().splitlines() or [type(error).__name__]
+        raise LinkError(f"{uri}: {text[0]}") from error
+    finally:
+        loader.close()
+
+
+def _enter(loader: Cloader, uri: str) -> None:
+    """Restart the board into its bootloader and ask it for the sizes of its flash."""
+    loader.open_bootloader_uri(uri)
+    if loader.link is None:
+        raise LinkError(f"{uri}: no driver for this link")
+    if not loader.reset_to_bootloader(TargetTypes.NRF51):
+        raise LinkError(f"{uri}: no answer: is the board on?")
+    if not loader.check_link_and_get_info(TargetTypes.STM32):
+        raise LinkError(f"{uri}: its bootloader does not answer")
+
+
+def _write(loader: Cloader, image: bytes, progress: Progress) -> None:
+    """Write page by page, as many at once as the bootloader's buffer holds."""
+    target = loader.targets[TargetTypes.STM32]
+    size, pages = target.page_size, target.buffer_pages
+    for first in range(0, len(image), size * pages):
+        parts = [image[at : at + size] for at in range(first, min(first + size * pages, len(image)), size)]
+        for number, part in enumerate(parts):
+            loader.upload_buffer(TargetTypes.STM32, number, 0, part)
+            progress("writing", first + number * size, len(image))
+        if not loader.write_flash(TargetTypes.STM32, 0, target.start_page + first // size, len(parts)):
+            raise LinkError(
+                f"{loader.uri}: writing at byte {first} failed (bootloader's code {loader.error_code})"
+            )
+    progress("writing", len(image), len(image))
+
+
+def _verify(loader: Cloader, image: bytes, progress: Progress) -> None:
+    """Read every page back."""
+    target = loader.targets[TargetTypes.STM32]
+    size = target.page_size
+    for at in range(0, len(image), size):
+        part = image[at : at + size]
+        if not any(
+            _read(loader, target.start_page + at // size)[: len(part)] == part for _ in range(READ_TRIES)
+        ):
+            raise LinkError(
+                f"{loader.uri}: the flash differs from the image in bytes {at}..{at + len(part) - 1}"
+            )
+        progress("checking", at + len(part), len(image))
+
+
+def _read(loader: Cloader, page: int) -> bytes:
+    """Return a page, empty when it cannot be read; a late answer to an earlier request confuses cflib."""
+    while loader.link.receive_packet(0) is not None:
+        pass
+    try:
+        return bytes(loader.read_flash(TargetTypes.STM32, page) or b"")
+    except struct.error:
+        while loader.link.receive_packet(QUIET_S) is not None:
+            pass
+        return b""
