@@ -1,11 +1,11 @@
-"""A Crazyflie build into the flash of a board, over cflib's bootloader: write, read back, start.
+"""A firmware image into the board's flash, by radio, through the bootloader that every Crazyflie carries.
 
-The STM32 keeps its old firmware until the first page is written; its bootloader, and the radio chip, are left alone. When
-what is read back is not what was written, everything is written once more, because whole sectors are erased at a time.
+The board restarts into its bootloader, takes the image in pages, is read back, and starts only what is there byte for
+byte. The bootloader listens to radio alone: neither USB nor UDP can flash. Besides the link the only file that knows cflib.
 """
 
+import re
 import struct
-import zlib
 from collections.abc import Callable
 
 import cflib.crtp
@@ -13,115 +13,107 @@ from cflib.bootloader.boottypes import TargetTypes
 from cflib.bootloader.cloader import Cloader
 
 from ground_station.errors import LinkError
+from ground_station.links.crazyradio import quiet_cflib
 
-ATTEMPTS = 2  # to write the whole image
-CALLS = 2  # for the bootloader, each answered within five seconds
-FLASH = (0x0800_4000, 0x0810_0000)  # STM32F405, behind the bootloader
-MEMORIES = ((0x2000_0000, 0x2002_0000), (0x1000_0000, 0x1001_0000))  # RAM and CCM, where a stack can begin
-VECTORS = struct.Struct("<II")  # first stack pointer, address of the first instruction
+Progress = Callable[[str, int, int], None]  # "writing" or "checking", bytes done, bytes in all
 
-Progress = Callable[[str, int, int], None]  # what is being done, pages done, pages in all
+URI = r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?"
+START = 0x0800_4000  # of the firmware in the flash of the STM32F405; the bootloader lies below
+FLASH_END = 0x0810_0000
+MEMORIES = ((0x2000_0000, 0x2002_0000), (0x1000_0000, 0x1001_0000))  # where the stack may begin
+QUIET_S = 0.2  # without an answer nothing is on the way any more
+READ_TRIES = 3
 
 
 def check_image(image: bytes) -> None:
-    """Raise `LinkError` for bytes that cannot be the .bin of a Crazyflie build: the board would not start."""
-    if len(image) >= VECTORS.size:
-        stack, start = VECTORS.unpack_from(image)
-        begin, end = FLASH
-        inside = begin <= start < begin + len(image) <= end
-        if inside and start & 1 and any(low < stack <= high for low, high in MEMORIES):
+    """Raise `LinkError` for what cannot be firmware for the board: its first words are the stack and the start."""
+    if len(image) > FLASH_END - START:
+        raise LinkError(f"an image of {len(image)} bytes: {FLASH_END - START} fit")
+    if len(image) >= 8:
+        stack, entry = struct.unpack_from("<II", image)
+        on_stack = any(low < stack <= high for low, high in MEMORIES)
+        if on_stack and entry & 1 and START <= entry < START + len(image):
             return
-    raise LinkError(
-        f"{len(image)} bytes that are not the .bin of a Crazyflie build for flash from 0x{FLASH[0]:08x} on"
-    )
+    raise LinkError("not an image for the board: build/cf2.bin of the app is one")
 
 
-def flash(uri: str, image: bytes, progress: Progress) -> int:
-    """Write an image, read it back and start it; returns the CRC-32 of what was read. Raises `LinkError`.
+def flash(uri: str, image: bytes, progress: Progress) -> None:
+    """Write an image, compare what is there, and start it; `LinkError` says in one line why not.
 
-    `uri` is that of the running board, radio://…; a board that answers nowhere is left as it is.
+    When that happens after the first page was written, the board stays in its bootloader until it is flashed again or
+    its button is pressed.
     """
+    if not re.fullmatch(URI, uri):
+        raise LinkError(f"{uri}: expected radio://0/80/2M/E7E7E7E7E7: the bootloader listens only to radio")
     check_image(image)
-    if not uri.startswith("radio://"):
-        raise LinkError(f"{uri}: a board is flashed over radio://… only")
+    quiet_cflib()
     if not cflib.crtp.CLASSES:
         cflib.crtp.init_drivers()
     loader = Cloader(uri)
     try:
         _enter(loader, uri)
-        pages = _pages(loader, image)
-        for _ in range(ATTEMPTS):
-            _write(loader, pages, progress)
-            if (different := _first_different(loader, pages, progress)) is None:
-                break
-        else:
-            raise LinkError(
-                f"{uri}: page {different} cannot be read back as it was written, {ATTEMPTS} times"
-            )
+        _write(loader, image, progress)
+        _verify(loader, image, progress)
         if not loader.reset_to_firmware(TargetTypes.NRF51):
-            raise LinkError(f"{uri}: the image is in flash, but the board does not leave its bootloader")
+            raise LinkError(f"{uri}: flashed and verified, but it does not restart: press its button")
+    except LinkError:
+        raise
+    except Exception as error:  # cflib raises bare exceptions
+        text = str(error).strip().splitlines() or [type(error).__name__]
+        raise LinkError(f"{uri}: {text[0]}") from error
     finally:
         loader.close()
-    return zlib.crc32(image)
-
-
-def write_image(loader: Cloader, image: bytes, progress: Progress) -> None:
-    """Write an image with a bootloader that has told about its STM32, and read it back. Raises `LinkError`."""
-    pages = _pages(loader, image)
-    for _ in range(ATTEMPTS):
-        _write(loader, pages, progress)
-        different = _first_different(loader, pages, progress)
-        if different is None:
-            return
-    raise LinkError(f"page {different} cannot be read back as it was written, {ATTEMPTS} times")
 
 
 def _enter(loader: Cloader, uri: str) -> None:
-    """Bring the board into its bootloader."""
-    for _ in range(CALLS):
-        try:
-            loader.open_bootloader_uri(uri)
-        except Exception as error:  # cflib's drivers raise plain ones
-            raise LinkError(f"{uri}: {str(error).splitlines()[0] if str(error) else error!r}") from None
-        if loader.reset_to_bootloader(TargetTypes.NRF51):
-            if loader.check_link_and_get_info(TargetTypes.STM32):
-                return
-            break
-    raise LinkError(f"{uri}: no answer from the bootloader")
+    """Restart the board into its bootloader and ask it for the sizes of its flash."""
+    loader.open_bootloader_uri(uri)
+    if loader.link is None:
+        raise LinkError(f"{uri}: no driver for this link")
+    if not loader.reset_to_bootloader(TargetTypes.NRF51):
+        raise LinkError(f"{uri}: no answer: is the board on?")
+    if not loader.check_link_and_get_info(TargetTypes.STM32):
+        raise LinkError(f"{uri}: its bootloader does not answer")
 
 
-def _pages(loader: Cloader, image: bytes) -> list[bytes]:
-    """Return the image page by page; `LinkError` when it does not fit."""
+def _write(loader: Cloader, image: bytes, progress: Progress) -> None:
+    """Write page by page, as many at once as the bootloader's buffer holds."""
     target = loader.targets[TargetTypes.STM32]
-    room = (target.flash_pages - target.start_page) * target.page_size
-    if len(image) > room:
-        raise LinkError(f"{len(image)} bytes do not fit into the board's {room}")
-    return [image[begin : begin + target.page_size] for begin in range(0, len(image), target.page_size)]
+    size, pages = target.page_size, target.buffer_pages
+    for first in range(0, len(image), size * pages):
+        parts = [image[at : at + size] for at in range(first, min(first + size * pages, len(image)), size)]
+        for number, part in enumerate(parts):
+            loader.upload_buffer(TargetTypes.STM32, number, 0, part)
+            progress("writing", first + number * size, len(image))
+        if not loader.write_flash(TargetTypes.STM32, 0, target.start_page + first // size, len(parts)):
+            raise LinkError(
+                f"{loader.uri}: writing at byte {first} failed (bootloader's code {loader.error_code})"
+            )
+    progress("writing", len(image), len(image))
 
 
-def _write(loader: Cloader, pages: list[bytes], progress: Progress) -> None:
-    """Write all pages, as many at a time as the bootloader has buffers."""
+def _verify(loader: Cloader, image: bytes, progress: Progress) -> None:
+    """Read every page back."""
     target = loader.targets[TargetTypes.STM32]
-    for begin in range(0, len(pages), target.buffer_pages):
-        batch = pages[begin : begin + target.buffer_pages]
-        for number, page in enumerate(batch):
-            loader.upload_buffer(target.addr, number, 0, page)
-            progress("writing", begin + number, len(pages))
-        if not loader.write_flash(target.addr, 0, target.start_page + begin, len(batch)):
-            raise LinkError(f"page {begin}: the bootloader cannot write it, error {loader.error_code}")
-    progress("writing", len(pages), len(pages))
+    size = target.page_size
+    for at in range(0, len(image), size):
+        part = image[at : at + size]
+        if not any(
+            _read(loader, target.start_page + at // size)[: len(part)] == part for _ in range(READ_TRIES)
+        ):
+            raise LinkError(
+                f"{loader.uri}: the flash differs from the image in bytes {at}..{at + len(part) - 1}"
+            )
+        progress("checking", at + len(part), len(image))
 
 
-def _first_different(loader: Cloader, pages: list[bytes], progress: Progress) -> int | None:
-    """Read everything back; returns the first page that is not as written."""
-    target = loader.targets[TargetTypes.STM32]
-    for number, page in enumerate(pages):
-        while loader.link.receive_packet(0) is not None:  # a late answer would be taken for the next one
+def _read(loader: Cloader, page: int) -> bytes:
+    """Return a page, empty when it cannot be read; a late answer to an earlier request confuses cflib."""
+    while loader.link.receive_packet(0) is not None:
+        pass
+    try:
+        return bytes(loader.read_flash(TargetTypes.STM32, page) or b"")
+    except struct.error:
+        while loader.link.receive_packet(QUIET_S) is not None:
             pass
-        read = loader.read_flash(target.addr, target.start_page + number)
-        if read is None:
-            raise LinkError(f"page {number}: the bootloader does not answer")
-        if read[: len(page)] != page:
-            return number
-        progress("reading back", number + 1, len(pages))
-    return None
+        return b""

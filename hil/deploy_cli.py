@@ -205,13 +205,11 @@ def flash(image: Path, uri: str) -> None:
     with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
         bar = progress.add_task("", total=None)
 
-        def show(what: str, done: int, pages: int) -> None:
-            progress.update(bar, description=what, completed=done, total=pages)
+        def show(what: str, done: int, size: int) -> None:
+            progress.update(bar, description=what, completed=done, total=size)
 
         try:
-            checksum = flash_board(uri, content, show)
+            flash_board(uri, content, show)
         except LinkError as error:
             raise LabError(f"{image}: {error}") from None
-    console.print(
-        f"{len(content)} bytes written and read back, CRC-32 {checksum:08x}; the board starts", soft_wrap=True
-    )
+    console.print(f"{len(content)} bytes written and read back; the board starts")

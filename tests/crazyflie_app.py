@@ -12,6 +12,8 @@ from firmware_py.export.native import compilers
 from hil.config import load_config
 
 STUBS = Path(__file__).parent / "stubs"
+TIMER_REGISTERS = "CR1 CR2 SMCR DIER SR EGR CCMR1 CCMR2 CCER CNT PSC ARR RCR CCR1 CCR2 CCR3 CCR4"
+PIN_REGISTERS = "MODER OTYPER OSPEEDR PUPDR IDR ODR BSRR LCKR"
 LOCALISATION = 6
 GENERIC = 1
 
@@ -56,38 +58,14 @@ class GyroZero(ctypes.Structure):
 class Timer(ctypes.Structure):
     """TIM_TypeDef, its registers in their order."""
 
-    _fields_ = tuple(
-        (name, ctypes.c_uint32)
-        for name in [
-            "CR1",
-            "CR2",
-            "SMCR",
-            "DIER",
-            "SR",
-            "EGR",
-            "CCMR1",
-            "CCMR2",
-            "CCER",
-            "CNT",
-            "PSC",
-            "ARR",
-            "RCR",
-            "CCR1",
-            "CCR2",
-            "CCR3",
-            "CCR4",
-        ]
-    )
+    _fields_ = tuple((name, ctypes.c_uint32) for name in TIMER_REGISTERS.split())
 
 
 class Pins(ctypes.Structure):
     """GPIO_TypeDef."""
 
     _fields_ = (
-        *(
-            (name, ctypes.c_uint32)
-            for name in ["MODER", "OTYPER", "OSPEEDR", "PUPDR", "IDR", "ODR", "BSRR", "LCKR"]
-        ),
+        *((name, ctypes.c_uint32) for name in PIN_REGISTERS.split()),
         ("AFR", ctypes.c_uint32 * 2),
     )
 
@@ -113,7 +91,10 @@ def build_app(folder: Path) -> Path:
     zig = ("-fno-sanitize=all", "-Wl,--no-gc-sections") if compiler.name == "zig" else ()
     caches = {name: str(folder / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
     subprocess.run(
-        (*compiler.command, *flags, *zig, "-I", str(STUBS), "-o", str(library), *map(str, sources), str(STUBS / "board.c"), "-lm"),
+        (
+            *compiler.command, *flags, *zig, "-I", str(STUBS), "-o", str(library),
+            *map(str, sources), str(STUBS / "board.c"), "-lm",
+        ),
         check=True, env=os.environ | caches,
     )  # fmt: skip
     return library

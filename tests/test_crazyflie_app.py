@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from crazyflie_app import STUBS, App, GyroZero, Pose, Supervisor, build_app
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from firmware_py import supervisor as reference
@@ -30,10 +30,11 @@ from hil.config import load_config
 
 ARM = "arm-none-eabi-gcc"
 ARM_FLAGS = (  # of the Crazyflie firmware
-    "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -std=gnu11 -Os -g3 -Wall -Wmissing-braces "
-    "-fno-strict-aliasing -ffunction-sections -fdata-sections -Wdouble-promotion -Werror -fno-math-errno "
-    "-fno-delete-null-pointer-checks"
-).split()
+    "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-std=gnu11", "-Os", "-g3", "-Wall",
+    "-Wmissing-braces", "-fno-strict-aliasing", "-ffunction-sections", "-fdata-sections", "-Wdouble-promotion",
+    "-Werror", "-fno-math-errno", "-fno-delete-null-pointer-checks",
+)  # fmt: skip
+BIAS = np.array((12, -7, 3))  # [counts]
 STABILIZER_STACK = 3 * 150 * 4  # [B] of the task that calls the hooks, in an unmodified firmware
 
 
@@ -112,7 +113,7 @@ def pose(data: bytes) -> Event:
 
 
 def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
-    """Poses at 50 Hz along a walk with ages, without, too old, garbage and jumps of the goal, one out of bounds; silence and stops."""
+    """Poses at 50 Hz along a walk: with ages, without, too old, garbage, jumps, out of bounds; silence and stops."""
     events: dict[int, list[Event]] = defaultdict(list)
     p = np.zeros(3)
     for step in range(600, steps, 20):
@@ -126,7 +127,8 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
         data = crtp.encode_ext_pose(tuple(p), q, None if rng.random() < 0.1 else age_us)
         if rng.random() < 0.03:
             data = data[:2] + bytes(29)
-        events[step + int(rng.integers(0, 20))].append(pose(data))
+        just_before_control = step in (600, 3800)  # the first one, and the one that ends the silence
+        events[step + (0 if just_before_control else int(rng.integers(0, 20)))].append(pose(data))
     header = bytes((crtp.header(6, 1),))
     events[5207] = [pose(header + b"\x03")]  # emergency stop
     events[5603] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
@@ -155,7 +157,7 @@ def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -
         before_us = (step - 1) * 1000
         if step > 700:
             rates = 0.98 * rates + rng.normal(0, 30, 3)
-        sample = [int(v) for v in np.rint(rates + (12, -7, 3) + rng.normal(0, 2, 3))]
+        sample = [int(v) for v in np.rint(rates + BIAS + rng.normal(0, 2, 3))]
         laboratory.imu = (*sample, 0, 0, 1365)  # type: ignore[assignment]
         app.gyro[:] = sample
         laboratory.battery_mv = 3000 if step > 3500 else 3900
@@ -322,7 +324,8 @@ def test_log_variables_have_names_of_the_laboratory(app: App) -> None:
 # The pure parts against their Python originals
 
 OPERATIONS = st.one_of(
-    st.tuples(st.just("mode"), st.integers(0, 300_000), st.integers(0, 3)),
+    st.tuples(st.just("mode"), st.integers(0, 600_000), st.integers(0, 1)),
+    st.tuples(st.just("bounded"), st.sampled_from([10_000, 49_000, 50_000, 51_000]), st.integers(1, 24)),
     st.tuples(st.just("pose"), st.integers(0, 300_000), st.just(0)),
     st.tuples(st.just("calibrated"), st.just(0), st.just(0)),
     st.tuples(st.just("stop"), st.just(0), st.just(0)),
@@ -334,6 +337,12 @@ OPERATIONS = st.one_of(
 )
 
 
+FLIGHT = [("calibrated", 0, 0), ("pose", 0, 0)]
+
+
+@example([*FLIGHT, ("bounded", 10_000, 24), ("pose", 0, 0), *[("mode", 50_000, 0)] * 11])
+@example([*FLIGHT, ("bounded", 50_000, 7), *[("mode", 50_000, 0)] * 2])
+@example([*FLIGHT, ("bounded", 51_000, 7), *[("mode", 50_000, 0)] * 2])
 @given(st.lists(OPERATIONS, max_size=60))
 def test_supervisor_decides_as_the_laboratorys(
     functions: App, operations: list[tuple[str, int, int]]
@@ -344,11 +353,16 @@ def test_supervisor_decides_as_the_laboratorys(
     c, here = functions.c, Supervisor()
     c.floaty_supervisor_init(ctypes.byref(here), config.pose_timeout_us, config.low_battery_mv)
     now = 0
-    for name, wait_us, value in operations:
+    steps = (
+        step
+        for name, wait_us, value in operations
+        for step in ([("mode", wait_us, 1)] * value if name == "bounded" else [(name, wait_us, value)])
+    )
+    for name, wait_us, value in steps:
         now += wait_us
         this = ctypes.byref(here)
         if name == "mode":
-            estimator.bounded += value // 2
+            estimator.bounded += value
             assert c.floaty_supervisor_mode(this, now, estimator.bounded) == python.mode(now)
             assert (here.state, here.cause) == (python.state, python.cause)
         elif name == "pose":
@@ -428,7 +442,7 @@ def test_only_an_empty_folder_or_an_app_is_written_to(tmp_path: Path) -> None:
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     with pytest.raises(ExportError, match="neither empty nor an app"):
         write_app(config, "floaty", tmp_path / "full")
-    with pytest.raises(ExportError, match="thesis.tex"):
+    with pytest.raises(ExportError, match=r"thesis\.tex"):
         write_app(config, "floaty", tmp_path / "full" / "thesis.tex")
 
 

@@ -2,7 +2,7 @@
 
 Corrections wait in a place for one, the newest; a thread sends them, so that nobody else waits for the radio, and sets
 their age at the last moment. Telemetry comes through log blocks that are created on connecting. Every wait here has a
-limit, and everything that goes wrong is a `LinkError` of one line. The only file that knows cflib.
+limit, and everything that goes wrong is a `LinkError` of one line. Of the links the only one that knows cflib.
 """
 
 import logging
@@ -73,7 +73,7 @@ class CrazyradioLink:
         self._mailbox: tuple[int, Correction] | None = None
         self._mail = threading.Condition()
         self._sending = False
-        _quiet_cflib()
+        quiet_cflib()
 
     def open(self, give_up: Callable[[], bool]) -> None:
         """Connect and start telemetry; raises `LinkError`, also when told to give up."""
@@ -277,7 +277,7 @@ class CrazyradioLink:
             closing.join(CLOSE_TIMEOUT_S)
 
 
-def _quiet_cflib() -> None:
+def quiet_cflib() -> None:
     """Keep cflib's own messages off the terminal: whatever matters becomes a `LinkError`."""
     logger = logging.getLogger("cflib")
     logger.propagate = False
