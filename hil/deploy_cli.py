@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hil.deploy_targets import MachineCode
     from hil.harness import Flight
 
-console = Console(highlight=False)
+console = Console(highlight=False, markup=False)
 notices = Console(stderr=True, highlight=False)
 INTERRUPTED = 130
 profile_option = click.option(

@@ -40,9 +40,7 @@ class Metered(CortexM4Runner):
     def __init__(self, blocks: CoreBlocks, image: Image, meter: Path, ticks: Load) -> None:
         super().__init__(blocks, image, meter)
         self._ticks = ticks
-        self._so_far: tuple[int, int] | None = (
-            None  # instructions and cycles at the last tick's end; None: at boot
-        )
+        self._so_far: tuple[int, int] | None = None  # instructions, cycles at the last tick's end; None: boot
 
     def control(self) -> None:
         """Run the controller, with which a tick ends."""
