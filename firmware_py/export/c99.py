@@ -7,6 +7,7 @@ forbids the fusing of multiplications with additions, so that every compiler giv
 Kernels and constants that the entry points do not reach are left out.
 """
 
+import ast
 import hashlib
 from collections import Counter
 from collections.abc import Mapping
@@ -18,7 +19,8 @@ from firmware_py.core import structs
 from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import C_TYPES, FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.locals import find_writes
-from firmware_py.export.reading import SHARED, Constant, Kernel, Module, StructType, read_modules
+from firmware_py.export.reading import read_modules
+from firmware_py.export.syntax import SHARED, Constant, Kernel, Module, StructType
 
 __all__ = ["ExportError", "Translation", "core_texts", "translate"]
 
@@ -100,8 +102,8 @@ def _header(modules: list[Module], public: list[FunctionPrinter], version: str) 
         "void floaty_core_init(FloatyParameters *parameters);\n",
     ]
     for printer in public:
-        kernel = printer.kernel
-        parts.append(f"\n{block_comment(kernel.node.body[0].value.value)}{printer.signature()};\n")  # type: ignore[attr-defined]
+        doc = ast.get_docstring(printer.kernel.node) or ""
+        parts.append(f"\n{block_comment(doc)}{printer.signature()};\n")
     parts.append("\n#endif\n")
     return "".join(parts)
 
@@ -122,7 +124,7 @@ def _source(modules: list[Module], printed: Mapping[str, str], used: set[int]) -
     parts = [
         block_comment(f"The flight core of Floaty. {GENERATED}"),
         '#include "floaty_core.h"\n\n#include <float.h>\n#include <stdbool.h>\n#include <stddef.h>\n\n',
-        f"{COMPILER}\n{_layout(modules)}",
+        COMPILER,
     ]
     for module in modules:
         own = [
@@ -140,12 +142,12 @@ def _source(modules: list[Module], printed: Mapping[str, str], used: set[int]) -
         if own:
             parts.append("\n" + "".join(f"{constant_definition(thing)}\n" for thing in own))
         parts += [f"\n{function}" for function in functions]
-    return "".join(parts)
+    return "".join((*parts, _layout(modules)))
 
 
 def _layout(modules: list[Module]) -> str:
     """Return checks that the structs lie in memory as numpy lays them out."""
-    lines = [CHECK]
+    lines = ["\n/* The structs lie in memory as the emulator has them. */\n", CHECK]
     for struct in (thing for module in modules for thing in module.own if isinstance(thing, StructType)):
         dtype = getattr(structs, struct.name).dtype
         name = f"Floaty{struct.name}"

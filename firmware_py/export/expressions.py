@@ -9,7 +9,8 @@ import ast
 from dataclasses import dataclass
 
 from firmware_py.export.errors import ExportError, refusal
-from firmware_py.export.reading import (
+from firmware_py.export.reading import constant_literal
+from firmware_py.export.syntax import (
     BOOL,
     F32,
     I32,
@@ -18,7 +19,6 @@ from firmware_py.export.reading import (
     Kind,
     Module,
     StructType,
-    constant_literal,
 )
 
 PRIMARY, UNARY, PRODUCT, SUM, COMPARISON, AND, OR = 9, 8, 7, 6, 5, 3, 2

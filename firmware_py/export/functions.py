@@ -5,7 +5,7 @@ import textwrap
 
 from firmware_py.export.expressions import Expressions, describe
 from firmware_py.export.locals import find_locals
-from firmware_py.export.reading import BOOL, I32, VOID, Constant, Kernel, Kind
+from firmware_py.export.syntax import BOOL, I32, VOID, Constant, Kernel, Kind
 
 C_TYPES = {"f32": "float", "i32": "int32_t", "bool": "bool", "void": "void"}
 WIDTH = 110

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from firmware_py.export.errors import refusal
-from firmware_py.export.reading import Kernel
+from firmware_py.export.syntax import C_KEYWORDS, Kernel
 
 Block = tuple[int, ...]
 
@@ -30,7 +30,10 @@ def find_locals(kernel: Kernel) -> tuple[dict[str, Local], set[str]]:
     targets = [node.target for node in ast.walk(kernel.node) if isinstance(node, ast.For)]
     loops = {target.id for target in targets if isinstance(target, ast.Name)}
     own = set(kernel.arguments) | loops
-    stored = {node.id for node in _stores(kernel.node)}
+    stored = {node.id: node for node in _stores(kernel.node)}
+    for name, store in stored.items():
+        if name in C_KEYWORDS or name.removesuffix("_end") in loops - {name}:
+            raise refusal(kernel.path, store, f"{name} is a word of C or the end of a loop")
     for name, block, node in _uses(kernel.node.body, ()):
         if name not in stored or name in own:
             if name in own and isinstance(node.ctx, ast.Store):

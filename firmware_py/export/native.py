@@ -73,15 +73,22 @@ def build(
     library = home / "floaty_core.so"
     if library.is_file():
         return library
-    home.mkdir(parents=True, exist_ok=True)
-    (home / "floaty_core.h").write_text(translation.header, "utf-8")
-    (home / "floaty_core.c").write_text(translation.source, "utf-8")
-    unfinished = home / f"floaty_core.{os.getpid()}.so"
+    work = home.with_suffix(f".{os.getpid()}")
+    work.mkdir(parents=True, exist_ok=True)
+    (work / "floaty_core.h").write_text(translation.header, "utf-8")
+    (work / "floaty_core.c").write_text(translation.source, "utf-8")
     caches = {
         name: str(folder.absolute() / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")
     }
-    _output((*command, "-o", str(unfinished), str(home / "floaty_core.c")), caches)
-    unfinished.replace(library)
+    try:
+        _output((*command, "-o", str(work / library.name), str(work / "floaty_core.c")), caches)
+        if not home.exists():
+            work.rename(home)
+    except OSError:
+        if not library.is_file():  # another process may have been faster
+            raise
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
     return library
 
 
@@ -104,6 +111,8 @@ class NativeRunner:
     def __init__(self, blocks: CoreBlocks, library: Path) -> None:
         self._blocks = blocks  # keeps the memory alive
         code = ctypes.CDLL(str(library.absolute()))
+        for function in (code.floaty_core_reset, code.floaty_core_estimate, code.floaty_core_control):
+            function.restype = None
         everything = (blocks.parameters, blocks.data, blocks.estimator, blocks.control)
         parameters, data, estimator, control = map(_address, everything)
         self.reset: Callable[[], None] = partial(code.floaty_core_reset, parameters, estimator)

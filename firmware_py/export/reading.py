@@ -7,117 +7,29 @@ import ast
 import io
 import tokenize
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from firmware_py.export.errors import refusal
-
-PACKAGE = "firmware_py.core"
-SUBSET = f"{PACKAGE}.subset"
-ENTRY = "entry"  # the module whose kernels are the C API
-SHARED = "structs"  # the module whose constants and structs stand in the header
-C_KEYWORDS = frozenset(
-    {
-        "auto", "bool", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
-        "false", "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short",
-        "signed", "sizeof", "static", "struct", "switch", "true", "typedef", "union", "unsigned", "void", "volatile",
-        "while", "NULL", "offsetof",
-    }
-)  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A type: f32, i32, bool, void or a struct's name; an array of `rank` 1 or 2 when that is not 0.
-
-    `shape` is empty for an array argument until a caller shows it; a `memory` argument is a struct that is passed on.
-    """
-
-    base: str
-    rank: int = 0
-    shape: tuple[int, ...] = ()
-    memory: bool = False
-
-
-F32, I32, BOOL, VOID = Kind("f32"), Kind("i32"), Kind("bool"), Kind("void")
-SCALARS = {"f32": F32, "i32": I32, "Integer": I32, "bool": BOOL}
-ARRAYS = {"F32s": "f32", "I32s": "i32"}
-
-
-@dataclass(slots=True)
-class Constant:
-    """A module constant; `text` is its C literal, of which the value is exact."""
-
-    c_name: str
-    kind: Kind
-    text: str
-    comment: str
-    shared: bool
-
-
-@dataclass(frozen=True, slots=True)
-class StructField:
-    """A field of a struct, with the comments above and beside it."""
-
-    name: str
-    kind: Kind
-    above: str
-    comment: str
-
-
-@dataclass(frozen=True, slots=True)
-class StructType:
-    """A state struct."""
-
-    name: str
-    doc: str
-    fields: Mapping[str, StructField]
-
-
-@dataclass(slots=True)
-class Kernel:
-    """A kernel's signature; `writes` and the shapes of array arguments are found later."""
-
-    c_name: str
-    path: str
-    node: ast.FunctionDef
-    arguments: dict[str, Kind]
-    result: Kind
-    public: bool
-    scope: "Module"
-    writes: set[str] = field(default_factory=set)  # arguments and array names through which it writes
-    calls: set[str] = field(default_factory=set)  # C names
-
-
-Named = Constant | StructType | Kernel
-
-
-@dataclass(slots=True)
-class Module:
-    """A module of the core: every name that it defines or imports, and its comments by line."""
-
-    name: str
-    path: str
-    doc: str
-    names: dict[str, "Named | Module"] = field(default_factory=dict)
-    builtins: set[str] = field(default_factory=set)  # names imported from the subset
-    own: list[Named] = field(default_factory=list)  # defined here, in order
-    trailing: dict[int, str] = field(default_factory=dict)
-    standing: dict[int, str] = field(default_factory=dict)  # comments that have a line of their own
-
-    def comment(self, node: ast.stmt) -> str:
-        """Return the comments that stand behind a statement."""
-        lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
-        return " ".join(self.trailing[line] for line in lines if line in self.trailing)
-
-    def above(self, line: int) -> str:
-        """Return the block of comment lines right above a line."""
-        found: list[str] = []
-        while line - 1 in self.standing:
-            line -= 1
-            found.insert(0, self.standing[line])
-        return " ".join(found)
+from firmware_py.export.syntax import (
+    ARRAYS,
+    C_KEYWORDS,
+    ENTRY,
+    F32,
+    I32,
+    PACKAGE,
+    SCALARS,
+    SHARED,
+    SUBSET,
+    VOID,
+    Constant,
+    Kernel,
+    Kind,
+    Module,
+    Named,
+    StructField,
+    StructType,
+)
 
 
 def read_modules(texts: Mapping[str, str]) -> list[Module]:
