@@ -317,7 +317,8 @@ void appMain(void) {
     if (length > 0) {
       receive_pose(data, (uint32_t)length);
     }
-    if (xTaskGetTickCount() - controlled_tick < M2T(STALE_MS)) {
+    const TickType_t controlled = controlled_tick; /* 0: not yet, and the servos are at hover since the start */
+    if (controlled == 0 || xTaskGetTickCount() - controlled < M2T(STALE_MS)) {
       stale = false;
     } else if (!stale) {
       stale = true;
