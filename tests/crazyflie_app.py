@@ -16,6 +16,7 @@ TIMER_REGISTERS = "CR1 CR2 SMCR DIER SR EGR CCMR1 CCMR2 CCER CNT PSC ARR RCR CCR
 PIN_REGISTERS = "MODER OTYPER OSPEEDR PUPDR IDR ODR BSRR LCKR"
 LOCALISATION = 6
 GENERIC = 1
+OUT_OF_TREE = 3  # StateEstimatorTypeOutOfTree
 
 
 class Supervisor(ctypes.Structure):
@@ -122,6 +123,8 @@ class App:
         self.gyro = (ctypes.c_int32 * 3).in_dll(c, "stub_gyro")
         self.battery = ctypes.c_float.in_dll(c, "stub_battery")
         self.locked = ctypes.c_int32.in_dll(c, "stub_locked")
+        self.gyro_known = ctypes.c_int32.in_dll(c, "stub_gyro_known")
+        self.estimator_type = ctypes.c_int32.in_dll(c, "stub_estimator")
         self.supervisor = Supervisor.in_dll(c, "floaty_supervisor")
         self.timers = (Timer * 2).in_dll(c, "stub_timer")  # TIM3, TIM5
         self.pins = (Pins * 2).in_dll(c, "stub_gpio")  # A, B
@@ -134,15 +137,17 @@ class App:
         self.logs = {name: i for i, name in _names(c.stub_log_name)}
 
     def boot(self) -> None:
-        """Initialise as the stabilizer does, and let the app's task start."""
-        self.c.estimatorOutOfTreeInit()
+        """Initialise as the stabilizer does, let the app's task start, and switch to the estimator that it wants."""
         self.c.controllerOutOfTreeInit()
         self.c.stub_run_app(0)
+        if self.estimator_type.value == OUT_OF_TREE:
+            self.c.estimatorOutOfTreeInit()
 
     def step(self, step: int) -> None:
         """Run one pass of the stabilizer."""
         self.now.value = step * 1000
-        self.c.estimatorOutOfTree(self._state, step)
+        if self.estimator_type.value == OUT_OF_TREE:
+            self.c.estimatorOutOfTree(self._state, step)
         self.c.controllerOutOfTree(self._control, self._nothing, self._nothing, self._state, step)
 
     def radio(self, data: bytes, port: int = LOCALISATION, channel: int = GENERIC) -> None:

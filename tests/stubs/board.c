@@ -29,12 +29,23 @@ int32_t stub_gyro[3];
 float stub_battery = 3.9f;
 int32_t stub_locked;
 int32_t stub_gyro_known = 1;
+int32_t stub_estimator = StateEstimatorTypeComplementary; /* what the stabilizer starts with */
 char stub_console[4096];
 
 uint64_t usecTimestamp(void) { return stub_now_us; }
 TickType_t xTaskGetTickCount(void) { return (TickType_t)(stub_now_us / 1000); }
 float pmGetBatteryVoltage(void) { return stub_battery; }
 bool supervisorIsLocked() { return stub_locked != 0; }
+StateEstimatorType stateEstimatorGetType(void) { return (StateEstimatorType)stub_estimator; }
+paramVarId_t paramGetVarId(const char *group, const char *name) {
+  const bool known = strcmp(group, "stabilizer") == 0 && strcmp(name, "estimator") == 0;
+  return (paramVarId_t){known ? 1 : 0xffff, 0};
+}
+void paramSetInt(paramVarId_t varid, int valuei) {
+  if (varid.id == 1) {
+    stub_estimator = valuei;
+  }
+}
 bool estimatorDequeue(measurement_t *measurement) { (void)measurement; return false; }
 
 void consoleLine(const char *format, ...) {

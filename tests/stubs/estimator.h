@@ -8,6 +8,13 @@ typedef struct {
     poseMeasurement_t pose;
   } data;
 } measurement_t;
+typedef enum {
+  StateEstimatorTypeAutoSelect = 0,
+  StateEstimatorTypeComplementary,
+  StateEstimatorTypeKalman,
+  StateEstimatorTypeOutOfTree,
+} StateEstimatorType;
+StateEstimatorType stateEstimatorGetType(void);
 bool estimatorDequeue(measurement_t *measurement);
 void estimatorOutOfTreeInit(void);
 bool estimatorOutOfTreeTest(void);

@@ -2,6 +2,12 @@
 #pragma once
 #include <stdbool.h>
 #include <stdint.h>
+typedef struct paramVarId_s {
+  uint16_t id;
+  uint16_t index;
+} __attribute__((packed)) paramVarId_t;
+paramVarId_t paramGetVarId(const char *group, const char *name);
+void paramSetInt(paramVarId_t varid, int valuei);
 struct param_s {
   uint8_t type;
   uint8_t extended_type;

@@ -29,6 +29,7 @@
 #include "debug.h"
 #include "estimator.h"
 #include "log.h"
+#include "param.h"
 #include "pm.h"
 #include "supervisor.h"
 #include "usec_time.h"
@@ -79,6 +80,9 @@ static void start(void) {
   pose_queue = xQueueCreateStatic(POSE_QUEUE, sizeof(FloatyPose), pose_queue_storage, &pose_queue_buffer);
   floaty_core_init(&floaty_parameters);
   floaty_core_reset(&floaty_parameters, &floaty_estimator);
+  gyro_raw[0] = logGetVarId("gyro", "xRaw");
+  gyro_raw[1] = logGetVarId("gyro", "yRaw");
+  gyro_raw[2] = logGetVarId("gyro", "zRaw");
   floaty_supervisor_init(&floaty_supervisor, FLOATY_POSE_TIMEOUT_US, FLOATY_LOW_BATTERY_MV);
   floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control); /* mode 0: hover */
   floaty_servos_init(floaty_control.count);
@@ -196,9 +200,6 @@ static void observe(void) {
 void estimatorOutOfTreeInit(void) {
   start();
   floaty_requests.reset = true;
-  gyro_raw[0] = logGetVarId("gyro", "xRaw");
-  gyro_raw[1] = logGetVarId("gyro", "yRaw");
-  gyro_raw[2] = logGetVarId("gyro", "zRaw");
 }
 
 bool estimatorOutOfTreeTest(void) {
@@ -206,6 +207,9 @@ bool estimatorOutOfTreeTest(void) {
 }
 
 void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
+  if (!estimatorOutOfTreeTest()) {
+    return; /* without a gyro Floaty stays calibrating, flaps at hover */
+  }
   if (asked(&floaty_requests.reset)) {
     floaty_core_reset(&floaty_parameters, &floaty_estimator);
   }
@@ -290,11 +294,22 @@ static void announce(void) {
   }
 }
 
+/* The firmware takes an out-of-tree controller by itself, but an out-of-tree estimator only when told to. */
+static void select_estimator(void) {
+  if (!estimatorOutOfTreeTest()) {
+    DEBUG_PRINT("no raw gyro counts: is this a BMI088?\n");
+  }
+  if (stateEstimatorGetType() != StateEstimatorTypeOutOfTree) {
+    paramSetInt(paramGetVarId("stabilizer", "estimator"), StateEstimatorTypeOutOfTree);
+  }
+}
+
 void appMain(void) {
   uint8_t data[APPCHANNEL_MTU];
   bool stale = false;
 
   floaty_toc_apply();
+  select_estimator();
   crtpRegisterPortCB(CRTP_PORT_LOCALIZATION, receive_localisation);
   DEBUG_PRINT("core %s, profile %s %s\n", FLOATY_CORE_VERSION, FLOATY_PROFILE_NAME, floaty_profile_hash);
   while (true) {
@@ -302,7 +317,8 @@ void appMain(void) {
     if (length > 0) {
       receive_pose(data, (uint32_t)length);
     }
-    if (xTaskGetTickCount() - controlled_tick < M2T(STALE_MS)) {
+    const TickType_t controlled = controlled_tick; /* 0: not yet, and the servos are at hover since the start */
+    if (controlled == 0 || xTaskGetTickCount() - controlled < M2T(STALE_MS)) {
       stale = false;
     } else if (!stale) {
       stale = true;
