@@ -466,10 +466,11 @@ def arm_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip(f"no {ARM} here: apt-get install gcc-arm-none-eabi")
     folder = tmp_path_factory.mktemp("arm")
     write_app(load_config(), "floaty", folder)
-    sources = sorted(path.name for path in (folder / "src").glob("*.c"))
-    subprocess.run(
-        (ARM, *ARM_FLAGS, "-fcallgraph-info=su", f"-I{STUBS}", "-c", *sources), cwd=folder / "src", check=True
-    )
+    kbuild = (folder / "src" / "Kbuild").read_text()
+    for name in re.findall(r"^obj-y \+= (\S+)$", kbuild, re.M):
+        own = re.findall(rf"^CFLAGS_{re.escape(name)} := (.*)$", kbuild, re.M)
+        flags = (*ARM_FLAGS, *" ".join(own).split(), "-fcallgraph-info=su", f"-I{STUBS}")
+        subprocess.run((ARM, *flags, "-c", name.replace(".o", ".c")), cwd=folder / "src", check=True)
     return folder / "src"
 
 
