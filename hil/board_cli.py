@@ -13,6 +13,7 @@ from hil.errors import LabError
 if TYPE_CHECKING:
     from ground_station.links.crazyradio import CrazyradioLink
     from ground_station.links.mavlink_serial import MavlinkSerialLink
+    from ground_station.natnet_reader import Version
     from hil.config import LabConfig
 
 UDP_PORT = 19850  # where cflib looks for boards
@@ -75,6 +76,7 @@ def serve(
     seed: int,
     profile: str,
     overrides: tuple[str, ...],
+    motive: "tuple[int, Version, bool] | None" = None,  # of `floaty lab serve`: port, version, multicast
 ) -> int:
     """Serve boards in virtual tunnels, in real time, until Ctrl-C.
 
@@ -107,6 +109,11 @@ def serve(
         _say(f"udp    {' '.join(server.serve_udp(udp))}")
     if ends:
         _say(f"mavlink {' '.join(server.serve_mavlink(ends))}")
+    if motive is not None:
+        seen = server.serve_motive(*motive)
+        _say(
+            f"motive 127.0.0.1:{seen.port} {'multicast' if motive[2] else 'unicast'}, data port {seen.data_port}"
+        )
     for number, served in enumerate(server.boards):
         if poses:
             served.publish(PosePublisher(poses + number).send)
@@ -118,6 +125,8 @@ def serve(
         server.run(lambda: bool(stops))
     finally:
         server.close()
+    if server.motive is not None and server.motive.malformed:
+        _say(f"motive could not read {server.motive.malformed} packets")
     _say(f"stopped; never more than {server.worst_lag_us / 1000:.1f} ms late")
     return 0
 
