@@ -1,14 +1,16 @@
 """A virtual Motive: a NatNet server on the loopback interface that streams what the virtual cameras see.
 
 It answers connect, model definitions, echo, keep-alive and the bitstream request on its command port, and sends every
-frame either to the multicast group or to each client: to where the client spoke from, and to the data port of its
-computer, because clients differ in where they listen. Nothing here blocks: the board server calls it. What it cannot
-read is counted. Its clock counts from its own start, as that of another computer would; its axes are Motive's, y up.
+frame either to the multicast group or to each client: to the data port of its computer and, once it keeps alive, to
+where it speaks from, because clients differ in where they listen. Nothing here blocks: the board server calls it.
+What it cannot read is counted. Its clock counts from its own start, as that of another computer would; its axes are
+Motive's, y up.
 """
 
 import socket
 import struct
 from contextlib import suppress
+from dataclasses import dataclass
 
 from firmware_py.geometry import Quaternion, Vector
 from ground_station.clock import clock_us
@@ -48,6 +50,14 @@ _ACCEPTED, _REFUSED = (
 Address = tuple[str, int]
 
 
+@dataclass(frozen=True, slots=True)
+class _Client:
+    """Who has connected."""
+
+    version: Version
+    keeps_alive: bool  # then it takes frames where it speaks from; others would take them for answers
+
+
 def in_motive_axes(p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
     """A pose in axes with y up, for world and body alike: x_M = x, y_M = z, z_M = -y."""
     x, y, z = p_WB
@@ -71,7 +81,7 @@ class VirtualMotive:
             )
         )
         self._readers = readers
-        self._clients: dict[Address, Version] = {}  # who spoke last comes last
+        self._clients: dict[Address, _Client] = {}  # who spoke last comes last
         self._number = 0
         self._seen: list[BodyPose] = []  # bodies of the frame that is being put together
         self._start_us = clock_us()
@@ -119,8 +129,8 @@ class VirtualMotive:
         """Where frames go, and in which version."""
         if self._multicast:
             return {(MULTICAST_GROUP, self.data_port): self._version}
-        ports = {(host, self.data_port): version for (host, _), version in self._clients.items()}
-        return ports | self._clients
+        ports = {(host, self.data_port): client.version for (host, _), client in self._clients.items()}
+        return ports | {at: client.version for at, client in self._clients.items() if client.keeps_alive}
 
     def _send(self, data: bytes, to: Address) -> None:
         with suppress(OSError):  # a full buffer, nobody there: UDP loses packets then
@@ -135,13 +145,13 @@ class VirtualMotive:
         kind, size = _HEADER.unpack_from(data) if len(data) >= HEADER_SIZE else (None, 0)
         payload = data[HEADER_SIZE:]
         if kind == MessageId.CONNECT:  # clients differ in what follows
-            self._admit(client)
+            self._admit(client, _Client(self._version, keeps_alive=False))
             self._send(self._info(), client)
         elif kind == MessageId.KEEPALIVE:
             if client in self._clients:
-                self._admit(client)
+                self._admit(client, _Client(self._version_of(client), keeps_alive=True))
         elif kind == MessageId.REQUEST_MODELDEF:
-            self._send(encode_models(self._models, self._clients.get(client, self._version)), client)
+            self._send(encode_models(self._models, self._version_of(client)), client)
         elif kind == MessageId.DISCONNECT:
             self._clients.pop(client, None)
         elif kind == MessageId.ECHO_REQUEST and len(payload) == _ECHO_REQUEST_SIZE:
@@ -166,11 +176,16 @@ class VirtualMotive:
             )
         )
 
-    def _admit(self, client: Address) -> None:
+    def _admit(self, address: Address, client: _Client) -> None:
         """Note that a client is there."""
-        self._clients[client] = self._clients.pop(client, self._version)
+        self._clients.pop(address, None)
+        self._clients[address] = client
         if len(self._clients) > MAX_CLIENTS:
             del self._clients[next(iter(self._clients))]
+
+    def _version_of(self, client: Address) -> Version:
+        """The version that a client is spoken to in."""
+        return self._clients[client].version if client in self._clients else self._version
 
     def _obey(self, command: bytes, client: Address) -> bytes:
         """Return the answer to a command: only the one about the version is known."""
@@ -178,11 +193,11 @@ class VirtualMotive:
         if name != b"Bitstream":
             return packet(MessageId.UNRECOGNIZED)
         if not comma:
-            major, minor = self._clients.get(client, self._version)
+            major, minor = self._version_of(client)
             return packet(MessageId.RESPONSE, b"Bitstream,%d.%d.0\0" % (major, minor))
         for version in _RELEASES:
             same = wanted.split(b".")[:2] == [b"%d" % number for number in version]
             if same and client in self._clients and not self._multicast:
-                self._clients[client] = version
+                self._admit(client, _Client(version, self._clients[client].keeps_alive))
                 return _ACCEPTED
         return _REFUSED
