@@ -5,6 +5,7 @@ FLOATY_FUZZ is the number of packets of the long run (default 20,000).
 
 import os
 import struct
+from contextlib import suppress
 
 import natnet_packets as packets
 import numpy as np
@@ -44,6 +45,26 @@ def test_models_are_read_in_every_version(version: Version) -> None:
     )
 
 
+@pytest.mark.parametrize("version", VERSIONS)
+def test_another_client_reads_the_same_out_of_these_packets(version: Version) -> None:
+    module = pytest.importorskip("MAVProxy.modules.mavproxy_optitrack.NatNetClient", exc_type=ImportError)
+    client = module.NatNetClient()
+    data = packets.frame(41, version, TICKS, parameters=2)
+    end, theirs = client._NatNetClient__unpack_mocap_data(data[4:], len(data) - 4, *version)
+    ours = decode(data, version)
+    assert isinstance(ours, Frame)
+    assert end == len(data) - 8
+    suffix = theirs.suffix_data
+    stamps = (suffix.stamp_camera_mid_exposure, suffix.stamp_data_received, suffix.stamp_transmit)
+    assert (ours.mid_exposure, ours.received, ours.transmitted) == stamps
+    (body,) = theirs.rigid_body_data.rigid_body_list
+    w, x, y, z = ours.bodies[0].q
+    assert (body.id_num, body.pos, body.rot) == (ours.bodies[0].id, ours.bodies[0].p, (x, y, z, w))
+    data = packets.model_definition({"floaty": 7, "other": 8}, version)
+    _, models = client._NatNetClient__unpack_data_descriptions(data[4:], len(data) - 4, *version)
+    assert [(body.sz_name, body.id_num) for body in models.rigid_body_list] == [(b"floaty", 7), (b"other", 8)]
+
+
 def test_the_server_and_its_echo_are_read() -> None:
     server = decode(packets.server_info((4, 1), True), (3, 0))
     group = "239.255.42.99"
@@ -72,10 +93,8 @@ def test_the_length_in_the_header_and_the_version_must_be_right() -> None:
 
 @given(st.binary(max_size=200), st.integers(0, 20), st.sampled_from(VERSIONS))
 def test_any_payload_is_read_or_refused(payload: bytes, message: int, version: Version) -> None:
-    try:
+    with suppress(MocapError):
         decode(packets.packet(message, payload), version)
-    except MocapError as error:
-        assert "\n" not in str(error)
 
 
 def test_no_mutated_packet_harms_the_stream() -> None:

@@ -185,15 +185,13 @@ def test_what_names_no_source_is_refused(text: str) -> None:
 @contextmanager
 def served(version: tuple[int, int], multicast: bool) -> Iterator[int]:
     """A server with one body at 200 Hz; gives its command port."""
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as commands,
-        socket.socket(type=socket.SOCK_DGRAM) as probe,
-    ):
+    with socket.socket(type=socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        data_port = probe.getsockname()[1]
+    with socket.socket(type=socket.SOCK_DGRAM) as commands:
         commands.bind(("127.0.0.1", 0))
         commands.settimeout(0.005)
         commands.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
-        probe.bind(("", 0))
-        data_port = probe.getsockname()[1]
         stop = threading.Event()
         thread = threading.Thread(target=_serve, args=(commands, data_port, version, multicast, stop))
         thread.start()
