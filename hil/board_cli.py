@@ -13,8 +13,8 @@ from hil.errors import LabError
 if TYPE_CHECKING:
     from ground_station.links.crazyradio import CrazyradioLink
     from ground_station.links.mavlink_serial import MavlinkSerialLink
-    from ground_station.natnet_reader import Version
     from hil.config import LabConfig
+    from hil.virtual_motive import Streaming
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
@@ -76,7 +76,7 @@ def serve(
     seed: int,
     profile: str,
     overrides: tuple[str, ...],
-    motive: "tuple[int, Version, bool] | None" = None,  # of `floaty lab serve`: port, version, multicast
+    motive: "Streaming | None" = None,  # of `floaty lab serve`
 ) -> int:
     """Serve boards in virtual tunnels, in real time, until Ctrl-C.
 
@@ -110,10 +110,8 @@ def serve(
     if ends:
         _say(f"mavlink {' '.join(server.serve_mavlink(ends))}")
     if motive is not None:
-        seen = server.serve_motive(*motive)
-        _say(
-            f"motive 127.0.0.1:{seen.port} {'multicast' if motive[2] else 'unicast'}, data port {seen.data_port}"
-        )
+        port = server.serve_motive(motive).port
+        _say(f"motive optitrack:127.0.0.1:{port}{',multicast' if motive.multicast else ''}")
     for number, served in enumerate(server.boards):
         if poses:
             served.publish(PosePublisher(poses + number).send)

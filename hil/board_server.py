@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 
-from ground_station.natnet_reader import Version
 from hil.config import LabConfig
 from hil.dongle_server import DongleServer, Readers
 from hil.errors import LabError
@@ -19,7 +18,7 @@ from hil.harness import Streams
 from hil.serial_server import Address
 from hil.served_board import ServedBoard
 from hil.virtual_dongle import VirtualDongle
-from hil.virtual_motive import VirtualMotive
+from hil.virtual_motive import Streaming, VirtualMotive
 
 WARM_UP_US = 20_000  # run before anybody looks: the first run on a machine compiles
 DONGLE_SEED = 10_000  # random streams of dongles: apart from those of the boards
@@ -70,12 +69,12 @@ class BoardServer:
             self.close()
             raise
 
-    def serve_motive(self, port: int, version: Version, multicast: bool) -> VirtualMotive:
-        """Let Motive see every board, under its number; `port`: of its commands, 0: any."""
+    def serve_motive(self, settings: Streaming) -> VirtualMotive:
+        """Let Motive see every board, under its number."""
         names = {
             board.number: "floaty" if board.number == 1 else f"floaty{board.number}" for board in self.boards
         }
-        self.motive = VirtualMotive(port, version, multicast, names, self.readers)
+        self.motive = VirtualMotive(settings, names, self.readers)
         for board in self.boards:
             board.publish(partial(self.motive.take, board.number))
         return self.motive

@@ -28,7 +28,9 @@ def serve(
 ) -> int:  # options of `floaty board serve`, handed on unread
     """Serve boards in virtual tunnels and Motive, which sees them, in real time, until Ctrl-C.
 
-    Motive calls the bodies floaty, floaty2, ...; its axes are its own, y up. The rest is `floaty board serve`.
+    Motive calls the bodies floaty, floaty2, ...; its y axis points up. Everything else is `floaty board serve`.
     """
-    motive = (natnet_port, VERSIONS[natnet], multicast)
+    from hil.virtual_motive import Streaming
+
+    motive = Streaming(natnet_port, VERSIONS[natnet], multicast)
     return int(context.invoke(serve_boards, **options, motive=motive))

@@ -3,8 +3,7 @@
 It answers connect, model definitions, echo, keep-alive and the bitstream request on its command port, and sends every
 frame either to the multicast group or to each client: to the data port of its computer and, once it keeps alive, to
 where it speaks from, because clients differ in where they listen. Nothing here blocks: the board server calls it.
-What it cannot read is counted. Its clock counts from its own start, as that of another computer would; its axes are
-Motive's, y up.
+What it cannot read is counted. Its clock counts from its own start, as that of another computer would; its axes are y up.
 """
 
 import socket
@@ -51,6 +50,15 @@ Address = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
+class Streaming:
+    """What Motive's streaming pane says."""
+
+    port: int  # of commands, 0: any; frames go to the next one, which clients are told
+    version: Version
+    multicast: bool  # to the group, else to each client
+
+
+@dataclass(frozen=True, slots=True)
 class _Client:
     """Who has connected."""
 
@@ -58,7 +66,7 @@ class _Client:
     keeps_alive: bool  # then it takes frames where it speaks from; others would take them for answers
 
 
-def in_motive_axes(p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
+def with_y_up(p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
     """A pose in axes with y up, for world and body alike: x_M = x, y_M = z, z_M = -y."""
     x, y, z = p_WB
     w, a, b, c = q_WB
@@ -66,14 +74,12 @@ def in_motive_axes(p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
 
 
 class VirtualMotive:
-    """Tracks `bodies` (names by id); frames go to the port after the command port (0: any), announced to clients."""
+    """Tracks `bodies` (names by id)."""
 
-    def __init__(
-        self, port: int, version: Version, multicast: bool, bodies: dict[int, str], readers: Readers
-    ) -> None:
+    def __init__(self, settings: Streaming, bodies: dict[int, str], readers: Readers) -> None:
         self.malformed = 0
-        self._version = version
-        self._multicast = multicast
+        self._version = settings.version
+        self._multicast = settings.multicast
         self._models = ModelDefinition(
             tuple(
                 BodyDescription(name, number, _NO_PARENT, (0.0, 0.0, 0.0), ())
@@ -88,10 +94,10 @@ class VirtualMotive:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
-            self._socket.bind((HOST, port))
+            self._socket.bind((HOST, settings.port))
         except OSError as error:
             self._socket.close()
-            raise LabError(f"natnet port {port}: {error.strerror or error}") from None
+            raise LabError(f"natnet port {settings.port}: {error.strerror or error}") from None
         self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(HOST))
         self.port: int = self._socket.getsockname()[1]
         self.data_port = self.port + 1
@@ -104,7 +110,7 @@ class VirtualMotive:
 
     def take(self, body: int, frame: MocapFrame, now_us: int) -> None:
         """Take what was seen of a body, of another clock, on which it is `now_us`; the last body completes a frame."""
-        p, q = in_motive_axes(frame.p_WB, frame.q_WB)
+        p, q = with_y_up(frame.p_WB, frame.q_WB)
         self._seen.append(BodyPose(body, p, q, 0.0, frame.valid))
         if len(self._seen) < len(self._models.bodies):
             return

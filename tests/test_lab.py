@@ -9,24 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from serving import Served, serve
+from serving import Served, free_port, serve
 from test_mavlink_clients import MavProxy, mavproxy_here
 from test_virtual_motive import FROM_MOTIVE, needs
 
 from ground_station.mocap_udp import PoseReceiver, decode_frame
 
 START_S = 20.0
+HOVER = 0.1  # off home at most [m]; the paper hovers within centimetres
 
 
 @needs("natnet")
 def test_the_cameras_pose_is_what_a_client_gets() -> None:
     """Against the poses that the same cameras send to `--mocap virtual`; the noise makes each frame one of a kind."""
-    receiver = PoseReceiver(0)
+    receiver = PoseReceiver(free_port())
     noise = ("--set", "mocap.rotation_noise=0.2", "--set", "mocap.position_noise=0.05")
     with serve("--udp", "0", "--natnet-port", "0", "--poses", str(receiver.port), *noise, what="lab") as lab:
-        port = lab.line("motive ")[0].rstrip(",").partition(":")[2]
+        port = lab.line("motive ")[0].split(":")[2]
         script = str(Path(__file__).with_name("natnet_clients.py"))
-        command = [sys.executable, script, "natnet", port.split()[0], "unicast", "50"]
+        command = [sys.executable, script, "natnet", port, "unicast", "50"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE)
         frames = []
         deadline = time.monotonic() + START_S
@@ -62,7 +63,29 @@ def test_mavproxy_flies_the_robot_from_what_motive_says(tmp_path: Path) -> None:
         assert_still_flying(lab, 4.0)
         pose = [message for message in proxy.heard() if message.get_type() == "LOCAL_POSITION_NED"][-1]
         proxy.kill()
-    assert np.linalg.norm([pose.x, pose.y, pose.z]) < 0.1
+    assert [pose.x, pose.y, pose.z] == pytest.approx([0.0, 0.0, -1.15], abs=HOVER)
+
+
+@pytest.mark.parametrize(
+    ("end", "motive"),
+    [(("--mavlink", "pty"), ()), (("--udp", "0"), ("--natnet", "3.1", "--multicast"))],
+    ids=["pty, 4.1 unicast", "udp, 3.1 multicast"],
+)
+def test_a_station_in_another_process_flies_the_robot(end: tuple[str, ...], motive: tuple[str, ...]) -> None:
+    with serve(*end, *motive, "--natnet-port", "0", "--poses", "0", what="lab") as lab:
+        uri = lab.udp_uris[0] if "--udp" in end else "mavlink:" + lab.line("mavlink ")[0]
+        command = [sys.executable, "-m", "hil.cli", "station", "--link", uri]
+        command += ["--mocap", lab.line("motive ")[0], "--duration", "10"]
+        station = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        try:
+            lab.wait_for("board 1: released", START_S)
+            assert_still_flying(lab, 3.0)
+            said, _ = station.communicate(timeout=START_S)
+        finally:
+            station.kill()
+            station.wait()
+    assert station.returncode == 0, said
+    assert "supervisor: flying" in said
 
 
 def assert_still_flying(lab: Served, duration_s: float) -> None:
@@ -73,7 +96,7 @@ def assert_still_flying(lab: Served, duration_s: float) -> None:
 
 def test_a_taken_natnet_port_is_one_line_and_exit_code_two() -> None:
     with serve("--udp", "0", "--natnet-port", "0", "--poses", "0", what="lab") as lab:
-        port = lab.line("motive ")[0].partition(":")[2]
+        port = lab.line("motive ")[0].split(":")[2]
         command = [sys.executable, "-m", "hil.cli", "lab", "serve", "--udp", "0", "--natnet-port", port]
         shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
         assert lab.interrupt() == 0

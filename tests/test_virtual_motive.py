@@ -34,7 +34,7 @@ from ground_station.natnet import (
 from hil.dongle_server import Readers
 from hil.errors import LabError
 from hil.natnet_bytes import encode_frame, encode_models, encode_server_info
-from hil.virtual_motive import MAX_CLIENTS, VirtualMotive, in_motive_axes
+from hil.virtual_motive import MAX_CLIENTS, Streaming, VirtualMotive, with_y_up
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
 FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
@@ -83,7 +83,7 @@ def test_the_server_info_arrives_as_it_was_sent() -> None:
 def test_motives_axes_have_y_up() -> None:
     """Against rotation matrices of scipy: nose x, left y, up z become nose x, up y, right z."""
     q = Rotation.from_euler("zyx", [0.3, -0.5, 0.9])
-    p_M, (w, x, y, z) = in_motive_axes((1.0, 2.0, 3.0), tuple(q.as_quat()[[3, 0, 1, 2]]))
+    p_M, (w, x, y, z) = with_y_up((1.0, 2.0, 3.0), tuple(q.as_quat()[[3, 0, 1, 2]]))
     assert p_M == (1.0, 3.0, -2.0)
     expected = FROM_MOTIVE.T @ q.as_matrix() @ FROM_MOTIVE
     assert Rotation.from_quat([x, y, z, w]).as_matrix() == pytest.approx(expected)
@@ -102,7 +102,7 @@ class Laboratory:
 
     def __init__(self, version: tuple[int, int] = (4, 1), multicast: bool = False) -> None:
         self.readers: Readers = {}
-        self.motive = VirtualMotive(0, version, multicast, {1: "floaty"}, self.readers)
+        self.motive = VirtualMotive(Streaming(0, version, multicast), {1: "floaty"}, self.readers)
         self.number = 0
 
     def expose(self, valid: bool = True) -> None:
@@ -212,13 +212,14 @@ def test_a_body_that_is_not_tracked_is_marked(lab: Laboratory, client: Client) -
 def test_bodies_of_one_exposure_share_a_frame() -> None:
     lab = Laboratory()
     lab.motive.close()
-    lab.motive = VirtualMotive(0, (3, 1), False, {1: "floaty", 2: "floaty2"}, lab.readers)
+    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), {1: "floaty", 2: "floaty2"}, lab.readers)
     client = Client(lab)
     client.connect()
     lab.motive.take(1, seen(1), 0)
     assert client.hears_nothing()
     lab.motive.take(2, seen(2), 0)
-    assert [body.id for body in decode(client.hear(), (3, 1)).bodies] == [1, 2]
+    found = decode(client.hear(), (3, 1)).bodies
+    assert [body.id for body in found] == [1, 2]
     client.say(MessageId.REQUEST_MODELDEF)
     assert [body.name for body in decode(client.hear(), (3, 1)).bodies] == ["floaty", "floaty2"]
     client.close()
@@ -282,7 +283,7 @@ def test_no_bytes_stop_the_server(lab: Laboratory, client: Client) -> None:
 
 def test_a_taken_port_is_said_in_one_line(lab: Laboratory) -> None:
     with pytest.raises(LabError, match=rf"^natnet port {lab.motive.port}: Address already in use$"):
-        VirtualMotive(lab.motive.port, (4, 1), False, {1: "floaty"}, {})
+        VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
 
 
 def needs(client: str) -> pytest.MarkDecorator:
