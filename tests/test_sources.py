@@ -236,11 +236,11 @@ def test_poses_come_over_real_sockets(version: tuple[int, int], multicast: bool)
         source = find_source(f"optitrack:127.0.0.1:{port}{',multicast' if multicast else ''},body=floaty")
         source.open()
         frames = [source.receive(1.0) for _ in range(10)]
-        assert source.notices() == [
-            f"mocap Motive at 127.0.0.1, NatNet {version[0]}.{version[1]}, {'multicast' if multicast else 'unicast'}"
-        ]
+        way = "multicast" if multicast else "unicast"
+        told = f"mocap Motive at 127.0.0.1, NatNet {version[0]}.{version[1]}, {way}, y-up"
+        assert source.notices() == [told]
         source.close()
-    assert all(frame is not None and frame.valid and frame.p_WB[1:] == (2.0, 3.0) for frame in frames)
+    assert all(frame is not None and frame.valid and frame.p_WB[1:] == (-3.0, 2.0) for frame in frames)
     assert frames[-1] is not None
     assert 7000 <= clock_us() - frames[-1].t_us < 2_000_000
 
