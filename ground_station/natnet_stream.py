@@ -137,8 +137,8 @@ class NatnetStream:
             return models.bodies[names.index(self._name)].id
         if not self._name and len(names) == 1:
             return models.bodies[0].id
-        wanted = f"no body {self._name!r}" if self._name else "which body (body=NAME)?"
-        raise MocapError(f"{wanted} There are: {', '.join(names) or 'none'}")
+        wanted = f"no body {self._name!r}" if self._name else "body=NAME is missing"
+        raise MocapError(f"{wanted}; there are: {', '.join(names) or 'none'}")
 
     def _on_frame(self, frame: Frame, now_us: int) -> MocapFrame | None:
         counters = self.counters

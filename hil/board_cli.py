@@ -138,7 +138,7 @@ def serve(
 @click.option(
     "--mocap", default="virtual", show_default=True, metavar="SYSTEM",
     help="Where poses come from: virtual[:PORT], those that `floaty board serve` sends, or Motive's at "
-    "optitrack:HOST[:PORT][,multicast][,body=NAME][,y-up].",
+    "optitrack:HOST[:PORT][,multicast][,body=NAME][,z-up].",
 )  # fmt: skip
 @click.option(
     "--trajectory", default="hover", show_default=True, metavar="NAME", help="An experiment of `floaty list`."

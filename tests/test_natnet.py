@@ -91,6 +91,11 @@ def test_the_length_in_the_header_and_the_version_must_be_right() -> None:
         decode(packets.server_info((4, 1), hz=0), (3, 0))
 
 
+def test_a_count_of_more_than_there_is_is_refused_at_once() -> None:
+    with pytest.raises(MocapError, match="4294967295 things of 5 bytes"):
+        decode(packets.packet(7, bytes(4) + b"\xff" * 4 + bytes(40)), (3, 0))
+
+
 @given(st.binary(max_size=200), st.integers(0, 20), st.sampled_from(VERSIONS))
 def test_any_payload_is_read_or_refused(payload: bytes, message: int, version: Version) -> None:
     with suppress(MocapError):

@@ -118,9 +118,9 @@ def test_frames_that_come_twice_or_late_are_dropped_and_counted() -> None:
 
 
 @pytest.mark.parametrize(("name", "bodies", "message"), [
-    ("flouty", {"floaty": 7, "wand": 8}, "no body 'flouty' There are: floaty, wand"),
-    ("", {"floaty": 7, "wand": 8}, "which body (body=NAME)? There are: floaty, wand"),
-    ("floaty", {}, "no body 'floaty' There are: none"),
+    ("flouty", {"floaty": 7, "wand": 8}, "no body 'flouty'; there are: floaty, wand"),
+    ("", {"floaty": 7, "wand": 8}, "body=NAME is missing; there are: floaty, wand"),
+    ("floaty", {}, "no body 'floaty'; there are: none"),
 ])  # fmt: skip
 def test_a_wrong_body_is_one_line_with_those_there_are(
     name: str, bodies: dict[str, int], message: str
@@ -135,7 +135,7 @@ def test_a_wrong_body_is_one_line_with_those_there_are(
 def test_a_body_that_goes_away_in_flight_is_a_notice_and_comes_back_with_any_id() -> None:
     bench = Bench()
     bench.stream.on_packet(packets.model_definition({"wand": 7}, V), bench.now_us)
-    assert bench.stream.notices == ["motion capture: no body 'floaty' There are: wand"]
+    assert bench.stream.notices == ["motion capture: no body 'floaty'; there are: wand"]
     assert not bench.pose().valid
     bench.stream.on_packet(packets.model_definition({"floaty": 9}, V), bench.now_us)
     assert bench.pose(number_of_body=9).valid
@@ -236,11 +236,11 @@ def test_poses_come_over_real_sockets(version: tuple[int, int], multicast: bool)
         source = find_source(f"optitrack:127.0.0.1:{port}{',multicast' if multicast else ''},body=floaty")
         source.open()
         frames = [source.receive(1.0) for _ in range(10)]
-        assert source.notices() == [
-            f"mocap Motive at 127.0.0.1, NatNet {version[0]}.{version[1]}, {'multicast' if multicast else 'unicast'}"
-        ]
+        way = "multicast" if multicast else "unicast"
+        told = f"mocap Motive at 127.0.0.1, NatNet {version[0]}.{version[1]}, {way}, y-up"
+        assert source.notices() == [told]
         source.close()
-    assert all(frame is not None and frame.valid and frame.p_WB[1:] == (2.0, 3.0) for frame in frames)
+    assert all(frame is not None and frame.valid and frame.p_WB[1:] == (-3.0, 2.0) for frame in frames)
     assert frames[-1] is not None
     assert 7000 <= clock_us() - frames[-1].t_us < 2_000_000
 

@@ -1,4 +1,7 @@
-"""What `--mocap` says: virtual[:PORT] or optitrack:HOST[:PORT][,multicast][,body=NAME][,y-up]."""
+"""What `--mocap` says: virtual[:PORT] or optitrack:HOST[:PORT][,multicast][,body=NAME][,z-up].
+
+Motive streams with its y axis up unless it is told otherwise.
+"""
 
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapSource
@@ -8,7 +11,7 @@ from ground_station.natnet_stream import Axes
 from ground_station.sources.optitrack import OptitrackSource
 from ground_station.sources.virtual import VirtualSource
 
-FORMS = "virtual, virtual:PORT or optitrack:HOST[:PORT][,multicast][,body=NAME][,y-up]"
+FORMS = "virtual, virtual:PORT or optitrack:HOST[:PORT][,multicast][,body=NAME][,z-up]"
 
 
 def find_source(text: str) -> MocapSource:
@@ -24,9 +27,9 @@ def find_source(text: str) -> MocapSource:
     for option in options:
         if option.startswith("body=") and len(option) > 5:
             body = option[5:]
-        elif option not in ("multicast", "y-up"):
+        elif option not in ("multicast", "z-up"):
             raise MocapError(f"{option!r}: expected {FORMS}")
-    axes: Axes = "y-up" if "y-up" in options else "z-up"
+    axes: Axes = "z-up" if "z-up" in options else "y-up"
     return OptitrackSource(host, _port(port) if colon else COMMAND_PORT, body, "multicast" in options, axes)
 
 

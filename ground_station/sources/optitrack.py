@@ -56,10 +56,9 @@ class OptitrackSource:
             raise MocapError(f"{server.name} at {self._host} does not stream by multicast")
         if server.multicast:
             self._join(server.group, server.data_port)
-        stream.notices.append(
-            f"mocap {server.name} at {self._host}, NatNet {server.natnet_version[0]}."
-            f"{server.natnet_version[1]}, {'multicast' if server.multicast else 'unicast'}"
-        )
+        version = f"NatNet {server.natnet_version[0]}.{server.natnet_version[1]}"
+        way = "multicast" if server.multicast else "unicast"
+        stream.notices.append(f"mocap {server.name} at {self._host}, {version}, {way}, {self._axes}")
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
         """The next frame, None when none comes in time."""
