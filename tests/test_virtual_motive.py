@@ -289,7 +289,7 @@ def test_a_taken_port_is_said_in_one_line(lab: Laboratory) -> None:
 def needs(client: str) -> pytest.MarkDecorator:
     """Skip where a client is not installed."""
     missing = importlib.util.find_spec(client) is None
-    return pytest.mark.skipif(missing, reason=f"{client} IS NOT TESTED: `pip install {client}` installs it")
+    return pytest.mark.skipif(missing, reason=f"{client} IS NOT TESTED: `make clients` installs it")
 
 
 @pytest.mark.parametrize(
