@@ -1,6 +1,6 @@
-"""Unmodified NatNet clients, each run as a process of its own: poses that they received, as JSON, one per line.
+"""Unmodified NatNet clients and ours, each run as a process of its own: poses that they received, as JSON, one per line.
 
-    python natnet_clients.py natnet|motioncapture PORT unicast|multicast COUNT
+    python natnet_clients.py natnet|motioncapture|ground_station PORT unicast|multicast COUNT
 
 A line: frame number (null: the client does not say), name, position, quaternion x y z w, tracked.
 """
@@ -51,9 +51,24 @@ def by_motioncapture(port: int, count: int) -> None:
             count -= 1
 
 
+def by_ground_station(port: int, multicast: bool, count: int) -> None:
+    from ground_station.sources.optitrack import OptitrackSource
+
+    source = OptitrackSource("127.0.0.1", port, "floaty", multicast, "z-up")  # as they come
+    source.open()
+    while count > 0:
+        if (frame := source.receive(1.0)) is not None:
+            w, x, y, z = frame.q_WB
+            print(json.dumps([None, "floaty", frame.p_WB, [x, y, z, w], frame.valid]))
+            count -= 1
+    source.close()
+
+
 if __name__ == "__main__":
     kind, port, how, count = sys.argv[1:]
     if kind == "natnet":
         by_natnet(int(port), how == "multicast", int(count))
+    elif kind == "ground_station":
+        by_ground_station(int(port), how == "multicast", int(count))
     else:
         by_motioncapture(int(port), int(count))

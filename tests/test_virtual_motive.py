@@ -108,8 +108,8 @@ class Laboratory:
     def expose(self, valid: bool = True) -> None:
         self.number += 1
         frame = seen(self.number)
-        shown = MocapFrame(0, frame.p_WB, frame.q_WB, valid)
-        self.motive.take(1, shown, LATENCY_US)
+        shown = MocapFrame(7_000_000, frame.p_WB, frame.q_WB, valid)
+        self.motive.take(1, shown, 7_000_000 + LATENCY_US)
 
     def answer(self) -> None:
         """Answer what clients have asked by now."""
@@ -293,11 +293,11 @@ def needs(client: str) -> pytest.MarkDecorator:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=needs(name)) for name in ("natnet", "motioncapture")]
+    "name", [pytest.param(name, marks=needs(name)) for name in ("natnet", "motioncapture", "ground_station")]
 )
 @pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
 @pytest.mark.parametrize("version", [(3, 1), (4, 1)], ids=["3.1", "4.1"])
-def test_an_unmodified_client_sees_the_pose(name: str, multicast: bool, version: tuple[int, int]) -> None:
+def test_every_client_sees_the_pose(name: str, multicast: bool, version: tuple[int, int]) -> None:
     lab = Laboratory(version, multicast)
     assert_poses(lab, name, "multicast" if multicast else "unicast", "20")
 
