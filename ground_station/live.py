@@ -8,10 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from firmware_py.wire import WireError
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
-from ground_station.mocap_udp import decode_frame
+from ground_station.mocap import MocapSource
 from ground_station.station import GroundStation
 
 POSE_TIMEOUT_US = 5_000_000
@@ -19,14 +18,6 @@ RECONNECT_TIMEOUT_US = 30_000_000
 STATUS_PERIOD_US = 5_000_000
 FAILSAFE_TIMEOUT_US = 2_000_000
 FAILSAFE = 3  # supervisor.state
-
-
-class PoseSource(Protocol):
-    """Where datagrams with poses come from."""
-
-    def receive(self, timeout_s: float) -> bytes | None:
-        """The next datagram, None when none comes in time."""
-        ...
 
 
 class LiveLink(Protocol):
@@ -77,10 +68,9 @@ class LiveStation:
 
     link: LiveLink
     station: GroundStation
-    source: PoseSource
+    source: MocapSource
     say: Callable[[str], None]
     stopping: Callable[[], bool]
-    malformed: int = 0  # datagrams that were not poses
 
     def run(self) -> None:
         """Fly until told to stop; raises `LinkError` when there are no poses or no board."""
@@ -117,9 +107,10 @@ class LiveStation:
         """Forward poses and telemetry while the link holds."""
         pose_us = status_us = clock_us()
         while not self.stopping():
-            data = self.source.receive(0.02)
+            frame = self.source.receive(0.02)
             now_us = clock_us()
-            if data is not None and self._on_pose(data, now_us):
+            if frame is not None:
+                self.station.on_frame(frame, now_us)
                 pose_us = now_us
             elif now_us - pose_us > POSE_TIMEOUT_US:
                 self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
@@ -131,28 +122,19 @@ class LiveStation:
                 status_us = now_us
                 self._show()
 
-    def _on_pose(self, data: bytes, now_us: int) -> bool:
-        try:
-            frame = decode_frame(data)
-        except WireError:
-            self.malformed += 1
-            return False
-        self.station.on_frame(frame, now_us)
-        return True
-
     def _take_telemetry(self) -> None:
         for t_us, packet in self.link.received():
             self.station.on_packet(t_us, packet)
 
     def _tell(self) -> None:
-        for notice in self.link.notices():
+        for notice in self.source.notices() + self.link.notices():
             self.say(notice)
 
     def _show(self) -> None:
         counters = self.station.counters
         self.say(
-            f"poses {counters.frames} ({counters.invalid} unusable)  {self.link.summary()}  "
-            f"telemetry {counters.samples}"
+            f"poses {counters.frames} ({counters.invalid} unusable)  {self.source.summary()}  "
+            f"{self.link.summary()}  telemetry {counters.samples}"
         )
 
     def _leave(self) -> None:

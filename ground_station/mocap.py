@@ -1,6 +1,7 @@
 """What a motion capture system says about the robot."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,3 +12,27 @@ class MocapFrame:
     p_WB: tuple[float, float, float]  # [m]
     q_WB: tuple[float, float, float, float]  # w x y z
     valid: bool  # False: the body was not tracked, the pose means nothing
+
+
+class MocapSource(Protocol):
+    """A motion capture system in real time; time stamps are of `ground_station.clock.clock_us`."""
+
+    def open(self) -> None:
+        """Connect; raises `MocapError`."""
+        ...
+
+    def receive(self, timeout_s: float) -> MocapFrame | None:
+        """The next frame, None when none comes in time."""
+        ...
+
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call."""
+        ...
+
+    def summary(self) -> str:
+        """A few words on how it does."""
+        ...
+
+    def close(self) -> None:
+        """Disconnect."""
+        ...

@@ -35,7 +35,6 @@ class PoseReceiver:
     """Listens for poses on a port; `OSError` when it is taken."""
 
     def __init__(self, port: int = DEFAULT_PORT) -> None:
-        self.malformed = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind((HOST, port))

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ground_station.links.crazyradio import CrazyradioLink
     from ground_station.links.mavlink_serial import MavlinkSerialLink
     from hil.config import LabConfig
+    from hil.virtual_motive import Streaming
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
@@ -75,6 +76,7 @@ def serve(
     seed: int,
     profile: str,
     overrides: tuple[str, ...],
+    motive: "Streaming | None" = None,  # of `floaty lab serve`
 ) -> int:
     """Serve boards in virtual tunnels, in real time, until Ctrl-C.
 
@@ -107,6 +109,9 @@ def serve(
         _say(f"udp    {' '.join(server.serve_udp(udp))}")
     if ends:
         _say(f"mavlink {' '.join(server.serve_mavlink(ends))}")
+    if motive is not None:
+        port = server.serve_motive(motive).port
+        _say(f"motive optitrack:127.0.0.1:{port}{',multicast' if motive.multicast else ''}")
     for number, served in enumerate(server.boards):
         if poses:
             served.publish(PosePublisher(poses + number).send)
@@ -118,6 +123,8 @@ def serve(
         server.run(lambda: bool(stops))
     finally:
         server.close()
+    if server.motive is not None and server.motive.malformed:
+        _say(f"motive could not read {server.motive.malformed} packets")
     _say(f"stopped; never more than {server.worst_lag_us / 1000:.1f} ms late")
     return 0
 
@@ -129,8 +136,9 @@ def serve(
     "COM3, socket://HOST:PORT, rfc2217://HOST:PORT.",
 )  # fmt: skip
 @click.option(
-    "--mocap", default="virtual", show_default=True, metavar="virtual[:PORT]",
-    help="Where poses come from: those that `floaty board serve` sends.",
+    "--mocap", default="virtual", show_default=True, metavar="SYSTEM",
+    help="Where poses come from: virtual[:PORT], those that `floaty board serve` sends, or Motive's at "
+    "optitrack:HOST[:PORT][,multicast][,body=NAME][,z-up].",
 )  # fmt: skip
 @click.option(
     "--trajectory", default="hover", show_default=True, metavar="NAME", help="An experiment of `floaty list`."
@@ -164,19 +172,19 @@ def station(
     config = load_config(profile, overrides)
     experiment = find_experiment(trajectory)
     from ground_station.clock import clock_us
-    from ground_station.errors import LinkError
+    from ground_station.errors import LinkError, MocapError
     from ground_station.live import LiveStation
-    from ground_station.mocap_udp import PoseReceiver
+    from ground_station.sources.address import find_source
     from ground_station.station import GroundStation
     from ground_station.telemetry_log import TelemetryLog
     from ground_station.trajectory import Goal
 
     link = _live_link(uri, config)
-    port = _virtual_port(mocap)
     try:
-        source = PoseReceiver(port)
-    except OSError as error:
-        raise LabError(f"--mocap {mocap}: port {port}: {error.strerror or error}") from None
+        source = find_source(mocap)
+        source.open()
+    except MocapError as error:
+        raise LabError(f"--mocap {mocap}: {error}") from None
     try:
         telemetry = TelemetryLog(log) if log else None
     except OSError as error:
@@ -220,14 +228,6 @@ def _live_link(uri: str, config: "LabConfig") -> "CrazyradioLink | MavlinkSerial
         return MavlinkSerialLink(uri, MavlinkLinkConfig(config.serial.baud, pose_hz, key))
     except LinkError as error:
         raise LabError(str(error)) from None
-
-
-def _virtual_port(mocap: str) -> int:
-    """Return the port of a pose source."""
-    name, colon, port = mocap.partition(":")
-    if name != "virtual" or (colon and not (port.isdigit() and 0 < int(port) < 65536)):
-        raise LabError(f"--mocap {mocap}: expected virtual or virtual:PORT")
-    return int(port) if colon else POSE_PORT
 
 
 def _stop_signals() -> list[int]:

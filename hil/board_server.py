@@ -8,6 +8,7 @@ import select
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 
 from hil.config import LabConfig
 from hil.dongle_server import DongleServer, Readers
@@ -17,6 +18,7 @@ from hil.harness import Streams
 from hil.serial_server import Address
 from hil.served_board import ServedBoard
 from hil.virtual_dongle import VirtualDongle
+from hil.virtual_motive import Streaming, VirtualMotive
 
 WARM_UP_US = 20_000  # run before anybody looks: the first run on a machine compiles
 DONGLE_SEED = 10_000  # random streams of dongles: apart from those of the boards
@@ -38,6 +40,7 @@ class BoardServer:
         self._config = config
         self._seed = seed + DONGLE_SEED
         self._dongles: DongleServer | None = None
+        self.motive: VirtualMotive | None = None
         while self.events.now_us < WARM_UP_US:
             self._step()
 
@@ -65,6 +68,16 @@ class BoardServer:
         except LabError:
             self.close()
             raise
+
+    def serve_motive(self, settings: Streaming) -> VirtualMotive:
+        """Let Motive see every board, under its number."""
+        names = {
+            board.number: "floaty" if board.number == 1 else f"floaty{board.number}" for board in self.boards
+        }
+        self.motive = VirtualMotive(settings, names, self.readers)
+        for board in self.boards:
+            board.publish(partial(self.motive.take, board.number))
+        return self.motive
 
     def run(self, stopping: Callable[[], bool]) -> None:
         """Go on until told to stop; may be called again."""
@@ -96,6 +109,8 @@ class BoardServer:
             board.close()
         if self._dongles is not None:
             self._dongles.close()
+        if self.motive is not None:
+            self.motive.close()
 
     def _new_dongle(self) -> VirtualDongle:
         self._seed += 1

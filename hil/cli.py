@@ -15,6 +15,7 @@ from rich.console import Console
 from hil.board_cli import board, station
 from hil.deploy_cli import deploy
 from hil.errors import LabError
+from hil.lab_cli import lab
 from hil.paper_cli import compare, paper, study
 
 if TYPE_CHECKING:
@@ -417,6 +418,7 @@ def _refuse(text: str) -> int:
 
 
 app.add_command(board)
+app.add_command(lab)
 app.add_command(station)
 app.add_command(compare)
 app.add_command(deploy)

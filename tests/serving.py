@@ -58,7 +58,9 @@ class Served:
     def forget(self) -> None:
         """Let `wait_for` look only at what comes from now on."""
         self.lines = [
-            line for line in self.lines if line.split()[:1] in (["radio"], ["udp"], ["use"], ["mavlink"])
+            line
+            for line in self.lines
+            if line.split()[:1] in (["radio"], ["udp"], ["use"], ["mavlink"], ["motive"])
         ]
 
     def interrupt(self) -> int:
@@ -75,9 +77,9 @@ def free_port() -> int:
 
 
 @contextmanager
-def serve(*arguments: str) -> Iterator[Served]:
-    """A server on free ports."""
-    command = [sys.executable, "-m", "hil.cli", "board", "serve", *arguments]
+def serve(*arguments: str, what: str = "board") -> Iterator[Served]:
+    """A server of boards, or of the laboratory, on free ports."""
+    command = [sys.executable, "-m", "hil.cli", what, "serve", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     served = Served(process)
     try:

@@ -45,8 +45,8 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "socket": (
         "hil/window.py", "hil/dongle_plugin.py", "hil/dongle_server.py", "hil/udp_server.py", "hil/serial_server.py",
-        "hil/linked_flight.py",
-        "ground_station/mocap_udp.py",
+        "hil/linked_flight.py", "hil/virtual_motive.py",
+        "ground_station/mocap_udp.py", "ground_station/sources/optitrack.py",
     ),
     "random": (),
     "secrets": (),

@@ -1,0 +1,275 @@
+"""NatNet, the protocol of OptiTrack's Motive: what its packets say, versions 3.0 to 4.1, little endian.
+
+A packet is u16 message, u16 length of what follows, payload. Sans I/O; positions and rotations are those of Motive's
+axes, and a quaternion's order is x y z w on the wire, w x y z here. Skeletons, assets, force plates, devices and
+cameras are checked and passed over. `hil.virtual_motive` writes what is read here. Layouts from the clients of links.md.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from ground_station.errors import MocapError
+from ground_station.natnet_reader import Quaternion, Reader, Vector, Version
+
+COMMAND_PORT = 1510
+DATA_PORT = 1511
+MULTICAST_GROUP = "239.255.42.99"
+VERSIONS: tuple[Version, ...] = ((3, 0), (3, 1), (4, 0), (4, 1))
+TRACKED = 1  # bit of a body's parameters
+HEADER_SIZE = 4
+END_TAG_SIZE = 4  # zeros behind a frame
+
+_NAME_SIZE = 256  # of the server, padded with zeros
+_BODY_SIZE = 38  # id, position, rotation, error, parameters
+_LABELLED_SIZE = 26  # id, position, size, parameters, residual
+
+
+class MessageId(IntEnum):
+    """What a packet is; clients send CONNECT, REQUEST, REQUEST_MODELDEF, KEEPALIVE, DISCONNECT and ECHO_REQUEST."""
+
+    CONNECT = 0
+    SERVER_INFO = 1
+    REQUEST = 2
+    RESPONSE = 3
+    REQUEST_MODELDEF = 4
+    MODELDEF = 5
+    FRAME = 7
+    MESSAGE = 8
+    DISCONNECT = 9
+    KEEPALIVE = 10
+    ECHO_REQUEST = 12  # u64 of the client's choice
+    ECHO_RESPONSE = 13  # the same u64, u64 the server's clock [ticks]
+    UNRECOGNIZED = 100
+
+
+@dataclass(frozen=True, slots=True)
+class ServerInfo:
+    """The answer to CONNECT."""
+
+    name: str
+    app_version: tuple[int, int, int, int]
+    natnet_version: tuple[int, int, int, int]
+    clock_hz: int  # ticks per second of all time stamps
+    data_port: int
+    multicast: bool
+    group: str  # of multicast, dotted
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerDescription:
+    """A marker of a rigid body."""
+
+    p: Vector  # [m] in the body's frame
+    label: int
+    name: str  # empty before 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class BodyDescription:
+    """A rigid body that the server knows; the frames carry its id only."""
+
+    name: str
+    id: int
+    parent: int
+    offset: Vector  # [m] from the parent
+    markers: tuple[MarkerDescription, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ModelDefinition:
+    """The answer to REQUEST_MODELDEF."""
+
+    bodies: tuple[BodyDescription, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BodyPose:
+    """A rigid body in a frame."""
+
+    id: int
+    p: Vector  # [m] in Motive's axes
+    q: Quaternion  # w x y z
+    error: float  # mean distance of the markers [m]
+    valid: bool  # tracked in this frame
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledMarker:
+    """A marker that the server told apart."""
+
+    id: int  # model << 16 | marker
+    p: Vector  # [m] in Motive's axes
+    size: float  # [m]
+    parameters: int
+    residual: float  # [m]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One exposure of the cameras; ticks are of the server's clock."""
+
+    number: int
+    bodies: tuple[BodyPose, ...]
+    unlabelled: tuple[Vector, ...]  # [m]
+    labelled: tuple[LabelledMarker, ...]
+    timestamp_s: float  # since the server started
+    mid_exposure: int  # [ticks]
+    received: int  # [ticks] by the server from the cameras
+    transmitted: int  # [ticks]
+    parameters: int  # 1 recording, 2 the models have changed
+
+
+@dataclass(frozen=True, slots=True)
+class Echo:
+    """The answer to ECHO_REQUEST."""
+
+    asked: int  # what the client sent
+    server: int  # [ticks]
+
+
+@dataclass(frozen=True, slots=True)
+class Other:
+    """A packet that carries nothing of use here."""
+
+    message: int
+
+
+Message = ServerInfo | ModelDefinition | Frame | Echo | Other
+
+
+def packet(message: MessageId, payload: bytes = b"") -> bytes:
+    """The bytes of a packet."""
+    return message.to_bytes(2, "little") + len(payload).to_bytes(2, "little") + payload
+
+
+def decode(data: bytes, version: Version) -> Message:
+    """What a packet says, in the layout of `version`; `MocapError` for what cannot be read."""
+    if version not in VERSIONS:
+        raise MocapError(f"NatNet {version[0]}.{version[1]}: only 3.0, 3.1, 4.0 and 4.1 can be read")
+    reader = Reader(data, version)
+    message, size = reader.u16(), reader.u16()
+    if size != len(data) - HEADER_SIZE:
+        raise MocapError(f"NatNet packet of {len(data)} bytes says that it has {size + HEADER_SIZE}")
+    if message == MessageId.FRAME:
+        return _frame(reader)
+    if message == MessageId.SERVER_INFO:
+        return _server_info(reader)
+    if message == MessageId.MODELDEF:
+        return _model_definition(reader)
+    if message == MessageId.ECHO_RESPONSE:
+        return Echo(reader.u64(), reader.u64())
+    return Other(message)
+
+
+def _server_info(reader: Reader) -> ServerInfo:
+    name = reader.take(_NAME_SIZE).partition(b"\0")[0].decode("utf-8", "replace")
+    a, b, c, d = reader.take(4)
+    e, f, g, h = reader.take(4)
+    clock_hz, port, multicast = reader.u64(), reader.u16(), reader.take(1) != b"\0"
+    if clock_hz == 0 or port == 0:
+        raise MocapError(f"NatNet server {name!r}: clock {clock_hz} Hz, data port {port}: neither may be 0")
+    group = ".".join(str(part) for part in reader.take(4))
+    return ServerInfo(name, (a, b, c, d), (e, f, g, h), clock_hz, port, multicast, group)
+
+
+def _frame(reader: Reader) -> Frame:
+    number = reader.u32()
+    for _ in range(reader.section(5)):  # marker sets
+        reader.text()
+        reader.take(12 * reader.count(12))
+    unlabelled = tuple(reader.vector() for _ in range(reader.section(12)))
+    bodies = tuple(_body(reader) for _ in range(reader.section(_BODY_SIZE)))
+    for _ in range(reader.section(8)):  # skeletons
+        reader.u32()
+        reader.take(_BODY_SIZE * reader.count(_BODY_SIZE))
+    if reader.version >= (4, 1):
+        for _ in range(reader.section(12)):  # assets
+            reader.u32()
+            reader.take(_BODY_SIZE * reader.count(_BODY_SIZE))
+            reader.take(_LABELLED_SIZE * reader.count(_LABELLED_SIZE))
+    labelled = tuple(_labelled(reader) for _ in range(reader.section(_LABELLED_SIZE)))
+    for _ in range(2):  # force plates, devices
+        for _ in range(reader.section(8)):
+            reader.u32()
+            for _ in range(reader.count(4)):  # channels
+                reader.take(4 * reader.count(4))
+    reader.take(8)  # time code
+    timestamp_s = reader.f64()
+    mid_exposure, received, transmitted = reader.u64(), reader.u64(), reader.u64()
+    if reader.version >= (4, 0):
+        reader.take(8)  # time of a precision time protocol
+    parameters = reader.u16()
+    if reader.left not in (0, END_TAG_SIZE):
+        raise MocapError(f"NatNet frame {number}: {reader.left} bytes too many")
+    return Frame(
+        number, bodies, unlabelled, labelled, timestamp_s, mid_exposure, received, transmitted, parameters
+    )
+
+
+def _body(reader: Reader) -> BodyPose:
+    return BodyPose(
+        reader.u32(), reader.vector(), reader.quaternion(), reader.f32(), bool(reader.u16() & TRACKED)
+    )
+
+
+def _labelled(reader: Reader) -> LabelledMarker:
+    return LabelledMarker(reader.u32(), reader.vector(), reader.f32(), reader.u16(), reader.f32())
+
+
+def _model_definition(reader: Reader) -> ModelDefinition:
+    bodies = []
+    for _ in range(reader.count(4)):
+        kind = reader.u32()
+        if reader.version >= (4, 1):
+            reader.u32()  # bytes
+        if kind == 1:
+            bodies.append(_description(reader))
+        else:
+            _pass_over(reader, kind)
+    return ModelDefinition(tuple(bodies))
+
+
+def _description(reader: Reader) -> BodyDescription:
+    name, number, parent, offset = reader.text(), reader.u32(), reader.u32(), reader.vector()
+    count = reader.count(16)
+    places = [reader.vector() for _ in range(count)]
+    labels = [reader.u32() for _ in range(count)]
+    names = [reader.text() if reader.version >= (4, 0) else "" for _ in range(count)]
+    markers = map(MarkerDescription, places, labels, names)
+    return BodyDescription(name, number, parent, offset, tuple(markers))
+
+
+def _pass_over(reader: Reader, kind: int) -> None:
+    """Read a description of no use: marker set, skeleton, force plate, device, camera, asset."""
+    if kind == 0:
+        reader.text()
+        reader.texts()
+    elif kind == 2:
+        reader.text()
+        reader.u32()
+        for _ in range(reader.count(25)):
+            _description(reader)
+    elif kind == 3:
+        reader.u32()
+        reader.text()
+        reader.take(4 * (2 + 3 + 144 + 12) + 8)  # size, origin, calibration, corners, types
+        reader.texts()
+    elif kind == 4:
+        reader.u32()
+        reader.text()
+        reader.text()
+        reader.take(8)
+        reader.texts()
+    elif kind == 5:
+        reader.text()
+        reader.take(28)
+    elif kind == 6:
+        reader.text()
+        reader.take(8)
+        for _ in range(reader.count(25)):
+            _description(reader)
+        for _ in range(reader.count(23)):
+            reader.text()
+            reader.take(22)  # id, position, size, parameters
+    else:
+        raise MocapError(f"NatNet model definition: {kind} is no kind of model")

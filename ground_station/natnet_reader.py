@@ -1,0 +1,110 @@
+"""The pieces that NatNet packets are made of, every length checked, so that no bytes can do harm."""
+
+import struct
+
+from ground_station.errors import MocapError
+
+Version = tuple[int, int]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+_U16 = struct.Struct("<H")
+_U32 = struct.Struct("<I")
+_U64 = struct.Struct("<Q")
+_F32 = struct.Struct("<f")
+_F64 = struct.Struct("<d")
+_VECTOR = struct.Struct("<3f")
+_QUATERNION = struct.Struct("<4f")
+
+
+class Reader:
+    """Goes through a packet of `version`; whatever would lie beyond its end raises `MocapError`."""
+
+    def __init__(self, data: bytes, version: Version) -> None:
+        self.version = version
+        self._data = data
+        self._at = 0
+
+    @property
+    def left(self) -> int:
+        """Bytes not read yet."""
+        return len(self._data) - self._at
+
+    def take(self, size: int) -> bytes:
+        """The next bytes."""
+        at = self._advance(size)
+        return self._data[at : at + size]
+
+    def u16(self) -> int:
+        """The next number of 2 bytes."""
+        value: int = _U16.unpack_from(self._data, self._advance(2))[0]
+        return value
+
+    def u32(self) -> int:
+        """The next number of 4 bytes."""
+        value: int = _U32.unpack_from(self._data, self._advance(4))[0]
+        return value
+
+    def u64(self) -> int:
+        """The next number of 8 bytes."""
+        value: int = _U64.unpack_from(self._data, self._advance(8))[0]
+        return value
+
+    def f32(self) -> float:
+        """The next float of 4 bytes."""
+        value: float = _F32.unpack_from(self._data, self._advance(4))[0]
+        return value
+
+    def f64(self) -> float:
+        """The next float of 8 bytes."""
+        value: float = _F64.unpack_from(self._data, self._advance(8))[0]
+        return value
+
+    def vector(self) -> Vector:
+        """The next three floats."""
+        x, y, z = _VECTOR.unpack_from(self._data, self._advance(12))
+        return x, y, z
+
+    def quaternion(self) -> Quaternion:
+        """The next rotation: x y z w in the packet, w x y z returned."""
+        x, y, z, w = _QUATERNION.unpack_from(self._data, self._advance(16))
+        return w, x, y, z
+
+    def text(self) -> str:
+        """The next text, which ends with a zero."""
+        end = self._data.find(b"\0", self._at)
+        if end < 0:
+            raise MocapError(f"NatNet packet of {len(self._data)} bytes: text at {self._at} does not end")
+        raw = self._data[self._at : end]
+        self._at = end + 1
+        return raw.decode("utf-8", "replace")
+
+    def texts(self) -> None:
+        """Pass over a count and as many texts."""
+        for _ in range(self.count(1)):
+            self.text()
+
+    def count(self, size: int) -> int:
+        """The next count, of things of at least `size` bytes each."""
+        count = self.u32()
+        if count * size > self.left:
+            raise MocapError(
+                f"NatNet packet of {len(self._data)} bytes: {count} things of {size} bytes at {self._at}"
+            )
+        return count
+
+    def section(self, size: int) -> int:
+        """The count at the start of a section of a frame; from 4.1 on its bytes stand behind it."""
+        count = self.count(size)
+        if self.version >= (4, 1):
+            self.u32()
+        return count
+
+    def _advance(self, size: int) -> int:
+        at = self._at
+        if size > len(self._data) - at:
+            raise MocapError(
+                f"NatNet packet of {len(self._data)} bytes ends before {size} bytes at {at} are read"
+            )
+        self._at = at + size
+        return at

@@ -1,0 +1,194 @@
+"""One rigid body out of a NatNet stream: packets and the time in, poses in the world and notices out. Sans I/O.
+
+World axes: z up. From Motive's "y up" the world is reached by a quarter turn about x, which leaves x where it is.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from ground_station.errors import MocapError
+from ground_station.mocap import MocapFrame
+from ground_station.natnet import (
+    VERSIONS,
+    BodyPose,
+    Echo,
+    Frame,
+    MessageId,
+    ModelDefinition,
+    ServerInfo,
+    decode,
+    packet,
+)  # fmt: skip
+from ground_station.natnet_reader import Quaternion, Vector
+from ground_station.server_clock import ServerClock
+
+Axes = Literal["z-up", "y-up"]
+
+LATE_FRAMES = 100  # a number that lies further back is that of a server that began anew
+FROZEN_FRAMES = 3  # with the very same pose: the server repeats what it saw last
+MISTIMED_FRAMES = (
+    1000  # one after the other: the server's clock was set. Those that waited in a socket are fewer
+)
+OLDEST_US = 1_000_000  # an exposure longer ago is of no use, or its time stamp is wrong
+SILENCE_US = 500_000  # without frames, after which the server is called again
+CALL_PERIOD_US = 500_000
+MODELS_CHANGED = 2  # bit of a frame's parameters
+NOWHERE: tuple[Vector, Quaternion] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+@dataclass(slots=True)
+class StreamCounters:
+    """What came."""
+
+    frames: int = 0  # passed on
+    lost: int = 0  # of these, without a pose
+    dropped: int = 0  # twice, or after a newer one
+    malformed: int = 0  # packets that cannot be read
+    mistimed: int = 0  # of the lost, for their time stamp
+
+
+class NatnetStream:
+    """Follows body `name`, the only one there is when empty; `outgoing` are packets for the server's command port."""
+
+    def __init__(self, name: str, axes: Axes) -> None:
+        self.counters = StreamCounters()
+        self.server: ServerInfo | None = None
+        self.models: ModelDefinition | None = None
+        self.age_us = 0  # of the last pose when it arrived
+        self.outgoing: list[bytes] = []
+        self.notices: list[str] = []
+        self._name = name
+        self._axes = axes
+        self._version = VERSIONS[0]
+        self._clock = ServerClock(1)
+        self._id: int | None = None
+        self._number: int | None = None
+        self._pose: BodyPose | None = None
+        self._repeated = 0
+        self._mistimed = 0  # frames on end
+        self._heard_us: int | None = None  # the last frame
+        self._silent = False
+        self._call_us = 0
+
+    def on_packet(self, data: bytes, now_us: int) -> MocapFrame | None:
+        """Take a packet; the pose, if it is a new frame.
+
+        `MocapError` when the server or its bodies are not those wanted; later, when they change, it is a notice.
+        """
+        try:
+            message = decode(data, self._version)
+        except MocapError:
+            self.counters.malformed += 1
+            return None
+        if isinstance(message, Frame):
+            return self._on_frame(message, now_us) if self.models is not None else None
+        if isinstance(message, Echo):
+            if 0 <= now_us - message.asked <= OLDEST_US:
+                self._clock.answered(message.asked, message.server, now_us)
+        elif isinstance(message, ServerInfo | ModelDefinition):
+            try:
+                self._on_answer(message)
+            except MocapError as error:
+                self._id = None
+                if self.models is None:
+                    raise
+                self.notices.append(f"motion capture: {error}")
+        return None
+
+    def call(self, now_us: int) -> None:
+        """Keep the connection; to be called often. A silent server is asked who it is."""
+        if now_us < self._call_us:
+            return
+        self._call_us = now_us + CALL_PERIOD_US
+        silent = self._heard_us is not None and now_us - self._heard_us > SILENCE_US
+        if silent and not self._silent:
+            self.notices.append("motion capture: no frames; calling the server again")
+        self._silent = silent
+        if self.server is None or silent:
+            self.outgoing.append(packet(MessageId.CONNECT, b"Ping\0"))
+        elif self.models is None:
+            self.outgoing.append(packet(MessageId.REQUEST_MODELDEF, b"\0"))
+        self.outgoing.append(packet(MessageId.KEEPALIVE, b"\0"))
+        self.outgoing.append(packet(MessageId.ECHO_REQUEST, now_us.to_bytes(8, "little")))
+
+    def _on_answer(self, answer: ServerInfo | ModelDefinition) -> None:
+        if isinstance(answer, ServerInfo):
+            self._on_server(answer)
+        elif self.server is not None:
+            self._id = self._find(answer)
+            self.models = answer
+
+    def _on_server(self, server: ServerInfo) -> None:
+        version = server.natnet_version[:2]
+        if version not in VERSIONS:
+            raise MocapError(
+                f"NatNet {version[0]}.{version[1]} of {server.name}: 3.0, 3.1, 4.0 or 4.1 is needed"
+            )
+        if self.server != server:
+            self._version = version
+            self._clock = ServerClock(server.clock_hz)
+        self.server = server
+        self.outgoing.append(packet(MessageId.REQUEST_MODELDEF, b"\0"))
+
+    def _find(self, models: ModelDefinition) -> int:
+        names = [body.name for body in models.bodies]
+        if self._name in names:
+            return models.bodies[names.index(self._name)].id
+        if not self._name and len(names) == 1:
+            return models.bodies[0].id
+        wanted = f"no body {self._name!r}" if self._name else "body=NAME is missing"
+        raise MocapError(f"{wanted}; there are: {', '.join(names) or 'none'}")
+
+    def _on_frame(self, frame: Frame, now_us: int) -> MocapFrame | None:
+        counters = self.counters
+        if self._number is not None and 0 <= self._number - frame.number < LATE_FRAMES:
+            counters.dropped += 1
+            return None
+        self._number = frame.number
+        if self._silent and self._heard_us is not None:
+            self.notices.append(
+                f"motion capture: frames again after {(now_us - self._heard_us) * 1e-6:.1f} s"
+            )
+            self._silent = False
+        self._heard_us = now_us
+        if frame.parameters & MODELS_CHANGED:
+            self.outgoing.append(packet(MessageId.REQUEST_MODELDEF, b"\0"))
+        counters.frames += 1
+        t_us = self._exposed_us(frame, now_us)
+        pose = next((body for body in frame.bodies if body.id == self._id), None)
+        if t_us is None or pose is None or not self._usable(pose):
+            counters.lost += 1
+            return MocapFrame(now_us if t_us is None else t_us, *NOWHERE, valid=False)
+        self.age_us = now_us - t_us
+        return MocapFrame(t_us, *in_world(pose.p, pose.q, self._axes), valid=True)
+
+    def _exposed_us(self, frame: Frame, now_us: int) -> int | None:
+        """The exposure by our clock, None if the server's time stamps make no sense."""
+        self._clock.sent(frame.transmitted, now_us)
+        # Cameras without a clock of their own have no exposure, only an arrival.
+        t_us = min(now_us, self._clock.to_station_us(frame.mid_exposure or frame.received))
+        if now_us - t_us <= OLDEST_US:
+            self._mistimed = 0
+            return t_us
+        self.counters.mistimed += 1
+        self._mistimed += 1
+        if self._mistimed == MISTIMED_FRAMES and self.server is not None:
+            self._mistimed = 0
+            self._clock = ServerClock(self.server.clock_hz)
+        return None
+
+    def _usable(self, pose: BodyPose) -> bool:
+        """Whether it is tracked, a rotation, and not the last one over and over."""
+        last, self._pose = self._pose, pose
+        same = last is not None and (last.p, last.q) == (pose.p, pose.q)
+        self._repeated = self._repeated + 1 if same else 0
+        rotation = abs(math.hypot(*pose.q) - 1.0) < 0.01  # False for NaN
+        return pose.valid and rotation and all(map(math.isfinite, pose.p)) and self._repeated < FROZEN_FRAMES
+
+
+def in_world(p: Vector, q: Quaternion, axes: Axes) -> tuple[Vector, Quaternion]:
+    """A pose in Motive's axes as p_WB and q_WB; the body's own axes turn like those of the world."""
+    if axes == "z-up":
+        return p, q
+    return (p[0], -p[2], p[1]), (q[0], q[1], -q[3], q[2])

@@ -1,0 +1,134 @@
+"""OptiTrack: the sockets of a NatNet client. Frames come to the socket of the commands or, by multicast, to one more."""
+
+import select
+import socket
+from contextlib import suppress
+
+from ground_station.clock import clock_us
+from ground_station.errors import MocapError
+from ground_station.mocap import MocapFrame
+from ground_station.natnet import MessageId, packet
+from ground_station.natnet_stream import Axes, NatnetStream
+
+CONNECT_TIMEOUT_US = 3_000_000
+PACKET_MAX = 65_536
+
+
+class OptitrackSource:
+    """Follows one body of the Motive at `host`; `multicast` insists on frames that come so."""
+
+    def __init__(self, host: str, port: int, body: str, multicast: bool, axes: Axes) -> None:
+        self._host = host
+        self._port = port
+        self._body = body
+        self._multicast = multicast
+        self._axes: Axes = axes
+        self._stream = NatnetStream(body, axes)
+        self._sockets: list[socket.socket] = []
+        self._waiting: list[socket.socket] = []  # sockets that have packets
+        self._address = ""
+
+    def open(self) -> None:
+        """Find the server and the body; raises `MocapError` within 4 s."""
+        self._stream = NatnetStream(self._body, self._axes)
+        try:
+            self._address = socket.gethostbyname(self._host)
+            self._add_socket(0)
+            self._connect()
+        except OSError as error:
+            self.close()
+            raise MocapError(f"{self._host}: {error.strerror or error}") from None
+        except MocapError:
+            self.close()
+            raise
+
+    def _connect(self) -> None:
+        stream = self._stream
+        deadline_us = clock_us() + CONNECT_TIMEOUT_US
+        while stream.models is None:
+            self.receive(0.05)
+            if clock_us() > deadline_us:
+                what = "no NatNet server answers" if stream.server is None else "the server names no bodies"
+                raise MocapError(f"{self._host}:{self._port}: {what}")
+        server = stream.server
+        assert server is not None
+        if self._multicast and not server.multicast:
+            raise MocapError(f"{server.name} at {self._host} does not stream by multicast")
+        if server.multicast:
+            self._join(server.group, server.data_port)
+        version = f"NatNet {server.natnet_version[0]}.{server.natnet_version[1]}"
+        way = "multicast" if server.multicast else "unicast"
+        stream.notices.append(f"mocap {server.name} at {self._host}, {version}, {way}, {self._axes}")
+
+    def receive(self, timeout_s: float) -> MocapFrame | None:
+        """The next frame, None when none comes in time."""
+        deadline_us = clock_us() + round(timeout_s * 1e6)
+        while True:
+            self._send(clock_us())
+            data = self._next_packet(max(0, deadline_us - clock_us()) * 1e-6)
+            if data is None:
+                return None
+            frame = self._stream.on_packet(data, clock_us())
+            if frame is not None:
+                return frame
+
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call."""
+        notices, self._stream.notices = self._stream.notices, []
+        return notices
+
+    def summary(self) -> str:
+        """A few words on how it does."""
+        counters = self._stream.counters
+        return (
+            f"mocap {self._stream.age_us / 1000:.1f} ms old, {counters.lost} lost, {counters.dropped} dropped, "
+            f"{counters.malformed} malformed"
+        )
+
+    def close(self) -> None:
+        """Take leave."""
+        for index, each in enumerate(self._sockets):
+            if index == 0 and self._address:
+                with suppress(OSError):
+                    each.sendto(packet(MessageId.DISCONNECT, b"\0"), (self._address, self._port))
+            each.close()
+        self._sockets, self._waiting = [], []
+
+    def _send(self, now_us: int) -> None:
+        self._stream.call(now_us)
+        outgoing, self._stream.outgoing = self._stream.outgoing, []
+        for data in outgoing:
+            with suppress(OSError):  # no network: nothing will come, and that is told
+                self._sockets[0].sendto(data, (self._address, self._port))
+
+    def _next_packet(self, timeout_s: float) -> bytes | None:
+        """The next packet of the server, None when none comes in time."""
+        if not self._waiting:
+            self._waiting = select.select(self._sockets, (), (), timeout_s)[0]
+        while self._waiting:
+            try:
+                data, (address, _) = self._waiting.pop().recvfrom(PACKET_MAX)
+            except OSError:
+                continue
+            if address == self._address:
+                return data
+        return None
+
+    def _add_socket(self, port: int) -> socket.socket:
+        added = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sockets.append(added)
+        added.setblocking(False)
+        if port:
+            added.setsockopt(
+                socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
+            )  # others on this computer listen as well
+        added.bind(("", port))
+        return added
+
+    def _join(self, group: str, port: int) -> None:
+        """Receive what is sent to the group, on the interface that leads to the server."""
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
+            way.connect((self._address, self._port))
+            interface = way.getsockname()[0]
+        membership = socket.inet_aton(group) + socket.inet_aton(interface)
+        self._add_socket(port).setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)

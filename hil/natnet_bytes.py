@@ -1,0 +1,99 @@
+"""What Motive says on the network, as bytes: the other direction of `ground_station.natnet`, whose values it packs.
+
+Pure functions; sockets: `virtual_motive`. Layouts: reference/links.md section 2.
+"""
+
+import struct
+from collections.abc import Sequence
+
+from ground_station.natnet import (
+    TRACKED,
+    BodyDescription,
+    BodyPose,
+    Frame,
+    LabelledMarker,
+    MessageId,
+    ModelDefinition,
+    ServerInfo,
+    packet,
+)
+from ground_station.natnet_reader import Version
+
+_SERVER_INFO = struct.Struct("<256s4B4BQHB4B")
+_COUNT = struct.Struct("<I")
+_DESCRIBED = struct.Struct("<II3fI")  # id, parent, offset, markers
+_VECTOR = struct.Struct("<3f")
+_BODY = struct.Struct("<I3f4ffH")  # id, position, rotation x y z w, error, parameters
+_LABELLED = struct.Struct("<I3ffHf")
+_SUFFIX = struct.Struct("<8xd3Q")  # no timecode, timestamp; exposure, arrival and departure
+_NO_PRECISION_TIME = bytes(8)
+_END = struct.Struct("<HI")  # parameters, end tag
+_RIGID_BODY = 1  # kind of a description
+
+
+def encode_server_info(info: ServerInfo) -> bytes:
+    """The answer to CONNECT, alike in all versions."""
+    group = (int(part) for part in info.group.split("."))
+    rest = (*info.app_version, *info.natnet_version, info.clock_hz, info.data_port, info.multicast, *group)
+    return packet(MessageId.SERVER_INFO, _SERVER_INFO.pack(info.name.encode(), *rest))
+
+
+def encode_models(models: ModelDefinition, version: Version) -> bytes:
+    """The answer to REQUEST_MODELDEF."""
+    rest = [_COUNT.pack(len(models.bodies))]
+    for body in models.bodies:
+        described = _described(body, version)
+        rest.append(_COUNT.pack(_RIGID_BODY))
+        if version >= (4, 1):
+            rest.append(_COUNT.pack(len(described)))
+        rest.append(described)
+    return packet(MessageId.MODELDEF, b"".join(rest))
+
+
+def encode_frame(frame: Frame, version: Version) -> bytes:
+    """A frame of data."""
+    nothing = _section((), version)
+    assets = nothing if version >= (4, 1) else b""
+    parts = (
+        _COUNT.pack(frame.number),
+        nothing,  # marker sets
+        _section([_VECTOR.pack(*p) for p in frame.unlabelled], version),
+        _section([_body(body) for body in frame.bodies], version),
+        nothing,  # skeletons
+        assets,
+        _section([_labelled(marker) for marker in frame.labelled], version),
+        nothing,  # force plates
+        nothing,  # devices
+        _SUFFIX.pack(frame.timestamp_s, frame.mid_exposure, frame.received, frame.transmitted),
+        _NO_PRECISION_TIME if version >= (4, 0) else b"",
+        _END.pack(frame.parameters, 0),
+    )
+    return packet(MessageId.FRAME, b"".join(parts))
+
+
+def _described(body: BodyDescription, version: Version) -> bytes:
+    head = _DESCRIBED.pack(body.id, body.parent, *body.offset, len(body.markers))
+    places = b"".join(_VECTOR.pack(*marker.p) for marker in body.markers)
+    labels = b"".join(_COUNT.pack(marker.label) for marker in body.markers)
+    names = b"".join(_text(marker.name) for marker in body.markers) if version >= (4, 0) else b""
+    return _text(body.name) + head + places + labels + names
+
+
+def _section(items: Sequence[bytes], version: Version) -> bytes:
+    """A list in a frame; from 4.1 on its size in bytes follows the count."""
+    data = b"".join(items)
+    size = _COUNT.pack(len(data)) if version >= (4, 1) else b""
+    return _COUNT.pack(len(items)) + size + data
+
+
+def _text(text: str) -> bytes:
+    return text.encode() + b"\0"
+
+
+def _body(body: BodyPose) -> bytes:
+    w, x, y, z = body.q
+    return _BODY.pack(body.id, *body.p, x, y, z, w, body.error, TRACKED if body.valid else 0)
+
+
+def _labelled(marker: LabelledMarker) -> bytes:
+    return _LABELLED.pack(marker.id, *marker.p, marker.size, marker.parameters, marker.residual)

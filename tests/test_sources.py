@@ -1,0 +1,254 @@
+"""Poses out of a NatNet stream: their age, what is no pose, and what goes wrong with the server."""
+
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import natnet_packets as packets
+import pytest
+from natnet_packets import VERSIONS
+from scipy.spatial.transform import Rotation
+
+from ground_station.clock import clock_us
+from ground_station.errors import MocapError
+from ground_station.mocap import MocapFrame
+from ground_station.natnet_stream import MISTIMED_FRAMES, Axes, NatnetStream, in_world
+from ground_station.server_clock import ServerClock
+from ground_station.sources.address import find_source
+
+V = (4, 1)
+TICKS_PER_US = packets.CLOCK_HZ // 1_000_000
+AHEAD_US = 7_000_000_000  # of the server's clock
+CAMERA_US = 8000  # exposure to transmission
+
+
+class Bench:
+    """A stream with one body, 7; packets take 300 us each way."""
+
+    def __init__(self, name: str = "floaty", axes: Axes = "z-up") -> None:
+        self.stream = NatnetStream(name, axes)
+        self.now_us = 50_000_000
+        self.number = 0
+        self.ahead_us = AHEAD_US
+        self.stream.on_packet(packets.server_info(V), self.now_us)
+        self.stream.on_packet(packets.model_definition({"floaty": 7}, V), self.now_us)
+        self.stream.outgoing.clear()
+
+    def ticks(self, t_us: int) -> int:
+        return (t_us + self.ahead_us) * TICKS_PER_US
+
+    def echo(self) -> None:
+        self.stream.on_packet(packets.echo(self.now_us, self.ticks(self.now_us + 300)), self.now_us + 600)
+
+    def frame(self, number: int | None = None, **options: object) -> MocapFrame | None:
+        """Expose after 5 ms; the pose differs each time."""
+        self.now_us += 5000
+        self.number = self.number + 1 if number is None else number
+        sent_us = self.now_us + CAMERA_US
+        ticks = (self.ticks(self.now_us), self.ticks(sent_us - 1000), self.ticks(sent_us))
+        options = {"pose": ((float(self.now_us), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))} | options
+        data = packets.frame(self.number, V, ticks, **options)  # type: ignore[arg-type]
+        return self.stream.on_packet(data, sent_us + 300)
+
+    def pose(self, **options: object) -> MocapFrame:
+        frame = self.frame(**options)  # type: ignore[arg-type]
+        assert frame is not None
+        return frame
+
+
+def test_the_age_counts_from_the_exposure_by_the_station_s_clock() -> None:
+    bench = Bench()
+    bench.echo()
+    assert abs(bench.pose().t_us - bench.now_us) <= 1
+    assert abs(bench.stream.age_us - (CAMERA_US + 300)) <= 1
+
+
+def test_without_echoes_only_the_way_through_the_network_is_missing() -> None:
+    bench = Bench()
+    assert abs(bench.pose().t_us - (bench.now_us + 300)) <= 1
+
+
+def test_the_clock_follows_drift_and_shrugs_off_late_packets() -> None:
+    clock = ServerClock(1_000_000)
+    for second in range(600):
+        now_us = second * 1_000_000
+        server_us = now_us + second * 30  # 30 ppm fast
+        clock.answered(now_us - 300, server_us, now_us + 300)
+        clock.sent(server_us, now_us + 40_000)
+        assert abs(clock.to_station_us(server_us) - now_us) < 60
+
+
+def test_a_server_whose_clock_was_set_is_followed_again() -> None:
+    bench = Bench()
+    bench.echo()
+    assert bench.pose().valid
+    bench.ahead_us -= 5_000_000
+    assert not bench.pose().valid
+    bench.echo()
+    assert bench.pose().valid
+    bench.ahead_us -= 5_000_000
+    for _ in range(MISTIMED_FRAMES):
+        assert not bench.pose().valid
+    assert bench.pose().valid  # without an echo
+
+
+def test_lost_tracking_is_never_a_pose() -> None:
+    bench = Bench()
+    assert bench.pose().valid
+    assert not bench.pose(tracked=False).valid
+    assert not bench.pose(number_of_body=8).valid
+    assert not bench.pose(pose=((float("nan"), 0, 0), (0, 0, 0, 1))).valid
+    assert not bench.pose(pose=((0, 0, 0), (0, 0, 0, 0))).valid
+    frozen = [bench.pose(pose=packets.POSE).valid for _ in range(6)]
+    assert frozen == [True, True, True, False, False, False]
+    assert bench.pose().valid
+    assert bench.stream.counters.lost == 7
+
+
+def test_frames_that_come_twice_or_late_are_dropped_and_counted() -> None:
+    bench = Bench()
+    numbers = [10, 11, 11, 13, 12, 14]
+    assert [bench.frame(number) is not None for number in numbers] == [True, True, False, True, False, True]
+    assert bench.stream.counters.dropped == 2
+    assert bench.frame(2_000_000) is not None
+    assert bench.frame(1) is not None  # the server began anew
+
+
+@pytest.mark.parametrize(("name", "bodies", "message"), [
+    ("flouty", {"floaty": 7, "wand": 8}, "no body 'flouty'; there are: floaty, wand"),
+    ("", {"floaty": 7, "wand": 8}, "body=NAME is missing; there are: floaty, wand"),
+    ("floaty", {}, "no body 'floaty'; there are: none"),
+])  # fmt: skip
+def test_a_wrong_body_is_one_line_with_those_there_are(
+    name: str, bodies: dict[str, int], message: str
+) -> None:
+    stream = NatnetStream(name, "z-up")
+    stream.on_packet(packets.server_info(V), 0)
+    with pytest.raises(MocapError) as caught:
+        stream.on_packet(packets.model_definition(bodies, V), 0)
+    assert str(caught.value) == message
+
+
+def test_a_body_that_goes_away_in_flight_is_a_notice_and_comes_back_with_any_id() -> None:
+    bench = Bench()
+    bench.stream.on_packet(packets.model_definition({"wand": 7}, V), bench.now_us)
+    assert bench.stream.notices == ["motion capture: no body 'floaty'; there are: wand"]
+    assert not bench.pose().valid
+    bench.stream.on_packet(packets.model_definition({"floaty": 9}, V), bench.now_us)
+    assert bench.pose(number_of_body=9).valid
+
+
+def test_changed_models_are_asked_for() -> None:
+    bench = Bench()
+    bench.frame(parameters=2)
+    assert [data[0] for data in bench.stream.outgoing] == [4]
+
+
+def test_a_stream_that_stops_is_told_once_and_called_until_it_is_back() -> None:
+    bench = Bench()
+    bench.frame()
+    calls = 0
+    for _ in range(30):
+        bench.now_us += 100_000
+        bench.stream.call(bench.now_us)
+        calls += sum(data[0] == 0 for data in bench.stream.outgoing)
+        bench.stream.outgoing.clear()
+    assert 4 <= calls <= 6
+    assert bench.pose().valid
+    assert bench.stream.notices == [
+        "motion capture: no frames; calling the server again", "motion capture: frames again after 3.0 s",
+    ]  # fmt: skip
+
+
+def test_y_up_is_a_quarter_turn_about_x() -> None:
+    turn = Rotation.from_euler("x", 90, degrees=True)
+    p, q = (1.0, 2.0, 3.0), (0.5, 0.1, -0.7, 0.5)
+    p_W, q_W = in_world(p, q, "y-up")
+    assert turn.apply(p) == pytest.approx(p_W)
+    expected = turn * Rotation.from_quat(q, scalar_first=True) * turn.inv()
+    assert expected.as_matrix() == pytest.approx(Rotation.from_quat(q_W, scalar_first=True).as_matrix())
+    assert in_world(p, q, "z-up") == (p, q)
+
+
+@pytest.mark.parametrize("text", [
+    "optitrack", "optitrack:", "optitrack:h:0", "optitrack:h,body=", "optitrack:h,x", "virtual:", "virtual:x",
+    "virtual:1,2", "vicon:h",
+])  # fmt: skip
+def test_what_names_no_source_is_refused(text: str) -> None:
+    with pytest.raises(MocapError, match="expected virtual"):
+        find_source(text)
+
+
+@contextmanager
+def served(version: tuple[int, int], multicast: bool) -> Iterator[int]:
+    """A server with one body at 200 Hz; gives its command port."""
+    with socket.socket(type=socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        data_port = probe.getsockname()[1]
+    with socket.socket(type=socket.SOCK_DGRAM) as commands:
+        commands.bind(("127.0.0.1", 0))
+        commands.settimeout(0.005)
+        commands.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+        stop = threading.Event()
+        thread = threading.Thread(target=_serve, args=(commands, data_port, version, multicast, stop))
+        thread.start()
+        try:
+            yield commands.getsockname()[1]
+        finally:
+            stop.set()
+            thread.join()
+
+
+def _serve(
+    commands: socket.socket, port: int, version: tuple[int, int], multicast: bool, stop: threading.Event
+) -> None:
+    number, client = 0, None
+    while not stop.is_set():
+        number += 1
+        now = clock_us() * TICKS_PER_US
+        data = packets.frame(
+            number, version, (now - 80_000, now, now), pose=((number, 2, 3), packets.POSE[1])
+        )
+        if multicast:
+            commands.sendto(data, ("239.255.42.99", port))
+        elif client is not None:
+            commands.sendto(data, client)
+        try:
+            asked, client = commands.recvfrom(1000)
+        except TimeoutError:
+            continue
+        if asked[0] == 0:
+            commands.sendto(packets.server_info(version, multicast, port), client)
+        elif asked[0] == 4:
+            commands.sendto(packets.model_definition({"floaty": 7}, version), client)
+        elif asked[0] == 12:
+            (asked_us,) = struct.unpack("<Q", asked[4:])
+            commands.sendto(packets.echo(asked_us, clock_us() * TICKS_PER_US), client)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
+def test_poses_come_over_real_sockets(version: tuple[int, int], multicast: bool) -> None:
+    with served(version, multicast) as port:
+        source = find_source(f"optitrack:127.0.0.1:{port}{',multicast' if multicast else ''},body=floaty")
+        source.open()
+        frames = [source.receive(1.0) for _ in range(10)]
+        way = "multicast" if multicast else "unicast"
+        told = f"mocap Motive at 127.0.0.1, NatNet {version[0]}.{version[1]}, {way}, y-up"
+        assert source.notices() == [told]
+        source.close()
+    assert all(frame is not None and frame.valid and frame.p_WB[1:] == (-3.0, 2.0) for frame in frames)
+    assert frames[-1] is not None
+    assert 7000 <= clock_us() - frames[-1].t_us < 2_000_000
+
+
+def test_a_server_that_is_not_there_or_not_so_is_one_line_within_four_seconds() -> None:
+    begin_s = time.monotonic()
+    with pytest.raises(MocapError, match=r"^127\.0\.0\.1:9: no NatNet server answers\Z"):
+        find_source("optitrack:127.0.0.1:9").open()
+    assert time.monotonic() - begin_s < 4
+    with served(V, False) as port, pytest.raises(MocapError, match="does not stream by multicast"):
+        find_source(f"optitrack:127.0.0.1:{port},multicast").open()

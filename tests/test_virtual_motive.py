@@ -1,0 +1,331 @@
+"""The virtual Motive: every client, ours and unmodified ones, sees the poses that the cameras saw."""
+
+import importlib.util
+import json
+import select
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ground_station.mocap import MocapFrame
+from ground_station.natnet import (
+    BodyDescription,
+    BodyPose,
+    Echo,
+    Frame,
+    LabelledMarker,
+    MarkerDescription,
+    MessageId,
+    ModelDefinition,
+    ServerInfo,
+    decode,
+    packet,
+)
+from hil.dongle_server import Readers
+from hil.errors import LabError
+from hil.natnet_bytes import encode_frame, encode_models, encode_server_info
+from hil.virtual_motive import MAX_CLIENTS, Streaming, VirtualMotive, with_y_up
+
+VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
+FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
+PERIOD_S = 0.005
+LATENCY_US = 38_000
+
+single = st.floats(-100, 100, width=32)
+vector = st.tuples(single, single, single)
+quaternion = st.tuples(single, single, single, single)
+u16, u32, u64 = (st.integers(0, 2**bits - 1) for bits in (16, 32, 64))
+text = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=20)
+bodies = st.builds(BodyPose, u32, vector, quaternion, single, st.booleans())
+labelled = st.builds(LabelledMarker, u32, vector, single, u16, single)
+frames = st.builds(
+    Frame, u32, *(st.lists(kind, max_size=3).map(tuple) for kind in (bodies, vector, labelled)),
+    st.floats(0, 1e9), u64, u64, u64, u16,
+)  # fmt: skip
+markers = st.lists(st.builds(MarkerDescription, vector, u32, text), max_size=3).map(tuple)
+described = st.builds(BodyDescription, text, u32, u32, vector, markers)
+
+
+@given(frames, st.sampled_from(VERSIONS))
+def test_a_frame_arrives_as_it_was_sent(frame: Frame, version: tuple[int, int]) -> None:
+    assert decode(encode_frame(frame, version), version) == frame
+
+
+@given(st.lists(described, max_size=3), st.sampled_from(VERSIONS[2:]))
+def test_model_definitions_arrive_as_they_were_sent(
+    models: list[BodyDescription], version: tuple[int, int]
+) -> None:
+    sent = ModelDefinition(tuple(models))
+    assert decode(encode_models(sent, version), version) == sent
+
+
+def test_markers_have_no_names_before_version_4() -> None:
+    body = BodyDescription("floaty", 1, 0, (0, 0, 0), (MarkerDescription((1, 2, 3), 4, "nose"),))
+    found = decode(encode_models(ModelDefinition((body,)), (3, 1)), (3, 1))
+    assert found.bodies[0].markers == (MarkerDescription((1, 2, 3), 4, ""),)
+
+
+def test_the_server_info_arrives_as_it_was_sent() -> None:
+    info = ServerInfo("Motive", (3, 1, 2, 4), (4, 1, 0, 7), 10**7, 1511, True, "239.255.42.99")
+    assert decode(encode_server_info(info), (4, 1)) == info
+
+
+def test_motives_axes_have_y_up() -> None:
+    """Against rotation matrices of scipy: nose x, left y, up z become nose x, up y, right z."""
+    q = Rotation.from_euler("zyx", [0.3, -0.5, 0.9])
+    p_M, (w, x, y, z) = with_y_up((1.0, 2.0, 3.0), tuple(q.as_quat()[[3, 0, 1, 2]]))
+    assert p_M == (1.0, 3.0, -2.0)
+    expected = FROM_MOTIVE.T @ q.as_matrix() @ FROM_MOTIVE
+    assert Rotation.from_quat([x, y, z, w]).as_matrix() == pytest.approx(expected)
+
+
+def seen(number: int) -> MocapFrame:
+    """The pose of the body in a frame: all over the place."""
+    rng = np.random.default_rng(number)
+    q = rng.standard_normal(4)
+    q /= np.linalg.norm(q)
+    return MocapFrame(number, tuple(rng.uniform(-1, 1, 3).tolist()), tuple(q.tolist()), valid=True)
+
+
+class Laboratory:
+    """A Motive that sees one body move, without a plant."""
+
+    def __init__(self, version: tuple[int, int] = (4, 1), multicast: bool = False) -> None:
+        self.readers: Readers = {}
+        self.motive = VirtualMotive(Streaming(0, version, multicast), {1: "floaty"}, self.readers)
+        self.number = 0
+
+    def expose(self, valid: bool = True) -> None:
+        self.number += 1
+        frame = seen(self.number)
+        shown = MocapFrame(7_000_000, frame.p_WB, frame.q_WB, valid)
+        self.motive.take(1, shown, 7_000_000 + LATENCY_US)
+
+    def answer(self) -> None:
+        """Answer what clients have asked by now."""
+        while ready := select.select(self.readers, (), (), 0)[0]:
+            for reader in ready:
+                self.readers[reader](0)
+
+    def run(self, stopping: Callable[[], bool]) -> None:
+        """Expose at 200 Hz and answer."""
+        deadline = time.monotonic() + 10.0
+        while not stopping():
+            assert time.monotonic() < deadline, "10 s have gone by"
+            self.expose()
+            select.select(self.readers, (), (), PERIOD_S)
+            self.answer()
+
+
+@pytest.fixture
+def lab() -> Iterator[Laboratory]:
+    lab = Laboratory()
+    yield lab
+    lab.motive.close()
+
+
+class Client:
+    """A bare socket that speaks NatNet."""
+
+    def __init__(self, lab: Laboratory) -> None:
+        self._lab = lab
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.5)
+
+    def say(self, message: MessageId, payload: bytes = b"") -> None:
+        self.send(packet(message, payload))
+
+    def send(self, data: bytes) -> None:
+        self._socket.sendto(data, ("127.0.0.1", self._lab.motive.port))
+        self._lab.answer()
+
+    def connect(self) -> ServerInfo:
+        """Connect and keep alive: frames come to this socket from now on."""
+        self.say(MessageId.CONNECT)
+        info = decode(self.hear(), (4, 1))
+        self.say(MessageId.KEEPALIVE)
+        return info
+
+    def hear(self) -> bytes:
+        return self._socket.recv(65536)
+
+    def hears_nothing(self) -> bool:
+        return not select.select([self._socket], (), (), 0)[0]
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def client(lab: Laboratory) -> Iterator[Client]:
+    client = Client(lab)
+    yield client
+    client.close()
+
+
+@pytest.mark.parametrize("payload", [b"", b"Ping\0", bytes(271)], ids=["empty", "Ping", "with the sender"])
+def test_every_form_of_connect_is_answered_and_frames_follow(
+    lab: Laboratory, client: Client, payload: bytes
+) -> None:
+    client.say(MessageId.CONNECT, payload)
+    info = decode(client.hear(), (4, 1))
+    assert (info.name, info.natnet_version, info.data_port) == ("Motive", (4, 1, 0, 0), lab.motive.data_port)
+    lab.expose()
+    assert client.hears_nothing()  # it might take a frame for the answer to its next question
+    client.say(MessageId.KEEPALIVE)
+    lab.expose()
+    frame = decode(client.hear(), (4, 1))
+    assert frame.number == 2
+    assert frame.bodies[0].p == pytest.approx(FROM_MOTIVE.T @ seen(2).p_WB, abs=1e-6)
+
+
+def test_a_frame_is_stamped_with_its_exposure(lab: Laboratory, client: Client) -> None:
+    hz = client.connect().clock_hz
+    lab.run(lambda: lab.number >= 20)  # Motive is older than its cameras' latency then
+    frames = [decode(client.hear(), (4, 1)) for _ in range(20)]
+    assert frames[-1].transmitted - frames[-1].mid_exposure == LATENCY_US * hz // 1_000_000
+    assert frames[-1].timestamp_s == pytest.approx(frames[-1].mid_exposure / hz)
+    client.say(MessageId.ECHO_REQUEST, (2**63 + 5).to_bytes(8, "little"))
+    echo = decode(client.hear(), (4, 1))
+    assert isinstance(echo, Echo)
+    assert echo.asked == 2**63 + 5
+    assert frames[-1].transmitted <= echo.server < frames[-1].transmitted + hz
+
+
+def test_a_body_that_is_not_tracked_is_marked(lab: Laboratory, client: Client) -> None:
+    client.connect()
+    lab.expose(valid=False)
+    assert not decode(client.hear(), (4, 1)).bodies[0].valid
+
+
+def test_bodies_of_one_exposure_share_a_frame() -> None:
+    lab = Laboratory()
+    lab.motive.close()
+    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), {1: "floaty", 2: "floaty2"}, lab.readers)
+    client = Client(lab)
+    client.connect()
+    lab.motive.take(1, seen(1), 0)
+    assert client.hears_nothing()
+    lab.motive.take(2, seen(2), 0)
+    found = decode(client.hear(), (3, 1)).bodies
+    assert [body.id for body in found] == [1, 2]
+    client.say(MessageId.REQUEST_MODELDEF)
+    assert [body.name for body in decode(client.hear(), (3, 1)).bodies] == ["floaty", "floaty2"]
+    client.close()
+    lab.motive.close()
+
+
+def test_the_bitstream_is_changed_for_the_client_that_asks(lab: Laboratory, client: Client) -> None:
+    client.connect()
+    client.say(MessageId.REQUEST, b"Bitstream\0")
+    assert client.hear() == packet(MessageId.RESPONSE, b"Bitstream,4.1.0\0")
+    client.say(MessageId.REQUEST, b"Bitstream,3.1\0")
+    assert client.hear() == packet(MessageId.RESPONSE, struct.pack("<i", 0))
+    lab.expose()
+    assert decode(client.hear(), (3, 1)).number == 1
+    client.say(MessageId.REQUEST, b"Bitstream,2.9\0")
+    assert client.hear() == packet(MessageId.RESPONSE, struct.pack("<i", -1))
+    client.say(MessageId.REQUEST, b"StartRecording\0")
+    assert client.hear() == packet(MessageId.UNRECOGNIZED)
+
+
+def test_frames_end_with_the_disconnect(lab: Laboratory, client: Client) -> None:
+    client.connect()
+    client.say(MessageId.DISCONNECT)
+    lab.expose()
+    assert client.hears_nothing()
+
+
+def test_one_client_too_many_displaces_the_most_silent_one(lab: Laboratory) -> None:
+    clients = [Client(lab) for _ in range(MAX_CLIENTS + 1)]
+    for client in clients[:-1]:
+        client.connect()
+    clients[0].say(MessageId.KEEPALIVE)
+    clients[-1].connect()
+    lab.expose()
+    assert [not client.hears_nothing() for client in clients] == [True, False] + [True] * (MAX_CLIENTS - 1)
+    for client in clients:
+        client.close()
+
+
+def test_what_cannot_be_read_is_counted_and_not_answered(lab: Laboratory, client: Client) -> None:
+    broken = [b"", b"\0", packet(MessageId.FRAME), packet(MessageId.ECHO_REQUEST, b"short")]
+    for data in (*broken, packet(MessageId.REQUEST, b"Bitstream")[:-1], b"\xff" * 2048):
+        client.send(data)
+    assert lab.motive.malformed == len(broken) + 2
+    assert client.hears_nothing()
+
+
+def test_no_bytes_stop_the_server(lab: Laboratory, client: Client) -> None:
+    @settings(max_examples=300, deadline=None)
+    @given(st.sampled_from([*MessageId, 3000]), st.binary(max_size=40), st.integers(-3, 3))
+    def fuzz(message: int, payload: bytes, wrong: int) -> None:
+        size = max(0, len(payload) + wrong)
+        client.send(message.to_bytes(2, "little") + size.to_bytes(2, "little") + payload)
+
+    fuzz()
+    while not client.hears_nothing():
+        client.hear()
+    client.say(MessageId.CONNECT)
+    assert decode(client.hear(), (4, 1)).name == "Motive"
+
+
+def test_a_taken_port_is_said_in_one_line(lab: Laboratory) -> None:
+    with pytest.raises(LabError, match=rf"^natnet port {lab.motive.port}: Address already in use$"):
+        VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
+
+
+def needs(client: str) -> pytest.MarkDecorator:
+    """Skip where a client is not installed."""
+    missing = importlib.util.find_spec(client) is None
+    return pytest.mark.skipif(missing, reason=f"{client} IS NOT TESTED: `make clients` installs it")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=needs(name)) for name in ("natnet", "motioncapture", "ground_station")]
+)
+@pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
+@pytest.mark.parametrize("version", [(3, 1), (4, 1)], ids=["3.1", "4.1"])
+def test_every_client_sees_the_pose(name: str, multicast: bool, version: tuple[int, int]) -> None:
+    lab = Laboratory(version, multicast)
+    assert_poses(lab, name, "multicast" if multicast else "unicast", "20")
+
+
+def assert_poses(lab: Laboratory, name: str, how: str, count: str) -> None:
+    """Run a client until it has its poses; each is that of the frame that it names, or of one at all."""
+    script = str(Path(__file__).with_name("natnet_clients.py"))
+    command = [sys.executable, script, name, str(lab.motive.port), how, count]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        lab.run(lambda: process.poll() is not None)
+        out, errors = process.communicate()
+    finally:
+        process.kill()
+        process.wait()
+        lab.motive.close()
+    assert process.returncode == 0, errors.decode()
+    rows = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]  # clients chat
+    assert len(rows) == int(count)
+    for number, body, p, q, tracked in rows:
+        assert (body, tracked) == ("floaty", True)
+        p_WB = FROM_MOTIVE @ p
+        if number is None:
+            numbers = range(1, lab.number + 1)
+            number = min(numbers, key=lambda number: np.linalg.norm(seen(number).p_WB - p_WB))
+        frame = seen(number)
+        assert p_WB == pytest.approx(frame.p_WB, abs=1e-6)
+        R_WB = Rotation.from_quat(np.roll(frame.q_WB, -1)).as_matrix()
+        assert FROM_MOTIVE @ Rotation.from_quat(q).as_matrix() @ FROM_MOTIVE.T == pytest.approx(
+            R_WB, abs=1e-5
+        )
