@@ -298,19 +298,15 @@ def _write_pictures(folder: Path) -> None:
 
 
 def _fly_many(requests: "list[Request]", parent: Path) -> int:
-    """Fly seeds in parallel processes; one row per seed as they finish, a summary at the end; returns the exit code."""
+    """Fly seeds in parallel processes; one row per seed, a summary at the end; returns the exit code."""
     from hil.sweep import Job, fly_all
 
-    rows: list[Result] = []
     jobs = [Job(request, parent / f"{request.experiment.name}-{request.seed}") for request in requests]
-    try:
-        for result in fly_all(jobs, notices):
-            rows.append(result)
-    except KeyboardInterrupt:
-        notices.print(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
-        _print_seeds(rows)
-        return INTERRUPTED
+    rows, interrupted = fly_all(jobs, notices)
     _print_seeds(rows)
+    if interrupted:
+        notices.print(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
+        return INTERRUPTED
     return 0 if all(result.passed for result in rows) else 1
 
 

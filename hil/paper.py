@@ -153,13 +153,8 @@ def fly_paper(
     for study_name, planned in cells.items():
         for number, (_, _, request) in enumerate(planned):
             jobs.setdefault(_key(request), Job(request, out / f"study-{study_name}-{number}", ()))
-    flown: dict[Hashable, Result] = {}
-    interrupted = False
-    try:
-        for result in fly_all(list(jobs.values()), notices):
-            flown[_key(result.request)] = result
-    except KeyboardInterrupt:
-        interrupted = True
+    results, interrupted = fly_all(list(jobs.values()), notices)
+    flown = {_key(result.request): result for result in results}
 
     def of(name: str, profile: str) -> Trials:
         return Trials(profile, tuple(flown[key] for key in trials[name, profile] if key in flown))

@@ -3,8 +3,8 @@
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +23,11 @@ class Job:
     keep: tuple[str, ...] | None = None
 
 
-def fly_all(jobs: Sequence[Job], notices: Console, workers: int | None = None) -> Iterator[Result]:
-    """Fly every job and yield the results in order; whoever stops early, as by Ctrl-C, waits for those in the air."""
+def fly_all(jobs: Sequence[Job], notices: Console, workers: int | None = None) -> tuple[list[Result], bool]:
+    """Fly every job; return the results in the order of the jobs, and whether Ctrl-C ended it early.
+
+    After Ctrl-C the flights in the air land first: every complete flight is among the results.
+    """
     workers = workers or min(len(jobs), os.cpu_count() or 1)
     columns = (
         TextColumn("{task.description}"),
@@ -34,16 +37,20 @@ def fly_all(jobs: Sequence[Job], notices: Console, workers: int | None = None) -
     )
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, context, _leave_interrupts_to_the_parent)
-    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
-        bar = progress.add_task("", total=len(jobs))
-        futures = [pool.submit(_fly, job) for job in jobs]
-        try:
-            for job, future in zip(jobs, futures, strict=True):
-                progress.update(bar, description=f"flying {job.folder.name}")
-                yield future.result()
+    futures = [pool.submit(_fly, job) for job in jobs]
+    interrupted = False
+    try:
+        with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+            bar = progress.add_task("flying", total=len(jobs))
+            for future in as_completed(futures):
+                future.result()  # an error ends the sweep
                 progress.advance(bar)
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    landed = [future for future in futures if not future.cancelled() and future.exception() is None]
+    return [future.result() for future in landed], interrupted
 
 
 def _fly(job: Job) -> Result:
