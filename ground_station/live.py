@@ -127,13 +127,14 @@ class LiveStation:
             self.station.on_packet(t_us, packet)
 
     def _tell(self) -> None:
-        for notice in self.source.notices() + self.link.notices():
+        for notice in self.source.notices() + self.station.notices() + self.link.notices():
             self.say(notice)
 
     def _show(self) -> None:
-        counters = self.station.counters
+        counters, tracker = self.station.counters, self.station.tracker
+        track = f"track {tracker.summary()}  " if tracker is not None else ""
         self.say(
-            f"poses {counters.frames} ({counters.invalid} unusable)  {self.source.summary()}  "
+            f"poses {counters.frames} ({counters.invalid} unusable)  {self.source.summary()}  {track}"
             f"{self.link.summary()}  telemetry {counters.samples}"
         )
 

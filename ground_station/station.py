@@ -1,8 +1,8 @@
 """The ground station: frames in, poses and goals out, telemetry into the log. It never looks at a clock: callers
 bring the time.
 
-A tracked pose leaves with the goal of the moment, as in the original: a new goal counts at once, not after the
-camera's latency.
+The tracker, if there is one, decides which frames are used. A tracked pose leaves with the goal of the moment, as in
+the original: a new goal counts at once, not after the camera's latency.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import Sample
 from ground_station.mocap import MocapFrame
 from ground_station.telemetry_log import TelemetryLog
+from ground_station.tracker import Track, Tracker
 from ground_station.trajectory import Goal, Trajectory
 
 TELEMETRY_TIMEOUT_US = 500_000  # of silence, after which the board is asked again
@@ -57,7 +58,7 @@ class StationCounters:
     """What went through the ground station."""
 
     frames: int = 0  # from motion capture
-    invalid: int = 0  # of these, not tracked or not a pose
+    invalid: int = 0  # of these, not tracked, refused or not a pose
     sent: int = 0  # handed to the link
     received: int = 0  # packets, or pieces of a stream, from the board
     samples: int = 0  # of telemetry in these
@@ -68,15 +69,22 @@ class GroundStation:
     """Passive: `on_frame` for each frame of motion capture, `on_packet` for whatever comes from the board."""
 
     def __init__(
-        self, link: Link, trajectory: Trajectory, log: TelemetryLog | None, config: StationConfig
+        self,
+        link: Link,
+        trajectory: Trajectory,
+        log: TelemetryLog | None,
+        config: StationConfig,
+        tracker: Tracker | None = None,
     ) -> None:
         self.counters = StationCounters()
+        self.tracker = tracker
         self._link = link
         self._trajectory = trajectory
         self._log = log
         self._send_every = config.send_every
         self._frames_until_due = 0
         self._last_frame: MocapFrame | None = None
+        self._last_track: Track | None = None
         self._ask_for_telemetry_us = 0  # put off by every sample that comes
 
     def on_frame(self, frame: MocapFrame, now_us: int) -> None:
@@ -88,6 +96,9 @@ class GroundStation:
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
         due = self._frames_until_due <= 0
         self._frames_until_due -= 1
+        if self.tracker is not None:
+            self._last_track = self.tracker.take(frame)
+            frame = self._last_track.frame
         if not frame.valid:
             counters.invalid += 1
             return
@@ -103,6 +114,10 @@ class GroundStation:
         # The slots keep their phase: a late frame does not delay the next one.
         self._frames_until_due %= self._send_every
 
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call."""
+        return self.tracker.notices() if self.tracker is not None else []
+
     def on_packet(self, now_us: int, data: bytes) -> None:
         """Take bytes of the board: telemetry goes to the log, what cannot be read is counted."""
         self.counters.received += 1
@@ -115,4 +130,6 @@ class GroundStation:
         for sample in samples:
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
             if self._log is not None:
-                self._log.write(now_us, sample, self._trajectory.at(now_us), self._last_frame)
+                self._log.write(
+                    now_us, sample, self._trajectory.at(now_us), self._last_frame, self._last_track
+                )

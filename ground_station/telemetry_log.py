@@ -1,9 +1,9 @@
 """The ground station's own record of a flight: a CSV file with one row per telemetry time stamp.
 
 A row joins the blocks that carry the same time stamp with what the ground station itself knew when the first
-of them arrived: its clock, the goal and the last tracked pose. What was missing is `nan`. The header names
-each column's unit: `stateEstimate.x [m]`. The file is complete to about a second when the process dies;
-memory holds one row.
+of them arrived: its clock, the goal, the last usable pose and what the tracker says. What was missing is `nan`.
+The header names each column's unit: `stateEstimate.x [m]`. The file is complete to about a second when the process
+dies; memory holds one row.
 """
 
 from math import nan
@@ -12,6 +12,7 @@ from pathlib import Path
 from firmware_py.geometry import to_euler_zyx
 from firmware_py.wire.telemetry import BLOCKS, Block, Sample
 from ground_station.mocap import MocapFrame
+from ground_station.tracker import Track
 from ground_station.trajectory import Goal
 
 FLUSH_PERIOD_US = 1_000_000
@@ -29,6 +30,13 @@ _GROUND_COLUMNS = (
     "mocap.roll [rad]",
     "mocap.pitch [rad]",
     "mocap.yaw [rad]",
+    "mocap.vx [m/s]",
+    "mocap.vy [m/s]",
+    "mocap.vz [m/s]",
+    "mocap.p [rad/s]",
+    "mocap.q [rad/s]",
+    "mocap.r [rad/s]",
+    "mocap.quality []",
 )
 
 
@@ -57,12 +65,14 @@ class TelemetryLog:
         self._telemetry: list[float] = []
         self._next_flush_us = 0
 
-    def write(self, now_us: int, sample: Sample, goal: Goal, frame: MocapFrame | None) -> None:
-        """Put `sample`, received at `now_us`, into its row; `goal` and `frame` are of that instant."""
+    def write(
+        self, now_us: int, sample: Sample, goal: Goal, frame: MocapFrame | None, track: Track | None
+    ) -> None:
+        """Put `sample`, received at `now_us`, into its row; the others are of that instant."""
         if sample.timestamp_ms != self._timestamp_ms:
             self._write_row()
             self._timestamp_ms = sample.timestamp_ms
-            self._ground = _ground_values(now_us, goal, frame)
+            self._ground = _ground_values(now_us, goal, frame, track)
             self._telemetry = [nan] * len(_TELEMETRY_COLUMNS)
         first = _FIRST_COLUMN[sample.block.id]
         self._telemetry[first : first + len(sample.values)] = sample.values
@@ -81,7 +91,9 @@ class TelemetryLog:
             self._file.write(_ROW % (self._timestamp_ms, *self._ground, *self._telemetry))
 
 
-def _ground_values(now_us: int, goal: Goal, frame: MocapFrame | None) -> tuple[float, ...]:
-    if frame is None:
-        return (now_us * 1e-6, *goal.p_WG, goal.yaw, *[nan] * 7)
-    return (now_us * 1e-6, *goal.p_WG, goal.yaw, frame.t_us * 1e-6, *frame.p_WB, *to_euler_zyx(frame.q_WB))
+def _ground_values(
+    now_us: int, goal: Goal, frame: MocapFrame | None, track: Track | None
+) -> tuple[float, ...]:
+    pose = [nan] * 7 if frame is None else [frame.t_us * 1e-6, *frame.p_WB, *to_euler_zyx(frame.q_WB)]
+    motion = [nan] * 7 if track is None else [*track.v_WB, *track.w_B, track.quality]
+    return (now_us * 1e-6, *goal.p_WG, goal.yaw, *pose, *motion)

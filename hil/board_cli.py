@@ -177,6 +177,7 @@ def station(
     from ground_station.sources.address import find_source
     from ground_station.station import GroundStation
     from ground_station.telemetry_log import TelemetryLog
+    from ground_station.tracker import tracker_of
     from ground_station.trajectory import Goal
 
     link = _live_link(uri, config)
@@ -192,7 +193,8 @@ def station(
     stops = _stop_signals()
     start_us = clock_us()
     goal = Goal(config.flight.home, 0.0)
-    ground = GroundStation(link, experiment.trajectory(goal, start_us), telemetry, config.station)
+    tracker = tracker_of(config.tracker, config.mocap.period_us)
+    ground = GroundStation(link, experiment.trajectory(goal, start_us), telemetry, config.station, tracker)
 
     def stopping() -> bool:
         return bool(stops) or (duration is not None and clock_us() - start_us > duration * 1e6)

@@ -8,6 +8,7 @@ from typing import Any
 
 from firmware_py.firmware import DEADLINES_US, Firmware
 from firmware_py.signals import COUNTERS
+from ground_station.tracker import Tracker
 from ground_station.trajectory import Trajectory
 from hil.faults import Fault
 from hil.plant.battery import Battery
@@ -45,6 +46,16 @@ def battery_channel(battery: Battery) -> Channel:
             quantity("battery", "power", "W"),
             quantity("battery", "charge"),
         ),
+    )
+
+
+def tracker_channel(tracker: Tracker) -> Channel:
+    """Return what the tracker makes of frames."""
+    counters = tracker.counters
+    return Channel(
+        "int32",
+        lambda: (tracker.quality, counters.refused, counters.bridged, counters.restarts),
+        (quantity("tracker", "quality refused bridged restarts"),),
     )
 
 

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 
 from firmware_py.config import FirmwareConfig
 from ground_station.station import StationConfig
+from ground_station.tracker import TrackerConfig
 from hil.errors import LabError
 from hil.plant.battery import BatteryConfig
 from hil.plant.config import PlantConfig, ServoConfig
@@ -59,6 +60,7 @@ class LabConfig(FirmwareConfig):
     radio: RadioConfig = Field(default_factory=RadioConfig)
     serial: SerialConfig = Field(default_factory=SerialConfig)
     station: StationConfig = Field(default_factory=StationConfig)
+    tracker: TrackerConfig = Field(default_factory=TrackerConfig)
     flight: FlightConfig = Field(default_factory=FlightConfig)
     limits: dict[str, dict[str, float]] = Field(
         default_factory=dict, description="limits by experiment that replace the experiment's own"

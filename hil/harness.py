@@ -20,8 +20,9 @@ from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
+from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal
-from hil.channels import battery_channel, fault_channel, flight_channels, radio_channel
+from hil.channels import battery_channel, fault_channel, flight_channels, radio_channel, tracker_channel
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
 from hil.errors import LabError
@@ -131,7 +132,8 @@ class Flight:
             else LoopbackLink(self.radio.uplink, config.station.link_latency_us)
         )
         self.telemetry = TelemetryLog(telemetry_path) if telemetry_path else None
-        self.station = GroundStation(end, self.trajectory, self.telemetry, config.station)
+        self.tracker = tracker_of(config.tracker, config.mocap.period_us)
+        self.station = GroundStation(end, self.trajectory, self.telemetry, config.station, self.tracker)
         uart = self.serial.uart if self.serial else None
         self.board = VirtualBoard(self.plant.set_counts, self.radio.downlink, self._console, uart)
         self.board.battery_mv = self.battery.millivolts
@@ -165,8 +167,9 @@ class Flight:
         channels = flight_channels(
             self.plant, self.board, self.firmware, link, self.trajectory, lambda: self.free
         )
+        tracker = (tracker_channel(self.tracker),) if self.tracker else ()
         faults = (fault_channel(self.active_faults),) if self.faults else ()
-        return (*channels, battery_channel(self.battery), *faults)
+        return (*channels, battery_channel(self.battery), *tracker, *faults)
 
     @cached_property
     def thief(self) -> Thief:
@@ -232,6 +235,8 @@ class Flight:
             self.recorder.row(now_us)
         self.firmware.check_watchdog()
         self._note_drops(now_us)
+        for line in self.station.notices():
+            self.note("station", line)
         if self.plant.lost is not None:
             self.lost = self.plant.lost
             self.end_us = now_us

@@ -16,6 +16,7 @@ from firmware_py.wire.memories import RadioSettings as EepromSettings
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
+from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
 from hil.config import LabConfig
 from hil.dongle_server import Readers
@@ -150,9 +151,11 @@ class ServedBoard:
 
     def fly(self) -> None:
         """Fly at home with a ground station of its own, on a wire that no client sees."""
-        station = self._config.station
-        link = _Wire(self._wire, station.link_latency_us)
-        ground = GroundStation(link, Hold(Goal(self._config.flight.home, 0.0)), None, station)
+        config = self._config
+        link = _Wire(self._wire, config.station.link_latency_us)
+        tracker = tracker_of(config.tracker, config.mocap.period_us)
+        home = Hold(Goal(config.flight.home, 0.0))
+        ground = GroundStation(link, home, None, config.station, tracker)
         self.publish(ground.on_frame)
 
     def _wire(self, now_us: int, data: bytes) -> None:

@@ -57,7 +57,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "pymavlink": (
         "firmware_py/wire/mavlink.py", "firmware_py/wire/mavlink_layouts.py", "firmware_py/wire/mavlink_services.py",
     ),
-    "filterpy": (),
+    "filterpy": ("ground_station/pose_filter.py",),
     "motioncapture": (),
     "scipy": (),
     "perfetto": ("hil/perfetto.py",),

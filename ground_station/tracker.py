@@ -1,0 +1,222 @@
+"""The tracker between motion capture and link: refuses wrong poses, bridges short gaps, knows the velocity.
+
+Good frames pass unchanged: smoothing would be a delay that the board's filter does not know. A pose is refused when it is
+further from the prediction than noise and pushes explain. Nothing good for `reacquire_us`: the track is lost, and begins
+anew with two poses in a row that fit each other. The first track begins so, too.
+"""
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from math import nan, sqrt
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from firmware_py.geometry import Vector
+from ground_station.mocap import MocapFrame
+from ground_station.pose_filter import PoseFilter
+from ground_station.track_notices import TrackNotices
+
+FIT_US = 50_000  # a second pose that comes later says nothing about the first
+WIDEN_US = 60_000  # refused poses widen the gate until then only, else they would open it to themselves
+FAR = 1000.0  # [m] no tunnel is as large
+UNKNOWN: Vector = (nan, nan, nan)
+
+
+class TrackerConfig(BaseModel):
+    """What the ground station takes for a pose of the robot."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    enabled: bool = Field(True, description="false: frames go to the link as they come, as in the original")
+    position_noise: float = Field(
+        0.0005, gt=0, le=0.1, description="of poses, per axis [m]; as the virtual cameras'"
+    )
+    rotation_noise: float = Field(
+        0.004, gt=0, le=0.5, description="of poses, per axis [rad]; as the virtual cameras'"
+    )
+    acceleration: float = Field(
+        15.0,
+        gt=0,
+        le=1000,
+        description="standard deviation, constant for a frame [m/s^2]; a push of 20 N (59 m/s^2) passes",
+    )
+    angular_acceleration: float = Field(
+        100.0,
+        gt=0,
+        le=10_000,
+        description="standard deviation [rad/s^2]; a torque of 0.2 N m (154 rad/s^2) passes",
+    )
+    gate: float = Field(
+        6.0,
+        ge=3,
+        le=20,
+        description="standard deviations that position or rotation may be off [1]; chi^2 (3) of 36: 8e-8",
+    )
+    bridge_us: int = Field(
+        0, ge=0, le=200_000, description="predicted poses go out this long after the last good one [us]"
+    )
+    reacquire_us: int = Field(
+        400_000, ge=50_000, le=5_000_000, description="without a good pose, then the track begins anew [us]; the board's "
+        "failsafe comes after 500 ms",
+    )  # fmt: skip
+
+
+class Quality(IntEnum):
+    """What became of a frame."""
+
+    NONE = 0  # there is no track, or nothing was seen
+    REFUSED = 1  # it fits neither the track nor the time
+    BRIDGED = 2  # the prediction stands in for it
+    TRACKED = 3  # good
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The frame to be used, and how the robot moves; NaN without a track."""
+
+    frame: MocapFrame
+    v_WB: Vector  # [m/s]
+    w_B: Vector  # [rad/s]
+    quality: Quality
+
+
+@dataclass(slots=True)
+class TrackerCounters:
+    """What happened to frames."""
+
+    refused: int = 0
+    bridged: int = 0
+    restarts: int = 0  # tracks begun but the first
+
+
+class Tracker:
+    """`take` every frame; they come `period_us` apart."""
+
+    def __init__(self, config: TrackerConfig, period_us: int) -> None:
+        self.counters = TrackerCounters()
+        self.quality = Quality.NONE  # of the last frame
+        self._config = config
+        self._period_us = period_us
+        self._gate2 = config.gate**2
+        self._filter = PoseFilter(
+            period_us * 1e-6,
+            config.position_noise,
+            config.rotation_noise,
+            config.acceleration,
+            config.angular_acceleration,
+        )
+        self._notices = TrackNotices()
+        self._begun = False  # the filter knows a pose
+        self._tracking = False  # and a second one that fits
+        self._t_us = 0  # of the newest frame
+        self._good_us = 0  # of the newest good one, or the first of a track
+        self._lost_us: int | None = None  # of the last good frame before a track was lost
+        self._refused_in_a_row = 0
+        self._widening = max(1, WIDEN_US // period_us)
+
+    def take(self, frame: MocapFrame) -> Track:
+        """What is to be used in the place of `frame`."""
+        track = self._take(frame)
+        self.quality = track.quality
+        return track
+
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call, half a second late so that one line tells it all."""
+        return self._notices.due(self._t_us)
+
+    def summary(self) -> str:
+        """A few words on how it does."""
+        counters = self.counters
+        return (
+            f"{self.quality.name.lower()} ({counters.refused} refused, {counters.bridged} bridged, "
+            f"{counters.restarts} restarts)"
+        )
+
+    def _take(self, frame: MocapFrame) -> Track:
+        t_us, usable = frame.t_us, _is_pose(frame)
+        if self._begun and abs(t_us - self._good_us) >= self._patience_us:
+            self._lose()
+        if not self._begun:
+            self._t_us = t_us
+            if usable:
+                self._begin(frame)
+            return _without(frame, Quality.NONE)
+        elapsed_us = t_us - self._t_us
+        if elapsed_us <= 0:  # late, or a repetition
+            self.counters.refused += 1
+            return _without(frame, Quality.REFUSED)
+        self._t_us = t_us
+        self._filter.predict(
+            max(1, round(elapsed_us / self._period_us)), widen=self._refused_in_a_row < self._widening
+        )
+        if not usable:
+            return self._stand_in(frame, Quality.NONE)
+        distance2, angle2, theta = self._filter.off(frame.p_WB, frame.q_WB)
+        position2, rotation2 = self._filter.variances
+        if distance2 > self._gate2 * position2 or angle2 > self._gate2 * rotation2:
+            if not self._tracking:  # one of the two is wrong: the newer one gets its chance
+                self._begin(frame)
+                return _without(frame, Quality.NONE)
+            self.counters.refused += 1
+            self._refused_in_a_row += 1
+            self._notices.refused(t_us, sqrt(distance2), sqrt(angle2))
+            return self._stand_in(frame, Quality.REFUSED)
+        if not self._tracking:
+            self._confirm(t_us)
+        self._good_us = t_us
+        self._refused_in_a_row = 0
+        v_WB, w_B = self._filter.update(frame.p_WB, theta)
+        return Track(frame, v_WB, w_B, Quality.TRACKED)
+
+    @property
+    def _patience_us(self) -> int:
+        """How far the last good frame may be away."""
+        return self._config.reacquire_us if self._tracking else FIT_US
+
+    def _begin(self, frame: MocapFrame) -> None:
+        """Take a pose for the first of a track."""
+        self._filter.begin(frame.p_WB, frame.q_WB)
+        self._begun = True
+        self._good_us = frame.t_us
+        self._refused_in_a_row = 0
+
+    def _confirm(self, t_us: int) -> None:
+        """The second pose fits the first: there is a track."""
+        self._tracking = True
+        if self._lost_us is not None:
+            self.counters.restarts += 1
+            self._notices.begun_anew(t_us, t_us - self._lost_us)
+
+    def _lose(self) -> None:
+        if self._tracking:
+            self._lost_us = self._good_us
+            self._notices.lost(self._t_us)
+        self._begun = self._tracking = False
+
+    def _stand_in(self, frame: MocapFrame, quality: Quality) -> Track:
+        """The prediction in the place of a pose that is missing or wrong, while it is good enough."""
+        v_WB, w_B = self._filter.leave_out()
+        if not self._tracking:
+            return _without(frame, quality)
+        if frame.t_us - self._good_us > self._config.bridge_us:
+            return Track(replace(frame, valid=False), v_WB, w_B, quality)
+        self.counters.bridged += 1
+        p_WB, q_WB = self._filter.pose
+        return Track(replace(frame, p_WB=p_WB, q_WB=q_WB, valid=True), v_WB, w_B, Quality.BRIDGED)
+
+
+def tracker_of(config: TrackerConfig, period_us: int) -> Tracker | None:
+    """The tracker that a profile asks for."""
+    return Tracker(config, period_us) if config.enabled else None
+
+
+def _is_pose(frame: MocapFrame) -> bool:
+    """Whether a frame holds one; the comparisons are false for NaN and infinity, too."""
+    x, y, z = frame.p_WB
+    a, b, c, d = frame.q_WB
+    return frame.valid and abs(x) + abs(y) + abs(z) < FAR and 0.81 <= a * a + b * b + c * c + d * d <= 1.21
+
+
+def _without(frame: MocapFrame, quality: Quality) -> Track:
+    """There is no pose to be used, and nothing is known."""
+    return Track(replace(frame, valid=False), UNKNOWN, UNKNOWN, quality)
