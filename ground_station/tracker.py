@@ -28,37 +28,44 @@ class TrackerConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     enabled: bool = Field(True, description="false: frames go to the link as they come, as in the original")
-    position_noise: float = Field(
-        0.0005, gt=0, le=0.1, description="of poses, per axis [m]; as the virtual cameras'"
-    )
+    position_noise: float = Field(0.0005, gt=0, le=0.1, description="of poses, per axis [m]; that of [mocap]")
     rotation_noise: float = Field(
-        0.004, gt=0, le=0.5, description="of poses, per axis [rad]; as the virtual cameras'"
+        0.004, gt=0, le=0.5, description="of poses, per axis [rad]; that of [mocap]"
     )
     acceleration: float = Field(
         15.0,
         gt=0,
         le=1000,
-        description="standard deviation, constant for a frame [m/s^2]; a push of 20 N (59 m/s^2) passes",
+        description="standard deviation, constant for a frame [m/s^2]; a push of 20 N (59 m/s^2) is 6 standard deviations "
+        "of the pose at most",
     )
     angular_acceleration: float = Field(
         100.0,
         gt=0,
         le=10_000,
-        description="standard deviation [rad/s^2]; a torque of 0.2 N m (154 rad/s^2) passes",
+        description="standard deviation, constant for a frame [rad/s^2]; a torque of 1 N m (680 rad/s^2) is 7.1 of the pose",
     )
     gate: float = Field(
-        6.0,
+        8.0,
         ge=3,
         le=20,
-        description="standard deviations that position or rotation may be off [1]; chi^2 (3) of 36: 8e-8",
+        description="standard deviations that position or rotation may be off [1]: 7 mm or 3 deg from frame to frame; "
+        "5.2 at most in all experiments",
     )
     bridge_us: int = Field(
-        0, ge=0, le=200_000, description="predicted poses go out this long after the last good one [us]"
+        20_000,
+        ge=0,
+        le=200_000,
+        description="predicted poses go out this long after the last good one [us]; blind for 20..300 ms, the hover is "
+        "up to a quarter closer in y with 20 ms (one correction), as without with 50 ms, and breaks limits with 100 ms: for "
+        "longer gaps the board predicts better, with its gyro",
     )
     reacquire_us: int = Field(
-        400_000, ge=50_000, le=5_000_000, description="without a good pose, then the track begins anew [us]; the board's "
-        "failsafe comes after 500 ms",
-    )  # fmt: skip
+        400_000,
+        ge=50_000,
+        le=5_000_000,
+        description="without a good pose, then the track begins anew [us]; the board's failsafe comes after 500 ms",
+    )
 
 
 class Quality(IntEnum):
@@ -66,7 +73,7 @@ class Quality(IntEnum):
 
     NONE = 0  # there is no track, or nothing was seen
     REFUSED = 1  # it fits neither the track nor the time
-    BRIDGED = 2  # the prediction stands in for it
+    BRIDGED = 2  # missing or refused, the prediction stands in for it
     TRACKED = 3  # good
 
 

@@ -72,6 +72,7 @@ METRICS: Mapping[str, Metric] = {
     "as_computed": Metric("", "min", "1 when the height is held exactly if the lift of the flaps allows it"),
     "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
+    "frames_refused": Metric("", "max", "frames that the ground station's tracker refused"),
     "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
     "line_up": Metric("share", "max", "mean load of the serial line to the board"),
     "line_down": Metric("share", "max", "mean load of the serial line from the board"),
@@ -167,6 +168,8 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
         values["line_overrun"] = float(column(flight, "serial.overrun")[-1])
     refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
     values["poses_refused"] = float(refused[-1])
+    if "tracker.refused" in table.schema.names:
+        values["frames_refused"] = float(column(flight, "tracker.refused")[-1])
     return values
 
 
