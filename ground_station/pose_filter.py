@@ -12,8 +12,8 @@ import numpy as np
 
 from firmware_py.geometry import IDENTITY, Quaternion, Vector, conjugate, multiply
 
-SPEED = 3.0  # [m/s] of a robot that is seen for the first time, one standard deviation per axis; chosen
-RATE = 15.0  # [rad/s] likewise
+SPEED = 1.0  # [m/s] of a robot that is seen for the first time, one standard deviation per axis; chosen
+RATE = 5.0  # [rad/s] likewise
 SETTLED = 1e-6  # gain and steady gain differ by less than this share of the largest
 STEPS_MAX = 10_000  # until the gain stands still; 10 to 200 are usual
 P, V, THETA, W = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)  # parts of the state

@@ -2,7 +2,7 @@
 
 Good frames pass unchanged: smoothing would be a delay that the board's filter does not know. A pose is refused when it is
 further from the prediction than noise and pushes explain. Nothing good for `reacquire_us`: the track is lost, and begins
-anew with two poses in a row that fit each other. The first track begins so, too.
+anew when three poses fit one another, which wrong ones rarely do. The first track begins so, too.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,8 @@ from ground_station.mocap import MocapFrame
 from ground_station.pose_filter import PoseFilter
 from ground_station.track_notices import TrackNotices
 
-FIT_US = 50_000  # a second pose that comes later says nothing about the first
+POSES = 3  # that begin a track
+FIT_US = 50_000  # between them; one that comes later says nothing about the others
 WIDEN_US = 60_000  # refused poses widen the gate until then only, else they would open it to themselves
 FAR = 1000.0  # [m] no tunnel is as large
 UNKNOWN: Vector = (nan, nan, nan)
@@ -113,10 +114,9 @@ class Tracker:
             config.angular_acceleration,
         )
         self._notices = TrackNotices()
-        self._begun = False  # the filter knows a pose
-        self._tracking = False  # and a second one that fits
+        self._poses = 0  # that the filter has taken, up to `POSES`
         self._t_us = 0  # of the newest frame
-        self._good_us = 0  # of the newest good one, or the first of a track
+        self._good_us = 0  # of the newest that the filter has taken
         self._lost_us: int | None = None  # of the last good frame before a track was lost
         self._refused_in_a_row = 0
         self._widening = max(1, WIDEN_US // period_us)
@@ -141,9 +141,9 @@ class Tracker:
 
     def _take(self, frame: MocapFrame) -> Track:
         t_us, usable = frame.t_us, _is_pose(frame)
-        if self._begun and abs(t_us - self._good_us) >= self._patience_us:
+        if self._poses and abs(t_us - self._good_us) >= self._patience_us:
             self._lose()
-        if not self._begun:
+        if not self._poses:
             self._t_us = t_us
             if usable:
                 self._begin(frame)
@@ -161,19 +161,23 @@ class Tracker:
         distance2, angle2, theta = self._filter.off(frame.p_WB, frame.q_WB)
         position2, rotation2 = self._filter.variances
         if distance2 > self._gate2 * position2 or angle2 > self._gate2 * rotation2:
-            if not self._tracking:  # one of the two is wrong: the newer one gets its chance
+            if not self._tracking:  # one of them is wrong: the newest gets its chance
                 self._begin(frame)
                 return _without(frame, Quality.NONE)
             self.counters.refused += 1
             self._refused_in_a_row += 1
             self._notices.refused(t_us, sqrt(distance2), sqrt(angle2))
             return self._stand_in(frame, Quality.REFUSED)
-        if not self._tracking:
-            self._confirm(t_us)
+        v_WB, w_B = self._filter.update(frame.p_WB, theta)
         self._good_us = t_us
         self._refused_in_a_row = 0
-        v_WB, w_B = self._filter.update(frame.p_WB, theta)
+        if not self._tracking and not self._is_track(t_us):
+            return _without(frame, Quality.NONE)
         return Track(frame, v_WB, w_B, Quality.TRACKED)
+
+    @property
+    def _tracking(self) -> bool:
+        return self._poses == POSES
 
     @property
     def _patience_us(self) -> int:
@@ -183,22 +187,23 @@ class Tracker:
     def _begin(self, frame: MocapFrame) -> None:
         """Take a pose for the first of a track."""
         self._filter.begin(frame.p_WB, frame.q_WB)
-        self._begun = True
+        self._poses = 1
         self._good_us = frame.t_us
         self._refused_in_a_row = 0
 
-    def _confirm(self, t_us: int) -> None:
-        """The second pose fits the first: there is a track."""
-        self._tracking = True
-        if self._lost_us is not None:
+    def _is_track(self, t_us: int) -> bool:
+        """Whether one more pose that fits makes a track."""
+        self._poses += 1
+        if self._tracking and self._lost_us is not None:
             self.counters.restarts += 1
             self._notices.begun_anew(t_us, t_us - self._lost_us)
+        return self._tracking
 
     def _lose(self) -> None:
         if self._tracking:
             self._lost_us = self._good_us
             self._notices.lost(self._t_us)
-        self._begun = self._tracking = False
+        self._poses = 0
 
     def _stand_in(self, frame: MocapFrame, quality: Quality) -> Track:
         """The prediction in the place of a pose that is missing or wrong, while it is good enough."""

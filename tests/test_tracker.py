@@ -1,0 +1,448 @@
+"""The tracker: velocity, the gate, gaps, new beginnings, and that it is filterpy's plain filter only faster."""
+
+from dataclasses import replace
+from math import inf, isnan, nan, pi
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from ground_station.mocap import MocapFrame
+from ground_station.pose_filter import PoseFilter, rotation_vector
+from ground_station.tracker import FIT_US, Quality, Tracker, TrackerConfig, tracker_of
+
+PERIOD_US = 5000
+CONFIG = TrackerConfig()
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+HALF_TURN = (0.0, 0.0, 0.0, 1.0)
+NOT_YET, YES = Quality.NONE, Quality.TRACKED
+
+
+def frame(number: float, p=(0.1, -0.2, 1.15), q=UPRIGHT, valid: bool = True) -> MocapFrame:
+    return MocapFrame(round(number * PERIOD_US), tuple(map(float, p)), tuple(map(float, q)), valid)
+
+
+def noisy(rng: np.random.Generator, number: float, p=(0.1, -0.2, 1.15), q=UPRIGHT) -> MocapFrame:
+    turn = Rotation.from_rotvec(rng.normal(0.0, CONFIG.rotation_noise, 3))
+    q = (Rotation.from_quat(q, scalar_first=True) * turn).as_quat(scalar_first=True)
+    return frame(number, p + rng.normal(0.0, CONFIG.position_noise, 3), q)
+
+
+def tracking(config: TrackerConfig = CONFIG, count: int = 100, seed: int = 1) -> Tracker:
+    """A tracker that has seen a robot that stands still."""
+    tracker = Tracker(config, PERIOD_US)
+    rng = np.random.default_rng(seed)
+    for number in range(count):
+        tracker.take(noisy(rng, number))
+    assert tracker.quality is Quality.TRACKED
+    return tracker
+
+
+# Velocity
+
+
+def motion(t: float) -> tuple[NDArray[np.float64], NDArray[np.float64], Rotation, NDArray[np.float64]]:
+    """Position, velocity, attitude and body rate on a swinging way; the rate is exact for a fixed axis."""
+    phase = 2 * pi * np.array([0.4, 0.7, 1.1])
+    size, axis = np.array([0.3, 0.2, 0.1]), np.array([1.0, 2.0, -2.0]) / 3
+    angle, rate = 1.5 * np.sin(2 * pi * 0.5 * t), 1.5 * pi * np.cos(2 * pi * 0.5 * t)
+    return (
+        size * np.sin(phase * t),
+        size * phase * np.cos(phase * t),
+        Rotation.from_rotvec(angle * axis),
+        rate * axis,
+    )
+
+
+def test_velocity_and_rate_are_those_of_a_known_trajectory() -> None:
+    tracker, rng = Tracker(CONFIG, PERIOD_US), np.random.default_rng(3)
+    errors = []
+    for number in range(1000):
+        p, v, R, w = motion(number * PERIOD_US * 1e-6)
+        track = tracker.take(noisy(rng, number, p, R.as_quat(scalar_first=True)))
+        if number > 20:
+            assert track.quality is Quality.TRACKED
+            errors.append([*(track.v_WB - v), *(track.w_B - w)])
+    bias, spread = np.mean(errors, axis=0), np.std(errors, axis=0)
+    assert np.abs(bias[:3]).max() < 0.01
+    assert np.abs(bias[3:]).max() < 0.1
+    # Two noisy poses tell 0.0005 * sqrt(2) / 0.005 = 0.14 m/s and 1.1 rad/s.
+    assert spread[:3].max() < 0.1
+    assert spread[3:].max() < 0.7
+
+
+def test_a_good_pose_passes_unchanged() -> None:
+    tracker = tracking()
+    seen = noisy(np.random.default_rng(9), 100)
+    assert tracker.take(seen).frame is seen
+
+
+def test_rotation_vector_is_scipys() -> None:
+    rng = np.random.default_rng(0)
+    for q in (*rng.normal(size=(200, 4)), (1, 0, 0, 0), (-1, 0, 0, 0), (1, 1e-12, 0, 0), (-0.5, 1e-12, 0, 0)):
+        expected = Rotation.from_quat(q, scalar_first=True).as_rotvec()
+        assert rotation_vector(tuple(map(float, q))) == pytest.approx(expected, abs=1e-9)
+
+
+# The same as a plain filter
+
+
+class Plain:
+    """The same model with filterpy's full steps only; attitude as scipy's rotations."""
+
+    def __init__(self, step_s: float) -> None:
+        block = np.array([[1, 0, 0, step_s, 0, 0], [0, 1, 0, 0, step_s, 0], [0, 0, 1, 0, 0, step_s],
+                          [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]])  # fmt: skip
+        one = np.array([[step_s**4 / 4, step_s**3 / 2], [step_s**3 / 2, step_s**2]])
+        noise = [np.kron(one, np.eye(3)) * s**2 for s in (CONFIG.acceleration, CONFIG.angular_acceleration)]
+        self.kf = KalmanFilter(12, 6)
+        self.kf.x = np.zeros(12)
+        self.kf.F, self.kf.Q = block_diag(block, block), block_diag(*noise)
+        self.kf.H = np.zeros((6, 12))
+        self.kf.H[range(6), [0, 1, 2, 6, 7, 8]] = 1.0
+        self.kf.R = np.diag([CONFIG.position_noise**2] * 3 + [CONFIG.rotation_noise**2] * 3)
+        self.kf.P = np.diag(
+            [*[CONFIG.position_noise**2] * 3, 1, 1, 1, *[CONFIG.rotation_noise**2] * 3, *[25] * 3]
+        )
+        self.R = Rotation.identity()
+
+    def step(self, seen: MocapFrame | None) -> None:
+        self.kf.predict()
+        if seen is not None:
+            theta = (self.R.inv() * Rotation.from_quat(seen.q_WB, scalar_first=True)).as_rotvec()
+            self.kf.update(np.array([*seen.p_WB, *theta]))
+        self.R *= Rotation.from_rotvec(self.kf.x[6:9])
+        self.kf.x[6:9] = 0.0
+
+
+def test_it_is_the_plain_kalman_filter_over_random_gaps() -> None:
+    """Frames missing, or there without a pose, for up to 30 periods; between them steady-state steps."""
+    rng = np.random.default_rng(7)
+    tracker, plain = Tracker(CONFIG, PERIOD_US), Plain(PERIOD_US * 1e-6)
+    number, steady, full = 0, 0, 0
+    while number < 3000:
+        if number > 1 and rng.random() < 0.02:
+            gap = int(rng.integers(1, 30))
+            silent = rng.random() < 0.5
+            for _ in range(gap):
+                if not silent:
+                    tracker.take(frame(number, valid=False))
+                plain.step(None)
+                number += 1
+        p, _, R, _ = motion(number * PERIOD_US * 1e-6)
+        seen = noisy(rng, number, p, R.as_quat(scalar_first=True))
+        if number == 0:
+            plain.kf.x[:3] = seen.p_WB
+            plain.R = Rotation.from_quat(seen.q_WB, scalar_first=True)
+            tracker.take(seen)
+        else:
+            plain.step(seen)
+            track = tracker.take(seen)
+            if number > 1:
+                assert track.quality is YES
+                assert track.v_WB == pytest.approx(plain.kf.x[3:6], abs=1e-5)
+                assert track.w_B == pytest.approx(plain.kf.x[9:12], abs=1e-4)
+        steady, full = steady + tracker._filter._steady, full + (not tracker._filter._steady)
+        number += 1
+    assert min(steady, full) > 500, "both kinds of steps were compared"
+
+
+def test_variances_are_those_of_the_plain_filter_before_the_pose() -> None:
+    one, plain = (
+        PoseFilter(0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration),
+        Plain(0.005),
+    )
+    one.begin((0.0, 0.0, 0.0), UPRIGHT)
+    for number in range(60):
+        seen = None if 30 <= number < 36 else frame(number, (0.0, 0.0, 0.0))
+        one.predict(1, widen=True)
+        kf = plain.kf
+        before = kf.F @ kf.P @ kf.F.T + kf.Q
+        expected = (kf.H @ before @ kf.H.T + kf.R)[[0, 3], [0, 3]]
+        plain.step(seen)
+        assert one.variances == pytest.approx(expected, rel=1e-4)
+        if seen is None:
+            one.leave_out()
+        else:
+            one.update(seen.p_WB, (0.0, 0.0, 0.0))
+
+
+# The gate
+
+
+def test_false_refusals_are_rarer_than_one_in_3800() -> None:
+    """Three times as many frames of a robot at rest, nominal noise."""
+    rng = np.random.default_rng(5)
+    tracker = tracking()
+    for number in range(100, 11_500):
+        assert tracker.take(noisy(rng, number)).quality is Quality.TRACKED
+    assert tracker.counters.refused == 0
+
+
+def test_distances_are_distributed_as_chi2_when_the_robot_moves_as_assumed() -> None:
+    one = PoseFilter(0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration)
+    rng, p, v = np.random.default_rng(5), np.zeros(3), np.zeros(3)
+    one.begin((0.0, 0.0, 0.0), UPRIGHT)
+    distances = []
+    for number in range(5000):
+        seen = noisy(rng, number, p)
+        one.predict(1, widen=True)
+        distance2, _, theta = one.off(seen.p_WB, seen.q_WB)
+        distances.append(distance2 / one.variances[0])
+        one.update(seen.p_WB, theta)
+        a = rng.normal(0.0, CONFIG.acceleration, 3)
+        p, v = p + v * 0.005 + 0.5 * a * 0.005**2, v + a * 0.005
+    for share in (0.5, 0.9, 0.99):
+        assert np.mean(distances < chi2.ppf(share, 3)) == pytest.approx(
+            share, abs=4 * np.sqrt(share * (1 - share) / 5000)
+        )
+
+
+@pytest.mark.parametrize("count", [1, 3, 20, 60, 78])
+@pytest.mark.parametrize(
+    ("p", "q"),
+    [
+        ((0.2, -0.2, 1.15), UPRIGHT),
+        ((0.1, -0.7, 1.15), UPRIGHT),
+        ((0.1, -0.2, 1.15), HALF_TURN),
+        ((0.1, -0.2, 1.15), (0.0, 1.0, 0.0, 0.0)),
+        ((0.2, -0.2, 1.15), HALF_TURN),
+    ],
+)
+def test_wrong_poses_that_agree_are_refused_for_less_than_the_time_to_reacquire(p, q, count: int) -> None:
+    tracker, rng = tracking(), np.random.default_rng(2)
+    for number in range(100, 100 + count):
+        track = tracker.take(noisy(rng, number, p, q))
+        assert track.quality is (Quality.BRIDGED if number < 104 else Quality.REFUSED)
+        assert track.frame.valid is (number < 104)
+    assert tracker.counters.refused == count
+
+
+def test_wrong_poses_each_in_a_direction_of_its_own_never_pass() -> None:
+    tracker, rng = tracking(), np.random.default_rng(4)
+    for number in range(100, 400):
+        offset = rng.normal(size=3)
+        track = tracker.take(noisy(rng, number, (0.1, -0.2, 1.15) + 0.5 * offset / np.linalg.norm(offset)))
+        assert track.quality is not Quality.TRACKED
+
+
+def test_the_robot_is_found_again_after_outliers_of_a_tenth_of_a_second() -> None:
+    tracker, rng = tracking(), np.random.default_rng(2)
+    for number in range(100, 120):
+        tracker.take(noisy(rng, number, (0.3, -0.2, 1.15)))
+    assert tracker.take(noisy(rng, 120)).quality is Quality.TRACKED
+    assert tracker.counters.restarts == 0
+
+
+def test_a_push_of_20_newton_is_no_outlier() -> None:
+    """59 m/s^2 for 0.1 s on each axis and its opposite, and 0.2 N m (154 rad/s^2) at the same time."""
+    for axis in np.vstack((np.eye(3), -np.eye(3))):
+        tracker, rng = tracking(), np.random.default_rng(6)
+        for number in range(100, 140):
+            t = (number - 100.3) * PERIOD_US * 1e-6
+            pushed, after = max(0.0, min(t, 0.1)), max(0.0, t - 0.1)
+            way = 0.5 * pushed**2 + pushed * after
+            turn = Rotation.from_rotvec(154.0 * way * axis).as_quat(scalar_first=True)
+            seen = noisy(rng, number, (0.1, -0.2, 1.15) + 20.0 / 0.34 * way * axis, turn)
+            assert tracker.take(seen).quality is Quality.TRACKED, f"{axis} {number}"
+
+
+# Gaps
+
+
+@pytest.mark.parametrize("bridge_us", [0, 20_000, 60_000])
+def test_a_gap_is_bridged_up_to_the_limit_and_no_longer(bridge_us: int) -> None:
+    """The bridged pose is where the robot is if it goes on as before."""
+    tracker = Tracker(CONFIG.model_copy(update={"bridge_us": bridge_us}), PERIOD_US)
+    rng = np.random.default_rng(8)
+    v, w = np.array([0.5, -0.3, 0.2]), np.array([0.0, 0.0, 1.0])
+    for number in range(160):
+        t = number * PERIOD_US * 1e-6
+        q = Rotation.from_rotvec(w * t).as_quat(scalar_first=True)
+        seen = noisy(rng, number, v * t, q)
+        if number <= 120:
+            tracker.take(seen)
+            continue
+        track = tracker.take(replace(seen, valid=False))
+        bridged = (number - 120) * PERIOD_US <= bridge_us
+        assert track.frame.valid is bridged
+        assert track.quality is (Quality.BRIDGED if bridged else Quality.NONE)
+        if bridged:
+            assert track.frame.t_us == seen.t_us
+            assert track.frame.p_WB == pytest.approx(v * t, abs=0.02)
+            assert Rotation.from_quat(track.frame.q_WB, scalar_first=True).as_rotvec() == pytest.approx(
+                w * t, abs=0.12
+            )
+    assert tracker.counters.bridged == bridge_us // PERIOD_US
+
+
+# New beginnings
+
+
+def qualities(*frames: MocapFrame) -> list[Quality]:
+    tracker = Tracker(CONFIG, PERIOD_US)
+    return [tracker.take(seen).quality for seen in frames]
+
+
+def test_a_track_begins_with_three_poses_that_fit() -> None:
+    tracker = Tracker(CONFIG, PERIOD_US)
+    for number in (0, 1):
+        track = tracker.take(frame(number))
+        assert (track.quality, track.frame.valid) == (NOT_YET, False)
+        assert isnan(track.v_WB[0])
+    assert tracker.take(frame(2)).quality is YES
+
+
+def test_a_stray_first_pose_does_not_lock_the_gate() -> None:
+    stray = (1.0, 1.0, 1.0)
+    assert qualities(frame(0, stray), frame(1), frame(2), frame(3), frame(4)) == [NOT_YET] * 3 + [YES] * 2
+    assert qualities(frame(0), frame(1, stray), frame(2), frame(3), frame(4)) == [NOT_YET] * 4 + [YES]
+
+
+def test_between_the_first_poses_frames_may_be_missing_but_not_for_long() -> None:
+    late = FIT_US // PERIOD_US
+    assert qualities(frame(0), frame(2), frame(3, valid=False), frame(5)) == [NOT_YET] * 3 + [YES]
+    assert qualities(frame(0), frame(1), frame(1 + late), frame(2 + late)) == [NOT_YET] * 4
+
+
+def test_a_robot_that_falls_is_tracked_from_the_third_pose_on() -> None:
+    falls = [frame(n, (0.0, 0.0, 1.0 - 6.0 * 0.005 * n)) for n in range(3)]
+    assert qualities(*falls) == [NOT_YET, NOT_YET, YES]
+
+
+def test_after_the_time_to_reacquire_the_track_begins_anew_at_the_newest_pose() -> None:
+    tracker, rng = tracking(), np.random.default_rng(2)
+    tracked = [
+        tracker.take(noisy(rng, n, (0.6, -0.2, 1.15))).quality is Quality.TRACKED for n in range(100, 200)
+    ]
+    assert tracked.index(True) == 81  # 99 was the last good one, 179 is 400 ms later, 180 and 181 fit it
+    assert all(tracked[81:])
+    assert tracker.counters.refused == 79
+    assert tracker.counters.restarts == 1
+
+
+@pytest.mark.parametrize("jump_us", [-(10**15), -3_600_000_000, -400_000, 400_000, 10**15])
+def test_a_clock_that_jumps_costs_two_frames(jump_us: int) -> None:
+    tracker, rng = tracking(), np.random.default_rng(2)
+    jumped = [replace(seen, t_us=seen.t_us + jump_us) for seen in (noisy(rng, n) for n in range(99, 103))]
+    assert [tracker.take(seen).quality for seen in jumped] == [NOT_YET, NOT_YET, YES, YES]
+
+
+def test_late_and_repeated_frames_are_refused_and_change_nothing() -> None:
+    first, second, rng = tracking(), tracking(), np.random.default_rng(2)
+    for number in range(100, 130):
+        seen = noisy(rng, number)
+        track = first.take(seen)
+        again = first.take(seen)
+        assert (again.quality, again.frame.valid) == (Quality.REFUSED, False)
+        assert first.take(frame(number - 7.5, (9.0, 9.0, 9.0))).quality is Quality.REFUSED
+        assert track == second.take(seen)
+    assert first.counters.refused == 60
+
+
+# What it tells
+
+
+def told(tracker: Tracker, frames: list[MocapFrame]) -> list[tuple[int, str]]:
+    """Frame times and lines."""
+    lines = []
+    for seen in frames:
+        tracker.take(seen)
+        lines += [(seen.t_us, line) for line in tracker.notices()]
+    return lines
+
+
+def test_one_line_tells_of_refused_poses() -> None:
+    rng = np.random.default_rng(2)
+    wrong = {120, 121, 122}
+    frames = [
+        noisy(
+            rng,
+            n,
+            (0.6, -0.2, 1.15) if n in wrong else (0.1, -0.2, 1.15),
+            HALF_TURN if n in wrong else UPRIGHT,
+        )
+        for n in range(100, 400)
+    ]
+    lines = told(tracking(), frames)
+    assert lines == [
+        (120 * PERIOD_US + 500_000, "motion capture: 3 poses refused, up to 0.50 m and 180 deg off")
+    ]
+
+
+def test_a_track_that_is_lost_and_begun_anew_is_told() -> None:
+    rng = np.random.default_rng(2)
+    blind = [replace(noisy(rng, n), valid=False) for n in range(100, 400)]
+    back = [noisy(rng, n) for n in range(400, 600)]
+    lines = told(tracking(), blind + back)
+    assert [line for _, line in lines] == [
+        "motion capture: track lost",
+        "motion capture: track begun anew after 1.5 s",
+    ]
+
+
+def test_rubbish_now_and_then_is_told_twice_a_second_at_most() -> None:
+    rng = np.random.default_rng(2)
+    frames = [noisy(rng, n) if n % 10 else frame(n, rng.uniform(-1, 1, 3)) for n in range(100, 2100)]
+    assert 10 <= len(told(tracking(), frames)) <= 20
+
+
+def test_the_summary_counts() -> None:
+    tracker = tracking()
+    tracker.take(frame(100, (0.0, 0.0, 0.0)))
+    assert tracker.summary() == "bridged (1 refused, 1 bridged, 0 restarts)"
+
+
+# Whatever comes
+
+number = st.floats(allow_nan=True, allow_infinity=True) | st.sampled_from([nan, inf, 0.0, 1e308, 1.15])
+moment = st.integers(-(2**63), 2**63) | st.integers(0, 400).map(lambda n: n * PERIOD_US)
+wild = st.builds(
+    MocapFrame, moment, st.tuples(number, number, number), st.tuples(*[number] * 4), st.booleans()
+)
+tame = st.builds(
+    MocapFrame,
+    st.integers(0, 400).map(lambda n: n * PERIOD_US),
+    st.tuples(*[st.floats(-2.0, 2.0)] * 3),
+    st.sampled_from([UPRIGHT, HALF_TURN, (0.6, 0.8, 0.0, 0.0), (-1.0, 0.0, 0.0, 0.0)]),
+    st.booleans(),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(wild | tame, max_size=40), st.integers(0, 100_000))
+def test_anything_may_come_and_the_tracker_recovers(frames: list[MocapFrame], bridge_us: int) -> None:
+    tracker = Tracker(CONFIG.model_copy(update={"bridge_us": bridge_us}), PERIOD_US)
+    good_us = None
+    for seen in frames:
+        track = tracker.take(seen)
+        tracker.notices()
+        if track.quality is Quality.TRACKED:
+            assert track.frame is seen
+            good_us = seen.t_us
+        elif track.frame.valid:
+            assert track.quality is Quality.BRIDGED
+            assert good_us is not None
+            assert 0 < track.frame.t_us - good_us <= bridge_us
+            assert np.isfinite([*track.frame.p_WB, *track.frame.q_WB]).all()
+    after = [tracker.take(frame(1000 + n)).quality for n in range(100)]
+    assert after[82:] == [YES] * 18
+
+
+def test_a_profile_may_do_without() -> None:
+    assert tracker_of(TrackerConfig(enabled=False), PERIOD_US) is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"gate": 0.0}, {"bridge_us": -1}, {"position_noise": 0.0}, {"reaquire_us": 1}]
+)
+def test_bad_configuration_is_refused(change: dict[str, float]) -> None:
+    with pytest.raises(ValidationError):
+        TrackerConfig(**change)
