@@ -191,11 +191,11 @@ KINDS: Mapping[str, Kind] = {
     ),
     "mocap.outlier": Kind(
         "every frame is this far off, each in a direction of its own", "m", 0.3, 0.0, 5.0,
-        (_mocap("wrong_by", max),), "holds", duration_s=0.1,
+        (_mocap("wrong_by", max),), "holds", duration_s=GLIMPSE_S,
     ),
     "mocap.swap": Kind(
         "markers swapped: every pose is turned by 180 deg about z and shifted by this along x of B", "m", 0.1, 0.001, 1.0,
-        (_mocap("swapped_by", max),), "degrades", duration_s=GLIMPSE_S,
+        (_mocap("swapped_by", max),), "holds", duration_s=GLIMPSE_S,
     ),
     "mocap.latency": Kind(
         "the cameras' computer needs this much longer", "ms", 40.0, 0.0, 500.0,

@@ -190,13 +190,6 @@ def _gust_ratio(rows: pa.Table, without: pa.Table) -> float:
     return float(fast / plain)
 
 
-def _heading(rows: pa.Table, _: pa.Table) -> float:
-    """The smallest error of the estimated heading [deg]."""
-    w, z = column(rows, "truth.qw"), column(rows, "truth.qz")
-    wrong = column(rows, "estimate.yaw") - 2 * np.arctan2(z, w)
-    return float(np.degrees(np.abs(np.angle(np.exp(1j * wrong)))).min())
-
-
 def _impulse(name: str) -> Seen:
     """What was gained over the window, against the flight without the fault."""
 
@@ -237,8 +230,8 @@ MASS, INERTIA = 0.340, (1.30e-3, 1.30e-3, 1.47e-3)  # physics.md section 3
 FIRST = (-0.005, 0.015)  # the first 10 ms
 SIGNS = [
     Sign("mocap.dropout", _grown("link.up_sent"), (0, 0), (38, 41)),
-    Sign("mocap.outlier", _grown("estimator.refused"), (20, 41), (0, 0)),
-    Sign("mocap.swap", _heading, (165, 180), (0, 20), (0.1, 0.25)),
+    Sign("mocap.outlier", _grown("tracker.refused"), (28, 28), (0, 0), (0.1, 0.25)),
+    Sign("mocap.swap", _grown("tracker.refused"), (28, 28), (0, 0), (0.15, 0.3)),
     Sign("mocap.latency=20", _mean_of("estimator.pose_age_us", 1e-3), (19.5, 20.5), (-1.5, 1.5)),
     Sign("radio.loss", _grown("link.retried"), (60, 1000), (0, 20)),
     Sign("radio.uplink_loss", _latency, (1.0, 2.5), (-0.3, 0.3)),
@@ -402,8 +395,10 @@ def test_an_experiments_faults_outside_a_shortened_flight_are_left_out(tmp_path:
 
 LONGER = {
     "mocap.dropout@1:0.7": "failsafe",
+    "mocap.outlier@1:0.3=0.5": "holds",
+    "mocap.outlier@1:0.6=0.5": "failsafe",
     "mocap.dropout@1:inf=0.5": "holds",
-    "mocap.swap@1:0.02": "holds",  # one pose that the gate refuses
+    "mocap.swap@1:0.6": "degrades",  # after 0.4 s the tracker believes it
     "mocap.latency@1=100": "lost",  # 140 ms; the predictor's buffer ends before
     "radio.cut@1:0.7": "failsafe",
     "serial.cut@1:0.7": "failsafe",
