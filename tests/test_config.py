@@ -17,9 +17,9 @@ def test_shipped_profiles_load() -> None:
         load_config(name)
 
 
-def test_as_flown_differs_from_floaty_in_gains_and_limits_only() -> None:
+def test_as_flown_differs_from_floaty_in_gains_limits_and_tracker_only() -> None:
     floaty, flown = (load_config(name).model_dump() for name in ("floaty", "as-flown"))
-    assert {key for key in floaty if floaty[key] != flown[key]} == {"controller", "limits"}
+    assert {key for key in floaty if floaty[key] != flown[key]} == {"controller", "limits", "tracker"}
     assert flown["controller"]["gain_roll"] == 0.2
 
 

@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ground_station.tracker import Quality
 from hil.clock import FreeRunning, Paced
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
+from hil.faults import parse
 from hil.harness import Flight
 from hil.metrics import METRICS, column, judge
 from hil.recorder import load_events, load_log
+from hil.report import write_report
 from hil.run import Request, Result, fly, prepare, read_result
 
 HOVER = EXPERIMENTS["hover"]
@@ -52,6 +55,49 @@ def test_without_the_predictor_the_authors_gains_lose_the_robot(tmp_path: Path, 
     result = hover(tmp_path / "run", "predictor.enabled=false", profile="as-flown", seed=seed)
     assert result.outcome == "lost", explain(result)
     assert result.cause is not None
+
+
+def test_log_events_and_report_know_what_the_tracker_refused(tmp_path: Path) -> None:
+    outlier = parse("mocap.outlier@1:0.05=0.5")
+    prepare(tmp_path / "run")
+    result = fly(Request.of(HOVER, duration_s=2.0, faults=[outlier]), tmp_path / "run")
+    log = load_log(result.folder)
+    assert column(log, "tracker.refused")[-1] == result.metrics["frames_refused"] == 10
+    assert set(column(log, "tracker.quality")[20:]) == {Quality.REFUSED, Quality.TRACKED}
+    told = [event["text"] for event in load_events(result.folder) if event["source"] == "station"]
+    assert len(told) == 1
+    assert told[0].startswith("motion capture: 10 poses refused, up to 0.5")
+    assert '<tr id="frames_refused"><td>frames_refused</td><td class="number">10<' in write_report(
+        result.folder
+    ).read_text(encoding="utf-8")
+
+
+def test_without_a_tracker_the_log_says_nothing_of_it(tmp_path: Path) -> None:
+    result = hover(tmp_path / "run", profile="as-flown", duration_s=0.2)
+    assert [name for name in load_log(result.folder).column_names if name.startswith("tracker")] == []
+    assert np.isnan(result.metrics["frames_refused"])
+
+
+HEALTHY = (
+    ("yaw-step", ()),
+    ("pushes", ()),
+    ("take-off-landing", ()),
+    ("hover", ("push.x@1=20",)),
+    ("hover", ("push.y@1=20",)),
+    ("hover", ("push.z@1=-20",)),
+    ("hover", ("push.yaw@1=1",)),
+    ("hover", ("wind.fan@1=0",)),
+)
+
+
+@pytest.mark.parametrize(("name", "faults"), HEALTHY)
+def test_the_tracker_refuses_no_healthy_pose(tmp_path: Path, name: str, faults: tuple[str, ...]) -> None:
+    prepare(tmp_path / "run")
+    duration_s = 4.0 if faults else None
+    request = Request.of(EXPERIMENTS[name], duration_s=duration_s, faults=[parse(text) for text in faults])
+    fly(request, tmp_path / "run")
+    log = load_log(tmp_path / "run")
+    assert column(log, "tracker.refused")[-1] == column(log, "tracker.restarts")[-1] == 0
 
 
 def test_same_seed_same_hash_other_seed_other_hash(tmp_path: Path) -> None:

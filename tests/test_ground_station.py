@@ -18,6 +18,7 @@ from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, StationConfig
 from ground_station.telemetry_log import TelemetryLog
+from ground_station.tracker import Quality, Tracker, TrackerConfig
 from ground_station.trajectory import Goal, Hold, Offsets, Sine, Square, Step
 
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
@@ -29,12 +30,12 @@ angle = st.floats(-pi, pi)
 class Bench:
     """A ground station whose packets end in a list."""
 
-    def __init__(self, send_every=4, latency_us=1000, log=None, trajectory=None):
+    def __init__(self, send_every=4, latency_us=1000, log=None, trajectory=None, tracker=None):
         self.sent = []  # corrections
         self.requests = []  # for telemetry
         link = LoopbackLink(self._transmit, latency_us)
         self.station = GroundStation(
-            link, trajectory or Hold(HOME), log, StationConfig(send_every=send_every)
+            link, trajectory or Hold(HOME), log, StationConfig(send_every=send_every), tracker
         )
 
     def _transmit(self, now_us, data):
@@ -96,6 +97,15 @@ def test_a_frame_without_a_pose_is_not_sent():
     bench.frames(3, p=lambda number: (nan, 0.0, 0.0) if number == 1 else (0.001 * number, 0.0, 1.15))
     assert bench.numbers() == [0, 2]
     assert bench.station.counters.invalid == 1
+
+
+def test_refused_frames_are_not_sent_and_the_next_good_one_takes_their_place():
+    """x grows by 1 mm per frame, 0.2 m/s; three frames are half a metre off. A track begins with the third frame."""
+    bench = Bench(tracker=Tracker(TrackerConfig(), 5000))
+    bench.frames(200, p=lambda number: (0.001 * number + 0.5 * (number in (99, 100, 101)), 0.0, 1.15))
+    assert bench.numbers() == [2, *range(4, 100, 4), 102, *range(104, 200, 4)]
+    assert bench.station.counters.invalid == 5
+    assert bench.station.notices() == ["motion capture: 3 poses refused, up to 0.50 m and 0 deg off"]
 
 
 def test_the_goal_of_the_moment_counts_not_that_of_the_exposure():
@@ -180,6 +190,26 @@ def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
     assert isnan(float(second["stateEstimate.x [m]"]))
     assert float(second["stateEstimate.roll [rad]"]) == 0.5 + telemetry.BLOCKS[1].id
     assert isnan(float(second["mocap.x [m]"]))
+
+
+def test_log_knows_velocity_and_quality_of_the_track_and_the_last_usable_pose(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = Bench(log=log, tracker=Tracker(TrackerConfig(), 5000))
+    packet = next(telemetry_packets(20, telemetry.BLOCKS))
+    bench.frames(100)
+    bench.station.on_packet(500_000, packet)
+    bench.station.on_frame(MocapFrame(500_000, (0.5, 0.0, 1.15), UPRIGHT, True), 538_000)
+    bench.station.on_packet(540_000, next(telemetry_packets(40, telemetry.BLOCKS)))
+    log.close()
+    good, refused = rows(tmp_path / "telemetry.csv")
+    assert (float(good["mocap.quality []"]), float(refused["mocap.quality []"])) == (
+        Quality.TRACKED,
+        Quality.REFUSED,
+    )
+    for row in (good, refused):
+        assert float(row["mocap.vx [m/s]"]) == pytest.approx(0.2, abs=1e-3)
+        assert float(row["mocap.r [rad/s]"]) == pytest.approx(0.0, abs=1e-6)
+        assert float(row["mocap.x [m]"]) == pytest.approx(0.099)
 
 
 def test_log_on_disk_is_never_much_more_than_a_second_old(tmp_path):

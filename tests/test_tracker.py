@@ -20,6 +20,7 @@ from ground_station.tracker import FIT_US, Quality, Tracker, TrackerConfig, trac
 
 PERIOD_US = 5000
 CONFIG = TrackerConfig()
+BRIDGING = CONFIG.model_copy(update={"bridge_us": 20_000})
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 HALF_TURN = (0.0, 0.0, 0.0, 1.0)
 NOT_YET, YES = Quality.NONE, Quality.TRACKED
@@ -217,7 +218,7 @@ def test_distances_are_distributed_as_chi2_when_the_robot_moves_as_assumed() -> 
     ],
 )
 def test_wrong_poses_that_agree_are_refused_for_less_than_the_time_to_reacquire(p, q, count: int) -> None:
-    tracker, rng = tracking(), np.random.default_rng(2)
+    tracker, rng = tracking(BRIDGING), np.random.default_rng(2)
     for number in range(100, 100 + count):
         track = tracker.take(noisy(rng, number, p, q))
         assert track.quality is (Quality.BRIDGED if number < 104 else Quality.REFUSED)
@@ -395,7 +396,7 @@ def test_rubbish_now_and_then_is_told_twice_a_second_at_most() -> None:
 
 
 def test_the_summary_counts() -> None:
-    tracker = tracking()
+    tracker = tracking(BRIDGING)
     tracker.take(frame(100, (0.0, 0.0, 0.0)))
     assert tracker.summary() == "bridged (1 refused, 1 bridged, 0 restarts)"
 
