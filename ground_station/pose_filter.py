@@ -5,12 +5,12 @@ reference after every step. Noise is the same on all axes, so that two numbers t
 come without a gap, gain and covariance stand still, and filterpy's steady-state steps do without them: 12 instead of 45 us.
 """
 
-from math import atan2, cos, sin, sqrt
+from math import sqrt
 from typing import Any
 
 import numpy as np
 
-from firmware_py.geometry import IDENTITY, Quaternion, Vector, conjugate, multiply
+from firmware_py.geometry import IDENTITY, Quaternion, Vector
 
 SPEED = 1.0  # [m/s] of a robot that is seen for the first time, one standard deviation per axis; chosen
 RATE = 5.0  # [rad/s] likewise
@@ -100,10 +100,21 @@ class PoseFilter:
         self.variances = self._variances_of(filter_.P)
 
     def off(self, p_WB: Vector, q_WB: Quaternion) -> tuple[float, float, Vector]:
-        """How far a pose is from the prediction, squared [m^2, rad^2], and its rotation from the reference [rad]."""
+        """How far a pose is from the prediction, squared [m^2, rad^2], and its rotation from the reference.
+
+        Rotations are twice Gibbs's vector, 2 tan(angle / 2) about the axis [rad]: the angle itself where it is small, and
+        far beyond every gate where it is not.
+        """
         x, y, z, _, _, _, a, b, c, _, _, _ = self._filter.x.tolist()
         dx, dy, dz = p_WB[0] - x, p_WB[1] - y, p_WB[2] - z
-        theta = rotation_vector(multiply(conjugate(self._q), q_WB))
+        w, x, y, z = self._q
+        qw, qx, qy, qz = q_WB
+        s = 2.0 / (w * qw + x * qx + y * qy + z * qz or 1e-9)
+        theta = (
+            s * (w * qx - x * qw - y * qz + z * qy),
+            s * (w * qy + x * qz - y * qw - z * qx),
+            s * (w * qz - x * qy + y * qx - z * qw),
+        )
         da, db, dc = theta[0] - a, theta[1] - b, theta[2] - c
         return dx * dx + dy * dy + dz * dz, da * da + db * db + dc * dc, theta
 
@@ -130,14 +141,12 @@ class PoseFilter:
         state = self._filter.x
         _, _, _, vx, vy, vz, a, b, c, p, q, r = state.tolist()
         w, x, y, z = self._q
-        angle = sqrt(a * a + b * b + c * c)
-        s = sin(0.5 * angle) / angle if angle > 1e-9 else 0.5
-        k, a, b, c = cos(0.5 * angle), s * a, s * b, s * c
+        a, b, c = 0.5 * a, 0.5 * b, 0.5 * c
         w, x, y, z = (
-            w * k - x * a - y * b - z * c,
-            w * a + x * k + y * c - z * b,
-            w * b - x * c + y * k + z * a,
-            w * c + x * b - y * a + z * k,
+            w - x * a - y * b - z * c,
+            w * a + x + y * c - z * b,
+            w * b - x * c + y + z * a,
+            w * c + x * b - y * a + z,
         )
         n = 1.0 / sqrt(w * w + x * x + y * y + z * z)
         self._q = (n * w, n * x, n * y, n * z)
@@ -146,11 +155,3 @@ class PoseFilter:
 
     def _variances_of(self, prior: Any) -> tuple[float, float]:
         return float(prior[0, 0]) + self._noise2[0], float(prior[6, 6]) + self._noise2[1]
-
-
-def rotation_vector(q: Quaternion) -> Vector:
-    """The rotation [rad] of a quaternion of any length but 0, the short way round."""
-    w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
-    n = sqrt(x * x + y * y + z * z)
-    s = 2.0 * atan2(n, w) / n if n > 1e-9 else 2.0 / w
-    return (s * x, s * y, s * z)

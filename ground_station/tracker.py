@@ -7,7 +7,7 @@ anew when three poses fit one another, which wrong ones rarely do. The first tra
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from math import nan, sqrt
+from math import atan, nan, sqrt
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -113,7 +113,9 @@ class Tracker:
             config.angular_acceleration,
         )
         self._notices = TrackNotices()
-        self._poses = 0  # that the filter has taken, up to `POSES`
+        self._poses = 0  # that fit, up to `POSES`
+        self._tracking = False  # there are as many
+        self._patience_us = FIT_US  # how far the last good frame may be away
         self._t_us = 0  # of the newest frame
         self._good_us = 0  # of the newest that the filter has taken
         self._lost_us: int | None = None  # of the last good frame before a track was lost
@@ -152,9 +154,8 @@ class Tracker:
             self.counters.refused += 1
             return _without(frame, Quality.REFUSED)
         self._t_us = t_us
-        self._filter.predict(
-            max(1, round(elapsed_us / self._period_us)), widen=self._refused_in_a_row < self._widening
-        )
+        steps = 1 if elapsed_us <= self._period_us else round(elapsed_us / self._period_us)
+        self._filter.predict(steps, self._refused_in_a_row < self._widening)
         if not usable:
             return self._stand_in(frame, Quality.NONE)
         distance2, angle2, theta = self._filter.off(frame.p_WB, frame.q_WB)
@@ -165,23 +166,16 @@ class Tracker:
                 return _without(frame, Quality.NONE)
             self.counters.refused += 1
             self._refused_in_a_row += 1
-            self._notices.refused(t_us, sqrt(distance2), sqrt(angle2))
+            self._notices.refused(t_us, sqrt(distance2), 2.0 * atan(0.5 * sqrt(angle2)))
             return self._stand_in(frame, Quality.REFUSED)
         v_WB, w_B = self._filter.update(frame.p_WB, theta)
         self._good_us = t_us
         self._refused_in_a_row = 0
-        if not self._tracking and not self._is_track(t_us):
-            return _without(frame, Quality.NONE)
+        if not self._tracking:
+            self._fit(t_us)
+            if not self._tracking:
+                return _without(frame, Quality.NONE)
         return Track(frame, v_WB, w_B, Quality.TRACKED)
-
-    @property
-    def _tracking(self) -> bool:
-        return self._poses == POSES
-
-    @property
-    def _patience_us(self) -> int:
-        """How far the last good frame may be away."""
-        return self._config.reacquire_us if self._tracking else FIT_US
 
     def _begin(self, frame: MocapFrame) -> None:
         """Take a pose for the first of a track."""
@@ -190,19 +184,22 @@ class Tracker:
         self._good_us = frame.t_us
         self._refused_in_a_row = 0
 
-    def _is_track(self, t_us: int) -> bool:
-        """Whether one more pose that fits makes a track."""
+    def _fit(self, t_us: int) -> None:
+        """One more pose fits those before it."""
         self._poses += 1
-        if self._tracking and self._lost_us is not None:
+        if self._poses < POSES:
+            return
+        self._tracking, self._patience_us = True, self._config.reacquire_us
+        if self._lost_us is not None:
             self.counters.restarts += 1
             self._notices.begun_anew(t_us, t_us - self._lost_us)
-        return self._tracking
 
     def _lose(self) -> None:
         if self._tracking:
             self._lost_us = self._good_us
             self._notices.lost(self._t_us)
         self._poses = 0
+        self._tracking, self._patience_us = False, FIT_US
 
     def _stand_in(self, frame: MocapFrame, quality: Quality) -> Track:
         """The prediction in the place of a pose that is missing or wrong, while it is good enough."""
