@@ -229,12 +229,35 @@ def test_wrong_poses_each_in_a_direction_of_its_own_never_pass() -> None:
         assert track.quality is not Quality.TRACKED
 
 
-def test_the_robot_is_found_again_after_outliers_of_a_tenth_of_a_second() -> None:
+def test_the_robot_is_found_again_after_outliers_of_a_tenth_of_a_second_however_often() -> None:
     tracker, rng = tracking(), np.random.default_rng(2)
-    for number in range(100, 120):
-        tracker.take(noisy(rng, number, (0.3, -0.2, 1.15)))
-    assert tracker.take(noisy(rng, 120)).quality is Quality.TRACKED
+    for start in range(100, 400, 100):
+        for number in range(start, start + 20):
+            assert tracker.take(noisy(rng, number, (0.6, -0.2, 1.15))).quality is Quality.REFUSED
+        here = (0.1 + 2e-4 * start, -0.2, 1.15)  # 2 cm further every time: the gate has widened
+        for number in range(start + 20, start + 100):
+            assert tracker.take(noisy(rng, number, here)).quality is YES
     assert tracker.counters.restarts == 0
+
+
+@pytest.mark.parametrize(
+    ("p", "q"),
+    [
+        ((nan, 0.0, 0.0), UPRIGHT),
+        ((0.0, inf, 0.0), UPRIGHT),
+        ((0.0, 0.0, -1e308), UPRIGHT),
+        ((0.1, -0.2, 1.15), (0.0, 0.0, 0.0, 0.0)),
+        ((0.1, -0.2, 1.15), (nan, 0.0, 0.0, 1.0)),
+        ((0.1, -0.2, 1.15), (2.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_what_is_no_pose_counts_as_not_seen(p, q) -> None:
+    tracker = tracking()
+    track = tracker.take(frame(100, p, q))
+    assert (track.quality, track.frame.valid) == (NOT_YET, False)
+    assert tracker.take(noisy(np.random.default_rng(2), 101)).quality is YES
+    assert tracker.counters.refused == 0
+    assert qualities(*[frame(n, p, q) for n in range(5)]) == [NOT_YET] * 5
 
 
 def test_a_push_of_20_newton_is_no_outlier() -> None:
@@ -305,6 +328,9 @@ def test_a_stray_first_pose_does_not_lock_the_gate() -> None:
 def test_between_the_first_poses_frames_may_be_missing_but_not_for_long() -> None:
     late = FIT_US // PERIOD_US
     assert qualities(frame(0), frame(2), frame(3, valid=False), frame(5)) == [NOT_YET] * 3 + [YES]
+    bridging = Tracker(BRIDGING, PERIOD_US)
+    begun = [bridging.take(seen) for seen in (frame(0), frame(2), frame(3, valid=False))]
+    assert [track.frame.valid for track in begun] == [False] * 3, "there is nothing to bridge yet"
     assert qualities(frame(0), frame(1), frame(1 + late), frame(2 + late)) == [NOT_YET] * 4
 
 
@@ -406,7 +432,7 @@ wild = st.builds(
 tame = st.builds(
     MocapFrame,
     st.integers(0, 400).map(lambda n: n * PERIOD_US),
-    st.tuples(*[st.floats(-2.0, 2.0)] * 3),
+    st.tuples(*[st.floats(-2.0, 2.0)] * 3) | st.tuples(number, number, number),
     st.sampled_from([UPRIGHT, HALF_TURN, (0.6, 0.8, 0.0, 0.0), (-1.0, 0.0, 0.0, 0.0)]),
     st.booleans(),
 )
