@@ -61,7 +61,7 @@ class Request:
             raise LabError(
                 f"fault {self.faults[0]}: --link {self.link}: faults act on flights in lockstep only"
             )
-        check(self.faults, self.duration_s, self.link)
+        check(self.faults, self.duration_s, self.link, self.config.markers.enabled)
 
     @classmethod
     def of(
