@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from firmware_py.geometry import Quaternion, Vector
 from hil.plant.config import PlantConfig
@@ -45,7 +45,7 @@ class MarkersConfig(BaseModel):
         le=0.1,
         description="of each marker, white, per axis [m]; makes the pose's of physics.md section 6",
     )
-    cameras: int = Field(5, ge=1, le=64, description="evenly around the tunnel; paper, Motion capture system")
+    cameras: int = Field(5, ge=2, le=64, description="evenly around the tunnel; paper, Motion capture system")
     camera_distance: float = Field(2.5, gt=0.5, le=20, description="from the tunnel's axis [m]; chosen")
     camera_height: float = Field(2.0, ge=-2, le=20, description="z in W [m]; chosen: above the robot")
     min_cameras: int = Field(
@@ -66,6 +66,12 @@ class MarkersConfig(BaseModel):
     ghosts: int = Field(
         0, ge=0, le=100, description="reflections near the robot that are no markers, per frame"
     )
+
+    @model_validator(mode="after")
+    def _enough_cameras(self) -> MarkersConfig:
+        if self.min_cameras > self.cameras:
+            raise ValueError(f"min_cameras = {self.min_cameras} of {self.cameras} cameras never see anything")
+        return self
 
 
 @dataclass(frozen=True, slots=True, eq=False)
