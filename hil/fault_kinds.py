@@ -223,7 +223,7 @@ KINDS: Mapping[str, Kind] = {
         _markers("hidden", max), "holds", markers=True,
     ),
     "marker.swap": Kind(
-        "markers 2 and 4 have each other's label: a pose turned over, or none where it is seen to fit badly",
+        "markers 1 and 3 have each other's label: a pose turned over, or none where it is seen to fit badly",
         "", 1.0, 1.0, 1.0, _markers("swapped", max), "holds", duration_s=GLIMPSE_S, markers=True,
     ),
     "marker.noise": Kind(

@@ -18,7 +18,7 @@ from hil.plant.config import PlantConfig
 
 NOISE_ROWS = 512  # exposures of noise drawn at once
 SPREAD = 0.01  # [m] root of the squares across the best line through markers; below, they count as collinear
-WORST_PAIR = (1, 3)  # rows: of the pairs whose exchange turns the body over, the one that fits best
+WORST_PAIR = (0, 2)  # rows: of the pairs whose exchange turns the body over, the one that fits best
 GHOST_REACH = 0.3  # [m] from the body, along each axis; chosen
 
 
@@ -67,7 +67,7 @@ class RigidBody:
 class VirtualMarkers:
     """The markers on one robot. Plain attributes that may change in flight:
 
-    `hidden` how many are covered, from marker 1 on; `swapped` 1: markers 2 and 4 have each other's label; `noise_scale`
+    `hidden` how many are covered, from marker 1 on; `swapped` 1: markers 1 and 3 have each other's label; `noise_scale`
     factor on the noise; `ghosts` per frame.
     """
 

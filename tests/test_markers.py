@@ -78,8 +78,14 @@ def test_no_other_assignment_of_labels_fits() -> None:
     proper = np.stack([np.ones(len(U)), np.ones(len(U)), np.sign(np.linalg.det(U @ Vt))], axis=1)
     R = np.einsum("nji,nj,nkj->nik", Vt, proper, U)
     error = np.linalg.norm(mixed - np.einsum("nij,kj->nki", R, around), axis=2).mean(axis=1)
-    assert error.min() == pytest.approx(0.0135, abs=0.0005)
+    assert error.min() == pytest.approx(0.0187, abs=0.0005)
     assert error.min() > 2 * ON.max_error
+
+
+def test_any_three_markers_are_far_from_one_line() -> None:
+    for rows in itertools.combinations(range(COUNT), 3):
+        around = PLACES[list(rows)] - PLACES[list(rows)].mean(axis=0)
+        assert np.linalg.svd(around, compute_uv=False)[1] > 0.02
 
 
 # The fit
@@ -198,7 +204,7 @@ def test_swapped_markers_are_refused_unless_the_limit_is_wide() -> None:
         here = markers(MarkersConfig(enabled=True, noise=0.0, max_error=limit))
         here.swapped = 1.0
         sighting = here.look(HOME, LEVEL)
-        assert sighting.error == pytest.approx(0.0964, abs=0.0005)
+        assert sighting.error == pytest.approx(0.0987, abs=0.0005)
         assert sighting.residuals.mean() == pytest.approx(sighting.error)
         if turned is None:
             assert sighting.pose is None
@@ -251,7 +257,7 @@ def test_a_marker_is_seen_when_enough_rays_are_free(
         assert seen[row] == (sum(free) >= needed)
 
 
-@pytest.mark.parametrize(("tilt", "fewest"), [(0, 8), (10, 8), (20, 8), (90, 7), (120, 6)])
+@pytest.mark.parametrize(("tilt", "fewest"), [(0, 8), (10, 8), (20, 8), (90, 7), (180, 6)])
 def test_hovering_shows_all_markers_and_lying_on_the_side_hides_some(tilt: int, fewest: int) -> None:
     seen = []
     for azimuth in np.radians(range(0, 360, 15)):
