@@ -153,16 +153,15 @@ class Cameras:
 
     def _behind_plate(self, p_BC: Points) -> Mask:
         """Which rays, marker by camera, pass through the square; markers in its plane are seen from both sides."""
-        markers, over, camera_over = self._places, self._over_plate, p_BC[:, 2] - self._plate_height
-        crosses = over * camera_over < 0.0
-        part = np.where(crosses, over, 0.0) / np.where(crosses, over - camera_over, 1.0)
-        x = markers[:, :1] + part * (p_BC[:, 0] - markers[:, :1])
-        y = markers[:, 1:2] + part * (p_BC[:, 1] - markers[:, 1:2])
-        half = self._plate_half
-        return np.asarray(crosses & (np.abs(x) < half) & (np.abs(y) < half))
+        over, camera_over = self._over_plate, p_BC[:, 2] - self._plate_height
+        reach = self._plate_half * np.abs(camera_over - over)
+        # The ray is in the plane at (marker * camera_over - camera * over) / (camera_over - over).
+        x = np.abs(self._places[:, :1] * camera_over - p_BC[:, 0] * over)
+        y = np.abs(self._places[:, 1:2] * camera_over - p_BC[:, 1] * over)
+        return np.asarray((over * camera_over < 0.0) & (x < reach) & (y < reach))
 
     def _behind_trunk(self, p_BC: Points) -> Mask:
         """Which rays, marker by camera, pass through the ball on their way to the camera, which is outside."""
-        along = self._places @ p_BC.T - self._squares  # marker times ray, of which the length is next
-        lengths = (p_BC**2).sum(axis=1) - self._squares - 2.0 * along
-        return np.asarray((along < 0.0) & (self._squares * lengths - along**2 < TRUNK_RADIUS**2 * lengths))
+        along = self._places @ p_BC.T - self._squares  # marker times ray
+        rays = (p_BC**2).sum(axis=1) - self._squares - 2.0 * along  # squared lengths
+        return np.asarray((along < 0.0) & (self._squares * rays - along**2 < TRUNK_RADIUS**2 * rays))
