@@ -258,20 +258,35 @@ def ray_hits(marker: Array, camera: Array) -> set[bool]:
 
 
 @settings(max_examples=40)
-@given(turns, st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0.1, 1.9)), st.integers(2, 5))
+@given(
+    turns,
+    st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0.1, 1.9)),
+    st.integers(2, 6),
+    st.floats(1, 4),
+    st.floats(0, 4),
+    st.data(),
+)
 def test_a_marker_is_seen_when_enough_rays_are_free(
-    turn: Rotation, p: tuple[float, float, float], needed: int
+    turn: Rotation,
+    p: tuple[float, float, float],
+    cameras: int,
+    away: float,
+    height: float,
+    data: st.DataObject,
 ) -> None:
-    config = MarkersConfig(enabled=True, min_cameras=needed)
+    config = MarkersConfig(
+        enabled=True, cameras=cameras, camera_distance=away, camera_height=height,
+        min_cameras=data.draw(st.integers(2, cameras)),
+    )  # fmt: skip
+    row = data.draw(st.integers(0, COUNT - 1))
+    free = []
+    for azimuth in 2 * np.pi * np.arange(cameras) / cameras:
+        camera = np.array([away * np.cos(azimuth), away * np.sin(azimuth), height])
+        hits = ray_hits(PLACES[row], turn.inv().apply(camera - p))
+        assume(len(hits) == 1)  # not by a hair
+        free.append(not hits.pop())
     seen = Cameras(config, PLANT).see(np.array(p), turn.as_matrix())
-    for row in range(0, COUNT, 3):
-        free = []
-        for azimuth in 2 * np.pi * np.arange(5) / 5:
-            camera = np.array([2.5 * np.cos(azimuth), 2.5 * np.sin(azimuth), 2.0])
-            hits = ray_hits(PLACES[row], turn.inv().apply(camera - p))
-            assume(len(hits) == 1)  # not by a hair
-            free.append(not hits.pop())
-        assert seen[row] == (sum(free) >= needed)
+    assert seen[row] == (sum(free) >= config.min_cameras)
 
 
 @pytest.mark.parametrize(("tilt", "fewest"), [(0, 8), (10, 8), (20, 8), (90, 7), (180, 6)])
