@@ -22,13 +22,21 @@ from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal
-from hil.channels import battery_channel, fault_channel, flight_channels, radio_channel, tracker_channel
+from hil.channels import (
+    battery_channel,
+    fault_channel,
+    flight_channels,
+    marker_channel,
+    radio_channel,
+    tracker_channel,
+)
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.experiments import Experiment
 from hil.faults import Fault, plan
+from hil.markers import make_markers
 from hil.plant.battery import Battery
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Recorder
@@ -69,11 +77,12 @@ class Streams:
     mocap: np.random.Generator
     radio: np.random.Generator
     serial: np.random.Generator
+    markers: np.random.Generator
 
     @classmethod
     def of_seed(cls, seed: int) -> Streams:
         """Split a seed."""
-        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(5)))
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)))
 
 
 class Flight:
@@ -123,7 +132,9 @@ class Flight:
         )  # fmt: skip
         self.battery: Battery = Battery(config.battery)
         self.imu = VirtualImu(config.imu, streams.imu)
-        self.mocap = VirtualMocap(config.mocap, streams.mocap)
+        self.mocap = VirtualMocap(
+            config.mocap, streams.mocap, make_markers(config.markers, config.plant, streams.markers)
+        )
         self.radio = VirtualRadio(config.radio, self.events, streams.radio)
         self.serial = _serial_line(config, self.events, streams.serial) if link == MAVLINK else None
         end: Link = (
@@ -169,7 +180,8 @@ class Flight:
         )
         tracker = (tracker_channel(self.tracker),) if self.tracker else ()
         faults = (fault_channel(self.active_faults),) if self.faults else ()
-        return (*channels, battery_channel(self.battery), *tracker, *faults)
+        markers = (marker_channel(self.mocap),) if self.mocap.markers else ()
+        return (*channels, battery_channel(self.battery), *tracker, *markers, *faults)
 
     @cached_property
     def thief(self) -> Thief:
