@@ -1,7 +1,7 @@
 """The ground station with real hardware: poses from a source, a link to a board, until told to stop.
 
-It connects again when the link is lost, shows how the link does, and leaves the board with its flaps at hover: the
-corrections stop first, and the link is closed when the board has noticed.
+It connects again when the link is lost, shows how the link does and how old poses are, and leaves the board with its
+flaps at hover: the corrections stop first, and the link is closed when the board has noticed.
 """
 
 from collections.abc import Callable
@@ -136,6 +136,7 @@ class LiveStation:
             f"poses {counters.frames} ({counters.invalid} unusable)  {self.source.summary()}  "
             f"{self.link.summary()}  telemetry {counters.samples}"
         )
+        self.say(str(self.station.budget))
 
     def _leave(self) -> None:
         """Stop correcting, wait until the board has put its flaps to hover, disconnect."""

@@ -55,7 +55,6 @@ class NatnetStream:
         self.counters = StreamCounters()
         self.server: ServerInfo | None = None
         self.models: ModelDefinition | None = None
-        self.age_us = 0  # of the last pose when it arrived
         self.outgoing: list[bytes] = []
         self.notices: list[str] = []
         self._name = name
@@ -160,8 +159,11 @@ class NatnetStream:
         if t_us is None or pose is None or not self._usable(pose):
             counters.lost += 1
             return MocapFrame(now_us if t_us is None else t_us, *NOWHERE, valid=False)
-        self.age_us = now_us - t_us
-        return MocapFrame(t_us, *in_world(pose.p, pose.q, self._axes), valid=True)
+        received_us, sent_us = map(self._clock.to_station_us, (frame.received, frame.transmitted))
+        p, q = in_world(pose.p, pose.q, self._axes)
+        received_us = max(t_us, min(received_us, now_us))  # the clocks are not known that well
+        sent_us = max(received_us, min(sent_us, now_us))
+        return MocapFrame(t_us, p, q, True, received_us, sent_us, now_us)
 
     def _exposed_us(self, frame: Frame, now_us: int) -> int | None:
         """The exposure by our clock, None if the server's time stamps make no sense."""

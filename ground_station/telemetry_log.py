@@ -1,7 +1,8 @@
 """The ground station's own record of a flight: a CSV file with one row per telemetry time stamp.
 
 A row joins the blocks that carry the same time stamp with what the ground station itself knew when the first
-of them arrived: its clock, the goal and the last tracked pose. What was missing is `nan`. The header names
+of them arrived: its clock, the goal, the last tracked pose and where the age of the last sent one came from. What was
+missing is `nan`. The header names
 each column's unit: `stateEstimate.x [m]`. The file is complete to about a second when the process dies;
 memory holds one row.
 """
@@ -11,10 +12,13 @@ from pathlib import Path
 
 from firmware_py.geometry import to_euler_zyx
 from firmware_py.wire.telemetry import BLOCKS, Block, Sample
+from ground_station.latency import STAGES
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
 FLUSH_PERIOD_US = 1_000_000
+
+AGE_COLUMNS = tuple(f"age.{stage} [s]" for stage in STAGES)
 
 _GROUND_COLUMNS = (
     "ground.t [s]",
@@ -29,6 +33,7 @@ _GROUND_COLUMNS = (
     "mocap.roll [rad]",
     "mocap.pitch [rad]",
     "mocap.yaw [rad]",
+    *AGE_COLUMNS,
 )
 
 
@@ -57,12 +62,14 @@ class TelemetryLog:
         self._telemetry: list[float] = []
         self._next_flush_us = 0
 
-    def write(self, now_us: int, sample: Sample, goal: Goal, frame: MocapFrame | None) -> None:
-        """Put `sample`, received at `now_us`, into its row; `goal` and `frame` are of that instant."""
+    def write(
+        self, now_us: int, sample: Sample, goal: Goal, frame: MocapFrame | None, ages_us: tuple[float, ...]
+    ) -> None:
+        """Put `sample`, received at `now_us`, into its row; the rest is of that instant, `ages_us` by stage."""
         if sample.timestamp_ms != self._timestamp_ms:
             self._write_row()
             self._timestamp_ms = sample.timestamp_ms
-            self._ground = _ground_values(now_us, goal, frame)
+            self._ground = (*_ground_values(now_us, goal, frame), *[age * 1e-6 for age in ages_us])
             self._telemetry = [nan] * len(_TELEMETRY_COLUMNS)
         first = _FIRST_COLUMN[sample.block.id]
         self._telemetry[first : first + len(sample.values)] = sample.values

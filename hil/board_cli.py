@@ -224,8 +224,10 @@ def _live_link(uri: str, config: "LabConfig") -> "CrazyradioLink | MavlinkSerial
         raise LabError(f"--link {uri}: {error}: pip install 'floaty-hil[{extra}]'") from None
     pose_hz = 1e6 / (config.mocap.period_us * config.station.send_every)
     key = bytes.fromhex(config.mavlink.signing_key)
+    latency_us = config.station.link_latency_us
+    settings = MavlinkLinkConfig(config.serial.baud, pose_hz, key, latency_us=latency_us)
     try:
-        return MavlinkSerialLink(uri, MavlinkLinkConfig(config.serial.baud, pose_hz, key))
+        return MavlinkSerialLink(uri, settings)
     except LinkError as error:
         raise LabError(str(error)) from None
 

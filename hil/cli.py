@@ -361,6 +361,7 @@ def _print_result(result: "Result") -> None:
     """Print the verdicts of one flight and where to look."""
     from rich.table import Table
 
+    from ground_station.latency import budget_line
     from hil.metrics import METRICS
 
     request = result.request
@@ -383,6 +384,8 @@ def _print_result(result: "Result") -> None:
     console.print(
         f"{result.outcome}{cause}; {result.real_time_factor:.0f} times real time; hash {result.hash[:16]}"
     )
+    if result.ages:
+        console.print(budget_line(result.ages), soft_wrap=True)
     if result.usage is not None:
         for name, load in result.usage.entries.items():
             console.print(f"  {request.board} {name:9} {load}", soft_wrap=True)

@@ -24,6 +24,8 @@ from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.cortex_m4 import CortexM4Runner, Usage
 from firmware_py.export.errors import ExportError
 from firmware_py.firmware import TaskReport, WatchdogError
+from ground_station.latency import Stage
+from hil.ages import ages_of
 from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError
@@ -117,6 +119,7 @@ class Result:
     tasks: tuple[TaskReport, ...]
     queues: tuple[QueueReport, ...]
     usage: Usage | None  # of the board, where it was measured
+    ages: tuple[Stage, ...]  # where the age of the poses came from
 
     @property
     def passed(self) -> bool:
@@ -171,7 +174,10 @@ def fly(
     )
     tasks = tuple(firmware.statistics.reports())
     usage = firmware.runner.usage if isinstance(firmware.runner, CortexM4Runner) else None
-    result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues, usage)
+    ages = ages_of(folder / "telemetry.csv", log, request.link)
+    result = Result(
+        folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues, usage, ages
+    )
     write_result(result)
     return result
 
@@ -236,6 +242,7 @@ def write_result(result: Result) -> None:
         "tasks": [asdict(task) for task in result.tasks],
         "queues": [asdict(queue) for queue in result.queues],
         "usage": asdict(result.usage) if result.usage else None,
+        "ages": [asdict(stage) for stage in result.ages],
         "hash": result.hash,
         "versions": versions(),
         "commit": commit(),
@@ -269,6 +276,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         "tasks": [],
         "queues": [],
         "usage": None,
+        "ages": [],
         "passed": False,
         "hash": "",
         "versions": json.loads(metadata.get("versions", "{}")),

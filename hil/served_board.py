@@ -287,7 +287,8 @@ class ServedBoard:
             self.catch_up(now_us)
             self._plant.advance(now_us - self._placed_us)
             frame = self._mocap.expose(now_us, self._plant)
-            self._events.at(now_us + self._config.mocap.latency_us, partial(self._deliver, frame))
+            arrival_us = self._mocap.arrival_us(now_us)
+            self._events.at(arrival_us, partial(self._deliver, self._mocap.stamped(frame, arrival_us)))
 
     def _deliver(self, frame: MocapFrame, now_us: int) -> None:
         for publish in self._publish:

@@ -117,10 +117,20 @@ class VirtualMotive:
         bodies, self._seen = tuple(self._seen), []
         self._number += 1
         sent = self._ticks()
-        # The cameras' latency is one number, spent ahead of Motive's computer; none of it lies before its start.
-        exposed = max(0, sent - (now_us - frame.t_us) * _TICKS_PER_US)
+        exposed, received = (
+            max(0, sent - (now_us - t_us) * _TICKS_PER_US)  # nothing lies before the start
+            for t_us in (frame.t_us, now_us if frame.received_us is None else frame.received_us)
+        )
         whole = Frame(
-            self._number, bodies, (), (), exposed * 1e-6 / _TICKS_PER_US, exposed, sent, sent, parameters=0
+            self._number,
+            bodies,
+            (),
+            (),
+            exposed * 1e-6 / _TICKS_PER_US,
+            exposed,
+            received,
+            sent,
+            parameters=0,
         )
         targets = self._targets()
         encoded = {version: encode_frame(whole, version) for version in set(targets.values())}

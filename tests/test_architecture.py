@@ -69,7 +69,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "pyarrow": (
         "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
         "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
-        "hil/compare.py", "hil/experiments/overload.py", "hil/overlays.py",
+        "hil/compare.py", "hil/ages.py", "hil/experiments/overload.py", "hil/overlays.py",
         "hil/picture.py", "hil/power_figures.py", "hil/experiments/experiment.py", "hil/experiments/measures.py",
         "hil/experiments/pictures.py", "hil/experiments/airspeed.py", "hil/experiments/power.py",
         "hil/experiments/take_off.py",

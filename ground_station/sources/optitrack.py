@@ -80,10 +80,7 @@ class OptitrackSource:
     def summary(self) -> str:
         """A few words on how it does."""
         counters = self._stream.counters
-        return (
-            f"mocap {self._stream.age_us / 1000:.1f} ms old, {counters.lost} lost, {counters.dropped} dropped, "
-            f"{counters.malformed} malformed"
-        )
+        return f"mocap {counters.lost} lost, {counters.dropped} dropped, {counters.malformed} malformed"
 
     def close(self) -> None:
         """Take leave."""
