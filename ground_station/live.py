@@ -74,6 +74,7 @@ class LiveStation:
 
     def run(self) -> None:
         """Fly until told to stop; raises `LinkError` when there are no poses or no board."""
+        self._tell()
         self._connect()
         try:
             while not self.stopping():

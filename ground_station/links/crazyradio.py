@@ -51,7 +51,7 @@ SUPERVISOR_STATE = "supervisor.state"
 
 @dataclass(slots=True)
 class LinkStatistics:
-    """What the link looks like; values of cflib, 0 when unknown (UDP)."""
+    """What the link looks like; quality, rate and signal strength are cflib's, 0 over UDP."""
 
     sent: int = 0  # corrections
     replaced: int = 0  # by a newer one before they could be sent
@@ -281,10 +281,8 @@ class CrazyradioLink:
     def summary(self) -> str:
         """Return one line on how the link does."""
         link = self.statistics
-        return (
-            f"corrections {link.sent} sent, {link.replaced + link.too_old} late  quality {link.quality:.0f} %  "
-            f"{link.rate:.0f} exchanges/s"
-        )
+        radio = f"  quality {link.quality:.0f} %  {link.rate:.0f} exchanges/s" if link.rate else ""
+        return f"corrections {link.sent} sent, {link.replaced + link.too_old} late{radio}"
 
     def check(self) -> None:
         """Raise `LinkError` when the link is lost."""
