@@ -1,8 +1,8 @@
 """Where the age of a pose comes from: camera, processing, network, station and link, from the exposure to the board.
 
 Camera: until the motion capture computer has the images. Processing: until the pose leaves it. Network: until the
-station has it. Station: until the link gets it. Link: until the board has it. A source that does not tell the first
-three apart has one stage in their place, "mocap". Times in microseconds.
+station has it. Station: until the link gets it. Link: until the board has it. "mocap" is the first three in one, for
+sources that do not tell them apart. Times in microseconds.
 """
 
 from collections import deque
@@ -15,7 +15,7 @@ from ground_station.mocap import MocapFrame
 STAGES = ("camera", "processing", "network", "mocap", "station", "link")
 SENT_POSES = 250  # that the budget is made of: 5 s at 50 Hz
 
-Row = tuple[float, ...]  # the time in each of `STAGES` of one pose, nan for those that it has not
+Row = tuple[float, ...]  # the time in each of `STAGES` of one pose; nan: not told
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,21 +42,21 @@ class Stage:
 def row_of(frame: MocapFrame, sent_us: int, link_us: int) -> Row:
     """The way of a pose that the link got at `sent_us`."""
     arrived_us = sent_us if frame.arrived_us is None else frame.arrived_us
-    station_us = sent_us - arrived_us
+    rest = (arrived_us - frame.t_us, sent_us - arrived_us, link_us)
     if frame.received_us is None or frame.transmitted_us is None:
-        return (nan, nan, nan, arrived_us - frame.t_us, station_us, link_us)
+        return (nan, nan, nan, *rest)
     camera_us, processing_us = frame.received_us - frame.t_us, frame.transmitted_us - frame.received_us
-    return (camera_us, processing_us, arrived_us - frame.transmitted_us, nan, station_us, link_us)
+    return (camera_us, processing_us, arrived_us - frame.transmitted_us, *rest)
 
 
 def budget_of(rows: Sequence[Row], medium: str) -> tuple[Stage, ...]:
-    """The stages that there are, and the age on board as "pose" ahead of them; empty without poses."""
+    """The stages that are told, and the age on board as "pose" ahead of them; empty without poses."""
     if not rows:
         return ()
-    in_all = [sum(part for part in row if not isnan(part)) for row in rows]
     columns = dict(zip((*STAGES[:-1], medium), zip(*rows, strict=True), strict=True))
-    known = {name: [part for part in column if not isnan(part)] for name, column in columns.items()}
-    return tuple(_stage(name, times) for name, times in ({"pose": in_all} | known).items() if times)
+    mocap = [name for name in STAGES[:3] if not isnan(sum(columns[name]))] or ["mocap"]
+    pose = _stage("pose", [sum(row[3:]) for row in rows])
+    return (pose, *(_stage(name, columns[name]) for name in (*mocap, "station", medium)))
 
 
 def _stage(name: str, times: Sequence[float]) -> Stage:

@@ -16,6 +16,8 @@ from ground_station.station import GroundStation
 POSE_TIMEOUT_US = 5_000_000
 RECONNECT_TIMEOUT_US = 30_000_000
 STATUS_PERIOD_US = 5_000_000
+STALE_TIMEOUT_US = 200_000
+WAITING_S = 0.001  # less than between frames
 FAILSAFE_TIMEOUT_US = 2_000_000
 FAILSAFE = 3  # supervisor.state
 
@@ -106,6 +108,9 @@ class LiveStation:
 
     def _fly(self) -> None:
         """Forward poses and telemetry while the link holds."""
+        fresh_us = clock_us() + STALE_TIMEOUT_US
+        while clock_us() < fresh_us and self.source.receive(WAITING_S) is not None:
+            pass  # it has waited while the link was opened
         pose_us = status_us = clock_us()
         while not self.stopping():
             frame = self.source.receive(0.02)
