@@ -124,4 +124,4 @@ class GroundStation:
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
             if self._log is not None:
                 goal = self._trajectory.at(now_us)
-                self._log.write(now_us, sample, goal, self._last_frame, self.budget.last())
+                self._log.write(now_us, sample, goal, self._last_frame, self.budget)

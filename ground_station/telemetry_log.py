@@ -12,7 +12,7 @@ from pathlib import Path
 
 from firmware_py.geometry import to_euler_zyx
 from firmware_py.wire.telemetry import BLOCKS, Block, Sample
-from ground_station.latency import STAGES
+from ground_station.latency import STAGES, LatencyBudget
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
@@ -63,13 +63,13 @@ class TelemetryLog:
         self._next_flush_us = 0
 
     def write(
-        self, now_us: int, sample: Sample, goal: Goal, frame: MocapFrame | None, ages_us: tuple[float, ...]
+        self, now_us: int, sample: Sample, goal: Goal, frame: MocapFrame | None, budget: LatencyBudget
     ) -> None:
-        """Put `sample`, received at `now_us`, into its row; the rest is of that instant, `ages_us` by stage."""
+        """Put `sample`, received at `now_us`, into its row; the rest is of that instant."""
         if sample.timestamp_ms != self._timestamp_ms:
             self._write_row()
             self._timestamp_ms = sample.timestamp_ms
-            self._ground = (*_ground_values(now_us, goal, frame), *[age * 1e-6 for age in ages_us])
+            self._ground = (*_ground_values(now_us, goal, frame), *[1e-6 * us for us in budget.last()])
             self._telemetry = [nan] * len(_TELEMETRY_COLUMNS)
         first = _FIRST_COLUMN[sample.block.id]
         self._telemetry[first : first + len(sample.values)] = sample.values

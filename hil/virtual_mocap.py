@@ -70,6 +70,7 @@ class VirtualMocap:
 
     def __init__(self, config: MocapConfig, rng: np.random.Generator) -> None:
         self._config = config
+        self._camera_us = max(0, config.latency_us - config.processing_us)
         self._rng = rng
         # Streams of their own, so that faults leave the noise of the other frames as it was, and one another alone.
         self._rng_outlier, self._rng_dropout, self._rng_wrong = rng.spawn(3)
@@ -112,7 +113,7 @@ class VirtualMocap:
 
     def stamped(self, frame: MocapFrame, arrival_us: int) -> MocapFrame:
         """Return the frame with its way: whatever is late is late in the cameras' computer, the network takes no time."""
-        received_us = frame.t_us + max(0, self._config.latency_us - self._config.processing_us)
+        received_us = frame.t_us + self._camera_us
         return MocapFrame(frame.t_us, frame.p_WB, frame.q_WB, frame.valid, received_us, arrival_us)
 
 
