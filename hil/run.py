@@ -70,7 +70,7 @@ class Request:
             )
         if self.mocap not in (None, *MOCAP):
             raise LabError(f"--mocap {self.mocap}: expected {' or '.join(MOCAP)}")
-        check(self.faults, self.duration_s, self.link)
+        check(self.faults, self.duration_s, self.link, self.config.markers.enabled)
 
     @classmethod
     def of(

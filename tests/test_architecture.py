@@ -59,7 +59,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "filterpy": (),
     "motioncapture": (),
-    "scipy": (),
+    "scipy": ("hil/rigid_body.py",),
     "perfetto": ("hil/perfetto.py",),
     "matplotlib": (
         "hil/figures.py", "hil/picture.py", "hil/drag_model_report.py", "hil/power_figures.py",
