@@ -10,11 +10,13 @@ from typing import Protocol
 
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
+from ground_station.frame_rate import FrameRate
 from ground_station.mocap import MocapSource
 from ground_station.station import GroundStation
 
 POSE_TIMEOUT_US = 5_000_000
 RECONNECT_TIMEOUT_US = 30_000_000
+RECONNECT_PERIOD_US = 500_000
 STATUS_PERIOD_US = 5_000_000
 FAILSAFE_TIMEOUT_US = 2_000_000
 FAILSAFE = 3  # supervisor.state
@@ -69,6 +71,7 @@ class LiveStation:
     link: LiveLink
     station: GroundStation
     source: MocapSource
+    rate: FrameRate
     say: Callable[[str], None]
     stopping: Callable[[], bool]
 
@@ -86,9 +89,15 @@ class LiveStation:
             self._leave()
 
     def _connect(self) -> None:
-        self.link.open(self.stopping)
+        self.link.open(self._serve_source)
         self.say(f"connected to {self.link.uri}")
         self._tell()
+
+    def _serve_source(self) -> bool:
+        """Take the frames that nobody wants while the link connects; whether to stop that."""
+        while self.source.receive(0.0) is not None:
+            pass
+        return self.stopping()
 
     def _reconnect(self, cause: LinkError) -> None:
         """Try until it works or takes too long."""
@@ -101,7 +110,9 @@ class LiveStation:
             except LinkError:
                 if clock_us() > deadline_us:
                     raise cause from None
-                self.source.receive(0.5)
+                again_us = clock_us() + RECONNECT_PERIOD_US
+                while clock_us() < again_us:
+                    self.source.receive(0.02)
 
     def _fly(self) -> None:
         """Forward poses and telemetry while the link holds."""
@@ -112,6 +123,8 @@ class LiveStation:
             if frame is not None:
                 self.station.on_frame(frame, now_us)
                 pose_us = now_us
+                if notice := self.rate.on_frame(frame.t_us):
+                    self.say(notice)
             elif now_us - pose_us > POSE_TIMEOUT_US:
                 self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
                 pose_us = now_us
