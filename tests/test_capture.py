@@ -652,7 +652,6 @@ def test_a_flight_is_recorded_and_its_record_flown_again(tmp_path: Path) -> None
             str(tmp_path / "telemetry.csv"),
         )  # fmt: skip
         assert shown.returncode == 0, shown.stdout + shown.stderr
-        assert "no frames" not in shown.stdout
         recorded = read_frames(frames)
         assert len(recorded) > 800
         assert max(abs(frame.p_WB[2] - 1.15) for _, frame in recorded) < 0.1
