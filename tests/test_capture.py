@@ -268,6 +268,7 @@ def test_poses_come_through_the_package_s_own_process_and_a_killed_one_comes_bac
         received(source, 60)
         assert not any(frame.valid for frame in received(source, 20))
         hidden.clear()
+        assert os.getsid(process_of(source)) != os.getsid(0)  # Ctrl-C does not reach it
         os.kill(process_of(source), signal.SIGKILL)
         assert_one_notice(source, "motion capture: no frames; calling the server again")
         await_notice(source, "frames again")
@@ -305,10 +306,11 @@ def test_a_wrong_body_is_one_line_with_those_that_are_seen() -> None:
 def test_vrpn_poses_come_from_a_server_over_its_own_protocol() -> None:
     silent: list[bool] = []
 
-    def pose(number: int) -> tuple[float, ...] | None:
-        return None if silent else (number * 1e-3, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)
+    def poses(number: int) -> dict[str, tuple[float, ...]]:
+        pose = (number * 1e-3, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)
+        return {"wand": pose} if silent else {"wand": pose, "floaty": pose}
 
-    with vrpn_server("floaty", pose) as port:
+    with vrpn_server(["wand", "floaty"], poses) as port:
         source = find_source(f"vrpn:localhost:{port},body=floaty", CaptureConfig())
         assert isinstance(source, MotioncaptureSource)
         with opened(source):
@@ -317,7 +319,7 @@ def test_vrpn_poses_come_from_a_server_over_its_own_protocol() -> None:
             assert frames[0].q_WB == (0.5, 0.5, -0.5, 0.5)
             assert all(a.p_WB[0] < b.p_WB[0] for a, b in pairwise(frames))
             silent.append(True)
-            await_notice(source, "no frames")
+            assert all(frame.valid for frame in await_notice(source, "no frames"))
             assert source.receive(0.1) is None  # VRPN does not say that a body is lost: it says nothing
             silent.clear()
             await_notice(source, "frames again")
@@ -504,10 +506,7 @@ def test_a_replay_keeps_the_pace_and_the_age_and_ends(tmp_path: Path) -> None:
         if (frame := source.receive(0.007)) is not None:
             arrivals.append((clock_us(), frame.t_us))
     assert len(arrivals) == 10
-    first_us = arrivals[0][0]
-    for number, (now_us, t_us) in enumerate(arrivals):
-        assert now_us - first_us >= 20_000 * number - 1000
-        assert now_us - t_us >= 7000
+    assert all(now_us - t_us >= 7000 for now_us, t_us in arrivals)
     assert all(b[1] - a[1] == 20_000 for a, b in pairwise(arrivals))
     assert source.receive(0.0) is None
     assert source.notices()[-1] == "the recording is over: 10 frames"

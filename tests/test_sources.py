@@ -10,6 +10,7 @@ from contextlib import contextmanager
 import natnet_packets as packets
 import pytest
 from natnet_packets import VERSIONS
+from serving import free_port
 
 from ground_station.clock import clock_us
 from ground_station.errors import MocapError
@@ -198,6 +199,13 @@ def test_a_stream_that_stops_is_told_once_and_called_until_it_is_back() -> None:
     assert bench.stream.notices == [
         "motion capture: no frames; calling the server again", "motion capture: frames again after 3.0 s",
     ]  # fmt: skip
+
+
+def test_looking_for_a_virtual_pose_does_not_wait() -> None:
+    source = find_source(f"virtual:{free_port()}", CaptureConfig())
+    source.open()
+    assert source.receive(0.0) is None
+    source.close()
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A VRPN server of one tracker, byte by byte, for the unmodified client inside `motioncapture`.
+"""A VRPN server of trackers, byte by byte, for the unmodified client inside `motioncapture`.
 
 A client says by UDP where it listens, the server connects there, both send a cookie, then messages: i32 length of header
 and payload, seconds, microseconds, sender, type, sequence number; payload, padded to 8 bytes. Network byte order.
@@ -13,10 +13,10 @@ from contextlib import contextmanager, suppress
 
 COOKIE = b"vrpn: ver. 07.35  0".ljust(24, b"\0")
 SENDER_DESCRIPTION, TYPE_DESCRIPTION = -1, -2
-SENDER = TYPE = 0
+POSE_TYPE = 0
 PERIOD_S = 0.005
 
-Pose = tuple[float, ...]  # p x y z, q x y z w
+Poses = Callable[[int], dict[str, tuple[float, ...]]]  # by name, p x y z, q x y z w, for each time
 
 
 def message(sender: int, kind: int, payload: bytes) -> bytes:
@@ -30,13 +30,13 @@ def named(number: int, kind: int, name: str) -> bytes:
 
 
 @contextmanager
-def vrpn_server(name: str, pose: Callable[[int], Pose | None]) -> Iterator[int]:
-    """Serves `name` at 200 Hz with the pose of each report, None: no report; gives the port."""
+def vrpn_server(names: list[str], poses: Poses) -> Iterator[int]:
+    """Serves trackers of these names at 200 Hz, those that have a pose then; gives the port."""
     stop = threading.Event()
     with socket.socket(type=socket.SOCK_DGRAM) as calls:
         calls.bind(("127.0.0.1", 0))
         calls.settimeout(0.05)
-        thread = threading.Thread(target=_serve, args=(calls, name, pose, stop))
+        thread = threading.Thread(target=_serve, args=(calls, names, poses, stop))
         thread.start()
         try:
             yield calls.getsockname()[1]
@@ -45,24 +45,18 @@ def vrpn_server(name: str, pose: Callable[[int], Pose | None]) -> Iterator[int]:
             thread.join()
 
 
-def _serve(
-    calls: socket.socket, name: str, pose: Callable[[int], Pose | None], stop: threading.Event
-) -> None:
+def _serve(calls: socket.socket, names: list[str], poses: Poses, stop: threading.Event) -> None:
     while not stop.is_set():
         with suppress(OSError):
             host, port = calls.recv(100).rstrip(b"\0").split()
             with socket.create_connection((host.decode(), int(port)), 1.0) as line:
-                _report(line, name, pose, stop)
+                _report(line, names, poses, stop)
 
 
-def _report(
-    line: socket.socket, name: str, pose: Callable[[int], Pose | None], stop: threading.Event
-) -> None:
-    line.sendall(
-        COOKIE
-        + named(SENDER, SENDER_DESCRIPTION, name)
-        + named(TYPE, TYPE_DESCRIPTION, "vrpn_Tracker Pos_Quat")
-    )
+def _report(line: socket.socket, names: list[str], poses: Poses, stop: threading.Event) -> None:
+    described = [named(sender, SENDER_DESCRIPTION, name) for sender, name in enumerate(names)]
+    described.append(named(POSE_TYPE, TYPE_DESCRIPTION, "vrpn_Tracker Pos_Quat"))
+    line.sendall(COOKIE + b"".join(described))
     line.settimeout(PERIOD_S)
     number = 0
     while not stop.is_set():
@@ -71,5 +65,6 @@ def _report(
                 return
             time.sleep(PERIOD_S)
         number += 1
-        if (report := pose(number)) is not None:
-            line.sendall(message(SENDER, TYPE, struct.pack(">ii7d", 0, 0, *report)))
+        for name, pose in poses(number).items():
+            payload = struct.pack(">ii7d", 0, 0, *pose)
+            line.sendall(message(names.index(name), POSE_TYPE, payload))
