@@ -10,14 +10,14 @@ from typing import Protocol
 
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
+from ground_station.frame_rate import FrameRate
 from ground_station.mocap import MocapSource
 from ground_station.station import GroundStation
 
 POSE_TIMEOUT_US = 5_000_000
 RECONNECT_TIMEOUT_US = 30_000_000
+RECONNECT_PERIOD_US = 500_000
 STATUS_PERIOD_US = 5_000_000
-STALE_TIMEOUT_US = 200_000
-WAITING_S = 0.001  # less than between frames
 FAILSAFE_TIMEOUT_US = 2_000_000
 FAILSAFE = 3  # supervisor.state
 
@@ -71,6 +71,7 @@ class LiveStation:
     link: LiveLink
     station: GroundStation
     source: MocapSource
+    rate: FrameRate
     say: Callable[[str], None]
     stopping: Callable[[], bool]
 
@@ -89,9 +90,19 @@ class LiveStation:
             self._leave()
 
     def _connect(self) -> None:
-        self.link.open(self.stopping)
+        self.link.open(self._serve_source)
         self.say(f"connected to {self.link.uri}")
         self._tell()
+
+    def _serve_source(self) -> bool:
+        """Keep the source going while the link connects; whether to stop that."""
+        self._drop_waiting()
+        return self.stopping()
+
+    def _drop_waiting(self) -> None:
+        """Take the frames that nobody wants any more."""
+        while self.source.receive(0.0) is not None:
+            pass
 
     def _reconnect(self, cause: LinkError) -> None:
         """Try until it works or takes too long."""
@@ -104,13 +115,13 @@ class LiveStation:
             except LinkError:
                 if clock_us() > deadline_us:
                     raise cause from None
-                self.source.receive(0.5)
+                again_us = clock_us() + RECONNECT_PERIOD_US
+                while clock_us() < again_us:
+                    self.source.receive(0.02)
 
     def _fly(self) -> None:
         """Forward poses and telemetry while the link holds."""
-        fresh_us = clock_us() + STALE_TIMEOUT_US
-        while clock_us() < fresh_us and self.source.receive(WAITING_S) is not None:
-            pass  # it has waited while the link was opened
+        self._drop_waiting()
         pose_us = status_us = clock_us()
         while not self.stopping():
             frame = self.source.receive(0.02)
@@ -118,6 +129,8 @@ class LiveStation:
             if frame is not None:
                 self.station.on_frame(frame, now_us)
                 pose_us = now_us
+                if notice := self.rate.on_frame(frame.t_us):
+                    self.say(notice)
             elif now_us - pose_us > POSE_TIMEOUT_US:
                 self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
                 pose_us = now_us

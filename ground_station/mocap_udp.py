@@ -55,7 +55,7 @@ class PoseReceiver:
         self._socket.settimeout(timeout_s)
         try:
             return self._socket.recv(2048)
-        except TimeoutError:
+        except (TimeoutError, BlockingIOError):  # the latter when it is 0
             return None
 
     def close(self) -> None:

@@ -48,7 +48,9 @@ def _columns_of(blocks: tuple[Block, ...]) -> tuple[list[str], dict[int, int]]:
 
 
 _TELEMETRY_COLUMNS, _FIRST_COLUMN = _columns_of(BLOCKS)
-_ROW = ",".join(["%d", "%.6f"] + ["%.7g"] * (len(_GROUND_COLUMNS) - 1 + len(_TELEMETRY_COLUMNS))) + "\n"
+_TIMES = ("ground.t [s]", "mocap.t [s]")  # to the microsecond
+_FORMATS = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *_TELEMETRY_COLUMNS)]
+_ROW = ",".join(["%d", *_FORMATS]) + "\n"
 
 
 class TelemetryLog:

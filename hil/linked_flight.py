@@ -36,6 +36,11 @@ OUTPUT_MAX = 65_536  # bytes of the station that are read at once
 SERIAL = "mavlink:"
 NATNET, VIRTUAL = "natnet", "virtual"
 MOCAP = (NATNET, VIRTUAL)  # a virtual Motive; poses as `floaty board serve` sends them
+BODY = "floaty"  # to Motive
+ALIGNED = [
+    f"--set=capture.{value}"
+    for value in ("origin=[0,0,0]", "yaw=0", "body_offset=[0,0,0]", "body_yaw=0", "multicast=false")
+]  # whatever the profile says of the real cameras
 STANDING = "hover"  # other goals move by the clock of the release, which the station does not know
 
 
@@ -74,7 +79,7 @@ class LinkedFlight:
         self._poses: PosePublisher | None = None
         self._command = [
             sys.executable, "-m", "hil.cli", "station", "--link", uri, "--mocap", self._serve_poses(mocap),
-            "--trajectory", experiment.name, "--log", str(telemetry_path), *arguments,
+            "--trajectory", experiment.name, "--log", str(telemetry_path), *arguments, *ALIGNED,
         ]  # fmt: skip
 
     def _serve(self, uri: str, baud: int) -> tuple[str, dict[str, str]]:
@@ -97,9 +102,8 @@ class LinkedFlight:
     def _serve_poses(self, mocap: str) -> str:
         """Let the cameras see the robot; returns the station's source of poses."""
         if mocap == NATNET:
-            return (
-                f"optitrack:127.0.0.1:{self._server.serve_motive(Streaming(0, (4, 1), multicast=False)).port}"
-            )
+            motive = self._server.serve_motive(Streaming(0, (4, 1), multicast=False))
+            return f"optitrack:127.0.0.1:{motive.port},body={BODY},y-up"
         port = _free_port()
         self._poses = PosePublisher(port)
         self._board.publish(self._poses.send)

@@ -15,6 +15,7 @@ from ground_station.clock import clock_us
 from ground_station.latency import SENT_POSES, LatencyBudget, LinkLatency, budget_line, budget_of, row_of
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
+from ground_station.sources.config import CaptureConfig
 from hil.config import load_config
 from hil.dongle_server import Readers
 from hil.experiments import EXPERIMENTS
@@ -154,7 +155,7 @@ def test_instants_of_the_way_survive_motive_and_the_clock_of_its_computer() -> N
 
     thread = threading.Thread(target=serve)
     thread.start()
-    source = find_source(f"optitrack:127.0.0.1:{motive.port}")
+    source = find_source(f"optitrack:127.0.0.1:{motive.port}", CaptureConfig())
     try:
         source.open()
         start_us = clock_us()

@@ -8,6 +8,8 @@ import numpy as np
 
 from ground_station.mocap import MocapFrame
 from ground_station.natnet_stream import NatnetStream
+from ground_station.sources.alignment import Alignment
+from ground_station.sources.config import CaptureConfig
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.harness import Flight
@@ -27,7 +29,7 @@ class NatnetFlight:
 
     def __init__(self, network: Network, duration_s: float, *overrides: str) -> None:
         self.flight = Flight(load_config("floaty", overrides), EXPERIMENTS["hover"], duration_s, 1, None)
-        self.stream = NatnetStream("floaty", "z-up")
+        self.stream = NatnetStream("floaty", Alignment(CaptureConfig(axes="z-up")))
         self.stream.on_packet(packets.server_info(V), 0)
         self.stream.on_packet(packets.model_definition({"wand": 3, "floaty": 7}, V), 0)
         self.states: list[tuple[int, str]] = []
