@@ -26,6 +26,7 @@ from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us
 from ground_station.errors import MocapError
 from ground_station.frame_rate import FRAMES, FrameRate
+from ground_station.latency import LinkLatency
 from ground_station.live import FAILSAFE, LiveStation
 from ground_station.mocap import MocapFrame, MocapSource
 from ground_station.sources.address import find_source, override
@@ -572,6 +573,7 @@ class SlowLink:
     """A board that takes its time to connect, which is when `open` asks whether to give up."""
 
     uri = "slow"
+    latency = LinkLatency("air", 0, measured=False)
     supervisor_state = FAILSAFE
     sent = 0
 
