@@ -260,6 +260,7 @@ def test_poses_come_through_the_package_s_own_process_and_a_killed_one_comes_bac
         assert source.notices() == ["mocap optitrack at 127.0.0.1, body floaty, y-up, age assumed: 7.0 ms"]
         frames = received(source, 20)
         assert all(7000 <= clock_us() - frame.t_us < 2_000_000 for frame in frames)
+        assert all(frame.arrived_us == frame.t_us + 7000 for frame in frames)
         assert any(frame.valid for frame in frames)
         for frame in frames:  # those that have come, as the virtual Motive drew them
             if frame.valid:
