@@ -19,7 +19,7 @@ from hil.markers import COUNT, TRUNK_RADIUS, Cameras, MarkersConfig, Sighting, m
 from hil.plant.body import AXIS, MIRRORS
 from hil.plant.config import PlantConfig, ServoConfig
 from hil.plant.plant import Plant
-from hil.rigid_body import GHOST_REACH, WORST_PAIR, RigidBody, VirtualMarkers
+from hil.rigid_body import GHOST_REACH, NOISE_ROWS, WORST_PAIR, RigidBody, VirtualMarkers
 from hil.tunnel import TunnelConfig
 from hil.virtual_mocap import MocapConfig, VirtualMocap
 
@@ -159,6 +159,7 @@ def test_too_few_markers_are_not_tracked(hidden: int, needed: int, tracked: bool
     sighting = here.look(HOME, LEVEL)
     assert sighting.bits == 0xFF << hidden & 0xFF
     assert (sighting.pose is not None) is tracked
+    assert (sighting.residuals != 0).tolist() == (sighting.seen.tolist() if tracked else [False] * COUNT)
     assert len(sighting.unlabelled) == (0 if tracked else COUNT - hidden)
 
 
@@ -169,6 +170,22 @@ def test_a_body_that_fits_badly_is_not_tracked() -> None:
     assert all(sighting.error > ON.max_error and sighting.pose is None for sighting in sightings)
     here.noise_scale = 1.0
     assert here.look(HOME, LEVEL).pose is not None
+
+
+def test_markers_that_are_not_seen_stand_where_the_body_has_them() -> None:
+    here = markers()
+    here.hidden = 4
+    sighting = here.look(HOME, LEVEL)
+    assert sighting.pose is not None
+    p, q = sighting.pose
+    assert sighting.points[:4] == pytest.approx(
+        Rotation.from_quat(q, scalar_first=True).apply(PLACES[:4]) + p, abs=1e-12
+    )
+    off = np.linalg.norm(
+        sighting.points[4:] - Rotation.from_quat(q, scalar_first=True).apply(PLACES[4:]) - p, axis=1
+    )
+    assert sighting.residuals[4:] == pytest.approx(off, abs=1e-12)
+    assert sighting.error == pytest.approx(off.mean(), abs=1e-12)
 
 
 # Labels
@@ -241,20 +258,35 @@ def ray_hits(marker: Array, camera: Array) -> set[bool]:
 
 
 @settings(max_examples=40)
-@given(turns, st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0.1, 1.9)), st.integers(2, 5))
+@given(
+    turns,
+    st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0.1, 1.9)),
+    st.integers(2, 6),
+    st.floats(1, 4),
+    st.floats(0, 4),
+    st.data(),
+)
 def test_a_marker_is_seen_when_enough_rays_are_free(
-    turn: Rotation, p: tuple[float, float, float], needed: int
+    turn: Rotation,
+    p: tuple[float, float, float],
+    cameras: int,
+    away: float,
+    height: float,
+    data: st.DataObject,
 ) -> None:
-    config = MarkersConfig(enabled=True, min_cameras=needed)
+    config = MarkersConfig(
+        enabled=True, cameras=cameras, camera_distance=away, camera_height=height,
+        min_cameras=data.draw(st.integers(2, cameras)),
+    )  # fmt: skip
+    row = data.draw(st.integers(0, COUNT - 1))
+    free = []
+    for azimuth in 2 * np.pi * np.arange(cameras) / cameras:
+        camera = np.array([away * np.cos(azimuth), away * np.sin(azimuth), height])
+        hits = ray_hits(PLACES[row], turn.inv().apply(camera - p))
+        assume(len(hits) == 1)  # not by a hair
+        free.append(not hits.pop())
     seen = Cameras(config, PLANT).see(np.array(p), turn.as_matrix())
-    for row in range(0, COUNT, 3):
-        free = []
-        for azimuth in 2 * np.pi * np.arange(5) / 5:
-            camera = np.array([2.5 * np.cos(azimuth), 2.5 * np.sin(azimuth), 2.0])
-            hits = ray_hits(PLACES[row], turn.inv().apply(camera - p))
-            assume(len(hits) == 1)  # not by a hair
-            free.append(not hits.pop())
-        assert seen[row] == (sum(free) >= needed)
+    assert seen[row] == (sum(free) >= config.min_cameras)
 
 
 @pytest.mark.parametrize(("tilt", "fewest"), [(0, 8), (10, 8), (20, 8), (90, 7), (180, 6)])
@@ -283,11 +315,13 @@ def test_as_many_cameras_as_must_see_a_marker_are_there() -> None:
 
 
 def test_ghosts_lie_near_the_body_have_no_label_and_do_not_change_its_pose() -> None:
-    plain, haunted = look(ON), look(MarkersConfig(enabled=True, ghosts=7))
-    assert haunted.unlabelled.shape == (7, 3)
-    assert np.abs(haunted.unlabelled - HOME).max() < GHOST_REACH
-    assert plain.unlabelled.shape == (0, 3)
-    assert plain.pose == haunted.pose
+    plain, haunted = markers(), markers(MarkersConfig(enabled=True, ghosts=7))
+    for _ in range(NOISE_ROWS + 1):
+        without, seen = plain.look(HOME, LEVEL), haunted.look(HOME, LEVEL)
+        assert without.pose == seen.pose
+    assert seen.unlabelled.shape == (7, 3)
+    assert 0.1 < np.abs(seen.unlabelled - HOME).max() < GHOST_REACH
+    assert without.unlabelled.shape == (0, 3)
 
 
 # In the cameras
@@ -328,18 +362,18 @@ def test_same_seed_same_frames() -> None:
 
 
 def test_markers_leave_all_other_randomness_as_it_was() -> None:
-    """The air around the held robot, the gyro's noise and the pose-level faults do not know about them."""
+    """The air around the held robot, the gyro's noise, and which frames are lost."""
     seen: list[list[object]] = []
     for on in ("false", "true"):
-        flight = Flight(load_config("floaty", [f"markers.enabled={on}"]), EXPERIMENTS["hover"], 0.1, 1, None)
+        settings = [f"markers.enabled={on}", "mocap.dropout=0.5"]
+        flight = Flight(load_config("floaty", settings), EXPERIMENTS["hover"], 0.1, 1, None)
         rows: list[object] = []
-        for moment_us in range(10_000, 1_000_000, 90_000):
-            flight.events.at(
-                moment_us,
-                lambda _, flight=flight, rows=rows: rows.append(
-                    (flight.plant.flow_W.tolist(), flight.board.imu)
-                ),
-            )
+        for moment_us in range(10_000, 1_000_000, 45_000):
+            flight.events.at(moment_us, lambda _, flight=flight, rows=rows: rows.append(random_parts(flight)))
         flight.run()
         seen.append(rows)
     assert seen[0] == seen[1]
+
+
+def random_parts(flight: Flight) -> tuple[object, ...]:
+    return flight.plant.flow_W.tolist(), flight.board.imu, flight.radio.up.sent
