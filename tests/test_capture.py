@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from qualisys_server import qualisys_server
 from scipy.spatial.transform import Rotation
 from serving import serve
 from test_virtual_motive import Laboratory, needs
@@ -322,6 +323,33 @@ def test_vrpn_poses_come_from_a_server_over_its_own_protocol() -> None:
             assert all(frame.valid for frame in await_notice(source, "no frames"))
             assert source.receive(0.1) is None  # VRPN does not say that a body is lost: it says nothing
             silent.clear()
+            await_notice(source, "frames again")
+
+
+@needs("motioncapture")
+def test_qualisys_poses_come_from_a_server_over_its_own_protocol() -> None:
+    state: list[str] = []
+
+    def pose(number: int) -> tuple[float, ...] | None:
+        if "stopped" in state:
+            return None
+        return (math.nan,) * 6 if "hidden" in state else (number * 1.0, 2000.0, 3000.0, 10.0, 20.0, 30.0)
+
+    with qualisys_server("floaty", pose):
+        source = find_source("qualisys:localhost,body=floaty", CaptureConfig())
+        assert isinstance(source, MotioncaptureSource)
+        with opened(source):
+            frames = received(source, 50)
+            assert all(frame.valid and frame.p_WB[1:] == (2.0, 3.0) for frame in frames)
+            expected = Rotation.from_euler("XYZ", (10, 20, 30), degrees=True)  # QTM's own convention
+            assert frames[0].q_WB == pytest.approx(expected.as_quat(scalar_first=True), abs=1e-6)
+            state.append("hidden")
+            time.sleep(0.1)
+            received(source, 30)
+            assert not any(frame.valid for frame in received(source, 10))
+            state.append("stopped")
+            await_notice(source, "no frames")
+            state.clear()
             await_notice(source, "frames again")
 
 
