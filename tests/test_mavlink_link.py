@@ -348,8 +348,11 @@ def test_what_the_budget_allows_fits_and_it_allows_no_less_than_fits(baud, pose_
     try:
         budget = link_budget(baud, pose_hz, signed)
     except LinkError:
-        poses = pose_hz * (48 + 13 * signed)  # [bytes/s]; beside them goals, heartbeats and clocks
-        assert poses + 400 > 0.09 * baud or baud < 20_000
+        poses = pose_hz * (48 + 13 * signed) + 400  # [bytes/s] with goals, heartbeats and clocks
+        telemetry = (
+            TELEMETRY_HZ[-1] * (40 + 40 + 96 + 39 * signed) + 600 + 208 * signed
+        )  # with what comes unasked
+        assert poses > 0.09 * baud or telemetry > 0.08 * baud
         return
     assert budget.up_load <= 0.9
     assert budget.down_load <= 0.8
