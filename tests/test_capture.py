@@ -26,7 +26,7 @@ from firmware_py.geometry import to_euler_zyx
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us
 from ground_station.errors import MocapError
-from ground_station.frame_rate import FRAMES, FrameRate
+from ground_station.frame_rate import FrameRate
 from ground_station.live import FAILSAFE, LiveStation
 from ground_station.mocap import MocapFrame, MocapSource
 from ground_station.sources.address import find_source, override
@@ -143,13 +143,17 @@ def test_qualisys_has_one_port() -> None:
 
 
 def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
-    def told(period_us: int) -> list[str]:
-        rate = FrameRate(5000)
-        return [line for number in range(3 * FRAMES) if (line := rate.on_frame(number * period_us))]
+    def told(*periods_us: int) -> list[str]:
+        rate, t_us, lines = FrameRate(5000), 7, []
+        for period_us in periods_us:
+            t_us += period_us
+            lines.append(rate.on_frame(t_us))
+        return [line for line in lines if line]
 
-    assert told(5000) == told(5400) == []
-    assert len(told(10_000)) == len(told(4000)) == 1
-    assert "every 10.0 ms, not every 5.0 ms" in told(10_000)[0]
+    assert told(*[5000] * 3000) == told(*[5400] * 3000) == []
+    assert told(*[400] * 280, 1_400_000, *[5000] * 3000) == []  # a burst and a stall
+    assert len(told(*[10_000] * 1000)) == len(told(*[4000] * 3000)) == 1
+    assert "every 10.0 ms, not every 5.0 ms" in told(*[10_000] * 1000)[0]
 
 
 # Lines of the other process
