@@ -1,28 +1,30 @@
 """Whether motion capture delivers frames as often as the profile says, on which the rate of corrections depends."""
 
+from itertools import pairwise
 from statistics import median
 
-FRAMES = 200  # over which it is measured
+WINDOW_US = 4_000_000  # in which it is measured: longer than a stall and the burst behind it
 TOLERANCE = 0.1
 
 
 class FrameRate:
-    """Measures the period between the exposures of the first frames; sans I/O."""
+    """Measures the usual period between exposures, once; sans I/O."""
 
     def __init__(self, period_us: int) -> None:
         self._period_us = period_us
-        self._last_us: int | None = None
-        self._periods_us: list[int] = []
+        self._exposures_us: list[int] = []
+        self._measured = False
 
     def on_frame(self, t_us: int) -> str:
         """Take an exposure; a line for the user, empty almost always."""
-        last_us, self._last_us = self._last_us, t_us
-        if last_us is None or len(self._periods_us) == FRAMES:
+        if self._measured:
             return ""
-        self._periods_us.append(t_us - last_us)
-        if len(self._periods_us) < FRAMES:
+        exposures_us = self._exposures_us
+        exposures_us.append(t_us)
+        if t_us - exposures_us[0] < WINDOW_US:
             return ""
-        period_us = median(self._periods_us)
+        self._measured = True
+        period_us = median(later - earlier for earlier, later in pairwise(exposures_us))
         if abs(period_us - self._period_us) <= TOLERANCE * self._period_us:
             return ""
         return (

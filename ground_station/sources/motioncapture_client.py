@@ -20,7 +20,7 @@ from ground_station.sources.config import CaptureConfig, choose_body
 CONNECT_TIMEOUT_US = 5_500_000  # the process gives up after 5 s without a frame
 SETTLE_US = 1_000_000  # from the first frame on, in which all bodies should have been seen
 SILENCE_US = 500_000
-RESTART_US = 1_000_000
+RESTART_US = 2_000_000  # starting one takes 0.2 s of a processor
 OLDEST_US = 1_000_000  # an arrival longer ago waited in the pipe
 LINE_MAX = 65_536
 
