@@ -10,6 +10,11 @@ def clock_us() -> int:
     return time.monotonic_ns() // 1000
 
 
+def wait(duration_s: float) -> None:
+    """Sleep."""
+    time.sleep(duration_s)
+
+
 def signing_start() -> int:
     """The time stamp of MAVLink's signatures when `clock_us` was 0 [10 us since 2015-01-01]; may be negative."""
     return (time.time_ns() // 1000 - _YEAR_2015_US - clock_us()) // 10

@@ -1,7 +1,7 @@
 """The ground station with real hardware: poses from a source, a link to a board, until told to stop.
 
-It connects again when the link is lost, shows how the link does, and leaves the board with its flaps at hover: the
-corrections stop first, and the link is closed when the board has noticed.
+It connects again when the link is lost, shows how the link does and how old poses are, and leaves the board with its
+flaps at hover: the corrections stop first, and the link is closed when the board has noticed.
 """
 
 from collections.abc import Callable
@@ -10,11 +10,13 @@ from typing import Protocol
 
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
+from ground_station.frame_rate import FrameRate
 from ground_station.mocap import MocapSource
 from ground_station.station import GroundStation
 
 POSE_TIMEOUT_US = 5_000_000
 RECONNECT_TIMEOUT_US = 30_000_000
+RECONNECT_PERIOD_US = 500_000
 STATUS_PERIOD_US = 5_000_000
 FAILSAFE_TIMEOUT_US = 2_000_000
 FAILSAFE = 3  # supervisor.state
@@ -69,11 +71,13 @@ class LiveStation:
     link: LiveLink
     station: GroundStation
     source: MocapSource
+    rate: FrameRate
     say: Callable[[str], None]
     stopping: Callable[[], bool]
 
     def run(self) -> None:
         """Fly until told to stop; raises `LinkError` when there are no poses or no board."""
+        self._tell()
         self._connect()
         try:
             while not self.stopping():
@@ -86,9 +90,19 @@ class LiveStation:
             self._leave()
 
     def _connect(self) -> None:
-        self.link.open(self.stopping)
+        self.link.open(self._serve_source)
         self.say(f"connected to {self.link.uri}")
         self._tell()
+
+    def _serve_source(self) -> bool:
+        """Keep the source going while the link connects; whether to stop that."""
+        self._drop_waiting()
+        return self.stopping()
+
+    def _drop_waiting(self) -> None:
+        """Take the frames that nobody wants any more."""
+        while self.source.receive(0.0) is not None:
+            pass
 
     def _reconnect(self, cause: LinkError) -> None:
         """Try until it works or takes too long."""
@@ -101,10 +115,13 @@ class LiveStation:
             except LinkError:
                 if clock_us() > deadline_us:
                     raise cause from None
-                self.source.receive(0.5)
+                again_us = clock_us() + RECONNECT_PERIOD_US
+                while clock_us() < again_us:
+                    self.source.receive(0.02)
 
     def _fly(self) -> None:
         """Forward poses and telemetry while the link holds."""
+        self._drop_waiting()
         pose_us = status_us = clock_us()
         while not self.stopping():
             frame = self.source.receive(0.02)
@@ -112,6 +129,8 @@ class LiveStation:
             if frame is not None:
                 self.station.on_frame(frame, now_us)
                 pose_us = now_us
+                if notice := self.rate.on_frame(frame.t_us):
+                    self.say(notice)
             elif now_us - pose_us > POSE_TIMEOUT_US:
                 self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
                 pose_us = now_us
@@ -137,6 +156,7 @@ class LiveStation:
             f"poses {counters.frames} ({counters.invalid} unusable)  {self.source.summary()}  {track}"
             f"{self.link.summary()}  telemetry {counters.samples}"
         )
+        self.say(str(self.station.budget))
 
     def _leave(self) -> None:
         """Stop correcting, wait until the board has put its flaps to hover, disconnect."""

@@ -6,12 +6,18 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class MocapFrame:
-    """The body's pose in the world at one exposure of the cameras."""
+    """The body's pose in the world at one exposure of the cameras, and when it passed where; None: not told.
 
-    t_us: int  # the exposure, by the clock of the ground station
+    All instants are of the ground station's clock.
+    """
+
+    t_us: int  # the exposure
     p_WB: tuple[float, float, float]  # [m]
     q_WB: tuple[float, float, float, float]  # w x y z
     valid: bool  # False: the body was not tracked, the pose means nothing
+    received_us: int | None = None  # the motion capture computer has the images
+    transmitted_us: int | None = None  # the pose leaves it
+    arrived_us: int | None = None  # the ground station has it
 
 
 class MocapSource(Protocol):

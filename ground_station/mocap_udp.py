@@ -1,6 +1,7 @@
 """Poses as datagrams on the loopback interface: the stand-in for a motion capture network (`--mocap virtual`).
 
-A datagram carries the pose and the instant of its exposure by `clock.clock_us`, which sender and receiver share.
+A datagram carries the pose and the instants of exposure, receipt and departure by `clock.clock_us`, which sender and
+receiver share.
 """
 
 import socket
@@ -14,21 +15,27 @@ from ground_station.mocap import MocapFrame
 HOST = "127.0.0.1"
 DEFAULT_PORT = 19870
 
-_MAGIC = b"FPO1"
-_FRAME = struct.Struct("<4sqB7d")  # magic, exposure [us], valid, p_WB x y z [m], q_WB w x y z
+NOT_TOLD = -1
+
+_MAGIC = b"FPO2"
+_FRAME = struct.Struct(
+    "<4s3qB7d"
+)  # magic, exposure, receipt, departure [us], valid, p_WB x y z [m], q_WB w x y z
 
 
 def encode_frame(frame: MocapFrame) -> bytes:
     """The datagram for a frame."""
-    return _FRAME.pack(_MAGIC, frame.t_us, frame.valid, *frame.p_WB, *frame.q_WB)
+    way = [NOT_TOLD if t_us is None else t_us for t_us in (frame.received_us, frame.transmitted_us)]
+    return _FRAME.pack(_MAGIC, frame.t_us, *way, frame.valid, *frame.p_WB, *frame.q_WB)
 
 
 def decode_frame(data: bytes) -> MocapFrame:
     """The frame in a datagram; `WireError` for anything else."""
     if len(data) != _FRAME.size or data[:4] != _MAGIC:
         raise WireError(f"not a pose: {len(data)} bytes")
-    _, t_us, valid, px, py, pz, qw, qx, qy, qz = _FRAME.unpack(data)
-    return MocapFrame(t_us, (px, py, pz), (qw, qx, qy, qz), bool(valid))
+    _, t_us, *way, valid, px, py, pz, qw, qx, qy, qz = _FRAME.unpack(data)
+    told = [None if t_us == NOT_TOLD else t_us for t_us in way]
+    return MocapFrame(t_us, (px, py, pz), (qw, qx, qy, qz), bool(valid), *told)
 
 
 class PoseReceiver:
@@ -48,7 +55,7 @@ class PoseReceiver:
         self._socket.settimeout(timeout_s)
         try:
             return self._socket.recv(2048)
-        except TimeoutError:
+        except (TimeoutError, BlockingIOError):  # the latter when it is 0
             return None
 
     def close(self) -> None:
@@ -66,7 +73,11 @@ class PosePublisher:
 
     def send(self, frame: MocapFrame, now_us: int) -> None:
         """Send a frame of another clock, on which it is `now_us`; what cannot be sent is lost."""
-        shared = replace(frame, t_us=clock_us() - (now_us - frame.t_us))
+        ahead_us = clock_us() - now_us
+        received_us, sent_us = (
+            None if t_us is None else t_us + ahead_us for t_us in (frame.received_us, frame.transmitted_us)
+        )
+        shared = replace(frame, t_us=frame.t_us + ahead_us, received_us=received_us, transmitted_us=sent_us)
         try:
             self._socket.sendto(encode_frame(shared), self._receiver)
         except OSError:

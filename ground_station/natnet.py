@@ -134,7 +134,15 @@ class Other:
     message: int
 
 
-Message = ServerInfo | ModelDefinition | Frame | Echo | Other
+@dataclass(frozen=True, slots=True)
+class Response:
+    """The answer to REQUEST: a number, 0 for done, or a text."""
+
+    code: int | None
+    text: str
+
+
+Message = ServerInfo | ModelDefinition | Frame | Echo | Response | Other
 
 
 def packet(message: MessageId, payload: bytes = b"") -> bytes:
@@ -158,7 +166,15 @@ def decode(data: bytes, version: Version) -> Message:
         return _model_definition(reader)
     if message == MessageId.ECHO_RESPONSE:
         return Echo(reader.u64(), reader.u64())
+    if message == MessageId.RESPONSE:
+        return _response(reader)
     return Other(message)
+
+
+def _response(reader: Reader) -> Response:
+    if reader.left == 4:
+        return Response(reader.u32(), "")
+    return Response(None, reader.take(reader.left).partition(b"\0")[0].decode("utf-8", "replace"))
 
 
 def _server_info(reader: Reader) -> ServerInfo:

@@ -1,11 +1,10 @@
 """One rigid body out of a NatNet stream: packets and the time in, poses in the world and notices out. Sans I/O.
 
-World axes: z up. From Motive's "y up" the world is reached by a quarter turn about x, which leaves x where it is.
+A server that speaks a newer NatNet than can be read here is asked for the newest that can.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
@@ -16,14 +15,15 @@ from ground_station.natnet import (
     Frame,
     MessageId,
     ModelDefinition,
+    Response,
     ServerInfo,
     decode,
     packet,
 )  # fmt: skip
-from ground_station.natnet_reader import Quaternion, Vector
+from ground_station.natnet_reader import Quaternion, Vector, Version
 from ground_station.server_clock import ServerClock
-
-Axes = Literal["z-up", "y-up"]
+from ground_station.sources.alignment import Alignment
+from ground_station.sources.config import choose_body
 
 LATE_FRAMES = 100  # a number that lies further back is that of a server that began anew
 FROZEN_FRAMES = 3  # with the very same pose: the server repeats what it saw last
@@ -34,6 +34,9 @@ OLDEST_US = 1_000_000  # an exposure longer ago is of no use, or its time stamp 
 SILENCE_US = 500_000  # without frames, after which the server is called again
 CALL_PERIOD_US = 500_000
 MODELS_CHANGED = 2  # bit of a frame's parameters
+BITSTREAM = (
+    f"Bitstream,{VERSIONS[-1][0]}.{VERSIONS[-1][1]}"  # command that changes the version of what is sent
+)
 NOWHERE: tuple[Vector, Quaternion] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -51,16 +54,16 @@ class StreamCounters:
 class NatnetStream:
     """Follows body `name`, the only one there is when empty; `outgoing` are packets for the server's command port."""
 
-    def __init__(self, name: str, axes: Axes) -> None:
+    def __init__(self, name: str, alignment: Alignment) -> None:
         self.counters = StreamCounters()
         self.server: ServerInfo | None = None
+        self.version = VERSIONS[0]  # of what the server sends
         self.models: ModelDefinition | None = None
-        self.age_us = 0  # of the last pose when it arrived
         self.outgoing: list[bytes] = []
         self.notices: list[str] = []
         self._name = name
-        self._axes = axes
-        self._version = VERSIONS[0]
+        self._alignment = alignment
+        self._newer: ServerInfo | None = None  # asked for an older version
         self._clock = ServerClock(1)
         self._id: int | None = None
         self._number: int | None = None
@@ -77,7 +80,7 @@ class NatnetStream:
         `MocapError` when the server or its bodies are not those wanted; later, when they change, it is a notice.
         """
         try:
-            message = decode(data, self._version)
+            message = decode(data, self.version)
         except MocapError:
             self.counters.malformed += 1
             return None
@@ -86,7 +89,7 @@ class NatnetStream:
         if isinstance(message, Echo):
             if 0 <= now_us - message.asked <= OLDEST_US:
                 self._clock.answered(message.asked, message.server, now_us)
-        elif isinstance(message, ServerInfo | ModelDefinition):
+        elif isinstance(message, ServerInfo | ModelDefinition | Response):
             try:
                 self._on_answer(message)
             except MocapError as error:
@@ -112,33 +115,47 @@ class NatnetStream:
         self.outgoing.append(packet(MessageId.KEEPALIVE, b"\0"))
         self.outgoing.append(packet(MessageId.ECHO_REQUEST, now_us.to_bytes(8, "little")))
 
-    def _on_answer(self, answer: ServerInfo | ModelDefinition) -> None:
+    def missing(self) -> str:
+        """What has not been heard of the server yet, before there are models."""
+        if self._newer is not None:
+            return str(_unreadable(self._newer))
+        return "no NatNet server answers" if self.server is None else "the server names no bodies"
+
+    def _on_answer(self, answer: ServerInfo | ModelDefinition | Response) -> None:
         if isinstance(answer, ServerInfo):
             self._on_server(answer)
+        elif isinstance(answer, Response):
+            self._on_response(answer)
         elif self.server is not None:
-            self._id = self._find(answer)
+            names = [body.name for body in answer.bodies]
+            self._id = answer.bodies[names.index(choose_body(self._name, names))].id
             self.models = answer
 
     def _on_server(self, server: ServerInfo) -> None:
         version = server.natnet_version[:2]
-        if version not in VERSIONS:
-            raise MocapError(
-                f"NatNet {version[0]}.{version[1]} of {server.name}: 3.0, 3.1, 4.0 or 4.1 is needed"
-            )
+        if version in VERSIONS:
+            self._accept(server, version)
+        elif version > VERSIONS[-1] and not server.multicast:  # else all clients get the same
+            self._newer = server
+            self.outgoing.append(packet(MessageId.REQUEST, BITSTREAM.encode() + b"\0"))
+        else:
+            raise _unreadable(server)
+
+    def _on_response(self, response: Response) -> None:
+        """The answer to `BITSTREAM`, the only request."""
+        server, self._newer = self._newer, None
+        if server is None:
+            return
+        if response.code != 0 and not response.text.startswith(BITSTREAM):
+            raise _unreadable(server)
+        self._accept(server, VERSIONS[-1])
+
+    def _accept(self, server: ServerInfo, version: Version) -> None:
         if self.server != server:
-            self._version = version
+            self.version = version
             self._clock = ServerClock(server.clock_hz)
         self.server = server
         self.outgoing.append(packet(MessageId.REQUEST_MODELDEF, b"\0"))
-
-    def _find(self, models: ModelDefinition) -> int:
-        names = [body.name for body in models.bodies]
-        if self._name in names:
-            return models.bodies[names.index(self._name)].id
-        if not self._name and len(names) == 1:
-            return models.bodies[0].id
-        wanted = f"no body {self._name!r}" if self._name else "body=NAME is missing"
-        raise MocapError(f"{wanted}; there are: {', '.join(names) or 'none'}")
 
     def _on_frame(self, frame: Frame, now_us: int) -> MocapFrame | None:
         counters = self.counters
@@ -160,8 +177,11 @@ class NatnetStream:
         if t_us is None or pose is None or not self._usable(pose):
             counters.lost += 1
             return MocapFrame(now_us if t_us is None else t_us, *NOWHERE, valid=False)
-        self.age_us = now_us - t_us
-        return MocapFrame(t_us, *in_world(pose.p, pose.q, self._axes), valid=True)
+        received_us, sent_us = map(self._clock.to_station_us, (frame.received, frame.transmitted))
+        p, q = self._alignment.to_world(pose.p, pose.q)
+        received_us = max(t_us, min(received_us, now_us))  # the clocks are not known that well
+        sent_us = max(received_us, min(sent_us, now_us))
+        return MocapFrame(t_us, p, q, True, received_us, sent_us, now_us)
 
     def _exposed_us(self, frame: Frame, now_us: int) -> int | None:
         """The exposure by our clock, None if the server's time stamps make no sense."""
@@ -187,8 +207,6 @@ class NatnetStream:
         return pose.valid and rotation and all(map(math.isfinite, pose.p)) and self._repeated < FROZEN_FRAMES
 
 
-def in_world(p: Vector, q: Quaternion, axes: Axes) -> tuple[Vector, Quaternion]:
-    """A pose in Motive's axes as p_WB and q_WB; the body's own axes turn like those of the world."""
-    if axes == "z-up":
-        return p, q
-    return (p[0], -p[2], p[1]), (q[0], q[1], -q[3], q[2])
+def _unreadable(server: ServerInfo) -> MocapError:
+    major, minor = server.natnet_version[:2]
+    return MocapError(f"NatNet {major}.{minor} of {server.name}: 3.0, 3.1, 4.0 or 4.1 is needed")

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import Sample
+from ground_station.latency import LatencyBudget, LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import Track, Tracker
@@ -33,7 +34,7 @@ class StationConfig(BaseModel):
         1400,
         ge=0,
         le=100_000,
-        description="expected from the link's input to the board [us]; mean of VirtualRadio",
+        description="from the link's input to the board [us], where it is not measured; mean of VirtualRadio",
     )
 
 
@@ -50,6 +51,11 @@ class Link(Protocol):
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
         """The telemetry in `data`, empty if it is something else; `WireError` if it is malformed."""
+        ...
+
+    @property
+    def latency(self) -> LinkLatency:
+        """From `send` to the board."""
         ...
 
 
@@ -78,6 +84,7 @@ class GroundStation:
     ) -> None:
         self.counters = StationCounters()
         self.tracker = tracker
+        self.budget = LatencyBudget()
         self._link = link
         self._trajectory = trajectory
         self._log = log
@@ -111,6 +118,7 @@ class GroundStation:
             counters.invalid += 1
             return
         counters.sent += 1
+        self.budget.add(frame, now_us, self._link.latency)
         # The slots keep their phase: a late frame does not delay the next one.
         self._frames_until_due %= self._send_every
 
@@ -130,6 +138,5 @@ class GroundStation:
         for sample in samples:
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
             if self._log is not None:
-                self._log.write(
-                    now_us, sample, self._trajectory.at(now_us), self._last_frame, self._last_track
-                )
+                goal = self._trajectory.at(now_us)
+                self._log.write(now_us, sample, goal, self._last_frame, self._last_track, self.budget)

@@ -1,9 +1,9 @@
 """The ground station's own record of a flight: a CSV file with one row per telemetry time stamp.
 
 A row joins the blocks that carry the same time stamp with what the ground station itself knew when the first
-of them arrived: its clock, the goal, the last usable pose and what the tracker says. What was missing is `nan`.
-The header names each column's unit: `stateEstimate.x [m]`. The file is complete to about a second when the process
-dies; memory holds one row.
+of them arrived: its clock, the goal, the last usable pose, what the tracker says and where the age of the last sent
+pose came from. What was missing is `nan`. The header names each column's unit: `stateEstimate.x [m]`. The file is
+complete to about a second when the process dies; memory holds one row.
 """
 
 from math import nan
@@ -11,11 +11,14 @@ from pathlib import Path
 
 from firmware_py.geometry import to_euler_zyx
 from firmware_py.wire.telemetry import BLOCKS, Block, Sample
+from ground_station.latency import STAGES, LatencyBudget
 from ground_station.mocap import MocapFrame
 from ground_station.tracker import Track
 from ground_station.trajectory import Goal
 
 FLUSH_PERIOD_US = 1_000_000
+
+AGE_COLUMNS = tuple(f"age.{stage} [s]" for stage in STAGES)
 
 _GROUND_COLUMNS = (
     "ground.t [s]",
@@ -37,6 +40,7 @@ _GROUND_COLUMNS = (
     "mocap.q [rad/s]",
     "mocap.r [rad/s]",
     "mocap.quality []",
+    *AGE_COLUMNS,
 )
 
 
@@ -51,7 +55,9 @@ def _columns_of(blocks: tuple[Block, ...]) -> tuple[list[str], dict[int, int]]:
 
 
 _TELEMETRY_COLUMNS, _FIRST_COLUMN = _columns_of(BLOCKS)
-_ROW = ",".join(["%d", "%.6f"] + ["%.7g"] * (len(_GROUND_COLUMNS) - 1 + len(_TELEMETRY_COLUMNS))) + "\n"
+_TIMES = ("ground.t [s]", "mocap.t [s]")  # to the microsecond
+_FORMATS = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *_TELEMETRY_COLUMNS)]
+_ROW = ",".join(["%d", *_FORMATS]) + "\n"
 
 
 class TelemetryLog:
@@ -66,13 +72,20 @@ class TelemetryLog:
         self._next_flush_us = 0
 
     def write(
-        self, now_us: int, sample: Sample, goal: Goal, frame: MocapFrame | None, track: Track | None
+        self,
+        now_us: int,
+        sample: Sample,
+        goal: Goal,
+        frame: MocapFrame | None,
+        track: Track | None,
+        budget: LatencyBudget,
     ) -> None:
-        """Put `sample`, received at `now_us`, into its row; the others are of that instant."""
+        """Put `sample`, received at `now_us`, into its row; the rest is of that instant."""
         if sample.timestamp_ms != self._timestamp_ms:
             self._write_row()
             self._timestamp_ms = sample.timestamp_ms
-            self._ground = _ground_values(now_us, goal, frame, track)
+            ages = [1e-6 * us for us in budget.last()]
+            self._ground = (*_ground_values(now_us, goal, frame, track), *ages)
             self._telemetry = [nan] * len(_TELEMETRY_COLUMNS)
         first = _FIRST_COLUMN[sample.block.id]
         self._telemetry[first : first + len(sample.values)] = sample.values

@@ -13,6 +13,8 @@ from hil.errors import LabError
 if TYPE_CHECKING:
     from ground_station.links.crazyradio import CrazyradioLink
     from ground_station.links.mavlink_serial import MavlinkSerialLink
+    from ground_station.mocap import MocapSource
+    from ground_station.sources.config import CaptureConfig
     from hil.config import LabConfig
     from hil.virtual_motive import Streaming
 
@@ -136,9 +138,11 @@ def serve(
     "COM3, socket://HOST:PORT, rfc2217://HOST:PORT.",
 )  # fmt: skip
 @click.option(
-    "--mocap", default="virtual", show_default=True, metavar="SYSTEM",
-    help="Where poses come from: virtual[:PORT], those that `floaty board serve` sends, or Motive's at "
-    "optitrack:HOST[:PORT][,multicast][,body=NAME][,z-up].",
+    "--mocap", metavar="SYSTEM",
+    help="Where poses come from, on top of [capture] of the profile: virtual[:PORT], those that `floaty board serve` "
+    "sends; optitrack:HOST[:PORT], vicon:HOST[:PORT], qualisys:HOST, vrpn:HOST[:PORT], each with [,body=NAME] "
+    "[,z-up|,y-up], optitrack with [,multicast]; or replay:PATH, a file of --record, a telemetry.csv or a run folder, "
+    "whose end ends the flight.",
 )  # fmt: skip
 @click.option(
     "--trajectory", default="hover", show_default=True, metavar="NAME", help="An experiment of `floaty list`."
@@ -149,16 +153,21 @@ def serve(
 @click.option(
     "--log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="Telemetry as CSV."
 )
+@click.option(
+    "--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Every frame of motion capture as CSV, for --mocap replay:FILE.",
+)  # fmt: skip
 @click.option("--profile", default="floaty", show_default=True, metavar="NAME|FILE")
 @click.option(
     "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE", help="Override a value; repeatable."
 )
 def station(
     uri: str,
-    mocap: str,
+    mocap: str | None,
     trajectory: str,
     duration: float | None,
     log: Path | None,
+    record: Path | None,
     profile: str,
     overrides: tuple[str, ...],
 ) -> int:
@@ -172,24 +181,28 @@ def station(
     config = load_config(profile, overrides)
     experiment = find_experiment(trajectory)
     from ground_station.clock import clock_us
-    from ground_station.errors import LinkError, MocapError
+    from ground_station.errors import LinkError
+    from ground_station.frame_rate import FrameRate
     from ground_station.live import LiveStation
-    from ground_station.sources.address import find_source
+    from ground_station.sources.record import RecordingSource
+    from ground_station.sources.replay import ReplaySource
     from ground_station.station import GroundStation
     from ground_station.telemetry_log import TelemetryLog
     from ground_station.tracker import tracker_of
     from ground_station.trajectory import Goal
 
     link = _live_link(uri, config)
-    try:
-        source = find_source(mocap)
-        source.open()
-    except MocapError as error:
-        raise LabError(f"--mocap {mocap}: {error}") from None
+    played = source = _open_source(mocap, config.capture)
     try:
         telemetry = TelemetryLog(log) if log else None
     except OSError as error:
+        source.close()
         raise LabError(f"--log {log}: {error.strerror or error}") from None
+    try:
+        source = RecordingSource(source, record) if record else source
+    except OSError as error:
+        source.close()
+        raise LabError(f"--record {record}: {error.strerror or error}") from None
     stops = _stop_signals()
     start_us = clock_us()
     goal = Goal(config.flight.home, 0.0)
@@ -197,10 +210,12 @@ def station(
     ground = GroundStation(link, experiment.trajectory(goal, start_us), telemetry, config.station, tracker)
 
     def stopping() -> bool:
+        if isinstance(played, ReplaySource) and played.over:
+            return True
         return bool(stops) or (duration is not None and clock_us() - start_us > duration * 1e6)
 
     try:
-        LiveStation(link, ground, source, _say, stopping).run()
+        LiveStation(link, ground, source, FrameRate(config.mocap.period_us), _say, stopping).run()
     except LinkError as error:
         raise LabError(str(error)) from None
     finally:
@@ -208,6 +223,20 @@ def station(
         if telemetry is not None:
             telemetry.close()
     return 0
+
+
+def _open_source(mocap: str | None, capture: "CaptureConfig") -> "MocapSource":
+    """Return where poses come from, connected."""
+    from ground_station.errors import MocapError
+    from ground_station.sources.address import find_source
+
+    try:
+        source = find_source(mocap, capture)
+        source.open()
+    except MocapError as error:
+        what = f"--mocap {mocap}" if mocap is not None else f"capture.system = {capture.system}"
+        raise LabError(f"{what}: {error}") from None
+    return source
 
 
 def _live_link(uri: str, config: "LabConfig") -> "CrazyradioLink | MavlinkSerialLink":
@@ -226,8 +255,10 @@ def _live_link(uri: str, config: "LabConfig") -> "CrazyradioLink | MavlinkSerial
         raise LabError(f"--link {uri}: {error}: pip install 'floaty-hil[{extra}]'") from None
     pose_hz = 1e6 / (config.mocap.period_us * config.station.send_every)
     key = bytes.fromhex(config.mavlink.signing_key)
+    latency_us = config.station.link_latency_us
+    settings = MavlinkLinkConfig(config.serial.baud, pose_hz, key, latency_us=latency_us)
     try:
-        return MavlinkSerialLink(uri, MavlinkLinkConfig(config.serial.baud, pose_hz, key))
+        return MavlinkSerialLink(uri, settings)
     except LinkError as error:
         raise LabError(str(error)) from None
 

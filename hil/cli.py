@@ -78,6 +78,11 @@ run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path
     "cflib or a serial port, in real time, the ground station in a process of its own.",
 )  # fmt: skip
 @click.option(
+    "--mocap", metavar="SYSTEM",
+    help="Where the ground station of a flight in real time has its poses from: natnet, a virtual Motive (the default), "
+    "or virtual, the cameras without Motive.",
+)  # fmt: skip
+@click.option(
     "--board", metavar="BOARD", default="python", show_default=True,
     help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated).",
 )  # fmt: skip
@@ -96,6 +101,7 @@ def fly(
     watch: bool,
     perfetto: bool,
     link: str,
+    mocap: str | None,
     board: str,
     out: Path | None,
 ) -> int:
@@ -118,7 +124,7 @@ def fly(
 
     faults = [parse(text) for text in fault_texts]
     requests = [
-        Request.of(chosen, profile, overrides, seed + index, flown_s, link, faults, board)
+        Request.of(chosen, profile, overrides, seed + index, flown_s, link, faults, board, mocap)
         for index in range(seeds)
     ]
     announce_compilation()
@@ -361,6 +367,7 @@ def _print_result(result: "Result") -> None:
     """Print the verdicts of one flight and where to look."""
     from rich.table import Table
 
+    from ground_station.latency import budget_line
     from hil.metrics import METRICS
 
     request = result.request
@@ -383,6 +390,8 @@ def _print_result(result: "Result") -> None:
     console.print(
         f"{result.outcome}{cause}; {result.real_time_factor:.0f} times real time; hash {result.hash[:16]}"
     )
+    if result.ages:
+        console.print(budget_line(result.ages), soft_wrap=True)
     if result.usage is not None:
         for name, load in result.usage.entries.items():
             console.print(f"  {request.board} {name:9} {load}", soft_wrap=True)

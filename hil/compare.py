@@ -21,7 +21,17 @@ from hil.recorder import load_log
 from hil.run import read_result
 
 PICTURE, PAGE = "compare.png", "compare.html"
-ORIGIN = ("experiment", "profile", "seed", "duration_s", "link", "board", "outcome", "commit")  # of a result
+ORIGIN = (
+    "experiment",
+    "profile",
+    "seed",
+    "duration_s",
+    "link",
+    "mocap",
+    "board",
+    "outcome",
+    "commit",
+)  # of a result
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from firmware_py.config import FirmwareConfig
+from ground_station.sources.config import CaptureConfig
 from ground_station.station import StationConfig
 from ground_station.tracker import TrackerConfig
 from hil.errors import LabError
@@ -63,6 +64,7 @@ class LabConfig(FirmwareConfig):
     serial: SerialConfig = Field(default_factory=SerialConfig)
     station: StationConfig = Field(default_factory=StationConfig)
     tracker: TrackerConfig = Field(default_factory=TrackerConfig)
+    capture: CaptureConfig = Field(default_factory=CaptureConfig)
     flight: FlightConfig = Field(default_factory=FlightConfig)
     limits: dict[str, dict[str, float]] = Field(
         default_factory=dict, description="limits by experiment that replace the experiment's own"

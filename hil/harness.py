@@ -226,7 +226,8 @@ class Flight:
     def _expose(self, now_us: int) -> None:
         self.plant.advance(now_us)
         frame = self.mocap.expose(now_us, self.plant)
-        self.events.at(self.mocap.arrival_us(now_us), self._deliver(frame))
+        arrival_us = self.mocap.arrival_us(now_us)
+        self.events.at(arrival_us, self._deliver(self.mocap.stamped(frame, arrival_us)))
 
     def _deliver(self, frame: MocapFrame) -> Callable[[int], None]:
         return lambda now_us: self.station.on_frame(frame, now_us)

@@ -1,7 +1,8 @@
 """A flight over a real link, in real time: the board in its tunnel here, `floaty station` in another process.
 
 The station is the one that flies a real board. It sees the virtual dongle, the UDP port or a serial port (a pty), and
-gets poses over the loopback interface. The robot is released when the board has flown in its holder for a second.
+gets poses from a virtual Motive, as in the laboratory, or from the cameras without one. The robot is released when the
+board has flown in its holder for a second.
 """
 
 import os
@@ -24,20 +25,29 @@ from hil.experiments import Experiment
 from hil.harness import RECORD_PERIOD_US, RECORD_PHASE_US, Outcome, Streams
 from hil.recorder import Channel, Recorder
 from hil.serial_server import Address
+from hil.virtual_motive import Streaming
 from hil.virtual_radio import VirtualRadio
 
 SITE = Path(__file__).parent / "dongle_site"
 RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder
 STATION_EXIT_TIMEOUT_US = 15_000_000
 PROGRESS_ROWS = 25
+OUTPUT_MAX = 65_536  # bytes of the station that are read at once
 SERIAL = "mavlink:"
+NATNET, VIRTUAL = "natnet", "virtual"
+MOCAP = (NATNET, VIRTUAL)  # a virtual Motive; poses as `floaty board serve` sends them
+BODY = "floaty"  # to Motive
+ALIGNED = [
+    f"--set=capture.{value}"
+    for value in ("origin=[0,0,0]", "yaw=0", "body_offset=[0,0,0]", "body_yaw=0", "multicast=false")
+]  # whatever the profile says of the real cameras
 STANDING = "hover"  # other goals move by the clock of the release, which the station does not know
 
 
 class LinkedFlight:
     """Like `hil.harness.Flight`, for `radio://…` (as the board's own URI), `udp://127.0.0.1:PORT` or `mavlink:PATH`.
 
-    `arguments` are those of the station's command line that say which profile it has.
+    `mocap` is one of `MOCAP`; `arguments` are those of the station's command line that say which profile it has.
     """
 
     def __init__(
@@ -48,6 +58,7 @@ class LinkedFlight:
         seed: int,
         telemetry_path: Path,
         uri: str,
+        mocap: str,
         arguments: Sequence[str],
     ) -> None:
         if experiment.name != STANDING:
@@ -58,17 +69,17 @@ class LinkedFlight:
         self._duration_us = round(duration_s * 1e6)
         self._server = BoardServer(config, 1, seed, self._note, mavlink=uri.startswith(SERIAL))
         self._board = self._server.boards[0]
+        self._heard = 0  # bytes of the station's output
+        self._said = ""  # its last line
         self._released = self._gave_up = self._over = False
         self._progress: Callable[[int], None] | None = None
         self._trajectory = experiment.trajectory(Goal(config.flight.home, 0.0), 0)
         self._no_radio = VirtualRadio(config.radio, self._server.events, Streams.of_seed(seed).radio)
         uri, self._environment = self._serve(uri, config.serial.baud)
-        port = _free_port()
-        self._poses = PosePublisher(port)
-        self._board.publish(self._poses.send)
+        self._poses: PosePublisher | None = None
         self._command = [
-            sys.executable, "-m", "hil.cli", "station", "--link", uri, "--mocap", f"virtual:{port}",
-            "--trajectory", experiment.name, "--log", str(telemetry_path), *arguments,
+            sys.executable, "-m", "hil.cli", "station", "--link", uri, "--mocap", self._serve_poses(mocap),
+            "--trajectory", experiment.name, "--log", str(telemetry_path), *arguments, *ALIGNED,
         ]  # fmt: skip
 
     def _serve(self, uri: str, baud: int) -> tuple[str, dict[str, str]]:
@@ -87,6 +98,16 @@ class LinkedFlight:
         raise LabError(
             f"--link {uri}: expected radio, mavlink, {self._board.uri}, udp://127.0.0.1:PORT, mavlink:pty or mavlink:PATH"
         )
+
+    def _serve_poses(self, mocap: str) -> str:
+        """Let the cameras see the robot; returns the station's source of poses."""
+        if mocap == NATNET:
+            motive = self._server.serve_motive(Streaming(0, (4, 1), multicast=False))
+            return f"optitrack:127.0.0.1:{motive.port},body={BODY},y-up"
+        port = _free_port()
+        self._poses = PosePublisher(port)
+        self._board.publish(self._poses.send)
+        return f"virtual:{port}"
 
     @property
     def now_us(self) -> int:
@@ -116,7 +137,8 @@ class LinkedFlight:
         self._progress = progress
         first_us = self.now_us // RECORD_PERIOD_US * RECORD_PERIOD_US + RECORD_PERIOD_US
         self._server.events.at(first_us + RECORD_PHASE_US, self._record)
-        with tempfile.TemporaryFile("w+") as output:
+        with tempfile.TemporaryFile("wb+") as output:
+            self._output = output
             self._station = subprocess.Popen(
                 self._command, env={**os.environ, **self._environment}, stdout=output, stderr=subprocess.STDOUT,
                 start_new_session=True,
@@ -128,12 +150,9 @@ class LinkedFlight:
                 interrupted = True
             end_us, gave_up = self.now_us, self._gave_up
             code = self._end_station()
-            output.seek(0)
-            lines = output.read().splitlines()
-        for line in lines:
-            self._note(f"station: {line}")
+            self._listen()
         if gave_up and not interrupted:
-            raise LabError(f"the station ended with {code}: {lines[-1] if lines else 'no output'}")
+            raise LabError(f"the station ended with {code}: {self._said or 'no output'}")
         return Outcome(end_us, self.lost, interrupted)
 
     def _record(self, now_us: int) -> None:
@@ -144,8 +163,10 @@ class LinkedFlight:
         self.lost = self._board.look(now_us)
         if self.recorder is not None:
             self.recorder.row(now_us)
-        if self._progress is not None and now_us // RECORD_PERIOD_US % PROGRESS_ROWS == 0:
-            self._progress(now_us)
+        if now_us // RECORD_PERIOD_US % PROGRESS_ROWS == 0:
+            self._listen()
+            if self._progress is not None:
+                self._progress(now_us)
         if not self._released and self._board.free:
             self._released = True
             self.end_us = now_us + self._duration_us
@@ -153,6 +174,15 @@ class LinkedFlight:
             not self._released and now_us >= RELEASE_TIMEOUT_US
         )
         self._over = self._gave_up or self.lost is not None or now_us >= self.end_us
+
+    def _listen(self) -> None:
+        """Note what the station said since the last time."""
+        fresh = os.pread(self._output.fileno(), OUTPUT_MAX, self._heard)
+        lines = fresh[: fresh.rfind(b"\n") + 1]
+        self._heard += len(lines)
+        for line in lines.decode(errors="replace").splitlines():
+            self._said = line
+            self._note(f"station: {line}")
 
     def _end_station(self) -> int:
         """Let the station leave in order, with the board still there, or kill it."""
@@ -170,7 +200,8 @@ class LinkedFlight:
 
     def close(self) -> None:
         """Close what the flight itself opened."""
-        self._poses.close()
+        if self._poses is not None:
+            self._poses.close()
         self._server.close()
 
 

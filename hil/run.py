@@ -24,13 +24,15 @@ from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.cortex_m4 import CortexM4Runner, Usage
 from firmware_py.export.errors import ExportError
 from firmware_py.firmware import TaskReport, WatchdogError
+from ground_station.latency import Stage
+from hil.ages import ages_of
 from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError
 from hil.experiments import Experiment
 from hil.faults import Fault, check
 from hil.harness import LOCKSTEP, Flight
-from hil.linked_flight import LinkedFlight
+from hil.linked_flight import MOCAP, NATNET, LinkedFlight
 from hil.metrics import METRICS, Verdict, free_flight, judge, measure
 from hil.recorder import Recorder, load_log
 
@@ -51,6 +53,7 @@ class Request:
     link: str = "radio"  # radio and mavlink: in lockstep; a URI: a station in a process of its own, paced
     faults: tuple[Fault, ...] = ()  # on top of the experiment's own; `LabError` for those that cannot act
     board: str = PYTHON  # what executes the flight core
+    mocap: str | None = None  # where a station in a process of its own has its poses from; None in lockstep
 
     def __post_init__(self) -> None:
         if self.board not in BOARDS:
@@ -61,6 +64,12 @@ class Request:
             raise LabError(
                 f"fault {self.faults[0]}: --link {self.link}: faults act on flights in lockstep only"
             )
+        if self.mocap is not None and self.in_lockstep:
+            raise LabError(
+                f"--mocap {self.mocap}: --link {self.link}: a flight in lockstep has its own poses"
+            )
+        if self.mocap not in (None, *MOCAP):
+            raise LabError(f"--mocap {self.mocap}: expected {' or '.join(MOCAP)}")
         check(self.faults, self.duration_s, self.link, self.config.markers.enabled)
 
     @classmethod
@@ -74,12 +83,20 @@ class Request:
         link: str = "radio",
         faults: Sequence[Fault] = (),
         board: str = PYTHON,
+        mocap: str | None = None,
     ) -> Request:
-        """Return the request for an experiment: its settings on the profile, `overrides` on both. Raises `LabError`."""
+        """Return the request for an experiment: its settings on the profile, `overrides` on both. Raises `LabError`.
+
+        Without `mocap` a station in a process of its own has its poses from a virtual Motive.
+        """
+        if mocap is None and link not in LOCKSTEP:
+            mocap = NATNET
         overrides = (*experiment.settings, *overrides)
         config = load_config(profile, overrides)
         duration_s = experiment.duration_s if duration_s is None else duration_s
-        return cls(experiment, config, profile, overrides, seed, duration_s, link, tuple(faults), board)
+        return cls(
+            experiment, config, profile, overrides, seed, duration_s, link, tuple(faults), board, mocap
+        )
 
     @property
     def in_lockstep(self) -> bool:
@@ -117,6 +134,7 @@ class Result:
     tasks: tuple[TaskReport, ...]
     queues: tuple[QueueReport, ...]
     usage: Usage | None  # of the board, where it was measured
+    ages: tuple[Stage, ...]  # where the age of the poses came from
 
     @property
     def passed(self) -> bool:
@@ -171,7 +189,10 @@ def fly(
     )
     tasks = tuple(firmware.statistics.reports())
     usage = firmware.runner.usage if isinstance(firmware.runner, CortexM4Runner) else None
-    result = Result(folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues, usage)
+    ages = ages_of(folder / "telemetry.csv", log, request.link)
+    result = Result(
+        folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues, usage, ages
+    )
     write_result(result)
     return result
 
@@ -187,9 +208,11 @@ def _flight(request: Request, telemetry: Path, clock: Clock | None, trace_all: b
             request.link, request.faults, runner,
         )  # fmt: skip
     profile = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
+    assert request.mocap is not None
     return LinkedFlight(
-        request.config, request.experiment, request.duration_s, request.seed, telemetry, request.link, profile
-    )
+        request.config, request.experiment, request.duration_s, request.seed, telemetry, request.link,
+        request.mocap, profile,
+    )  # fmt: skip
 
 
 def prepare(folder: Path) -> None:
@@ -218,6 +241,7 @@ def write_result(result: Result) -> None:
         "seed": request.seed,
         "duration_s": request.duration_s,
         "link": request.link,
+        "mocap": request.mocap,
         "board": request.board,
         "faults": [str(fault) for fault in request.all_faults],
         "outcome": result.outcome,
@@ -236,6 +260,7 @@ def write_result(result: Result) -> None:
         "tasks": [asdict(task) for task in result.tasks],
         "queues": [asdict(queue) for queue in result.queues],
         "usage": asdict(result.usage) if result.usage else None,
+        "ages": [asdict(stage) for stage in result.ages],
         "hash": result.hash,
         "versions": versions(),
         "commit": commit(),
@@ -260,6 +285,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         "seed": int(metadata.get("seed", 0)),
         "duration_s": float(metadata.get("duration_s", 0)),
         "link": metadata.get("link", "radio"),
+        "mocap": metadata.get("mocap") or None,
         "board": metadata.get("board", PYTHON),
         "faults": json.loads(metadata.get("faults", "[]")),
         "outcome": "error",
@@ -269,6 +295,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         "tasks": [],
         "queues": [],
         "usage": None,
+        "ages": [],
         "passed": False,
         "hash": "",
         "versions": json.loads(metadata.get("versions", "{}")),
@@ -286,6 +313,7 @@ def metadata_of(request: Request) -> dict[str, str]:
         "seed": str(request.seed),
         "duration_s": str(request.duration_s),
         "link": request.link,
+        "mocap": request.mocap or "",
         "board": request.board,
         "faults": json.dumps([str(fault) for fault in request.all_faults]),
         "config": request.config.model_dump_json(),

@@ -21,8 +21,10 @@ class SerialLine:
         self.uart = VirtualSerial(config.serial, events, rng)
         poses_hz = 1e6 / (config.mocap.period_us * config.station.send_every)
         key = bytes.fromhex(config.mavlink.signing_key)
+        latency_us = config.station.link_latency_us
+        settings = MavlinkLinkConfig(config.serial.baud, poses_hz, key, latency_us=latency_us)
         try:
-            self.link = MavlinkLink(self.uart.uplink, MavlinkLinkConfig(config.serial.baud, poses_hz, key))
+            self.link = MavlinkLink(self.uart.uplink, settings)
         except LinkError as error:
             raise LabError(f"--link mavlink: {error}") from None
 

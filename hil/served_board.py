@@ -299,9 +299,9 @@ class ServedBoard:
             self.catch_up(now_us)
             self._plant.advance(now_us - self._placed_us)
             frame = self._mocap.expose(now_us, self._plant)
-            self._events.at(
-                now_us + self._config.mocap.latency_us, partial(self._deliver, frame, self._mocap.sighting)
-            )
+            arrival_us, sighting = self._mocap.arrival_us(now_us), self._mocap.sighting
+            frame = self._mocap.stamped(frame, arrival_us)
+            self._events.at(arrival_us, partial(self._deliver, frame, sighting))
 
     def _deliver(self, frame: MocapFrame, sighting: Sighting | None, now_us: int) -> None:
         for publish in self._publish:

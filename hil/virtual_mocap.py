@@ -44,6 +44,12 @@ class MocapConfig(BaseModel):
         le=1_000_000,
         description="exposure to arrival at the ground station; with the radio's 2 ms the paper's 40 ms",
     )
+    processing_us: int = Field(
+        18_000,
+        ge=0,
+        le=1_000_000,
+        description="of these, in the cameras' computer [us]: the rest is exposure and transfer; assumed",
+    )
     position_noise: float = Field(
         0.0005, ge=0, le=0.1, description="white, per axis [m]; physics.md section 6"
     )
@@ -72,6 +78,7 @@ class VirtualMocap:
     ) -> None:
         """With `markers`, poses come from them."""
         self._config = config
+        self._camera_us = max(0, config.latency_us - config.processing_us)
         self._rng = rng
         # Streams of their own, so that faults leave the noise of the other frames as it was, and one another alone.
         self._rng_outlier, self._rng_dropout, self._rng_wrong = rng.spawn(3)
@@ -125,6 +132,11 @@ class VirtualMocap:
         latency_us = self._config.latency_us + round(self.more_latency_us)
         self._arrival_us = max(self._arrival_us, now_us + latency_us)
         return self._arrival_us
+
+    def stamped(self, frame: MocapFrame, arrival_us: int) -> MocapFrame:
+        """Return the frame with its way: whatever is late is late in the cameras' computer, the network takes no time."""
+        received_us = frame.t_us + self._camera_us
+        return MocapFrame(frame.t_us, frame.p_WB, frame.q_WB, frame.valid, received_us, arrival_us)
 
 
 def _direction(rng: np.random.Generator) -> Vector:

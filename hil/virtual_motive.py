@@ -145,8 +145,10 @@ class VirtualMotive:
         self._seen, self._labelled, self._unlabelled = [], [], []
         self._number += 1
         sent = self._ticks()
-        # The cameras' latency is one number, spent ahead of Motive's computer; none of it lies before its start.
-        exposed = max(0, sent - (now_us - frame.t_us) * _TICKS_PER_US)
+        exposed, received = (
+            max(0, sent - (now_us - t_us) * _TICKS_PER_US)  # nothing lies before the start
+            for t_us in (frame.t_us, now_us if frame.received_us is None else frame.received_us)
+        )
         whole = Frame(
             self._number,
             bodies,
@@ -154,7 +156,7 @@ class VirtualMotive:
             labelled,
             exposed * 1e-6 / _TICKS_PER_US,
             exposed,
-            sent,
+            received,
             sent,
             parameters=0,
         )

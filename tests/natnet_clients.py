@@ -75,9 +75,13 @@ def by_motioncapture(port: int, count: int) -> None:
 
 
 def by_ground_station(port: int, multicast: bool, count: int) -> None:
+    from ground_station.sources.config import CaptureConfig
     from ground_station.sources.optitrack import OptitrackSource
 
-    source = OptitrackSource("127.0.0.1", port, "floaty", multicast, "z-up")  # as they come
+    as_they_come = CaptureConfig(
+        system="optitrack", port=port, body="floaty", multicast=multicast, axes="z-up"
+    )
+    source = OptitrackSource(as_they_come)
     source.open()
     while count > 0:
         if (frame := source.receive(1.0)) is not None:

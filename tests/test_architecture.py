@@ -40,13 +40,15 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "elftools": ("firmware_py/export/arm_image.py",),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
     "subprocess": (
-        "hil/run.py", "hil/window.py", "hil/linked_flight.py", "firmware_py/export/native.py",
+        "hil/run.py", "hil/window.py", "hil/linked_flight.py", "ground_station/sources/motioncapture_client.py",
+        "firmware_py/export/native.py",
         "firmware_py/export/arm_image.py", "firmware_py/export/plain.py",
     ),
     "socket": (
         "hil/window.py", "hil/dongle_plugin.py", "hil/dongle_server.py", "hil/udp_server.py", "hil/serial_server.py",
         "hil/linked_flight.py", "hil/virtual_motive.py",
         "ground_station/mocap_udp.py", "ground_station/sources/optitrack.py",
+        "ground_station/sources/motioncapture_process.py",
     ),
     "random": (),
     "secrets": (),
@@ -58,7 +60,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
         "firmware_py/wire/mavlink.py", "firmware_py/wire/mavlink_layouts.py", "firmware_py/wire/mavlink_services.py",
     ),
     "filterpy": ("ground_station/pose_filter.py",),
-    "motioncapture": (),
+    "motioncapture": ("ground_station/sources/motioncapture_process.py",),
     "scipy": ("hil/rigid_body.py",),
     "perfetto": ("hil/perfetto.py",),
     "matplotlib": (
@@ -69,7 +71,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "pyarrow": (
         "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
         "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
-        "hil/compare.py", "hil/experiments/overload.py", "hil/overlays.py",
+        "hil/compare.py", "hil/ages.py", "hil/experiments/overload.py", "hil/overlays.py",
         "hil/picture.py", "hil/power_figures.py", "hil/experiments/experiment.py", "hil/experiments/measures.py",
         "hil/experiments/pictures.py", "hil/experiments/airspeed.py", "hil/experiments/power.py",
         "hil/experiments/take_off.py",

@@ -178,6 +178,19 @@ def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
             assert float(first[f"{variable.name} [{variable.unit}]"]) == expected
 
 
+def test_times_are_to_the_microsecond_on_a_computer_that_has_run_for_days(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = Bench(log=log)
+    now_us = 1_000_000_123_457
+    bench.station.on_frame(MocapFrame(now_us - 38_001, (0.0, 0.0, 1.15), UPRIGHT, True), now_us)
+    for data in telemetry_packets(20):
+        bench.station.on_packet(now_us, data)
+    log.close()
+    (row,) = rows(tmp_path / "telemetry.csv")
+    times_us = [round(float(row[title]) * 1e6) for title in ("ground.t [s]", "mocap.t [s]")]
+    assert times_us == [now_us, now_us - 38_001]
+
+
 def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
     bench = Bench(log=log)

@@ -50,7 +50,7 @@ class Bench:
             self.codec.signing.sign_outgoing = True
         self.sent = []  # (now_us, message)
         self.bytes = 0
-        self.link = MavlinkLink(self._transmit, MavlinkLinkConfig(baud, pose_hz, key))
+        self.link = MavlinkLink(self._transmit, MavlinkLinkConfig(baud, pose_hz, key, latency_us=900))
 
     def _transmit(self, now_us, data):
         self.bytes += len(data)
@@ -264,6 +264,32 @@ def test_the_round_trip_is_that_of_the_own_request_only():
     assert bench.link.statistics.round_trip_us is None
     bench.hear(1_004_200, dialect.MAVLink_timesync_message(5, request.ts1))
     assert bench.link.statistics.round_trip_us == 4200
+
+
+def test_the_latency_is_half_of_the_round_trip_and_assumed_before():
+    bench = Bench()
+    assert str(bench.link.latency) == "serial (assumed)"
+    assert bench.link.latency.us == 900
+    bench.pose(1_000_000)
+    ((_, request),) = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)
+    bench.hear(1_004_200, dialect.MAVLink_timesync_message(5, request.ts1))
+    assert str(bench.link.latency) == "serial"
+    assert bench.link.latency.us == 2100
+
+
+def test_what_is_read_late_counts_from_its_arrival():
+    """The board's request is answered with the middle between arrival and answer, as NTP has it."""
+    bench = Bench()
+    bench.pose(1_000_000)
+    request = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)[0][1]
+    messages = (
+        dialect.MAVLink_timesync_message(5, request.ts1),
+        dialect.MAVLink_timesync_message(0, 777),
+    )
+    bench.link.receive(1_004_200, b"".join(message.pack(bench.codec) for message in messages), 1_010_200)
+    assert bench.link.latency.us == 2100
+    answered_us, answer = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)[1]
+    assert (answered_us, answer.tc1, answer.ts1) == (1_010_200, 1_007_200_000, 777)
 
 
 # What goes wrong

@@ -17,6 +17,8 @@ from natnet_packets import VERSIONS
 from ground_station.errors import MocapError
 from ground_station.natnet import Echo, Frame, ModelDefinition, Other, ServerInfo, decode
 from ground_station.natnet_stream import NatnetStream
+from ground_station.sources.alignment import Alignment
+from ground_station.sources.config import CaptureConfig
 
 PACKETS = int(os.environ.get("FLOATY_FUZZ", "20000"))
 TICKS = (100, 200, 300)
@@ -105,7 +107,7 @@ def test_any_payload_is_read_or_refused(payload: bytes, message: int, version: V
 def test_no_mutated_packet_harms_the_stream() -> None:
     rng = np.random.default_rng(8)
     version: Version = (4, 1)
-    stream = NatnetStream("floaty", "z-up")
+    stream = NatnetStream("floaty", Alignment(CaptureConfig()))
     models = packets.model_definition({"floaty": 7}, version)
     stream.on_packet(packets.server_info(version), 0)
     stream.on_packet(models, 0)

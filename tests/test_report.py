@@ -123,6 +123,24 @@ def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_pictures")
+def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) -> None:
+    ages = read_result(folder)["ages"]
+    rows = report(folder).tables["ages"][1:]
+    assert [row[0] for row in rows] == [
+        "pose on board",
+        "camera",
+        "processing",
+        "network",
+        "station",
+        "radio",
+    ]
+    for row, stage in zip(rows, ages, strict=True):
+        assert [float(text) for text in row[1:]] == pytest.approx(
+            [1e-3 * stage["mean_us"], 1e-3 * stage["p99_us"]], abs=0.006
+        )
+
+
+@pytest.mark.usefixtures("few_pictures")
 def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
     change_result(folder, overrides=["tunnel.turbulence=T1"], commit="0123456789ab")
     result, page = read_result(folder), report(folder)

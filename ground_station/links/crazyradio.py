@@ -8,11 +8,13 @@ limit, and everything that goes wrong is a `LinkError` of one line. Of the links
 import logging
 import queue
 import re
+import struct
 import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import median_low
 
 import cflib.crtp
 from cflib.crazyflie import Crazyflie
@@ -25,6 +27,7 @@ from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, Block, Sample
 from ground_station.clock import clock_us
 from ground_station.corrections import Correction, correct
 from ground_station.errors import LinkError
+from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
@@ -34,6 +37,12 @@ SILENCE_TIMEOUT_US = 2_000_000  # connected: telemetry comes 50 times, an echo 1
 CLOSE_TIMEOUT_S = 3.0
 MAX_AGE_US = 120_000  # older corrections are not sent: the board could not use them
 RECEIVE_QUEUE = 1000  # packets of telemetry
+ECHO_PERIOD_US = 100_000  # between packets that the board sends back
+ECHO_APART_US = 3_000  # from the last correction, in whose way they would be
+ECHOES = 30  # of which the median counts
+ECHO_HEADER = 0xF0  # port 15, channel 0
+ECHO = struct.Struct("<BQ")  # kind, own clock [us]; as long as cflib's own, which have kind 0
+OWN_ECHO = 1
 MIN_PROTOCOL = 4  # version from which the tables of contents are as read here
 NULL_HEADER, NULL_MASK = 0xF3, 0xF3
 URIS = (r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?", r"udp://[\w.-]+:\d{1,5}")
@@ -42,26 +51,33 @@ SUPERVISOR_STATE = "supervisor.state"
 
 @dataclass(slots=True)
 class LinkStatistics:
-    """What the link looks like; values of cflib, 0 when unknown (UDP)."""
+    """What the link looks like; quality, rate and signal strength are cflib's, 0 over UDP."""
 
     sent: int = 0  # corrections
     replaced: int = 0  # by a newer one before they could be sent
     too_old: int = 0
     quality: float = 0.0  # [%] 100: no retries
-    latency_ms: float = 0.0  # round trip, 95th percentile
     rate: float = 0.0  # exchanges with the board [1/s]
     rssi: float = 0.0  # [-dBm]
 
 
 class CrazyradioLink:
-    """One board. `open` before use; it may be opened again after `close`. `latency_us`: from sending to the board."""
+    """One board. `open` before use; it may be opened again after `close`.
+
+    `latency_us`: to the board, until it is measured as half of the round trip of packets that the board sends back.
+    """
 
     def __init__(self, uri: str, latency_us: int) -> None:
         self.uri = uri
         self.statistics = LinkStatistics()
         self.supervisor_state: int | None = None  # as last received
         self._missing: list[str] = []  # telemetry variables that the board does not have, not told yet
-        self._latency_us = latency_us
+        self._medium = uri.partition(":")[0]
+        self.latency = LinkLatency(self._medium, latency_us, measured=False)
+        self._round_trips_us: deque[int] = deque(maxlen=ECHOES)
+        self._echo_us = 0  # when to ask for the next one
+        self._echo_is_due = False
+        self._sent_us = 0  # the last correction
         self._cache = tempfile.TemporaryDirectory(prefix="floaty-toc-")
         self._crazyflie: Crazyflie | None = None
         self._blocks: dict[int, Block] = {}
@@ -138,7 +154,7 @@ class CrazyradioLink:
             return lambda value: setattr(statistics, name, float(value))
 
         source.link_quality_updated.add_callback(note("quality"))
-        source.latency_updated.add_callback(note("latency_ms"))
+        crazyflie.add_port_callback(CRTPPort.LINKCTRL, self._on_echo)
         source.uplink_rate_updated.add_callback(note("rate"))
         source.uplink_rssi_updated.add_callback(note("rssi"))
 
@@ -180,19 +196,26 @@ class CrazyradioLink:
             self._mail.notify()
 
     def _send_loop(self, crazyflie: Crazyflie) -> None:
-        """Send what lies in the mailbox, with the age that it has by now."""
+        """Send what lies in the mailbox, with the age that it has by now, and what is to be echoed."""
         while True:
             with self._mail:
-                self._mail.wait_for(lambda: self._mailbox is not None or not self._sending)
-                if not self._sending or self._mailbox is None or self._crazyflie != crazyflie:
+                self._mail.wait_for(lambda: self._mailbox or self._echo_is_due or not self._sending)
+                if not self._sending or self._crazyflie != crazyflie:
                     return
-                (submitted_us, correction), self._mailbox = self._mailbox, None
-            age_us = correction.age_us + clock_us() - submitted_us + self._latency_us
+                echo_is_due, self._echo_is_due = self._echo_is_due, False
+                mail, self._mailbox = self._mailbox, None
+            if echo_is_due:
+                crazyflie.send_packet(_packet(ECHO_HEADER, ECHO.pack(OWN_ECHO, clock_us())))
+            if mail is None:
+                continue
+            submitted_us, correction = mail
+            self._sent_us = clock_us()
+            age_us = correction.age_us + self._sent_us - submitted_us + self.latency.us
             if age_us > MAX_AGE_US:
                 self.statistics.too_old += 1
                 continue
             data = encode_ext_pose(correction.p_GB, correction.q_GB, age_us)
-            crazyflie.send_packet(CRTPPacket(data[0], list(data[1:])))
+            crazyflie.send_packet(_packet(data[0], data[1:]))
             self.statistics.sent += 1
 
     # Downlink
@@ -231,6 +254,23 @@ class CrazyradioLink:
             self._telemetry_us = clock_us()
             self._received.append((self._telemetry_us, bytes((packet.header,)) + bytes(packet.data)))
 
+    def _ask_for_echo(self, now_us: int) -> None:
+        """Let the board send a packet back, well apart from corrections: both would be slower."""
+        if now_us < self._echo_us or now_us - self._sent_us < ECHO_APART_US:
+            return
+        self._echo_us = now_us + ECHO_PERIOD_US
+        with self._mail:
+            self._echo_is_due = True
+            self._mail.notify()
+
+    def _on_echo(self, packet: CRTPPacket) -> None:
+        if packet.channel or len(packet.data) != ECHO.size:
+            return
+        kind, asked_us = ECHO.unpack(packet.data)
+        if kind == OWN_ECHO:
+            self._round_trips_us.append(clock_us() - asked_us)
+            self.latency = LinkLatency(self._medium, median_low(self._round_trips_us) // 2, measured=True)
+
     def notices(self) -> list[str]:
         """Return what the user should know and was not told yet."""
         missing, self._missing = self._missing, []
@@ -241,16 +281,15 @@ class CrazyradioLink:
     def summary(self) -> str:
         """Return one line on how the link does."""
         link = self.statistics
-        return (
-            f"corrections {link.sent} sent, {link.replaced + link.too_old} late  quality {link.quality:.0f} %  "
-            f"round trip {link.latency_ms:.1f} ms  {link.rate:.0f} exchanges/s"
-        )
+        radio = f"  quality {link.quality:.0f} %  {link.rate:.0f} exchanges/s" if link.rate else ""
+        return f"corrections {link.sent} sent, {link.replaced + link.too_old} late{radio}"
 
     def check(self) -> None:
         """Raise `LinkError` when the link is lost."""
         if not self._news.empty():
             raise LinkError(f"{self.uri}: lost: {self._news.get() or 'connected twice'}")
         now_us = clock_us()
+        self._ask_for_echo(now_us)
         if now_us - self._heard_us > SILENCE_TIMEOUT_US:
             raise LinkError(f"{self.uri}: lost: silent for {SILENCE_TIMEOUT_US * 1e-6:.0f} s")
         if (
@@ -275,6 +314,10 @@ class CrazyradioLink:
             closing = threading.Thread(target=crazyflie.close_link, name="closing", daemon=True)
             closing.start()
             closing.join(CLOSE_TIMEOUT_S)
+
+
+def _packet(header: int, data: bytes) -> CRTPPacket:
+    return CRTPPacket(header, list(data))
 
 
 def quiet_cflib() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, encode_ext_pose
 from firmware_py.wire.telemetry import Sample, decode_sample, encode_stream_request
 from ground_station.corrections import correct
+from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
@@ -13,8 +14,8 @@ class LoopbackLink:
     """CRTP to a carrier in the same process. `latency_us` is what the carrier is expected to need."""
 
     def __init__(self, transmit: Callable[[int, bytes], object], latency_us: int) -> None:
+        self.latency = LinkLatency("radio", latency_us, measured=False)
         self._transmit = transmit
-        self._latency_us = latency_us
 
     def start_telemetry(self, now_us: int) -> None:
         """Ask the board for its telemetry."""
@@ -23,7 +24,7 @@ class LoopbackLink:
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         """Hand the correction to the carrier, with the age that it will have on arrival."""
         correction = correct(frame, goal, now_us)
-        age_us = correction.age_us + self._latency_us
+        age_us = correction.age_us + self.latency.us
         self._transmit(now_us, encode_ext_pose(correction.p_GB, correction.q_GB, age_us))
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:

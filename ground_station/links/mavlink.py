@@ -18,6 +18,7 @@ from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
 from firmware_py.wire.telemetry import BLOCKS, Sample
+from ground_station.latency import LinkLatency
 from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
@@ -46,6 +47,7 @@ class MavlinkLinkConfig:
     pose_hz: float
     signing_key: bytes = b""  # 32 bytes; empty: nothing is signed
     signing_start: int = 0  # [10 us since 2015-01-01]
+    latency_us: int = 0  # to the board, until it is measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,7 @@ class MavlinkLink:
         self.board: int | None = None  # its system id, None before the first heartbeat
         self.answered = False  # it has acknowledged a command
         self.heard_us = 0  # when its last frame came
+        self.latency = LinkLatency("serial", config.latency_us, measured=False)
         self._carry = transmit
         self._sender = FrameSender(SYSTEM, COMPONENT, signing)
         self._receiver = FrameReceiver(signing)
@@ -86,6 +89,7 @@ class MavlinkLink:
         self._streamed: Counter[int] = Counter()  # messages by number since the last look
         self._look_us = 0  # when to look after the link next
         self._time_request_ns = 0  # own clock in the last one
+        self._read_us = 0  # when what is being understood was read
         self._handlers: dict[int, Callable[[int, Message], Sequence[Sample]]] = {
             mavlink.MSG_HEARTBEAT: self._on_heartbeat,
             mavlink.MSG_TIMESYNC: self._on_timesync,
@@ -151,8 +155,12 @@ class MavlinkLink:
 
     # Downlink
 
-    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """The telemetry in a piece of the stream of bytes, which may be empty; never raises."""
+    def receive(self, now_us: int, data: bytes, read_us: int | None = None) -> Sequence[Sample]:
+        """The telemetry in a piece of the stream of bytes that came at `now_us`, which may be empty; never raises.
+
+        `read_us` is the present instant where it is a later one.
+        """
+        self._read_us = now_us if read_us is None else read_us
         samples: list[Sample] = []
         for message in self._receiver.feed(now_us, data):
             handler = self._handlers.get(message.get_msgId())
@@ -161,8 +169,8 @@ class MavlinkLink:
             self.heard_us = now_us
             self._streamed[message.get_msgId()] += 1
             samples += handler(now_us, message)
-        if now_us >= self._look_us:
-            self._look_after(now_us)
+        if self._read_us >= self._look_us:
+            self._look_after(self._read_us)
         return samples
 
     def _is_of_board(self, message: Message) -> bool:
@@ -177,9 +185,13 @@ class MavlinkLink:
 
     def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:
         if message.tc1 == 0:
-            self._send(now_us, mavlink.timesync(now_us * 1000, message.ts1))
+            # The board takes our answer's time for the middle between its request and its receipt. So the middle
+            # between arrival and answer is said, as NTP has it: a late answer is less precise, but not wrong.
+            middle_us = (now_us + self._read_us) // 2
+            self._send(self._read_us, mavlink.timesync(middle_us * 1000, message.ts1))
         elif message.ts1 == self._time_request_ns:
             self._round_trip_us = now_us - message.ts1 // 1000
+            self.latency = LinkLatency("serial", self._round_trip_us // 2, measured=True)
         return ()
 
     def _on_command_ack(self, now_us: int, message: Message) -> Sequence[Sample]:

@@ -21,6 +21,7 @@ from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us, signing_start
 from ground_station.errors import LinkError
+from ground_station.latency import LinkLatency
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
@@ -232,13 +233,14 @@ class MavlinkSerialLink:
         return pieces
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """The telemetry in what arrived at `now_us`.
-
-        The board takes our answer's time for the middle between its request and its receipt. So the middle between
-        arrival and answer is said, as NTP has it: a late answer is less precise, but not wrong.
-        """
+        """The telemetry in what arrived at `now_us`."""
         with self._lock:
-            return self._link.receive((now_us + clock_us()) // 2, data)
+            return self._link.receive(now_us, data, clock_us())
+
+    @property
+    def latency(self) -> LinkLatency:
+        """From `send` to the board: half of the round trip of a time request."""
+        return self._link.latency
 
     @property
     def supervisor_state(self) -> int | None:

@@ -1,36 +1,68 @@
-"""What `--mocap` says: virtual[:PORT] or optitrack:HOST[:PORT][,multicast][,body=NAME][,z-up].
+"""What `--mocap` says, on top of `[capture]` of the profile: SYSTEM[:HOST[:PORT]][,OPTION...] or replay:PATH."""
 
-Motive streams with its y axis up unless it is told otherwise.
-"""
+from pathlib import Path
+from typing import Any, get_args
 
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapSource
-from ground_station.mocap_udp import DEFAULT_PORT
-from ground_station.natnet import COMMAND_PORT
-from ground_station.natnet_stream import Axes
+from ground_station.sources.config import CaptureConfig, System
+from ground_station.sources.motioncapture_client import MotioncaptureSource, settings_of
 from ground_station.sources.optitrack import OptitrackSource
+from ground_station.sources.replay import ReplaySource
 from ground_station.sources.virtual import VirtualSource
 
-FORMS = "virtual, virtual:PORT or optitrack:HOST[:PORT][,multicast][,body=NAME][,z-up]"
+FORMS = (
+    "virtual[:PORT], optitrack:HOST[:PORT], vicon:HOST[:PORT], qualisys:HOST or vrpn:HOST[:PORT], "
+    "with ,multicast ,body=NAME ,z-up or ,y-up; or replay:PATH"
+)
+REPLAY = "replay:"
 
 
-def find_source(text: str) -> MocapSource:
-    """The source of that name, not open yet; `MocapError` for what is none."""
-    system, *options = text.split(",")
-    name, _, place = system.partition(":")
-    if name == "virtual" and not options and ":" not in place:
-        return VirtualSource(_port(place) if system != name else DEFAULT_PORT)
-    host, colon, port = place.partition(":")
-    if name != "optitrack" or not host:
+def find_source(text: str | None, capture: CaptureConfig) -> MocapSource:
+    """The source that `text` names, else the profile's, not open yet; `MocapError` for what is none."""
+    if text is not None and text.startswith(REPLAY):
+        return ReplaySource(Path(text.removeprefix(REPLAY)))
+    chosen = capture if text is None else override(text, capture)
+    if chosen.system == "qualisys" and chosen.port is not None:
+        raise MocapError("qualisys: its client knows no port but 22222")
+    if chosen.system == "virtual":
+        return VirtualSource(chosen.port)
+    if chosen.system == "optitrack":
+        return OptitrackSource(chosen)
+    return MotioncaptureSource(chosen.system, settings_of(chosen), chosen)
+
+
+def override(text: str, capture: CaptureConfig) -> CaptureConfig:
+    """`capture` with what `text` names; another system comes with its own host, port, multicast and axes."""
+    place, *options = text.split(",")
+    system, colon, where = place.partition(":")
+    if system not in get_args(System):
         raise MocapError(f"expected {FORMS}")
-    body = ""
+    host, second_colon, port = ("", colon, where) if system == "virtual" else where.partition(":")
+    another = system != capture.system
+    if system != "virtual" and not host and (colon or another):
+        raise MocapError(f"expected {FORMS}")
+    values: dict[str, Any] = {"system": system}
+    if another:
+        values |= {"port": None, "multicast": False, "axes": None}
+    if host:
+        values |= {"host": host, "port": None}
+    if second_colon:
+        values["port"] = _port(port)
     for option in options:
+        values |= _option(option, system)
+    return capture.model_copy(update=values)
+
+
+def _option(option: str, system: str) -> dict[str, Any]:
+    if system != "virtual":  # that one is a stream of one body, in W
         if option.startswith("body=") and len(option) > 5:
-            body = option[5:]
-        elif option not in ("multicast", "z-up"):
-            raise MocapError(f"{option!r}: expected {FORMS}")
-    axes: Axes = "z-up" if "z-up" in options else "y-up"
-    return OptitrackSource(host, _port(port) if colon else COMMAND_PORT, body, "multicast" in options, axes)
+            return {"body": option[5:]}
+        if option in ("z-up", "y-up"):
+            return {"axes": option}
+        if option == "multicast" and system == "optitrack":
+            return {"multicast": True}
+    raise MocapError(f"{option!r}: expected {FORMS}")
 
 
 def _port(text: str) -> int:

@@ -7,30 +7,32 @@ from contextlib import suppress
 from ground_station.clock import clock_us
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
-from ground_station.natnet import MessageId, packet
-from ground_station.natnet_stream import Axes, NatnetStream
+from ground_station.natnet import COMMAND_PORT, MessageId, packet
+from ground_station.natnet_stream import NatnetStream
+from ground_station.sources.alignment import Alignment
+from ground_station.sources.config import CaptureConfig
 
 CONNECT_TIMEOUT_US = 3_000_000
 PACKET_MAX = 65_536
 
 
 class OptitrackSource:
-    """Follows one body of the Motive at `host`; `multicast` insists on frames that come so."""
+    """Follows one body of a Motive."""
 
-    def __init__(self, host: str, port: int, body: str, multicast: bool, axes: Axes) -> None:
-        self._host = host
-        self._port = port
-        self._body = body
-        self._multicast = multicast
-        self._axes: Axes = axes
-        self._stream = NatnetStream(body, axes)
+    def __init__(self, capture: CaptureConfig) -> None:
+        self._host = capture.host
+        self._port = capture.port or COMMAND_PORT
+        self._body = capture.body
+        self._multicast = capture.multicast
+        self._alignment = Alignment(capture)
+        self._stream = NatnetStream(self._body, self._alignment)
         self._sockets: list[socket.socket] = []
         self._waiting: list[socket.socket] = []  # sockets that have packets
         self._address = ""
 
     def open(self) -> None:
         """Find the server and the body; raises `MocapError` within 4 s."""
-        self._stream = NatnetStream(self._body, self._axes)
+        self._stream = NatnetStream(self._body, self._alignment)
         try:
             self._address = socket.gethostbyname(self._host)
             self._add_socket(0)
@@ -48,17 +50,18 @@ class OptitrackSource:
         while stream.models is None:
             self.receive(0.05)
             if clock_us() > deadline_us:
-                what = "no NatNet server answers" if stream.server is None else "the server names no bodies"
-                raise MocapError(f"{self._host}:{self._port}: {what}")
+                raise MocapError(f"{self._host}:{self._port}: {stream.missing()}")
         server = stream.server
         assert server is not None
         if self._multicast and not server.multicast:
             raise MocapError(f"{server.name} at {self._host} does not stream by multicast")
         if server.multicast:
             self._join(server.group, server.data_port)
-        version = f"NatNet {server.natnet_version[0]}.{server.natnet_version[1]}"
+        version = f"NatNet {stream.version[0]}.{stream.version[1]}"
         way = "multicast" if server.multicast else "unicast"
-        stream.notices.append(f"mocap {server.name} at {self._host}, {version}, {way}, {self._axes}")
+        stream.notices.append(
+            f"mocap {server.name} at {self._host}, {version}, {way}, {self._alignment.axes}"
+        )
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
         """The next frame, None when none comes in time."""
@@ -80,10 +83,7 @@ class OptitrackSource:
     def summary(self) -> str:
         """A few words on how it does."""
         counters = self._stream.counters
-        return (
-            f"mocap {self._stream.age_us / 1000:.1f} ms old, {counters.lost} lost, {counters.dropped} dropped, "
-            f"{counters.malformed} malformed"
-        )
+        return f"mocap {counters.lost} lost, {counters.dropped} dropped, {counters.malformed} malformed"
 
     def close(self) -> None:
         """Take leave."""

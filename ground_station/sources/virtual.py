@@ -1,16 +1,19 @@
 """Poses of `floaty board serve`, which come as datagrams of our own."""
 
+from dataclasses import replace
+
 from firmware_py.wire import WireError
+from ground_station.clock import clock_us
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
-from ground_station.mocap_udp import PoseReceiver, decode_frame
+from ground_station.mocap_udp import DEFAULT_PORT, PoseReceiver, decode_frame
 
 
 class VirtualSource:
-    """Listens on a port."""
+    """Listens on a port, by default that of `floaty board serve`."""
 
-    def __init__(self, port: int) -> None:
-        self._port = port
+    def __init__(self, port: int | None) -> None:
+        self._port = DEFAULT_PORT if port is None else port
         self._receiver: PoseReceiver | None = None
         self._malformed = 0
 
@@ -28,7 +31,7 @@ class VirtualSource:
         if data is None:
             return None
         try:
-            return decode_frame(data)
+            return replace(decode_frame(data), arrived_us=clock_us())
         except WireError:
             self._malformed += 1
             return None

@@ -1,0 +1,92 @@
+"""Where the age of a pose comes from: camera, processing, network, station and link, from the exposure to the board.
+
+Camera: until the motion capture computer has the images. Processing: until the pose leaves it. Network: until the
+station has it. Station: until the link gets it. Link: until the board has it. "mocap" is the first three in one, for
+sources that do not tell them apart. Times in microseconds.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil, isnan, nan
+
+from ground_station.mocap import MocapFrame
+
+STAGES = ("camera", "processing", "network", "mocap", "station", "link")
+SENT_POSES = 250  # that the budget is made of: 5 s at 50 Hz
+
+Row = tuple[float, ...]  # the time in each of `STAGES` of one pose; nan: not told
+
+
+@dataclass(frozen=True, slots=True)
+class LinkLatency:
+    """How long a link takes to bring a pose to the board."""
+
+    medium: str
+    us: int
+    measured: bool  # False: assumed
+
+    def __str__(self) -> str:
+        return self.medium if self.measured else f"{self.medium} (assumed)"
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """What many poses spent in a stage."""
+
+    name: str
+    mean_us: float
+    p99_us: float  # 99 of 100 spent no more
+
+
+def row_of(frame: MocapFrame, sent_us: int, link_us: int) -> Row:
+    """The way of a pose that the link got at `sent_us`."""
+    arrived_us = sent_us if frame.arrived_us is None else frame.arrived_us
+    rest = (arrived_us - frame.t_us, sent_us - arrived_us, link_us)
+    if frame.received_us is None or frame.transmitted_us is None:
+        return (nan, nan, nan, *rest)
+    camera_us, processing_us = frame.received_us - frame.t_us, frame.transmitted_us - frame.received_us
+    return (camera_us, processing_us, arrived_us - frame.transmitted_us, *rest)
+
+
+def budget_of(rows: Sequence[Row], medium: str) -> tuple[Stage, ...]:
+    """The stages that are told, and the age on board as "pose" ahead of them; empty without poses."""
+    if not rows:
+        return ()
+    columns = dict(zip((*STAGES[:-1], medium), zip(*rows, strict=True), strict=True))
+    mocap = [name for name in STAGES[:3] if not isnan(sum(columns[name]))] or ["mocap"]
+    pose = _stage("pose", [sum(row[3:]) for row in rows])
+    return (pose, *(_stage(name, columns[name]) for name in (*mocap, "station", medium)))
+
+
+def _stage(name: str, times: Sequence[float]) -> Stage:
+    return Stage(name, sum(times) / len(times), sorted(times)[ceil(0.99 * len(times)) - 1])
+
+
+def budget_line(budget: Sequence[Stage]) -> str:
+    """The budget in one line."""
+    if not budget:
+        return "no pose sent"
+    pose, *parts = budget
+    shares = " + ".join(f"{part.name} {part.mean_us / 1000:.1f}" for part in parts)
+    return f"pose {pose.mean_us / 1000:.1f} ms old on board (99 %: {pose.p99_us / 1000:.1f}): {shares}"
+
+
+class LatencyBudget:
+    """The ways of the poses that were sent last."""
+
+    def __init__(self) -> None:
+        self._link: LinkLatency | None = None  # of the last pose
+        self._sent: deque[tuple[MocapFrame, int, int]] = deque(maxlen=SENT_POSES)
+
+    def add(self, frame: MocapFrame, sent_us: int, link: LinkLatency) -> None:
+        """The link got this pose at `sent_us`."""
+        self._link = link
+        self._sent.append((frame, sent_us, link.us))
+
+    def last(self) -> Row:
+        """The way of the last pose, all nan before."""
+        return row_of(*self._sent[-1]) if self._sent else (nan,) * len(STAGES)
+
+    def __str__(self) -> str:
+        return budget_line(budget_of([row_of(*sent) for sent in self._sent], str(self._link)))

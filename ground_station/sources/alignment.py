@@ -1,0 +1,32 @@
+"""From a motion capture system's frames to ours: the one place where its poses become p_WB and q_WB.
+
+Frames: M as the system streams, C the same with z up, W the tunnel; D the rigid body as it was defined in the system,
+its axes turned z up like those of M, B the robot. C is W turned by `yaw` and moved by `origin`, B likewise in D.
+"""
+
+from firmware_py.geometry import Quaternion, Vector, conjugate, multiply, rotate, yaw_quaternion
+from ground_station.sources.config import Axes, CaptureConfig
+
+
+def with_z_up(p: Vector, q: Quaternion) -> tuple[Vector, Quaternion]:
+    """A pose in axes with y up, for world and body alike, after a quarter turn about x."""
+    return (p[0], -p[2], p[1]), (q[0], q[1], -q[3], q[2])
+
+
+class Alignment:
+    """Where the tunnel lies in the system's frame, and the robot in the rigid body's."""
+
+    def __init__(self, capture: CaptureConfig) -> None:
+        self.axes: Axes = capture.axes or ("y-up" if capture.system == "optitrack" else "z-up")
+        self._p_CW = capture.origin
+        self._q_WC = conjugate(yaw_quaternion(capture.yaw))
+        self._p_DB = capture.body_offset
+        self._q_DB = yaw_quaternion(capture.body_yaw)
+
+    def to_world(self, p_MD: Vector, q_MD: Quaternion) -> tuple[Vector, Quaternion]:
+        """p_WB and q_WB of a pose that the system streamed."""
+        p_CD, q_CD = with_z_up(p_MD, q_MD) if self.axes == "y-up" else (p_MD, q_MD)
+        x, y, z = rotate(q_CD, self._p_DB)
+        a, b, c = self._p_CW
+        p_WB = rotate(self._q_WC, (p_CD[0] + x - a, p_CD[1] + y - b, p_CD[2] + z - c))
+        return p_WB, multiply(multiply(self._q_WC, q_CD), self._q_DB)

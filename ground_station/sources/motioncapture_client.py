@@ -1,0 +1,183 @@
+"""Vicon, Qualisys and VRPN, through the package `motioncapture` in a process of its own (`motioncapture_process`).
+
+That package hides the cameras' time stamps: the exposure is the arrival less `capture.latency_us`. Of VRPN it takes no more
+than 100 poses a second. A process that has ended, because nothing came or it was killed, is started again until frames come.
+"""
+
+import math
+import os
+import select
+import subprocess
+import sys
+
+from ground_station.clock import clock_us
+from ground_station.errors import MocapError
+from ground_station.mocap import MocapFrame
+from ground_station.sources.alignment import Alignment
+from ground_station.sources.capture_lines import Arrival, Body, decode_line
+from ground_station.sources.config import CaptureConfig, choose_body
+
+CONNECT_TIMEOUT_US = 5_500_000  # the process gives up after 5 s without a frame
+SETTLE_US = 1_000_000  # from the first frame on, in which all bodies should have been seen
+SILENCE_US = 500_000
+RESTART_US = 2_000_000  # starting one takes 0.2 s of a processor
+OLDEST_US = 1_000_000  # an arrival longer ago waited in the pipe
+LINE_MAX = 65_536
+
+_MODULE = "ground_station.sources.motioncapture_process"
+
+
+def settings_of(capture: CaptureConfig) -> dict[str, str]:
+    """What `motioncapture.connect` is told."""
+    return {"hostname": capture.host if capture.port is None else f"{capture.host}:{capture.port}"}
+
+
+class MotioncaptureSource:
+    """Follows one body of a system that `motioncapture` knows as `system`."""
+
+    def __init__(self, system: str, settings: dict[str, str], capture: CaptureConfig) -> None:
+        self._system = system
+        arguments = [f"{key}={value}" for key, value in settings.items()]
+        self._command = [sys.executable, "-m", _MODULE, system, *arguments]
+        self._capture = capture
+        self._alignment = Alignment(capture)
+        self._body = ""
+        self._process: subprocess.Popen[bytes] | None = None
+        self._restart_us = 0
+        self._buffer = b""
+        self._lines: list[bytes] = []  # whole ones, the next last
+        self._pose: Body | None = None
+        self._heard_us = 0  # the last frame
+        self._silent = False
+        self._age_us = 0
+        self._lost = 0  # frames without a pose
+        self._malformed = 0
+        self._notices: list[str] = []
+
+    def open(self) -> None:
+        """Find the server and the body; raises `MocapError` within 6 s."""
+        try:
+            self._body = self._find()
+        except MocapError as error:
+            self.close()
+            raise MocapError(f"{self._capture.host}: {error}") from None
+        assumed = f"age assumed: {self._capture.latency_us / 1000:.1f} ms"
+        self._notices.append(
+            f"mocap {self._system} at {self._capture.host}, body {self._body}, {self._alignment.axes}, {assumed}"
+        )
+
+    def _find(self) -> str:
+        """The name of the body; of several the wanted one is taken when it is seen, a single one after a while."""
+        names: dict[str, None] = {}
+        self._start()
+        now_us = clock_us()
+        deadline_us, settled_us = now_us + CONNECT_TIMEOUT_US, math.inf
+        while now_us < min(deadline_us, settled_us) and self._capture.body not in names:
+            arrival = self._next(min(0.1, (deadline_us - now_us) * 1e-6))
+            now_us = clock_us()
+            if isinstance(arrival, str):
+                raise MocapError(arrival)
+            if self._process is None:
+                break
+            if arrival is not None:
+                names |= dict.fromkeys(arrival.bodies)
+                settled_us = min(settled_us, now_us + SETTLE_US)
+                self._heard_us = now_us
+        if settled_us == math.inf:
+            raise MocapError(f"no frames of a {self._system} server")
+        return choose_body(self._capture.body, list(names))
+
+    def receive(self, timeout_s: float) -> MocapFrame | None:
+        """The next frame, None when none comes in time."""
+        deadline_us = clock_us() + round(timeout_s * 1e6)
+        while True:
+            now_us = clock_us()
+            if self._process is None and now_us >= self._restart_us:
+                self._start()
+            if now_us - self._heard_us > SILENCE_US and not self._silent:
+                self._silent = True
+                self._notices.append("motion capture: no frames; calling the server again")
+            arrival = self._next(max(0, deadline_us - now_us) * 1e-6)
+            frame = self._on_arrival(arrival, clock_us()) if isinstance(arrival, Arrival) else None
+            if frame is not None or clock_us() >= deadline_us:
+                return frame
+
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def summary(self) -> str:
+        """A few words on how it does."""
+        return f"mocap {self._age_us / 1000:.1f} ms old (assumed), {self._lost} lost, {self._malformed} malformed"
+
+    def close(self) -> None:
+        """End the process."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+            assert process.stdout is not None
+            process.stdout.close()
+        self._buffer, self._lines = b"", []
+
+    def _on_arrival(self, arrival: Arrival, now_us: int) -> MocapFrame | None:
+        """The frame, None if it tells nothing of the body."""
+        body = arrival.bodies.get(self._body)
+        if (body is None and self._system == "vrpn") or now_us - arrival.t_us > OLDEST_US:
+            return None  # VRPN tells each body's news apart
+        if self._silent:
+            self._silent = False
+            self._notices.append(
+                f"motion capture: frames again after {(now_us - self._heard_us) * 1e-6:.1f} s"
+            )
+        self._heard_us = now_us
+        arrived_us = min(arrival.t_us, now_us)
+        t_us = arrived_us - self._capture.latency_us
+        if body is None or not self._usable(body):
+            self._lost += 1
+            return MocapFrame(t_us, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), valid=False)
+        self._age_us = now_us - t_us
+        x, y, z, qw, qx, qy, qz = body
+        p_WB, q_WB = self._alignment.to_world((x, y, z), (qw, qx, qy, qz))
+        return MocapFrame(t_us, p_WB, q_WB, valid=True, arrived_us=arrived_us)
+
+    def _usable(self, body: Body) -> bool:
+        """Whether it is a rotation, and not the last pose again, which cameras never see."""
+        last, self._pose = self._pose, body
+        rotation = abs(math.hypot(*body[3:]) - 1.0) < 0.01  # False for NaN
+        return rotation and all(map(math.isfinite, body)) and body != last
+
+    def _start(self) -> None:
+        self._process = subprocess.Popen(
+            self._command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True
+        )  # a session of its own: Ctrl-C is for the station
+
+    def _next(self, timeout_s: float) -> Arrival | str | None:
+        """What the process says next, None when nothing comes in time, it has ended, or it cannot be read."""
+        if not self._lines:
+            self._read(timeout_s)
+        if not self._lines:
+            return None
+        try:
+            return decode_line(self._lines.pop())
+        except MocapError:
+            self._malformed += 1
+            return None
+
+    def _read(self, timeout_s: float) -> None:
+        """Wait for bytes and cut them into lines."""
+        pipe = self._process.stdout if self._process is not None else None
+        ready = select.select([pipe] if pipe is not None else [], (), (), timeout_s)[0]
+        if pipe is None or not ready:
+            return
+        data = os.read(pipe.fileno(), LINE_MAX)
+        if not data:
+            self.close()
+            self._restart_us = clock_us() + RESTART_US
+            return
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        self._lines = lines[::-1]
+        if len(self._buffer) > LINE_MAX:
+            self._buffer = b""
+            self._malformed += 1

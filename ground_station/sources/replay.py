@@ -1,0 +1,139 @@
+"""Frames out of a file, at the pace at which they came: a record of `floaty station --record`, or a flight's telemetry.
+
+Telemetry has only the frames that were the last ones when a row began, which arrived then at the latest.
+"""
+
+import csv
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+from firmware_py.geometry import from_euler_zyx
+from ground_station.clock import clock_us, wait
+from ground_station.errors import MocapError
+from ground_station.mocap import MocapFrame
+from ground_station.sources.record import COLUMNS
+
+TELEMETRY = "telemetry.csv"  # in a run folder
+TELEMETRY_COLUMNS = (
+    "ground.t [s]", "mocap.t [s]", "mocap.x [m]", "mocap.y [m]", "mocap.z [m]",
+    "mocap.roll [rad]", "mocap.pitch [rad]", "mocap.yaw [rad]",
+)  # fmt: skip
+TIME_MAX_US = 2**53
+
+Arrived = tuple[int, MocapFrame]  # when, what
+
+
+class ReplaySource:
+    """Plays the file, or the run folder, at `path` once, from the first `receive` that may wait; then it is `over`."""
+
+    def __init__(self, path: Path) -> None:
+        self.over = False
+        self._path = path
+        self._frames: list[Arrived] = []
+        self._next = 0
+        self._shift_us: int | None = None  # from the recording's clock to ours
+        self._notices: list[str] = []
+
+    def open(self) -> None:
+        """Read the file; raises `MocapError`."""
+        self._frames = read_frames(self._path / TELEMETRY if self._path.is_dir() else self._path)
+        self.over, self._next, self._shift_us = False, 0, None
+        first_us, last_us = self._frames[0][0], self._frames[-1][0]
+        self._notices.append(
+            f"mocap {self._path}, {len(self._frames)} frames in {(last_us - first_us) * 1e-6:.1f} s"
+        )
+
+    def receive(self, timeout_s: float) -> MocapFrame | None:
+        """The next frame, None when none comes in time."""
+        now_us = clock_us()
+        if (
+            self._shift_us is None and timeout_s > 0
+        ):  # who only looks whether something is there is not ready yet
+            self._shift_us = now_us - self._frames[0][0]
+        if self._shift_us is None or self.over:
+            wait(timeout_s)
+            return None
+        t_us, frame = self._frames[self._next]
+        ahead_s = (t_us + self._shift_us - now_us) * 1e-6
+        wait(max(0.0, min(ahead_s, timeout_s)))
+        if ahead_s > timeout_s:
+            return None
+        self._next += 1
+        if self._next == len(self._frames):
+            self.over = True
+            self._notices.append(f"the recording is over: {len(self._frames)} frames")
+        return MocapFrame(frame.t_us + self._shift_us, frame.p_WB, frame.q_WB, frame.valid)
+
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def summary(self) -> str:
+        """A few words on how it does."""
+        return f"mocap {self._next} of {len(self._frames)} replayed"
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+
+def read_frames(path: Path) -> list[Arrived]:
+    """The frames of a record or a telemetry log, at least one; `MocapError` for other files."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            frames = list(_frames(csv.DictReader(_whole_lines(file), strict=True)))
+    except OSError as error:
+        raise MocapError(f"{path}: {error.strerror or error}") from None
+    except (csv.Error, UnicodeDecodeError, MocapError) as error:
+        raise MocapError(f"{path}: {error}") from None
+    if not frames:
+        raise MocapError(f"{path}: no frames")
+    for (t_us, _), (next_us, _) in pairwise(frames):
+        if next_us < t_us:
+            raise MocapError(f"{path}: frames go back in time, from {t_us} to {next_us} us")
+    return frames
+
+
+def _whole_lines(lines: Iterator[str]) -> Iterator[str]:
+    """All but a last one that was cut short with its writer's life."""
+    return (line for line in lines if line.endswith("\n"))
+
+
+def _frames(rows: "csv.DictReader[str]") -> Iterator[Arrived]:
+    titles = set(rows.fieldnames or ())
+    recorded = titles.issuperset(COLUMNS)
+    if not recorded and not titles.issuperset(TELEMETRY_COLUMNS):
+        raise MocapError("neither frames of floaty station --record nor telemetry of a flight")
+    last_us: int | None = None
+    for row in rows:
+        try:
+            arrived = _recorded(row) if recorded else _telemetry(row)
+        except (TypeError, ValueError) as error:  # a cell that is missing, or no number
+            raise MocapError(f"line {rows.line_num}: {error}") from None
+        if arrived is not None and (recorded or arrived[1].t_us != last_us):
+            last_us = arrived[1].t_us
+            yield arrived
+
+
+def _recorded(row: dict[str, str]) -> Arrived:
+    x, y, z, qw, qx, qy, qz = (float(row[title]) for title in COLUMNS[2:9])
+    valid = bool(int(row[COLUMNS[9]]))
+    return _time(row[COLUMNS[0]]), MocapFrame(_time(row[COLUMNS[1]]), (x, y, z), (qw, qx, qy, qz), valid)
+
+
+def _telemetry(row: dict[str, str]) -> Arrived | None:
+    """None before the first frame."""
+    arrival_s, t_s, x, y, z, roll, pitch, yaw = (float(row[title]) for title in TELEMETRY_COLUMNS)
+    if math.isnan(t_s):
+        return None
+    frame = MocapFrame(_time(t_s * 1e6), (x, y, z), from_euler_zyx(roll, pitch, yaw), valid=True)
+    return _time(arrival_s * 1e6), frame
+
+
+def _time(value: str | float) -> int:
+    t_us = float(value)
+    if not abs(t_us) <= TIME_MAX_US:  # nor is NaN
+        raise ValueError(f"{value} us is no time")
+    return round(t_us)

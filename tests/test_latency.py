@@ -1,0 +1,178 @@
+"""Where the age of a pose comes from: the budget of its stages, and that the age on board is the true one."""
+
+import math
+import select
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from firmware_py.signals import COUNTERS
+from ground_station.clock import clock_us
+from ground_station.latency import SENT_POSES, LatencyBudget, LinkLatency, budget_line, budget_of, row_of
+from ground_station.mocap import MocapFrame
+from ground_station.sources.address import find_source
+from ground_station.sources.config import CaptureConfig
+from hil.config import load_config
+from hil.dongle_server import Readers
+from hil.experiments import EXPERIMENTS
+from hil.harness import MAVLINK, RADIO, Flight
+from hil.recorder import load_log
+from hil.run import Request, fly, prepare
+from hil.virtual_motive import Streaming, VirtualMotive
+
+HOME = (0.0, 0.0, 1.15)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+HOVER = EXPERIMENTS["hover"]
+stage = st.integers(0, 100_000)
+ASSUMED = LinkLatency("radio", 1400, measured=False)
+
+
+def frame(t_us: int, *way_us: int) -> MocapFrame:
+    """Exposed at `t_us`; received, transmitted and arrived that much later, each."""
+    instants = np.cumsum([t_us, *way_us]).tolist()
+    return MocapFrame(t_us, HOME, UPRIGHT, True, *instants[1:])
+
+
+@given(st.lists(st.tuples(stage, stage, stage, stage, stage), min_size=1, max_size=30))
+def test_the_budget_is_numpys_mean_and_percentile_of_each_stage(times: list[tuple[int, ...]]) -> None:
+    rows = [row_of(frame(7_000, *way[:3]), 7_000 + sum(way[:4]), way[4]) for way in times]
+    pose, *stages = budget_of(rows, "radio")
+    assert [one.name for one in stages] == ["camera", "processing", "network", "station", "radio"]
+    for one, values in ((pose, np.sum(times, axis=1)), *zip(stages, np.transpose(times), strict=True)):
+        assert one.mean_us == pytest.approx(np.mean(values))
+        assert one.p99_us == np.percentile(values, 99, method="inverted_cdf")
+
+
+def test_the_line_says_what_is_assumed_and_nothing_that_was_not_told() -> None:
+    budget = LatencyBudget()
+    assert str(budget) == "no pose sent"
+    assert all(map(math.isnan, budget.last()))
+    budget.add(MocapFrame(0, HOME, UPRIGHT, True), 38_200, ASSUMED)
+    assert str(budget) == (
+        "pose 39.6 ms old on board (99 %: 39.6): mocap 38.2 + station 0.0 + radio (assumed) 1.4"
+    )
+    budget = LatencyBudget()
+    budget.add(frame(0, 20_000, 18_000, 300), 38_500, LinkLatency("serial", 2100, measured=True))
+    assert str(budget) == (
+        "pose 40.6 ms old on board (99 %: 40.6): camera 20.0 + processing 18.0 + network 0.3 + station 0.2 + serial 2.1"
+    )
+
+
+def test_the_budget_forgets_what_is_long_ago() -> None:
+    budget = LatencyBudget()
+    for late_us in (100_000, *[0] * SENT_POSES):
+        budget.add(frame(0, 20_000, 18_000, 0), 38_000 + late_us, ASSUMED)
+    assert "station 0.0" in str(budget)
+    assert "(99 %: 39.4)" in str(budget)
+
+
+@pytest.mark.parametrize("link", [RADIO, MAVLINK])
+def test_the_age_on_board_is_the_true_one_while_the_latency_changes(link: str) -> None:
+    """A pose that the estimator thinks to be so old was sent: poses are 20 ms apart."""
+    config = load_config("floaty", ["radio.uplink_loss=0", "radio.downlink_loss=0"])
+    flight = Flight(config, HOVER, 3.0, 1, None, link=link)
+    rng = np.random.default_rng(1)
+    exposed_us: list[int] = []
+    fused_us: list[int] = []  # exposures, as the board has them
+    on_frame = flight.station.on_frame
+
+    def send(frame: MocapFrame, now_us: int) -> None:
+        sent = flight.station.counters.sent
+        on_frame(frame, now_us)
+        if flight.station.counters.sent > sent:
+            exposed_us.append(frame.t_us)
+        flight.mocap.more_latency_us = rng.uniform(0.0, 25_000.0)
+
+    def look(now_us: int) -> None:
+        """At the end of a tick: the age is that at the estimator's next step, at 9 ms of every 10."""
+        age_us = int(flight.firmware.signals.counters[COUNTERS.index("pose_age_us")])
+        tick = now_us // 1000
+        step_us = 1000 * (tick + (9 - tick) % 10)
+        if now_us > 1_500_000 and age_us != last[0]:
+            fused_us.append(step_us - age_us)
+        last[0] = age_us
+
+    last = [0]
+    flight.station.on_frame = send  # type: ignore[method-assign]
+    flight.events.every(1000, 999, look)
+    flight.run()
+    assert len(fused_us) > 60
+    wrong_us = np.abs(np.subtract.outer(fused_us, exposed_us)).min(axis=1)
+    assert wrong_us.max() <= 1000
+
+
+@pytest.mark.parametrize(("link", "name", "off_us"), [(RADIO, "radio", 20.0), (MAVLINK, "serial", 500.0)])
+def test_a_flight_has_its_budget(tmp_path: Path, link: str, name: str, off_us: float) -> None:
+    """On the serial line the way down, among telemetry, is not quite as long as the way up."""
+    settings = ("mocap.latency_us=30000", "mocap.processing_us=12000")
+    prepare(tmp_path / "run")
+    result = fly(Request.of(HOVER, overrides=settings, duration_s=1.0, link=link), tmp_path / "run")
+    means = {stage.name: stage.mean_us for stage in result.ages}
+    assert list(means) == ["pose", "camera", "processing", "network", "station", name]
+    expected = {"camera": 18_000.0, "processing": 12_000.0, "network": 0.0, "station": 0.0}
+    assert {name: means[name] for name in expected} == pytest.approx(expected, abs=0.01)
+    assert means["pose"] == pytest.approx(sum(expected.values()) + means[name], abs=0.01)
+    log = load_log(tmp_path / "run")
+    delivered, sum_us = (log.column(f"link.up_{what}")[-1].as_py() for what in ("delivered", "latency_sum"))
+    assert means[name] == pytest.approx(sum_us / delivered, abs=off_us)
+
+
+def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:
+    from hil.ages import ages_of
+
+    prepare(tmp_path / "run")
+    result = fly(Request.of(HOVER, duration_s=0.5), tmp_path / "run")
+    telemetry, log = tmp_path / "run" / "telemetry.csv", load_log(tmp_path / "run")
+    text = telemetry.read_text()
+    telemetry.write_text(text[: len(text) - 30])
+    assert budget_line(ages_of(telemetry, log, RADIO)) == budget_line(result.ages)
+    telemetry.write_text(text.splitlines(keepends=True)[0])
+    assert ages_of(telemetry, log, RADIO) == ()
+
+
+def test_instants_of_the_way_survive_motive_and_the_clock_of_its_computer() -> None:
+    """Stamps against stamps: how long anything takes here does not matter."""
+    readers: Readers = {}
+    motive = VirtualMotive(Streaming(0, (4, 1), multicast=False), {1: "floaty"}, readers)
+    stop, latency_us, processing_us = threading.Event(), 38_000, 18_000
+    taken: dict[float, tuple[int, int]] = {}  # clock before and after, by x
+
+    def serve() -> None:
+        number = 0
+        while not stop.is_set():
+            for reader in select.select(readers, (), (), 0.004)[0]:
+                readers[reader](0)
+            number += 1
+            x = number / 1024  # exact in float32
+            shown = MocapFrame(0, (x, 0.0, 1.0), UPRIGHT, True, latency_us - processing_us, latency_us)
+            before_us = clock_us()
+            motive.take(1, shown, latency_us)
+            taken[x] = before_us, clock_us()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    source = find_source(f"optitrack:127.0.0.1:{motive.port}", CaptureConfig())
+    try:
+        source.open()
+        start_us = clock_us()
+        frames: list[MocapFrame] = []
+        while len(frames) < 50 and clock_us() - start_us < 10_000_000:
+            pose = source.receive(0.5)
+            if pose is not None and clock_us() - start_us > 1_800_000:  # after four echoes
+                frames.append(pose)
+        source.close()
+    finally:
+        stop.set()
+        thread.join()
+        motive.close()
+    assert len(frames) == 50
+    for pose in frames:
+        before_us, after_us = taken[pose.p_WB[0]]
+        instants = (pose.t_us, pose.received_us, pose.transmitted_us)
+        for instant, ahead_us in zip(instants, (latency_us, processing_us, 0), strict=True):
+            assert instant is not None
+            assert before_us - ahead_us - 1000 <= instant <= after_us - ahead_us + 1000

@@ -1,0 +1,330 @@
+"""Vicon, Qualisys and VRPN through the package `motioncapture` in its own process: poses, and all that goes wrong."""
+
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from qualisys_server import qualisys_server
+from scipy.spatial.transform import Rotation
+from test_virtual_motive import Laboratory, needs, seen
+from vrpn_server import vrpn_server
+
+from ground_station.clock import clock_us
+from ground_station.errors import MocapError
+from ground_station.mocap import MocapFrame, MocapSource
+from ground_station.sources.address import find_source
+from ground_station.sources.capture_lines import Arrival, decode_line, encode_arrival, encode_error
+from ground_station.sources.config import CaptureConfig
+from ground_station.sources.motioncapture_client import MotioncaptureSource, settings_of
+
+names = st.text(max_size=10)
+body = st.tuples(*[st.floats()] * 7)
+
+
+@given(st.integers(0, 2**63 - 1), st.dictionaries(names, body, max_size=3))
+@settings(max_examples=50)
+def test_a_line_says_what_was_seen(t_us: int, bodies: dict[str, tuple[float, ...]]) -> None:
+    line = encode_arrival(Arrival(t_us, bodies))
+    assert line.count("\n") == 1
+    decoded = decode_line(line.encode())
+    assert isinstance(decoded, Arrival)
+    assert repr(decoded) == repr(Arrival(t_us, bodies))  # NaN is as NaN here
+
+
+def test_a_line_says_why_no_more_will_come() -> None:
+    assert decode_line(encode_error("no\nway").encode()) == "no\nway"
+
+
+json = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=8) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=12,
+)
+
+
+@given(st.binary(max_size=60) | json.map(lambda value: repr(value).replace("'", '"').encode()))
+def test_no_bytes_of_the_other_process_do_harm(line: bytes) -> None:
+    with contextlib.suppress(MocapError):
+        decode_line(line)
+
+
+@pytest.mark.parametrize(
+    "line", [b"[" * 100_000, b"[" + b"9" * 5000 + b", {}]", b'[1, {"a": [1e999]}]', b"[true]"]
+)
+def test_extreme_lines_are_refused(line: bytes) -> None:
+    with pytest.raises(MocapError, match="not a line"):
+        decode_line(line)
+
+
+@contextlib.contextmanager
+def opened(source: MotioncaptureSource) -> Iterator[MotioncaptureSource]:
+    try:
+        source.open()
+        yield source
+    finally:
+        source.close()
+
+
+def received(source: MocapSource, count: int, timeout_s: float = 10.0) -> list[MocapFrame]:
+    deadline = time.monotonic() + timeout_s
+    frames: list[MocapFrame] = []
+    while len(frames) < count:
+        assert time.monotonic() < deadline, f"{len(frames)} frames within {timeout_s} s"
+        if (frame := source.receive(0.1)) is not None:
+            frames.append(frame)
+    return frames
+
+
+def await_notice(source: MocapSource, words: str, timeout_s: float = 10.0) -> list[MocapFrame]:
+    """The frames until a notice has these words."""
+    deadline, frames = time.monotonic() + timeout_s, []
+    while not any(words in notice for notice in source.notices()):
+        assert time.monotonic() < deadline, words
+        if (frame := source.receive(0.02)) is not None:
+            frames.append(frame)
+    return frames
+
+
+@contextlib.contextmanager
+def moving(stands: Callable[[], bool] = lambda: False) -> Iterator[Laboratory]:
+    """A Motive that streams in a thread, without the body while it `stands`."""
+    lab, stop = Laboratory(), threading.Event()
+
+    def pump() -> None:
+        while not stop.wait(0.005):
+            lab.expose(valid=not stands())
+            lab.answer()
+
+    thread = threading.Thread(target=pump)
+    thread.start()
+    try:
+        yield lab
+    finally:
+        stop.set()
+        thread.join()
+        lab.motive.close()
+
+
+def from_motive(lab: Laboratory, **options: object) -> MotioncaptureSource:
+    """The backend of the package that can be tried here, which follows the same rules as those that cannot."""
+    settings = {"hostname": "localhost", "interface_ip": "127.0.0.1", "port_command": str(lab.motive.port)}
+    capture = CaptureConfig(system="vicon", axes="y-up", latency_us=7000).model_copy(update=options)
+    return MotioncaptureSource("optitrack", settings, capture)
+
+
+@needs("motioncapture")
+def test_poses_come_through_the_package_s_own_process_and_a_killed_one_comes_back() -> None:
+    hidden: list[bool] = []
+    with moving(lambda: bool(hidden)) as lab, opened(from_motive(lab, body="floaty")) as source:
+        assert source.notices() == ["mocap optitrack at 127.0.0.1, body floaty, y-up, age assumed: 7.0 ms"]
+        frames = received(source, 20)
+        assert all(7000 <= clock_us() - frame.t_us < 2_000_000 for frame in frames)
+        assert all(frame.arrived_us == frame.t_us + 7000 for frame in frames)
+        assert any(frame.valid for frame in frames)
+        for frame in frames:  # those that have come, as the virtual Motive drew them
+            if frame.valid:
+                assert min(math.dist(frame.p_WB, seen_p) for seen_p in drawn(lab.number)) < 1e-6
+        hidden.append(True)
+        time.sleep(0.2)
+        received(source, 60)
+        assert not any(frame.valid for frame in received(source, 20))
+        hidden.clear()
+        assert os.getsid(process_of(source)) != os.getsid(0)  # Ctrl-C does not reach it
+        os.kill(process_of(source), signal.SIGKILL)
+        assert_one_notice(source, "motion capture: no frames; calling the server again")
+        await_notice(source, "frames again")
+        assert any(frame.valid for frame in received(source, 20))
+
+
+def drawn(count: int) -> list[tuple[float, float, float]]:
+    return [seen(number).p_WB for number in range(1, count + 2)]
+
+
+def process_of(source: MotioncaptureSource) -> int:
+    assert source._process is not None
+    return source._process.pid
+
+
+def assert_one_notice(source: MocapSource, text: str) -> None:
+    notices: list[str] = []
+    deadline = time.monotonic() + 0.9
+    while time.monotonic() < deadline:
+        source.receive(0.02)
+        notices += source.notices()
+    assert notices == [text]
+
+
+@needs("motioncapture")
+def test_a_wrong_body_is_one_line_with_those_that_are_seen() -> None:
+    told = r"^127\.0\.0\.1: no body 'flouty'; there are: floaty\Z"
+    with moving() as lab, pytest.raises(MocapError, match=told):
+        from_motive(lab, body="flouty").open()
+
+
+@needs("motioncapture")
+def test_vrpn_poses_come_from_a_server_over_its_own_protocol() -> None:
+    silent: list[bool] = []
+
+    def poses(number: int) -> dict[str, tuple[float, ...]]:
+        pose = (number * 1e-3, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5)
+        return {"wand": pose} if silent else {"wand": pose, "floaty": pose}
+
+    with vrpn_server(["wand", "floaty"], poses) as port:
+        source = find_source(f"vrpn:localhost:{port},body=floaty", CaptureConfig())
+        assert isinstance(source, MotioncaptureSource)
+        with opened(source):
+            frames = received(source, 50)
+            assert all(frame.valid and frame.p_WB[1:] == (2.0, 3.0) for frame in frames)
+            assert frames[0].q_WB == (0.5, 0.5, -0.5, 0.5)
+            assert all(a.p_WB[0] < b.p_WB[0] for a, b in pairwise(frames))
+            silent.append(True)
+            assert all(frame.valid for frame in await_notice(source, "no frames"))
+            assert source.receive(0.1) is None  # VRPN does not say that a body is lost: it says nothing
+            silent.clear()
+            await_notice(source, "frames again")
+
+
+@needs("motioncapture")
+def test_qualisys_poses_come_from_a_server_over_its_own_protocol() -> None:
+    state: list[str] = []
+
+    def pose(number: int) -> tuple[float, ...] | None:
+        if "stopped" in state:
+            return None
+        return (math.nan,) * 6 if "hidden" in state else (number * 1.0, 2000.0, 3000.0, 10.0, 20.0, 30.0)
+
+    with qualisys_server("floaty", pose):
+        source = find_source("qualisys:localhost,body=floaty", CaptureConfig())
+        assert isinstance(source, MotioncaptureSource)
+        with opened(source):
+            frames = received(source, 50)
+            assert all(frame.valid and frame.p_WB[1:] == (2.0, 3.0) for frame in frames)
+            expected = Rotation.from_euler("XYZ", (10, 20, 30), degrees=True)  # QTM's own convention
+            assert frames[0].q_WB == pytest.approx(expected.as_quat(scalar_first=True), abs=1e-6)
+            state.append("hidden")
+            time.sleep(0.1)
+            received(source, 30)
+            assert not any(frame.valid for frame in received(source, 10))
+            state.append("stopped")
+            await_notice(source, "no frames")
+            state.clear()
+            await_notice(source, "frames again")
+
+
+@needs("motioncapture")
+def test_a_server_that_is_not_there_is_one_line_within_six_seconds() -> None:
+    begin_s = time.monotonic()
+    with pytest.raises(MocapError, match=r"^127\.0\.0\.1: .*22222\Z"):
+        find_source("qualisys:127.0.0.1", CaptureConfig()).open()
+    with pytest.raises(MocapError, match=r"^nowhere\.invalid: .*known\Z"):
+        find_source("vicon:nowhere.invalid", CaptureConfig()).open()
+    assert time.monotonic() - begin_s < 3
+    with pytest.raises(MocapError, match=r"^127\.0\.0\.1: no frames of a vrpn server\Z"):
+        find_source("vrpn:127.0.0.1:9", CaptureConfig()).open()
+    assert time.monotonic() - begin_s < 9
+
+
+@pytest.fixture
+def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., MotioncaptureSource]:
+    """A source whose process finds a module of this text in place of the package."""
+
+    def make(text: str, body: str = "") -> MotioncaptureSource:
+        (tmp_path / "motioncapture.py").write_text(text)
+        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path(__file__).parent.parent}")
+        capture = CaptureConfig(system="qualisys", body=body)
+        return MotioncaptureSource(capture.system, settings_of(capture), capture)
+
+    return make
+
+
+CAMERAS = """
+import os, time
+from types import SimpleNamespace as Thing
+import numpy as np
+
+class connect:
+    number = 0
+    def __init__(self, system, settings):
+        assert settings == {"hostname": "127.0.0.1"} and system == "qualisys"
+    def waitForNextFrame(self):
+        time.sleep(0.005)
+        self.number += 1
+    @property
+    def rigidBodies(self):
+        return self.bodies(self.number)
+    def body(self, x, w=1.0):
+        return Thing(position=np.array([x, 2.0, 3.0]), rotation=Thing(w=w, x=0.0, y=0.0, z=0.0))
+    def bodies(self, number):
+        return {"one": self.body(float(number))}
+"""
+GOOD_BODIES = CAMERAS[CAMERAS.index("        return {") :]
+
+
+def test_a_missing_package_is_one_line_that_says_how_to_get_it(
+    stand_in: Callable[..., MotioncaptureSource],
+) -> None:
+    with pytest.raises(
+        MocapError, match=r"No module named 'motioncapture': pip install 'floaty-hil\[mocap\]'"
+    ):
+        stand_in("raise ImportError(\"No module named 'motioncapture'\")").open()
+
+
+def test_of_several_bodies_one_must_be_named(stand_in: Callable[..., MotioncaptureSource]) -> None:
+    two = "        return {'one': self.body(0.0), 'two': self.body(1.0)} if number > 9 else {'one': self.body(0.0)}\n"
+    with pytest.raises(MocapError, match="body=NAME is missing; there are: one, two"):
+        stand_in(CAMERAS.replace(GOOD_BODIES, two)).open()
+
+
+def test_what_is_no_pose_is_never_one(stand_in: Callable[..., MotioncaptureSource]) -> None:
+    """Twenty frames each: good, lost, the same over and over, not a number, not a rotation, good."""
+    cases = """
+        return [{"one": self.body(float(number))}, {"two": self.body(1.0)}, {"one": self.body(5.0)},
+                {"one": self.body(float("nan"))}, {"one": self.body(float(number), 2.0)}][number // 20 % 5]
+"""
+    with opened(stand_in(CAMERAS.replace(GOOD_BODIES, cases), "one")) as source:  # takes the first one
+        frames = received(source, 118)
+    valid = [number for number, frame in enumerate(frames, 2) if frame.valid]
+    assert valid == [*range(2, 20), 40, *range(100, 120)]
+
+
+def test_garbage_on_the_pipe_is_counted(stand_in: Callable[..., MotioncaptureSource]) -> None:
+    """The standard output was moved away: the module finds the pipe by trying."""
+    garbage = """
+    def waitForNextFrame(self):
+        time.sleep(0.005)
+        self.number += 1
+        if self.number < 20:
+            os.write(3, os.urandom(20_000) + b"[1, {}]\\n[[[\\n" + b"x" * 70_000 + b"\\n")
+"""
+    with opened(stand_in(CAMERAS + garbage, "one")) as source:
+        assert all(frame.valid for frame in received(source, 30))
+        malformed = int(source.summary().split()[-2])
+    assert malformed > 40
+
+
+@needs("motioncapture")
+def test_a_process_that_nobody_looks_after_ends_by_itself() -> None:
+    """Vicon's connect() goes on for ever, and lets no signal handler of Python's run."""
+    command = [
+        sys.executable,
+        "-m",
+        "ground_station.sources.motioncapture_process",
+        "vicon",
+        "hostname=127.0.0.1",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        assert process.wait(10.0) == -signal.SIGALRM
+    finally:
+        process.kill()
