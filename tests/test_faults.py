@@ -471,10 +471,14 @@ def test_the_hover_has_the_stated_outcome(tmp_path: Path, text: str, seed: int) 
 
 
 @pytest.mark.parametrize("seed", [1, 2] if LONG else [1])
-def test_swapped_markers_turn_the_body_over_where_bad_fits_are_accepted(tmp_path: Path, seed: int) -> None:
+def test_swapped_markers_lose_the_robot_where_neither_the_fit_nor_the_tracker_refuses_them(
+    tmp_path: Path, seed: int
+) -> None:
     wide = (MARKERS_ON, "markers.max_error=0.2")
-    assert go(tmp_path / "long", "marker.swap@1", seed=seed, duration_s=4.0, settings=wide).outcome == "lost"
-    short = go(tmp_path / "short", "marker.swap@1:0.02", seed=seed, duration_s=2.0, settings=wide)
+    assert go(tmp_path / "run", "marker.swap@1", seed=seed, duration_s=4.0, settings=wide).passed
+    alone = (*wide, "tracker.enabled=false")
+    assert go(tmp_path / "long", "marker.swap@1", seed=seed, duration_s=4.0, settings=alone).outcome == "lost"
+    short = go(tmp_path / "short", "marker.swap@1:0.02", seed=seed, duration_s=2.0, settings=alone)
     assert short.passed  # one pose, which the gate refuses
     assert column(load_log(short.folder), "estimator.refused")[-1] == 1
 

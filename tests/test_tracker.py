@@ -240,6 +240,19 @@ def test_the_robot_is_found_again_after_outliers_of_a_tenth_of_a_second_however_
     assert tracker.counters.restarts == 0
 
 
+@pytest.mark.parametrize("w", [0.0, 5e-324, -1e-300, 1e-17])
+def test_the_exact_opposite_attitude_is_refused(w: float) -> None:
+    tracker = Tracker(CONFIG, PERIOD_US)
+    for number in range(3):
+        tracker.take(frame(number))
+    assert tracker._filter.pose[1] == UPRIGHT
+    assert tracker.take(frame(3, q=(w, 1.0, 0.0, 0.0))).quality is Quality.REFUSED
+    after = [frame(number) for number in range(4, 110)]
+    assert [line for _, line in told(tracker, after)] == [
+        "motion capture: 1 pose refused, up to 0.00 m and 180 deg off"
+    ]
+
+
 @pytest.mark.parametrize(
     ("p", "q"),
     [
