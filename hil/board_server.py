@@ -15,6 +15,7 @@ from hil.dongle_server import DongleServer, Readers
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.harness import Streams
+from hil.markers import NO_POINTS, marker_places
 from hil.serial_server import Address
 from hil.served_board import ServedBoard
 from hil.virtual_dongle import VirtualDongle
@@ -74,9 +75,11 @@ class BoardServer:
         names = {
             board.number: "floaty" if board.number == 1 else f"floaty{board.number}" for board in self.boards
         }
-        self.motive = VirtualMotive(settings, names, self.readers)
+        config = self._config
+        markers = marker_places(config.plant) if config.markers.enabled else NO_POINTS
+        self.motive = VirtualMotive(settings, names, self.readers, markers)
         for board in self.boards:
-            board.publish(partial(self.motive.take, board.number))
+            board.show(partial(self.motive.take, board.number))
         return self.motive
 
     def run(self, stopping: Callable[[], bool]) -> None:

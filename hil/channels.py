@@ -14,6 +14,7 @@ from hil.plant.battery import Battery
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Quantity
 from hil.virtual_board import VirtualBoard
+from hil.virtual_mocap import VirtualMocap
 from hil.virtual_radio import VirtualRadio
 
 
@@ -51,6 +52,20 @@ def battery_channel(battery: Battery) -> Channel:
 def fault_channel(active: Sequence[Fault]) -> Channel:
     """Return how many faults are in force."""
     return Channel("int8", lambda: len(active), (quantity("fault", "active"),))
+
+
+def marker_channel(mocap: VirtualMocap) -> Channel:
+    """Return which markers the last exposure saw (bit 0: marker 1), how many points have no label, how well all fit."""
+
+    def read() -> tuple[float, ...]:
+        seen = mocap.sighting
+        if seen is None:
+            return (0.0, 0.0, 0.0)
+        return (seen.bits, len(seen.unlabelled), seen.error)
+
+    return Channel(
+        "float32", read, (quantity("markers", "visible unlabelled"), quantity("markers", "error", "m"))
+    )
 
 
 def _view(array: Any) -> Callable[[], Any]:

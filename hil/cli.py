@@ -166,7 +166,7 @@ def _list_faults() -> None:
         unit = f" {kind.unit}".rstrip()
         size, bounds = (f"{kind.size:g}{unit}", f"{kind.low:g}..{kind.high:g}") if kind.sized else ("", "")
         lasts = f"{kind.duration_s:g} s" if math.isfinite(kind.duration_s) else "to the end"
-        only = f" (--link {kind.link})" if kind.link else ""
+        only = f" ({kind.needs})" if kind.needs else ""
         table.add_row(name, size, bounds, lasts, kind.outcome, f"{kind.meaning}{only}")
     Console(highlight=False, width=max(console.width, 150)).print(table)
 

@@ -17,6 +17,7 @@ from firmware_py.config import FirmwareConfig
 from ground_station.sources.config import CaptureConfig
 from ground_station.station import StationConfig
 from hil.errors import LabError
+from hil.markers import MarkersConfig
 from hil.plant.battery import BatteryConfig
 from hil.plant.config import PlantConfig, ServoConfig
 from hil.tunnel import TunnelConfig
@@ -57,6 +58,7 @@ class LabConfig(FirmwareConfig):
     tunnel: TunnelConfig = Field(default_factory=TunnelConfig)
     imu: ImuConfig = Field(default_factory=ImuConfig)
     mocap: MocapConfig = Field(default_factory=MocapConfig)
+    markers: MarkersConfig = Field(default_factory=MarkersConfig)
     radio: RadioConfig = Field(default_factory=RadioConfig)
     serial: SerialConfig = Field(default_factory=SerialConfig)
     station: StationConfig = Field(default_factory=StationConfig)

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from hil.harness import Flight
+    from hil.rigid_body import VirtualMarkers
     from hil.virtual_serial import VirtualSerial
 
 Outcome = Literal["holds", "degrades", "failsafe", "lost"]
 OCCLUSION_RADIUS = 0.3  # [m] around the axis: the robot is inside the shadow wherever it is in its box
 PUSH_S = 0.1  # physics.md section 8, and the sizes of pushes and shadow
+MARKERS_ON = "markers.enabled=true"
 GLIMPSE_S = 0.3  # shorter than the supervisor's patience of 0.5 s
 
 Read = Callable[["Flight"], float]
@@ -56,11 +58,17 @@ class Kind:
     scale: float = 1.0  # from the unit to SI
     duration_s: float = math.inf  # default; inf: to the end of the flight
     link: str = ""  # the only one on which it acts
+    markers: bool = False  # acts on markers: only with `markers.enabled`
 
     @property
     def sized(self) -> bool:
         """Whether there is a size to choose."""
         return self.low < self.high
+
+    @property
+    def needs(self) -> str:
+        """What the flight must have for it, as options of `floaty fly`; empty: nothing special."""
+        return f"--link {self.link}" if self.link else f"--set {MARKERS_ON}" if self.markers else ""
 
 
 def add(value: float, size: float) -> float:
@@ -90,6 +98,15 @@ def _knob(owner: Callable[[Flight], object], name: str, blend: Blend) -> Knob:
 def _uart(flight: Flight) -> VirtualSerial:
     assert flight.serial is not None  # the kind's link says so
     return flight.serial.uart
+
+
+def _of_flight(flight: Flight) -> VirtualMarkers:
+    assert flight.mocap.markers is not None  # the kind says so
+    return flight.mocap.markers
+
+
+def _markers(name: str, blend: Blend) -> tuple[Knob, ...]:
+    return (_knob(_of_flight, name, blend),)
 
 
 def _mocap(name: str, blend: Blend) -> Knob:
@@ -200,6 +217,22 @@ KINDS: Mapping[str, Kind] = {
     "mocap.latency": Kind(
         "the cameras' computer needs this much longer", "ms", 40.0, 0.0, 500.0,
         (_mocap("more_latency_us", add),), "holds", MS,
+    ),
+    "marker.hidden": Kind(
+        "this many markers are covered, from the first one on", "", 4.0, 0.0, 8.0,
+        _markers("hidden", max), "holds", markers=True,
+    ),
+    "marker.swap": Kind(
+        "markers 1 and 3 have each other's label: a pose turned over, or none where it is seen to fit badly",
+        "", 1.0, 1.0, 1.0, _markers("swapped", max), "holds", duration_s=GLIMPSE_S, markers=True,
+    ),
+    "marker.noise": Kind(
+        "factor on the noise of every marker", "", 2.0, 0.0, 100.0,
+        _markers("noise_scale", times), "holds", markers=True,
+    ),
+    "marker.ghosts": Kind(
+        "this many reflections more, which are no markers", "", 5.0, 0.0, 50.0,
+        _markers("ghosts", add), "holds", markers=True,
     ),
     "radio.loss": Kind(
         "packets lost on the air, per try, both ways", "", 0.5, 0.0, 1.0,

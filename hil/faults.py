@@ -16,7 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from hil.errors import LabError
-from hil.fault_kinds import KINDS, Kind, Knob
+from hil.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
 
 if TYPE_CHECKING:
     from hil.harness import Flight
@@ -79,8 +79,8 @@ def parse(text: str) -> Fault:
     )  # fmt: skip
 
 
-def check(faults: Iterable[Fault], duration_s: float, link: str) -> None:
-    """Raise `LabError` when a fault begins after the flight, or acts on a link that the flight has not."""
+def check(faults: Iterable[Fault], duration_s: float, link: str, markers: bool) -> None:
+    """Raise `LabError` when a fault begins after the flight, or acts on a link or on markers that the flight has not."""
     for fault in faults:
         if fault.start_s >= duration_s:
             raise LabError(
@@ -89,6 +89,8 @@ def check(faults: Iterable[Fault], duration_s: float, link: str) -> None:
         needed = KINDS[fault.kind].link
         if needed and needed != link:
             raise LabError(f"fault {fault}: acts with --link {needed} only; this flight has --link {link}")
+        if KINDS[fault.kind].markers and not markers:
+            raise LabError(f"fault {fault}: needs --set {MARKERS_ON}")
 
 
 def plan(faults: Sequence[Fault], flight: Flight) -> list[Fault]:
@@ -98,9 +100,12 @@ def plan(faults: Sequence[Fault], flight: Flight) -> list[Fault]:
     """
     board = _Switchboard(flight)
     for span in spans(faults, flight.release_us):
-        if span.begin_us >= flight.end_us or KINDS[span.fault.kind].link not in ("", flight.link):
+        kind = KINDS[span.fault.kind]
+        if kind.link not in ("", flight.link) or (kind.markers and flight.mocap.markers is None):
             continue
-        for knob in KINDS[span.fault.kind].knobs:
+        if span.begin_us >= flight.end_us:
+            continue
+        for knob in kind.knobs:
             knob.read(flight)  # so that what it needs is there from the start
         flight.events.at(int(span.begin_us), partial(board.begin, span.fault))
         if span.end_us < flight.end_us:

@@ -21,13 +21,14 @@ from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Goal
-from hil.channels import battery_channel, fault_channel, flight_channels, radio_channel
+from hil.channels import battery_channel, fault_channel, flight_channels, marker_channel, radio_channel
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.experiments import Experiment
 from hil.faults import Fault, plan
+from hil.markers import make_markers
 from hil.plant.battery import Battery
 from hil.plant.plant import Plant
 from hil.recorder import Channel, Recorder
@@ -68,11 +69,12 @@ class Streams:
     mocap: np.random.Generator
     radio: np.random.Generator
     serial: np.random.Generator
+    markers: np.random.Generator
 
     @classmethod
     def of_seed(cls, seed: int) -> Streams:
         """Split a seed."""
-        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(5)))
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)))
 
 
 class Flight:
@@ -122,7 +124,9 @@ class Flight:
         )  # fmt: skip
         self.battery: Battery = Battery(config.battery)
         self.imu = VirtualImu(config.imu, streams.imu)
-        self.mocap = VirtualMocap(config.mocap, streams.mocap)
+        self.mocap = VirtualMocap(
+            config.mocap, streams.mocap, make_markers(config.markers, config.plant, streams.markers)
+        )
         self.radio = VirtualRadio(config.radio, self.events, streams.radio)
         self.serial = _serial_line(config, self.events, streams.serial) if link == MAVLINK else None
         end: Link = (
@@ -166,7 +170,8 @@ class Flight:
             self.plant, self.board, self.firmware, link, self.trajectory, lambda: self.free
         )
         faults = (fault_channel(self.active_faults),) if self.faults else ()
-        return (*channels, battery_channel(self.battery), *faults)
+        markers = (marker_channel(self.mocap),) if self.mocap.markers else ()
+        return (*channels, battery_channel(self.battery), *markers, *faults)
 
     @cached_property
     def thief(self) -> Thief:

@@ -28,9 +28,12 @@ def serve(
 ) -> int:  # options of `floaty board serve`, handed on unread
     """Serve boards in virtual tunnels and Motive, which sees them, in real time, until Ctrl-C.
 
-    Motive calls the bodies floaty, floaty2, ...; its y axis points up. Everything else is `floaty board serve`.
+    Motive calls the bodies floaty, floaty2, ...; its y axis points up. It tracks them by eight markers each, which
+    --set markers.enabled=false takes off: poses have noise of their own then. Everything else is `floaty board serve`.
     """
+    from hil.fault_kinds import MARKERS_ON
     from hil.virtual_motive import Streaming
 
     motive = Streaming(natnet_port, VERSIONS[natnet], multicast)
+    options["overrides"] = (MARKERS_ON, *options["overrides"])
     return int(context.invoke(serve_boards, **options, motive=motive))

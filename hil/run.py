@@ -61,7 +61,7 @@ class Request:
             raise LabError(
                 f"fault {self.faults[0]}: --link {self.link}: faults act on flights in lockstep only"
             )
-        check(self.faults, self.duration_s, self.link)
+        check(self.faults, self.duration_s, self.link, self.config.markers.enabled)
 
     @classmethod
     def of(
@@ -297,7 +297,7 @@ def metadata_of(request: Request) -> dict[str, str]:
 def versions() -> dict[str, str]:
     """Return the versions of what computed the flight."""
     found = {"python": platform.python_version()}
-    for name in ("floaty-hil", "numpy", "numba", "pyarrow"):
+    for name in ("floaty-hil", "numpy", "numba", "scipy", "pyarrow"):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -22,6 +22,7 @@ from hil.dongle_server import Readers
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.harness import IMU_PERIOD_US, Streams
+from hil.markers import Sighting, make_markers
 from hil.nrf51 import Nrf51, Power, RadioSettings
 from hil.plant.plant import Plant
 from hil.serial_server import Address, Endpoint
@@ -43,6 +44,7 @@ MAX_SYSTEM = 255  # MAVLink
 FLYING = "FLYING"  # the supervisor's state
 
 Publish = Callable[[MocapFrame, int], None]  # (frame, now_us)
+Show = Callable[[MocapFrame, int, Sighting | None], None]  # with what was seen of the markers
 
 
 def address_of(number: int) -> bytes:
@@ -96,7 +98,9 @@ class ServedBoard:
         self._say = say
         self._gusts = streams.gusts
         self._imu = VirtualImu(config.imu, streams.imu)
-        self._mocap = VirtualMocap(config.mocap, streams.mocap)
+        self._mocap = VirtualMocap(
+            config.mocap, streams.mocap, make_markers(config.markers, config.plant, streams.markers)
+        )
         self.line = VirtualSerial(config.serial, events, streams.radio) if mavlink else None
         self._line_end: Endpoint | None = None
         if self.line is not None:
@@ -110,6 +114,7 @@ class ServedBoard:
         self._boot_us = 0
         self._flying_since_us: int | None = None
         self._publish: list[Publish] = []
+        self._show: list[Show] = []
         self.start(events.now_us)
         events.at(events.now_us + IMU_PERIOD_US, self._sample)
         events.at(events.now_us + config.mocap.period_us, self._expose)
@@ -147,6 +152,10 @@ class ServedBoard:
     def publish(self, to: Publish) -> None:
         """Hand every mocap frame to `to` when the cameras' computer has it."""
         self._publish.append(to)
+
+    def show(self, to: Show) -> None:
+        """Hand every mocap frame to `to`, likewise, together with its markers."""
+        self._show.append(to)
 
     def fly(self) -> None:
         """Fly at home with a ground station of its own, on a wire that no client sees."""
@@ -283,15 +292,19 @@ class ServedBoard:
 
     def _expose(self, now_us: int) -> None:
         self._events.at(now_us + self._config.mocap.period_us, self._expose)
-        if self._publish:
+        if self._publish or self._show:
             self.catch_up(now_us)
             self._plant.advance(now_us - self._placed_us)
             frame = self._mocap.expose(now_us, self._plant)
-            self._events.at(now_us + self._config.mocap.latency_us, partial(self._deliver, frame))
+            self._events.at(
+                now_us + self._config.mocap.latency_us, partial(self._deliver, frame, self._mocap.sighting)
+            )
 
-    def _deliver(self, frame: MocapFrame, now_us: int) -> None:
+    def _deliver(self, frame: MocapFrame, sighting: Sighting | None, now_us: int) -> None:
         for publish in self._publish:
             publish(frame, now_us)
+        for show in self._show:
+            show(frame, now_us, sighting)
 
     # Holding and letting go
 

@@ -21,6 +21,7 @@ from hil import curves, scene
 from hil.curves import Curves, States
 from hil.errors import LabError
 from hil.faults import Span, spans_of
+from hil.markers import DIAMETER, marker_places
 from hil.metrics import BOX, column
 from hil.plant.config import PlantConfig
 from hil.recorder import load_events, load_log
@@ -43,6 +44,8 @@ TRAIL_S = 4.0
 NOZZLE_RADIUS = 0.6  # [m] paper, Experimental platform: 1.2 m wide
 NOZZLE_TOP = 1.8  # [m] where the picture of the tunnel ends
 FLOW_RADIUS = 0.2  # [m] physics.md section 6: effective cylinder
+MARKERS_SEEN = "markers.visible"
+SEEN, HIDDEN = 0xFFFFFFFF, 0xFF3030FF  # colours of markers
 SLOW = 10  # rows between samples of what changes slowly: 10 Hz
 
 PLOTS: Mapping[str, Curves] = {
@@ -84,6 +87,12 @@ class Stage:
         )
         self._build_tunnel()
         self._build_robot()
+        if MARKERS_SEEN in schema.names:
+            self._recording.log(
+                "world/robot/markers",
+                rr.Points3D(marker_places(self._plant), radii=DIAMETER / 2),
+                static=True,
+            )
         self._name_curves()
 
     def add_rows(self, rows: pa.Table) -> None:
@@ -94,6 +103,8 @@ class Stage:
         fresh = joined.num_rows - rows.num_rows  # the first row of `joined` that is new
         self._last = rows.slice(rows.num_rows - 1)
         self._move(rows)
+        if MARKERS_SEEN in rows.column_names:
+            self._colour_markers(joined, fresh)
         for path, plot in self._plots.items():
             self._send(f"plot/{path}", column(rows, "t"), rr.Scalars.columns(scalars=plot.read(rows)))
         slow = joined.take(np.arange(0, joined.num_rows, SLOW))
@@ -165,6 +176,21 @@ class Stage:
         self._send("world/drag", times, arrows.partition(np.full(len(times), len(parts))))
         flow = SECONDS_OF_FLOW * column(rows, "flow.x", "flow.y", "flow.z")
         self._send("world/flow", times, rr.Arrows3D.columns(vectors=flow, origins=p_WB - flow - (0, 0, 0.1)))
+
+    def _colour_markers(self, rows: pa.Table, fresh: int) -> None:
+        """Colour the markers where they come into sight or go, from row `fresh` on."""
+        bits = column(rows, MARKERS_SEEN).astype(np.int64)
+        changed = np.flatnonzero(np.diff(bits, prepend=-1))
+        changed = changed[changed >= fresh]
+        places = marker_places(self._plant)
+        seen = bits[changed, None] >> np.arange(len(places)) & 1
+        colours = np.where(seen, SEEN, HIDDEN).astype(np.uint32)
+        points = rr.Points3D.columns(colors=colours.ravel())
+        self._send(
+            "world/robot/markers",
+            column(rows, "t")[changed],
+            points.partition(np.full(len(seen), len(places))),
+        )
 
     def _place(
         self, path: str, times: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]

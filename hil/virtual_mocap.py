@@ -1,23 +1,28 @@
 """The motion capture cameras: noisy poses of the plant, late, sometimes missing or wrong.
 
+A pose is the truth with noise on it or, with `markers.enabled`, what eight markers make of it (`hil.rigid_body`).
 Computes frames and when they arrive; the harness exposes at `period_us` and delivers.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from firmware_py.geometry import multiply, rotate
+from firmware_py.geometry import IDENTITY, Quaternion, Vector, multiply, rotate
 from ground_station.mocap import MocapFrame
+from hil.markers import Sighting
 from hil.plant.plant import Plant
+
+if TYPE_CHECKING:
+    from hil.rigid_body import VirtualMarkers
 
 NOISE_ROWS = 512  # frames of noise drawn at once
 
-Vector = tuple[float, float, float]
 NOWHERE: Vector = (0.0, 0.0, 0.0)
 FORWARD: Vector = (1.0, 0.0, 0.0)
 HALF_TURN = (0.0, 0.0, 0.0, 1.0)  # about z, w x y z
@@ -59,10 +64,13 @@ class VirtualMocap:
 
     `dropout`, `outlier` (0..1) share of frames; `wrong_by` [m] how far every position is off, in random directions;
     `swapped_by` [m] markers are swapped: poses turned by 180 degrees about z of B and shifted along its x; 0: they are not;
-    `more_latency_us` on top of the configured one.
+    `more_latency_us` on top of the configured one. `sighting` is what the last exposure saw of the markers, None without.
     """
 
-    def __init__(self, config: MocapConfig, rng: np.random.Generator) -> None:
+    def __init__(
+        self, config: MocapConfig, rng: np.random.Generator, markers: VirtualMarkers | None = None
+    ) -> None:
+        """With `markers`, poses come from them."""
         self._config = config
         self._rng = rng
         # Streams of their own, so that faults leave the noise of the other frames as it was, and one another alone.
@@ -73,30 +81,44 @@ class VirtualMocap:
         self.wrong_by = 0.0
         self.swapped_by = 0.0
         self.more_latency_us = 0.0
+        self.markers = markers
+        self.sighting: Sighting | None = None
         self._arrival_us = 0  # of the last frame
 
     def expose(self, now_us: int, plant: Plant) -> MocapFrame:
         """Return what the cameras see at this instant; the harness has advanced the plant to it."""
-        if not self._draws:
-            self._draws = self._rng.standard_normal((NOISE_ROWS, 6)).tolist()
-        x, y, z, a, b, c = self._draws.pop()
+        pose = self._noisy_pose(plant) if self.markers is None else self._solved_pose(self.markers, plant)
         outlier = self.outlier > 0.0 and self._rng_outlier.random() < self.outlier
         offset = _direction(self._rng_outlier) if outlier else NOWHERE
-        if self.dropout > 0.0 and self._rng_dropout.random() < self.dropout:
-            return MocapFrame(now_us, NOWHERE, (1.0, 0.0, 0.0, 0.0), valid=False)
-        px, py, pz = plant.p_WB.tolist()
-        s = self._config.position_noise
-        p_WB = (px + s * x, py + s * y, pz + s * z)
+        dropped = self.dropout > 0.0 and self._rng_dropout.random() < self.dropout
+        if dropped or pose is None:
+            if self.sighting is not None:
+                self.sighting = replace(self.sighting, pose=None)
+            return MocapFrame(now_us, NOWHERE, IDENTITY, valid=False)
+        p_WB, q_WB = pose
         if outlier:
             p_WB = _shifted(p_WB, self._config.outlier_size, offset)
         if self.wrong_by > 0.0:
             p_WB = _shifted(p_WB, self.wrong_by, _direction(self._rng_wrong))
-        s = 0.5 * self._config.rotation_noise
-        q_WB = turned(plant.q_WB.tolist(), s * a, s * b, s * c)
         if self.swapped_by > 0.0:
             p_WB = _shifted(p_WB, self.swapped_by, rotate(q_WB, FORWARD))
             q_WB = multiply(q_WB, HALF_TURN)
         return MocapFrame(now_us, p_WB, q_WB, valid=True)
+
+    def _noisy_pose(self, plant: Plant) -> tuple[Vector, Quaternion]:
+        """Return the truth with the configured noise."""
+        if not self._draws:
+            self._draws = self._rng.standard_normal((NOISE_ROWS, 6)).tolist()
+        x, y, z, a, b, c = self._draws.pop()
+        px, py, pz = plant.p_WB.tolist()
+        s, half = self._config.position_noise, 0.5 * self._config.rotation_noise
+        q_WB = turned(plant.q_WB.tolist(), half * a, half * b, half * c)
+        return (px + s * x, py + s * y, pz + s * z), q_WB
+
+    def _solved_pose(self, markers: VirtualMarkers, plant: Plant) -> tuple[Vector, Quaternion] | None:
+        """Return what the markers say, None when they do not say enough."""
+        self.sighting = markers.look(plant.p_WB, plant.q_WB)
+        return self.sighting.pose
 
     def arrival_us(self, now_us: int) -> int:
         """Return when the frame exposed now is at the ground station; frames do not overtake one another."""
@@ -116,7 +138,7 @@ def _shifted(p: Vector, distance: float, direction: Vector) -> Vector:
     return (p[0] + distance * direction[0], p[1] + distance * direction[1], p[2] + distance * direction[2])
 
 
-def turned(q: list[float], a: float, b: float, c: float) -> tuple[float, float, float, float]:
+def turned(q: list[float], a: float, b: float, c: float) -> Quaternion:
     """Return q (1, a, b, c) of unit length: `q` turned by the small rotation 2 (a, b, c) [rad] in its own frame."""
     w, x, y, z = q
     n = 1.0 / math.sqrt((w * w + x * x + y * y + z * z) * (1.0 + a * a + b * b + c * c))

@@ -20,6 +20,8 @@ from ground_station.natnet import (
     BodyDescription,
     BodyPose,
     Frame,
+    LabelledMarker,
+    MarkerDescription,
     MessageId,
     ModelDefinition,
     ServerInfo,
@@ -28,6 +30,7 @@ from ground_station.natnet import (
 from ground_station.natnet_reader import Version
 from hil.dongle_server import HOST, Readers
 from hil.errors import LabError
+from hil.markers import DIAMETER, NO_POINTS, Points, Sighting
 from hil.natnet_bytes import encode_frame, encode_models, encode_server_info
 
 MAX_CLIENTS = 16  # one more displaces the one that has been silent for longest
@@ -39,6 +42,9 @@ _RELEASES: dict[Version, tuple[int, int, int, int]] = {
 }  # of Motive
 _TICKS_PER_US = 10  # the performance counter of its computer
 _NO_PARENT = 0xFFFF_FFFF  # -1 as the unsigned number that clients read
+_PASSIVE = 0  # label of a marker that does not shine by itself
+_OCCLUDED, _RECONSTRUCTED, _FILLED, _OF_MODEL = 1, 2, 4, 8  # bits of a labelled marker
+_SEEN, _UNSEEN = _RECONSTRUCTED | _OF_MODEL, _OCCLUDED | _FILLED | _OF_MODEL
 _HEADER = struct.Struct("<HH")  # kind, length
 _ECHO = struct.Struct("<QQ")
 _ECHO_REQUEST_SIZE = 8
@@ -68,28 +74,45 @@ class _Client:
 
 def with_y_up(p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
     """A pose in axes with y up, for world and body alike: x_M = x, y_M = z, z_M = -y."""
-    x, y, z = p_WB
     w, a, b, c = q_WB
-    return (x, z, -y), (w, a, c, -b)
+    return _turned(*p_WB), (w, *_turned(a, b, c))
+
+
+def _turned(x: float, y: float, z: float) -> Vector:
+    return (x, z, -y)
+
+
+def _all_turned(points: Points) -> list[Vector]:
+    """Points (N, 3) in axes with y up."""
+    return [_turned(x, y, z) for x, y, z in points.tolist()]
 
 
 class VirtualMotive:
-    """Tracks `bodies` (names by id)."""
+    """Tracks `bodies` (names by id), each with the same `markers`, (N, 3) [m] in B."""
 
-    def __init__(self, settings: Streaming, bodies: dict[int, str], readers: Readers) -> None:
+    def __init__(
+        self, settings: Streaming, bodies: dict[int, str], readers: Readers, markers: Points = NO_POINTS
+    ) -> None:
         self.malformed = 0
         self._version = settings.version
         self._multicast = settings.multicast
+        described = tuple(
+            MarkerDescription(place, _PASSIVE, f"Marker{number}")
+            for number, place in enumerate(_all_turned(markers), 1)
+        )
         self._models = ModelDefinition(
             tuple(
-                BodyDescription(name, number, _NO_PARENT, (0.0, 0.0, 0.0), ())
+                BodyDescription(name, number, _NO_PARENT, (0.0, 0.0, 0.0), described)
                 for number, name in bodies.items()
             )
         )
         self._readers = readers
         self._clients: dict[Address, _Client] = {}  # who spoke last comes last
         self._number = 0
-        self._seen: list[BodyPose] = []  # bodies of the frame that is being put together
+        # Of the frame that is being put together.
+        self._seen: list[BodyPose] = []
+        self._labelled: list[LabelledMarker] = []
+        self._unlabelled: list[Vector] = []
         self._start_us = clock_us()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -108,19 +131,32 @@ class VirtualMotive:
         del self._readers[self._socket]
         self._socket.close()
 
-    def take(self, body: int, frame: MocapFrame, now_us: int) -> None:
+    def take(self, body: int, frame: MocapFrame, now_us: int, sighting: Sighting | None = None) -> None:
         """Take what was seen of a body, of another clock, on which it is `now_us`; the last body completes a frame."""
         p, q = with_y_up(frame.p_WB, frame.q_WB)
-        self._seen.append(BodyPose(body, p, q, 0.0, frame.valid))
+        error = 0.0 if sighting is None else sighting.error
+        self._seen.append(BodyPose(body, p, q, error, frame.valid))
+        if sighting is not None:
+            self._unlabelled += _all_turned(sighting.unlabelled)
+            self._labelled += _labelled(body, sighting) if frame.valid else ()
         if len(self._seen) < len(self._models.bodies):
             return
-        bodies, self._seen = tuple(self._seen), []
+        bodies, labelled, unlabelled = tuple(self._seen), tuple(self._labelled), tuple(self._unlabelled)
+        self._seen, self._labelled, self._unlabelled = [], [], []
         self._number += 1
         sent = self._ticks()
         # The cameras' latency is one number, spent ahead of Motive's computer; none of it lies before its start.
         exposed = max(0, sent - (now_us - frame.t_us) * _TICKS_PER_US)
         whole = Frame(
-            self._number, bodies, (), (), exposed * 1e-6 / _TICKS_PER_US, exposed, sent, sent, parameters=0
+            self._number,
+            bodies,
+            unlabelled,
+            labelled,
+            exposed * 1e-6 / _TICKS_PER_US,
+            exposed,
+            sent,
+            sent,
+            parameters=0,
         )
         targets = self._targets()
         encoded = {version: encode_frame(whole, version) for version in set(targets.values())}
@@ -207,3 +243,12 @@ class VirtualMotive:
                 self._admit(client, _Client(version, self._clients[client].keeps_alive))
                 return _ACCEPTED
         return _REFUSED
+
+
+def _labelled(body: int, sighting: Sighting) -> list[LabelledMarker]:
+    """All the markers of a body that is tracked: those that nobody sees stand where the body has them."""
+    rows = zip(_all_turned(sighting.points), sighting.seen.tolist(), sighting.residuals.tolist(), strict=True)
+    return [
+        LabelledMarker(body << 16 | number, p, DIAMETER, _SEEN if seen else _UNSEEN, residual)
+        for number, (p, seen, residual) in enumerate(rows, 1)
+    ]

@@ -61,7 +61,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "filterpy": (),
     "motioncapture": ("ground_station/sources/motioncapture_process.py",),
-    "scipy": (),
+    "scipy": ("hil/rigid_body.py",),
     "perfetto": ("hil/perfetto.py",),
     "matplotlib": (
         "hil/figures.py", "hil/picture.py", "hil/drag_model_report.py", "hil/power_figures.py",

@@ -21,7 +21,7 @@ from hil.cli import main
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, Experiment
-from hil.fault_kinds import KINDS
+from hil.fault_kinds import KINDS, MARKERS_ON
 from hil.faults import Fault, check, parse, spans_of
 from hil.harness import MAVLINK, RADIO, Flight
 from hil.metrics import column
@@ -30,12 +30,28 @@ from hil.report import write_report
 from hil.run import Request, Result, fly, prepare, read_result
 
 HOVER = EXPERIMENTS["hover"]
+LONG = bool(os.environ.get("FLOATY_LONG"))
+Settings = tuple[str, ...]
+
+
+def settings_for(fault: str) -> Settings:
+    """What a flight must be told for a fault to act in it."""
+    return (MARKERS_ON,) if KINDS[parse(fault).kind].markers else ()
+
+
 RELEASE_S = load_config().flight.release_us * 1e-6
 
 
-def go(folder: Path, *faults: str, seed: int = 1, duration_s: float = 3.0, link: str = RADIO) -> Result:
+def go(
+    folder: Path,
+    *faults: str,
+    seed: int = 1,
+    duration_s: float = 3.0,
+    link: str = RADIO,
+    settings: Settings = (),
+) -> Result:
     prepare(folder)
-    request = Request.of(HOVER, "floaty", (), seed, duration_s, link, [parse(text) for text in faults])
+    request = Request.of(HOVER, "floaty", settings, seed, duration_s, link, [parse(text) for text in faults])
     return fly(request, folder)
 
 
@@ -87,6 +103,7 @@ def test_every_default_is_a_size_that_its_kind_allows() -> None:
         ("push.x@1=nan", "size nan: expected -20..20 N"),
         ("servo.stuck.1@1=0.5", "this kind has no size to choose"),
         ("push.x@30", "the flight ends 30 s after the release, before it begins"),
+        ("marker.swap@1", "fault marker.swap@1: needs --set markers.enabled=true"),
         ("serial.cut@1", "acts with --link mavlink only; this flight has --link radio"),
     ],
 )
@@ -116,7 +133,11 @@ def test_a_paced_link_refuses_faults(link: str) -> None:
 
 def test_a_radio_fault_is_refused_on_the_serial_line() -> None:
     with pytest.raises(LabError, match="--link radio only"):
-        check([parse("radio.loss@1")], 30.0, MAVLINK)
+        check([parse("radio.loss@1")], 30.0, MAVLINK, markers=False)
+
+
+def test_markers_have_faults_on_either_link() -> None:
+    check([parse("marker.swap@1")], 30.0, MAVLINK, markers=True)
 
 
 # Every kind acts from its begin to its end and no longer
@@ -206,6 +227,15 @@ def _impulse(name: str) -> Seen:
     return lambda rows, without: gained(rows) - gained(without)
 
 
+def _markers_seen(rows: pa.Table, _: pa.Table) -> float:
+    bits = column(rows, "markers.visible").astype(np.int64)
+    return float((bits[:, None] >> np.arange(8) & 1).sum(axis=1).mean())
+
+
+def _mean(name: str, scale: float = 1.0) -> Seen:
+    return lambda rows, _: float(scale * column(rows, name).mean())
+
+
 def _latency(rows: pa.Table, without: pa.Table) -> float:
     """Mean time in the air upwards [ms], less that without."""
 
@@ -240,6 +270,10 @@ SIGNS = [
     Sign("mocap.outlier", _grown("estimator.refused"), (20, 41), (0, 0)),
     Sign("mocap.swap", _heading, (165, 180), (0, 20), (0.1, 0.25)),
     Sign("mocap.latency=20", _mean_of("estimator.pose_age_us", 1e-3), (19.5, 20.5), (-1.5, 1.5)),
+    Sign("marker.hidden", _markers_seen, (4, 4), (8, 8)),
+    Sign("marker.swap", _mean("markers.error", 1e3), (97, 100), (1.4, 1.7), (0.1, 0.25)),
+    Sign("marker.noise", _mean("markers.error", 1e3), (2.8, 3.3), (1.4, 1.7)),
+    Sign("marker.ghosts", _mean("markers.unlabelled"), (5, 5), (0, 0)),
     Sign("radio.loss", _grown("link.retried"), (60, 1000), (0, 20)),
     Sign("radio.uplink_loss", _latency, (1.0, 2.5), (-0.3, 0.3)),
     Sign("radio.downlink_loss", _latency, (0.3, 0.95), (-0.3, 0.3)),
@@ -272,14 +306,14 @@ SIGNS = [
 
 
 @cache
-def without_fault(link: str) -> pa.Table:
+def without_fault(link: str, settings: Settings) -> pa.Table:
     """The log of the flight to compare with; in memory only, as are those with a fault."""
-    return fly_for_log(link)
+    return fly_for_log(link, settings)
 
 
-def fly_for_log(link: str, *faults: str) -> pa.Table:
+def fly_for_log(link: str, settings: Settings, *faults: str) -> pa.Table:
     with tempfile.TemporaryDirectory() as folder:
-        go(Path(folder) / "run", *faults, duration_s=2.6, link=link)
+        go(Path(folder) / "run", *faults, duration_s=2.6, link=link, settings=settings)
         return load_log(Path(folder) / "run").combine_chunks()
 
 
@@ -293,7 +327,8 @@ def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
     name, _, size = sign.fault.partition("=")
     link = KINDS[name].link or RADIO
     fault = f"{name}@{BEGIN_S}:{sign.duration_s}" + (f"={size}" if size else "")
-    log, without = fly_for_log(link, fault), without_fault(link)
+    settings = settings_for(fault)
+    log, without = fly_for_log(link, settings, fault), without_fault(link, settings)
     truth = [name for name in without.column_names if name.startswith(("truth", "flow"))]
     before = (-RELEASE_S, BEGIN_S + 0.001)  # with the row at the begin: nothing acts backwards
     assert rows_between(log, *before).select(truth).equals(rows_between(without, *before).select(truth))
@@ -389,8 +424,8 @@ def test_same_seed_same_hash_with_faults(tmp_path: Path) -> None:
     assert first.hash == again.hash != other.hash
 
 
-def test_an_experiments_faults_outside_a_shortened_flight_are_left_out(tmp_path: Path) -> None:
-    own = (parse("push.x@0.2=0.1"), parse("push.x@5=0.1"), parse("serial.cut@0.1"))
+def test_an_experiments_faults_that_do_not_concern_the_flight_are_left_out(tmp_path: Path) -> None:
+    own = (*map(parse, ("push.x@0.2=0.1", "push.x@5=0.1", "serial.cut@0.1", "marker.swap@0.1")),)
     experiment = Experiment("hover", "", 10.0, {}, faults=own)
     prepare(tmp_path / "run")
     fly(Request.of(experiment, duration_s=1.0, faults=[parse("push.y@0.5")]), tmp_path / "run")
@@ -416,19 +451,37 @@ LONGER = {
     "cpu.load@1=0.95": "lost",
     "cpu.load@1=1": "lost",
 }  # fmt: skip
-STATED = {**{f"{name}@1": kind.outcome for name, kind in KINDS.items()}, **LONGER}
+LONGEST = {
+    "marker.hidden@1=5": "holds",
+    "marker.hidden@1:0.7=6": "failsafe",  # two are too few
+    "marker.noise@1:0.7=6": "failsafe",  # it fits too badly
+}
+STATED = {
+    **{f"{name}@1": kind.outcome for name, kind in KINDS.items()},
+    **LONGER,
+    **(LONGEST if LONG else {}),
+}
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("text", STATED)
 def test_the_hover_has_the_stated_outcome(tmp_path: Path, text: str, seed: int) -> None:
     link = KINDS[parse(text).kind].link or RADIO
-    result = go(tmp_path / "run", text, seed=seed, duration_s=7.0, link=link)
+    result = go(tmp_path / "run", text, seed=seed, duration_s=7.0, link=link, settings=settings_for(text))
     opened = (column(load_log(result.folder), "supervisor.state") == 3)[round(100 * RELEASE_S) :].any()
     flown = "failsafe" if opened else "holds" if result.passed else "degrades"
     outcome = "lost" if result.outcome == "lost" else flown
     failed = [str(verdict) for verdict in result.verdicts if not verdict.holds]
     assert outcome == STATED[text], f"{result.cause} {failed}"
+
+
+@pytest.mark.parametrize("seed", [1, 2] if LONG else [1])
+def test_swapped_markers_turn_the_body_over_where_bad_fits_are_accepted(tmp_path: Path, seed: int) -> None:
+    wide = (MARKERS_ON, "markers.max_error=0.2")
+    assert go(tmp_path / "long", "marker.swap@1", seed=seed, duration_s=4.0, settings=wide).outcome == "lost"
+    short = go(tmp_path / "short", "marker.swap@1:0.02", seed=seed, duration_s=2.0, settings=wide)
+    assert short.passed  # one pose, which the gate refuses
+    assert column(load_log(short.folder), "estimator.refused")[-1] == 1
 
 
 def test_the_watchdog_ends_a_flight_whose_processor_is_taken(tmp_path: Path) -> None:

@@ -24,9 +24,12 @@ AGE_MS = 5.0  # off the cameras' latency at most: the loopback interface and a b
 
 @needs("natnet")
 def test_the_cameras_pose_is_what_a_client_gets() -> None:
-    """Against the poses that the same cameras send to `--mocap virtual`; the noise makes each frame one of a kind."""
+    """Against the poses that the same cameras send to `--mocap virtual`; the noise makes each frame one of a kind.
+
+    The body is tracked by markers here, with noise that Motive would refuse.
+    """
     receiver = PoseReceiver(free_port())
-    noise = ("--set", "mocap.rotation_noise=0.2", "--set", "mocap.position_noise=0.05")
+    noise = ("--set", "markers.noise=0.02", "--set", "markers.max_error=1")
     with serve("--udp", "0", "--natnet-port", "0", "--poses", str(receiver.port), *noise, what="lab") as lab:
         port = lab.line("motive ")[0].split(":")[2]
         script = str(Path(__file__).with_name("natnet_clients.py"))
@@ -39,7 +42,13 @@ def test_the_cameras_pose_is_what_a_client_gets() -> None:
                 frames.append(decode_frame(data))
         process.kill()
         out, _ = process.communicate()
+        markers = subprocess.run(
+            [sys.executable, script, "natnet-markers", port, "unicast", "5"],
+            capture_output=True,
+            timeout=START_S,
+        )
     receiver.close()
+    assert_markers(markers.stdout)
     rows = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]
     assert len(rows) == 50
     places = np.array([frame.p_WB for frame in frames])
@@ -51,6 +60,35 @@ def test_the_cameras_pose_is_what_a_client_gets() -> None:
         assert FROM_MOTIVE @ Rotation.from_quat(q).as_matrix() @ FROM_MOTIVE.T == pytest.approx(
             R_WB, abs=1e-5
         )
+
+
+def assert_markers(out: bytes) -> None:
+    """The markers of each frame fit the model: as well as the frame itself says."""
+    (described,), *rows = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]
+    places = np.array([p for _, p in described])
+    assert places.shape == (8, 3)
+    assert len(rows) == 5
+    for _, (error,), labelled, unlabelled in rows:
+        assert ([occluded for *_, occluded, _ in labelled], unlabelled) == ([False] * 8, [])
+        points = np.array([p for _, _, p, _, _ in labelled])
+        around, model = points - points.mean(axis=0), places - places.mean(axis=0)
+        turn, _ = Rotation.align_vectors(around, model)
+        off = np.linalg.norm(around - turn.apply(model), axis=1)
+        assert off == pytest.approx([residual for *_, residual in labelled], abs=1e-5)
+        assert error == pytest.approx(off.mean(), abs=1e-5)
+
+
+@needs("natnet")
+def test_markers_can_be_taken_off() -> None:
+    with serve(
+        "--udp", "0", "--natnet-port", "0", "--poses", "0", "--set", "markers.enabled=false", what="lab"
+    ) as lab:
+        port = lab.line("motive ")[0].split(":")[2]
+        script = str(Path(__file__).with_name("natnet_clients.py"))
+        command = [sys.executable, script, "natnet-markers", port, "unicast", "1"]
+        out = subprocess.run(command, capture_output=True, timeout=START_S).stdout
+    described, (_, error, *markers) = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]
+    assert (described, error, markers) == ([[]], [0.0], [[], []])
 
 
 @mavproxy_here

@@ -25,6 +25,9 @@ from hil import curves, scene, viewer, window
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.fault_kinds import MARKERS_ON
+from hil.faults import parse
+from hil.markers import marker_places
 from hil.metrics import column
 from hil.plant import layout as at
 from hil.plant.body import place_plates
@@ -85,6 +88,36 @@ def test_texts_and_changes_of_state_are_recorded_once(folder: Path) -> None:
     assert values(path, "/state/robot", "StateChange:state")[:, 0].tolist() == ["held", "free"]
     for event in load_events(folder):
         assert 1000 * event["t_us"] in moments(path, f"/text/{event['source']}")
+
+
+def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) -> None:
+    prepare(tmp_path / "run")
+    request = Request.of(
+        EXPERIMENTS["hover"],
+        overrides=[MARKERS_ON],
+        duration_s=0.5,
+        faults=[parse("marker.hidden@0.2:0.1=3")],
+    )
+    fly(request, tmp_path / "run")
+    log, path = load_log(tmp_path / "run"), viewer.write_run_rrd(tmp_path / "run")
+    colours = values(path, "/world/robot/markers", "Points3D:colors")
+    expected = [[viewer.HIDDEN] * n + [viewer.SEEN] * (8 - n) for n in (8, 0, 3, 0)]  # no exposure yet; all
+    assert colours.tolist() == expected
+    times_us = [250, 10_250, 1_210_250, 1_310_250]
+    assert moments(path, "/world/robot/markers") == [1000 * t for t in times_us]
+    still = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.is_static]
+    (places,) = [batch for batch in still if "Points3D:positions" in batch.schema.names]
+    np.testing.assert_allclose(
+        places.column("Points3D:positions").to_pylist()[0], marker_places(PlantConfig()), atol=1e-7
+    )
+    split = tmp_path / "split.rrd"
+    recording = viewer.rr.RecordingStream("test")
+    recording.save(split)
+    stage = viewer.Stage(recording, log.schema)
+    for start in range(0, log.num_rows, 40):  # as live: nothing twice, nothing missing
+        stage.add_rows(log.slice(start, 40))
+    recording.disconnect()
+    assert moments(split, "/world/robot/markers") == moments(path, "/world/robot/markers")
 
 
 def rows_by_entity(path: Path) -> Counter[str]:

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,13 +34,17 @@ from ground_station.natnet import (
 )
 from hil.dongle_server import Readers
 from hil.errors import LabError
+from hil.markers import NO_POINTS, Sighting, marker_places
 from hil.natnet_bytes import encode_frame, encode_models, encode_server_info
+from hil.plant.config import PlantConfig
 from hil.virtual_motive import MAX_CLIENTS, Streaming, VirtualMotive, with_y_up
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
 FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
 PERIOD_S = 0.005
 LATENCY_US = 38_000
+PLACES = marker_places(PlantConfig())
+NO_POSE = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))  # Motive looks at the frame's
 
 single = st.floats(-100, 100, width=32)
 vector = st.tuples(single, single, single)
@@ -97,19 +102,33 @@ def seen(number: int) -> MocapFrame:
     return MocapFrame(number, tuple(rng.uniform(-1, 1, 3).tolist()), tuple(q.tolist()), valid=True)
 
 
+def sighted(number: int, tracked: bool = True) -> Sighting:
+    """What is seen of the markers in a frame: anything, anywhere."""
+    rng = np.random.default_rng(number)
+    points, ghosts = rng.uniform(-1, 1, (8, 3)), rng.uniform(-1, 1, (number % 3, 3))
+    shown = rng.random(8) < 0.7
+    residuals = 0.01 * rng.random(8) * shown
+    return Sighting(points, shown, residuals, ghosts, 0.001 * number, NO_POSE if tracked else None)
+
+
 class Laboratory:
     """A Motive that sees one body move, without a plant."""
 
-    def __init__(self, version: tuple[int, int] = (4, 1), multicast: bool = False) -> None:
+    def __init__(
+        self, version: tuple[int, int] = (4, 1), multicast: bool = False, markers: bool = False
+    ) -> None:
         self.readers: Readers = {}
-        self.motive = VirtualMotive(Streaming(0, version, multicast), {1: "floaty"}, self.readers)
+        places = PLACES if markers else NO_POINTS
+        self.motive = VirtualMotive(Streaming(0, version, multicast), {1: "floaty"}, self.readers, places)
         self.number = 0
+        self.markers = markers
 
     def expose(self, valid: bool = True) -> None:
         self.number += 1
         frame = seen(self.number)
         shown = MocapFrame(7_000_000, frame.p_WB, frame.q_WB, valid)
-        self.motive.take(1, shown, 7_000_000 + LATENCY_US)
+        sighting = sighted(self.number, valid) if self.markers else None
+        self.motive.take(1, shown, 7_000_000 + LATENCY_US, sighting)
 
     def answer(self) -> None:
         """Answer what clients have asked by now."""
@@ -209,6 +228,41 @@ def test_a_body_that_is_not_tracked_is_marked(lab: Laboratory, client: Client) -
     assert not decode(client.hear(), (4, 1)).bodies[0].valid
 
 
+def test_markers_of_a_body_that_is_not_tracked_have_no_label() -> None:
+    lab = Laboratory(markers=True)
+    client = Client(lab)
+    client.connect()
+    lab.expose(valid=False)
+    frame = decode(client.hear(), (4, 1))
+    expected = sighted(1)
+    assert frame.labelled == ()
+    places = np.vstack((expected.points[expected.seen], expected.ghosts)) @ FROM_MOTIVE
+    assert np.array(frame.unlabelled) == pytest.approx(places, abs=1e-6)
+    client.close()
+    lab.motive.close()
+
+
+def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
+    lab = Laboratory()
+    lab.motive.close()
+    names = {1: "floaty", 2: "floaty2"}
+    lab.motive = VirtualMotive(Streaming(0, (3, 1), False), names, lab.readers, PLACES)
+    client = Client(lab)
+    client.connect()
+    for _ in range(2):  # nothing is left of the frame before
+        lab.motive.take(1, seen(1), 0, sighted(1))
+        lab.motive.take(2, seen(2), 0, sighted(2))
+        frame = decode(client.hear(), (3, 1))
+        assert [marker.id for marker in frame.labelled] == [
+            body << 16 | row for body in (1, 2) for row in range(1, 9)
+        ]
+        ghosts = np.vstack((sighted(1).ghosts, sighted(2).ghosts))
+        assert np.array(frame.unlabelled) == pytest.approx(ghosts @ FROM_MOTIVE, abs=1e-6)
+        assert [body.error for body in frame.bodies] == pytest.approx([0.001, 0.002])
+    client.close()
+    lab.motive.close()
+
+
 def test_bodies_of_one_exposure_share_a_frame() -> None:
     lab = Laboratory()
     lab.motive.close()
@@ -298,12 +352,33 @@ def needs(client: str) -> pytest.MarkDecorator:
 @pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
 @pytest.mark.parametrize("version", [(3, 1), (4, 1)], ids=["3.1", "4.1"])
 def test_every_client_sees_the_pose(name: str, multicast: bool, version: tuple[int, int]) -> None:
-    lab = Laboratory(version, multicast)
+    lab = Laboratory(version, multicast, markers=True)
     assert_poses(lab, name, "multicast" if multicast else "unicast", "20")
 
 
-def assert_poses(lab: Laboratory, name: str, how: str, count: str) -> None:
-    """Run a client until it has its poses; each is that of the frame that it names, or of one at all."""
+@needs("natnet")
+@pytest.mark.parametrize("version", [(3, 1), (4, 1)], ids=["3.1", "4.1"])
+def test_an_unmodified_client_sees_the_markers(version: tuple[int, int]) -> None:
+    lab = Laboratory(version, markers=True)
+    (described,), *rows = rows_of_client(lab, "natnet-markers", "unicast", "10")
+    names = [f"Marker{number}" if version >= (4, 0) else None for number in range(1, 9)]
+    assert [name for name, _ in described] == names
+    assert np.array([p for _, p in described]) @ FROM_MOTIVE.T == pytest.approx(PLACES, abs=1e-6)
+    assert len(rows) == 10
+    for number, errors, labelled, unlabelled in rows:
+        expected = sighted(number)
+        assert errors == pytest.approx([expected.error])
+        assert [(model, row) for model, row, *_ in labelled] == [(1, row) for row in range(1, 9)]
+        points = np.array([p for _, _, p, _, _ in labelled]) @ FROM_MOTIVE.T
+        assert points == pytest.approx(expected.points, abs=1e-6)
+        assert [not occluded for *_, occluded, _ in labelled] == expected.seen.tolist()
+        assert [residual for *_, residual in labelled] == pytest.approx(expected.residuals)
+        ghosts = np.reshape(unlabelled, (-1, 3)) @ FROM_MOTIVE.T
+        assert ghosts == pytest.approx(expected.ghosts, abs=1e-6)
+
+
+def rows_of_client(lab: Laboratory, name: str, how: str, count: str) -> list[list[Any]]:
+    """Run a client until it has what it wants; returns what it printed."""
     script = str(Path(__file__).with_name("natnet_clients.py"))
     command = [sys.executable, script, name, str(lab.motive.port), how, count]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -315,7 +390,12 @@ def assert_poses(lab: Laboratory, name: str, how: str, count: str) -> None:
         process.wait()
         lab.motive.close()
     assert process.returncode == 0, errors.decode()
-    rows = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]  # clients chat
+    return [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]  # clients chat
+
+
+def assert_poses(lab: Laboratory, name: str, how: str, count: str) -> None:
+    """The poses that a client has; each is that of the frame that it names, or of one at all."""
+    rows = rows_of_client(lab, name, how, count)
     assert len(rows) == int(count)
     for number, body, p, q, tracked in rows:
         assert (body, tracked) == ("floaty", True)

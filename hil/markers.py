@@ -1,0 +1,167 @@
+"""Eight reflective markers on the robot, and which of them the cameras around the tunnel see.
+
+Where the markers of the real robot sit is published nowhere; here they sit on what is rigid, which the flaps are not: four
+on the flap axes, which stay where they are when the flaps turn, two on posts over the base plate, two on the frame below.
+No two arms are alike, so that no other assignment of labels fits (the closest misses by 19 mm, tests/test_markers.py), any
+three markers are far from one line, and they spread far enough for both noise figures of physics.md to come out of one:
+1.1 mm per marker and axis makes 0.4 mm and 0.004 rad of the pose. `hil.rigid_body` makes points and poses of what is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from firmware_py.geometry import Quaternion, Vector
+from hil.plant.config import PlantConfig
+
+if TYPE_CHECKING:
+    from hil.rigid_body import VirtualMarkers
+
+COUNT = 8  # paper, Setup specifications
+DIAMETER = 0.014  # [m]; chosen, a common size
+TRUNK_RADIUS = 0.03  # [m] of what hangs around the centre of mass: batteries and boards; chosen
+
+Points = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+NO_POINTS: Points = np.zeros((0, 3))
+
+
+class MarkersConfig(BaseModel):
+    """Markers one by one, instead of the pose-level noise of `[mocap]`: slower, but what is lost is lost by geometry."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    enabled: bool = Field(
+        False, description="poses come from markers; `mocap.position_noise` and `rotation_noise` rest then"
+    )
+    noise: float = Field(
+        0.0011,
+        ge=0,
+        le=0.1,
+        description="of each marker, white, per axis [m]; makes the pose's of physics.md section 6",
+    )
+    cameras: int = Field(5, ge=2, le=64, description="evenly around the tunnel; paper, Motion capture system")
+    camera_distance: float = Field(2.5, gt=0.5, le=20, description="from the tunnel's axis [m]; chosen")
+    camera_height: float = Field(2.0, ge=-2, le=20, description="z in W [m]; chosen: above the robot")
+    min_cameras: int = Field(
+        3, ge=2, le=64, description="that must see a marker to place it; chosen: two rays may meet by chance"
+    )
+    min_markers: int = Field(
+        3, ge=3, le=COUNT, description="that must be placed to track the body; geometry: 3 fix a pose"
+    )
+    max_error: float = Field(
+        0.005,
+        gt=0,
+        le=1,
+        description="mean distance from the fitted body [m]; above, it is not tracked; chosen",
+    )
+    mislabelled: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.0, description="share of frames in which two markers, any two, have each other's label"
+    )
+    ghosts: int = Field(
+        0, ge=0, le=100, description="reflections near the robot that are no markers, per frame"
+    )
+
+    @model_validator(mode="after")
+    def _enough_cameras(self) -> MarkersConfig:
+        if self.min_cameras > self.cameras:
+            raise ValueError(f"min_cameras = {self.min_cameras} of {self.cameras} cameras never see anything")
+        return self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """What was seen of one robot's markers in one exposure; row k belongs to label k + 1."""
+
+    points: Points  # (8, 3) [m] in W; of labels that are not seen: where the body that was fitted has them
+    seen: Mask  # (8,)
+    residuals: Points  # (8,) [m] distance from the body that was fitted; 0 where nothing is seen or fitted
+    ghosts: Points  # (N, 3) [m] in W
+    error: float  # [m] mean residual of what is seen
+    pose: tuple[Vector, Quaternion] | None  # p_WB [m], q_WB w x y z; None: not tracked
+
+    @property
+    def bits(self) -> int:
+        """Bit k is set when label k + 1 is seen."""
+        return int(np.packbits(self.seen, bitorder="little")[0])
+
+    @property
+    def unlabelled(self) -> Points:
+        """Points that belong to no body, (N, 3) [m] in W: ghosts, and all the markers when the body is not tracked."""
+        return self.ghosts if self.pose else np.vstack((self.points[self.seen], self.ghosts))
+
+
+def make_markers(
+    config: MarkersConfig, plant: PlantConfig, rng: np.random.Generator
+) -> VirtualMarkers | None:
+    """Return the markers on a robot; None when they are not enabled."""
+    if not config.enabled:
+        return None
+    from hil.rigid_body import VirtualMarkers  # scipy takes half a second to import
+
+    return VirtualMarkers(config, plant, rng)
+
+
+def marker_places(plant: PlantConfig) -> Points:
+    """Return the markers' places in B, (8, 3) [m]."""
+    corner, base, axis = plant.footprint / 2, plant.base_side, plant.axis_height
+    spread, below = plant.ground.foot_spread, plant.ground.foot_below
+    return np.array(
+        [
+            (1.00 * corner, -1.00 * corner, axis),  # on the axes of flaps 1 to 4
+            (0.85 * corner, 0.85 * corner, axis),
+            (-0.95 * corner, 0.95 * corner, axis),
+            (-0.70 * corner, -0.70 * corner, axis),
+            (0.375 * base, 0.0, axis + 0.02),  # on posts over the base plate
+            (-0.375 * base, 0.25 * base, axis + 0.06),
+            (spread, 0.0, -0.4 * below),  # on the frame that holds batteries and feet
+            (-0.5 * spread, -spread, -below),
+        ]
+    )
+
+
+class Cameras:
+    """Where the cameras stand, and what the robot itself hides from them.
+
+    Base plate and flaps are one flat square for that, whatever the flaps do; what hangs below them is a ball around the
+    centre of mass. A marker is placed when enough cameras have it in sight.
+    """
+
+    def __init__(self, config: MarkersConfig, plant: PlantConfig) -> None:
+        azimuth = 2.0 * np.pi * np.arange(config.cameras) / config.cameras
+        height = np.full(config.cameras, config.camera_height)
+        self._p_WC = np.column_stack(
+            (config.camera_distance * np.cos(azimuth), config.camera_distance * np.sin(azimuth), height)
+        )
+        self._needed = config.min_cameras
+        self._plate_height = plant.axis_height
+        self._plate_half = plant.footprint / 2
+        self._places = marker_places(plant)
+        self._squares = (self._places**2).sum(axis=1)[:, None]
+        self._over_plate = self._places[:, 2:] - plant.axis_height
+
+    def see(self, p_WB: Points, R_WB: Points) -> Mask:
+        """Return which markers enough cameras see, (8,), at a pose: (3,) [m] and (3, 3)."""
+        p_BC = (self._p_WC - p_WB) @ R_WB
+        in_sight = ~(self._behind_plate(p_BC) | self._behind_trunk(p_BC))
+        return np.asarray(in_sight.sum(axis=1) >= self._needed)
+
+    def _behind_plate(self, p_BC: Points) -> Mask:
+        """Which rays, marker by camera, pass through the square; markers in its plane are seen from both sides."""
+        over, camera_over = self._over_plate, p_BC[:, 2] - self._plate_height
+        reach = self._plate_half * np.abs(camera_over - over)
+        # The ray is in the plane at (marker * camera_over - camera * over) / (camera_over - over).
+        x = np.abs(self._places[:, :1] * camera_over - p_BC[:, 0] * over)
+        y = np.abs(self._places[:, 1:2] * camera_over - p_BC[:, 1] * over)
+        return np.asarray((over * camera_over < 0.0) & (x < reach) & (y < reach))
+
+    def _behind_trunk(self, p_BC: Points) -> Mask:
+        """Which rays, marker by camera, pass through the ball on their way to the camera, which is outside."""
+        along = self._places @ p_BC.T - self._squares  # marker times ray
+        rays = (p_BC**2).sum(axis=1) - self._squares - 2.0 * along  # squared lengths
+        return np.asarray((along < 0.0) & (self._squares * rays - along**2 < TRUNK_RADIUS**2 * rays))
