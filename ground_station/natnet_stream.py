@@ -174,14 +174,15 @@ class NatnetStream:
         counters.frames += 1
         t_us = self._exposed_us(frame, now_us)
         pose = next((body for body in frame.bodies if body.id == self._id), None)
-        if t_us is None or pose is None or not self._usable(pose):
-            counters.lost += 1
-            return MocapFrame(now_us if t_us is None else t_us, *NOWHERE, valid=False)
+        usable = t_us is not None and pose is not None and self._usable(pose)
+        counters.lost += not usable
+        if t_us is None:
+            return MocapFrame(now_us, *NOWHERE, valid=False)
         received_us, sent_us = map(self._clock.to_station_us, (frame.received, frame.transmitted))
-        p, q = self._alignment.to_world(pose.p, pose.q)
+        p, q = self._alignment.to_world(pose.p, pose.q) if usable and pose is not None else NOWHERE
         received_us = max(t_us, min(received_us, now_us))  # the clocks are not known that well
         sent_us = max(received_us, min(sent_us, now_us))
-        return MocapFrame(t_us, p, q, True, received_us, sent_us, now_us)
+        return MocapFrame(t_us, p, q, usable, received_us, sent_us, now_us)
 
     def _exposed_us(self, frame: Frame, now_us: int) -> int | None:
         """The exposure by our clock, None if the server's time stamps make no sense."""

@@ -62,10 +62,12 @@ class Bench:
         return frame
 
 
-def test_every_instant_of_the_way_is_by_the_station_s_clock() -> None:
+@pytest.mark.parametrize("tracked", [True, False])
+def test_every_instant_of_the_way_is_by_the_station_s_clock(tracked: bool) -> None:
     bench = Bench()
     bench.echo()
-    pose = bench.pose()
+    pose = bench.pose(tracked=tracked)
+    assert pose.valid == tracked
     instants = (pose.t_us, pose.received_us, pose.transmitted_us, pose.arrived_us)
     way_us = (0, CAMERA_US - 1000, CAMERA_US, CAMERA_US + 300)
     assert instants == pytest.approx([bench.now_us + t_us for t_us in way_us], abs=1)
