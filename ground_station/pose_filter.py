@@ -1,8 +1,9 @@
-"""The state behind a stream of poses: one linear Kalman filter (filterpy) with position, velocity, attitude, rate.
+"""The state behind a stream of poses: a linear Kalman filter with position, velocity, attitude, rate.
 
-The attitude lives in a reference quaternion; the filter holds the small rotation that it is off, which goes into the
-reference after every step. Noise is the same on all axes, so that two numbers tell how far off a pose may be. While poses
-come without a gap, gain and covariance stand still, and filterpy's steady-state steps do without them: 13 instead of 45 us.
+All axes are alike: one filter of filterpy, for position, velocity, angle and rate of one axis, says how uncertain they are
+and with which gains a pose counts; the state itself is plain numbers. While poses come without a gap, uncertainty and
+gains stand still and filterpy rests: 3 instead of 40 us. The attitude lives in a reference quaternion; the filter's angle
+is the small rotation that it is off, which goes into the reference after every step.
 """
 
 from math import sqrt
@@ -16,7 +17,9 @@ SPEED = 1.0  # [m/s] of a robot that is seen for the first time, one standard de
 RATE = 5.0  # [rad/s] likewise
 SETTLED = 1e-6  # gain and steady gain differ by less than this share of the largest
 STEPS_MAX = 10_000  # until the gain stands still; 10 to 200 are usual
-P, V, THETA, W = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)  # parts of the state
+NOTHING: Vector = (0.0, 0.0, 0.0)
+
+Gains = tuple[float, float, float, float]  # of position and velocity [1, 1/s], of angle and rate
 
 
 class PoseFilter:
@@ -34,48 +37,47 @@ class PoseFilter:
         from filterpy.common import Q_discrete_white_noise
         from filterpy.kalman import KalmanFilter
 
+        self._step_s = step_s
         self._noise2 = position_noise**2, rotation_noise**2
-        filter_: Any = KalmanFilter(dim_x=12, dim_z=6)
-        filter_.x = np.zeros(12)
-        filter_.F = np.kron(np.eye(2), np.kron([[1.0, step_s], [0.0, 1.0]], np.eye(3)))
-        filter_.H[:3, P] = filter_.H[3:, THETA] = np.eye(3)
-        filter_.R = np.diag(np.repeat(self._noise2, 3))
-        filter_.Q = np.zeros((12, 12))
-        for part, noise in ((slice(0, 6), acceleration), (slice(6, 12), angular_acceleration)):
-            filter_.Q[part, part] = Q_discrete_white_noise(
-                2, step_s, noise**2, block_size=3, order_by_dim=False
-            )
+        filter_: Any = KalmanFilter(dim_x=4, dim_z=2)
+        filter_.F = np.kron(np.eye(2), [[1.0, step_s], [0.0, 1.0]])
+        filter_.H = np.kron(np.eye(2), [[1.0, 0.0]])
+        filter_.R = np.diag(self._noise2)
+        filter_.Q = np.zeros((4, 4))
+        filter_.Q[:2, :2] = Q_discrete_white_noise(2, step_s, acceleration**2)
+        filter_.Q[2:, 2:] = Q_discrete_white_noise(2, step_s, angular_acceleration**2)
         self._filter = filter_
+        self._first_P = np.diag([self._noise2[0], SPEED**2, self._noise2[1], RATE**2])
+        self._p = self._v = self._theta = self._w = NOTHING
         self._q = IDENTITY  # reference
-        self._first_P = np.diag(np.repeat([self._noise2[0], SPEED**2, self._noise2[1], RATE**2], 3))
         self._settle()
 
     def _settle(self) -> None:
-        """Find what gain and covariance settle to."""
-        filter_, gain = self._filter, np.zeros((12, 6))
+        """Find what gain and uncertainty settle to."""
+        filter_, gain = self._filter, np.zeros((4, 2))
         filter_.P = self._first_P
         for _ in range(STEPS_MAX):
             filter_.predict()
             self._steady_prior = filter_.P
-            filter_.update(np.zeros(6))
+            filter_.update(np.zeros(2))
             if np.abs(filter_.K - gain).max() < 0.1 * SETTLED * gain.max():
                 break
             gain = filter_.K
         self._steady_K, self._steady_P = filter_.K, filter_.P
         self._margin = SETTLED * float(self._steady_K.max())
         self._steady_variances = self._variances_of(self._steady_prior)
+        self._steady_gains = self._gains = _gains_of(filter_.K)
         self._steady = False
         self.variances = self._steady_variances
 
     @property
     def pose(self) -> tuple[Vector, Quaternion]:
         """Position and attitude of B in W."""
-        x, y, z = self._filter.x[P].tolist()
-        return (x, y, z), self._q
+        return self._p, self._q
 
     def begin(self, p_WB: Vector, q_WB: Quaternion) -> None:
         """Know this pose and nothing before it."""
-        self._filter.x = np.array([*p_WB, *[0.0] * 9])
+        self._p, self._v, self._theta, self._w = p_WB, NOTHING, NOTHING, NOTHING
         self._filter.P = self._first_P
         w, x, y, z = q_WB
         n = 1.0 / sqrt(w * w + x * x + y * y + z * z)
@@ -87,17 +89,17 @@ class PoseFilter:
 
         They are those of its distance and of its rotation from the prediction, per axis [m^2, rad^2].
         """
-        filter_ = self._filter
+        for _ in range(steps - 1):
+            self._move()
+            self._turn()
+        self._move()
         if self._steady and steps == 1:
-            filter_.predict_steadystate()
             return
         self._steady = False
-        step = filter_.predict if widen else filter_.predict_steadystate
-        for _ in range(steps - 1):
-            step()
-            self._turn()
-        step()
-        self.variances = self._variances_of(filter_.P)
+        if widen:
+            for _ in range(steps):
+                self._filter.predict()
+        self.variances = self._variances_of(self._filter.P)
 
     def off(self, p_WB: Vector, q_WB: Quaternion) -> tuple[float, float, Vector]:
         """How far a pose is from the prediction, squared [m^2, rad^2], and its rotation from the reference.
@@ -105,7 +107,8 @@ class PoseFilter:
         Rotations are twice Gibbs's vector, 2 tan(angle / 2) about the axis [rad]: the angle itself where it is small, and
         far beyond every gate where it is not.
         """
-        x, y, z, _, _, _, a, b, c, _, _, _ = self._filter.x.tolist()
+        x, y, z = self._p
+        a, b, c = self._theta
         dx, dy, dz = p_WB[0] - x, p_WB[1] - y, p_WB[2] - z
         w, x, y, z = self._q
         qw, qx, qy, qz = q_WB
@@ -121,26 +124,41 @@ class PoseFilter:
 
     def update(self, p_WB: Vector, theta: Vector) -> tuple[Vector, Vector]:
         """Take a pose, as position and rotation from the reference; returns velocity in W and rate in B."""
-        filter_, z = self._filter, [*p_WB, *theta]
-        if self._steady:
-            filter_.update_steadystate(z)
-        else:
-            filter_.update(z)
-            if np.abs(filter_.K - self._steady_K).max() < self._margin:
-                filter_.K, filter_.P = self._steady_K, self._steady_P
-                self.variances, self._steady = self._steady_variances, True
-        return self._turn()
+        if not self._steady:
+            self._weigh()
+        k_p, k_v, k_theta, k_w = self._gains
+        self._p, self._v = _corrected(self._p, self._v, p_WB, k_p, k_v)
+        self._theta, self._w = _corrected(self._theta, self._w, theta, k_theta, k_w)
+        self._turn()
+        return self._v, self._w
+
+    def _weigh(self) -> None:
+        """Find the gains of the next pose, and what uncertainty it leaves."""
+        filter_ = self._filter
+        filter_.update(np.zeros(2))
+        if np.abs(filter_.K - self._steady_K).max() >= self._margin:
+            self._gains = _gains_of(filter_.K)
+            return
+        filter_.P, self._gains = self._steady_P, self._steady_gains
+        self.variances, self._steady = self._steady_variances, True
 
     def leave_out(self) -> tuple[Vector, Vector]:
         """Take no pose this time; returns velocity and rate as predicted."""
         if self._steady:
             self._filter.P, self._steady = self._steady_prior, False
-        return self._turn()
+        self._turn()
+        return self._v, self._w
 
-    def _turn(self) -> tuple[Vector, Vector]:
-        """Put the attitude error into the reference; returns velocity and rate."""
-        state = self._filter.x
-        _, _, _, vx, vy, vz, a, b, c, p, q, r = state.tolist()
+    def _move(self) -> None:
+        """Predict the state one step ahead."""
+        t = self._step_s
+        (x, y, z), (vx, vy, vz), (p, q, r) = self._p, self._v, self._w
+        self._p = (x + t * vx, y + t * vy, z + t * vz)
+        self._theta = (t * p, t * q, t * r)
+
+    def _turn(self) -> None:
+        """Put the attitude error into the reference."""
+        a, b, c = self._theta
         w, x, y, z = self._q
         a, b, c = 0.5 * a, 0.5 * b, 0.5 * c
         w, x, y, z = (
@@ -151,8 +169,24 @@ class PoseFilter:
         )
         n = 1.0 / sqrt(w * w + x * x + y * y + z * z)
         self._q = (n * w, n * x, n * y, n * z)
-        state[THETA] = 0.0
-        return (vx, vy, vz), (p, q, r)
+        self._theta = NOTHING
 
     def _variances_of(self, prior: Any) -> tuple[float, float]:
-        return float(prior[0, 0]) + self._noise2[0], float(prior[6, 6]) + self._noise2[1]
+        return float(prior[0, 0]) + self._noise2[0], float(prior[2, 2]) + self._noise2[1]
+
+
+def _gains_of(K: Any) -> Gains:
+    return float(K[0, 0]), float(K[1, 0]), float(K[2, 1]), float(K[3, 1])
+
+
+def _corrected(
+    value: Vector, slope: Vector, measured: Vector, gain: float, slope_gain: float
+) -> tuple[Vector, Vector]:
+    """Three values and their slopes, after a measurement."""
+    x, y, z = value
+    a, b, c = slope
+    dx, dy, dz = measured[0] - x, measured[1] - y, measured[2] - z
+    return (
+        (x + gain * dx, y + gain * dy, z + gain * dz),
+        (a + slope_gain * dx, b + slope_gain * dy, c + slope_gain * dz),
+    )
