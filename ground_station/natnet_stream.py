@@ -99,12 +99,15 @@ class NatnetStream:
                 self.notices.append(f"motion capture: {error}")
         return None
 
-    def call(self, now_us: int) -> None:
-        """Keep the connection; to be called often. A silent server is asked who it is."""
+    def call(self, now_us: int, packets_wait: bool) -> None:
+        """Keep the connection; to be called often. A server that is silent is asked who it is.
+
+        It is not while packets wait: then it was us who did not listen.
+        """
         if now_us < self._call_us:
             return
         self._call_us = now_us + CALL_PERIOD_US
-        silent = self._heard_us is not None and now_us - self._heard_us > SILENCE_US
+        silent = not packets_wait and self._heard_us is not None and now_us - self._heard_us > SILENCE_US
         if silent and not self._silent:
             self.notices.append("motion capture: no frames; calling the server again")
         self._silent = silent

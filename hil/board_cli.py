@@ -192,6 +192,9 @@ def station(
     from ground_station.trajectory import Goal
 
     link = _live_link(uri, config)
+    tracker = tracker_of(
+        config.tracker, config.mocap.period_us
+    )  # takes a second, in which no frame should wait
     played = source = _open_source(mocap, config.capture)
     try:
         telemetry = TelemetryLog(log) if log else None
@@ -206,7 +209,6 @@ def station(
     stops = _stop_signals()
     start_us = clock_us()
     goal = Goal(config.flight.home, 0.0)
-    tracker = tracker_of(config.tracker, config.mocap.period_us)
     ground = GroundStation(link, experiment.trajectory(goal, start_us), telemetry, config.station, tracker)
 
     def stopping() -> bool:

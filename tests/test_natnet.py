@@ -127,7 +127,7 @@ def test_no_mutated_packet_harms_the_stream() -> None:
             data[2:4] = struct.pack("<H", max(0, len(data) - 4))
         pose = stream.on_packet(bytes(data), now_us)
         assert pose is None or not pose.valid or (np.isfinite(pose.p_WB).all() and pose.t_us <= now_us)
-        stream.call(now_us)
+        stream.call(now_us, packets_wait=False)
         stream.outgoing.clear()
         stream.notices.clear()
     assert stream.counters.malformed > PACKETS // 20

@@ -54,7 +54,7 @@ class NatnetFlight:
             self._number, V, tuple((t_us + AHEAD_US) * TICKS_PER_US for t_us in instants),
             tracked=frame.valid, pose=(frame.p_WB, (x, y, z, w)),
         )  # fmt: skip
-        self.stream.call(now_us)
+        self.stream.call(now_us, packets_wait=False)
         for asked in self.stream.outgoing:
             if asked[0] == 12:
                 asked_us = int.from_bytes(asked[4:], "little")

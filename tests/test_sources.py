@@ -207,7 +207,7 @@ def test_a_stream_that_stops_is_told_once_and_called_until_it_is_back() -> None:
     calls = 0
     for _ in range(30):
         bench.now_us += 100_000
-        bench.stream.call(bench.now_us)
+        bench.stream.call(bench.now_us, packets_wait=False)
         calls += sum(data[0] == 0 for data in bench.stream.outgoing)
         bench.stream.outgoing.clear()
     assert 4 <= calls <= 6
@@ -215,6 +215,16 @@ def test_a_stream_that_stops_is_told_once_and_called_until_it_is_back() -> None:
     assert bench.stream.notices == [
         "motion capture: no frames; calling the server again", "motion capture: frames again after 3.0 s",
     ]  # fmt: skip
+
+
+def test_who_did_not_listen_does_not_call_the_server_silent() -> None:
+    bench = Bench()
+    bench.frame()
+    bench.now_us += 3_000_000
+    bench.stream.call(bench.now_us, packets_wait=True)
+    assert 0 not in [data[0] for data in bench.stream.outgoing]
+    assert bench.pose().valid
+    assert bench.stream.notices == []
 
 
 def test_looking_for_a_virtual_pose_does_not_wait() -> None:

@@ -94,10 +94,10 @@ class MotioncaptureSource:
             now_us = clock_us()
             if self._process is None and now_us >= self._restart_us:
                 self._start()
-            if now_us - self._heard_us > SILENCE_US and not self._silent:
+            arrival = self._next(max(0, deadline_us - now_us) * 1e-6)
+            if arrival is None and now_us - self._heard_us > SILENCE_US and not self._silent:
                 self._silent = True
                 self._notices.append("motion capture: no frames; calling the server again")
-            arrival = self._next(max(0, deadline_us - now_us) * 1e-6)
             frame = self._on_arrival(arrival, clock_us()) if isinstance(arrival, Arrival) else None
             if frame is not None or clock_us() >= deadline_us:
                 return frame

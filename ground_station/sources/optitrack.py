@@ -67,8 +67,10 @@ class OptitrackSource:
         """The next frame, None when none comes in time."""
         deadline_us = clock_us() + round(timeout_s * 1e6)
         while True:
-            self._send(clock_us())
-            data = self._next_packet(max(0, deadline_us - clock_us()) * 1e-6)
+            data = self._next_packet(0.0)
+            self._send(clock_us(), packets_wait=data is not None)
+            if data is None:
+                data = self._next_packet(max(0, deadline_us - clock_us()) * 1e-6)
             if data is None:
                 return None
             frame = self._stream.on_packet(data, clock_us())
@@ -94,8 +96,8 @@ class OptitrackSource:
             each.close()
         self._sockets, self._waiting = [], []
 
-    def _send(self, now_us: int) -> None:
-        self._stream.call(now_us)
+    def _send(self, now_us: int, packets_wait: bool) -> None:
+        self._stream.call(now_us, packets_wait)
         outgoing, self._stream.outgoing = self._stream.outgoing, []
         for data in outgoing:
             with suppress(OSError):  # no network: nothing will come, and that is told
