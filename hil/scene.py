@@ -77,6 +77,15 @@ def outline(plant: PlantConfig) -> list[Points]:
     return [*squares, np.array([(0.0, 0.0, 0.0), (0.0, 0.0, plant.axis_height)])]
 
 
+def stand_lines(plant: PlantConfig) -> list[Points]:
+    """Return the stand in B: from each corner of the base plate to a foot, and around the feet."""
+    corner, foot = plant.base_side / 2, plant.ground.foot_spread
+    turn = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
+    feet = np.array([(foot * x, foot * y, -plant.ground.foot_below) for x, y in turn])
+    corners = np.array([(corner * x, corner * y, plant.axis_height) for x, y in turn])
+    return [feet, *np.stack((corners[:4], feet[:4]), axis=1)]
+
+
 def box_lines(half: float) -> list[Points]:
     """Return the edges of a cube around the origin as five closed or straight lines."""
     low, high = (

@@ -235,6 +235,8 @@ class Stage:
         log("world/robot/body", body, static=True)
         rod = [[(0, 0, 0), (0, 0, plant.axis_height)]]
         log("world/robot/rod", rr.LineStrips3D(rod, colors=0x707880FF, radii=0.003), static=True)
+        stand = rr.LineStrips3D(scene.stand_lines(plant), colors=0x707880FF, radii=0.0015)
+        log("world/robot/stand", stand, static=True)
         log("world/robot/plates", rr.Transform3D(translation=(0, 0, plant.axis_height)), static=True)
         meshes = [("base", scene.base_mesh(plant), "#c8ccd0")]
         for flap, colour in enumerate(curves.FLAP_COLOURS):

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections import Counter
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -246,6 +247,17 @@ def _part(mesh: scene.Mesh, flat: bool) -> NDArray[np.int64]:
 def _area(mesh: scene.Mesh) -> float:
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def test_the_lowest_marker_sits_on_the_drawn_stand() -> None:
+    plant = PlantConfig()
+    lowest = min(marker_places(plant), key=lambda place: place[2])
+    foot = scene.stand_lines(plant)[0]
+    along = [
+        np.linalg.norm(lowest - a) + np.linalg.norm(lowest - b) - np.linalg.norm(b - a)
+        for a, b in pairwise(foot)
+    ]
+    assert min(along) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_drawn_areas_are_the_papers() -> None:
