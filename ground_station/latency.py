@@ -6,7 +6,7 @@ sources that do not tell them apart. Times in microseconds.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, isnan, nan
 
@@ -53,10 +53,16 @@ def budget_of(rows: Sequence[Row], medium: str) -> tuple[Stage, ...]:
     """The stages that are told, and the age on board as "pose" ahead of them; empty without poses."""
     if not rows:
         return ()
-    columns = dict(zip((*STAGES[:-1], medium), zip(*rows, strict=True), strict=True))
-    mocap = [name for name in STAGES[:3] if not isnan(sum(columns[name]))] or ["mocap"]
+    columns = dict(zip(STAGES, zip(*rows, strict=True), strict=True))
     pose = _stage("pose", [sum(row[3:]) for row in rows])
-    return (pose, *(_stage(name, columns[name]) for name in (*mocap, "station", medium)))
+    stages = (_stage(medium if name == "link" else name, columns[name]) for name in stages_told(columns))
+    return (pose, *stages)
+
+
+def stages_told(columns: Mapping[str, Sequence[float]]) -> tuple[str, ...]:
+    """The stages that add up to the age: "mocap" only where one of those before it is not told."""
+    apart = [name for name in STAGES[:3] if not isnan(sum(columns[name]))]
+    return (*(apart if len(apart) == 3 else ("mocap",)), *STAGES[4:])
 
 
 def _stage(name: str, times: Sequence[float]) -> Stage:

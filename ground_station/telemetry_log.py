@@ -18,10 +18,11 @@ from ground_station.trajectory import Goal
 
 FLUSH_PERIOD_US = 1_000_000
 
+TIME_COLUMN = "ground.t [s]"
 AGE_COLUMNS = tuple(f"age.{stage} [s]" for stage in STAGES)
 
 _GROUND_COLUMNS = (
-    "ground.t [s]",
+    TIME_COLUMN,
     "goal.x [m]",
     "goal.y [m]",
     "goal.z [m]",
@@ -55,7 +56,7 @@ def _columns_of(blocks: tuple[Block, ...]) -> tuple[list[str], dict[int, int]]:
 
 
 _TELEMETRY_COLUMNS, _FIRST_COLUMN = _columns_of(BLOCKS)
-_TIMES = ("ground.t [s]", "mocap.t [s]")  # to the microsecond
+_TIMES = (TIME_COLUMN, "mocap.t [s]")  # to the microsecond
 _FORMATS = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *_TELEMETRY_COLUMNS)]
 _ROW = ",".join(["%d", *_FORMATS]) + "\n"
 

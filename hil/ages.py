@@ -3,21 +3,23 @@
 Of a radio in lockstep the station knows no more than what is usual; there its share comes from the flight log.
 """
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from pyarrow import csv
 
-from ground_station.latency import Row, Stage, budget_of
-from ground_station.telemetry_log import AGE_COLUMNS
+from ground_station.latency import STAGES, Row, Stage, budget_of
+from ground_station.telemetry_log import AGE_COLUMNS, TIME_COLUMN
 from hil.metrics import column
 
+TELEMETRY = "telemetry.csv"
 
-def ages_of(telemetry: Path, log: pa.Table, link: str) -> tuple[Stage, ...]:
+
+def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
     """The budget of a flight over `link`; empty when no telemetry came."""
-    rows = _told(telemetry)
+    rows: list[Row] = list(zip(*(_us(told_ages, stage) for stage in STAGES), strict=True))
     radio_us = _on_air(log)
     if rows and len(radio_us):
         rows = [
@@ -27,17 +29,30 @@ def ages_of(telemetry: Path, log: pa.Table, link: str) -> tuple[Stage, ...]:
     return budget_of(rows, "serial" if medium == "mavlink" else medium)
 
 
-def _told(telemetry: Path) -> list[Row]:
-    """What the station says of the poses that it sent; the last line may be cut."""
-    if not telemetry.is_file():
-        return []
-    with telemetry.open(encoding="utf-8", newline="") as file:
-        lines = csv.reader(file)
-        titles = next(lines)
-        first = titles.index(AGE_COLUMNS[0])
-        parts = [line[first : first + len(AGE_COLUMNS)] for line in lines if len(line) == len(titles)]
-    rows = [tuple(1e6 * float(part) for part in row) for row in parts]
-    return [row for row in rows if not np.isnan(row[-1])]
+def told(folder: Path) -> pa.Table:
+    """What the station said of the poses that it sent: `t` [s] by its clock, from the first one on, and each stage [ms].
+
+    A stage of which it does not know is NaN. The last line of the file may be cut.
+    """
+    path, titles = folder / TELEMETRY, (TIME_COLUMN, *AGE_COLUMNS)
+    times = np.empty((0, len(titles)))
+    if path.is_file() and path.stat().st_size:
+        convert = csv.ConvertOptions(
+            include_columns=titles,
+            column_types=dict.fromkeys(titles, pa.float64()),
+            include_missing_columns=True,
+        )
+        parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
+        table = csv.read_csv(path, parse_options=parse, convert_options=convert)
+        times = np.column_stack([table.column(title).to_numpy() for title in titles])
+    times = times[~np.isnan(times[:, -1])]
+    times[:, 0] -= times[:1, 0].sum()
+    times[:, 1:] *= 1e3
+    return pa.table(dict(zip(("t", *STAGES), times.T, strict=True)))
+
+
+def _us(told_ages: pa.Table, stage: str) -> list[float]:
+    return [1e3 * age for age in told_ages.column(stage).to_pylist()]
 
 
 def _on_air(log: pa.Table) -> NDArray[np.float64]:

@@ -87,11 +87,10 @@ def flight_channels(
     plant: Plant,
     board: VirtualBoard,
     firmware: Firmware,
-    link: Channel,
     trajectory: Trajectory,
     free: Callable[[], bool],
 ) -> tuple[Channel, ...]:
-    """Return the channels of a flight, `link` among them; the first column, `t`, is the recorder's own."""
+    """Return the channels of any flight; the first column, `t`, is the recorder's own."""
     signals, queue = firmware.signals, firmware.measurements
     kernel = firmware.kernel
     tasks = kernel.tasks
@@ -151,7 +150,6 @@ def flight_channels(
             _view(signals.counters),
             (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us")),
         ),
-        link,
         Channel(
             "int64",
             counts,

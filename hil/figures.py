@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ground_station.latency import STAGES, stages_told
 from hil import curves, scene
 from hil.curves import Curves
 from hil.faults import spans_of
@@ -158,24 +159,45 @@ def flaps(rows: pa.Table) -> Figure:
     return figure
 
 
-def radio(rows: pa.Table) -> Figure:
-    """Draw the age of the poses, the time in the air and the packets that were lost."""
-    figure, axes = stack((1.5, 1.5, 1.5))
+def age(rows: pa.Table) -> Figure:
+    """Draw how old poses are when the estimator takes them."""
+    figure, axes = stack((1.5,))
     _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
-    _up_and_down(axes[1], rows, SECOND, curves.latency, "mean latency [ms]")
-    _lines(axes[2], _seconds(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
+    shade(axes, rows)
+    return figure
+
+
+def way(told: pa.Table) -> Figure:
+    """Draw where the poses of `ages.told` spent their time, stage on stage."""
+    figure, (axes,) = stack((1.8,))
+    axes.set_xlabel("time [s], by the clock of the ground station")
+    columns = {name: told.column(name).to_numpy() for name in STAGES}
+    names = stages_told(columns)
+    colours = curves.TASK_COLOURS[: len(names)]
+    seconds = told.column("t").to_numpy()
+    axes.stackplot(seconds, *[columns[name] for name in names], labels=names, colors=colours)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), reverse=True)
+    axes.margins(x=0.0)
+    axes.set_ylabel("age [ms]")
+    return figure
+
+
+def radio(rows: pa.Table) -> Figure:
+    """Draw the time in the air and the packets that were lost."""
+    figure, axes = stack((1.5, 1.5))
+    _up_and_down(axes[0], rows, SECOND, curves.latency, "mean latency [ms]")
+    _lines(axes[1], _seconds(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
     shade(axes, rows)
     return figure
 
 
 def serial_line(rows: pa.Table) -> Figure:
-    """Draw the age of the poses, the load of the line, the time on it and what was lost or spoilt."""
-    figure, axes = stack((1.5, 1.5, 1.5, 1.5))
-    _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
-    _up_and_down(axes[1], rows, TENTH, curves.line_load, "load of the line [%]")
-    axes[1].set_ylim(0.0, 105.0)
-    _up_and_down(axes[2], rows, SECOND, curves.latency, "mean latency [ms]")
-    _lines(axes[3], _seconds(rows), curves.SERIAL_FAULTS, curves.SERIAL_FAULTS.read(rows), "bytes or frames")
+    """Draw the load of the line, the time on it and what was lost or spoilt."""
+    figure, axes = stack((1.5, 1.5, 1.5))
+    _up_and_down(axes[0], rows, TENTH, curves.line_load, "load of the line [%]")
+    axes[0].set_ylim(0.0, 105.0)
+    _up_and_down(axes[1], rows, SECOND, curves.latency, "mean latency [ms]")
+    _lines(axes[2], _seconds(rows), curves.SERIAL_FAULTS, curves.SERIAL_FAULTS.read(rows), "bytes or frames")
     shade(axes, rows)
     return figure
 
@@ -237,7 +259,7 @@ def schedule(table: pa.Table) -> Figure:
     figure = Figure(figsize=(WIDTH, 2.4), layout="constrained")
     axes = figure.subplots()
     stretches = [run for run in runs(table) if run.task != "IDLE"]
-    begin_us = table.column("us")[0].as_py() if table.num_rows else 0
+    begin_us = table.column("us")[0].as_py()
     stretches = [run for run in stretches if run.start_us < begin_us + SCHEDULE_US]
     names = sorted({run.task for run in stretches}, reverse=True)
     for height, name in enumerate(names):
@@ -273,17 +295,21 @@ PICTURES = (
         flaps,
     ),
     Picture(
+        "Age",
+        "Age of the pose when the estimator takes it, and the horizon of its predictor.",
+        age,
+    ),
+    Picture(
         "Radio",
-        "Age of the pose when the estimator takes it and the horizon of its predictor; mean time of a packet in the air, "
-        "per second; packets lost and sent again, since the start.",
+        "Mean time of a packet in the air, per second; packets lost and sent again, since the start.",
         radio,
         needs="link.retried",
     ),
     Picture(
         "Serial line",
-        "Age of the pose when the estimator takes it and the horizon of its predictor; share of the time in which the line "
-        "carries bytes, over 0.1 s; mean time from sender to receiver, per second; since the start: bytes that overran the "
-        "board's receive buffer or found no room to be sent, frames that neither end could read.",
+        "Share of the time in which the line carries bytes, over 0.1 s; mean time from sender to receiver, per second; "
+        "since the start: bytes that overran the board's receive buffer or found no room to be sent, frames that neither "
+        "end could read.",
         serial_line,
         needs="serial.up_busy",
     ),
@@ -298,5 +324,10 @@ PICTURES = (
         "What the estimator believed, less the truth, in the goal frame.",
         estimate,
     ),
+)
+WAY = Picture(
+    "Way of the poses",
+    "Where poses spent their time from the exposure to the board, as the ground station told each that it sent.",
+    way,
 )
 SCHEDULE = Picture("Scheduler", "Which task had the processor, for 20 ms.", schedule)

@@ -175,13 +175,11 @@ class Flight:
     def channels(self) -> tuple[Channel, ...]:
         """Return what there is to record."""
         link = self.serial.channel(self.firmware) if self.serial else radio_channel(self.radio)
-        channels = flight_channels(
-            self.plant, self.board, self.firmware, link, self.trajectory, lambda: self.free
-        )
+        channels = flight_channels(self.plant, self.board, self.firmware, self.trajectory, lambda: self.free)
         tracker = (tracker_channel(self.tracker),) if self.tracker else ()
         faults = (fault_channel(self.active_faults),) if self.faults else ()
         markers = (marker_channel(self.mocap),) if self.mocap.markers else ()
-        return (*channels, battery_channel(self.battery), *tracker, *markers, *faults)
+        return (*channels, link, battery_channel(self.battery), *tracker, *markers, *faults)
 
     @cached_property
     def thief(self) -> Thief:

@@ -17,16 +17,15 @@ from firmware_py.firmware import Firmware
 from ground_station.mocap_udp import PosePublisher
 from ground_station.trajectory import Goal
 from hil.board_server import BoardServer
-from hil.channels import flight_channels, radio_channel
+from hil.channels import flight_channels
 from hil.config import LabConfig
 from hil.dongle_plugin import VARIABLE
 from hil.errors import LabError
 from hil.experiments import Experiment
-from hil.harness import RECORD_PERIOD_US, RECORD_PHASE_US, Outcome, Streams
+from hil.harness import RECORD_PERIOD_US, RECORD_PHASE_US, Outcome
 from hil.recorder import Channel, Recorder
 from hil.serial_server import Address
 from hil.virtual_motive import Streaming
-from hil.virtual_radio import VirtualRadio
 
 SITE = Path(__file__).parent / "dongle_site"
 RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder
@@ -74,7 +73,6 @@ class LinkedFlight:
         self._released = self._gave_up = self._over = False
         self._progress: Callable[[int], None] | None = None
         self._trajectory = experiment.trajectory(Goal(config.flight.home, 0.0), 0)
-        self._no_radio = VirtualRadio(config.radio, self._server.events, Streams.of_seed(seed).radio)
         uri, self._environment = self._serve(uri, config.serial.baud)
         self._poses: PosePublisher | None = None
         self._command = [
@@ -123,14 +121,14 @@ class LinkedFlight:
         """Write nothing: the scheduler is traced in lockstep only."""
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return what there is to record; of radio and UDP nothing is counted: those columns stay zero."""
+        """Return what there is to record; of radio and UDP nothing is counted."""
         plant, board, firmware = self._board.parts()
-        link = radio_channel(self._no_radio)
-        if self._board.line is not None:
-            from hil.serial_line import serial_channel  # needs pymavlink
+        channels = flight_channels(plant, board, firmware, self._trajectory, lambda: self._board.free)
+        if self._board.line is None:
+            return channels
+        from hil.serial_line import serial_channel  # needs pymavlink
 
-            link = serial_channel(self._board.line, firmware, None)
-        return flight_channels(plant, board, firmware, link, self._trajectory, lambda: self._board.free)
+        return (*channels, serial_channel(self._board.line, firmware, None))
 
     def run(self, progress: Callable[[int], None] | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C; raises `LabError` when the station gives up."""

@@ -13,10 +13,11 @@ from typing import Any
 import pyarrow as pa
 
 from firmware_py.firmware import LATENCY_BOUNDS_US
+from hil.ages import told
 from hil.experiments import EXPERIMENTS
 from hil.fault_kinds import KINDS
 from hil.faults import Span, spans_of
-from hil.figures import PICTURES, SCHEDULE
+from hil.figures import PICTURES, SCHEDULE, WAY
 from hil.metrics import METRICS, SHOWN
 from hil.pages import data_uri, write_page
 from hil.picture import Picture
@@ -66,7 +67,11 @@ def write_report(folder: Path) -> Path:
     experiment = EXPERIMENTS.get(result["experiment"])
     own = experiment.pictures if experiment else ()
     shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
-    shown.append(_show(SCHEDULE, load_schedule(folder)))
+    shown += [
+        _show(picture, table)
+        for picture, table in ((WAY, told(folder)), (SCHEDULE, load_schedule(folder)))
+        if table.num_rows
+    ]
     config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
     return write_page(
         folder / REPORT,

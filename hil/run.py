@@ -25,7 +25,7 @@ from firmware_py.export.cortex_m4 import CortexM4Runner, Usage
 from firmware_py.export.errors import ExportError
 from firmware_py.firmware import TaskReport, WatchdogError
 from ground_station.latency import Stage
-from hil.ages import ages_of
+from hil.ages import TELEMETRY, ages_of, told
 from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError
@@ -156,7 +156,7 @@ def fly(
     """
     limits = request.config.limits.get(request.experiment.name, request.experiment.limits)
     judge(dict.fromkeys(METRICS, 0.0), limits)  # refuse unknown metrics before the flight
-    flight = _flight(request, folder / "telemetry.csv", clock, trace_all)
+    flight = _flight(request, folder / TELEMETRY, clock, trace_all)
     recorder = Recorder(folder, flight.channels(), metadata_of(request), on_batch)
     flight.recorder = recorder
     outcome, cause = "error", None
@@ -189,7 +189,7 @@ def fly(
     )
     tasks = tuple(firmware.statistics.reports())
     usage = firmware.runner.usage if isinstance(firmware.runner, CortexM4Runner) else None
-    ages = ages_of(folder / "telemetry.csv", log, request.link)
+    ages = ages_of(told(folder), log, request.link)
     result = Result(
         folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues, usage, ages
     )

@@ -12,14 +12,17 @@ import pyarrow.parquet as pq
 import pytest
 
 import hil.report
+from ground_station.latency import STAGES
+from hil import ages
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.figures import PICTURES
+from hil.figures import PICTURES, way
 from hil.metrics import METRICS
 from hil.recorder import load_log
 from hil.report import metric_rows, write_report
 from hil.run import Request, fly, prepare, read_result
+from hil.schedule import load_schedule
 
 
 class Page(HTMLParser):
@@ -66,7 +69,8 @@ class Page(HTMLParser):
 def report(folder: Path) -> Page:
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     drawn = [picture for picture in hil.report.PICTURES if picture.needs in load_log(folder).column_names]
-    assert len(page.pictures) == len(drawn) + 1  # and the scheduler's
+    others = [table for table in (ages.told(folder), load_schedule(folder)) if table.num_rows]
+    assert len(page.pictures) == len(drawn) + len(others)
     assert all(picture.startswith(b"\x89PNG\r\n\x1a\n") for picture in page.pictures)
     assert page.links == []
     assert page.scripts == 0
@@ -122,9 +126,27 @@ def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
     assert told["rms_x"][2] == "cm"
 
 
+def test_the_way_of_the_poses_adds_up_to_their_age_and_survives_a_cut_file(folder: Path) -> None:
+    told = ages.told(folder)
+    stage = {name: told.column(name).to_numpy() for name in STAGES}
+    assert told.num_rows > 100
+    apart = stage["camera"] + stage["processing"] + stage["network"]
+    assert apart == pytest.approx(stage["mocap"], abs=1e-3)
+    drawn = way(told).axes[0].collections
+    top = max(path.vertices[:, 1].max() for area in drawn for path in area.get_paths())
+    assert top == pytest.approx((apart + stage["station"] + stage["link"]).max())
+    file = folder / ages.TELEMETRY
+    file.write_bytes(file.read_bytes()[:-40])
+    assert ages.told(folder).num_rows in (told.num_rows, told.num_rows - 1)
+    for rest in (b"", b"board.t [ms],gr"):
+        file.write_bytes(rest)
+        assert ages.told(folder).num_rows == 0
+    report(folder)
+
+
 @pytest.mark.usefixtures("few_pictures")
 def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) -> None:
-    ages = read_result(folder)["ages"]
+    stages = read_result(folder)["ages"]
     rows = report(folder).tables["ages"][1:]
     assert [row[0] for row in rows] == [
         "pose on board",
@@ -134,7 +156,7 @@ def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) ->
         "station",
         "radio",
     ]
-    for row, stage in zip(rows, ages, strict=True):
+    for row, stage in zip(rows, stages, strict=True):
         assert [float(text) for text in row[1:]] == pytest.approx(
             [1e-3 * stage["mean_us"], 1e-3 * stage["p99_us"]], abs=0.006
         )
