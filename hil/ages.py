@@ -34,17 +34,18 @@ def told(folder: Path) -> pa.Table:
 
     A stage of which it does not know is NaN. The last line of the file may be cut.
     """
-    path, titles = folder / TELEMETRY, (TIME_COLUMN, *AGE_COLUMNS)
-    times = np.empty((0, len(titles)))
-    if path.is_file() and path.stat().st_size:
-        convert = csv.ConvertOptions(
-            include_columns=titles,
-            column_types=dict.fromkeys(titles, pa.float64()),
-            include_missing_columns=True,
-        )
-        parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
-        table = csv.read_csv(path, parse_options=parse, convert_options=convert)
+    titles = (TIME_COLUMN, *AGE_COLUMNS)
+    convert = csv.ConvertOptions(
+        include_columns=titles,
+        column_types=dict.fromkeys(titles, pa.float64()),
+        include_missing_columns=True,
+    )
+    parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
+    try:
+        table = csv.read_csv(folder / TELEMETRY, parse_options=parse, convert_options=convert)
         times = np.column_stack([table.column(title).to_numpy() for title in titles])
+    except (FileNotFoundError, pa.ArrowInvalid):  # nothing came, not even a whole line
+        times = np.empty((0, len(titles)))
     times = times[~np.isnan(times[:, -1])]
     times[:, 0] -= times[:1, 0].sum()
     times[:, 1:] *= 1e3
