@@ -204,12 +204,12 @@ def test_hover_holds_its_limits_when_a_third_of_the_packets_is_lost(tmp_path: Pa
         "body_yaw=1",
     )
     others = [f"--set=capture.{setting}" for setting in cameras]
-    assert fly(tmp_path / "run", "--link", URI, "--duration", "8", *losses, *others)["passed"]
+    assert fly(tmp_path / "run", "--link", URI, "--duration", "5", *losses, *others)["passed"]
 
 
 def test_hover_over_udp_and_without_motive_holds_its_limits(tmp_path: Path) -> None:
     link = ("--link", f"udp://127.0.0.1:{free_port()}")
-    result = fly(tmp_path / "run", *link, "--mocap", "virtual", "--duration", "8")
+    result = fly(tmp_path / "run", *link, "--mocap", "virtual", "--duration", "4")
     assert result["passed"]
     assert [stage["name"] for stage in result["ages"]][-1] == "udp"
 

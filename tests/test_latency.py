@@ -16,6 +16,7 @@ from ground_station.latency import SENT_POSES, LatencyBudget, LinkLatency, budge
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
 from ground_station.sources.config import CaptureConfig
+from hil.ages import ages_of, told
 from hil.config import load_config
 from hil.dongle_server import Readers
 from hil.experiments import EXPERIMENTS
@@ -122,16 +123,14 @@ def test_a_flight_has_its_budget(tmp_path: Path, link: str, name: str, off_us: f
 
 
 def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:
-    from hil.ages import ages_of
-
     prepare(tmp_path / "run")
     result = fly(Request.of(HOVER, duration_s=0.5), tmp_path / "run")
     telemetry, log = tmp_path / "run" / "telemetry.csv", load_log(tmp_path / "run")
     text = telemetry.read_text()
     telemetry.write_text(text[: len(text) - 30])
-    assert budget_line(ages_of(telemetry, log, RADIO)) == budget_line(result.ages)
+    assert budget_line(ages_of(told(telemetry.parent), log, RADIO)) == budget_line(result.ages)
     telemetry.write_text(text.splitlines(keepends=True)[0])
-    assert ages_of(telemetry, log, RADIO) == ()
+    assert ages_of(told(telemetry.parent), log, RADIO) == ()
 
 
 def test_instants_of_the_way_survive_motive_and_the_clock_of_its_computer() -> None:
