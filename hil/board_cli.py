@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hil.errors import LabError
+from hil.options import profile_option, set_option
 
 if TYPE_CHECKING:
     from ground_station.links.crazyradio import CrazyradioLink
@@ -61,10 +62,8 @@ def board() -> None:
 @click.option(
     "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Of everything random."
 )
-@click.option("--profile", default="floaty", show_default=True, metavar="NAME|FILE")
-@click.option(
-    "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE", help="Override a value; repeatable."
-)
+@profile_option
+@set_option
 def serve(
     udp: int | None,
     radio: bool,
@@ -157,10 +156,8 @@ def serve(
     "--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help="Every frame of motion capture as CSV, for --mocap replay:FILE.",
 )  # fmt: skip
-@click.option("--profile", default="floaty", show_default=True, metavar="NAME|FILE")
-@click.option(
-    "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE", help="Override a value; repeatable."
-)
+@profile_option
+@set_option
 def station(
     uri: str,
     mocap: str | None,

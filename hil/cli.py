@@ -16,6 +16,7 @@ from hil.board_cli import board, station
 from hil.deploy_cli import deploy
 from hil.errors import LabError
 from hil.lab_cli import lab
+from hil.options import profile_option, set_option
 from hil.paper_cli import compare, paper, study
 
 if TYPE_CHECKING:
@@ -51,20 +52,8 @@ run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path
     help="Fly N seeds from --seed on, in parallel; logs without pictures.",
 )  # fmt: skip
 @click.option("--duration", type=float, metavar="S", help="Free flight [s]; default: the experiment's.")
-@click.option(
-    "--profile",
-    default="floaty",
-    show_default=True,
-    metavar="NAME|FILE",
-    help="A profile that ships, or a TOML file.",
-)
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="SECTION.KEY=VALUE",
-    help="Override a value of the profile; repeatable.",
-)
+@profile_option
+@set_option
 @click.option(
     "--fault", "fault_texts", multiple=True, metavar="KIND@START[:DURATION][=SIZE]",
     help="Let something go wrong, START seconds after the release; repeatable. `floaty list --faults` has the kinds.",
@@ -199,14 +188,8 @@ def report(run: Path) -> None:
 @click.option(
     "--seed", type=click.IntRange(0, 2**63 - 1), default=1, show_default=True, help="Of everything random."
 )
-@click.option("--profile", default="floaty", show_default=True, metavar="NAME|FILE", help="As for fly.")
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="SECTION.KEY=VALUE",
-    help="Override a value of the profile; repeatable.",
-)
+@profile_option
+@set_option
 @click.option(
     "--out",
     type=click.Path(path_type=Path),

@@ -11,6 +11,7 @@ import click
 from rich.console import Console
 
 from hil.errors import LabError
+from hil.options import profile_option, set_option
 
 if TYPE_CHECKING:
     from hil.deploy_check import Checked
@@ -20,13 +21,6 @@ if TYPE_CHECKING:
 console = Console(highlight=False, markup=False)
 notices = Console(stderr=True, highlight=False)
 INTERRUPTED = 130
-profile_option = click.option(
-    "--profile", default="floaty", show_default=True, metavar="NAME|FILE", help="As for fly."
-)
-set_option = click.option(
-    "--set", "overrides", multiple=True, metavar="SECTION.KEY=VALUE",
-    help="Override a value of the profile; repeatable.",
-)  # fmt: skip
 
 
 @click.group()
