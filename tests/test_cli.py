@@ -8,20 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from command import floaty
 
-from hil.cli import main
 from hil.errors import LabError
 from hil.recorder import load_log
 
 FLOATY = (sys.executable, "-m", "hil.cli")
-
-
-def floaty(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["floaty", *arguments])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert isinstance(left.value.code, int)
-    return left.value.code
 
 
 @pytest.fixture(autouse=True)

@@ -3,17 +3,16 @@
 import json
 import math
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from command import floaty
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.cli import main
 from hil.compare import Run, compare, load_run
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
@@ -36,14 +35,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "two": flown(parent / "two", 2),
         "strong": flown(parent / "strong", 1, "controller.gain_z=3.5"),
     }
-
-
-def floaty(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
-    monkeypatch.setattr(sys, "argv", ["floaty", *map(str, arguments)])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert isinstance(left.value.code, int)
-    return left.value.code
 
 
 def changed(run: Run, row: int, column: str, value: float) -> Run:

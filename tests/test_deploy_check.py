@@ -12,11 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from command import floaty
 
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
 from firmware_py.export.c99 import translate
 from firmware_py.export.plain import PlainRunner
-from hil.cli import main
 from hil.deploy_check import Checked, check_flight, plan
 from hil.deploy_targets import TARGETS
 from hil.faults import parse
@@ -24,14 +24,6 @@ from hil.harness import Flight
 from hil.run import Request
 
 LONG = bool(os.environ.get("FLOATY_LONG"))
-
-
-def floaty(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["floaty", *arguments])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert isinstance(left.value.code, int)
-    return left.value.code
 
 
 @pytest.fixture(autouse=True)

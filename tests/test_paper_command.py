@@ -12,23 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command import floaty
 from test_report import Page
 
-from hil.cli import main
 from hil.experiments import EXPERIMENTS
 from hil.metrics import METRICS, Verdict
 from hil.paper import Paper, Spread, Trials
 from hil.paper_rows import OUTSIDE, ROWS, Claim, Row
 from hil.run import Request, Result, fly, prepare
 from hil.studies import PROFILES
-
-
-def floaty(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["floaty", *arguments])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert isinstance(left.value.code, int)
-    return left.value.code
 
 
 @pytest.fixture(scope="module")
