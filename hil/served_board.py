@@ -114,7 +114,6 @@ class ServedBoard:
         self._board: VirtualBoard | None = None
         self._boot_us = 0
         self._flying_since_us: int | None = None
-        self._publish: list[Publish] = []
         self._show: list[Show] = []
         self.start(events.now_us)
         events.at(events.now_us + IMU_PERIOD_US, self._sample)
@@ -152,7 +151,7 @@ class ServedBoard:
 
     def publish(self, to: Publish) -> None:
         """Hand every mocap frame to `to` when the cameras' computer has it."""
-        self._publish.append(to)
+        self.show(lambda frame, now_us, _: to(frame, now_us))
 
     def show(self, to: Show) -> None:
         """Hand every mocap frame to `to`, likewise, together with its markers."""
@@ -295,7 +294,7 @@ class ServedBoard:
 
     def _expose(self, now_us: int) -> None:
         self._events.at(now_us + self._config.mocap.period_us, self._expose)
-        if self._publish or self._show:
+        if self._show:
             self.catch_up(now_us)
             self._plant.advance(now_us - self._placed_us)
             frame = self._mocap.expose(now_us, self._plant)
@@ -304,8 +303,6 @@ class ServedBoard:
             self._events.at(arrival_us, partial(self._deliver, frame, sighting))
 
     def _deliver(self, frame: MocapFrame, sighting: Sighting | None, now_us: int) -> None:
-        for publish in self._publish:
-            publish(frame, now_us)
         for show in self._show:
             show(frame, now_us, sighting)
 
