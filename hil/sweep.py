@@ -23,12 +23,11 @@ class Job:
     keep: tuple[str, ...] | None = None
 
 
-def fly_all(jobs: Sequence[Job], notices: Console, workers: int | None = None) -> tuple[list[Result], bool]:
+def fly_all(jobs: Sequence[Job], notices: Console) -> tuple[list[Result], bool]:
     """Fly every job; return the results in the order of the jobs, and whether Ctrl-C ended it early.
 
     After Ctrl-C the flights in the air land first: every complete flight is among the results.
     """
-    workers = workers or min(len(jobs), os.cpu_count() or 1)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -36,7 +35,7 @@ def fly_all(jobs: Sequence[Job], notices: Console, workers: int | None = None) -
         TimeRemainingColumn(),
     )
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, _leave_interrupts_to_the_parent)
+    pool = ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), context, _leave_interrupts_to_the_parent)
     futures = [pool.submit(_fly, job) for job in jobs]
     interrupted = False
     try:
