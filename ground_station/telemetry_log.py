@@ -18,7 +18,11 @@ from ground_station.trajectory import Goal
 
 FLUSH_PERIOD_US = 1_000_000
 
+TELEMETRY = "telemetry.csv"  # in a run folder
 TIME_COLUMN = "ground.t [s]"
+POSE_COLUMNS = (
+    "mocap.t [s]", "mocap.x [m]", "mocap.y [m]", "mocap.z [m]", "mocap.roll [rad]", "mocap.pitch [rad]", "mocap.yaw [rad]",
+)  # fmt: skip
 AGE_COLUMNS = tuple(f"age.{stage} [s]" for stage in STAGES)
 
 _GROUND_COLUMNS = (
@@ -27,13 +31,7 @@ _GROUND_COLUMNS = (
     "goal.y [m]",
     "goal.z [m]",
     "goal.yaw [rad]",
-    "mocap.t [s]",
-    "mocap.x [m]",
-    "mocap.y [m]",
-    "mocap.z [m]",
-    "mocap.roll [rad]",
-    "mocap.pitch [rad]",
-    "mocap.yaw [rad]",
+    *POSE_COLUMNS,
     "mocap.vx [m/s]",
     "mocap.vy [m/s]",
     "mocap.vz [m/s]",
@@ -56,7 +54,7 @@ def _columns_of(blocks: tuple[Block, ...]) -> tuple[list[str], dict[int, int]]:
 
 
 _TELEMETRY_COLUMNS, _FIRST_COLUMN = _columns_of(BLOCKS)
-_TIMES = (TIME_COLUMN, "mocap.t [s]")  # to the microsecond
+_TIMES = (TIME_COLUMN, POSE_COLUMNS[0])  # to the microsecond
 _FORMATS = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *_TELEMETRY_COLUMNS)]
 _ROW = ",".join(["%d", *_FORMATS]) + "\n"
 

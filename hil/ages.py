@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from ground_station.latency import STAGES, Row, Stage, budget_of
-from ground_station.telemetry_log import AGE_COLUMNS, TIME_COLUMN
+from ground_station.telemetry_log import AGE_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.metrics import column
-
-TELEMETRY = "telemetry.csv"
 
 
 def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:

@@ -25,7 +25,8 @@ from firmware_py.export.cortex_m4 import CortexM4Runner, Usage
 from firmware_py.export.errors import ExportError
 from firmware_py.firmware import TaskReport, WatchdogError
 from ground_station.latency import Stage
-from hil.ages import TELEMETRY, ages_of, told
+from ground_station.telemetry_log import TELEMETRY
+from hil.ages import ages_of, told
 from hil.clock import Clock, Paced
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError

@@ -13,6 +13,7 @@ import pytest
 
 import hil.report
 from ground_station.latency import STAGES
+from ground_station.telemetry_log import TELEMETRY
 from hil import ages
 from hil.config import load_config
 from hil.errors import LabError
@@ -135,7 +136,7 @@ def test_the_way_of_the_poses_adds_up_to_their_age_and_survives_a_cut_file(folde
     drawn = way(told).axes[0].collections
     top = max(path.vertices[:, 1].max() for area in drawn for path in area.get_paths())
     assert top == pytest.approx((apart + stage["station"] + stage["link"]).max())
-    file = folder / ages.TELEMETRY
+    file = folder / TELEMETRY
     file.write_bytes(file.read_bytes()[:-40])
     assert ages.told(folder).num_rows in (told.num_rows, told.num_rows - 1)
     for rest in (b"", b"board.t [ms],gr"):

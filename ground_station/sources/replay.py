@@ -14,12 +14,9 @@ from ground_station.clock import clock_us, wait
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
 from ground_station.sources.record import COLUMNS
+from ground_station.telemetry_log import POSE_COLUMNS, TELEMETRY, TIME_COLUMN
 
-TELEMETRY = "telemetry.csv"  # in a run folder
-TELEMETRY_COLUMNS = (
-    "ground.t [s]", "mocap.t [s]", "mocap.x [m]", "mocap.y [m]", "mocap.z [m]",
-    "mocap.roll [rad]", "mocap.pitch [rad]", "mocap.yaw [rad]",
-)  # fmt: skip
+TELEMETRY_COLUMNS = (TIME_COLUMN, *POSE_COLUMNS)
 TIME_MAX_US = 2**53
 
 Arrived = tuple[int, MocapFrame]  # when, what
