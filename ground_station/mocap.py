@@ -1,5 +1,7 @@
 """What a motion capture system says about the robot."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,6 +20,11 @@ class MocapFrame:
     received_us: int | None = None  # the motion capture computer has the images
     transmitted_us: int | None = None  # the pose leaves it
     arrived_us: int | None = None  # the ground station has it
+
+
+def is_pose(p: Sequence[float], q: Sequence[float]) -> bool:
+    """Whether numbers of a motion capture system are a place and a rotation."""
+    return abs(math.hypot(*q) - 1.0) < 0.01 and all(map(math.isfinite, p))  # the former is false for NaN
 
 
 class MocapSource(Protocol):

@@ -3,11 +3,10 @@
 A server that speaks a newer NatNet than can be read here is asked for the newest that can.
 """
 
-import math
 from dataclasses import dataclass
 
 from ground_station.errors import MocapError
-from ground_station.mocap import MocapFrame
+from ground_station.mocap import MocapFrame, is_pose
 from ground_station.natnet import (
     VERSIONS,
     BodyPose,
@@ -207,8 +206,7 @@ class NatnetStream:
         last, self._pose = self._pose, pose
         same = last is not None and (last.p, last.q) == (pose.p, pose.q)
         self._repeated = self._repeated + 1 if same else 0
-        rotation = abs(math.hypot(*pose.q) - 1.0) < 0.01  # False for NaN
-        return pose.valid and rotation and all(map(math.isfinite, pose.p)) and self._repeated < FROZEN_FRAMES
+        return pose.valid and is_pose(pose.p, pose.q) and self._repeated < FROZEN_FRAMES
 
 
 def _unreadable(server: ServerInfo) -> MocapError:

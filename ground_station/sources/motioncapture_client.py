@@ -12,7 +12,7 @@ import sys
 
 from ground_station.clock import clock_us
 from ground_station.errors import MocapError
-from ground_station.mocap import MocapFrame
+from ground_station.mocap import MocapFrame, is_pose
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.capture_lines import Arrival, Body, decode_line
 from ground_station.sources.config import CaptureConfig, choose_body
@@ -145,8 +145,7 @@ class MotioncaptureSource:
     def _usable(self, body: Body) -> bool:
         """Whether it is a rotation, and not the last pose again, which cameras never see."""
         last, self._pose = self._pose, body
-        rotation = abs(math.hypot(*body[3:]) - 1.0) < 0.01  # False for NaN
-        return rotation and all(map(math.isfinite, body)) and body != last
+        return is_pose(body[:3], body[3:]) and body != last
 
     def _start(self) -> None:
         self._process = subprocess.Popen(
