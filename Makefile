@@ -1,15 +1,20 @@
-# `make fly` flies the hover experiment, `make test` runs every test, `make check` compares the C and the machine code with
-# the Python that flies; all set up .venv by themselves.
+# `make fly` flies the hover experiment, `make test` runs the tests that need no wall clock, `make test-all` the real-time, client
+# and long ones as well, `make check` compares the C and the machine code with the Python that flies; all set up .venv by themselves.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 
-.PHONY: fly test check bench clients clean
+.PHONY: fly test test-all check bench clients clean
 
 fly: .venv/fly.stamp
 	$(BIN)/floaty fly hover
 
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto
+
+# Real-time tests run one at a time and beside nothing else; one that failed on a machine that stood still is repeated.
+test-all: .venv/test.stamp
+	$(BIN)/python -m pytest -n auto -m 'not realtime'
+	$(BIN)/python -m pytest -m realtime --reruns 2 --only-rerun InconclusiveError
 
 check: .venv/test.stamp
 	$(BIN)/floaty deploy check

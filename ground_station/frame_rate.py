@@ -1,4 +1,4 @@
-"""Whether motion capture delivers frames as often as the profile says, on which the rate of corrections depends."""
+"""Whether motion capture delivers frames as often as the profile says, and often enough for the corrections."""
 
 from itertools import pairwise
 from statistics import median
@@ -10,8 +10,9 @@ TOLERANCE = 0.1
 class FrameRate:
     """Measures the usual period between exposures, once; sans I/O."""
 
-    def __init__(self, period_us: int) -> None:
+    def __init__(self, period_us: int, corrections_hz: float) -> None:
         self._period_us = period_us
+        self._corrections_hz = corrections_hz
         self._exposures_us: list[int] = []
         self._measured = False
 
@@ -25,9 +26,14 @@ class FrameRate:
             return ""
         self._measured = True
         period_us = median(later - earlier for earlier, later in pairwise(exposures_us))
-        if abs(period_us - self._period_us) <= TOLERANCE * self._period_us:
+        rate_hz = 1e6 / period_us
+        as_told = abs(period_us - self._period_us) <= TOLERANCE * self._period_us
+        slow = rate_hz < (1.0 - TOLERANCE) * self._corrections_hz
+        if as_told and not slow:
             return ""
+        expected = "" if as_told else f", not every {self._period_us * 1e-3:.1f} ms as mocap.period_us says"
+        leaving = f"{rate_hz:.0f}, not {self._corrections_hz:g}" if slow else f"{self._corrections_hz:g}"
         return (
-            f"motion capture: a frame every {period_us * 1e-3:.1f} ms, not every {self._period_us * 1e-3:.1f} ms as "
-            "mocap.period_us says: corrections leave at another rate"
+            f"motion capture: a frame every {period_us * 1e-3:.1f} ms{expected}: "
+            f"{leaving} corrections leave per second"
         )

@@ -27,8 +27,8 @@ class StationConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    send_every: int = Field(
-        4, ge=1, le=200, description="frames per correction [1]; 200 Hz to 50 Hz; original"
+    corrections_hz: float = Field(
+        50.0, ge=1, le=200, description="corrections per second [Hz], if there are as many frames; original"
     )
     link_latency_us: int = Field(
         1400,
@@ -71,6 +71,31 @@ class StationCounters:
     malformed: int = 0  # of these, not decodable
 
 
+class Slots:
+    """When corrections are due: evenly, by the exposures' clock, whatever the rate of the frames.
+
+    A frame up to an eighth of the period early takes its slot, so that cameras about as fast as the corrections lose
+    none to jitter. The slots keep their phase: a late frame does not delay the next one.
+    """
+
+    def __init__(self, period_us: int) -> None:
+        self._period_us = period_us
+        self._early_us = period_us // 8
+        self._next_us: int | None = None  # None until the first frame sets the phase
+
+    def due(self, t_us: int) -> bool:
+        """Whether the frame exposed at `t_us` belongs to a slot that is free; the first one does."""
+        if self._next_us is None or t_us < self._next_us - self._period_us - self._early_us:  # clock set back
+            self._next_us = t_us
+        return t_us >= self._next_us - self._early_us
+
+    def take(self, t_us: int) -> None:
+        """Fill the slot of the frame exposed at `t_us`, and those that passed empty."""
+        assert self._next_us is not None
+        passed = (t_us + self._early_us - self._next_us) // self._period_us
+        self._next_us += (passed + 1) * self._period_us
+
+
 class GroundStation:
     """Passive: `on_frame` for each frame of motion capture, `on_packet` for whatever comes from the board."""
 
@@ -88,21 +113,19 @@ class GroundStation:
         self._link = link
         self._trajectory = trajectory
         self._log = log
-        self._send_every = config.send_every
-        self._frames_until_due = 0
+        self._slots = Slots(round(1e6 / config.corrections_hz))
         self._last_frame: MocapFrame | None = None
         self._last_track: Track | None = None
         self._ask_for_telemetry_us = 0  # put off by every sample that comes
 
     def on_frame(self, frame: MocapFrame, now_us: int) -> None:
-        """Send every `send_every`-th frame, or the first usable one after it."""
+        """Send the frame of each slot, or the first usable one after it."""
         counters = self.counters
         counters.frames += 1
         if now_us >= self._ask_for_telemetry_us:
             self._link.start_telemetry(now_us)
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
-        due = self._frames_until_due <= 0
-        self._frames_until_due -= 1
+        due = self._slots.due(frame.t_us)
         if self.tracker is not None:
             self._last_track = self.tracker.take(frame)
             frame = self._last_track.frame
@@ -119,8 +142,7 @@ class GroundStation:
             return
         counters.sent += 1
         self.budget.add(frame, now_us, self._link.latency)
-        # The slots keep their phase: a late frame does not delay the next one.
-        self._frames_until_due %= self._send_every
+        self._slots.take(frame.t_us)
 
     def notices(self) -> list[str]:
         """Lines for the user since the last call."""

@@ -126,7 +126,7 @@ def serve(
         server.close()
     if server.motive is not None and server.motive.malformed:
         _say(f"motive could not read {server.motive.malformed} packets")
-    _say(f"stopped; never more than {server.worst_lag_us / 1000:.1f} ms late")
+    _say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
     return 0
 
 
@@ -213,8 +213,9 @@ def station(
             return True
         return bool(stops) or (duration is not None and clock_us() - start_us > duration * 1e6)
 
+    rate = FrameRate(config.mocap.period_us, config.station.corrections_hz)
     try:
-        LiveStation(link, ground, source, FrameRate(config.mocap.period_us), _say, stopping).run()
+        LiveStation(link, ground, source, rate, _say, stopping).run()
     except LinkError as error:
         raise LabError(str(error)) from None
     finally:
@@ -252,7 +253,7 @@ def _live_link(uri: str, config: "LabConfig") -> "CrazyradioLink | MavlinkSerial
     except ImportError as error:
         extra = "mavlink" if serial else "radio"
         raise LabError(f"--link {uri}: {error}: pip install 'floaty-hil[{extra}]'") from None
-    pose_hz = 1e6 / (config.mocap.period_us * config.station.send_every)
+    pose_hz = min(config.station.corrections_hz, 1e6 / config.mocap.period_us)
     key = bytes.fromhex(config.mavlink.signing_key)
     latency_us = config.station.link_latency_us
     settings = MavlinkLinkConfig(config.serial.baud, pose_hz, key, latency_us=latency_us)

@@ -1,15 +1,15 @@
 """Boards for real clients: one thread that lets simulated time follow the wall clock and answers sockets in between.
 
 Nothing blocks but the wait for the next instant or the next packet, whichever comes first. When the machine is too
-slow simulated time falls behind and catches up later; nothing is skipped, and the worst lag is remembered.
+slow simulated time stands still and goes on from there (`hil.clock.Paced`).
 """
 
 import select
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 
+from hil.clock import Paced
 from hil.config import LabConfig
 from hil.dongle_server import DongleServer, Readers
 from hil.errors import LabError
@@ -33,7 +33,8 @@ class BoardServer:
     ) -> None:
         self.events = EventQueue()
         self.readers: Readers = {}
-        self.worst_lag_us = 0
+        self.clock = Paced()
+        self._say = say
         self.boards = [
             ServedBoard(number, config, self.events, Streams.of_seed(seed + number - 1), say, mavlink)
             for number in range(1, count + 1)
@@ -84,22 +85,20 @@ class BoardServer:
 
     def run(self, stopping: Callable[[], bool]) -> None:
         """Go on until told to stop; may be called again."""
-        events, readers = self.events, self.readers
-        start_ns = time.monotonic_ns() - events.now_us * 1000
+        events, readers, clock = self.events, self.readers, self.clock
+        clock.start(events.now_us)
         while not stopping():
             next_us = events.next_us or 0
-            wall_us = (time.monotonic_ns() - start_ns) // 1000
-            ready, _, _ = select.select(readers, (), (), max(0, next_us - wall_us) * 1e-6)
-            wall_us = (time.monotonic_ns() - start_ns) // 1000
+            ready, _, _ = select.select(readers, (), (), clock.ahead_us(next_us) * 1e-6)
             if ready:
-                now_us = max(events.now_us, min(wall_us, next_us))
+                now_us = max(events.now_us, min(clock.now_us(), next_us))
                 for reader in ready:
                     with suppress(KeyError):  # closed by one of the others
                         readers[reader](now_us)
-            elif wall_us >= next_us:
-                self.worst_lag_us = max(self.worst_lag_us, wall_us - next_us)
-            if wall_us >= (events.next_us or 0):
+            if clock.now_us() >= (events.next_us or 0):
                 self._step()
+            for line in clock.notices():
+                self._say(line)
 
     def _step(self) -> None:
         """Do everything that hardware does at the next instant."""

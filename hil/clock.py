@@ -7,33 +7,77 @@ from typing import Protocol
 class Clock(Protocol):
     """Waits until a simulated instant may happen."""
 
+    stood_still_us: int  # how long simulated time stood still in all, because the machine was too slow
+
     def wait_until(self, now_us: int) -> None:
         """Return when the simulated instant may happen."""
+        ...
+
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call."""
         ...
 
 
 class FreeRunning:
     """Every instant may happen at once."""
 
+    stood_still_us = 0
+
     def wait_until(self, now_us: int) -> None:
         """Return at once."""
 
+    def notices(self) -> list[str]:
+        """Nothing: there is no wall clock to fall behind."""
+        return []
+
 
 class Paced:
-    """One simulated second per real second; it never skips, and remembers how late it was."""
+    """One simulated second per real second.
+
+    A little lateness is made up for. More than `STALL_US` is a stall: simulated time goes on from where it stood, because
+    clients outside would see a burst of the past otherwise, and a line says how long it stood.
+    """
 
     SLACK_US = 1000  # do not sleep for less than this
+    STALL_US = 20_000
+    NOTICE_PERIOD_US = 1_000_000  # of simulated time between lines
 
     def __init__(self) -> None:
-        self.worst_lag_us = 0
-        self._start_ns: int | None = None
+        self.stood_still_us = 0
+        self._start_ns: int | None = None  # when simulated time was 0
+        self._told_us = 0  # of the standstill
+        self._next_notice_us = 0
+
+    def start(self, now_us: int) -> None:
+        """Let the simulated instant be now."""
+        self._start_ns = time.monotonic_ns() - now_us * 1000
+
+    def now_us(self) -> int:
+        """The simulated instant that the wall clock has reached; only after `start`."""
+        assert self._start_ns is not None
+        return (time.monotonic_ns() - self._start_ns) // 1000
+
+    def ahead_us(self, now_us: int) -> int:
+        """How long it is until the simulated instant may happen, 0 when it may; the first call sets the start."""
+        if self._start_ns is None:
+            self.start(now_us)
+        late_us = self.now_us() - now_us
+        if late_us > self.STALL_US:
+            self.start(now_us)
+            self.stood_still_us += late_us
+        return max(0, -late_us)
 
     def wait_until(self, now_us: int) -> None:
-        """Sleep until the wall clock has reached the instant; the first one sets the start."""
-        if self._start_ns is None:
-            self._start_ns = time.monotonic_ns() - now_us * 1000
-        ahead_us = now_us - (time.monotonic_ns() - self._start_ns) // 1000
+        """Sleep until the wall clock has reached the instant."""
+        ahead_us = self.ahead_us(now_us)
         if ahead_us > self.SLACK_US:
             time.sleep(ahead_us * 1e-6)
-        elif -ahead_us > self.worst_lag_us:
-            self.worst_lag_us = -ahead_us
+
+    def notices(self) -> list[str]:
+        """Lines for the user since the last call, one per simulated second at the most."""
+        fresh_us = self.stood_still_us - self._told_us
+        if fresh_us == 0 or self.now_us() < self._next_notice_us:
+            return []
+        self._told_us = self.stood_still_us
+        self._next_notice_us = self.now_us() + self.NOTICE_PERIOD_US
+        return [f"this machine was too slow: time stood still for {fresh_us / 1000:.0f} ms"]

@@ -248,6 +248,8 @@ class Flight:
         self._note_drops(now_us)
         for line in self.station.notices():
             self.note("station", line)
+        for line in self.clock.notices():
+            self.note("lab", line)
         if self.plant.lost is not None:
             self.lost = self.plant.lost
             self.end_us = now_us

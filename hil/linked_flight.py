@@ -18,6 +18,7 @@ from ground_station.mocap_udp import PosePublisher
 from ground_station.trajectory import Goal
 from hil.board_server import BoardServer
 from hil.channels import flight_channels
+from hil.clock import Clock
 from hil.config import LabConfig
 from hil.dongle_plugin import VARIABLE
 from hil.errors import LabError
@@ -111,6 +112,11 @@ class LinkedFlight:
     def now_us(self) -> int:
         """The present instant of the simulation."""
         return self._server.events.now_us
+
+    @property
+    def clock(self) -> Clock:
+        """The wall clock's."""
+        return self._server.clock
 
     @property
     def firmware(self) -> Firmware:

@@ -27,7 +27,7 @@ from firmware_py.firmware import TaskReport, WatchdogError
 from ground_station.latency import Stage
 from ground_station.telemetry_log import TELEMETRY
 from hil.ages import ages_of, told
-from hil.clock import Clock, Paced
+from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError
 from hil.experiments import Experiment
@@ -137,6 +137,7 @@ class Result:
     queues: tuple[QueueReport, ...]
     usage: Usage | None  # of the board, where it was measured
     ages: tuple[Stage, ...]  # where the age of the poses came from
+    stood_still_us: int = 0  # simulated time, while the machine was too slow for a paced flight
 
     @property
     def passed(self) -> bool:
@@ -162,7 +163,7 @@ def fly(
     recorder = Recorder(folder, flight.channels(), metadata_of(request), on_batch)
     flight.recorder = recorder
     outcome, cause = "error", None
-    pace = _Pace(0 if isinstance(clock, Paced) else LOADED_US)  # a paced flight makes up for its slow begin
+    pace = _Pace()
 
     def on_progress(now_us: int) -> None:
         pace.begin(now_us)
@@ -198,8 +199,9 @@ def fly(
     usage = firmware.runner.usage if isinstance(firmware.runner, CortexM4Runner) else None
     ages = ages_of(told(folder), log, request.link)
     result = Result(
-        folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues, usage, ages
-    )
+        folder, request, outcome, cause, metrics, verdicts, digest, factor, tasks, queues, usage, ages,
+        flight.clock.stood_still_us,
+    )  # fmt: skip
     write_result(result)
     return result
 
@@ -207,14 +209,13 @@ def fly(
 class _Pace:
     """Simulated over real time, from an instant on before which the machine loads or compiles the core."""
 
-    def __init__(self, begin_us: int) -> None:
-        self._begin_us = begin_us
+    def __init__(self) -> None:
         self._us, self._ns = 0, time.monotonic_ns()
         self._begun = False
 
     def begin(self, now_us: int) -> None:
         """Count from here, if it is time to; later calls do nothing."""
-        if not self._begun and now_us >= self._begin_us:
+        if not self._begun and now_us >= LOADED_US:
             self._begun, self._us, self._ns = True, now_us, time.monotonic_ns()
 
     def end(self, now_us: int) -> float:
@@ -290,6 +291,7 @@ def write_result(result: Result) -> None:
         "versions": versions(),
         "commit": commit(),
         "real_time_factor": round(result.real_time_factor, 2),
+        "stood_still_ms": result.stood_still_us / 1000,
     }
     (result.folder / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
@@ -326,6 +328,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         "versions": json.loads(metadata.get("versions", "{}")),
         "commit": metadata.get("commit", ""),
         "real_time_factor": None,
+        "stood_still_ms": None,
     }
 
 

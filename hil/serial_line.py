@@ -19,7 +19,7 @@ class SerialLine:
 
     def __init__(self, config: LabConfig, events: EventQueue, rng: np.random.Generator) -> None:
         self.uart = VirtualSerial(config.serial, events, rng)
-        poses_hz = 1e6 / (config.mocap.period_us * config.station.send_every)
+        poses_hz = min(config.station.corrections_hz, 1e6 / config.mocap.period_us)
         key = bytes.fromhex(config.mavlink.signing_key)
         latency_us = config.station.link_latency_us
         settings = MavlinkLinkConfig(config.serial.baud, poses_hz, key, latency_us=latency_us)

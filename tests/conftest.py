@@ -1,16 +1,94 @@
-"""Property tests try the same examples on every machine, and look for new ones with FLOATY_FUZZ set; `-n auto` is one
-worker more than there are processors, because a third of the time is spent waiting for flights in real time.
+"""The tiers of the tests, and what holds in each.
+
+A test in `tests/realtime/` or marked `realtime` needs the wall clock: it runs alone (`make test-all`), and one that
+fails while this machine stood still is inconclusive and repeated. All other tests pass however busy the machine is.
+Property tests try the same examples on every machine, and look for new ones with FLOATY_FUZZ set.
 """
 
 import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
+import pytest
 from hypothesis import settings
+from serving import SERVED
 
 settings.register_profile("reproducible", derandomize=True)
 if "FLOATY_FUZZ" not in os.environ:
     settings.load_profile("reproducible")
 
+REALTIME = Path(__file__).parent / "realtime"
+STANDSTILL_MS = 100  # of the test's own process, which no real-time test need survive
+METER_PERIOD_S = 0.005
+
+
+class InconclusiveError(Exception):
+    """A real-time test failed on a machine that stood still: it says nothing. `make test-all` repeats it."""
+
+
+class StallMeter(threading.Thread):
+    """Measures the longest time [ms] that this process did not run when it was due."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.longest_ms = 0.0
+
+    def run(self) -> None:
+        before_s = time.monotonic()
+        while True:
+            threading.Event().wait(METER_PERIOD_S)
+            now_s = time.monotonic()
+            self.longest_ms = max(self.longest_ms, 1000 * (now_s - before_s - METER_PERIOD_S))
+            before_s = now_s
+
+
+METER = StallMeter()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what stands in `tests/realtime/`."""
+    for item in items:
+        if item.path.is_relative_to(REALTIME):
+            item.add_marker("realtime")
+
 
 def pytest_xdist_auto_num_workers() -> int:
     """Return the number of workers of `-n auto`."""
-    return (os.cpu_count() or 1) + 1
+    return os.cpu_count() or 1
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Iterator[Any]:
+    """Judge a fixture that fails."""
+    return (yield from judged(item))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[Any]:
+    """Judge a test that fails."""
+    return (yield from judged(item))
+
+
+def judged(item: pytest.Item) -> Iterator[Any]:
+    """Call a real-time test inconclusive when it fails while this process or a server that it uses stood still."""
+    if "realtime" not in item.keywords:
+        return (yield)
+    if not METER.is_alive():
+        METER.start()
+    METER.longest_ms = 0.0
+    heard = {served: len(served.standstills_ms) for served in SERVED}
+    try:
+        return (yield)
+    except Exception as error:
+        for served in SERVED:
+            served.listen()
+        served_ms = sum(sum(served.standstills_ms[heard.get(served, 0) :]) for served in SERVED)
+        if METER.longest_ms > STANDSTILL_MS or served_ms:
+            text = (
+                f"the machine stood still for {METER.longest_ms:.0f} ms, its servers for {served_ms:.0f} ms"
+            )
+            raise InconclusiveError(f"{text}: {type(error).__name__}: {error}") from error
+        raise

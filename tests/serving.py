@@ -13,14 +13,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 START_TIMEOUT_S = 60.0
+STANDSTILL = re.compile(r"time stood still for (\d+) ms")
+SERVED: list["Served"] = []  # those of this test session
 
 
-@dataclass
+@dataclass(eq=False)
 class Served:
     """A running server and what it said so far."""
 
     process: "subprocess.Popen[bytes]"
     lines: list[str] = field(default_factory=list)
+    standstills_ms: list[int] = field(default_factory=list)  # that it told
     _rest: bytes = b""
 
     @property
@@ -50,10 +53,25 @@ class Served:
                     return line
             ready, _, _ = select.select([self.process.stdout], [], [], max(0.0, deadline - time.monotonic()))
             assert ready, f"no line {pattern!r} within {timeout_s} s: {self.lines}"
-            data = os.read(self.process.stdout.fileno(), 65536)
-            assert data, f"the server ended: {self.lines}"
-            *lines, self._rest = (self._rest + data).split(b"\n")
-            self.lines += [line.decode() for line in lines]
+            assert self._read(), f"the server ended: {self.lines}"
+
+    def listen(self) -> None:
+        """Take what it said and nobody waited for."""
+        if not self.process.stdout.closed:
+            while select.select([self.process.stdout], [], [], 0.0)[0] and self._read():
+                pass
+
+    def _read(self) -> bool:
+        """Take a piece of its output; False at the end."""
+        data = os.read(self.process.stdout.fileno(), 65536)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        self.lines += [line.decode() for line in lines]
+        self.standstills_ms += [
+            int(found[1])
+            for line in self.lines[len(self.lines) - len(lines) :]
+            if (found := STANDSTILL.search(line))
+        ]
+        return bool(data)
 
     def forget(self) -> None:
         """Let `wait_for` look only at what comes from now on."""
@@ -82,10 +100,12 @@ def serve(*arguments: str, what: str = "board") -> Iterator[Served]:
     command = [sys.executable, "-m", "hil.cli", what, "serve", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     served = Served(process)
+    SERVED.append(served)
     try:
         served.wait_for("^serving", START_TIMEOUT_S)
         yield served
     finally:
+        served.listen()
         process.kill()
         process.wait()
         process.stdout.close()

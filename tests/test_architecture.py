@@ -30,7 +30,7 @@ CORE_LIBRARIES = {"numpy", "typing"}
 CONFINED: dict[str, tuple[str, ...]] = {
     "numba": ("firmware_py/core/subset.py", "hil/plant/compiled.py"),
     "rerun": ("hil/viewer.py",),
-    "time": ("hil/clock.py", "hil/run.py", "hil/board_server.py", "ground_station/clock.py"),
+    "time": ("hil/clock.py", "hil/run.py", "ground_station/clock.py"),
     "datetime": (),
     "asyncio": (),
     "threading": ("hil/window.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py"),
@@ -171,3 +171,27 @@ def test_a_legal_file_is_not_accused() -> None:
 def test_every_confined_file_exists() -> None:
     files = {file for files in CONFINED.values() for file in files} | {SUBSET}
     assert {file for file in files if not (ROOT / file).is_file()} == set()
+
+
+def watches_the_clock(source: str) -> list[str]:
+    """The tests and helpers in `source` that sleep or read the wall clock, and are not marked as real-time tests."""
+    return [
+        function.name
+        for function in ast.walk(ast.parse(source))
+        if isinstance(function, ast.FunctionDef)
+        and "pytest.mark.realtime" not in map(ast.unparse, function.decorator_list)
+        and any(
+            isinstance(node, ast.Attribute) and ast.unparse(node) in ("time.sleep", "time.monotonic")
+            for node in ast.walk(function)
+        )
+    ]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").glob("test_*.py")), ids=lambda path: path.name)
+def test_only_real_time_tests_look_at_the_wall_clock(path: Path) -> None:
+    assert watches_the_clock(path.read_text(encoding="utf-8")) == []
+
+
+def test_a_planted_sleep_is_caught() -> None:
+    assert watches_the_clock("def test_x():\n    for _ in range(3):\n        time.sleep(1)") == ["test_x"]
+    assert watches_the_clock("@pytest.mark.realtime\ndef test_x():\n    time.sleep(1)") == []

@@ -129,6 +129,7 @@ def test_a_nearly_empty_battery_ends_in_the_failsafe(tmp_path: Path) -> None:
     assert 0.0 < result.metrics["endurance"] < 1.0
 
 
+@pytest.mark.long
 def test_the_estimate_of_a_short_hover_is_the_endurance(tmp_path: Path) -> None:
     small = "battery.capacity=20"  # [A s]
     whole = flown(tmp_path / "whole", "endurance", small, duration_s=90.0)

@@ -1,38 +1,23 @@
 """Motion capture of a real laboratory: where its frame lies, which system it is, and what the station makes of it."""
 
 import math
-import os
-import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command import floaty
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from serving import serve
-from test_motioncapture import moving
 
 from firmware_py.geometry import to_euler_zyx
-from firmware_py.wire.telemetry import Sample
 from ground_station.errors import MocapError
 from ground_station.frame_rate import FrameRate
-from ground_station.latency import LinkLatency
-from ground_station.live import FAILSAFE, LiveStation
-from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source, override
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.config import CaptureConfig
-from ground_station.sources.replay import read_frames
-from ground_station.station import GroundStation, StationConfig
-from ground_station.trajectory import Goal, Hold
 from hil.config import load_config
 
-LONG = bool(os.environ.get("FLOATY_LONG"))
-FLOATY = (sys.executable, "-m", "hil.cli")
 QUARTER = math.pi / 2
 
 length = st.floats(-10, 10)
@@ -134,8 +119,8 @@ def test_qualisys_has_one_port() -> None:
 
 
 def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
-    def told(*periods_us: int) -> list[str]:
-        rate, t_us, lines = FrameRate(5000), 7, []
+    def told(*periods_us: int, expected_us: int = 5000) -> list[str]:
+        rate, t_us, lines = FrameRate(expected_us, 50.0), 7, []
         for period_us in periods_us:
             t_us += period_us
             lines.append(rate.on_frame(t_us))
@@ -144,66 +129,17 @@ def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
     assert told(*[5000] * 3000) == told(*[5400] * 3000) == []
     assert told(*[400] * 280, 1_400_000, *[5000] * 3000) == []  # a burst and a stall
     assert len(told(*[10_000] * 1000)) == len(told(*[4000] * 3000)) == 1
-    assert "every 10.0 ms, not every 5.0 ms" in told(*[10_000] * 1000)[0]
+    (faster,) = told(*[10_000] * 1000)
+    assert "every 10.0 ms, not every 5.0 ms as mocap.period_us says: 50 corrections leave" in faster
+    (slower,) = told(*[40_000] * 1000)
+    assert "25, not 50 corrections leave per second" in slower
+    assert told(*[10_000] * 1000, expected_us=10_000) == []
+    assert told(*[40_000] * 1000, expected_us=40_000) == [
+        "motion capture: a frame every 40.0 ms: 25, not 50 corrections leave per second"
+    ]
 
 
-# The station
-
-
-class SlowLink:
-    """A board that takes its time to connect, which is when `open` asks whether to give up."""
-
-    uri = "slow"
-    latency = LinkLatency("air", 0, measured=False)
-    supervisor_state = FAILSAFE
-    sent = 0
-
-    def open(self, give_up: Callable[[], bool]) -> None:
-        for _ in range(12):
-            time.sleep(0.1)
-            assert not give_up()
-
-    def received(self) -> list[tuple[int, bytes]]:
-        return []
-
-    def start_telemetry(self, now_us: int) -> None: ...
-
-    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        self.sent += 1
-
-    def receive(self, now_us: int, data: bytes) -> list[Sample]:
-        return []
-
-    def notices(self) -> list[str]:
-        return []
-
-    def summary(self) -> str:
-        return ""
-
-    def check(self) -> None: ...
-
-    def mute(self) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def test_while_the_board_connects_the_cameras_are_served() -> None:
-    said: list[str] = []
-    with moving() as lab:
-        source = find_source(f"optitrack:127.0.0.1:{lab.motive.port}", CaptureConfig())
-        source.open()
-        end = time.monotonic() + 1.5
-        link = SlowLink()
-        ground = GroundStation(link, Hold(Goal((0.0, 0.0, 1.15), 0.0)), None, StationConfig())
-        LiveStation(link, ground, source, FrameRate(5000), said.append, lambda: time.monotonic() > end).run()
-        source.close()
-    assert 10 < link.sent < 20  # of 0.3 s, not of the 1.5 s before
-    assert not any("frames" in line for line in said)
-
-
-def station(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [*FLOATY, "station", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+# The command
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
@@ -213,35 +149,13 @@ def station(*arguments: str) -> subprocess.CompletedProcess[str]:
     (("--set", "capture.system=qualisys", "--set", "capture.port=1"), "capture.system = qualisys: qualisys: its client"),
     (("--mocap", "virtual:0"), "--mocap virtual:0: expected virtual"),
 ])  # fmt: skip
-def test_what_cannot_be_is_one_line_and_exit_code_two(arguments: tuple[str, ...], message: str) -> None:
-    shown = station("--link", "udp://127.0.0.1:1", *arguments)
-    assert shown.returncode == 2
-    assert message in shown.stderr
-    assert "Traceback" not in shown.stderr
-
-
-@pytest.mark.skipif(not LONG, reason="20 s: FLOATY_LONG=1")
-def test_a_flight_is_recorded_and_its_record_flown_again(tmp_path: Path) -> None:
-    profile, frames = tmp_path / "lab.toml", tmp_path / "frames.csv"
-    with serve("--mavlink", "pty", "--natnet-port", "0", "--poses", "0", what="lab") as lab:
-        link = "mavlink:" + lab.line("mavlink ")[0]
-        port = lab.line("motive ")[0].split(":")[2]
-        profile.write_text(
-            f'base = "floaty"\n[capture]\nsystem = "optitrack"\nport = {port}\nbody = "floaty"\n'
-        )
-        shown = station(
-            "--link", link, "--profile", str(profile), "--duration", "5", "--record", str(frames), "--log",
-            str(tmp_path / "telemetry.csv"),
-        )  # fmt: skip
-        assert shown.returncode == 0, shown.stdout + shown.stderr
-        recorded = read_frames(frames)
-        assert len(recorded) > 800
-        assert max(abs(frame.p_WB[2] - 1.15) for _, frame in recorded) < 0.1
-        begin_s = time.monotonic()
-        shown = station("--link", link, "--mocap", f"replay:{frames}")
-        assert shown.returncode == 0, shown.stdout + shown.stderr
-        assert f"the recording is over: {len(recorded)} frames" in shown.stdout
-        assert time.monotonic() - begin_s > (recorded[-1][0] - recorded[0][0]) * 1e-6
-        assert len(read_frames(tmp_path / "telemetry.csv")) > 100
-        shown = station("--link", link, "--mocap", f"replay:{tmp_path}")
-        assert "a frame every" in shown.stdout  # telemetry has 50 a second
+def test_what_cannot_be_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    assert floaty(monkeypatch, "station", "--link", "udp://127.0.0.1:1", *arguments) == 2
+    shown = capsys.readouterr().err
+    assert message in shown
+    assert shown.count("\n") == 1

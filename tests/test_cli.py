@@ -137,6 +137,7 @@ def test_ctrl_c_leaves_log_report_and_recording(tmp_path: Path) -> None:
     assert {"report.html", "flight.rrd", "result.json"} <= set(os.listdir("run"))
 
 
+@pytest.mark.long
 def test_a_killed_flight_can_still_be_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     process = start("fly", "hover", "--realtime", "--duration", "600", "--out", "run")
     process.kill()

@@ -3,7 +3,6 @@
 FLOATY_FUZZ is the number of packets of the long run (default 200,000).
 """
 
-import os
 import struct
 
 import numpy as np
@@ -17,7 +16,6 @@ from test_firmware import LEVEL
 from firmware_py.supervisor import State
 from firmware_py.wire import WireError, crtp, localisation, memories, parameters
 
-PACKETS = int(os.environ.get("FLOATY_FUZZ", "200000"))
 BATCH = 4  # packets per millisecond: more than the delivery queue's tasks are ever given by a radio
 UPRIGHT = compress_quaternion((0, 0, 0, 1))
 
@@ -60,13 +58,14 @@ def mutant(rng: np.random.Generator) -> bytes:
     return bytes(data)
 
 
-def test_the_board_survives_random_and_mutated_packets() -> None:
+@pytest.mark.parametrize("packets", [8_000, pytest.param(200_000, marks=pytest.mark.long)])
+def test_the_board_survives_random_and_mutated_packets(packets: int) -> None:
     rng = np.random.default_rng(4)
     client = Client()
     client.imu_alive = False
     link = client.firmware.link
     offered = 0
-    while offered < PACKETS:
+    while offered < packets:
         for _ in range(BATCH):
             client.firmware.radio_received(mutant(rng))
         offered += BATCH
@@ -76,7 +75,7 @@ def test_the_board_survives_random_and_mutated_packets() -> None:
         client.console.clear()
     for queue in client.firmware.kernel.queues:
         assert queue.high_water <= queue.length, queue.name
-    assert link.malformed > PACKETS // 20
+    assert link.malformed > packets // 20
     assert link.unserved > 0
     fresh = Client()
     for port in (LOG, PARAM):

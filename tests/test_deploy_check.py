@@ -23,8 +23,6 @@ from hil.faults import parse
 from hil.harness import Flight
 from hil.run import Request
 
-LONG = bool(os.environ.get("FLOATY_LONG"))
-
 
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -131,6 +129,7 @@ def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> No
 SOMETHING_OF_EACH = ("--duration", "0.8", "--fault", "mocap.latency@0.2:0.4=150", "--fault", "push.y@0.4=2")
 
 
+@pytest.mark.long
 def test_all_targets_are_equal_in_a_short_flight_with_faults(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
 ) -> None:
@@ -144,7 +143,7 @@ def test_all_targets_are_equal_in_a_short_flight_with_faults(
     assert 10_000 < mean <= worst < 200_000
 
 
-@pytest.mark.skipif(not LONG, reason="two minutes: FLOATY_LONG=1")
+@pytest.mark.long
 def test_ten_thousand_ticks_of_hover_yaw_step_and_faults_do_not_differ_in_a_bit(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
 ) -> None:

@@ -93,6 +93,7 @@ def test_the_sweeps_are_the_papers() -> None:
         assert flaps.tolist() == list(expected)
 
 
+@pytest.mark.long
 def test_command_writes_a_table_the_figures_and_a_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

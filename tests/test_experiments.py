@@ -146,7 +146,11 @@ def test_no_flap_angle_carries_the_plant_at_eight_metres_per_second() -> None:
 # The flights
 
 
-@pytest.mark.parametrize("name", PAPER)
+QUICK = ("yaw-step", "y-square", "side-wind-3", "airspeed-10")
+FLIGHTS = [pytest.param(name, marks=() if name in QUICK else pytest.mark.long) for name in PAPER]
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
 def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str) -> None:
     result = flown(tmp_path / "run", name, seed=7)
     assert result.passed, explain(result)
@@ -156,6 +160,7 @@ def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str) -> None
     assert len(written) > 10_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", ["yaw-step-0", "yaw-sine-0.15", "height-sine", "y-square", "pushes", "side-wind-3"]
 )
@@ -165,6 +170,7 @@ def test_the_authors_gains_hold_their_own_limits(tmp_path: Path, name: str) -> N
     assert {verdict.metric for verdict in result.verdicts} == set(load_config("as-flown").limits[name])
 
 
+@pytest.mark.long
 def test_the_step_needs_flaps_that_open_through_zero(tmp_path: Path) -> None:
     opened, closed = (flown(tmp_path / name, name) for name in ("yaw-step", "yaw-step-0"))
     assert opened.metrics["settle"] < 0.5 < closed.metrics["settle"]
@@ -178,6 +184,7 @@ def test_a_user_overrides_the_settings_of_an_experiment(tmp_path: Path) -> None:
     assert request.overrides[-1] == "allocation.opening_min=0"
 
 
+@pytest.mark.long
 def test_pushes_come_one_after_the_other_and_are_counted_until_the_robot_is_lost(tmp_path: Path) -> None:
     calm = flown(tmp_path / "calm", "pushes")
     begun = [event["text"] for event in load_events(calm.folder) if "begins" in event["text"]]

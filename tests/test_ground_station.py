@@ -30,20 +30,22 @@ angle = st.floats(-pi, pi)
 class Bench:
     """A ground station whose packets end in a list."""
 
-    def __init__(self, send_every=4, latency_us=1000, log=None, trajectory=None, tracker=None):
+    def __init__(self, corrections_hz=50.0, latency_us=1000, log=None, trajectory=None, tracker=None):
         self.sent = []  # corrections
         self.requests = []  # for telemetry
         link = LoopbackLink(self._transmit, latency_us)
         self.station = GroundStation(
-            link, trajectory or Hold(HOME), log, StationConfig(send_every=send_every), tracker
+            link, trajectory or Hold(HOME), log, StationConfig(corrections_hz=corrections_hz), tracker
         )
 
     def _transmit(self, now_us, data):
         (self.sent if data[0] >> 4 == crtp.PORT_LOCALISATION else self.requests).append((now_us, data))
 
-    def frames(self, count, valid=lambda number: True, p=lambda number: (0.001 * number, 0.0, 1.15)):
+    def frames(
+        self, count, valid=lambda number: True, p=lambda number: (0.001 * number, 0.0, 1.15), period_us=5000
+    ):
         for number in range(count):
-            frame = MocapFrame(5000 * number, p(number), UPRIGHT, valid(number))
+            frame = MocapFrame(round(period_us * number), p(number), UPRIGHT, valid(number))
             self.station.on_frame(frame, frame.t_us + 38_000)
 
     def numbers(self):
@@ -79,6 +81,38 @@ def test_every_fourth_frame_is_sent_at_once():
     assert (bench.station.counters.frames, bench.station.counters.sent) == (20, 5)
 
 
+@pytest.mark.parametrize("camera_hz", [50, 60, 90, 100, 120, 180, 200, 240, 360, 1000])
+def test_fifty_corrections_leave_per_second_whatever_the_cameras_rate(camera_hz):
+    bench = Bench()
+    bench.frames(10 * camera_hz, period_us=1e6 / camera_hz)
+    assert len(bench.sent) == pytest.approx(500, abs=2)
+    gaps_us = np.diff([now_us for now_us, _ in bench.sent])
+    assert gaps_us.max() <= 20_000 + 1e6 / camera_hz
+
+
+@pytest.mark.parametrize("camera_hz", [10, 25, 40, 45])
+def test_slower_cameras_lose_no_frame(camera_hz):
+    bench = Bench()
+    bench.frames(10 * camera_hz, period_us=1e6 / camera_hz)
+    assert len(bench.sent) == 10 * camera_hz
+
+
+@given(st.lists(st.integers(-2000, 2000), min_size=100, max_size=100))
+def test_jitter_of_a_camera_at_the_corrections_rate_loses_no_frame(jitter_us):
+    bench = Bench()
+    for number, late_us in enumerate(jitter_us):
+        frame = MocapFrame(20_000 * number + (late_us if number else 0), HOME.p_WG, UPRIGHT, True)
+        bench.station.on_frame(frame, frame.t_us + 38_000)
+    assert len(bench.sent) == 100
+
+
+def test_a_camera_clock_that_is_set_back_does_not_silence_the_corrections():
+    bench = Bench()
+    for t_us in (10_000_000, 10_020_000, 5_000_000, 5_020_000):
+        bench.station.on_frame(MocapFrame(t_us, HOME.p_WG, UPRIGHT, True), 20_000_000)
+    assert len(bench.sent) == 4
+
+
 def test_sent_age_is_that_on_arrival():
     bench = Bench(latency_us=2000)
     bench.frames(1)
@@ -93,7 +127,7 @@ def test_untracked_frames_are_never_sent_and_the_slots_keep_their_phase():
 
 
 def test_a_frame_without_a_pose_is_not_sent():
-    bench = Bench(send_every=1)
+    bench = Bench(corrections_hz=200.0)
     bench.frames(3, p=lambda number: (nan, 0.0, 0.0) if number == 1 else (0.001 * number, 0.0, 1.15))
     assert bench.numbers() == [0, 2]
     assert bench.station.counters.invalid == 1
@@ -109,7 +143,7 @@ def test_refused_frames_are_not_sent_and_the_next_good_one_takes_their_place():
 
 
 def test_the_goal_of_the_moment_counts_not_that_of_the_exposure():
-    bench = Bench(send_every=1, trajectory=Offsets(HOME, 40_000, x=Step(0.5)))
+    bench = Bench(corrections_hz=200.0, trajectory=Offsets(HOME, 40_000, x=Step(0.5)))
     bench.frames(2, p=lambda number: HOME.p_WG)  # arrive at 38 and 43 ms
     assert bench.numbers() == [0, -500]
 
@@ -130,7 +164,7 @@ def test_unreadable_telemetry_is_counted_and_other_services_are_not():
     assert bench.station.counters.malformed == 1
 
 
-@pytest.mark.parametrize("change", [{"send_every": 0}, {"link_latency_us": -1}, {"sendevery": 4}])
+@pytest.mark.parametrize("change", [{"corrections_hz": 0}, {"link_latency_us": -1}, {"correctionshz": 50}])
 def test_bad_configuration_is_refused(change):
     with pytest.raises(ValidationError):
         StationConfig(**change)

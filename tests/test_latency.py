@@ -133,6 +133,7 @@ def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:
     assert ages_of(told(telemetry.parent), log, RADIO) == ()
 
 
+@pytest.mark.realtime
 def test_instants_of_the_way_survive_motive_and_the_clock_of_its_computer() -> None:
     """Stamps against stamps: how long anything takes here does not matter."""
     readers: Readers = {}

@@ -394,7 +394,7 @@ def test_what_the_budget_allows_fits_and_it_allows_no_less_than_fits(baud, pose_
         (
             9600,
             50.0,
-            "9600 baud: 50 poses/s need 2.63 kB/s, 90 % of the line are 0.86: raise station.send_every",
+            "9600 baud: 50 poses/s need 2.63 kB/s, 90 % of the line are 0.86: lower station.corrections_hz",
         ),
         (
             9600,

@@ -107,7 +107,7 @@ def test_every_kernel_gives_the_same_bits_in_c(c_name: str) -> None:
     function.restype = SCALARS[signature.return_annotation]
     scalar = [next((SCALARS[known] for known in SCALARS if kind == known), None) for kind in kinds.values()]
     function.argtypes = [c_type or ctypes.c_void_p for c_type in scalar]
-    count = 10_000 if LONG or all(scalar) else 150
+    count = 10_000 if all(scalar) else 150
     rng = np.random.default_rng(len(c_name))
     for ours in zip(*(draws(rng, key, kind, count) for key, kind in kinds.items()), strict=True):
         if c_name in INSIDE_1000 and not abs(ours[0]) <= 1000:

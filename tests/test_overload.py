@@ -32,6 +32,7 @@ def hover(script: object = None) -> Experiment:
     return Experiment("hover", "", 2.0, {}, **({"script": script} if script else {}))
 
 
+@pytest.mark.long
 def test_overload_names_the_loads_at_which_tasks_are_late_and_the_hover_fails(tmp_path: Path) -> None:
     overload = EXPERIMENTS["overload"]
     result = go(tmp_path, overload, overload.duration_s)

@@ -56,6 +56,7 @@ def test_a_row_shows_metrics_that_exist_and_says_where_the_paper_claims_them(nam
     assert ROWS[name].place
 
 
+@pytest.mark.long
 def test_every_flight_keeps_its_log_and_nothing_big_besides(flown: Path) -> None:
     folders = {path.name for path in flown.iterdir() if path.is_dir()}
     assert folders == {f"hover-{profile}-{seed}" for profile in PROFILES for seed in (1, 2)}
@@ -67,6 +68,7 @@ def test_every_flight_keeps_its_log_and_nothing_big_besides(flown: Path) -> None
         }
 
 
+@pytest.mark.long
 def test_the_table_is_the_mean_and_deviation_of_the_flights(flown: Path) -> None:
     (row,) = content(flown)["rows"]
     for profile in PROFILES:
@@ -84,6 +86,7 @@ def test_the_table_is_the_mean_and_deviation_of_the_flights(flown: Path) -> None
         ]
 
 
+@pytest.mark.long
 def test_a_flight_of_the_paper_is_the_flight_that_fly_flies(
     flown: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -94,6 +97,7 @@ def test_a_flight_of_the_paper_is_the_flight_that_fly_flies(
     assert content(flown)["rows"][0]["profiles"]["as-flown"]["flights"][1]["hash"] == alone["hash"]
 
 
+@pytest.mark.long
 def test_the_report_tells_the_papers_value_and_ours(flown: Path) -> None:
     page = Page((flown / "report.html").read_text(encoding="utf-8"))
     rows = {row[0]: row[1:] for row in page.tables["paper"]}
@@ -185,6 +189,7 @@ def test_bad_input_is_one_line_and_exit_code_two(
     assert error.count("\n") == 1
 
 
+@pytest.mark.long
 def test_ctrl_c_keeps_what_was_flown_and_writes_the_report(tmp_path: Path) -> None:
     seeds = 10 * (os.cpu_count() or 1)
     command = [

@@ -72,6 +72,7 @@ def test_a_full_disk_ends_the_record_but_not_the_flight() -> None:
     assert recording.notices() == ["played", told]
 
 
+@pytest.mark.realtime
 def test_a_replay_keeps_the_pace_and_the_age_and_ends(tmp_path: Path) -> None:
     path = tmp_path / "frames.csv"
     rows = [f"{100_000 + 20_000 * n},{93_000 + 20_000 * n},1,2,3,1,0,0,0,1\n" for n in range(10)]

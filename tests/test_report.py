@@ -191,7 +191,7 @@ def test_a_failed_limit_is_told_first(folder: Path) -> None:
     assert "lost: fell" in (folder / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("rows", [0, 1, 15])
+@pytest.mark.parametrize("rows", [1, *(pytest.param(rows, marks=pytest.mark.long) for rows in (0, 15))])
 def test_a_flight_that_never_began_has_a_report(folder: Path, rows: int) -> None:
     keep_rows(folder, rows)
     change_result(folder, metrics=dict.fromkeys(METRICS, None), verdicts=[], passed=False)

@@ -58,7 +58,7 @@ def test_the_budget_is_stated_before_take_off(tmp_path: Path) -> None:
 
 def test_a_line_that_cannot_carry_the_poses_is_refused_before_take_off(tmp_path: Path) -> None:
     with pytest.raises(
-        LabError, match=r"9600 baud: 50 poses/s need .* raise station\.send_every or serial\.baud"
+        LabError, match=r"9600 baud: 50 poses/s need .* lower station\.corrections_hz or raise serial\.baud"
     ):
         fly_over_mavlink(tmp_path / "run", "serial.baud=9600")
 
@@ -119,6 +119,7 @@ def test_the_report_shows_the_line(tmp_path: Path) -> None:
     assert "Radio" not in shown
 
 
+@pytest.mark.realtime
 def test_the_station_flies_a_board_behind_a_pty_in_real_time(tmp_path: Path) -> None:
     line = tmp_path / "uart"
     done = subprocess.run(

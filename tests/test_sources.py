@@ -281,6 +281,7 @@ def _serve(
             commands.sendto(packets.echo(asked_us, clock_us() * TICKS_PER_US), client)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
 def test_poses_come_over_real_sockets(version: tuple[int, int], multicast: bool) -> None:
@@ -299,6 +300,7 @@ def test_poses_come_over_real_sockets(version: tuple[int, int], multicast: bool)
     assert 7000 <= clock_us() - frames[-1].t_us < 2_000_000
 
 
+@pytest.mark.realtime
 def test_a_server_that_is_not_there_or_not_so_is_one_line_within_four_seconds() -> None:
     begin_s = time.monotonic()
     with pytest.raises(MocapError, match=r"^127\.0\.0\.1:9: no NatNet server answers\Z"):

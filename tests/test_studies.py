@@ -128,6 +128,7 @@ def test_the_typical_outcome_is_the_median_and_the_worse_of_two() -> None:
     assert Cell(1.0, ("failsafe", "degrades", "lost"), ()).typical == "failsafe"
 
 
+@pytest.mark.long
 def test_the_predictors_cliff(tmp_path: Path) -> None:
     """The author's gains at 40 ms: lost without the predictor, not with it (physics.md section 8: 20 of 20, 0)."""
     study = STUDIES["latency"]
@@ -153,6 +154,7 @@ def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold(tmp_path: Pa
     assert picture(result).startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_a_study_can_be_flown_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(
         sys, "argv", ["floaty", "study", "loss", "--seeds", "1", "--out", str(tmp_path / "out")]

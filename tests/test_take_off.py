@@ -103,8 +103,16 @@ def test_the_net_ends_where_the_feet_are_above_it() -> None:
     assert plant.state.tobytes() == free.state.tobytes()
 
 
-@pytest.mark.parametrize("profile", ["floaty", "as-flown"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("profile", "seed"),
+    [
+        ("floaty", 1),
+        *(
+            pytest.param(*flight, marks=pytest.mark.long)
+            for flight in (("as-flown", 1), ("floaty", 2), ("as-flown", 2))
+        ),
+    ],
+)
 def test_take_off_and_landing_hold_their_limits(tmp_path: Path, profile: str, seed: int) -> None:
     result = flown(tmp_path / "run", profile=profile, seed=seed)
     assert result.passed, [str(verdict) for verdict in result.verdicts if not verdict.holds]

@@ -78,7 +78,7 @@ class CrazyradioLink:
         self._echo_us = 0  # when to ask for the next one
         self._echo_is_due = False
         self._sent_us = 0  # the last correction
-        self._cache = tempfile.TemporaryDirectory(prefix="floaty-toc-")
+        self._cache: tempfile.TemporaryDirectory[str] | None = None  # of the TOC, for connecting again
         self._crazyflie: Crazyflie | None = None
         self._blocks: dict[int, Block] = {}
         # What cflib says: an empty text is "connected", any other a failure.
@@ -99,6 +99,7 @@ class CrazyradioLink:
             cflib.crtp.init_drivers()
         self._news = queue.SimpleQueue()
         self._heard_us = 0
+        self._cache = self._cache or tempfile.TemporaryDirectory(prefix="floaty-toc-")
         crazyflie = self._crazyflie = Crazyflie(rw_cache=self._cache.name)
         crazyflie.packet_received.add_callback(self._on_any_packet)
         crazyflie.connected.add_callback(lambda uri: self._news.put(""))

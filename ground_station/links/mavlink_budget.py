@@ -43,7 +43,7 @@ def link_budget(baud: int, pose_hz: float, signed: bool = False) -> Budget:
     if up > UP_LIMIT * line:
         raise LinkError(
             f"{baud} baud: {pose_hz:g} poses/s need {up / 1000:.2f} kB/s, {100 * UP_LIMIT:.0f} % of the line are "
-            f"{UP_LIMIT * line / 1000:.2f}: raise station.send_every or serial.baud"
+            f"{UP_LIMIT * line / 1000:.2f}: lower station.corrections_hz or raise serial.baud"
         )
     goal_hz = STANDING_GOAL_HZ + (UP_LIMIT * line - up) / goal
     goal_period_us = 0 if goal_hz >= pose_hz else round(1e6 / goal_hz)

@@ -1,6 +1,5 @@
 """Flashing through the virtual dongle: byte for byte, with progress, verified, and one line for whatever goes wrong."""
 
-import os
 import random
 import struct
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from ground_station.flashing import check_image, flash
 from hil.dongle_plugin import VARIABLE, Backend
 
 START = 0x0800_4000
-LOSSES = ["loss=0", "loss=0.1"] if os.environ.get("FLOATY_LONG") else ["loss=0"]
+LOSSES = ["loss=0", pytest.param("loss=0.1", marks=pytest.mark.long)]
 
 
 def image_of(size: int, seed: int = 1) -> bytes:

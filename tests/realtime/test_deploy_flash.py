@@ -33,7 +33,7 @@ def image(tmp_path: Path) -> Path:
 
 def flash(served: Served, *arguments: object) -> "subprocess.CompletedProcess[str]":
     command = [sys.executable, "-m", "hil.cli", "deploy", "flash", *map(str, arguments)]
-    dongle, here = served.environment["PYTHONPATH"], str(Path(__file__).parents[1])
+    dongle, here = served.environment["PYTHONPATH"], str(Path(__file__).parents[2])
     environment = {**served.environment, "PYTHONPATH": os.pathsep.join((dongle, here))}
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
 

@@ -241,7 +241,7 @@ def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., M
 
     def make(text: str, body: str = "") -> MotioncaptureSource:
         (tmp_path / "motioncapture.py").write_text(text)
-        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path(__file__).parent.parent}")
+        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}")
         capture = CaptureConfig(system="qualisys", body=body)
         return MotioncaptureSource(capture.system, settings_of(capture), capture)
 

@@ -1,0 +1,77 @@
+"""Simulated time against the wall clock, on a wall clock that only moves when it is told to."""
+
+import pytest
+
+from hil import clock
+from hil.clock import FreeRunning, Paced
+
+
+class Wall:
+    """Stands for the module `time`: sleeping takes exactly as long as asked."""
+
+    def __init__(self) -> None:
+        self.us = 5_000_000
+
+    def monotonic_ns(self) -> int:
+        return self.us * 1000
+
+    def sleep(self, duration_s: float) -> None:
+        self.us += round(duration_s * 1e6)
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
+    wall = Wall()
+    monkeypatch.setattr(clock, "time", wall)
+    return wall
+
+
+def test_a_paced_instant_happens_when_the_wall_clock_has_reached_it(wall: Wall) -> None:
+    paced, begin_us = Paced(), wall.us
+    for now_us in (0, 10_000, 15_000, 2_000_000):
+        paced.wait_until(now_us)
+        assert wall.us - begin_us == now_us
+    assert paced.stood_still_us == 0
+    assert paced.notices() == []
+
+
+def test_a_little_lateness_is_made_up_for(wall: Wall) -> None:
+    paced = Paced()
+    paced.start(0)
+    wall.us += 19_000
+    paced.wait_until(1000)
+    paced.wait_until(30_000)
+    assert paced.now_us() == 30_000
+    assert (paced.stood_still_us, paced.notices()) == (0, [])
+
+
+def test_after_a_stall_time_goes_on_from_where_it_stood(wall: Wall) -> None:
+    paced = Paced()
+    paced.start(0)
+    wall.us += 300_000
+    paced.wait_until(1000)
+    assert paced.now_us() == 1000
+    before_us = wall.us
+    paced.wait_until(6000)
+    assert wall.us - before_us == 5000  # no burst
+    assert paced.stood_still_us == 299_000
+    assert paced.notices() == ["this machine was too slow: time stood still for 299 ms"]
+    assert paced.notices() == []
+
+
+def test_a_machine_that_is_always_too_slow_is_told_once_per_second_and_every_stall_counts(wall: Wall) -> None:
+    paced, lines = Paced(), []
+    for now_us in range(0, 5_000_000, 50_000):
+        paced.wait_until(now_us)
+        wall.us += 75_000  # what 50 ms cost
+        lines += paced.notices()
+    told_ms = [int(line.split()[-2]) for line in lines]
+    assert 4 <= len(lines) <= 6
+    assert sum(told_ms) == pytest.approx(paced.stood_still_us / 1000, abs=600)
+    assert paced.stood_still_us == pytest.approx(2_500_000, abs=30_000)
+
+
+def test_free_running_time_never_stands_still() -> None:
+    free = FreeRunning()
+    free.wait_until(10**15)
+    assert (free.stood_still_us, free.notices()) == (0, [])
