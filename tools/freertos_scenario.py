@@ -9,6 +9,7 @@ import argparse
 import sys
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,9 @@ Operation = tuple[str, list[Any]]
 Record = Callable[[int, str, str, int, int], None]
 
 
+Interrupt = tuple[int, Operation]  # instant [us] and what is called then
+
+
 class ScenarioError(Exception):
     """A scenario that cannot be run; says the line and the reason."""
 
@@ -57,7 +61,7 @@ class Scenario:
     mutexes: list[int] = field(default_factory=list)
     semaphores: dict[int, tuple[int, int]] = field(default_factory=dict)  # id to maximum and initial count
     timers: list[tuple[str, int, bool, Operation]] = field(default_factory=list)
-    interrupts: list[tuple[int, Operation]] = field(default_factory=list)
+    interrupts: list[Interrupt] = field(default_factory=list)
     tasks: list[tuple[str, int, bool, list[Operation]]] = field(
         default_factory=list
     )  # name, priority, once, ...
@@ -142,6 +146,10 @@ def _check(line: int, name: str, operands: list[Any], known: dict[str, str], kin
             raise ScenarioError(f"line {line}: {name} {operands[place]}: there is no such object for it")
 
 
+def _instant_us(interrupt: Interrupt) -> int:
+    return interrupt[0]
+
+
 class Run:
     """One scenario on one kernel; `record` gets the runner's events and, when `traced`, the kernel's."""
 
@@ -171,14 +179,14 @@ class Run:
         kernel = self.kernel
         end_us = self.scenario.ticks * TICK_US
         kernel.start()
-        for instant_us, (name, operands) in sorted(
-            self.scenario.interrupts, key=lambda interrupt: interrupt[0]
-        ):
+        interrupts = sorted(self.scenario.interrupts, key=_instant_us)
+        for instant_us, raised in groupby(interrupts, _instant_us):
             if instant_us >= end_us:
                 break
             kernel.run(instant_us - 1)
             kernel.advance(instant_us)
-            self._interrupt(name, operands)
+            for _, (name, operands) in raised:
+                self._interrupt(name, operands)
             kernel.run(instant_us)
         kernel.run(end_us - 1)
         self.record(end_us, "END", "-", 0, 0)
