@@ -307,3 +307,24 @@ def test_the_start_latency_ends_at_the_first_switch_to_the_task(kernel):
     kernel.start()
     run_with(kernel, 5_000, (500, semaphore.give_from_isr))
     assert [report.worst_latency_us for report in statistics.reports()] == [0, 0]
+
+
+def test_a_notification_of_a_task_that_is_ready_already_does_not_begin_its_activation_anew(kernel):
+    """Its wait ends at 1 ms, the notification comes at 2 ms, it runs at 3 ms."""
+
+    def low():
+        yield from kernel.notify_take(True, 1)
+
+    low_task = kernel.create_task("low", 2, low)
+
+    def high():
+        yield from kernel.delay(1)
+        yield from kernel.work(1_000)
+        yield from low_task.notify()
+        yield from kernel.work(1_000)
+
+    kernel.create_task("high", 3, high)
+    statistics = Statistics(kernel, {})
+    kernel.start()
+    kernel.run(5_000)
+    assert statistics.reports()[0].worst_latency_us == 2_000

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-VECTORS = Path(__file__).parent / "vectors" / "freertos"
+VECTORS = Path(__file__).parent / "vectors"
 TOOL = Path(__file__).parents[1] / "tools" / "freertos_scenario.py"
-SCENARIOS = sorted(path.stem for path in VECTORS.glob("*.txt"))
+SCENARIOS = sorted(str(path.relative_to(VECTORS).with_suffix("")) for path in VECTORS.glob("freertos*/*.txt"))
 
 spec = importlib.util.spec_from_file_location("freertos_scenario", TOOL)
 freertos_scenario = importlib.util.module_from_spec(spec)
@@ -21,8 +21,8 @@ def recorded(name, mode):
     return (VECTORS / f"{name}.{mode}.csv").read_text()
 
 
-def test_all_62_scenarios_are_there():
-    assert len(SCENARIOS) == 62
+def test_all_62_random_scenarios_and_17_corners_are_there():
+    assert len(SCENARIOS) == 62 + 17
 
 
 @pytest.mark.parametrize("mode", ["coop", "preempt"])
@@ -56,8 +56,8 @@ def command(*arguments):
 
 
 def test_command_prints_the_trace_of_its_mode():
-    result = command(VECTORS / "slices.txt", "--mode", "coop")
-    assert (result.returncode, result.stdout) == (0, recorded("slices", "coop"))
+    result = command(VECTORS / "freertos" / "slices.txt", "--mode", "coop")
+    assert (result.returncode, result.stdout) == (0, recorded("freertos/slices", "coop"))
 
 
 @pytest.mark.parametrize(
@@ -90,4 +90,4 @@ def test_missing_file_and_bad_mode_are_exit_code_2(tmp_path):
     missing = command(tmp_path / "missing.txt")
     assert missing.returncode == 2
     assert "missing.txt" in missing.stderr
-    assert command(VECTORS / "demo.txt", "--mode", "sometimes").returncode == 2
+    assert command(VECTORS / "freertos" / "demo.txt", "--mode", "sometimes").returncode == 2

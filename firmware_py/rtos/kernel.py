@@ -131,14 +131,14 @@ class Kernel(Scheduler):
 
     def suspend_all(self) -> None:
         """Keeps the running task running, ticks pend, until as many calls of `resume_all`."""
-        self._suspended += 1
+        self.suspended += 1
 
     def resume_all(self) -> Iterable[int]:
         """Ends the innermost `suspend_all`; after the outermost what pended happens now."""
-        if self._suspended == 0:
+        if self.suspended == 0:
             raise KernelError("resume_all without suspend_all")
-        self._suspended -= 1
-        if self._suspended:
+        self.suspended -= 1
+        if self.suspended:
             return GO_ON
         while self._pending_ready:
             task = self._pending_ready.pop(0)

@@ -49,7 +49,7 @@ class Scheduler:
         self._wake_ticks: list[int] = []  # ascending, parallel to _delayed
         self._delayed: list[Task] = []
         self._pending_ready: list[Task] = []  # woken by interrupts while the scheduler is suspended
-        self._suspended = 0
+        self.suspended = 0  # how many calls of suspend_all wait for their resume_all
         self.interrupts_off = False
         self._switch_pending = False
         self._interrupted = False
@@ -98,7 +98,7 @@ class Scheduler:
     def block(self, waiters: list[Task] | None, wake_tick: int) -> None:
         """Takes the running task off the ready ring until it is woken or, unless negative, `wake_tick` comes."""
         task = self.current
-        if self._suspended:
+        if self.suspended:
             self.check_may_wait()
         if waiters is not None:
             if waiters:
@@ -133,12 +133,12 @@ class Scheduler:
 
     def check_may_wait(self) -> None:
         """Raises KernelError if the running task would wait while nobody else may run."""
-        if self._suspended:
+        if self.suspended:
             raise KernelError(f"task {self.current.name} must not wait while the scheduler is suspended")
 
     def wake(self, task: Task) -> bool:
         """Makes a waiting task ready, later if the scheduler is suspended; True when it outranks the running one."""
-        if self._suspended:
+        if self.suspended:
             self._pending_ready.append(task)
             task.waiting_in = self._pending_ready
         else:
@@ -147,19 +147,23 @@ class Scheduler:
         return task.priority > self.current.priority
 
     def unblock(self, task: Task) -> None:
-        """Makes a waiting or suspended task ready."""
-        if task.place == DELAYED:
+        """Takes the task off whatever list holds it and puts it behind the others of its ready ring.
+
+        It may be ready already: a notification can reach a task whose wait timed out and that has not run since.
+        """
+        if task.place != READY:  # otherwise its activation has begun
+            task.released_us = self.now_us
+            task.fresh = True
+        if task.place != SUSPENDED:
             self.unlink(task)
         if self.trace is not None:
             self.trace(self.now_us, "READY", task.name, task.priority, 0)
         task.place = READY
         task.ring.insert(-1, task)
         self._ready_bits |= task.ready_bit
-        task.released_us = self.now_us
-        task.fresh = True
 
     def make_ready(self, task: Task) -> None:
-        """Appends the task to the ring of its priority."""
+        """Puts a task that is in no list behind the others of the ring of its priority."""
         if self.trace is not None:
             self.trace(self.now_us, "READY", task.name, task.priority, 0)
         task.place = READY
@@ -223,7 +227,7 @@ class Scheduler:
         """Takes the tick that is due now, if one is; jumps over those before at which nothing could happen."""
         tick = self.now_us // TICK_US
         self._next_tick_us = tick * TICK_US + TICK_US
-        if self._suspended:
+        if self.suspended:
             if self.trace is not None:
                 self.record("TICK", self.tick_count + 1)
         elif self.now_us == tick * TICK_US:
@@ -257,7 +261,7 @@ class Scheduler:
         idle = self._idle
         now_us = self.now_us
         trace = self.trace
-        switch = self._switch_pending and not self._suspended
+        switch = self._switch_pending and not self.suspended
         self._spins = 0
         if task.work_left_us:  # every interrupt ends the sleep of the idle task
             task.work_left_us = 0 if task is idle else self._work_end_us - now_us
@@ -293,8 +297,8 @@ class Scheduler:
                 if result:
                     task.work_left_us = result
                     task.work_us += result
-                    switch = self._switch_pending and not self._suspended
-                elif self._suspended:
+                    switch = self._switch_pending and not self.suspended
+                elif self.suspended:
                     self._switch_pending = True
                     switch = False
                 else:
@@ -302,7 +306,7 @@ class Scheduler:
             else:
                 raise StuckTaskError(task.name, now_us, f"{STUCK_CALLS} switches at one instant")
         except StopIteration:
-            if self._suspended:
+            if self.suspended:
                 raise TaskError(task.name, now_us, "ended while the scheduler was suspended") from None
             self.unlink(task)
             task.place = DELETED
@@ -318,7 +322,7 @@ class Scheduler:
         wake_us: int | None = None
         if self.trace is not None or (len(task.ring) > 2 and self.preemption):
             wake_us = self._next_tick_us
-        elif self._wake_ticks and not self._suspended:
+        elif self._wake_ticks and not self.suspended:
             wake_us = self._wake_ticks[0] * TICK_US
         if task is not idle:
             self._work_end_us = work_end_us = now_us + task.work_left_us

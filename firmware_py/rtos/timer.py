@@ -85,7 +85,9 @@ class TimerService:
         self._running: list[Timer] = []
 
     def send(self, number: int, timer: Timer, value: int, timeout: int) -> Generator[int, None, bool]:
-        """Queues a command from the running task."""
+        """Queues a command from the running task, without waiting while the scheduler is suspended."""
+        if self.kernel.suspended:
+            timeout = 0
         sent = yield from self.commands.send(_Command(number, timer, value), timeout)
         if self.kernel.trace is not None:
             self.kernel.record("TMR_CMD", number, int(sent))
