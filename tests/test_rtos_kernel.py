@@ -1,12 +1,14 @@
 """Laws of the scheduler that hold for every program: property tests, errors, statistics."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_py.rtos import FOREVER, TICK_US, Kernel, KernelError, Statistics, StuckTaskError, TaskError
+from firmware_py.rtos.scheduler import STUCK_CALLS
 
 
 def run_until(kernel, end_us, interrupts=()):
@@ -499,32 +501,101 @@ def test_a_task_that_raises_is_named_with_the_time_and_the_others_can_go_on():
     assert ticks == list(range(1, 11))
 
 
-def spinning(kernel, call):
+# What a task can do for ever while no time passes: calls that fail, that change nothing, that undo each other.
+LOOPS = {
+    "task_yield": lambda o: (o.kernel.task_yield(),),
+    "delay(0)": lambda o: (o.kernel.delay(0),),
+    "delay_until now": lambda o: (o.kernel.delay_until(o.kernel.tick_count),),
+    "work(0)": lambda o: (o.kernel.work(0),),
+    "receive from an empty queue": lambda o: (o.queue.receive(0),),
+    "send into a full queue": lambda o: (o.queue.send("item", 0),),
+    "send and receive": lambda o: (o.queue.send("item"), o.queue.receive()),
+    "send and receive without waiting": lambda o: (
+        o.queue.send_nowait("item"),
+        o.queue.receive_nowait() and (),
+    ),
+    "overwrite": lambda o: (o.queue.overwrite("item"),),
+    "take what was not given": lambda o: (o.semaphore.take(0),),
+    "give what was not taken": lambda o: (o.semaphore.give(),),
+    "give and take": lambda o: (o.semaphore.give(), o.semaphore.take()),
+    "take and give a mutex": lambda o: (o.mutex.take(), o.mutex.give()),
+    "notify": lambda o: (o.kernel.current.notify(),),
+    "notify_take": lambda o: (o.kernel.notify_take(True, 0),),
+    "notify and notify_take": lambda o: (o.kernel.current.notify(), o.kernel.notify_take(True, 5)),
+    "notification by an interrupt": lambda o: (
+        o.kernel.current.notify_from_isr() or (),
+        o.kernel.notify_take(True, 5),
+    ),
+    "suspend another": lambda o: (o.other.suspend(),),
+    "resume another": lambda o: (o.other.resume(),),
+    "suspend and resume another": lambda o: (o.other.suspend(), o.other.resume()),
+    "priority_set": lambda o: (o.kernel.current.priority_set(2),),
+    "suspend_all": lambda o: (o.kernel.suspend_all() or (),),
+    "suspend_all and resume_all": lambda o: (o.kernel.suspend_all() or (), o.kernel.resume_all()),
+    "timer commands": lambda o: (o.timer.start(0), o.timer.stop(0)),
+}
+
+
+@pytest.mark.parametrize("traced", [False, True])
+@pytest.mark.parametrize("loop", LOOPS)
+def test_a_task_that_never_lets_time_pass_is_named(loop, traced):
+    lines = []
+    kernel = Kernel(trace=(lambda *line: lines.append(line)) if traced else None)
+
     def body():
         yield from kernel.delay(1)
         while True:
-            yield from call()
+            for call in LOOPS[loop](objects):
+                yield from call
 
-    return body
-
-
-@pytest.mark.parametrize("spin", ["task_yield", "receive", "take", "give", "notify", "notify_take"])
-def test_a_task_that_never_lets_time_pass_is_named(spin):
-    kernel = Kernel()
-    queue = kernel.create_queue(1, "queue")
-    semaphore = kernel.create_binary_semaphore("semaphore")
-    calls = {
-        "task_yield": kernel.task_yield,
-        "receive": lambda: queue.receive(0),
-        "take": lambda: semaphore.take(0),
-        "give": semaphore.give,
-        "notify": lambda: kernel.current.notify(),
-        "notify_take": lambda: kernel.notify_take(True, 0),
-    }
-    kernel.create_task("spinner", 1, spinning(kernel, calls[spin]))
+    kernel.create_task("spinner", 2, body)
+    objects = SimpleNamespace(
+        kernel=kernel,
+        queue=kernel.create_queue(1, "queue"),
+        semaphore=kernel.create_binary_semaphore("semaphore"),
+        mutex=kernel.create_mutex("mutex"),
+        timer=kernel.create_timer("timer", 1, False, lambda timer: iter(())),
+        other=kernel.create_task("other", 1, sleeper, kernel),
+    )
     kernel.start()
-    with pytest.raises(StuckTaskError, match=r"task spinner at 1\.000 ms: 100000 .* at one instant"):
+    with pytest.raises(StuckTaskError, match=rf"task spinner at 1\.000 ms: {STUCK_CALLS} .* at one instant"):
         kernel.run(5_000)
+    assert len(lines) < 10 * STUCK_CALLS
+
+
+def sleeper(kernel):
+    yield from kernel.delay(1_000)
+
+
+def test_two_tasks_that_hand_each_other_the_processor_for_ever_are_stuck():
+    kernel = Kernel()
+    ping, pong = kernel.create_binary_semaphore("ping"), kernel.create_binary_semaphore("pong")
+
+    def player(own, other):
+        while True:
+            yield from other.give()
+            yield from own.take()
+
+    kernel.create_task("a", 2, player, ping, pong)
+    kernel.create_task("b", 2, player, pong, ping)
+    kernel.start()
+    with pytest.raises(StuckTaskError, match=f"{STUCK_CALLS} switches at one instant"):
+        kernel.run(0)
+
+
+def test_tasks_that_each_end_at_once_end_at_one_instant_however_many_they_are():
+    kernel = Kernel()
+    ended = []
+
+    def body(number):
+        ended.append(number)
+        yield from ()
+
+    for number in range(2_000):
+        kernel.create_task(f"task {number}", 1, body, number)
+    kernel.start()
+    kernel.run(0)
+    assert sorted(ended) == list(range(2_000))
 
 
 def wrong_yield(kernel):
@@ -567,7 +638,7 @@ def negative_priority(kernel):
         (end_while_suspended, "ended while the scheduler was suspended"),
         (give_a_mutex_of_another, "mutex lock: given by task, held by nobody"),
         (resume_too_often, "resume_all without suspend_all"),
-        (negative_priority, "priority -1 is negative"),
+        (negative_priority, "priority -1 is outside 0..6"),
     ],
 )
 def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
@@ -590,6 +661,10 @@ def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
         (lambda kernel: kernel.create_counting_semaphore(2, 3, "s"), "semaphore s: initial count 3"),
         (lambda kernel: kernel.create_timer("t", 0, True, iter), "timer t: period 0"),
         (lambda kernel: kernel.create_task("t", -1, wrong_yield, kernel), "task t: priority -1"),
+        (
+            lambda kernel: kernel.create_task("t", 7, wrong_yield, kernel),
+            "task t: priority 7 is outside 0..6",
+        ),
         (
             lambda kernel: kernel.create_task("t", 1, lambda: 5),
             "task t: its function returned int, not a generator",

@@ -73,7 +73,7 @@ def test_command_prints_the_trace_of_its_mode():
         ("run 5\ntask a 1", "task a has no operations"),
         ("task a 1\n  work 5", "run TICKS"),
         ("run 5\nqueue 1 0\ntask a 1\n  work 5", "queue 1: length 0"),
-        ("run 5\ntask a 1\n  yield", "task a at 0.000 ms: 100000 switches at one instant"),
+        ("run 5\ntask a 1\n  yield", "task a at 0.000 ms: 10000 switches at one instant"),
     ],
 )
 def test_bad_scenario_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys, text, complaint):

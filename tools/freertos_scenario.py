@@ -15,8 +15,8 @@ from typing import Any
 
 from firmware_py.rtos import TICK_US, Kernel, KernelError, Mutex, Queue, Semaphore, Task, Timer
 
-# The operands of each operation: n number, p positive number, q id of a queue, s of a semaphore, l of a semaphore or
-# mutex, t name of a task, T index of a timer.
+# The operands of each operation: n number, p positive number, q id of a queue, l of a semaphore or mutex, t name of a
+# task, T index of a timer.
 OPERATIONS = {
     "work": "n",
     "delay": "n",
@@ -211,7 +211,7 @@ class Run:
                 result = yield from self._perform(operation, wake_tick)
                 self.record(self.kernel.now_us, "RET", name, place, result)
             while once:
-                yield from self.kernel.current.suspend()
+                yield from self.tasks[name].suspend()
 
     def _timer_callback(self, operation: Operation) -> Callable[[Timer], Generator[int, None, None]]:
         def callback(timer: Timer) -> Generator[int, None, None]:

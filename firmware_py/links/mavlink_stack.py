@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterable
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig, MavlinkConfig
 from firmware_py.rtos import Kernel, Queue
-from firmware_py.rtos.task import GO_ON
+from firmware_py.rtos.scheduler import GO_ON
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
 

@@ -10,9 +10,9 @@ from typing import Any
 
 from firmware_py.rtos.errors import KernelError
 from firmware_py.rtos.queue import Queue
-from firmware_py.rtos.scheduler import TICK_US, Scheduler, Trace
+from firmware_py.rtos.scheduler import FOREVER, GO_ON, SWITCH, TICK_US, Scheduler, Trace
 from firmware_py.rtos.semaphore import Mutex, Semaphore
-from firmware_py.rtos.task import GO_ON, SWITCH, Task
+from firmware_py.rtos.task import Task
 from firmware_py.rtos.timer import SERVICE_PRIORITY, Callback, Timer, TimerService
 
 TaskFunction = Callable[..., Generator[int, None, Any]]
@@ -87,7 +87,10 @@ class Kernel(Scheduler):
 
     def work(self, duration_us: int) -> Iterable[int]:
         """Takes processor time; others may run in between."""
-        return (duration_us,) if duration_us > 0 else GO_ON
+        if duration_us > 0:
+            return (duration_us,)
+        self.count_call()
+        return GO_ON
 
     def task_yield(self) -> Iterable[int]:
         """Lets the next task of the same priority run."""
@@ -114,7 +117,22 @@ class Kernel(Scheduler):
 
         Then sets it to zero (`clear`) or lowers it by one. 0 means that no notification came.
         """
-        return self.current.take_notification(clear, timeout)
+        task = self.current
+        if task.notification or timeout == 0:
+            self.count_call()
+        else:
+            task.notify_waiting = True
+            self.block(None, FOREVER if timeout < 0 else self.tick_count + timeout)
+            if self.trace is not None:
+                self.record("NTAKE_BLOCK")
+            yield 0
+        if self.trace is not None:
+            self.record("NTAKE")
+        task.notify_waiting = False
+        value = task.notification
+        if value:
+            task.notification = 0 if clear else value - 1
+        return value
 
     def enter_critical(self) -> None:
         """Keeps the running task running and, until `exit_critical`, interrupts waiting.
@@ -131,6 +149,7 @@ class Kernel(Scheduler):
 
     def suspend_all(self) -> None:
         """Keeps the running task running, ticks pend, until as many calls of `resume_all`."""
+        self.count_call()
         self.suspended += 1
 
     def resume_all(self) -> Iterable[int]:

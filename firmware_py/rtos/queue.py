@@ -8,14 +8,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Iterable
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
+from firmware_py.rtos.control_block import ControlBlock
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.task import FOREVER, GO_ON
-
-if TYPE_CHECKING:
-    from firmware_py.rtos.scheduler import Scheduler
-    from firmware_py.rtos.task import Task
+from firmware_py.rtos.scheduler import FOREVER, GO_ON, Scheduler
 
 T = TypeVar("T")
 
@@ -40,8 +37,8 @@ class Queue(Generic[T]):
             raise KernelError(f"queue {name}: length {length}, a queue holds at least one item")
         self._kernel = kernel
         self._items: deque[T] = deque()
-        self._receivers: list[Task] = []
-        self._senders: list[Task] = []
+        self._receivers: list[ControlBlock] = []
+        self._senders: list[ControlBlock] = []
         self.length = length
         self.name = name
         self.number = 0  # how the trace calls this queue
@@ -98,7 +95,9 @@ class Queue(Generic[T]):
         """Takes the oldest item, waiting up to `timeout` ticks for one; None when none came."""
         kernel = self._kernel
         items = self._items
-        if not items:
+        if items:
+            kernel.count_call()
+        else:
             deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
             while not items:
                 if 0 <= deadline <= kernel.tick_count:
@@ -126,6 +125,7 @@ class Queue(Generic[T]):
         if not items:
             kernel.failed("Q_RECV_FAIL", self.number)
             return None
+        kernel.count_call()
         if kernel.trace is not None:
             kernel.record("Q_RECV", self.number, len(items))
         item = items.popleft()
@@ -144,6 +144,7 @@ class Queue(Generic[T]):
                 f"queue {self.name}: overwrite needs a queue of length 1, this one holds {self.length}"
             )
         kernel = self._kernel
+        kernel.count_call()
         if kernel.trace is not None:
             kernel.record("Q_SEND", self.number, len(self._items))
         self._items.clear()

@@ -15,11 +15,19 @@ from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable
 from typing import Any
 
+from firmware_py.rtos.control_block import DELAYED, DELETED, READY, SUSPENDED, ControlBlock
 from firmware_py.rtos.errors import KernelError, StuckTaskError, TaskError
-from firmware_py.rtos.task import DELAYED, DELETED, GO_ON, READY, SUSPENDED, SWITCH, Task
+
+SWITCH = (0,)  # what a call returns for `yield from` when the processor may go to another task
+GO_ON: tuple[int, ...] = ()  # ... and when the caller just continues
+
+FOREVER = -1  # a timeout that never ends, FreeRTOS's portMAX_DELAY; any other timeout is a number of ticks
 
 TICK_US = 1000
-STUCK_CALLS = 100_000  # calls of the kernel at one instant after which the running task counts as stuck
+MAX_PRIORITIES = 7  # the Crazyflie's six, 0 to 5, and one above them for what stands for interrupts
+# Calls of the kernel, or switches, at one instant after which the running task counts as stuck. The most that a task
+# of the firmware needs is 25.
+STUCK_CALLS = 10_000
 _STUCK_SWITCHES = range(STUCK_CALLS)
 _FOR_EVER_US = 1 << 50
 
@@ -39,23 +47,24 @@ class Scheduler:
         self.now_us = 0
         self.next_wake_us: int | None = None
         self.tick_count = 0  # up to date while tasks run
-        self._rings: list[list[Any]] = []  # by priority; of tasks and the marker None
-        self.current = Task(self, "main", 0, _nothing())  # whoever calls before the scheduler starts
+        self.rings: list[list[Any]] = [[None] for _ in range(MAX_PRIORITIES)]  # of tasks and the marker None
+        # Before the scheduler starts, whoever calls.
+        self.current = ControlBlock("main", 0, _nothing(), self.rings[0], 0)
         self.task_woken = False  # whether the latest call from an interrupt woke a task above the running one
         self._idle = self.current
         self._idle_slept = False
         self._started = False
         self._ready_bits = 0  # bit n is set when ring n holds a task
         self._wake_ticks: list[int] = []  # ascending, parallel to _delayed
-        self._delayed: list[Task] = []
-        self._pending_ready: list[Task] = []  # woken by interrupts while the scheduler is suspended
+        self._delayed: list[ControlBlock] = []
+        self._pending_ready: list[ControlBlock] = []  # woken by interrupts while the scheduler is suspended
         self.suspended = 0  # how many calls of suspend_all wait for their resume_all
         self.interrupts_off = False
         self._switch_pending = False
         self._interrupted = False
         self._next_tick_us = TICK_US
         self._work_end_us = 0  # of the running task, when it has work left
-        self._spins = 0
+        self._calls = 0  # of the kernel at this instant
         self.until_us = 0  # how far `run` goes
 
     def run(self, now_us: int) -> None:
@@ -95,7 +104,7 @@ class Scheduler:
             raise KernelError(f"advance({now_us}): outside {self.now_us}..{self.next_wake_us}")
         self.now_us = now_us
 
-    def block(self, waiters: list[Task] | None, wake_tick: int) -> None:
+    def block(self, waiters: list[ControlBlock] | None, wake_tick: int) -> None:
         """Takes the running task off the ready ring until it is woken or, unless negative, `wake_tick` comes."""
         task = self.current
         if self.suspended:
@@ -136,7 +145,7 @@ class Scheduler:
         if self.suspended:
             raise KernelError(f"task {self.current.name} must not wait while the scheduler is suspended")
 
-    def wake(self, task: Task) -> bool:
+    def wake(self, task: ControlBlock) -> bool:
         """Makes a waiting task ready, later if the scheduler is suspended; True when it outranks the running one."""
         if self.suspended:
             self._pending_ready.append(task)
@@ -146,7 +155,7 @@ class Scheduler:
             self.unblock(task)
         return task.priority > self.current.priority
 
-    def unblock(self, task: Task) -> None:
+    def unblock(self, task: ControlBlock) -> None:
         """Takes the task off whatever list holds it and puts it behind the others of its ready ring.
 
         It may be ready already: a notification can reach a task whose wait timed out and that has not run since.
@@ -162,7 +171,7 @@ class Scheduler:
         task.ring.insert(-1, task)
         self._ready_bits |= task.ready_bit
 
-    def make_ready(self, task: Task) -> None:
+    def make_ready(self, task: ControlBlock) -> None:
         """Puts a task that is in no list behind the others of the ring of its priority."""
         if self.trace is not None:
             self.trace(self.now_us, "READY", task.name, task.priority, 0)
@@ -170,7 +179,18 @@ class Scheduler:
         task.ring.insert(-1, task)
         self._ready_bits |= task.ready_bit
 
-    def unlink(self, task: Task) -> None:
+    def change_priority(self, task: ControlBlock, priority: int) -> None:
+        """Sets the effective priority of the task, which goes behind the others there when it is ready."""
+        ready = task.place == READY
+        if ready:
+            self.unlink(task)
+        task.priority = priority
+        task.ring = self.rings[priority]
+        task.ready_bit = 1 << priority
+        if ready:
+            self.make_ready(task)
+
+    def unlink(self, task: ControlBlock) -> None:
         """Removes the task from the ring or the delayed list."""
         if task.place == READY:
             ring = task.ring
@@ -198,30 +218,26 @@ class Scheduler:
         if task_woken:
             self._switch_pending = True
 
-    def ring(self, priority: int) -> list[Any]:
-        """The ready ring of that priority."""
-        while len(self._rings) <= priority:
-            self._rings.append([None])
-        return self._rings[priority]
-
     def record(self, event: str, a: int = 0, b: int = 0) -> None:
         """Traces what the running task does; only with a trace."""
         assert self.trace is not None
         self.trace(self.now_us, event, self.current.name, a, b)
 
     def failed(self, event: str, a: int) -> None:
-        """Traces a call that came to nothing, and counts it, because a task might try for ever."""
+        """Traces a call that came to nothing, and counts it."""
         if self.trace is not None:
             self.record(event, a)
-        self.spin()
+        self.count_call()
 
-    def spin(self) -> None:
-        """Counts a call that a task could repeat for ever without yielding."""
-        self._spins += 1
-        if self._spins > STUCK_CALLS:
-            raise StuckTaskError(
-                self.current.name, self.now_us, f"{STUCK_CALLS} calls of the kernel at one instant"
-            )
+    def count_call(self) -> None:
+        """Counts a call that returns at once, because a task might make it for ever while no time passes.
+
+        Of two calls that can only follow each other, like giving and taking, the one that takes is counted.
+        """
+        self._calls += 1
+        if self._calls > STUCK_CALLS:
+            what = f"{STUCK_CALLS} calls of the kernel at one instant"
+            raise StuckTaskError(self.current.name, self.now_us, what)
 
     def _pass_ticks(self) -> None:
         """Takes the tick that is due now, if one is; jumps over those before at which nothing could happen."""
@@ -262,7 +278,7 @@ class Scheduler:
         now_us = self.now_us
         trace = self.trace
         switch = self._switch_pending and not self.suspended
-        self._spins = 0
+        self._calls = 0
         if task.work_left_us:  # every interrupt ends the sleep of the idle task
             task.work_left_us = 0 if task is idle else self._work_end_us - now_us
         result: Any = 0
@@ -270,7 +286,7 @@ class Scheduler:
             for _ in _STUCK_SWITCHES:
                 if switch:
                     self._switch_pending = False
-                    ring = self._rings[self._ready_bits.bit_length() - 1]
+                    ring = self.rings[self._ready_bits.bit_length() - 1]
                     if len(ring) == 2:
                         if ring[1] is None:
                             ring.reverse()
@@ -293,7 +309,10 @@ class Scheduler:
                             task.latencies[latency_us] = task.latencies.get(latency_us, 0) + 1
                 if task.work_left_us:
                     break
-                result = task.step(None)
+                try:
+                    result = task.step(None)
+                except StopIteration:
+                    result = self._end(task)
                 if result:
                     task.work_left_us = result
                     task.work_us += result
@@ -305,13 +324,6 @@ class Scheduler:
                     switch = True
             else:
                 raise StuckTaskError(task.name, now_us, f"{STUCK_CALLS} switches at one instant")
-        except StopIteration:
-            if self.suspended:
-                raise TaskError(task.name, now_us, "ended while the scheduler was suspended") from None
-            self.unlink(task)
-            task.place = DELETED
-            self._switch_pending = True
-            return self._dispatch()
         except TaskError:
             raise
         except Exception as error:
@@ -330,10 +342,18 @@ class Scheduler:
                 wake_us = work_end_us
         self.next_wake_us = wake_us
 
+    def _end(self, task: ControlBlock) -> int:
+        """Deletes the running task, whose function returned; gives up the processor for it."""
+        if self.suspended:
+            raise TaskError(task.name, self.now_us, "ended while the scheduler was suspended") from None
+        self.unlink(task)
+        task.place = DELETED
+        return 0
+
     def _idle_task(self) -> Generator[int, None, None]:
         """Lets others of priority 0 run, then sleeps until the next interrupt, like the Crazyflie's idle hook."""
         while True:
-            if not self.preemption or len(self._rings[0]) > 2:
+            if not self.preemption or len(self.rings[0]) > 2:
                 self._idle_slept = False
                 yield 0
                 if self._idle_slept:

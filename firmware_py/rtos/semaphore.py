@@ -6,14 +6,10 @@ To the trace they are queues, as they are in FreeRTOS: take is Q_RECV, give is Q
 from __future__ import annotations
 
 from collections.abc import Generator
-from typing import TYPE_CHECKING
 
+from firmware_py.rtos.control_block import ControlBlock
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.task import FOREVER
-
-if TYPE_CHECKING:
-    from firmware_py.rtos.scheduler import Scheduler
-    from firmware_py.rtos.task import Task
+from firmware_py.rtos.scheduler import FOREVER, Scheduler
 
 
 class Semaphore:
@@ -25,7 +21,7 @@ class Semaphore:
         if not 0 <= initial <= maximum or maximum < 1:
             raise KernelError(f"semaphore {name}: initial count {initial} is outside 0..{maximum}")
         self._kernel = kernel
-        self._takers: list[Task] = []
+        self._takers: list[ControlBlock] = []
         self.count = initial
         self.maximum = maximum
         self.overruns = 0  # gives that found the count at its maximum: the taker did not keep up
@@ -35,7 +31,9 @@ class Semaphore:
     def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
         """Lowers the count by one, waiting up to `timeout` ticks until it is above zero; False when it never was."""
         kernel = self._kernel
-        if self.count == 0:
+        if self.count:
+            kernel.count_call()
+        else:
             deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
             while self.count == 0:
                 if 0 <= deadline <= kernel.tick_count:
@@ -90,8 +88,8 @@ class Mutex:
 
     def __init__(self, kernel: Scheduler, name: str) -> None:
         self._kernel = kernel
-        self._takers: list[Task] = []
-        self.holder: Task | None = None
+        self._takers: list[ControlBlock] = []
+        self.holder: ControlBlock | None = None
         self.name = name
         self.number = 0  # how the trace calls it
         if kernel.trace is not None:  # FreeRTOS makes a mutex by giving it once
@@ -100,6 +98,7 @@ class Mutex:
     def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
         """Becomes the holder, waiting up to `timeout` ticks while somebody else is; False when time ran out."""
         kernel = self._kernel
+        kernel.count_call()
         task = kernel.current
         deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
         lent = False
@@ -133,38 +132,36 @@ class Mutex:
         task.mutexes_held -= 1
         lowered = task.priority != task.base_priority and task.mutexes_held == 0
         if lowered:
-            kernel.unlink(task)
-            if kernel.trace is not None:
-                kernel.trace(kernel.now_us, "DISINHERIT", task.name, task.base_priority, 0)
-            task.event_priority = task.base_priority
-            task.set_priority(task.base_priority)
-            kernel.make_ready(task)
+            self._disinherit(task, task.base_priority)
         if self._takers:
             lowered = kernel.wake(self._takers.pop(0))
         if lowered and kernel.preemption:
             yield 0
         return True
 
-    def _lend_priority(self, holder: Task, waiter: Task) -> bool:
+    def _lend_priority(self, holder: ControlBlock, waiter: ControlBlock) -> bool:
         """Raises the holder to the waiter's priority; True when it owes its priority to a waiter like this one."""
         if holder.priority >= waiter.priority:
             return holder.base_priority < waiter.priority
-        holder.event_priority = waiter.priority
-        holder.change_priority(waiter.priority)
         kernel = self._kernel
+        holder.event_priority = waiter.priority
+        kernel.change_priority(holder, waiter.priority)
         if kernel.trace is not None:
             kernel.trace(kernel.now_us, "INHERIT", holder.name, waiter.priority, 0)
         return True
 
-    def _lower_after_timeout(self, holder: Task) -> None:
+    def _lower_after_timeout(self, holder: ControlBlock) -> None:
         """Takes back what a waiter lent that gave up; a holder of several mutexes keeps it until it gives them."""
         priority = holder.base_priority
         if self._takers and self._takers[0].event_priority > priority:
             priority = self._takers[0].event_priority
         if holder.priority == priority or holder.mutexes_held != 1:
             return
+        self._disinherit(holder, priority)
+
+    def _disinherit(self, holder: ControlBlock, priority: int) -> None:
         kernel = self._kernel
         if kernel.trace is not None:
             kernel.trace(kernel.now_us, "DISINHERIT", holder.name, priority, 0)
         holder.event_priority = priority
-        holder.change_priority(priority)
+        kernel.change_priority(holder, priority)

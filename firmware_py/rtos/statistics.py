@@ -10,9 +10,10 @@ from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from firmware_py.rtos.control_block import NO_DEADLINE_US, READY
 from firmware_py.rtos.errors import KernelError
 from firmware_py.rtos.kernel import Kernel
-from firmware_py.rtos.task import NO_DEADLINE_US, READY, Task
+from firmware_py.rtos.task import Task
 
 LATENCY_BOUNDS_US = (1, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)  # of the histogram's classes
 

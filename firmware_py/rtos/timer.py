@@ -9,14 +9,11 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from firmware_py.rtos.errors import KernelError
 from firmware_py.rtos.queue import Queue
-from firmware_py.rtos.task import FOREVER
-
-if TYPE_CHECKING:
-    from firmware_py.rtos.scheduler import Scheduler
+from firmware_py.rtos.scheduler import FOREVER, Scheduler
 
 RELOAD, START, RESET, STOP, CHANGE_PERIOD = range(5)  # FreeRTOS's command numbers
 COMMAND_QUEUE_LENGTH = 20  # crazyflie-firmware, FreeRTOSConfig.h

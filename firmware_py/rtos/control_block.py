@@ -1,0 +1,67 @@
+"""What the scheduler knows of one task: its control block, data only."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+# Which list holds the task. A wait without timeout is a suspension, as in FreeRTOS.
+READY, DELAYED, SUSPENDED, DELETED = range(4)
+
+NO_DEADLINE_US = 1 << 62
+
+
+class ControlBlock:
+    """One task. Its fields, but for the name and the priorities, belong to the kernel."""
+
+    __slots__ = (
+        "activations",
+        "base_priority",
+        "deadline_misses",
+        "deadline_us",
+        "event_priority",
+        "fresh",
+        "latencies",
+        "mutexes_held",
+        "name",
+        "notification",
+        "notify_waiting",
+        "place",
+        "priority",
+        "ready_bit",
+        "released_us",
+        "ring",
+        "step",
+        "waiting_in",
+        "work_left_us",
+        "work_us",
+        "worst_response_us",
+    )
+
+    def __init__(
+        self, name: str, priority: int, body: Generator[int, None, Any], ring: list[Any], now_us: int
+    ) -> None:
+        self.name = name
+        self.step = body.send
+        self.priority = priority  # the effective one, after inheritance
+        self.ring = ring  # of all ready tasks of that priority
+        self.ready_bit = 1 << priority
+        self.base_priority = priority
+        self.event_priority = priority  # orders the waiters; a change does not move a task that waits already
+        self.mutexes_held = 0
+        self.place = SUSPENDED
+        self.waiting_in: list[ControlBlock] | None = None  # waiters of a queue, or the pending-ready list
+        self.notification = 0
+        self.notify_waiting = False  # it waits for a notification, or has not run since that wait ended
+        self.work_left_us = 0  # what is left of the current `work`
+        self.work_us = 0  # all work so far, with what is left of the current one
+        # How it keeps up. An activation lasts from the instant at which the task becomes ready after a wait to its next
+        # wait; its response time is that duration, its start latency the part before it first runs.
+        self.released_us = now_us
+        self.fresh = True  # released, and has not run since
+        self.activations = 0
+        self.worst_response_us = 0
+        self.deadline_us = NO_DEADLINE_US
+        self.deadline_misses = 0
+        # Number of activations by start latency [us], without those that ran at once.
+        self.latencies: dict[int, int] = {}
