@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from firmware_py.rtos import FOREVER, TICK_US, Kernel, KernelError, Statistics, StuckTaskError, TaskError
 from firmware_py.rtos.scheduler import STUCK_CALLS
+from firmware_py.rtos.timer import COMMAND_QUEUE_LENGTH
 
 
 def run_until(kernel, end_us, interrupts=()):
@@ -519,6 +520,7 @@ LOOPS = {
     "give what was not taken": lambda o: (o.semaphore.give(),),
     "give and take": lambda o: (o.semaphore.give(), o.semaphore.take()),
     "take and give a mutex": lambda o: (o.mutex.take(), o.mutex.give()),
+    "give a free mutex": lambda o: (o.mutex.give(),),
     "notify": lambda o: (o.kernel.current.notify(),),
     "notify_take": lambda o: (o.kernel.notify_take(True, 0),),
     "notify and notify_take": lambda o: (o.kernel.current.notify(), o.kernel.notify_take(True, 5)),
@@ -602,43 +604,72 @@ def wrong_yield(kernel):
     yield kernel.create_queue(1, "queue").receive()
 
 
-def wait_while_suspended(kernel):
-    kernel.suspend_all()
-    yield from kernel.delay(1)
+def in_suspend_all(call):
+    """A task that does `call(kernel)` while the scheduler is suspended."""
+
+    def body(kernel):
+        kernel.suspend_all()
+        yield from call(kernel)
+
+    return body
 
 
-def suspend_itself_while_suspended(kernel):
-    kernel.suspend_all()
-    yield from kernel.current.suspend()
+def doing(call):
+    def body(kernel):
+        yield from call(kernel)
 
-
-def end_while_suspended(kernel):
-    kernel.suspend_all()
-    yield from ()
+    return body
 
 
 def give_a_mutex_of_another(kernel):
-    yield from kernel.create_mutex("lock").give()
+    mutex = kernel.create_mutex("lock")
+
+    def other():
+        yield from mutex.take()
+
+    kernel.create_task("other", 2, other)
+    yield from kernel.task_yield()
+    yield from mutex.give()
 
 
-def resume_too_often(kernel):
-    yield from kernel.resume_all()
+def give_a_held_mutex_as_an_interrupt(kernel):
+    mutex = kernel.create_mutex("lock")
+    yield from mutex.take()
+    mutex.give_from_isr()
 
 
-def negative_priority(kernel):
-    yield from kernel.current.priority_set(-1)
+def given(semaphore):
+    for _ in semaphore.give():
+        pass
+    return semaphore
+
+
+NO_WAIT = "must not wait while the scheduler is suspended"
 
 
 @pytest.mark.parametrize(
     ("body", "complaint"),
     [
         (wrong_yield, "yielded a generator; kernel calls need `yield from`"),
-        (wait_while_suspended, "must not wait while the scheduler is suspended"),
-        (suspend_itself_while_suspended, "must not wait while the scheduler is suspended"),
-        (end_while_suspended, "ended while the scheduler was suspended"),
-        (give_a_mutex_of_another, "mutex lock: given by task, held by nobody"),
-        (resume_too_often, "resume_all without suspend_all"),
-        (negative_priority, "priority -1 is outside 0..6"),
+        (in_suspend_all(lambda kernel: kernel.delay(1)), NO_WAIT),
+        (in_suspend_all(lambda kernel: kernel.delay_until(1)), NO_WAIT),
+        (in_suspend_all(lambda kernel: kernel.delay_until(0)), NO_WAIT),
+        (in_suspend_all(lambda kernel: kernel.notify_take(True, 1)), NO_WAIT),
+        (in_suspend_all(lambda kernel: kernel.current.suspend()), NO_WAIT),
+        # A timeout alone is against the rules, also when there would be nothing to wait for.
+        (in_suspend_all(lambda kernel: kernel.create_queue(1, "q").send("item", 1)), NO_WAIT),
+        (in_suspend_all(lambda kernel: kernel.create_queue(1, "q").receive(1)), NO_WAIT),
+        (in_suspend_all(lambda kernel: given(kernel.create_binary_semaphore("s")).take(1)), NO_WAIT),
+        (in_suspend_all(lambda kernel: kernel.create_mutex("m").take()), NO_WAIT),
+        (in_suspend_all(lambda kernel: ()), "ended while the scheduler was suspended"),
+        (doing(lambda kernel: kernel.resume_all()), "resume_all without suspend_all"),
+        (give_a_mutex_of_another, "mutex lock: given by task, held by other"),
+        (give_a_held_mutex_as_an_interrupt, "mutex lock: given from an interrupt, held by task"),
+        (doing(lambda kernel: kernel.create_queue(1, "q").send(None)), "queue q: None cannot be sent"),
+        (doing(lambda kernel: kernel.create_queue(1, "q").send_nowait(None)), "queue q: None cannot be sent"),
+        (doing(lambda kernel: kernel.create_queue(1, "q").overwrite(None)), "queue q: None cannot be sent"),
+        (doing(lambda kernel: kernel.current.priority_set(-1)), "priority -1 is outside 0..6"),
+        (doing(lambda kernel: kernel.current.priority_set(7)), "priority 7 is outside 0..6"),
     ],
 )
 def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
@@ -650,6 +681,92 @@ def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
     assert complaint in str(caught.value)
 
 
+def test_what_need_not_wait_is_allowed_while_the_scheduler_is_suspended():
+    kernel = Kernel()
+    queue = kernel.create_queue(1, "queue")
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    mutex = kernel.create_mutex("mutex")
+    results = []
+
+    def body():
+        kernel.suspend_all()
+        results.append((yield from queue.receive(0)))
+        results.append((yield from queue.send("item", 0)))
+        results.append((yield from semaphore.take(0)))
+        results.append((yield from mutex.take(0)))
+        results.append((yield from mutex.give()))
+        yield from kernel.current.notify()
+        results.append((yield from kernel.notify_take(True, 5)))
+        yield from kernel.delay(0)
+        yield from kernel.resume_all()
+
+    kernel.create_task("task", 1, body)
+    kernel.start()
+    kernel.run(0)
+    assert results == [None, True, False, True, True, 1]
+
+
+def test_a_free_mutex_cannot_be_given():
+    kernel = Kernel()
+    mutex = kernel.create_mutex("mutex")
+    results = []
+
+    def body():
+        results.append((yield from mutex.give()))
+        results.append(mutex.give_from_isr())
+
+    kernel.create_task("task", 1, body)
+    kernel.start()
+    kernel.run(0)
+    assert results == [False, False]
+    assert mutex.holder is None
+
+
+def test_a_task_that_waits_for_a_mutex_it_holds_is_an_error_when_a_lent_priority_would_be_taken_back():
+    kernel = Kernel()
+    mutex = kernel.create_mutex("lock")
+
+    def holder():
+        yield from mutex.take()
+        yield from kernel.delay(2)
+        yield from mutex.take(3)
+
+    def lender():
+        yield from kernel.delay(1)
+        yield from mutex.take()
+
+    def boss():
+        yield from kernel.delay(3)
+        yield from lender_task.suspend()  # what it lent stays lent
+
+    kernel.create_task("holder", 1, holder)
+    lender_task = kernel.create_task("lender", 3, lender)
+    kernel.create_task("boss", 4, boss)
+    kernel.start()
+    with pytest.raises(
+        TaskError, match=r"^task holder at 5\.000 ms: .*lock: holder waited for it and holds it"
+    ):
+        kernel.run(10_000)
+
+
+def test_a_late_timer_that_finds_no_place_for_its_reload_is_an_error_of_the_timer_service():
+    """The start is obeyed at 3 ms, later than the timer's period; the callback that is due then lasts until 5 ms."""
+    kernel = Kernel()
+    timer = kernel.create_timer("late", 1, True, lambda timer: kernel.work(2_000))
+
+    def body():
+        yield from timer.start()
+        yield from kernel.work(3_000)
+        yield from kernel.delay(1)
+        for _ in range(COMMAND_QUEUE_LENGTH):
+            yield from timer.stop()
+
+    kernel.create_task("task", 2, body)
+    kernel.start()
+    with pytest.raises(TaskError, match=r"^task Tmr Svc at 5\.000 ms: .* timer late: no place to reload it"):
+        kernel.run(10_000)
+
+
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
@@ -659,6 +776,8 @@ def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
             "queue q: overwrite needs a queue of length 1",
         ),
         (lambda kernel: kernel.create_counting_semaphore(2, 3, "s"), "semaphore s: initial count 3"),
+        (lambda kernel: kernel.create_counting_semaphore(0, 0, "s"), "semaphore s: maximum 0"),
+        (lambda kernel: kernel.create_queue(1, "q").send_from_isr(None), "queue q: None cannot be sent"),
         (lambda kernel: kernel.create_timer("t", 0, True, iter), "timer t: period 0"),
         (lambda kernel: kernel.create_task("t", -1, wrong_yield, kernel), "task t: priority -1"),
         (

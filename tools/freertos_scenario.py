@@ -20,7 +20,7 @@ from firmware_py.rtos import TICK_US, Kernel, KernelError, Mutex, Queue, Semapho
 OPERATIONS = {
     "work": "n",
     "delay": "n",
-    "delay_until": "n",
+    "delay_until": "p",
     "send": "qnn",
     "recv": "qn",
     "take": "ln",
@@ -38,7 +38,7 @@ OPERATIONS = {
     "tmr_reset": "Tn",
     "tmr_period": "Tpn",
 }
-INTERRUPTS = {"isr_send": "qn", "isr_give": "s", "isr_notify": "t"}
+INTERRUPTS = {"isr_send": "qn", "isr_give": "l", "isr_notify": "t"}
 NOT_HELD = -2  # result of giving a mutex that the task does not hold
 
 Operation = tuple[str, list[Any]]
@@ -71,7 +71,6 @@ class Scenario:
         semaphores = set(self.semaphores)
         return {
             "q": set(self.queues),
-            "s": semaphores,
             "l": semaphores | set(self.mutexes),
             "t": {name for name, *_ in self.tasks},
             "T": set(range(len(self.timers))),
@@ -142,6 +141,8 @@ def _check(line: int, name: str, operands: list[Any], known: dict[str, str], kin
                 operands[place] = int(operands[place])
             except ValueError:
                 raise ScenarioError(f"line {line}: {operands[place]!r} is not a number") from None
+        if kind == "p" and operands[place] < 1:
+            raise ScenarioError(f"line {line}: {name} {operands[place]}: it must be at least 1")
         if kind in kinds and operands[place] not in kinds[kind]:
             raise ScenarioError(f"line {line}: {name} {operands[place]}: there is no such object for it")
 

@@ -99,6 +99,8 @@ class Kernel(Scheduler):
     def delay(self, ticks: int) -> Iterable[int]:
         """Waits until the tick count has risen by `ticks`; 0 is `task_yield`."""
         if ticks > 0:
+            if self.suspended:
+                self.check_may_wait()
             if self.trace is not None:
                 self.record("DELAY", ticks)
             self.block(None, self.tick_count + ticks)
@@ -106,6 +108,8 @@ class Kernel(Scheduler):
 
     def delay_until(self, wake_tick: int) -> Iterable[int]:
         """Waits until the tick count is `wake_tick`; when that is past it is `task_yield`."""
+        if self.suspended:
+            self.check_may_wait()
         if wake_tick > self.tick_count:
             if self.trace is not None:
                 self.record("DELAY_UNTIL", wake_tick)
@@ -121,6 +125,7 @@ class Kernel(Scheduler):
         if task.notification or timeout == 0:
             self.count_call()
         else:
+            self.check_may_wait()
             task.notify_waiting = True
             self.block(None, FOREVER if timeout < 0 else self.tick_count + timeout)
             if self.trace is not None:

@@ -52,6 +52,10 @@ class Queue(Generic[T]):
         """Appends `item`, waiting up to `timeout` ticks for space; False when it was dropped."""
         kernel = self._kernel
         items = self._items
+        if item is None:
+            raise self._null_item()
+        if timeout and kernel.suspended:
+            kernel.check_may_wait()
         if len(items) >= self.length:
             deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
             while len(items) >= self.length:
@@ -80,6 +84,8 @@ class Queue(Generic[T]):
         """
         kernel = self._kernel
         items = self._items
+        if item is None:
+            raise self._null_item()
         if len(items) >= self.length:
             self.dropped += 1
             kernel.failed("Q_SEND_FAIL", self.number)
@@ -95,6 +101,8 @@ class Queue(Generic[T]):
         """Takes the oldest item, waiting up to `timeout` ticks for one; None when none came."""
         kernel = self._kernel
         items = self._items
+        if timeout and kernel.suspended:
+            kernel.check_may_wait()
         if items:
             kernel.count_call()
         else:
@@ -143,6 +151,8 @@ class Queue(Generic[T]):
             raise KernelError(
                 f"queue {self.name}: overwrite needs a queue of length 1, this one holds {self.length}"
             )
+        if item is None:
+            raise self._null_item()
         kernel = self._kernel
         kernel.count_call()
         if kernel.trace is not None:
@@ -158,10 +168,13 @@ class Queue(Generic[T]):
 
     def wait_for_item(self, wake_tick: int) -> None:
         """Blocks the running task until an item comes or, unless negative, `wake_tick`; for the timer service."""
+        self._kernel.check_may_wait()
         self._kernel.block(self._receivers, wake_tick)
 
     def send_from_isr(self, item: T) -> bool:
         """Appends `item` from an interrupt; False when the queue was full and it was dropped."""
+        if item is None:
+            raise self._null_item()
         kernel = self._kernel
         items = self._items
         if len(items) >= self.length:
@@ -177,3 +190,6 @@ class Queue(Generic[T]):
             self.high_water = len(items)
         kernel.interrupted(bool(self._receivers) and kernel.wake(self._receivers.pop(0)))
         return True
+
+    def _null_item(self) -> KernelError:
+        return KernelError(f'queue {self.name}: None cannot be sent, it stands for "nothing came"')

@@ -105,10 +105,11 @@ class Scheduler:
         self.now_us = now_us
 
     def block(self, waiters: list[ControlBlock] | None, wake_tick: int) -> None:
-        """Takes the running task off the ready ring until it is woken or, unless negative, `wake_tick` comes."""
+        """Takes the running task off the ready ring until it is woken or, unless negative, `wake_tick` comes.
+
+        The caller has checked that it may wait.
+        """
         task = self.current
-        if self.suspended:
-            self.check_may_wait()
         if waiters is not None:
             if waiters:
                 priority = task.event_priority

@@ -18,7 +18,9 @@ class Semaphore:
     __slots__ = ("_kernel", "_takers", "count", "maximum", "name", "number", "overruns")
 
     def __init__(self, kernel: Scheduler, maximum: int, initial: int, name: str) -> None:
-        if not 0 <= initial <= maximum or maximum < 1:
+        if maximum < 1:
+            raise KernelError(f"semaphore {name}: maximum {maximum}, it must be at least 1")
+        if not 0 <= initial <= maximum:
             raise KernelError(f"semaphore {name}: initial count {initial} is outside 0..{maximum}")
         self._kernel = kernel
         self._takers: list[ControlBlock] = []
@@ -31,6 +33,8 @@ class Semaphore:
     def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
         """Lowers the count by one, waiting up to `timeout` ticks until it is above zero; False when it never was."""
         kernel = self._kernel
+        if timeout and kernel.suspended:
+            kernel.check_may_wait()
         if self.count:
             kernel.count_call()
         else:
@@ -98,6 +102,8 @@ class Mutex:
     def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
         """Becomes the holder, waiting up to `timeout` ticks while somebody else is; False when time ran out."""
         kernel = self._kernel
+        if timeout and kernel.suspended:
+            kernel.check_may_wait()
         kernel.count_call()
         task = kernel.current
         deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
@@ -120,12 +126,17 @@ class Mutex:
         return True
 
     def give(self) -> Generator[int, None, bool]:
-        """Sets the mutex free and, with the last one held, returns to the task's own priority; always True."""
+        """Sets the mutex free and, with the last one held, returns to the task's own priority.
+
+        False when it was free already.
+        """
         kernel = self._kernel
         task = kernel.current
+        if self.holder is None:
+            kernel.failed("Q_SEND_FAIL", self.number)
+            return False
         if self.holder is not task:
-            holder = "nobody" if self.holder is None else self.holder.name
-            raise KernelError(f"mutex {self.name}: given by {task.name}, held by {holder}")
+            raise KernelError(f"mutex {self.name}: given by {task.name}, held by {self.holder.name}")
         if kernel.trace is not None:
             kernel.record("Q_SEND", self.number)
         self.holder = None
@@ -138,6 +149,16 @@ class Mutex:
         if lowered and kernel.preemption:
             yield 0
         return True
+
+    def give_from_isr(self) -> bool:
+        """Finds a free mutex, and is False; that a task holds it is an error, because only that task may give it."""
+        kernel = self._kernel
+        if self.holder is not None:
+            raise KernelError(f"mutex {self.name}: given from an interrupt, held by {self.holder.name}")
+        if kernel.trace is not None:
+            kernel.trace(kernel.now_us, "Q_SEND_ISR_FAIL", "isr", self.number, 0)
+        kernel.interrupted(False)
+        return False
 
     def _lend_priority(self, holder: ControlBlock, waiter: ControlBlock) -> bool:
         """Raises the holder to the waiter's priority; True when it owes its priority to a waiter like this one."""
@@ -157,6 +178,8 @@ class Mutex:
             priority = self._takers[0].event_priority
         if holder.priority == priority or holder.mutexes_held != 1:
             return
+        if holder is self._kernel.current:
+            raise KernelError(f"mutex {self.name}: {holder.name} waited for it and holds it")
         self._disinherit(holder, priority)
 
     def _disinherit(self, holder: ControlBlock, priority: int) -> None:

@@ -116,7 +116,7 @@ class TimerService:
         if timer.autoreload:
             expired = timer.expiry_tick
             if not self._run_from(timer, expired, now):
-                yield from self.send(RELOAD, timer, expired, 0)
+                yield from self._reload(timer, expired)
         yield from timer.callback(timer)
 
     def _obey(self, command: _Command) -> Generator[int, None, None]:
@@ -137,7 +137,14 @@ class TimerService:
         yield from timer.callback(timer)
         self._record("TMR_EXPIRED", timer)
         if timer.autoreload:
-            yield from self.send(RELOAD, timer, command.value + timer.period_ticks, 0)
+            yield from self._reload(timer, command.value + timer.period_ticks)
+
+    def _reload(self, timer: Timer, start_tick: int) -> Generator[int, None, None]:
+        """Catches up with a period that is over already."""
+        if not (yield from self.send(RELOAD, timer, start_tick, 0)):
+            raise KernelError(
+                f"timer {timer.name}: no place to reload it, {COMMAND_QUEUE_LENGTH} commands are waiting"
+            )
 
     def _run_from(self, timer: Timer, start_tick: int, now: int) -> bool:
         """Lets the timer run for one period from `start_tick`; False when that is already over."""
