@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from firmware_py.rtos import FOREVER, TICK_US, Kernel, KernelError, Statistics, StuckTaskError, TaskError
 from firmware_py.rtos.scheduler import STUCK_CALLS
+from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
 from firmware_py.rtos.timer import COMMAND_QUEUE_LENGTH
 
 
@@ -381,6 +382,39 @@ def test_while_the_scheduler_is_suspended_ticks_and_interrupts_pend():
     kernel.start()
     run_until(kernel, 10_000, [(500, semaphore.give_from_isr)])
     assert order == [("low", 3_500, 0), ("tick", 3_500, 3), ("interrupt", 3_500, 3), ("low again", 3_500, 3)]
+
+
+@given(
+    raised=st.permutations(range(2, 7)), own=st.integers(2, 6), nesting=st.integers(1, 3), tick=st.booleans()
+)
+def test_after_the_outermost_resume_all_the_highest_ready_task_runs_at_once(raised, own, nesting, tick):
+    """In whatever order the interrupts, one for a task of each priority, and a tick came meanwhile."""
+    kernel = Kernel()
+    wakes = {priority: kernel.create_binary_semaphore("wake") for priority in raised}
+    order = []
+
+    def waiter(priority):
+        yield from wakes[priority].take()
+        order.append(priority)
+
+    def suspender():
+        yield from kernel.delay(1)
+        for _ in range(nesting):
+            kernel.suspend_all()
+        yield from kernel.work(1_500 if tick else 800)
+        for _ in range(nesting):
+            yield from kernel.resume_all()
+        order.append("goes on")
+
+    for priority in raised:
+        kernel.create_task(f"waiter {priority}", priority, waiter, priority)
+    kernel.create_task("suspender", own, suspender)
+    kernel.start()
+    run_until(
+        kernel, 9_000, [(1_100 + 100 * n, wakes[priority].give_from_isr) for n, priority in enumerate(raised)]
+    )
+    # The one of the suspender's own priority, too: it stands before it in their ring.
+    assert order == [*range(6, own - 1, -1), "goes on", *range(own - 1, 1, -1)]
 
 
 def test_timers_expire_at_their_ticks_and_obey_stop_reset_and_period():
@@ -767,6 +801,20 @@ def test_a_late_timer_that_finds_no_place_for_its_reload_is_an_error_of_the_time
         kernel.run(10_000)
 
 
+def test_a_timer_callback_that_leaves_the_scheduler_suspended_is_an_error_of_the_timer_service():
+    kernel = Kernel()
+
+    def callback(timer):
+        kernel.suspend_all()
+        yield from ()
+
+    timer = kernel.create_timer("timer", 1, False, callback)
+    kernel.create_task("task", 2, doing(lambda _: timer.start()), kernel)
+    kernel.start()
+    with pytest.raises(TaskError, match=rf"^task Tmr Svc at 1\.000 ms: .*{NO_WAIT}"):
+        kernel.run(2_000)
+
+
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
@@ -830,6 +878,47 @@ def test_statistics_count_time_responses_and_missed_deadlines():
     assert late_report.deadline_misses == 1
     assert statistics.load() == pytest.approx(3_100 / 8_500)
     assert kernel.run_time_us(kernel.tasks[2]) == 8_500 - 3_100  # of the idle task
+
+
+@pytest.mark.parametrize(("deadline_us", "misses"), [(1_299, 1), (1_300, 0)])
+@pytest.mark.parametrize("end_us", [2_300, 4_000])
+def test_a_response_exactly_at_its_deadline_is_no_miss(deadline_us, misses, end_us):
+    """Both while the activation still lasts and when it is over: the task works from 1 to 2.3 ms."""
+    kernel = Kernel()
+
+    def body():
+        yield from kernel.delay(1)
+        yield from kernel.work(1_300)
+        if end_us > 2_300:
+            yield from kernel.delay(5)
+        yield from kernel.work(1)
+
+    kernel.create_task("task", 2, body)
+    statistics = Statistics(kernel, {"task": deadline_us})
+    kernel.start()
+    kernel.run(end_us)
+    assert statistics.reports()[0].deadline_misses == misses
+
+
+@pytest.mark.parametrize(("place", "bound_us"), list(enumerate(LATENCY_BOUNDS_US)))
+def test_a_latency_equal_to_a_class_bound_belongs_to_the_class_above(place, bound_us):
+    kernel = Kernel()
+
+    def low():
+        yield from kernel.delay(1)
+
+    def high():
+        yield from kernel.delay(1)
+        yield from kernel.work(bound_us)
+
+    kernel.create_task("low", 2, low)
+    kernel.create_task("high", 3, high)
+    statistics = Statistics(kernel, {})
+    kernel.start()
+    kernel.run(20_000)
+    low_report = statistics.reports()[0]
+    assert low_report.worst_latency_us == bound_us
+    assert low_report.latency_histogram[place + 1] == 1
 
 
 def test_statistics_show_a_task_that_starves():
