@@ -126,8 +126,8 @@ class App:
         self.gyro_known = ctypes.c_int32.in_dll(c, "stub_gyro_known")
         self.estimator_type = ctypes.c_int32.in_dll(c, "stub_estimator")
         self.supervisor = Supervisor.in_dll(c, "floaty_supervisor")
-        self.timers = (Timer * 2).in_dll(c, "stub_timer")  # TIM3, TIM5
-        self.pins = (Pins * 2).in_dll(c, "stub_gpio")  # A, B
+        self.timers = [Timer.in_dll(c, name) for name in ("stub_tim3", "stub_tim5")]
+        self.pins = [Pins.in_dll(c, name) for name in ("stub_gpio_a", "stub_gpio_b")]
         self._estimator = (ctypes.c_char * Estimator.dtype.itemsize).in_dll(c, "floaty_estimator")
         self._console = (ctypes.c_char * 4096).in_dll(c, "stub_console")
         self._state = ctypes.create_string_buffer(256)

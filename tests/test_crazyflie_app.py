@@ -2,10 +2,12 @@
 
 import ctypes
 import math
+import os
 import re
 import shutil
 import struct
 import subprocess
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -458,6 +460,39 @@ def test_every_source_is_built_and_every_include_is_there(tmp_path: Path) -> Non
     for path in (tmp_path / "src").iterdir():
         for name in re.findall(r'#include "(\S+)"', path.read_text()):
             assert (tmp_path / "src" / name).is_file() or (STUBS / name).is_file(), name
+
+
+def test_the_stubs_are_as_the_firmwares_headers(tmp_path: Path) -> None:
+    zig = (sys.executable, "-m", "ziglang", "cc", "-target", "thumb-freestanding-eabihf", "-fshort-enums")
+    caches = dict.fromkeys(("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR"), str(tmp_path))
+    built = subprocess.run(
+        (*zig, "-std=gnu11", "-Wall", "-Werror", "-c", STUBS / "facts.c", "-o", tmp_path / "facts.o"),
+        env=os.environ | caches, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+
+
+@pytest.mark.parametrize("header", sorted(STUBS.glob("*.h")), ids=lambda header: header.name)
+def test_the_stubs_declare_nothing_that_the_facts_do_not_state(header: Path) -> None:
+    words_of_c = "typedef enum union extern inline return packed section used aligned format printf opaque"
+    only_in_stubs = (
+        r"stub_\w+|\w+_PLACE|(LOG|PARAM)_ADD_(GROUP|FULL)|(sensorData|setpoint)_s|__(logs|params)_|stop_"
+    )
+    declared = {
+        name
+        for name in names_in(header.read_text()) - names_in((STUBS / "facts.c").read_text())
+        if not re.fullmatch(only_in_stubs, name)
+    }
+    assert declared - set(words_of_c.split()) == set()
+
+
+def names_in(c: str) -> set[str]:
+    """The identifiers of a C source, without those of comments, texts, directives and macros' parameters."""
+    c = re.sub(r'/\*(.|\n)*?\*/|"[^"\n]*"|#(pragma|include|if|else|endif).*', "", c)
+    parameters = {
+        name for listed in re.findall(r"#define \w+\(([^)]*)\)", c) for name in re.findall(r"\w+", listed)
+    }
+    return set(re.findall(r"(?<!\w)[A-Za-z_]\w*", c)) - parameters
 
 
 @pytest.fixture(scope="module")

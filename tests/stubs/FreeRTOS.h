@@ -7,9 +7,7 @@ typedef unsigned long UBaseType_t;
 typedef uint32_t TickType_t;
 #define pdFALSE ((BaseType_t)0)
 #define pdTRUE ((BaseType_t)1)
-#define portMAX_DELAY ((TickType_t)0xffffffffUL)
 #define M2T(X) ((unsigned int)(X))
 typedef struct {
-  void *dummy[3];
-  uintptr_t more[17];
+  void *opaque[20];
 } StaticQueue_t;

@@ -3,4 +3,4 @@
 #include <stddef.h>
 #include "crtp.h"
 #define APPCHANNEL_MTU (30)
-size_t appchannelReceiveDataPacket(void *buffer, size_t max_length, int timeout_ms);
+size_t appchannelReceiveDataPacket(void *, size_t, int);

@@ -48,18 +48,25 @@ void paramSetInt(paramVarId_t varid, int valuei) {
 }
 bool estimatorDequeue(measurement_t *measurement) { (void)measurement; return false; }
 
-void consoleLine(const char *format, ...) {
+int consolePutchar(int c) { return c; }
+int eprintf(int (*put)(int), const char *format, ...) {
   const size_t used = strlen(stub_console);
   va_list arguments;
+  (void)put;
   va_start(arguments, format);
-  vsnprintf(stub_console + used, sizeof stub_console - used, format, arguments);
+  const int length = vsnprintf(stub_console + used, sizeof stub_console - used, format, arguments);
   va_end(arguments);
+  return length;
 }
 
 /* Timers and pins */
 
-GPIO_TypeDef stub_gpio[2];
-TIM_TypeDef stub_timer[2];
+struct stub_port {
+  volatile uint32_t MODER, OTYPER, OSPEEDR, PUPDR, IDR, ODR, BSRR, LCKR, AFR[2];
+} stub_gpio_a, stub_gpio_b;
+struct stub_timer {
+  volatile uint32_t CR1, CR2, SMCR, DIER, SR, EGR, CCMR1, CCMR2, CCER, CNT, PSC, ARR, RCR, CCR1, CCR2, CCR3, CCR4;
+} stub_tim3, stub_tim5;
 static uint32_t ahb1, apb1;
 
 void RCC_AHB1PeriphClockCmd(uint32_t peripheral, FunctionalState state) { ahb1 = state ? ahb1 | peripheral : ahb1 & ~peripheral; }

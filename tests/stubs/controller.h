@@ -2,5 +2,4 @@
 #include "stabilizer_types.h"
 void controllerOutOfTreeInit(void);
 bool controllerOutOfTreeTest(void);
-void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const sensorData_t *sensors,
-                         const state_t *state, const stabilizerStep_t stabilizerStep);
+void controllerOutOfTree(control_t *, const setpoint_t *, const sensorData_t *, const state_t *, stabilizerStep_t);

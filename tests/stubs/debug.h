@@ -1,3 +1,4 @@
 #pragma once
-void consoleLine(const char *format, ...) __attribute__((format(printf, 1, 2)));
-#define DEBUG_PRINT(fmt, ...) consoleLine(DEBUG_MODULE ": " fmt, ##__VA_ARGS__)
+int consolePutchar(int);
+int eprintf(int (*)(int), const char *, ...) __attribute__((format(printf, 2, 3)));
+#define DEBUG_PRINT(FORMAT, ...) eprintf(consolePutchar, DEBUG_MODULE ": " FORMAT, ##__VA_ARGS__)

@@ -1,21 +1,15 @@
 #pragma once
 #include "autoconf.h"
 #include "stabilizer_types.h"
-typedef enum { MeasurementTypePose = 2, MeasurementTypeGyroscope = 9 } MeasurementType;
 typedef struct {
-  MeasurementType type;
-  union {
-    poseMeasurement_t pose;
-  } data;
+  uint32_t opaque[12];
 } measurement_t;
 typedef enum {
-  StateEstimatorTypeAutoSelect = 0,
-  StateEstimatorTypeComplementary,
-  StateEstimatorTypeKalman,
-  StateEstimatorTypeOutOfTree,
+  StateEstimatorTypeComplementary = 1,
+  StateEstimatorTypeOutOfTree = 3, /* after Kalman, which is built by default */
 } StateEstimatorType;
 StateEstimatorType stateEstimatorGetType(void);
-bool estimatorDequeue(measurement_t *measurement);
+bool estimatorDequeue(measurement_t *);
 void estimatorOutOfTreeInit(void);
 bool estimatorOutOfTreeTest(void);
-void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep);
+void estimatorOutOfTree(state_t *, stabilizerStep_t);

@@ -2,12 +2,12 @@
 #pragma once
 #include <stdbool.h>
 #include <stdint.h>
-typedef struct paramVarId_s {
+typedef struct {
   uint16_t id;
   uint16_t index;
 } __attribute__((packed)) paramVarId_t;
-paramVarId_t paramGetVarId(const char *group, const char *name);
-void paramSetInt(paramVarId_t varid, int valuei);
+paramVarId_t paramGetVarId(const char *, const char *);
+void paramSetInt(paramVarId_t, int);
 struct param_s {
   uint8_t type;
   uint8_t extended_type;
@@ -26,20 +26,20 @@ struct param_s {
 #define PARAM_START 1
 #define PARAM_STOP 0
 #define PARAM_ADD_FULL(TYPE, NAME, ADDRESS, CALLBACK, DEFAULT_GETTER)           \
-  {.type = ((TYPE) <= 0xFF) ? (TYPE) : (((TYPE) | PARAM_EXTENDED) & 0xFF),      \
+  {.type = ((TYPE) <= 0xFF) ? ((TYPE)&0xFF) : (((TYPE) | PARAM_EXTENDED) & 0xFF), \
    .extended_type = (((TYPE)&0xFF00) >> 8),                                     \
    .name = #NAME,                                                               \
    .address = (void *)(ADDRESS),                                                \
-   .callback = (void *)CALLBACK,                                                \
-   .getter = (void *)DEFAULT_GETTER},
+   .callback = (void (*)(void))CALLBACK,                                        \
+   .getter = (void *(*)(void))DEFAULT_GETTER},
 #define PARAM_ADD_WITH_CALLBACK(TYPE, NAME, ADDRESS, CALLBACK) PARAM_ADD_FULL(TYPE, NAME, ADDRESS, CALLBACK, 0)
 #define PARAM_ADD_GROUP(TYPE, NAME, ADDRESS) PARAM_ADD_FULL(TYPE, NAME, ADDRESS, 0, 0)
-#define PARAM_GROUP_START(NAME)                                                                         \
-  static struct param_s __params_##NAME[] __attribute__((section(PARAM_SECTION(NAME)), used, aligned(sizeof(void *)))) = { \
+#ifdef __arm__
+#define PARAM_PLACE(NAME) section(".param." #NAME), used
+#else
+#define PARAM_PLACE(NAME) section("param_table"), used, aligned(sizeof(void *))
+#endif
+#define PARAM_GROUP_START(NAME)                                              \
+  static struct param_s __params_##NAME[] __attribute__((PARAM_PLACE(NAME))) = { \
       PARAM_ADD_GROUP(PARAM_GROUP | PARAM_START, NAME, 0x0)
 #define PARAM_GROUP_STOP(NAME) PARAM_ADD_GROUP(PARAM_GROUP | PARAM_STOP, stop_##NAME, 0x0) };
-#ifdef __arm__
-#define PARAM_SECTION(NAME) ".param." #NAME
-#else
-#define PARAM_SECTION(NAME) "param_table"
-#endif

@@ -2,30 +2,29 @@
 #pragma once
 #include <stdint.h>
 typedef enum { DISABLE = 0, ENABLE = !DISABLE } FunctionalState;
-typedef struct {
-  volatile uint32_t MODER, OTYPER, OSPEEDR, PUPDR, IDR, ODR, BSRR, LCKR, AFR[2];
-} GPIO_TypeDef;
-typedef struct {
-  volatile uint32_t CR1, CR2, SMCR, DIER, SR, EGR, CCMR1, CCMR2, CCER, CNT, PSC, ARR, RCR, CCR1, CCR2, CCR3, CCR4;
-} TIM_TypeDef;
+typedef struct stub_port GPIO_TypeDef; /* registers: in board.c */
+typedef struct stub_timer TIM_TypeDef;
 #ifdef __arm__
-#define GPIOA ((GPIO_TypeDef *)0x40020000)
-#define GPIOB ((GPIO_TypeDef *)0x40020400)
-#define TIM3 ((TIM_TypeDef *)0x40000400)
-#define TIM5 ((TIM_TypeDef *)0x40000C00)
+#define GPIOA_BASE 0x40020000u
+#define GPIOB_BASE 0x40020400u
+#define TIM3_BASE 0x40000400u
+#define TIM5_BASE 0x40000C00u
 #else
-extern GPIO_TypeDef stub_gpio[2];
-extern TIM_TypeDef stub_timer[2];
-#define GPIOA (&stub_gpio[0])
-#define GPIOB (&stub_gpio[1])
-#define TIM3 (&stub_timer[0])
-#define TIM5 (&stub_timer[1])
+extern GPIO_TypeDef stub_gpio_a, stub_gpio_b;
+extern TIM_TypeDef stub_tim3, stub_tim5;
+#define GPIOA_BASE &stub_gpio_a
+#define GPIOB_BASE &stub_gpio_b
+#define TIM3_BASE &stub_tim3
+#define TIM5_BASE &stub_tim5
 #endif
-typedef enum { GPIO_Mode_IN = 0, GPIO_Mode_OUT = 1, GPIO_Mode_AF = 2, GPIO_Mode_AN = 3 } GPIOMode_TypeDef;
-typedef enum { GPIO_OType_PP = 0, GPIO_OType_OD = 1 } GPIOOType_TypeDef;
-typedef enum { GPIO_Low_Speed = 0, GPIO_High_Speed = 3 } GPIOSpeed_TypeDef;
-typedef enum { GPIO_PuPd_NOPULL = 0, GPIO_PuPd_UP = 1 } GPIOPuPd_TypeDef;
-#define GPIO_Speed_2MHz GPIO_Low_Speed
+#define GPIOA ((GPIO_TypeDef *)GPIOA_BASE)
+#define GPIOB ((GPIO_TypeDef *)GPIOB_BASE)
+#define TIM3 ((TIM_TypeDef *)TIM3_BASE)
+#define TIM5 ((TIM_TypeDef *)TIM5_BASE)
+typedef enum { GPIO_Mode_AF = 2 } GPIOMode_TypeDef;
+typedef enum { GPIO_OType_OD = 1 } GPIOOType_TypeDef;
+typedef enum { GPIO_Speed_2MHz = 0 } GPIOSpeed_TypeDef;
+typedef enum { GPIO_PuPd_NOPULL = 0 } GPIOPuPd_TypeDef;
 typedef struct {
   uint32_t GPIO_Pin;
   GPIOMode_TypeDef GPIO_Mode;
@@ -63,25 +62,25 @@ typedef struct {
 #define TIM_OutputState_Enable ((uint16_t)0x0001)
 #define TIM_OCPolarity_High ((uint16_t)0x0000)
 #define TIM_OCPreload_Enable ((uint16_t)0x0008)
-void GPIO_StructInit(GPIO_InitTypeDef *init);
-void GPIO_Init(GPIO_TypeDef *port, GPIO_InitTypeDef *init);
-void GPIO_PinAFConfig(GPIO_TypeDef *port, uint16_t source, uint8_t function);
-void RCC_AHB1PeriphClockCmd(uint32_t peripheral, FunctionalState state);
-void RCC_APB1PeriphClockCmd(uint32_t peripheral, FunctionalState state);
-void TIM_TimeBaseStructInit(TIM_TimeBaseInitTypeDef *init);
-void TIM_TimeBaseInit(TIM_TypeDef *timer, TIM_TimeBaseInitTypeDef *init);
-void TIM_ARRPreloadConfig(TIM_TypeDef *timer, FunctionalState state);
-void TIM_OCStructInit(TIM_OCInitTypeDef *init);
-void TIM_OC1Init(TIM_TypeDef *timer, TIM_OCInitTypeDef *init);
-void TIM_OC2Init(TIM_TypeDef *timer, TIM_OCInitTypeDef *init);
-void TIM_OC3Init(TIM_TypeDef *timer, TIM_OCInitTypeDef *init);
-void TIM_OC4Init(TIM_TypeDef *timer, TIM_OCInitTypeDef *init);
-void TIM_OC1PreloadConfig(TIM_TypeDef *timer, uint16_t preload);
-void TIM_OC2PreloadConfig(TIM_TypeDef *timer, uint16_t preload);
-void TIM_OC3PreloadConfig(TIM_TypeDef *timer, uint16_t preload);
-void TIM_OC4PreloadConfig(TIM_TypeDef *timer, uint16_t preload);
-void TIM_SetCompare1(TIM_TypeDef *timer, uint32_t compare);
-void TIM_SetCompare2(TIM_TypeDef *timer, uint32_t compare);
-void TIM_SetCompare3(TIM_TypeDef *timer, uint32_t compare);
-void TIM_SetCompare4(TIM_TypeDef *timer, uint32_t compare);
-void TIM_Cmd(TIM_TypeDef *timer, FunctionalState state);
+void GPIO_StructInit(GPIO_InitTypeDef *);
+void GPIO_Init(GPIO_TypeDef *, GPIO_InitTypeDef *);
+void GPIO_PinAFConfig(GPIO_TypeDef *, uint16_t, uint8_t);
+void RCC_AHB1PeriphClockCmd(uint32_t, FunctionalState);
+void RCC_APB1PeriphClockCmd(uint32_t, FunctionalState);
+void TIM_TimeBaseStructInit(TIM_TimeBaseInitTypeDef *);
+void TIM_TimeBaseInit(TIM_TypeDef *, TIM_TimeBaseInitTypeDef *);
+void TIM_ARRPreloadConfig(TIM_TypeDef *, FunctionalState);
+void TIM_OCStructInit(TIM_OCInitTypeDef *);
+void TIM_OC1Init(TIM_TypeDef *, TIM_OCInitTypeDef *);
+void TIM_OC2Init(TIM_TypeDef *, TIM_OCInitTypeDef *);
+void TIM_OC3Init(TIM_TypeDef *, TIM_OCInitTypeDef *);
+void TIM_OC4Init(TIM_TypeDef *, TIM_OCInitTypeDef *);
+void TIM_OC1PreloadConfig(TIM_TypeDef *, uint16_t);
+void TIM_OC2PreloadConfig(TIM_TypeDef *, uint16_t);
+void TIM_OC3PreloadConfig(TIM_TypeDef *, uint16_t);
+void TIM_OC4PreloadConfig(TIM_TypeDef *, uint16_t);
+void TIM_SetCompare1(TIM_TypeDef *, uint32_t);
+void TIM_SetCompare2(TIM_TypeDef *, uint32_t);
+void TIM_SetCompare3(TIM_TypeDef *, uint32_t);
+void TIM_SetCompare4(TIM_TypeDef *, uint32_t);
+void TIM_Cmd(TIM_TypeDef *, FunctionalState);

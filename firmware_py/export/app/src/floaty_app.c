@@ -203,7 +203,7 @@ void estimatorOutOfTreeInit(void) {
 }
 
 bool estimatorOutOfTreeTest(void) {
-  return LOG_VARID_IS_VALID(gyro_raw[0]) && LOG_VARID_IS_VALID(gyro_raw[1]) && LOG_VARID_IS_VALID(gyro_raw[2]);
+  return logVarIdIsValid(gyro_raw[0]) && logVarIdIsValid(gyro_raw[1]) && logVarIdIsValid(gyro_raw[2]);
 }
 
 void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
