@@ -1,13 +1,14 @@
 """The log variables of the firmware: names as on the Crazyflie and on the original Floaty, values from the running core.
 
-Units are Floaty's (angles in rad) except in the groups `stabilizer`, `gyro` and `acc`, which are Crazyflie's own and keep
-deg, deg/s and g. Position, velocity and yaw are those of the goal frame: what the board knows is its error.
+Units are Floaty's (angles in rad) except where Crazyflie's own programs look: attitudes in `stateEstimate` and `stabilizer`
+are in degrees with the nose up positive, `gyro` and `acc` in deg/s and g. Position, velocity and yaw are those of the goal
+frame: what the board knows is its error.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import degrees, pi, sqrt
+from math import degrees, sqrt
 from typing import TYPE_CHECKING, Any
 
 from firmware_py.board import Board
@@ -26,7 +27,7 @@ from firmware_py.measurements import Measurement
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import State, Supervisor
 from firmware_py.wire.scalars import Scalar
-from firmware_py.wire.telemetry import FIRST_ID, Block
+from firmware_py.wire.telemetry import FIRST_ID, LEGACY_DEGREES, Block
 
 if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
@@ -111,7 +112,7 @@ def _state_estimate(estimator: Any, control: Any) -> Iterator[LogVariable]:
     now = estimator.now
     yield from _each("stateEstimate", "x y z", F32, "m", now, POSITION)
     yield from _each("stateEstimate", "vx vy vz", F32, "m/s", now, VELOCITY)
-    yield from _each("stateEstimate", "roll pitch yaw", F32, "rad", now, ATTITUDE)
+    yield from _parts("stateEstimate", "roll pitch yaw", "deg", partial(_legacy_attitude, estimator))
     yield from _each("stateEstimate", "roll_rate pitch_rate yaw_rate", F32, "rad/s", now, RATE)
     yield from _parts(
         "stateEstimate",
@@ -124,9 +125,14 @@ def _state_estimate(estimator: Any, control: Any) -> Iterator[LogVariable]:
     )
 
 
+def _legacy_attitude(estimator: Any) -> Sequence[float]:
+    angles = estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
+    return [scale * angle for scale, angle in zip(LEGACY_DEGREES, angles, strict=True)]
+
+
 def _crazyflie(running: Running, estimator: Any) -> Iterator[LogVariable]:
     """What only Crazyflie's own programs look at."""
-    now, board, bias = estimator.now, running.board, running.core.data.fields.gyro_bias
+    board, bias = running.board, running.core.data.fields.gyro_bias
 
     def gyro() -> Sequence[float]:
         x, y, z = (
@@ -147,9 +153,7 @@ def _crazyflie(running: Running, estimator: Any) -> Iterator[LogVariable]:
     def battery_state() -> float:
         return PM_LOW if board.read_battery_mv() < running.supervisor.low_battery_mv else PM_BATTERY
 
-    yield from _parts(
-        "stabilizer", "roll pitch yaw", "deg", lambda: (now[ATTITUDE : ATTITUDE + 3] * (180 / pi)).tolist()
-    )
+    yield from _parts("stabilizer", "roll pitch yaw", "deg", partial(_legacy_attitude, estimator))
     yield LogVariable("stabilizer.thrust", F32, "", lambda: 0.0)
     yield from _parts("gyro", "x y z", "deg/s", gyro)
     yield from _parts("acc", "x y z", "g", acceleration)

@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import struct
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -167,6 +168,12 @@ class App:
     def estimator(self) -> bytes:
         """Return the estimator's memory."""
         return self._estimator.raw
+
+    def state(self) -> dict[str, float]:
+        """Return what the firmware logs of the estimate, by the names of its log variables."""
+        parts = (("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw"), ("x", "y", "z"), ("vx", "vy", "vz"))
+        values = struct.unpack_from("<4x3f4f4x3f4x3f", self._state)
+        return dict(zip((f"stateEstimate.{name}" for part in parts for name in part), values, strict=True))
 
     def console(self) -> str:
         """Return what the app has printed."""

@@ -189,6 +189,10 @@ def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -
     for name in ("fused", "refused", "jumps", "too_old", "bounded"):
         value = getattr(laboratory.firmware._core.estimator.fields, name)
         assert app.log(f"kalman.{name}") == value > 0, name
+    shown = {variable.name: variable.read() for variable in laboratory.firmware.variables}
+    state = app.state()
+    assert state == pytest.approx({name: shown[name] for name in state}, rel=1e-6)
+    assert abs(state["stateEstimate.pitch"]) > 0.5  # [deg]
 
 
 def test_servos_hang_on_the_originals_pins_at_400_hz(app: App) -> None:

@@ -19,13 +19,14 @@ from cflib.utils.encoding import compress_quaternion
 from crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, Client
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from test_firmware import HOVER_COUNTS
 
 from firmware_py.config import parameters_of
 from firmware_py.links.console import pieces
 from firmware_py.links.crtp_stack import PORT_QUEUE
 from firmware_py.links.storage import ParameterStorage
-from firmware_py.wire import telemetry
+from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.localisation import unpack_quaternion
 from firmware_py.wire.scalars import LOG_SCALARS, Scalar
 from firmware_py.wire.toc import Toc
@@ -171,7 +172,8 @@ def test_the_stream_is_byte_for_byte_what_the_same_log_blocks_give(client: Clien
     for number, block in enumerate(telemetry.BLOCKS):
         for variable in block.variables:
             assert logs[variable.name][1] == variable.type.log_number
-            assert client.firmware.variables[logs[variable.name][0]].unit == variable.unit
+            unit = "deg" if variable.scale else variable.unit
+            assert client.firmware.variables[logs[variable.name][0]].unit == unit
         assert client.create(number, *(logs[variable.name][::-1] for variable in block.variables[:8])) == 0
         rest = b"".join(struct.pack("<BH", *logs[variable.name][::-1]) for variable in block.variables[8:])
         assert client.one(LOG, 1, bytes((7, number)) + rest) == bytes((7, number, 0))
@@ -186,6 +188,24 @@ def test_the_stream_is_byte_for_byte_what_the_same_log_blocks_give(client: Clien
         streamed = [row[1:] for row in rows if row[0] == block.id]
         assert len(ours) >= 9
         assert ours == [row for row in streamed if row[:3] in {other[:3] for other in ours}]
+
+
+def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_firmware_shows_them(
+    client: Client,
+) -> None:
+    qx, qy, qz, qw = (
+        Rotation.from_euler("ZYX", (15, 10, 5), degrees=True).as_quat().tolist()
+    )  # the nose is down
+    data = crtp.encode_ext_pose((0.0, 0.0, 0.0), (qw, qx, qy, qz), 40_000)
+    client.events.at(605_000, lambda now_us: client.firmware.radio_received(data))
+    client.run(650_000)
+    shown = {variable.name: variable.read() for variable in client.firmware.variables}
+    quaternion = [shown[f"stateEstimate.{name}"] for name in ("qx", "qy", "qz", "qw")]
+    yaw, pitch, roll = Rotation.from_quat(quaternion).as_euler("ZYX", degrees=True)
+    assert min(yaw, pitch, roll) > 4
+    for group in ("stateEstimate", "stabilizer"):
+        angles = [shown[f"{group}.{name}"] for name in ("roll", "pitch", "yaw")]
+        assert angles == pytest.approx([roll, -pitch, yaw], rel=1e-5)
 
 
 def test_stream_is_a_parameter_that_can_be_switched_off_and_on(client: Client, params) -> None:

@@ -1,6 +1,7 @@
 """The telemetry of a flight: which variables travel in which log block, as one table for both ends.
 
-Names, types and numbers are the Crazyflie's log variables and log types, units are Floaty's (angles in rad).
+Names, types and numbers are the Crazyflie's log variables and log types. On the wire the attitude is in the Crazyflie's
+degrees; a `Sample` has SI units and Floaty's signs only, converted here.
 Each block is one CRTP log data packet. The four blocks of one period carry the same time stamp, so that the
 receiver can join them into one row.
 
@@ -11,6 +12,7 @@ blocks of their own.
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import degrees
 
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import MAX_LOG_VALUES, decode_log_data, encode_log_data
@@ -23,6 +25,9 @@ PERIOD_MS = 20  # of the original ground station's log blocks
 STREAM = "telemetry.stream"  # uint8 parameter: 1 switches the stream on
 FIRST_ID = 0xF1
 
+# What the Crazyflie's log variables of roll, pitch and yaw show per radian: its legacy pitch is positive with the nose up.
+LEGACY_DEGREES = (degrees(1), -degrees(1), degrees(1))
+
 
 def encode_stream_request(on: bool) -> bytes:
     """The complete packet that switches the stream on or off."""
@@ -31,11 +36,12 @@ def encode_stream_request(on: bool) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """One log variable: `group.name`, its type on the wire and its unit (empty for a pure number)."""
+    """One log variable: `group.name`, its type on the wire and the unit of its samples (empty for a pure number)."""
 
     name: str
     type: Scalar
     unit: str
+    scale: float | None = None  # of the value on the wire to that of a sample; None: they are equal
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +57,31 @@ class Block:
         if layout.size > MAX_LOG_VALUES:
             raise WireError(f"log block {self.id}: {layout.size} bytes, at most {MAX_LOG_VALUES} fit")
         object.__setattr__(self, "layout", layout)
+
+    def pack(self, values: Sequence[float]) -> bytes:
+        """The bytes of a sample's values; integers wrap at their width."""
+        if len(values) != len(self.variables):
+            raise WireError(f"log block {self.id}: {len(values)} values for {len(self.variables)} variables")
+        values = [
+            value if variable.scale is None else variable.scale * value
+            for variable, value in zip(self.variables, values, strict=True)
+        ]
+        try:
+            return self.layout.pack(*values)
+        except struct.error:
+            pairs = zip(self.variables, values, strict=True)
+            return self.layout.pack(*(variable.type.cast(value) for variable, value in pairs))
+
+    def unpack(self, packed: bytes) -> tuple[float, ...]:
+        """The values of a sample; `WireError` for a wrong length."""
+        if len(packed) != self.layout.size:
+            raise WireError(
+                f"log block {self.id}: {len(packed)} bytes of values instead of {self.layout.size}"
+            )
+        return tuple(
+            value if variable.scale is None else value / variable.scale
+            for variable, value in zip(self.variables, self.layout.unpack(packed), strict=True)
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +106,10 @@ BLOCKS = (
     ),
     Block(
         FIRST_ID + 1,
-        _variables("stateEstimate", "roll pitch yaw", Scalar.F32, "rad")
+        tuple(
+            Variable(f"stateEstimate.{name}", Scalar.F32, "rad", scale)
+            for name, scale in zip(("roll", "pitch", "yaw"), LEGACY_DEGREES, strict=True)
+        )
         + _variables("stateEstimate", "roll_rate pitch_rate yaw_rate", Scalar.F32, "rad/s"),
     ),
     Block(
@@ -97,15 +131,7 @@ _BLOCK_OF_ID = {block.id: block for block in BLOCKS}
 
 def encode_sample(block: Block, timestamp_ms: int, values: Sequence[float]) -> bytes:
     """The complete packet with `values` in the order of `block.variables`; integers wrap at their width."""
-    if len(values) != len(block.variables):
-        raise WireError(f"log block {block.id}: {len(values)} values for {len(block.variables)} variables")
-    try:
-        packed = block.layout.pack(*values)
-    except struct.error:
-        packed = block.layout.pack(
-            *(variable.type.cast(value) for variable, value in zip(block.variables, values, strict=True))
-        )
-    return encode_log_data(block.id, timestamp_ms, packed)
+    return encode_log_data(block.id, timestamp_ms, block.pack(values))
 
 
 def decode_sample(data: bytes) -> Sample:
@@ -114,6 +140,4 @@ def decode_sample(data: bytes) -> Sample:
     block = _BLOCK_OF_ID.get(block_id)
     if block is None:
         raise WireError(f"log block {block_id}: not among {sorted(_BLOCK_OF_ID)}")
-    if len(packed) != block.layout.size:
-        raise WireError(f"log block {block_id}: {len(packed)} bytes of values instead of {block.layout.size}")
-    return Sample(block, timestamp_ms, block.layout.unpack(packed))
+    return Sample(block, timestamp_ms, block.unpack(packed))

@@ -238,9 +238,9 @@ class CrazyradioLink:
             return ()
         number, timestamp_ms, values = decode_log_data(packet.data)
         block = self._blocks.get(number)
-        if block is None or len(values) != block.layout.size:
-            raise WireError(f"log block {number} with {len(values)} bytes of values: not one of ours")
-        sample = Sample(block, timestamp_ms - timestamp_ms % PERIOD_MS, block.layout.unpack(values))
+        if block is None:
+            raise WireError(f"log block {number}: not one of ours")
+        sample = Sample(block, timestamp_ms - timestamp_ms % PERIOD_MS, block.unpack(values))
         for variable, value in zip(block.variables, sample.values, strict=True):
             if variable.name == SUPERVISOR_STATE:
                 self.supervisor_state = int(value)

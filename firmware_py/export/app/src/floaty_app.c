@@ -51,6 +51,7 @@
 #define STALE_MS 50 /* without a controller step: servos to hover */
 #define LOOK_MS 20  /* how often the app's task looks at that */
 #define POSE_ON_TIME 0
+#define DEGREES 57.2957795f /* per radian */
 
 FloatyParameters floaty_parameters;
 FloatyInput floaty_input;
@@ -162,7 +163,7 @@ static void take_measurements(stabilizerStep_t step) {
   }
 }
 
-/* Angles in radians and pitch nose down positive, as everywhere in Floaty; the firmware only logs them. */
+/* For the firmware's log variables, which are in degrees and whose pitch is positive with the nose up. */
 static void tell_state(state_t *state, stabilizerStep_t step) {
   const float *now = floaty_estimator.now;
   const float cr = cosf(0.5f * now[6]), sr = sinf(0.5f * now[6]);
@@ -177,9 +178,9 @@ static void tell_state(state_t *state, stabilizerStep_t step) {
   state->velocity.y = now[4];
   state->velocity.z = now[5];
   state->attitude.timestamp = step;
-  state->attitude.roll = now[6];
-  state->attitude.pitch = now[7];
-  state->attitude.yaw = now[8];
+  state->attitude.roll = DEGREES * now[6];
+  state->attitude.pitch = -DEGREES * now[7];
+  state->attitude.yaw = DEGREES * now[8];
   state->attitudeQuaternion.w = cr * cp * cy + sr * sp * sy;
   state->attitudeQuaternion.x = sr * cp * cy - cr * sp * sy;
   state->attitudeQuaternion.y = cr * sp * cy + sr * cp * sy;

@@ -2,7 +2,7 @@
  *
  * A client writes into a variable of this file; only a value inside the limits goes on to the core or the supervisor, any
  * other is put back. Names that the firmware has already are left to it; Floaty's own are then in the group `floaty` or
- * `FloatyKalm`. Angles are radians.
+ * `FloatyKalm`. Their angles are radians.
  */
 #include "floaty_app.h"
 
