@@ -251,8 +251,10 @@ def _live_link(uri: str, config: "LabConfig") -> "CrazyradioLink | MavlinkSerial
         from ground_station.links.mavlink import MavlinkLinkConfig
         from ground_station.links.mavlink_serial import MavlinkSerialLink
     except ImportError as error:
+        from firmware_py.extras import install_command
+
         extra = "mavlink" if serial else "radio"
-        raise LabError(f"--link {uri}: {error}: pip install 'floaty-hil[{extra}]'") from None
+        raise LabError(f"--link {uri}: {error}: {install_command(extra)}") from None
     pose_hz = min(config.station.corrections_hz, 1e6 / config.mocap.period_us)
     key = bytes.fromhex(config.mavlink.signing_key)
     latency_us = config.station.link_latency_us

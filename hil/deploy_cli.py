@@ -188,7 +188,9 @@ def flash(image: Path, uri: str) -> None:
     try:
         from ground_station.flashing import flash as flash_board
     except ImportError as error:
-        raise LabError(f"deploy flash: {error}: pip install 'floaty-hil[radio]'") from None
+        from firmware_py.extras import install_command
+
+        raise LabError(f"deploy flash: {error}: {install_command('radio')}") from None
     from ground_station.errors import LinkError
 
     try:

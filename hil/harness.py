@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.extras import install_command
 from firmware_py.firmware import Firmware, Thief
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
@@ -291,9 +292,7 @@ def _serial_line(config: LabConfig, events: EventQueue, rng: np.random.Generator
     try:
         from hil.serial_line import SerialLine
     except ImportError as error:
-        raise LabError(
-            f"--link mavlink needs pymavlink ({error}): pip install 'floaty-hil[mavlink]'"
-        ) from None
+        raise LabError(f"--link mavlink needs pymavlink ({error}): {install_command('mavlink')}") from None
     return SerialLine(config, events, rng)
 
 

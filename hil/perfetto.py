@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from firmware_py.extras import install_command
 from hil.errors import LabError
 from hil.schedule import load_schedule, runs
 
@@ -14,9 +15,7 @@ try:
     from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TrackEvent
     from perfetto.trace_builder.proto_builder import StreamingTraceProtoBuilder
 except ImportError as error:
-    raise LabError(
-        f"no Perfetto trace without its package: pip install 'floaty-hil[view]' ({error})"
-    ) from None
+    raise LabError(f"no Perfetto trace without its package ({error}): {install_command('view')}") from None
 
 FILE = "flight.perfetto-trace"
 SEQUENCE = 1

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from firmware_py.extras import install_command
 from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil import curves, scene
 from hil.curves import Curves, States
@@ -32,7 +33,7 @@ try:
     import rerun as rr
     import rerun.blueprint as rrb
 except ImportError as error:
-    raise LabError("the viewer needs rerun: pip install 'floaty-hil[view]'") from error
+    raise LabError(f"the viewer needs rerun: {install_command('view')}") from error
 
 RECORDING = "flight.rrd"
 APPLICATION, TIMELINE = "floaty", "sim_time"

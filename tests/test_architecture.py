@@ -13,13 +13,14 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "firmware_py.core": ("firmware_py.core",),
     "firmware_py.wire": ("firmware_py.wire",),
     "firmware_py.geometry": (),
+    "firmware_py.extras": (),
     "firmware_py": ("firmware_py",),
-    "ground_station": ("ground_station", "firmware_py.wire", "firmware_py.geometry"),
+    "ground_station": ("ground_station", "firmware_py.wire", "firmware_py.geometry", "firmware_py.extras"),
     "hil": (
         "hil", "ground_station",
         "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
         "firmware_py.config", "firmware_py.signals",
-        "firmware_py.wire", "firmware_py.geometry", "firmware_py.errors",
+        "firmware_py.wire", "firmware_py.geometry", "firmware_py.errors", "firmware_py.extras",
     ),
 }  # fmt: skip
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from firmware_py.extras import install_command
 from hil.cli import main
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
@@ -99,4 +100,4 @@ def test_a_missing_package_is_said_in_one_line(
     assert end.value.code == 2
     assert said.count("\n") == 0
     assert said.startswith("floaty: --board cortex-m4: ")
-    assert said.endswith("pip install 'floaty-hil[deploy]'")
+    assert said.endswith(f"is missing: {install_command('deploy')}")

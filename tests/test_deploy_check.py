@@ -17,6 +17,7 @@ from command import floaty
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
 from firmware_py.export.c99 import translate
 from firmware_py.export.plain import PlainRunner
+from firmware_py.extras import install_command
 from hil.deploy_check import Checked, check_flight, plan
 from hil.deploy_targets import TARGETS
 from hil.faults import parse
@@ -232,7 +233,7 @@ def test_a_missing_package_is_one_line_and_exit_code_two(
     monkeypatch.setitem(sys.modules, package, None)
     assert floaty(monkeypatch, "deploy", "check", "hover", "--targets", "cortex-m4") == 2
     error = capsys.readouterr().err
-    assert error.endswith("is missing: pip install 'floaty-hil[deploy]'\n")
+    assert error.endswith(f"is missing: {install_command('deploy')}\n")
     assert error.count("\n") == 1
 
 

@@ -132,9 +132,7 @@ def test_arbitrary_bits_meet_no_undefined_behaviour_and_an_unclamped_conversion_
 
 
 def test_a_missing_compiler_is_one_line_that_says_what_to_install() -> None:
-    with pytest.raises(
-        ExportError, match=r"no C compiler tcc on this machine: pip install 'floaty-hil\[deploy\]'"
-    ):
+    with pytest.raises(ExportError, match=r"no C compiler tcc on this machine: .*pip install .*ziglang"):
         find_compiler("tcc")
 
 

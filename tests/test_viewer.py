@@ -192,7 +192,7 @@ def test_without_a_display_the_error_says_so(folder: Path, monkeypatch: pytest.M
 def test_without_rerun_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "hil.viewer")
-    with pytest.raises(LabError, match=r"floaty-hil\[view\]"):
+    with pytest.raises(LabError, match=r"pip install .*rerun-sdk"):
         importlib.import_module("hil.viewer")
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from firmware_py.export.errors import ExportError
+from firmware_py.extras import install_command
 
 FLASH = 0x0800_0000
 FLASH_SIZE = 0x10_0000
@@ -27,7 +28,6 @@ TARGET_FLAGS = (
     "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror",
 )  # fmt: skip
 HOST_FLAGS = ("-O2", "-shared", "-fPIC", "-std=c99", "-fno-sanitize=all", "-Wall", "-Wextra", "-Werror")
-NEEDS_EXTRA = "pip install 'floaty-hil[deploy]'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def read_image(path: Path, alone: bool = True) -> Image:
         from elftools.common.exceptions import ELFError
         from elftools.elf.elffile import ELFFile
     except ImportError:
-        raise ExportError(f"pyelftools is missing: {NEEDS_EXTRA}") from None
+        raise ExportError(f"pyelftools is missing: {install_command('deploy')}") from None
     try:
         stream = path.open("rb")
     except OSError as error:
@@ -121,7 +121,7 @@ def _compile(
     try:
         compiler = version("ziglang")
     except PackageNotFoundError:
-        raise ExportError(f"the compiler ziglang is missing: {NEEDS_EXTRA}") from None
+        raise ExportError(f"the compiler ziglang is missing: {install_command('deploy')}") from None
     folder = folder.absolute()
     digest = hashlib.sha256(repr((compiler, sys.platform, sorted(texts.items()), inputs, flags)).encode())
     place = folder / digest.hexdigest()[:16]

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.arm_image import FLASH, FLASH_SIZE, NEEDS_EXTRA, Image
+from firmware_py.export.arm_image import FLASH, FLASH_SIZE, Image
 from firmware_py.export.cycles import count
 from firmware_py.export.errors import ExportError
+from firmware_py.extras import install_command
 
 CLOCK_MHZ = 168
 RAM = 0x2000_0000
@@ -80,7 +81,7 @@ def find_emulator() -> Any:
     try:
         import unicorn
     except ImportError:
-        raise ExportError(f"unicorn is missing: {NEEDS_EXTRA}") from None
+        raise ExportError(f"unicorn is missing: {install_command('deploy')}") from None
     return unicorn
 
 

@@ -20,6 +20,7 @@ from firmware_py.core.subset import Block
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.c99 import Translation
 from firmware_py.export.errors import ExportError
+from firmware_py.extras import install_command
 
 SYSTEM_COMPILERS = ("gcc", "clang", "cc")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror", "-fno-math-errno")
@@ -53,7 +54,7 @@ def find_compiler(name: str = "") -> Compiler:
         if name in ("", compiler.name):
             return compiler
     raise ExportError(
-        f"no C compiler{' ' + name if name else ''} on this machine: pip install 'floaty-hil[deploy]'"
+        f"no C compiler{' ' + name if name else ''} on this machine: {install_command('deploy')}"
     )
 
 

@@ -11,6 +11,7 @@ import socket
 import sys
 from typing import TextIO
 
+from firmware_py.extras import install_command
 from ground_station.clock import clock_us
 from ground_station.sources.capture_lines import Arrival, encode_arrival, encode_error
 
@@ -26,7 +27,7 @@ def main(system: str, *settings: str) -> None:
     try:
         _stream(lines, system, dict(setting.split("=", 1) for setting in settings))
     except ImportError as error:
-        lines.write(encode_error(f"{error}: pip install 'floaty-hil[mocap]'"))
+        lines.write(encode_error(f"{error}: {install_command('mocap')}"))
     except (OSError, RuntimeError) as error:
         text = (isinstance(error, OSError) and error.strerror) or str(error)
         lines.write(encode_error(text.partition("\n")[0]))
