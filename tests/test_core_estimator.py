@@ -497,14 +497,17 @@ def test_outliers_between_good_poses_are_never_accepted() -> None:
     assert np.abs(core.now).max() < 1e-6
 
 
-def test_outlier_is_forgotten_when_its_confirmation_comes_too_late() -> None:
+@pytest.mark.parametrize("ticks", range(1, 8))
+def test_a_suspect_pose_is_confirmed_by_one_that_comes_1_to_4_ticks_later_and_no_later(ticks: int) -> None:
     core = settled()
-    for _ in range(3):
+    for _ in range(2):
         core.pose((0.5, 0, 0))
-        for _ in range(5):
+        for _ in range(ticks):
             core.tick()
-    assert core.counters["refused"] == 3
-    assert "jumps" not in core.counters
+    for _ in range(8):
+        core.tick()
+    assert core.counters["refused"] == (1 if ticks <= 4 else 2)
+    assert core.counters.get("jumps", 0) == (1 if ticks <= 4 else 0)
 
 
 def test_gate_opens_with_the_uncertainty_of_a_silence() -> None:

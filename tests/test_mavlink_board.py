@@ -314,6 +314,27 @@ def test_position_and_attitude_are_those_in_the_world() -> None:
     assert (sent.inv() * expected).magnitude() < 0.05
 
 
+@pytest.mark.parametrize("goal_yaw", [-0.5, 2.0])
+def test_the_reported_velocity_is_the_derivative_of_the_reported_position(goal_yaw: float) -> None:
+    client = Client()
+    client.command(511, 32, 20_000)
+    client.command(400, 0)  # disarmed: no flap moves the model elsewhere than the poses go
+    target(client, (0.1, -0.2, -1.15), goal_yaw)
+    start, v_WB = np.array((-0.3, -0.2, 1.25)), np.array((0.3, 0.2, -0.1))
+    x, y, z, w = Rotation.from_euler("z", -goal_yaw).as_quat()
+    for at_us in range(100_000, 2_000_000, 20_000):
+        p_WB = tuple(start + v_WB * (at_us * 1e-6))
+        client.events.at(at_us, lambda now_us, p=p_WB: client.pose((p, (w, x, y, z)), now_us))
+    client.run(2_000_000)
+    late = [message for message in client.of("LOCAL_POSITION_NED") if message.time_boot_ms > 1000]
+    p = np.array([(message.x, message.y, message.z) for message in late])
+    derivative = (p[-1] - p[0]) / (1e-3 * (late[-1].time_boot_ms - late[0].time_boot_ms))
+    assert derivative == pytest.approx((0.3, -0.2, 0.1), abs=0.01)
+    assert np.mean([(message.vx, message.vy, message.vz) for message in late], 0) == pytest.approx(
+        derivative, abs=0.06
+    )
+
+
 def test_a_new_goal_does_not_move_the_robot() -> None:
     client = Client()
     client.poses(100_000, 1_000_000)

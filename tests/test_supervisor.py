@@ -1,14 +1,18 @@
 """The failsafe on board: every cause leads to the hover angles, is announced, and ends only as documented."""
 
 import struct
+from collections.abc import Callable
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 from crtp_client import LOC, LOG, PARAM, SUPERVISOR, Client
 from test_firmware import HOVER_COUNTS, LEVEL
 
-from firmware_py.supervisor import Cause, State
+from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
+from firmware_py.supervisor import Cause, Manual, State, Supervisor
 from firmware_py.wire import crtp
+from hil.config import load_config
 
 OFF_CENTRE = (0.0, 0.04, 0.02)
 
@@ -68,6 +72,44 @@ def test_emergency_stop_beats_flaps_from_outside(flying: Client) -> None:
     stop(flying)
     flying.run(flying.now_us + 20_000)
     assert flying.writes[-1][1] == HOVER_COUNTS
+
+
+def fell_silent(supervisor: Supervisor) -> None:
+    supervisor.last_pose_us = 0
+
+
+def was_held_at_its_bounds(supervisor: Supervisor) -> None:
+    for now_us in range(5_000_000, 6_000_000, 10_000):
+        supervisor._estimator.bounded += 1
+        supervisor.mode(now_us)
+
+
+def ran_down(supervisor: Supervisor) -> None:
+    for now_us in range(0, 6_000_000, 100_000):
+        supervisor.see_battery(now_us, 3000)
+
+
+@pytest.mark.parametrize(
+    ("happen", "cause", "flown_by"),
+    [
+        (lambda supervisor: None, Cause.NONE, (MODE_FLY, MODE_MANUAL, MODE_HOVER)),
+        (fell_silent, Cause.SILENCE, (MODE_HOVER, MODE_MANUAL, MODE_HOVER)),
+        (was_held_at_its_bounds, Cause.OUT_OF_BOUNDS, (MODE_HOVER, MODE_MANUAL, MODE_HOVER)),
+        (Supervisor.emergency_stop, Cause.EMERGENCY_STOP, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (ran_down, Cause.LOW_BATTERY, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (lambda supervisor: supervisor.arm(False), Cause.DISARMED, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+    ],
+)
+@pytest.mark.parametrize("manual", Manual)
+def test_angles_from_outside_move_the_flaps_unless_somebody_or_the_battery_stopped_the_robot(
+    happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int], manual: Manual
+) -> None:
+    supervisor = Supervisor(load_config().supervisor, SimpleNamespace(bounded=0), lambda text: None)
+    supervisor.calibrated, supervisor.last_pose_us = True, 6_000_000
+    supervisor.manual = manual
+    happen(supervisor)
+    assert supervisor.mode(6_000_000) == flown_by[manual]
+    assert supervisor.cause is cause
 
 
 @pytest.mark.parametrize(("port", "data"), [(LOC, b"\4"), (SUPERVISOR, b"\4")])
