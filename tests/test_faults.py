@@ -21,7 +21,7 @@ from hil.cli import main
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, Experiment
-from hil.fault_kinds import KINDS, MARKERS_ON
+from hil.fault_kinds import KINDS, MARKERS_ON, Kind
 from hil.faults import Fault, check, parse, spans_of
 from hil.harness import MAVLINK, RADIO, Flight
 from hil.metrics import column
@@ -371,6 +371,30 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
     assert wind == pytest.approx([0.2, 1.2, 3.2, 3.2, 2.2, 0.2])
     assert pace == pytest.approx([0.8, 0.4, 0.0, 0.4, 0.8, 0.8])
     assert flight.plant.tunnel.side_wind == (0.1, 0.2, 0.3)
+
+
+@pytest.mark.parametrize("link", [RADIO, MAVLINK])
+def test_a_fault_turns_its_own_knobs_and_no_other(link: str) -> None:
+    """Every knob stands away from where it rests, so that one that is put back shows."""
+    flight = Flight(load_config("floaty", [MARKERS_ON]), HOVER, 1.0, 1, None, link=link)
+    kinds = [kind for kind in KINDS.values() if kind.link in ("", link)]
+    knobs = list(dict.fromkeys(knob for kind in kinds for knob in kind.knobs))
+
+    def turn(kind: Kind, share: float) -> None:
+        for knob in kind.knobs:
+            knob.turn(flight, knob.blend(knob.read(flight), kind.scale * kind.size * share))
+
+    def readings() -> list[float]:
+        return [knob.read(flight) for knob in knobs]
+
+    for kind in kinds:
+        if kind.size != 0.0:  # a servo that is stuck has no pace to be changed
+            turn(kind, 0.5)
+    for kind in kinds:
+        before = readings()
+        turn(kind, 0.9)
+        turned = {knob for knob, was, now in zip(knobs, before, readings(), strict=True) if was != now}
+        assert turned <= set(kind.knobs), kind.meaning
 
 
 def test_what_changed_between_two_faults_stays_changed() -> None:
