@@ -1,6 +1,7 @@
 """What becomes of a flight when the processor has no time: deadlines, queues, watchdog; and the scheduler's trace."""
 
 import json
+import re
 from collections.abc import Generator
 from pathlib import Path
 
@@ -136,6 +137,26 @@ def test_an_overflowing_queue_is_counted_with_its_time(tmp_path: Path) -> None:
     noted = [event for event in load_events(tmp_path) if "queue measurements is full" in event["text"]]
     assert noted
     assert noted[0]["t_us"] < 1_000_000
+
+
+def test_a_full_queue_is_noted_again_only_when_it_dropped_more(tmp_path: Path) -> None:
+    """Starved from 0.5 s to 2.5 s, then never again; each note says more than the last, and the last says it all."""
+
+    def starve(flight: Flight) -> None:
+        thief = flight.thief
+        flight.events.at(500_000, lambda _: setattr(thief, "share", 0.93))
+        flight.events.at(2_500_000, lambda _: setattr(thief, "share", 0.0))
+
+    result = go(tmp_path, hover(starve), 5.0)
+    noted: dict[str, list[int]] = {}
+    for event in load_events(tmp_path):
+        if match := re.fullmatch(r"queue (\w+) is full: (\d+) dropped so far", event["text"]):
+            noted.setdefault(match[1], []).append(int(match[2]))
+    dropped = {queue.name: queue.dropped for queue in result.queues if queue.dropped}
+    assert len(noted["measurements"]) > 1
+    for name, counts in noted.items():
+        assert counts == sorted(set(counts)), name
+    assert {name: counts[-1] for name, counts in noted.items()} == dropped
 
 
 def test_perfetto_has_a_track_per_task_and_the_slices_of_the_schedule(tmp_path: Path) -> None:
