@@ -4,7 +4,6 @@ Bad input ends in one line on standard error and exit code 2; a failed limit in 
 """
 
 import math
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -219,8 +218,10 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
 
 def announce_compilation() -> None:
     """Say that the first run compiles, because it takes a while."""
-    cache = Path(__file__).parent / "plant" / "__pycache__"
-    if not os.environ.get("NUMBA_DISABLE_JIT") and not any(cache.glob("*.nbi")):
+    from firmware_py.compiling import is_kept
+    from hil.plant.motion import advance
+
+    if not is_kept(advance):
         notices.print("first run on this machine: compiling flight core and plant, once, some ten seconds")
 
 

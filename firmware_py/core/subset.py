@@ -7,65 +7,26 @@ other kernels; `abs`, `sqrt`. Floats never meet ints without `f32(..)`, and ever
 would otherwise compute in double where CPython and C do not.
 
 A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, numba and the
-microcontroller can be compared byte by byte. Kernels are compiled by numba and cached beside this file; with
+microcontroller can be compared byte by byte. Kernels are compiled by numba (`firmware_py.compiling`); with
 NUMBA_DISABLE_JIT=1 they stay plain Python that a debugger can step through.
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias, TypeVar, cast
+from typing import Any, ClassVar, TypeAlias
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from firmware_py import compiling
 
 f32 = np.float32
 i32 = np.int32
 sqrt = np.sqrt  # correctly rounded on every target: sqrtss on x86, VSQRT.F32 on the Cortex-M4
 
-PLAIN = bool(getattr(numba.config, "DISABLE_JIT"))  # noqa: B009 - set by numba at run time
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
-def _drop_stale_cache() -> None:
-    """Delete numba's cache files of this package when any of its sources changed.
-
-    Numba looks only at the file of the function that it loads, not at the files of the functions that were inlined.
-    """
-    folder = Path(__file__).parent
-    digest = hashlib.sha256(f"{numba.__version__} {np.__version__} {sys.version}".encode())
-    for source in sorted(folder.glob("*.py")):
-        digest.update(source.read_bytes())
-    stamp = folder / "__pycache__" / "kernels.sha256"
-    if stamp.is_file() and stamp.read_text() == digest.hexdigest():
-        return
-    for pattern in ("*.nbi", "*.nbc"):
-        for stale in stamp.parent.glob(pattern):
-            stale.unlink(missing_ok=True)
-    try:
-        stamp.parent.mkdir(exist_ok=True)
-        partial = stamp.with_suffix(f".{os.getpid()}")
-        partial.write_text(digest.hexdigest())
-        partial.replace(stamp)
-    except OSError:  # a read-only installation: numba then keeps its cache elsewhere
-        return
-
-
-if not PLAIN:
-    _drop_stale_cache()
-
-
-def kernel(function: _Function) -> _Function:
-    """Compile a function of the subset; the same function in plain Python when numba is switched off."""
-    compiled: Any = numba.njit(cache=True, error_model="numpy", fastmath=False)(function)
-    return cast(_Function, compiled)
-
+# Compiles a function of the subset; the same function in plain Python when numba is switched off.
+kernel = compiling.compiler(Path(__file__).parent)
 
 F32s: TypeAlias = NDArray[np.float32]
 I32s: TypeAlias = NDArray[np.int32]
@@ -85,7 +46,7 @@ class Block:
     def __init__(self, dtype: np.dtype[Any], view: type[Any]) -> None:
         self.memory: NDArray[Any] = np.zeros(1, dtype)
         self.fields: Any = view(self.memory)
-        self.arg: Any = [self.fields] if PLAIN else self.memory
+        self.arg: Any = [self.fields] if compiling.PLAIN else self.memory
 
     def bytes(self) -> bytes:
         """Return the struct as the bytes that lie in memory."""

@@ -15,8 +15,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from firmware_py.compiling import PLAIN
 from firmware_py.core.structs import Parameters
-from firmware_py.core.subset import PLAIN
 from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.export.compare import STRUCTS, blocks_of
 from firmware_py.export.errors import ExportError

@@ -1,0 +1,48 @@
+"""Compilation by numba: IEEE arithmetic as it is written, kept on disk, and never older than its sources.
+
+Without fast maths LLVM neither reorders nor fuses, so that every processor computes the same bits. Numba recognises what it
+has kept by the file of the function alone, not by the files of what was inlined; here the content of all sources counts,
+wherever the cache lies (`__pycache__`, `NUMBA_CACHE_DIR`). What is stale is overwritten.
+"""
+
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+
+PLAIN = bool(getattr(numba.config, "DISABLE_JIT"))  # noqa: B009 - set by numba at run time
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiler(*sources: Path) -> Callable[[Function], Function]:
+    """Return the decorator of functions that depend on nothing but `sources`, files or folders, and their own file."""
+    shared = hashlib.sha256(f"{np.__version__} {sys.version}".encode())
+    for source in (Path(__file__), *sources):
+        for path in sorted(source.glob("*.py")) if source.is_dir() else (source,):
+            shared.update(path.read_bytes())
+
+    def compiled(function: Function) -> Function:
+        dispatcher: Any = numba.njit(cache=True, error_model="numpy", fastmath=False)(function)
+        if not PLAIN:
+            stamp = shared.copy()
+            stamp.update(Path(inspect.getfile(function)).read_bytes())
+            _kept(dispatcher)._source_stamp = stamp.hexdigest()
+        return cast(Function, dispatcher)
+
+    return compiled
+
+
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Return whether a compiled function needs no compiling on this machine."""
+    return PLAIN or bool(_kept(function)._load_index())
+
+
+def _kept(dispatcher: Any) -> Any:
+    """Return numba's index of what it has kept of a function."""
+    return dispatcher._cache._cache_file
