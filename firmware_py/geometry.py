@@ -6,10 +6,12 @@ Single attitudes are tuples because one numpy call costs more than the arithmeti
 are converted as one array.
 """
 
-from math import asin, atan2, cos, pi, remainder, sin, tau
+from math import pi, remainder, tau
 
 import numpy as np
 from numpy.typing import NDArray
+
+from firmware_py.elementary import asin, atan2, cos, sin
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

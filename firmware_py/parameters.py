@@ -5,7 +5,7 @@ Names are the Crazyflie's and the original Floaty's. Limits are those of the con
 """
 
 from collections.abc import Iterator
-from math import pi
+from math import pi, sqrt
 from typing import Any
 
 from pydantic import BaseModel
@@ -165,7 +165,7 @@ def _kalman(running: Running) -> Iterator[Parameter]:
         low, high = STD_LIMITS
         return Parameter(
             name, F32, unit,
-            lambda: getattr(fields, field).item() ** 0.5, lambda value: setattr(fields, field, value**2), low, high,
+            lambda: sqrt(getattr(fields, field)), lambda value: setattr(fields, field, value * value), low, high,
         )  # fmt: skip
 
     yield _field("kalman.maxPos", "m", core.parameters.fields, "bound_position", EstimatorConfig)

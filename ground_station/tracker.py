@@ -7,10 +7,11 @@ anew when three poses fit one another, which wrong ones rarely do. The first tra
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from math import atan, nan, sqrt
+from math import nan, sqrt
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.elementary import atan2
 from firmware_py.geometry import Vector
 from ground_station.mocap import MocapFrame
 from ground_station.pose_filter import PoseFilter
@@ -104,7 +105,7 @@ class Tracker:
         self.quality = Quality.NONE  # of the last frame
         self._config = config
         self._period_us = period_us
-        self._gate2 = config.gate**2
+        self._gate2 = config.gate * config.gate
         self._filter = PoseFilter(
             period_us * 1e-6,
             config.position_noise,
@@ -166,7 +167,7 @@ class Tracker:
                 return _without(frame, Quality.NONE)
             self.counters.refused += 1
             self._refused_in_a_row += 1
-            self._notices.refused(t_us, sqrt(distance2), 2.0 * atan(0.5 * sqrt(angle2)))
+            self._notices.refused(t_us, sqrt(distance2), 2.0 * atan2(sqrt(angle2), 2.0))
             return self._stand_in(frame, Quality.REFUSED)
         v_WB, w_B = self._filter.update(frame.p_WB, theta)
         self._good_us = t_us

@@ -7,8 +7,10 @@ trajectory, so that a flight can be repeated.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import sin, tau
+from math import tau
 from typing import Protocol
+
+from firmware_py.elementary import sin
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.elementary import cos, sin
 from hil.config import LabConfig
 from hil.harness import Streams
+from hil.noise import normal
 from hil.plant.body import AXIS, MIRRORS, SIGNS, flap_plates
 from hil.plant.config import PlantConfig
 from hil.plant.layout import STEP_US
@@ -96,7 +98,7 @@ class SimplifiedModel:
         """Return force and torque in B, (6,), for flap angles (4,) [rad]."""
         up = np.array([0.0, 0.0, 1.0])
         lift = np.array([0.0, 0.0, self._config.axis_height])
-        total = self._push(self._config.base_side**2, up, lift)
+        total = self._push(self._config.base_side * self._config.base_side, up, lift)
         for mirror, sign, angle in zip(MIRRORS, SIGNS, flaps, strict=True):
             for part in self._parts:
                 n, r = (mirror * _turned(v, -sign * angle) for v in (part.normal, part.centre))
@@ -112,8 +114,8 @@ class SimplifiedModel:
 
 def _turned(vector: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
     """Return a vector turned about the axis of flap 2."""
-    along = AXIS * (AXIS @ vector)
-    return np.asarray(along + (vector - along) * math.cos(angle) + np.cross(AXIS, vector) * math.sin(angle))
+    along = AXIS * math.fsum(AXIS * vector)
+    return np.asarray(along + (vector - along) * cos(angle) + np.cross(AXIS, vector) * sin(angle))
 
 
 def measure(config: LabConfig, seed: int) -> Iterator[Row]:
@@ -131,7 +133,7 @@ def measure(config: LabConfig, seed: int) -> Iterator[Row]:
         for index, (sweep, angle_deg) in enumerate(product(SWEEPS, ANGLES_DEG)):
             flaps = SIGNS * body.hover_angle
             sweep.turn(flaps, math.radians(angle_deg))
-            noise = streams.imu.standard_normal((SAMPLES, 6)) * SENSOR_NOISE
+            noise = normal(streams.imu, (SAMPLES, 6)) * SENSOR_NOISE
             samples = _measure(plant, flaps, index * SAMPLES * STEP_US) + noise
             mean, deviation = samples.mean(axis=0), samples.std(axis=0)
             yield Row(robot, sweep.name, angle_deg, model.wrench(flaps), mean, deviation)

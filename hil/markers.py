@@ -9,6 +9,7 @@ three markers are far from one line, and they spread far enough for both noise f
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from firmware_py.elementary import cos, sin
 from firmware_py.geometry import Quaternion, Vector
 from hil.plant.config import PlantConfig
+from hil.plant.fixed_order import product
 
 if TYPE_CHECKING:
     from hil.rigid_body import VirtualMarkers
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 COUNT = 8  # paper, Setup specifications
 DIAMETER = 0.014  # [m]; chosen, a common size
 TRUNK_RADIUS = 0.03  # [m] of what hangs around the centre of mass: batteries and boards; chosen
+TRUNK_AREA = TRUNK_RADIUS * TRUNK_RADIUS  # [m2]
 
 Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -102,7 +106,7 @@ def make_markers(
     """Return the markers on a robot; None when they are not enabled."""
     if not config.enabled:
         return None
-    from hil.rigid_body import VirtualMarkers  # scipy takes half a second to import
+    from hil.rigid_body import VirtualMarkers
 
     return VirtualMarkers(config, plant, rng)
 
@@ -133,10 +137,12 @@ class Cameras:
     """
 
     def __init__(self, config: MarkersConfig, plant: PlantConfig) -> None:
-        azimuth = 2.0 * np.pi * np.arange(config.cameras) / config.cameras
-        height = np.full(config.cameras, config.camera_height)
-        self._p_WC = np.column_stack(
-            (config.camera_distance * np.cos(azimuth), config.camera_distance * np.sin(azimuth), height)
+        azimuths = [2.0 * math.pi * camera / config.cameras for camera in range(config.cameras)]
+        self._p_WC = np.array(
+            [
+                (*(config.camera_distance * f(azimuth) for f in (cos, sin)), config.camera_height)
+                for azimuth in azimuths
+            ]
         )
         self._needed = config.min_cameras
         self._plate_height = plant.axis_height
@@ -147,7 +153,7 @@ class Cameras:
 
     def see(self, p_WB: Points, R_WB: Points) -> Mask:
         """Return which markers enough cameras see, (8,), at a pose: (3,) [m] and (3, 3)."""
-        p_BC = (self._p_WC - p_WB) @ R_WB
+        p_BC = product(self._p_WC - p_WB, R_WB)
         in_sight = ~(self._behind_plate(p_BC) | self._behind_trunk(p_BC))
         return np.asarray(in_sight.sum(axis=1) >= self._needed)
 
@@ -162,6 +168,6 @@ class Cameras:
 
     def _behind_trunk(self, p_BC: Points) -> Mask:
         """Which rays, marker by camera, pass through the ball on their way to the camera, which is outside."""
-        along = self._places @ p_BC.T - self._squares  # marker times ray
+        along = product(self._places, p_BC.T) - self._squares  # marker times ray
         rays = (p_BC**2).sum(axis=1) - self._squares - 2.0 * along  # squared lengths
-        return np.asarray((along < 0.0) & (self._squares * rays - along**2 < TRUNK_RADIUS**2 * rays))
+        return np.asarray((along < 0.0) & (self._squares * rays - along**2 < TRUNK_AREA * rays))

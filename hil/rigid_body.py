@@ -1,20 +1,22 @@
-"""From the markers of one exposure to the pose of the body: noise, wrong labels, ghosts, and the best fit (Kabsch).
+"""From the markers of one exposure to the pose of the body: noise, wrong labels, ghosts, and the best fit.
 
-The only file that knows scipy. Exchanging two labels leaves the fitted pose as it is or turns it by 180 degrees, and shows
+Exchanging two labels leaves the fitted pose as it is or turns it by 180 degrees, and shows
 in the mean error; a body that fits badly is not tracked, as in Motive.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import Quaternion, Vector, rotation_matrix
 from hil.markers import COUNT, NO_POINTS, Cameras, MarkersConfig, Mask, Points, Sighting, marker_places
+from hil.noise import normal
 from hil.plant.config import PlantConfig
+from hil.plant.fixed_order import eigen, product
 
 NOISE_ROWS = 512  # exposures of noise drawn at once
 SPREAD = 0.01  # [m] root of the squares across the best line through markers; below, they count as collinear
@@ -47,21 +49,41 @@ class RigidBody:
         centre_B, around_B = part
         shown = points[seen]
         centre_W = shown.sum(axis=0) / len(shown)
-        rotation, _ = Rotation.align_vectors(shown - centre_W, around_B)
-        x, y, z, w = rotation.as_quat().tolist()
-        R_WB = rotation_matrix((w, x, y, z))
-        p_WB = centre_W - R_WB @ centre_B
-        a, b, c = p_WB.tolist()
-        return Fit((a, b, c), (w, x, y, z), self._places @ R_WB.T + p_WB)
+        q_WB = _best_turn(around_B, shown - centre_W)
+        R_WB = rotation_matrix(q_WB)
+        p_WB = centre_W - product(R_WB, centre_B[:, None])[:, 0]
+        x, y, z = p_WB.tolist()
+        return Fit((x, y, z), q_WB, product(self._places, R_WB.T) + p_WB)
 
     def _part(self, seen: Mask) -> tuple[Points, Points] | None:
         key = seen.tobytes()
         if key not in self._parts:
             places = self._places[seen]
             around = places - places.mean(axis=0) if len(places) > 2 else np.zeros((3, 3))
-            across = np.linalg.svd(around, compute_uv=False)[1]
-            self._parts[key] = (places.mean(axis=0), around) if across > SPREAD else None
+            variances, _ = eigen(product(around.T, around))
+            across2 = np.sort(variances)[1]
+            self._parts[key] = (places.mean(axis=0), around) if across2 > SPREAD * SPREAD else None
         return self._parts[key]
+
+
+def _best_turn(body: Points, points: Points) -> Quaternion:
+    """Return w x y z of the turn of `body` that is closest to `points`, both (N, 3) about their centres.
+
+    Horn, "Closed-form solution of absolute orientation using unit quaternions", JOSA A 4(4), 1987: the eigenvector of the
+    largest eigenvalue.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = product(body.T, points).tolist()
+    N = np.array(
+        [
+            (xx + yy + zz, yz - zy, zx - xz, xy - yx),
+            (yz - zy, xx - yy - zz, xy + yx, zx + xz),
+            (zx - xz, xy + yx, yy - xx - zz, yz + zy),
+            (xy - yx, zx + xz, yz + zy, zz - xx - yy),
+        ]
+    )
+    values, vectors = eigen(N)
+    w, x, y, z = vectors[:, np.argmax(values)].tolist()
+    return (w, x, y, z) if w >= 0.0 else (-w, -x, -y, -z)
 
 
 class VirtualMarkers:
@@ -92,7 +114,7 @@ class VirtualMarkers:
         seen = self._cameras.see(p_WB, R_WB)
         if self.hidden:
             seen[: round(self.hidden)] = False
-        points = self._places @ R_WB.T + p_WB + self._noise()
+        points = product(self._places, R_WB.T) + p_WB + self._noise()
         labels = self._labels()
         if labels is not None:
             points, seen = points[labels], seen[labels]
@@ -108,14 +130,14 @@ class VirtualMarkers:
             return Sighting(points, seen, np.zeros(COUNT), ghosts, 0.0, None)
         off = points - fit.points
         residuals = np.sqrt((off * off).sum(axis=1)) * seen
-        error = float(residuals.sum()) / count
+        error = math.fsum(residuals) / count
         pose = (fit.p_WB, fit.q_WB) if error <= self._config.max_error else None
         return Sighting(np.where(seen[:, None], points, fit.points), seen, residuals, ghosts, error, pose)
 
     def _noise(self) -> Points:
         """Return the noise of one exposure, (8, 3) [m]."""
         if self._row == len(self._draws):
-            self._draws = self._config.noise * self._rng.standard_normal((NOISE_ROWS, COUNT, 3))
+            self._draws = self._config.noise * normal(self._rng, (NOISE_ROWS, COUNT, 3))
             self._row = 0
         self._row += 1
         return np.asarray(self.noise_scale * self._draws[self._row - 1])

@@ -353,7 +353,7 @@ def metadata_of(request: Request) -> dict[str, str]:
 def versions() -> dict[str, str]:
     """Return the versions of what computed the flight."""
     found = {"python": platform.python_version()}
-    for name in ("floaty-hil", "numpy", "numba", "scipy", "pyarrow"):
+    for name in ("floaty-hil", "numpy", "numba", "pyarrow"):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.elementary import exp
 from hil.errors import LabError
 from hil.plant import layout as at
 
@@ -64,7 +65,7 @@ class Tunnel:
         s[at.HEIGHT_SLOPE] = config.height_slope
         s[at.HOVER_HEIGHT] = config.hover_height
         s[at.GUST_RADIUS], s[at.GUST_GROWTH_MAX] = GUST_RADIUS, GUST_GROWTH_MAX
-        decay = np.exp(-at.STEP_US * 1e-6 / np.array(GUST_TAU))
+        decay = np.array([exp(-at.STEP_US * 1e-6 / tau) for tau in GUST_TAU])
         s[at.GUST_DECAY : at.GUST_DECAY + 14] = decay  # exact discretisation of an Ornstein-Uhlenbeck process
         s[at.GUST_KICK : at.GUST_KICK + 14] = np.array(GUST_RMS[config.turbulence]) * np.sqrt(1.0 - decay**2)
         self.set_gust_scale(config.gust_scale)

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.elementary import cos, sin, tan
 from hil.errors import LabError
+from hil.noise import normal
 from hil.plant.compiled import compiled
 from hil.plant.motion import GRAVITY
 from hil.plant.plant import Plant
@@ -60,7 +62,7 @@ class ImuConfig(BaseModel):
 
 # Where things lie in the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
 NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, FIELDS = range(13)
-COS, SIN = math.cos(S_AZIMUTH), math.sin(S_AZIMUTH)
+COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)
 
 
 @compiled
@@ -90,7 +92,7 @@ def channels(rows: View, omega: View, force: View, draws: View) -> Counts:
 
 def low_pass(bandwidth: float) -> tuple[float, float, float]:
     """Return b0, a1, a2 of the second-order Butterworth low pass of `bandwidth` [Hz] at the sample rate (bilinear)."""
-    k = math.tan(math.pi * bandwidth / SAMPLE_RATE)
+    k = tan(math.pi * bandwidth / SAMPLE_RATE)
     norm = 1.0 / (1.0 + math.sqrt(2.0) * k + k * k)
     return k * k * norm, 2.0 * (k * k - 1.0) * norm, (1.0 - math.sqrt(2.0) * k + k * k) * norm
 
@@ -106,7 +108,7 @@ class VirtualImu:
         self._rows = rows = np.zeros((6, FIELDS))
         self._noise = np.repeat([config.gyro_noise, config.accel_noise], 3)
         rows[:, SCALE] = np.repeat([GYRO_COUNTS, ACCEL_COUNTS], 3)
-        rows[:, BIAS] = rng.standard_normal(6) * np.repeat([config.gyro_bias, config.accel_bias], 3)
+        rows[:, BIAS] = normal(rng, 6) * np.repeat([config.gyro_bias, config.accel_bias], 3)
         rows[:3, [B0, A1, A2]] = low_pass(config.gyro_bandwidth)
         rows[3:, [B0, A1, A2]] = low_pass(config.accel_bandwidth)
         self._draws: list[View] = []
@@ -119,7 +121,7 @@ class VirtualImu:
     def sample(self, plant: Plant) -> Counts:
         """Return gyro x y z and accelerometer x y z counts, in S, of the plant as it is now."""
         if not self._draws:
-            self._draws = list(self._rng.standard_normal((NOISE_ROWS, 6)))
+            self._draws = list(normal(self._rng, (NOISE_ROWS, 6)))
         return channels(self._rows, plant.omega_B, plant.specific_force_B, self._draws.pop())
 
     def set_noise_scale(self, scale: float) -> None:

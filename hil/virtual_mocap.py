@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from firmware_py.geometry import IDENTITY, Quaternion, Vector, multiply, rotate
 from ground_station.mocap import MocapFrame
 from hil.markers import Sighting
+from hil.noise import normal
 from hil.plant.plant import Plant
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ class VirtualMocap:
     def _noisy_pose(self, plant: Plant) -> tuple[Vector, Quaternion]:
         """Return the truth with the configured noise."""
         if not self._draws:
-            self._draws = self._rng.standard_normal((NOISE_ROWS, 6)).tolist()
+            self._draws = normal(self._rng, (NOISE_ROWS, 6)).tolist()
         x, y, z, a, b, c = self._draws.pop()
         px, py, pz = plant.p_WB.tolist()
         s, half = self._config.position_noise, 0.5 * self._config.rotation_noise
@@ -141,7 +142,7 @@ class VirtualMocap:
 
 def _direction(rng: np.random.Generator) -> Vector:
     """Return a random unit vector."""
-    x, y, z = rng.standard_normal(3).tolist()
+    x, y, z = normal(rng, 3).tolist()
     s = 1.0 / math.sqrt(x * x + y * y + z * z)
     return (s * x, s * y, s * z)
 

@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.elementary import power
 from hil.events import EventQueue
 
 Receiver = Callable[[int, bytes], object]  # (now_us, packet)
@@ -127,7 +128,7 @@ def packet_loss(loss: float, bit_error_rate: float, size: int) -> float:
     """The chance that a packet with `size` bytes of payload is lost as a whole or by a wrong bit."""
     if not bit_error_rate:
         return loss
-    return 1.0 - (1.0 - loss) * (1.0 - bit_error_rate) ** (FRAME_BITS + 8 * size)
+    return 1.0 - (1.0 - loss) * power(1.0 - bit_error_rate, FRAME_BITS + 8 * size)
 
 
 @dataclass(slots=True)
@@ -353,8 +354,8 @@ def _polls_met(
         host_us + (RETRIES + 1) * again_us,
     )
     weights = (
-        *((1.0 - lost) * lost**tries * lengths[tries] for tries in range(RETRIES + 1)),
-        lost ** (RETRIES + 1) * lengths[-1],
+        *((1.0 - lost) * power(lost, tries) * lengths[tries] for tries in range(RETRIES + 1)),
+        power(lost, RETRIES + 1) * lengths[-1],
     )
     return lengths, weights, sum(weights)
 

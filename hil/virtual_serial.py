@@ -14,10 +14,12 @@ from functools import partial
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.elementary import log_1p
 from hil.events import EventQueue
 
 BYTE_BITS = 10  # start, 8 data, stop
 HOST_BUFFER = 4096  # bytes; Linux, drivers/usb/serial: one page for what a program writes
+NEVER = 2.0**60  # bits that no flight sends
 BYTE_TICKS = BYTE_BITS * 1_000_000  # a byte's time in units of 1/baud microseconds
 
 Arrived = Callable[[bytes, int, int], None]  # (chunk, sent_us, now_us)
@@ -152,7 +154,10 @@ class _Line:
         return bytes(spoilt)
 
     def _draw(self) -> int:
-        return int(self._rng.geometric(self._rate)) - 1
+        """Return how many bits are good before a wrong one: the geometric distribution, inverted."""
+        if self._rate == 1.0:
+            return 0
+        return int(min(log_1p(-self._rng.random()) / log_1p(-self._rate), NEVER))
 
 
 class VirtualSerial:

@@ -48,13 +48,10 @@ def look(config: MarkersConfig, turn: Rotation | None = None, p_WB: Array = HOME
     return markers(config, seed).look(p_WB, q_WB)
 
 
-def horn(points: Array, body: Array) -> tuple[Array, Array]:
-    """p and R of the best fit by Horn's quaternion: the eigenvector of a symmetric 4 x 4 matrix."""
-    a, b = body - body.mean(axis=0), points - points.mean(axis=0)
-    S = a.T @ b
-    skew = np.array([S[1, 2] - S[2, 1], S[2, 0] - S[0, 2], S[0, 1] - S[1, 0]])
-    N = np.block([[np.trace(S), skew], [skew[:, None], S + S.T - np.trace(S) * np.eye(3)]])
-    R = Rotation.from_quat(np.linalg.eigh(N)[1][:, -1], scalar_first=True).as_matrix()
+def kabsch(points: Array, body: Array) -> tuple[Array, Array]:
+    """p and R of the best fit by scipy: Kabsch's, from a singular value decomposition."""
+    turn, _ = Rotation.align_vectors(points - points.mean(axis=0), body - body.mean(axis=0))
+    R = turn.as_matrix()
     return points.mean(axis=0) - R @ body.mean(axis=0), R
 
 
@@ -103,14 +100,14 @@ def test_exact_points_give_the_pose_whichever_are_seen(p_WB: Array, turn: Rotati
 
 
 @given(places, turns, st.integers(0, 2**32), st.sets(st.integers(0, COUNT - 1), min_size=4))
-def test_noisy_points_give_the_pose_of_horns_method(
+def test_noisy_points_give_the_pose_of_scipys_kabsch(
     p_WB: Array, turn: Rotation, seed: int, rows: set[int]
 ) -> None:
     seen = np.isin(np.arange(COUNT), list(rows))
     points = turn.apply(PLACES) + p_WB + 0.002 * np.random.default_rng(seed).standard_normal((COUNT, 3))
     fit = RigidBody(PLACES).fit(points, seen)
     assert fit is not None
-    p, R = horn(points[seen], PLACES[seen])
+    p, R = kabsch(points[seen], PLACES[seen])
     assert fit.p_WB == pytest.approx(p, abs=1e-9)
     assert Rotation.from_quat(fit.q_WB, scalar_first=True).as_matrix() == pytest.approx(R, abs=1e-7)
 

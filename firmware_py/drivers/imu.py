@@ -25,7 +25,7 @@ class GyroZero:
         sums = [sum(sample[axis] for sample in window) for axis in range(3)]
         squares = [sum(sample[axis] ** 2 for sample in window) for axis in range(3)]
         for total, square in zip(sums, squares, strict=True):
-            if square / SAMPLES - (total / SAMPLES) ** 2 > VARIANCE_LIMIT:
+            if square * SAMPLES - total * total > VARIANCE_LIMIT * SAMPLES * SAMPLES:
                 self.windows_refused += 1
                 return False
         self.bias = (sums[0] / SAMPLES, sums[1] / SAMPLES, sums[2] / SAMPLES)

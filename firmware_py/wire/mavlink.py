@@ -9,10 +9,11 @@ What goes down saturates where an integer is too narrow and never raises; what c
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, isfinite, nan, sin
+from math import isfinite, nan
 
 import pymavlink.dialects.v20.common as dialect
 
+from firmware_py.elementary import cos, sin
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.mavlink_frames import Message

@@ -9,6 +9,8 @@ import math
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.elementary import exp
+
 SERVOS = 4
 
 
@@ -48,7 +50,7 @@ def open_circuit_voltage(charge: float) -> float:
 
     A lithium polymer cell: Chen and Rincon-Mora, IEEE Transactions on Energy Conversion 21(2), 2006, equation 2.
     """
-    return 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * math.exp(-35.0 * charge)
+    return 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * exp(-35.0 * charge)
 
 
 class Battery:
@@ -93,7 +95,8 @@ class Battery:
         open_circuit = open_circuit_voltage(self.charge)
         per_cell = self.power / self._config.cells
         return 0.5 * (
-            open_circuit + math.sqrt(max(open_circuit**2 - 4.0 * self._config.resistance * per_cell, 0.0))
+            open_circuit
+            + math.sqrt(max(open_circuit * open_circuit - 4.0 * self._config.resistance * per_cell, 0.0))
         )
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.elementary import cos, sin
 from hil.plant import layout as at
 from hil.plant.config import PlantConfig
 from hil.plant.plates import State
@@ -25,7 +26,7 @@ AXIS = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0])  # of flap 2, outwards
 
 def _turning(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return A, B, C, (3, 3), of a vector that turns about AXIS."""
-    along = AXIS * (AXIS @ vector)
+    along = AXIS * math.fsum(AXIS * vector)
     return np.array([along, vector - along, np.cross(AXIS, vector)])
 
 
@@ -42,20 +43,22 @@ def flap_plates(config: PlantConfig) -> tuple[Plate, Plate]:
     """Return the flat part and the kinked strip of flap 2."""
     side, corner = config.footprint / 2, config.base_side / 2
     width, kink = config.strip_width, config.kink_angle
-    quadrant, strip = side**2 - corner**2, width * side
+    quadrant, strip = side * side - corner * corner, width * side
     flat = quadrant - strip
-    moment = (side**3 - corner**3) / 2  # of the quadrant without its corner, about either side
+    moment = (
+        side * side * side - corner * corner * corner
+    ) / 2  # of the quadrant without its corner, about either side
     flat_centre = np.array([moment - strip * side / 2, moment - strip * (side - width / 2), 0.0]) / flat
-    strip_centre = np.array([side / 2, side - width + width / 2 * math.cos(kink), width / 2 * math.sin(kink)])
+    strip_centre = np.array([side / 2, side - width + width / 2 * cos(kink), width / 2 * sin(kink)])
     return (
         Plate(flat, np.array([0.0, 0.0, 1.0]), flat_centre),
-        Plate(strip, np.array([0.0, -math.sin(kink), math.cos(kink)]), strip_centre),
+        Plate(strip, np.array([0.0, -sin(kink), cos(kink)]), strip_centre),
     )
 
 
 def place_plates(s: State, config: PlantConfig) -> None:
     """Write the areas, normals and centres of pressure of all plates, and the hover angles."""
-    s[at.BASE_AREA] = config.base_side**2
+    s[at.BASE_AREA] = config.base_side * config.base_side
     s[at.AXIS_HEIGHT] = config.axis_height
     s[at.HOVER_FLAPS : at.HOVER_FLAPS + 4] = SIGNS * config.hover_angle
     lift = np.array([[0.0, 0.0, config.axis_height], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])

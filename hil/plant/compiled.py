@@ -2,6 +2,6 @@
 
 from pathlib import Path
 
-from firmware_py import compiling
+from firmware_py import compiling, elementary
 
-compiled = compiling.compiler(Path(__file__).parent)
+compiled = compiling.compiler(Path(__file__).parent, Path(elementary.__file__))

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.elementary import cos, sin
 from hil.plant import layout as at
 from hil.plant.body import MIX
 from hil.plant.config import PlantConfig
+from hil.plant.fixed_order import fit_polynomial
 from hil.plant.motion import GRAVITY, evaluate
 from hil.plant.plates import LIFT_U4_MAX, State
 
@@ -82,7 +84,7 @@ def _accelerations(c: State, cause: str, amount: float) -> State:
     elif cause[0] == "v":
         s[at.V + "xyz".index(cause[1])] = amount
     elif cause[0] == "q":
-        s[at.Q], s[at.Q + 1 + "xyz".index(cause[1])] = math.cos(amount / 2), math.sin(amount / 2)
+        s[at.Q], s[at.Q + 1 + "xyz".index(cause[1])] = cos(amount / 2), sin(amount / 2)
     else:
         s[at.OMEGA + "xyz".index(cause[1])] = amount
     evaluate(s)
@@ -137,9 +139,7 @@ def trim_and_correct(s: State, config: PlantConfig) -> None:
         return
 
     lift = [_accelerations(design, "u4", u4)[2] / GRAVITY + 1.0 for u4 in LIFT_SAMPLES.tolist()]
-    s[at.LIFT_FIT : at.LIFT_FIT + LIFT_ORDER + 1] = np.polynomial.polynomial.polyfit(
-        LIFT_SAMPLES, lift, LIFT_ORDER
-    )
+    s[at.LIFT_FIT : at.LIFT_FIT + LIFT_ORDER + 1] = fit_polynomial(LIFT_SAMPLES, np.array(lift), LIFT_ORDER)
     L = linearise(design, config.airspeed)
     T = target_constants(config, L)
     m, (ix, iy, iz) = config.mass, config.inertia

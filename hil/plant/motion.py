@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hil.plant import layout as at
 from hil.plant.compiled import compiled
+from hil.plant.fixed_order import atan2, exp
 from hil.plant.ground import stand
 from hil.plant.plates import State, drag
 
@@ -82,7 +83,7 @@ def turn_flaps(s: State, duration: float) -> None:
             error -= s[at.SERVO_RATE] * run
             left -= run
         if left > 0.0:
-            error = max(error * math.exp(-left / s[at.SERVO_TAU]), s[at.DEAD_BAND])
+            error = max(error * exp(-left / s[at.SERVO_TAU]), s[at.DEAD_BAND])
         before = s[at.FLAPS + i]
         s[at.FLAPS + i] = target - math.copysign(error, target - before)
         s[at.TRAVEL] += abs(s[at.FLAPS + i] - before)
@@ -133,7 +134,7 @@ def watch(s: State) -> None:
     elif s[at.PULL] != 0.0 or s[at.PULL + 1] != 0.0 or s[at.PULL + 2] != 0.0:
         cause, value = at.TETHER_TAUT, -z
     elif cos_tilt < s[at.LIMIT_COS_TILT]:
-        cause, value = at.TUMBLED, math.acos(cos_tilt)
+        cause, value = at.TUMBLED, atan2(math.sqrt(1.0 - cos_tilt * cos_tilt), cos_tilt)
     if cause != 0:
         s[at.LOST], s[at.LOST_US], s[at.LOST_VALUE] = cause, s[at.TIME_US], value
 

@@ -12,7 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.elementary import cos
 from hil.errors import LabError
+from hil.noise import normal
 from hil.plant import layout as at
 from hil.plant.body import SIGNS, place_plates
 from hil.plant.config import PlantConfig, ServoConfig
@@ -72,9 +74,11 @@ class Plant:
         s[at.NET_HEIGHT], s[at.FRICTION] = ground.height, ground.friction
         s[at.NET_STIFFNESS], s[at.NET_DAMPING] = ground.stiffness, ground.damping
         s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = ground.foot_spread, ground.foot_below
-        s[at.FOOT_REACH] = math.sqrt(2.0 * ground.foot_spread**2 + ground.foot_below**2)
+        s[at.FOOT_REACH] = math.sqrt(
+            2.0 * ground.foot_spread * ground.foot_spread + ground.foot_below * ground.foot_below
+        )
         s[at.LIMIT_RADIUS], s[at.LIMIT_BELOW], s[at.LIMIT_ABOVE] = limits.radius, limits.below, limits.above
-        s[at.LIMIT_COS_TILT] = math.cos(limits.tilt)
+        s[at.LIMIT_COS_TILT] = cos(limits.tilt)
 
         s[at.SERVO_TAU], s[at.SERVO_RATE], s[at.DEAD_BAND] = servos.tau, servos.rate_limit, servos.dead_band
         self._zero_offset = servos.zero_offset
@@ -88,7 +92,7 @@ class Plant:
         s[at.NEXT_US] = s[at.AFTER_US] = math.inf
 
         self._rng = rng_gust
-        self._draws = rng_gust.standard_normal((NOISE_ROWS, 14))
+        self._draws = normal(rng_gust, (NOISE_ROWS, 14))
         self.state = self._view(at.P, 17)
         self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
         self.omega_B, self.flaps = self._view(at.OMEGA, 3), self._view(at.FLAPS, 4)
@@ -113,7 +117,7 @@ class Plant:
     ) -> None:
         """Put the body into a state; `q_WB` is normalised, `flaps` None leaves them as they are. Raises LabError."""
         s = self._s
-        length = math.sqrt(sum(component**2 for component in q_WB))
+        length = math.sqrt(math.fsum(component * component for component in q_WB))
         if not (
             length > 0.0
             and all(map(math.isfinite, (*p_WB, *q_WB, *v_WB, *omega_B, *(() if flaps is None else flaps))))
@@ -128,7 +132,7 @@ class Plant:
     def advance(self, now_us: int) -> None:
         """Bring the truth to the last whole millisecond at or before `now_us`."""
         while advance(self._s, self._draws, now_us):
-            self._rng.standard_normal(out=self._draws)
+            self._draws = normal(self._rng, self._draws.shape)
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
         """Take over what the four timer registers hold; it reaches the servos at the next PWM period."""

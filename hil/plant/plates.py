@@ -11,10 +11,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.elementary import tan
 from hil.plant import layout as at
 from hil.plant.compiled import compiled
+from hil.plant.fixed_order import sine_ahead
 
-TILT_MAX = math.tan(
+TILT_MAX = tan(
     math.radians(35.0)
 )  # slope of the wind beyond which identified stiffness does not grow; section 4
 LIFT_U4_MAX = 0.55  # [rad] the lift ratio l(u4) is fitted for |u4| up to here
@@ -101,7 +103,7 @@ def press(s: State) -> None:
         for pose in range(2 if s[at.CORRECTED] != 0.0 else 1):
             angle = s[at.FLAPS + flap] if pose == 0 else s[at.HOVER_FLAPS + flap]
             phi = -angle if flap % 2 == 0 else angle  # flaps 1 and 3 (0 and 2 here) are mirror images of 2
-            c, d = math.cos(phi), math.sin(phi)
+            c, d = sine_ahead(phi, 1), sine_ahead(phi, 0)
             total = at.DRAG if pose == 0 else at.HOVER_DRAG
             for plate in range(2 * flap, 2 * flap + 2):
                 n, r = at.NORMAL + 9 * plate, at.CENTRE + 9 * plate
