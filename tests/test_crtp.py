@@ -4,6 +4,7 @@ import struct
 from contextlib import suppress
 from math import inf, nan
 
+import numpy as np
 import pytest
 from cflib.crazyflie.localization import Localization
 from cflib.crazyflie.log import LogConfig
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from firmware_py.wire import WireError, crtp, telemetry
 from firmware_py.wire.scalars import Scalar
+from ground_station.links.crazyradio import CrazyradioLink
 
 metres = st.floats(-100.0, 100.0, width=32)
 Q = (0.5, -0.5, 0.5, 0.5)
@@ -159,6 +161,15 @@ def test_cflib_reads_the_block(block):
     }
     expected = {variable.name: value for variable, value in zip(block.variables, values, strict=True)}
     assert received == pytest.approx({name: degrees.get(name, value) for name, value in expected.items()})
+
+
+def test_attitudes_of_a_crazyflie_come_in_degrees_and_are_logged_in_radians():
+    link = CrazyradioLink("radio://0/80/2M", 0)
+    link._blocks = {3: telemetry.BLOCKS[1]}
+    data = crtp.encode_log_data(3, 1234, struct.pack("<6f", 10, -20, 30, 0.4, 0.5, 0.6))
+    (sample,) = link.receive(0, data)
+    assert sample.timestamp_ms == 1220
+    assert sample.values == pytest.approx((*np.radians((10, 20, 30)), 0.4, 0.5, 0.6))
 
 
 def test_variables_have_one_home():

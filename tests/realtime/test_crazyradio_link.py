@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import time
@@ -13,15 +12,11 @@ from pathlib import Path
 
 import cflib.crtp
 import libusb_package
-import numpy as np
 import pytest
 from cflib.crtp.radiodriver import RadioManager
 from cflib.utils.power_switch import PowerSwitch
 from serving import Served, serve
 
-from firmware_py.wire.crtp import encode_log_data
-from firmware_py.wire.telemetry import BLOCKS
-from ground_station.links.crazyradio import CrazyradioLink
 from ground_station.mocap import MocapFrame
 from ground_station.mocap_udp import PoseReceiver, decode_frame, encode_frame
 from hil.dongle_plugin import VARIABLE, Backend
@@ -167,16 +162,6 @@ def test_it_flies_reconnects_after_a_reboot_and_leaves_the_board_in_failsafe(tmp
     assert max(errors) < 0.2
     complete = [row for row in flown if "nan" not in row.values()]
     assert len(complete) / len(flown) > 0.9
-
-
-def test_attitudes_come_in_degrees_and_are_logged_in_radians() -> None:
-    link = CrazyradioLink(URI, 0)
-    link._cache.cleanup()
-    link._blocks = {3: BLOCKS[1]}
-    data = encode_log_data(3, 1234, struct.pack("<6f", 10, -20, 30, 0.4, 0.5, 0.6))
-    (sample,) = link.receive(0, data)
-    assert sample.timestamp_ms == 1220
-    assert sample.values == pytest.approx((*np.radians((10, 20, 30)), 0.4, 0.5, 0.6))
 
 
 def fly(folder: Path, *arguments: str) -> dict[str, object]:
