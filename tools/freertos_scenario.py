@@ -250,6 +250,7 @@ class Run:
             case "give":
                 given: Semaphore | Mutex = self.objects[operands[0]]
                 if isinstance(given, Mutex) and given.holder is not kernel.current:
+                    kernel.count_call()
                     return NOT_HELD
                 return int((yield from given.give()))
             case "notify":

@@ -161,11 +161,12 @@ class Scheduler:
 
         It may be ready already: a notification can reach a task whose wait timed out and that has not run since.
         """
-        if task.place != READY:  # otherwise its activation has begun
+        place = task.place
+        if place != SUSPENDED:
+            self.unlink(task)
+        if place != READY:  # otherwise its activation has begun
             task.released_us = self.now_us
             task.fresh = True
-        if task.place != SUSPENDED:
-            self.unlink(task)
         if self.trace is not None:
             self.trace(self.now_us, "READY", task.name, task.priority, 0)
         task.place = READY
