@@ -74,7 +74,10 @@ def test_command_prints_the_trace_of_its_mode():
         ("task a 1\n  work 5", "run TICKS"),
         ("run 5\nqueue 1 0\ntask a 1\n  work 5", "queue 1: length 0"),
         ("run 5\ntask a 1\n  yield", "task a at 0.000 ms: 10000 switches at one instant"),
-        ("run 5\nmutex 1\ntask a 1\n  give 1", "task a at 0.000 ms: 10000 calls of the kernel at one instant"),
+        (
+            "run 5\nmutex 1\ntask a 1\n  give 1",
+            "task a at 0.000 ms: 10000 calls of the kernel at one instant",
+        ),
         ("run 5\ntask a 1\n  delay_until 0", "line 3: delay_until 0: it must be at least 1"),
         (
             "run 5\nmutex 1\ntask a 1\n  take 1 0\n  delay 9\nat 500 isr_give 1",
