@@ -1,7 +1,8 @@
 """The robustness studies beyond the paper, as data: what is made worse, for whom, and what is expected to come of it.
 
 A study flies its experiment for every variant, size and seed. Faults begin 2 s after the release and last to the end
-unless the study says otherwise. What is expected was measured over at least 5 seeds and stated with a step to spare.
+unless the study says otherwise. What is expected was measured over at least 5 seeds and stated with a step to spare; for
+latency and jitter other seeds were flown as well.
 """
 
 from __future__ import annotations
@@ -93,12 +94,12 @@ _ALL = (
         "Does the robot survive late poses, and what does the predictor on board make of them?",
         "latency from exposure to estimator", "ms", (0, 20, 40, 60, 80, 100, 120),
         (
-            Variant("floaty, measured age", _latency, Expected(holds_to=120)),
-            Variant("floaty, fixed 40 ms", _latency, Expected(holds_to=80, flies_to=120), settings=FIXED_PREDICTOR),
+            Variant("floaty, measured age", _latency, Expected(holds_to=80, flies_to=120)),
+            Variant("floaty, fixed 40 ms", _latency, Expected(holds_to=60, flies_to=120), settings=FIXED_PREDICTOR),
             Variant("floaty, no predictor", _latency, Expected(holds_to=60, lost_from=120), settings=NO_PREDICTOR),
-            Variant("mid gains, measured age", _latency, Expected(holds_to=100), settings=MID),
+            Variant("mid gains, measured age", _latency, Expected(holds_to=80), settings=MID),
             Variant(
-                "mid gains, fixed 40 ms", _latency, Expected(holds_to=40, lost_from=100),
+                "mid gains, fixed 40 ms", _latency, Expected(flies_to=60, lost_from=120),
                 settings=(*MID, *FIXED_PREDICTOR),
             ),
             Variant(
@@ -125,7 +126,7 @@ _ALL = (
         (0, 5, 10, 15, 20, 30, 60, 100),
         _both(
             lambda size: Change((f"radio.uplink_jitter_us={round(1000 * size)}",)),
-            Expected(holds_to=60), Expected(holds_to=20, lost_from=100),
+            Expected(holds_to=30, flies_to=100), Expected(holds_to=20, flies_to=30),
         ),
         remark="The delay is after the age of the pose was measured: to the predictor it is unknown latency.",
     ),
