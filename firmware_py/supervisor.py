@@ -19,6 +19,7 @@ from typing import Any
 
 from firmware_py.config import SupervisorConfig
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
+from firmware_py.wire.supervisor import Cause, State
 
 WATCHDOG_US = 1_000_000  # Crazyflie firmware
 BATTERY_LOW_US = 5_000_000  # original firmware
@@ -26,26 +27,6 @@ EPISODE_GAP_US = 50_000  # two bounded steps closer than this belong to one epis
 EPISODE_LIMIT_US = 200_000
 BOUNDS_RECOVERY_US = 500_000
 NEVER_US = -(1 << 40)
-
-
-class State(IntEnum):
-    """What the robot is allowed to do."""
-
-    CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
-    WAITING = 1  # no pose has come yet: flaps at hover
-    FLYING = 2  # loop closed
-    FAILSAFE = 3  # flaps at hover, see the cause
-
-
-class Cause(IntEnum):
-    """Why the robot is in failsafe."""
-
-    NONE = 0
-    SILENCE = 1
-    OUT_OF_BOUNDS = 2
-    EMERGENCY_STOP = 3
-    LOW_BATTERY = 4
-    DISARMED = 5
 
 
 class Manual(IntEnum):

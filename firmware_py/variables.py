@@ -25,8 +25,9 @@ from firmware_py.links.stream import TelemetryStream
 from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.rtos import Queue
-from firmware_py.supervisor import State, Supervisor
+from firmware_py.supervisor import Supervisor
 from firmware_py.wire.scalars import Scalar
+from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import FIRST_ID, LEGACY_DEGREES, Block
 
 if TYPE_CHECKING:

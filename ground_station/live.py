@@ -8,22 +8,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
 from ground_station.frame_rate import FrameRate
 from ground_station.mocap import MocapSource
-from ground_station.station import GroundStation
+from ground_station.station import GroundStation, Link
 
 POSE_TIMEOUT_US = 5_000_000
 RECONNECT_TIMEOUT_US = 30_000_000
 RECONNECT_PERIOD_US = 500_000
 STATUS_PERIOD_US = 5_000_000
 FAILSAFE_TIMEOUT_US = 2_000_000
-FAILSAFE = 3  # supervisor.state
 
 
-class LiveLink(Protocol):
-    """A link to a board that is out there; what the ground station needs of it is `ground_station.station.Link`."""
+class LiveLink(Link, Protocol):
+    """A link to a board that is out there."""
 
     @property
     def uri(self) -> str:
@@ -74,6 +74,7 @@ class LiveStation:
     rate: FrameRate
     say: Callable[[str], None]
     stopping: Callable[[], bool]
+    flying: Callable[[int], None]  # called again and again with the instant while the board flies
 
     def run(self) -> None:
         """Fly until told to stop; raises `LinkError` when there are no poses or no board."""
@@ -135,6 +136,8 @@ class LiveStation:
                 self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
                 pose_us = now_us
             self._take_telemetry()
+            if self.link.supervisor_state == State.FLYING:
+                self.flying(now_us)
             self._tell()
             self.link.check()
             if now_us - status_us >= STATUS_PERIOD_US:
@@ -162,9 +165,9 @@ class LiveStation:
         """Stop correcting, wait until the board has put its flaps to hover, disconnect."""
         self.link.mute()
         deadline_us = clock_us() + FAILSAFE_TIMEOUT_US
-        while clock_us() < deadline_us and self.link.supervisor_state != FAILSAFE:
+        while clock_us() < deadline_us and self.link.supervisor_state != State.FAILSAFE:
             self.source.receive(0.02)
             self._take_telemetry()
-        if self.link.supervisor_state == FAILSAFE:
+        if self.link.supervisor_state == State.FAILSAFE:
             self.say("the board is in failsafe, flaps at hover")
         self.link.close()

@@ -2,7 +2,7 @@
 
 A packet is u16 message, u16 length of what follows, payload. Sans I/O; positions and rotations are those of Motive's
 axes, and a quaternion's order is x y z w on the wire, w x y z here. Skeletons, assets, force plates, devices and
-cameras are checked and passed over. `hil.virtual_motive` writes what is read here. Layouts from the clients of links.md.
+cameras are checked and passed over. `hil.servers.motive` writes what is read here. Layouts from the clients of links.md.
 """
 
 from dataclasses import dataclass

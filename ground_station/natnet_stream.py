@@ -22,7 +22,7 @@ from ground_station.natnet import (
 from ground_station.natnet_reader import Quaternion, Vector, Version
 from ground_station.server_clock import ServerClock
 from ground_station.sources.alignment import Alignment
-from ground_station.sources.config import choose_body
+from ground_station.sources.bodies import choose_body
 
 LATE_FRAMES = 100  # a number that lies further back is that of a server that began anew
 FROZEN_FRAMES = 3  # with the very same pose: the server repeats what it saw last

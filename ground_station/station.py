@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from pydantic import BaseModel, ConfigDict, Field
-
 from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import Sample
+from ground_station.config import StationConfig
 from ground_station.latency import LatencyBudget, LinkLatency
 from ground_station.mocap import MocapFrame
 from ground_station.telemetry_log import TelemetryLog
@@ -20,22 +19,6 @@ from ground_station.tracker import Track, Tracker
 from ground_station.trajectory import Goal, Trajectory
 
 TELEMETRY_TIMEOUT_US = 500_000  # of silence, after which the board is asked again
-
-
-class StationConfig(BaseModel):
-    """What the ground station does with frames."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    corrections_hz: float = Field(
-        50.0, ge=1, le=200, description="corrections per second [Hz], if there are as many frames; original"
-    )
-    link_latency_us: int = Field(
-        1400,
-        ge=0,
-        le=100_000,
-        description="from the link's input to the board [us], where it is not measured; mean of VirtualRadio",
-    )
 
 
 class Link(Protocol):

@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from math import nan, sqrt
 
-from pydantic import BaseModel, ConfigDict, Field
-
 from firmware_py.elementary import atan2
 from firmware_py.geometry import Vector
+from ground_station.config import TrackerConfig
 from ground_station.mocap import MocapFrame
 from ground_station.pose_filter import PoseFilter
 from ground_station.track_notices import TrackNotices
@@ -22,51 +21,6 @@ FIT_US = 50_000  # between them; one that comes later says nothing about the oth
 WIDEN_US = 60_000  # refused poses widen the gate until then only, else they would open it to themselves
 FAR = 1000.0  # [m] no tunnel is as large
 UNKNOWN: Vector = (nan, nan, nan)
-
-
-class TrackerConfig(BaseModel):
-    """What the ground station takes for a pose of the robot."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    enabled: bool = Field(True, description="false: frames go to the link as they come, as in the original")
-    position_noise: float = Field(0.0005, gt=0, le=0.1, description="of poses, per axis [m]; that of [mocap]")
-    rotation_noise: float = Field(
-        0.004, gt=0, le=0.5, description="of poses, per axis [rad]; that of [mocap]"
-    )
-    acceleration: float = Field(
-        15.0,
-        gt=0,
-        le=1000,
-        description="standard deviation, constant for a frame [m/s^2]; a push of 20 N (59 m/s^2) is 6 standard deviations "
-        "of the pose at most",
-    )
-    angular_acceleration: float = Field(
-        100.0,
-        gt=0,
-        le=10_000,
-        description="standard deviation, constant for a frame [rad/s^2]; a torque of 1 N m (680 rad/s^2) is 7.1 of the pose",
-    )
-    gate: float = Field(
-        8.0,
-        ge=3,
-        le=20,
-        description="standard deviations that position or rotation may be off [1]: 7 mm or 3 deg from frame to frame; "
-        "5.2 at most in all experiments",
-    )
-    bridge_us: int = Field(
-        0,
-        ge=0,
-        le=200_000,
-        description="predicted poses go out this long after the last good one [us], for boards that do not predict; ours "
-        "does, with its gyro: 0.3 s without cameras make the hover's rms of y 3.2 mm with 0, 3.8 with 20 ms, 5.2 with 50",
-    )
-    reacquire_us: int = Field(
-        400_000,
-        ge=50_000,
-        le=5_000_000,
-        description="without a good pose, then the track begins anew [us]; the board's failsafe comes after 500 ms",
-    )
 
 
 class Quality(IntEnum):

@@ -39,6 +39,28 @@ class Hold:
         return self.goal
 
 
+class Waiting:
+    """`home` until it is told to `start`, then the trajectory that `make(home, start_us)` returns."""
+
+    def __init__(self, home: Goal, make: Callable[[Goal, int], Trajectory]) -> None:
+        self._home = home
+        self._make = make
+        self._flown: Trajectory | None = None
+
+    @property
+    def started(self) -> bool:
+        """Whether its clock has been set."""
+        return self._flown is not None
+
+    def start(self, start_us: int) -> None:
+        """Let the trajectory's clock begin at an instant; only the first call counts."""
+        if self._flown is None:
+            self._flown = self._make(self._home, start_us)
+
+    def at(self, t_us: int) -> Goal:
+        return self._home if self._flown is None else self._flown.at(t_us)
+
+
 Signal = Callable[[int], float]  # time since the start [us], never negative, to an offset [m or rad]
 
 

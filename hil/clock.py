@@ -1,16 +1,30 @@
 """How simulated time follows the wall clock: not at all, or step by step. The only file that sleeps."""
 
+import select
+import socket
 import time
+from collections.abc import Callable
 from typing import Protocol
+
+Readers = dict[socket.socket | int, Callable[[int], None]]
 
 
 class Clock(Protocol):
     """Waits until a simulated instant may happen."""
 
+    paced: bool
     stood_still_us: int  # how long simulated time stood still in all, because the machine was too slow
 
-    def wait_until(self, now_us: int) -> None:
-        """Return when the simulated instant may happen."""
+    def start(self, now_us: int) -> None:
+        """Let the simulated instant be now."""
+        ...
+
+    def wait_until(self, now_us: int) -> int:
+        """Wait for a simulated instant, or an earlier one at which something arrives from outside; returns which it is."""
+        ...
+
+    def serve(self, now_us: int) -> None:
+        """Take what arrived from outside, at the instant that `wait_until` returned."""
         ...
 
     def notices(self) -> list[str]:
@@ -21,10 +35,18 @@ class Clock(Protocol):
 class FreeRunning:
     """Every instant may happen at once."""
 
+    paced = False
     stood_still_us = 0
 
-    def wait_until(self, now_us: int) -> None:
+    def start(self, now_us: int) -> None:
+        """Nothing: it is always now."""
+
+    def wait_until(self, now_us: int) -> int:
         """Return at once."""
+        return now_us
+
+    def serve(self, now_us: int) -> None:
+        """Nothing: nothing comes from outside."""
 
     def notices(self) -> list[str]:
         """Nothing: there is no wall clock to fall behind."""
@@ -35,8 +57,11 @@ class Paced:
     """One simulated second per real second.
 
     A little lateness is made up for. More than `STALL_US` is a stall: simulated time goes on from where it stood, because
-    clients outside would see a burst of the past otherwise, and a line says how long it stood.
+    clients outside would see a burst of the past otherwise, and a line says how long it stood. `readers` has who is called,
+    with the instant, when a socket or a file descriptor is readable.
     """
+
+    paced = True
 
     SLACK_US = 1000  # do not sleep for less than this
     STALL_US = 20_000
@@ -44,6 +69,9 @@ class Paced:
 
     def __init__(self) -> None:
         self.stood_still_us = 0
+        self.readers: Readers = {}
+        self._readable: list[socket.socket | int] = []
+        self._served_us = 0  # the latest instant
         self._start_ns: int | None = None  # when simulated time was 0
         self._told_us = 0  # of the standstill
         self._next_notice_us = 0
@@ -67,11 +95,24 @@ class Paced:
             self.stood_still_us += late_us
         return max(0, -late_us)
 
-    def wait_until(self, now_us: int) -> None:
-        """Sleep until the wall clock has reached the instant."""
+    def wait_until(self, now_us: int) -> int:
+        """Sleep until the wall clock has reached the instant, or something is readable."""
         ahead_us = self.ahead_us(now_us)
-        if ahead_us > self.SLACK_US:
+        if self.readers:
+            self._readable, _, _ = select.select(self.readers, (), (), ahead_us * 1e-6)
+        elif ahead_us > self.SLACK_US:
             time.sleep(ahead_us * 1e-6)
+        if self._readable:
+            now_us = max(self._served_us, min(self.now_us(), now_us))
+        self._served_us = now_us
+        return now_us
+
+    def serve(self, now_us: int) -> None:
+        """Call the readers of what is readable."""
+        for readable in self._readable:
+            if readable in self.readers:  # not closed by one of the others
+                self.readers[readable](now_us)
+        self._readable = []
 
     def notices(self) -> list[str]:
         """Lines for the user since the last call, one per simulated second at the most."""

@@ -14,18 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from firmware_py.config import FirmwareConfig
-from ground_station.sources.config import CaptureConfig
-from ground_station.station import StationConfig
-from ground_station.tracker import TrackerConfig
+from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
+from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, RadioConfig, SerialConfig
 from hil.errors import LabError
-from hil.markers import MarkersConfig
-from hil.plant.battery import BatteryConfig
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.tunnel import TunnelConfig
-from hil.virtual_imu import ImuConfig
-from hil.virtual_mocap import MocapConfig
-from hil.virtual_radio import RadioConfig
-from hil.virtual_serial import SerialConfig
+from hil.world.config import BatteryConfig, PlantConfig, ServoConfig, TunnelConfig
 
 DEFAULT_PROFILE = "floaty"
 _FOLDERS = (Path(__file__).parent.parent / "profiles", Path(__file__).parent / "profiles")

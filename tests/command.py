@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.cli import main
+from hil.commands.app import main
 
 
 def floaty(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:

@@ -20,8 +20,8 @@ from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.export.native import NativeRunner
 from hil.config import load_config
 from hil.experiments.hover import HOVER
-from hil.faults import parse
-from hil.harness import Flight
+from hil.laboratory.faults import parse
+from hil.laboratory.lockstep import lockstep_flight
 
 CONFIG = load_config()
 BUILD = Path(__file__).parent.parent / "runs" / "build" / "core"
@@ -131,8 +131,8 @@ class RecordingRunner:
 def record_flight(duration_s: float) -> Recording:
     """Return the core's calls in a hover with pushes and with gaps, outliers and late poses."""
     faults = ["push.y@2=2", "push.roll@3=0.2", "mocap.dropout@4:0.4", "push.z@5=2"]
-    flight = Flight(CONFIG, HOVER, duration_s, 1, None, faults=[parse(text) for text in faults])
-    core = flight.firmware._core
+    flight = lockstep_flight(CONFIG, HOVER, duration_s, 1, None, faults=[parse(text) for text in faults])
+    core = flight.robot.firmware._core
     runner = RecordingRunner(core)
     core.run = runner  # type: ignore[assignment]
     flight.run()

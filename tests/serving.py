@@ -1,4 +1,4 @@
-"""`floaty board serve` as a process of its own, for the tests of what talks to it."""
+"""`floaty serve` as a process of its own, for the tests of what talks to it."""
 
 import os
 import re
@@ -55,6 +55,16 @@ class Served:
             assert ready, f"no line {pattern!r} within {timeout_s} s: {self.lines}"
             assert self._read(), f"the server ended: {self.lines}"
 
+    @property
+    def motive(self) -> str:
+        """What `--mocap` calls its cameras."""
+        return self.line("motive ")[0]
+
+    def type(self, line: str) -> None:
+        """Type a line into its terminal."""
+        self.process.stdin.write(line.encode() + b"\n")
+        self.process.stdin.flush()
+
     def listen(self) -> None:
         """Take what it said and nobody waited for."""
         if not self.process.stdout.closed:
@@ -95,10 +105,13 @@ def free_port() -> int:
 
 
 @contextmanager
-def serve(*arguments: str, what: str = "board") -> Iterator[Served]:
-    """A server of boards, or of the laboratory, on free ports."""
-    command = [sys.executable, "-m", "hil.cli", what, "serve", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+def serve(*arguments: str, motive: bool = False) -> Iterator[Served]:
+    """A server, with or without Motive, on a free port."""
+    cameras = ("--natnet-port", "0") if motive else ("--no-motive",)
+    command = [sys.executable, "-m", "hil.commands", "serve", *cameras, *arguments]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
     served = Served(process)
     SERVED.append(served)
     try:
@@ -108,4 +121,5 @@ def serve(*arguments: str, what: str = "board") -> Iterator[Served]:
         served.listen()
         process.kill()
         process.wait()
+        process.stdin.close()
         process.stdout.close()

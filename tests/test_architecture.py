@@ -30,36 +30,50 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 
+# The rooms of hil from the ground up: a room imports from itself and from floors below, a `config` also from other configs.
+FLOORS = (
+    ("errors", "clock", "events"),
+    ("world",),
+    ("devices",),
+    ("config",),
+    ("laboratory",),
+    ("experiments",),
+    ("pictures",),
+    ("servers",),
+    ("studies", "deploy"),
+    ("commands",),
+)
+FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+
 # Outside libraries that the core may use at all.
 CORE_LIBRARIES = {"numpy", "typing"}
 
 # Module or attribute -> the files that alone may use it.
 CONFINED: dict[str, tuple[str, ...]] = {
     "numba": ("firmware_py/compiling.py",),
-    "rerun": ("hil/viewer.py",),
-    "time": ("hil/clock.py", "hil/run.py", "ground_station/clock.py"),
+    "rerun": ("hil/pictures/viewer.py",),
+    "time": ("hil/clock.py", "hil/laboratory/run.py", "ground_station/clock.py"),
     "datetime": (),
     "asyncio": (),
-    "threading": ("hil/window.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py"),
-    "multiprocessing": ("hil/sweep.py",),
-    "concurrent": ("hil/sweep.py",),
+    "threading": ("hil/pictures/window.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py"),
+    "multiprocessing": ("hil/studies/sweep.py",),
+    "concurrent": ("hil/studies/sweep.py",),
     "unicorn": ("firmware_py/export/cortex_m4.py",),
     "elftools": ("firmware_py/export/arm_image.py",),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
     "subprocess": (
-        "hil/run.py", "hil/window.py", "hil/linked_flight.py", "ground_station/sources/motioncapture_client.py",
-        "firmware_py/export/native.py",
-        "firmware_py/export/arm_image.py", "firmware_py/export/plain.py",
+        "hil/laboratory/run.py", "hil/pictures/window.py", "hil/servers/linked.py",
+        "ground_station/sources/motioncapture_client.py",
+        "firmware_py/export/native.py", "firmware_py/export/arm_image.py", "firmware_py/export/plain.py",
     ),
     "socket": (
-        "hil/window.py", "hil/dongle_plugin.py", "hil/dongle_server.py", "hil/udp_server.py", "hil/serial_server.py",
-        "hil/linked_flight.py", "hil/virtual_motive.py",
-        "ground_station/mocap_udp.py", "ground_station/sources/optitrack.py",
-        "ground_station/sources/motioncapture_process.py",
+        "hil/clock.py", "hil/pictures/window.py", "hil/servers/dongle_plugin.py", "hil/servers/dongle_server.py",
+        "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py",
+        "ground_station/sources/optitrack.py", "ground_station/sources/motioncapture_process.py",
     ),
     "random": (),
     "secrets": (),
-    "numpy.random.default_rng": ("hil/harness.py",),
+    "numpy.random.default_rng": ("hil/laboratory/robot.py",),
     "numpy.random.seed": (),
     "cflib": ("ground_station/links/crazyradio.py", "ground_station/flashing.py"),
     "serial": ("ground_station/links/mavlink_serial.py",),
@@ -69,34 +83,15 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "filterpy": (),
     "motioncapture": ("ground_station/sources/motioncapture_process.py",),
     "scipy": (),
-    "perfetto": ("hil/perfetto.py",),
-    "matplotlib": (
-        "hil/figures.py", "hil/picture.py", "hil/drag_model_report.py", "hil/power_figures.py",
-        "hil/experiments/overload.py", "hil/overlays.py", "hil/study_figures.py",
-        "hil/experiments/pictures.py", "hil/experiments/power.py", "hil/experiments/take_off.py",
-    ),
-    "pyarrow": (
-        "hil/recorder.py", "hil/metrics.py", "hil/run.py", "hil/viewer.py", "hil/report.py",
-        "hil/figures.py", "hil/curves.py", "hil/schedule.py", "hil/perfetto.py",
-        "hil/compare.py", "hil/ages.py", "hil/experiments/overload.py", "hil/overlays.py",
-        "hil/picture.py", "hil/power_figures.py", "hil/experiments/experiment.py", "hil/experiments/measures.py",
-        "hil/experiments/pictures.py", "hil/experiments/airspeed.py", "hil/experiments/power.py",
-        "hil/experiments/take_off.py",
-    ),
+    "perfetto": ("hil/pictures/perfetto.py",),
+    "matplotlib": ("hil/pictures/", "hil/studies/"),
+    "pyarrow": ("hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/"),
 }  # fmt: skip
 # BLAS, LAPACK, the C library's functions and numpy's vector code have other last bits on other processors, so they
 # stay out of all that flies; these files look at what was flown.
-AFTER_THE_FLIGHT = tuple(
-    f"hil/{name}.py"
-    for name in (
-        "metrics",
-        "scene",
-        "viewer",
-        "experiments/measures",
-        "experiments/pictures",
-        "experiments/take_off",
-    )
-)
+AFTER_THE_FLIGHT = (
+    "hil/laboratory/metrics.py", "hil/pictures/", "hil/experiments/measures.py", "hil/experiments/take_off.py",
+)  # fmt: skip
 BY_PROCESSOR = """
     math.sin math.cos math.tan math.asin math.acos math.atan math.atan2 math.exp math.expm1 math.log math.log1p math.log2
     math.log10 math.pow numpy.sin numpy.cos numpy.tan numpy.arcsin numpy.arccos numpy.arctan numpy.arctan2 numpy.exp
@@ -104,10 +99,11 @@ BY_PROCESSOR = """
     numpy.matmul numpy.einsum numpy.convolve numpy.polyfit numpy.polynomial
 """.split()  # noqa: SIM905
 CONFINED |= dict.fromkeys(BY_PROCESSOR, AFTER_THE_FLIGHT)
+CONFINED["click"] = CONFINED["rich"] = ("hil/commands/", "hil/studies/sweep.py", "hil/studies/paper.py")
 CONFINED |= dict.fromkeys(
     ("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",)
 )  # of a whole flight
-NORMAL_NOISE = "hil/noise.py"
+NORMAL_NOISE = "hil/world/noise.py"
 DRAWS = (
     "standard_normal",
     "exponential",
@@ -145,6 +141,18 @@ def below(name: str, prefix: str) -> bool:
     return name == prefix or name.startswith(prefix + ".")
 
 
+def room_of(name: str) -> str:
+    return name.split(".")[1] if name.startswith("hil.") else "hil"
+
+
+def climbs(module: str, name: str) -> bool:
+    """Whether a module of hil imports from a floor that is not below its own."""
+    here, there = room_of(module), room_of(name)
+    if there not in FLOOR or here not in FLOOR or here == there or name.split(".")[2:3] == ["config"]:
+        return False
+    return FLOOR[there] >= FLOOR[here]
+
+
 def violations(path: str, source: str) -> list[str]:
     """What in a source file breaks the architecture; path is relative to the root, with slashes."""
     tree = ast.parse(source)
@@ -155,16 +163,22 @@ def violations(path: str, source: str) -> list[str]:
         if any(below(name, package) for package in PACKAGES):
             if not any(below(name, allowed) for allowed in LAYERS[layer]):
                 found.append(f"{path}:{line}: {layer} must not import {name}")
+            if climbs(module, name):
+                found.append(f"{path}:{line}: {room_of(name)} is not below {room_of(module)}")
         elif layer == "firmware_py.core" and path != SUBSET and name.split(".")[0] not in CORE_LIBRARIES:
             found.append(f"{path}:{line}: the core must not import {name}")
     for line, name in imported(tree) + used_attributes(tree):
         for confined, files in CONFINED.items():
-            if below(name, confined) and path not in files:
+            if below(name, confined) and not path.startswith(files or "-"):
                 found.append(f"{path}:{line}: {confined} belongs to {', '.join(files) or 'no file'}")
     for node in ast.walk(tree):
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult) and path not in AFTER_THE_FLIGHT:
+        if (
+            isinstance(node, ast.BinOp)
+            and isinstance(node.op, ast.MatMult)
+            and not path.startswith(AFTER_THE_FLIGHT)
+        ):
             found.append(
-                f"{path}:{node.lineno}: @ is BLAS; hil.plant.fixed_order.product has the same bits everywhere"
+                f"{path}:{node.lineno}: @ is BLAS; hil.world.fixed_order.product has the same bits everywhere"
             )
         if isinstance(node, ast.Attribute) and node.attr in DRAWS and path != NORMAL_NOISE:
             found.append(
@@ -197,21 +211,27 @@ def test_file_keeps_to_its_room(path: Path) -> None:
         ("ground_station/station.py", "from firmware_py.firmware import Firmware"),
         ("ground_station/station.py", "from hil.errors import LabError"),
         ("ground_station/tracker.py", "from firmware_py.core import maths"),
-        ("hil/harness.py", "from firmware_py.core import entry"),
-        ("hil/harness.py", "from firmware_py.tasks import estimator_task"),
-        ("hil/plant/plates.py", "from firmware_py.core.model import derivative"),
+        ("hil/laboratory/robot.py", "from firmware_py.core import entry"),
+        ("hil/laboratory/robot.py", "from firmware_py.tasks import estimator_task"),
+        ("hil/world/plant.py", "from hil.devices.imu import VirtualImu"),
+        ("hil/laboratory/flight.py", "from hil.experiments import EXPERIMENTS"),
+        ("hil/pictures/report.py", "import hil.servers.server"),
+        ("hil/deploy/check.py", "from hil.studies.paper import fly_paper"),
+        ("hil/clock.py", "from hil.config import LabConfig"),
+        ("hil/laboratory/run.py", "import click"),
+        ("hil/world/plates.py", "from firmware_py.core.model import derivative"),
         ("hil/events.py", "import threading"),
-        ("hil/report.py", "import rerun as rr"),
-        ("hil/virtual_imu.py", "import numpy as np\nrng = np.random.default_rng()"),
-        ("hil/virtual_imu.py", "from numpy.random import default_rng"),
-        ("hil/virtual_imu.py", "import random"),
-        ("hil/markers.py", "import numpy as np\nx = np.cos(1.0)"),
-        ("hil/plant/battery.py", "import math\nx = math.exp(1.0)"),
+        ("hil/pictures/report.py", "import rerun as rr"),
+        ("hil/devices/imu.py", "import numpy as np\nrng = np.random.default_rng()"),
+        ("hil/devices/imu.py", "from numpy.random import default_rng"),
+        ("hil/devices/imu.py", "import random"),
+        ("hil/devices/markers.py", "import numpy as np\nx = np.cos(1.0)"),
+        ("hil/world/battery.py", "import math\nx = math.exp(1.0)"),
         ("ground_station/trajectory.py", "from math import sin"),
-        ("hil/plant/body.py", "x = AXIS @ vector"),
-        ("hil/plant/correction.py", "import numpy as np\nx = np.polynomial.polynomial.polyfit(a, b, 3)"),
-        ("hil/rigid_body.py", "import numpy as np\nx = np.linalg.svd(a)"),
-        ("hil/virtual_mocap.py", "x = rng.standard_normal(3)"),
+        ("hil/world/body.py", "x = AXIS @ vector"),
+        ("hil/world/correction.py", "import numpy as np\nx = np.polynomial.polynomial.polyfit(a, b, 3)"),
+        ("hil/devices/rigid_body.py", "import numpy as np\nx = np.linalg.svd(a)"),
+        ("hil/devices/cameras.py", "x = rng.standard_normal(3)"),
     ],
 )
 def test_a_planted_violation_is_caught(path: str, source: str) -> None:
@@ -220,12 +240,73 @@ def test_a_planted_violation_is_caught(path: str, source: str) -> None:
 
 def test_a_legal_file_is_not_accused() -> None:
     source = "import numpy as np\nfrom ground_station.station import GroundStation\nfrom firmware_py.wire import crtp\n"
-    assert violations("hil/harness.py", source) == []
+    assert violations("hil/laboratory/robot.py", source) == []
 
 
 def test_every_confined_file_exists() -> None:
     files = {file for files in CONFINED.values() for file in files} | {SUBSET}
-    assert {file for file in files if not (ROOT / file).is_file()} == set()
+    assert {file for file in files if not (ROOT / file).exists()} == set()
+
+
+def test_every_room_has_its_floor_and_no_more_than_sixteen_files() -> None:
+    rooms = {
+        path.relative_to(ROOT / "hil").parts[0].removesuffix(".py") for path in (ROOT / "hil").rglob("*.py")
+    }
+    assert rooms - {"__init__"} == set(FLOOR)
+    assert {
+        room: len(list((ROOT / "hil" / room).glob("*.py")))
+        for room in FLOOR
+        if len(list((ROOT / "hil" / room).glob("*.py"))) > 18
+    } == {}
+
+
+def circles(imports: dict[str, set[str]]) -> list[set[str]]:
+    """The sets of modules that import one another, directly or not."""
+
+    def reach(module: str) -> set[str]:
+        seen: set[str] = set()
+        waiting = [module]
+        while waiting:
+            for name in imports[waiting.pop()] - seen:
+                seen.add(name)
+                waiting.append(name)
+        return seen
+
+    reached = {module: reach(module) for module in imports}
+    found = {frozenset(n for n in reached[m] if m in reached[n]) for m in imports if m in reached[m]}
+    return sorted(map(set, found), key=sorted)
+
+
+def imports_of_ours() -> dict[str, set[str]]:
+    """Every module and the modules of ours that it imports, also only for types."""
+    modules = {
+        path.relative_to(ROOT)
+        .as_posix()
+        .removesuffix(".py")
+        .removesuffix("/__init__")
+        .replace("/", "."): path
+        for path in sources()
+    }
+
+    def target(name: str) -> str | None:
+        return name if name in modules else next((n for n in [name.rpartition(".")[0]] if n in modules), None)
+
+    return {
+        module: {
+            found
+            for _, name in imported(ast.parse(path.read_text(encoding="utf-8")))
+            if (found := target(name)) is not None and found != module
+        }
+        for module, path in modules.items()
+    }
+
+
+def test_no_modules_import_one_another() -> None:
+    assert circles(imports_of_ours()) == []
+
+
+def test_a_planted_circle_is_found() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == [{"b", "c"}]
 
 
 def watches_the_clock(source: str) -> list[str]:

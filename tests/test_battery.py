@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
 
 from hil.experiments import EXPERIMENTS
-from hil.faults import parse
-from hil.metrics import column, free_flight
-from hil.plant.battery import Battery, BatteryConfig, endurance, open_circuit_voltage
-from hil.recorder import load_events, load_log
-from hil.run import Request, Result, fly, prepare
-from hil.specific_power import VEHICLES
+from hil.experiments.specific_power import VEHICLES
+from hil.laboratory.faults import parse
+from hil.laboratory.metrics import column, free_flight
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.world.battery import Battery, endurance, open_circuit_voltage
+from hil.world.config import BatteryConfig
 
 CONFIG = BatteryConfig()
 

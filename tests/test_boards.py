@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from firmware_py.extras import install_command
-from hil.cli import main
+from hil.commands.app import main
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.recorder import load_log
-from hil.run import Request, Result, fly, prepare
+from hil.laboratory.recorder import load_log
+from hil.laboratory.run import Request, Result, fly, prepare
 
 HOVER = EXPERIMENTS["hover"]
 DURATION_S = 1.5
@@ -68,7 +68,7 @@ def test_measured_costs_are_the_processor_time_of_the_tasks(tmp_path: Path) -> N
 
 
 def test_the_report_shows_what_the_board_takes(tmp_path: Path) -> None:
-    from hil.report import write_report
+    from hil.pictures.report import write_report
 
     go(tmp_path, "cortex-m4")
     page = write_report(tmp_path).read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from cflib.crtp.crtpstack import CRTPPacket
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.bootloader import DONE, OUT_OF_RANGE, PAGE_SIZE, Bootloader
+from hil.devices.bootloader import DONE, OUT_OF_RANGE, PAGE_SIZE, Bootloader
 
 
 class DirectLink:

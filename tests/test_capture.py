@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import to_euler_zyx
+from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.frame_rate import FrameRate
 from ground_station.sources.address import find_source, override
 from ground_station.sources.alignment import Alignment
-from ground_station.sources.config import CaptureConfig
 from hil.config import load_config
 
 QUARTER = math.pi / 2
@@ -32,12 +32,14 @@ def test_the_tunnel_is_moved_and_turned_in_the_system_s_frame() -> None:
     unturned = (1.0, 0.0, 0.0, 0.0)
     p, q = Alignment(CaptureConfig(axes="y-up")).to_world((1.0, 2.0, 3.0), unturned)
     assert (p, q) == ((1.0, -3.0, 2.0), unturned)
-    p, _ = Alignment(CaptureConfig(origin=(10.0, 20.0, 30.0))).to_world((11.0, 22.0, 33.0), unturned)
+    p, _ = Alignment(CaptureConfig(axes="z-up", origin=(10.0, 20.0, 30.0))).to_world(
+        (11.0, 22.0, 33.0), unturned
+    )
     assert p == (1.0, 2.0, 3.0)
-    p, q = Alignment(CaptureConfig(yaw=QUARTER)).to_world((1.0, 2.0, 3.0), unturned)
+    p, q = Alignment(CaptureConfig(axes="z-up", yaw=QUARTER)).to_world((1.0, 2.0, 3.0), unturned)
     assert p == pytest.approx((2.0, -1.0, 3.0))  # the tunnel's x axis is the system's y axis
     assert to_euler_zyx(q) == pytest.approx((0.0, 0.0, -QUARTER))
-    p, q = Alignment(CaptureConfig(body_offset=(1.0, 2.0, 3.0), body_yaw=QUARTER)).to_world(
+    p, q = Alignment(CaptureConfig(axes="z-up", body_offset=(1.0, 2.0, 3.0), body_yaw=QUARTER)).to_world(
         (0, 0, 0), unturned
     )
     assert p == (1.0, 2.0, 3.0)
@@ -97,19 +99,18 @@ ROOM = CaptureConfig(
     ("optitrack:10.0.0.1:1510,body=wand", {"host": "10.0.0.1", "port": 1510, "body": "wand"}),
     ("vicon:h", {"system": "vicon", "host": "h", "port": None, "multicast": False, "axes": None}),
     ("vrpn:h:3884,y-up", {"system": "vrpn", "host": "h", "port": 3884, "multicast": False, "axes": "y-up"}),
-    ("virtual", {"system": "virtual", "port": None, "multicast": False, "axes": None}),
-    ("virtual:7", {"system": "virtual", "port": 7, "multicast": False, "axes": None}),
+    ("optitrack", {"system": "optitrack"}),
 ])  # fmt: skip
 def test_the_command_line_overrides_what_it_names(text: str, changes: dict[str, object]) -> None:
     assert override(text, ROOM) == ROOM.model_copy(update=changes)
 
 
 @pytest.mark.parametrize("text", [
-    "optitrack", "optitrack:", "optitrack:h:0", "optitrack:h,body=", "optitrack:h,x", "virtual:", "virtual:x",
-    "virtual:1,2", "virtual,body=x", "vicon", "vicon:h,multicast", "qualisys:", "vrpn:h:x", "phasespace:h", "",
+    "optitrack:", "optitrack:h:0", "optitrack:h,body=", "optitrack:h,x", "virtual:1",
+    "vicon", "vicon:h,multicast", "qualisys:", "vrpn:h:x", "phasespace:h", "",
 ])  # fmt: skip
 def test_what_names_no_source_is_refused(text: str) -> None:
-    with pytest.raises(MocapError, match="expected virtual"):
+    with pytest.raises(MocapError, match="expected optitrack"):
         find_source(text, CaptureConfig())
 
 
@@ -144,10 +145,9 @@ def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (("--mocap", "replay:/nowhere"), "--mocap replay:/nowhere: /nowhere: No such file or directory"),
-    (("--mocap", "kinect:h"), "--mocap kinect:h: expected virtual[:PORT], optitrack:HOST"),
-    (("--set", "capture.system=optitrak"), "capture.system = 'optitrak': input should be 'virtual', 'optitrack'"),
+    (("--mocap", "kinect:h"), "--mocap kinect:h: expected optitrack:HOST"),
+    (("--set", "capture.system=optitrak"), "capture.system = 'optitrak': input should be 'optitrack', 'vicon'"),
     (("--set", "capture.system=qualisys", "--set", "capture.port=1"), "capture.system = qualisys: qualisys: its client"),
-    (("--mocap", "virtual:0"), "--mocap virtual:0: expected virtual"),
 ])  # fmt: skip
 def test_what_cannot_be_is_one_line_and_exit_code_two(
     monkeypatch: pytest.MonkeyPatch,

@@ -11,9 +11,9 @@ import pytest
 from command import floaty
 
 from hil.errors import LabError
-from hil.recorder import load_log
+from hil.laboratory.recorder import load_log
 
-FLOATY = (sys.executable, "-m", "hil.cli")
+FLOATY = (sys.executable, "-m", "hil.commands")
 
 
 @pytest.fixture(autouse=True)
@@ -151,10 +151,10 @@ def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "hil.viewer", raising=False)
+    monkeypatch.delitem(sys.modules, "hil.pictures.viewer", raising=False)
     assert floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--out", "run") == 0
     assert "view" in capsys.readouterr().err
     assert not Path("run/flight.rrd").exists()
     assert Path("run/report.html").exists()
-    monkeypatch.delitem(sys.modules, "hil.viewer", raising=False)
+    monkeypatch.delitem(sys.modules, "hil.pictures.viewer", raising=False)
     assert floaty(monkeypatch, "fly", "hover", "--view", "--out", "run2") == 2

@@ -13,11 +13,11 @@ from command import floaty
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.compare import Run, compare, load_run
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.recorder import load_log
-from hil.run import Request, fly, prepare
+from hil.laboratory.recorder import load_log
+from hil.laboratory.run import Request, fly, prepare
+from hil.pictures.compare import Run, compare, load_run
 
 
 def flown(folder: Path, seed: int, *overrides: str) -> Path:

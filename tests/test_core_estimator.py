@@ -31,7 +31,7 @@ from firmware_py.core.structs import (
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
 from hil.config import load_config
 from hil.experiments import Experiment
-from hil.harness import Flight
+from hil.laboratory.lockstep import lockstep_flight
 
 Vector = NDArray[np.float64]
 CONFIG = load_config()
@@ -254,14 +254,14 @@ def flight() -> list[Record]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(entry, "file_pose", listen_pose)
         patch.setattr(entry, "estimate", listen_tick)
-        flight = Flight(CONFIG, Experiment("tour", "", 10.0, {}, tour), 10.0, 3, None)
+        flight = lockstep_flight(CONFIG, Experiment("tour", "", 10.0, {}, tour), 10.0, 3, None)
         for at_us, force, torque in (
             (3_000_000, (0.3, 0.0, 0.0), (0.0, 0.0, 0.003)),
             (5_000_000, (0.0, -0.5, 0.3), (0.002, 0.0, 0.0)),
             (7_500_000, (0.0, 0.0, -0.5), (0.0, 0.001, -0.003)),
         ):
-            flight.events.at(at_us, lambda _, f=force, t=torque: flight.plant.push(f, t))
-            flight.events.at(at_us + 100_000, lambda _: flight.plant.push((0.0, 0.0, 0.0)))
+            flight.events.at(at_us, lambda _, f=force, t=torque: flight.robot.plant.push(f, t))
+            flight.events.at(at_us + 100_000, lambda _: flight.robot.plant.push((0.0, 0.0, 0.0)))
         assert flight.run().lost is None
     return records
 

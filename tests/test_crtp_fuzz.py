@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_firmware import LEVEL
 
-from firmware_py.supervisor import State
 from firmware_py.wire import WireError, crtp, localisation, memories, parameters
+from firmware_py.wire.supervisor import State
 
 BATCH = 4  # packets per millisecond: more than the delivery queue's tasks are ever given by a radio
 UPRIGHT = compress_quaternion((0, 0, 0, 1))

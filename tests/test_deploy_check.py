@@ -18,11 +18,11 @@ from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, Runner
 from firmware_py.export.c99 import translate
 from firmware_py.export.plain import PlainRunner
 from firmware_py.extras import install_command
-from hil.deploy_check import Checked, check_flight, plan
-from hil.deploy_targets import TARGETS
-from hil.faults import parse
-from hil.harness import Flight
-from hil.run import Request
+from hil.deploy.check import Checked, check_flight, plan
+from hil.deploy.targets import TARGETS
+from hil.laboratory.faults import parse
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.run import Request
 
 
 @pytest.fixture(autouse=True)
@@ -187,7 +187,7 @@ def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
     shown = capsys.readouterr().out
     [request] = plan("hover", False, "floaty", (), 1, 0.8, [parse(text) for text in SOMETHING_OF_EACH[3::2]])
     Watch.first.clear()
-    flight = Flight(
+    flight = lockstep_flight(
         request.config, request.experiment, request.duration_s, 1, None, faults=request.faults, runner=Watch
     )
     flight.run()

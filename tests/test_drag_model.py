@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hil import cli
+from hil.commands import app
 from hil.config import load_config
-from hil.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, SimplifiedModel, measure
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.plant.plant import Plant
-from hil.tunnel import TunnelConfig
+from hil.studies.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, SimplifiedModel, measure
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
 
 AZIMUTHS = np.radians((-45.0, 45.0, 135.0, -135.0))  # of the flap axes, outwards
 AXES = np.array([0.0, 0.0, 0.07])  # above the centre of mass
@@ -99,7 +98,7 @@ def test_command_writes_a_table_the_figures_and_a_page(
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["floaty", "drag-model", "--out", str(tmp_path / "out")])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        app.main()
     assert end.value.code == 0
     with (tmp_path / "out" / "drag_model.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

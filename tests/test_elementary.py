@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py import elementary
-from hil.plant import fixed_order
+from hil.world import fixed_order
 
 angles = st.floats(-1e6, 1e6)
 ULPS = 6  # ours come within 5, the C library within 1

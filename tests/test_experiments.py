@@ -19,15 +19,16 @@ from hil.experiments import EXPERIMENTS
 from hil.experiments.airspeed import LIFT_PER_RAD, attainable, hover_angle
 from hil.experiments.measures import recoveries, response, steps
 from hil.experiments.pushes import FAULTS, PUSHES
-from hil.faults import Fault
-from hil.metrics import METRICS
-from hil.picture import Picture
-from hil.plant.body import SIGNS
-from hil.plant.correction import TABLE
-from hil.plant.plant import Plant
-from hil.recorder import load_events, load_log
-from hil.run import Request, Result, fly, prepare
-from hil.tunnel import TunnelConfig
+from hil.laboratory.faults import Fault
+from hil.laboratory.metrics import METRICS
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.pictures.gallery import pictures_of
+from hil.pictures.picture import Picture
+from hil.world.body import SIGNS
+from hil.world.config import TunnelConfig
+from hil.world.correction import TABLE
+from hil.world.plant import Plant
 
 FAMILIES = ("yaw-", "height-sine", "y-square", "pushes", "side-wind-", "occlusion", "airspeed-")
 PAPER = [name for name in EXPERIMENTS if name.startswith(FAMILIES)]
@@ -155,7 +156,7 @@ def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str) -> None
     result = flown(tmp_path / "run", name, seed=7)
     assert result.passed, explain(result)
     assert result.verdicts
-    written = EXPERIMENTS[name].pictures[0].png(load_log(result.folder))
+    written = pictures_of(name)[0].png(load_log(result.folder))
     assert written.startswith(PNG)
     assert len(written) > 10_000
 
@@ -203,7 +204,7 @@ def test_a_flight_too_short_to_measure_fails_its_limits(tmp_path: Path) -> None:
         result = flown(tmp_path / name, name, duration_s=0.5)
         assert result.outcome == "completed"
         assert not result.passed, name
-        for picture in EXPERIMENTS[name].pictures:
+        for picture in pictures_of(name):
             assert picture.png(load_log(result.folder)).startswith(PNG)
 
 
@@ -233,7 +234,7 @@ def test_listing_experiments_draws_nothing() -> None:
 
 def test_trials_are_drawn_behind_the_first_flight(tmp_path: Path) -> None:
     logs = [load_log(flown(tmp_path / str(seed), "yaw-step", seed=seed).folder) for seed in (1, 2, 3)]
-    picture: Picture = EXPERIMENTS["yaw-step"].pictures[0]
+    picture: Picture = pictures_of("yaw-step")[0]
     figure = picture.draw(*logs)
     lines = figure.axes[0].get_lines()
     assert len(lines) == 4  # two trials, the flight, its target

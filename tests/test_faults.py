@@ -17,17 +17,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hil.cli import main
+from hil.commands.app import main
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, Experiment
-from hil.fault_kinds import KINDS, MARKERS_ON, Kind
-from hil.faults import Fault, check, parse, spans_of
-from hil.harness import MAVLINK, RADIO, Flight
-from hil.metrics import column
-from hil.recorder import load_events, load_log
-from hil.report import write_report
-from hil.run import Request, Result, fly, prepare, read_result
+from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind
+from hil.laboratory.faults import Fault, check, parse, spans_of
+from hil.laboratory.lockstep import MAVLINK, RADIO, lockstep_flight
+from hil.laboratory.metrics import column
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, Result, fly, prepare, read_result
+from hil.pictures.report import write_report
 
 HOVER = EXPERIMENTS["hover"]
 Settings = tuple[str, ...]
@@ -124,10 +124,11 @@ def test_a_wrong_fault_is_one_line_and_exit_code_two(
     assert os.listdir() == []
 
 
-@pytest.mark.parametrize("link", ["udp://127.0.0.1:19850", "mavlink:pty", "radio://0/80/2M/E7E7E7E7E7"])
-def test_a_paced_link_refuses_faults(link: str) -> None:
-    with pytest.raises(LabError, match="in lockstep only"):
-        Request.of(HOVER, link=link, faults=[parse("push.x@1")])
+@pytest.mark.parametrize("link", ["radio", "udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"])
+def test_a_fault_of_the_radio_acts_on_every_radio_and_on_no_serial_line(link: str) -> None:
+    check([parse("radio.cut@1")], 3.0, link, markers=False)
+    with pytest.raises(LabError, match="acts with --link mavlink only"):
+        check([parse("serial.cut@1")], 3.0, link, markers=False)
 
 
 def test_a_radio_fault_is_refused_on_the_serial_line() -> None:
@@ -336,10 +337,10 @@ def test_every_kind_has_a_sign() -> None:
 
 
 def test_a_sagging_battery_is_what_the_board_reads() -> None:
-    flight = Flight(load_config(), HOVER, 3.0, 1, None, faults=[parse("battery.sag@1:1=0.5")])
+    flight = lockstep_flight(load_config(), HOVER, 3.0, 1, None, faults=[parse("battery.sag@1:1=0.5")])
     read: list[int] = []
     for moment_us in (1_999_000, 2_050_000, 2_999_000, 3_050_000):
-        flight.events.at(moment_us, lambda _: read.append(flight.board.read_battery_mv()))
+        flight.events.at(moment_us, lambda _: read.append(flight.robot.board.read_battery_mv()))
     flight.run()
     before, *sagging, after = read
     assert sagging == pytest.approx([before - 500] * 2, abs=80)  # the flaps' load comes and goes
@@ -357,35 +358,35 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
         "servo.stuck.1@0.4:0.1",
     ]
     config = load_config("floaty", ["tunnel.side_wind=[0.1, 0.2, 0.3]", "actuators.speed=[0.8, 1, 1, 1]"])
-    flight = Flight(config, HOVER, 2.0, 1, None, faults=[parse(text) for text in texts])
+    flight = lockstep_flight(config, HOVER, 2.0, 1, None, faults=[parse(text) for text in texts])
     wind: list[float] = []
     pace: list[float] = []
 
     def look(_: int) -> None:
-        wind.append(flight.plant.tunnel.side_wind[1])
-        pace.append(float(flight.plant.servo_speed[0]))
+        wind.append(flight.robot.plant.tunnel.side_wind[1])
+        pace.append(float(flight.robot.plant.servo_speed[0]))
 
     for moment in (0.1, 0.3, 0.45, 0.7, 0.9, 1.1):
         flight.events.at(flight.release_us + round(moment * 1e6), look)
     flight.run()
     assert wind == pytest.approx([0.2, 1.2, 3.2, 3.2, 2.2, 0.2])
     assert pace == pytest.approx([0.8, 0.4, 0.0, 0.4, 0.8, 0.8])
-    assert flight.plant.tunnel.side_wind == (0.1, 0.2, 0.3)
+    assert flight.robot.plant.tunnel.side_wind == (0.1, 0.2, 0.3)
 
 
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])
 def test_a_fault_turns_its_own_knobs_and_no_other(link: str) -> None:
     """Every knob stands away from where it rests, so that one that is put back shows."""
-    flight = Flight(load_config("floaty", [MARKERS_ON]), HOVER, 1.0, 1, None, link=link)
+    flight = lockstep_flight(load_config("floaty", [MARKERS_ON]), HOVER, 1.0, 1, None, link=link)
     kinds = [kind for kind in KINDS.values() if kind.link in ("", link)]
     knobs = list(dict.fromkeys(knob for kind in kinds for knob in kind.knobs))
 
     def turn(kind: Kind, share: float) -> None:
         for knob in kind.knobs:
-            knob.turn(flight, knob.blend(knob.read(flight), kind.scale * kind.size * share))
+            knob.turn(flight.robot, knob.blend(knob.read(flight.robot), kind.scale * kind.size * share))
 
     def readings() -> list[float]:
-        return [knob.read(flight) for knob in knobs]
+        return [knob.read(flight.robot) for knob in knobs]
 
     for kind in kinds:
         if kind.size != 0.0:  # a servo that is stuck has no pace to be changed
@@ -398,12 +399,12 @@ def test_a_fault_turns_its_own_knobs_and_no_other(link: str) -> None:
 
 
 def test_what_changed_between_two_faults_stays_changed() -> None:
-    flight = Flight(
+    flight = lockstep_flight(
         load_config(), HOVER, 1.0, 1, None, faults=[parse("wind.fan@0.1:0.1=0.9"), parse("wind.fan@0.5:0.1=0.9")]
     )  # fmt: skip
-    flight.events.at(1_300_000, lambda _: flight.plant.tunnel.set_fan_factor(1.1))
+    flight.events.at(1_300_000, lambda _: flight.robot.plant.tunnel.set_fan_factor(1.1))
     flight.run()
-    assert flight.plant.tunnel.fan_factor == 1.1
+    assert flight.robot.plant.tunnel.fan_factor == 1.1
 
 
 def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> None:
@@ -527,7 +528,7 @@ def test_the_watchdog_ends_a_flight_whose_processor_is_taken(tmp_path: Path) -> 
 def test_report_and_recording_show_the_faults(tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 
-    from hil.viewer import write_run_rrd
+    from hil.pictures.viewer import write_run_rrd
 
     folder = go(tmp_path / "run", "push.x@0.3=0.5", "servo.slow.2@0.5", duration_s=1.0).folder
     page = write_report(folder).read_text(encoding="utf-8")

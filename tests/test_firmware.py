@@ -9,8 +9,8 @@ from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.drivers.imu import SAMPLES, GyroZero
 from firmware_py.errors import FirmwareError
 from firmware_py.firmware import MEASUREMENT_QUEUE, Firmware
-from firmware_py.supervisor import State
 from firmware_py.wire import crtp, telemetry
+from firmware_py.wire.supervisor import State
 from hil.config import load_config
 from hil.events import EventQueue
 

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from hil.noise import STEPS, normal
-from hil.plant.fixed_order import eigen, fit_polynomial, product
+from hil.world.fixed_order import eigen, fit_polynomial, product
+from hil.world.noise import STEPS, normal
 
 shapes = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))
 seeds = st.integers(0, 2**32)

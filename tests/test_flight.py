@@ -11,12 +11,12 @@ from hil.clock import FreeRunning, Paced
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
-from hil.faults import parse
-from hil.harness import Flight
-from hil.metrics import METRICS, column, judge
-from hil.recorder import load_events, load_log
-from hil.report import write_report
-from hil.run import Request, Result, fly, prepare, read_result
+from hil.laboratory.faults import parse
+from hil.laboratory.flight import Flight
+from hil.laboratory.metrics import METRICS, column, judge
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, Result, fly, prepare, read_result
+from hil.pictures.report import write_report
 
 HOVER = EXPERIMENTS["hover"]
 
@@ -150,7 +150,7 @@ def test_ctrl_c_keeps_what_was_flown(tmp_path: Path) -> None:
 def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -> None:
     def sabotage(now_us: int, flight: Flight) -> None:
         if now_us > 1_500_000:
-            flight.board.read_imu = lambda: None  # type: ignore[method-assign,assignment,return-value]
+            flight.robot.board.read_imu = lambda: None  # type: ignore[method-assign,assignment,return-value]
 
     request = Request(HOVER, load_config(), "floaty", (), 1, 30.0)
     prepare(tmp_path / "run")

@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.scalars import Scalar
+from ground_station.config import StationConfig, TrackerConfig
 from ground_station.corrections import correct
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
-from ground_station.station import GroundStation, StationConfig
+from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
-from ground_station.tracker import Quality, Tracker, TrackerConfig
+from ground_station.tracker import Quality, Tracker
 from ground_station.trajectory import Goal, Hold, Offsets, Sine, Square, Step
 
 HOME = Goal((0.0, 0.0, 1.15), 0.0)

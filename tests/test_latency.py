@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 
 from firmware_py.signals import COUNTERS
 from ground_station.clock import clock_us
+from ground_station.config import CaptureConfig
 from ground_station.latency import SENT_POSES, LatencyBudget, LinkLatency, budget_line, budget_of, row_of
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
-from ground_station.sources.config import CaptureConfig
-from hil.ages import ages_of, told
 from hil.config import load_config
-from hil.dongle_server import Readers
 from hil.experiments import EXPERIMENTS
-from hil.harness import MAVLINK, RADIO, Flight
-from hil.recorder import load_log
-from hil.run import Request, fly, prepare
-from hil.virtual_motive import Streaming, VirtualMotive
+from hil.laboratory.ages import ages_of, told
+from hil.laboratory.lockstep import MAVLINK, RADIO, lockstep_flight
+from hil.laboratory.recorder import load_log
+from hil.laboratory.run import Request, fly, prepare
+from hil.servers.dongle_server import Readers
+from hil.servers.motive import Streaming, VirtualMotive
 
 HOME = (0.0, 0.0, 1.15)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -75,22 +75,22 @@ def test_the_budget_forgets_what_is_long_ago() -> None:
 def test_the_age_on_board_is_the_true_one_while_the_latency_changes(link: str) -> None:
     """A pose that the estimator thinks to be so old was sent: poses are 20 ms apart."""
     config = load_config("floaty", ["radio.uplink_loss=0", "radio.downlink_loss=0"])
-    flight = Flight(config, HOVER, 3.0, 1, None, link=link)
+    flight = lockstep_flight(config, HOVER, 3.0, 1, None, link=link)
     rng = np.random.default_rng(1)
     exposed_us: list[int] = []
     fused_us: list[int] = []  # exposures, as the board has them
-    on_frame = flight.station.on_frame
+    on_frame = flight.line.station.on_frame
 
     def send(frame: MocapFrame, now_us: int) -> None:
-        sent = flight.station.counters.sent
+        sent = flight.line.station.counters.sent
         on_frame(frame, now_us)
-        if flight.station.counters.sent > sent:
+        if flight.line.station.counters.sent > sent:
             exposed_us.append(frame.t_us)
-        flight.mocap.more_latency_us = rng.uniform(0.0, 25_000.0)
+        flight.robot.mocap.more_latency_us = rng.uniform(0.0, 25_000.0)
 
     def look(now_us: int) -> None:
         """At the end of a tick: the age is that at the estimator's next step, at 9 ms of every 10."""
-        age_us = int(flight.firmware.signals.counters[COUNTERS.index("pose_age_us")])
+        age_us = int(flight.robot.firmware.signals.counters[COUNTERS.index("pose_age_us")])
         tick = now_us // 1000
         step_us = 1000 * (tick + (9 - tick) % 10)
         if now_us > 1_500_000 and age_us != last[0]:
@@ -98,7 +98,7 @@ def test_the_age_on_board_is_the_true_one_while_the_latency_changes(link: str) -
         last[0] = age_us
 
     last = [0]
-    flight.station.on_frame = send  # type: ignore[method-assign]
+    flight.line.station.on_frame = send  # type: ignore[method-assign]
     flight.events.every(1000, 999, look)
     flight.run()
     assert len(fused_us) > 60

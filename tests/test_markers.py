@@ -12,16 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from ground_station.mocap import MocapFrame
 from hil.config import load_config
+from hil.devices.cameras import VirtualMocap
+from hil.devices.config import MarkersConfig, MocapConfig
+from hil.devices.markers import COUNT, TRUNK_RADIUS, Cameras, Sighting, marker_places
+from hil.devices.rigid_body import GHOST_REACH, NOISE_ROWS, WORST_PAIR, RigidBody, VirtualMarkers
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.harness import Flight
-from hil.markers import COUNT, TRUNK_RADIUS, Cameras, MarkersConfig, Sighting, marker_places
-from hil.plant.body import AXIS, MIRRORS
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.plant.plant import Plant
-from hil.rigid_body import GHOST_REACH, NOISE_ROWS, WORST_PAIR, RigidBody, VirtualMarkers
-from hil.tunnel import TunnelConfig
-from hil.virtual_mocap import MocapConfig, VirtualMocap
+from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import lockstep_flight
+from hil.world.body import AXIS, MIRRORS
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
 
 ON = MarkersConfig(enabled=True)
 EXACT = MarkersConfig(enabled=True, noise=0.0)
@@ -330,7 +331,7 @@ def frames(count: int, seed: int = 1, **knobs: float) -> list[tuple[MocapFrame, 
     mocap = VirtualMocap(MocapConfig(), np.random.default_rng(seed), markers(seed=seed))
     for name, value in knobs.items():
         setattr(mocap, name, value)
-    return [(mocap.expose(5000 * i, plant), mocap.sighting) for i in range(count)]
+    return [(mocap.expose(5000 * i, plant)[0], mocap.sighting) for i in range(count)]
 
 
 def test_a_frame_carries_the_pose_that_the_markers_make() -> None:
@@ -363,7 +364,7 @@ def test_markers_leave_all_other_randomness_as_it_was() -> None:
     seen: list[list[object]] = []
     for on in ("false", "true"):
         settings = [f"markers.enabled={on}", "mocap.dropout=0.5"]
-        flight = Flight(load_config("floaty", settings), EXPERIMENTS["hover"], 0.1, 1, None)
+        flight = lockstep_flight(load_config("floaty", settings), EXPERIMENTS["hover"], 0.1, 1, None)
         rows: list[object] = []
         for moment_us in range(10_000, 1_000_000, 45_000):
             flight.events.at(moment_us, lambda _, flight=flight, rows=rows: rows.append(random_parts(flight)))
@@ -373,4 +374,4 @@ def test_markers_leave_all_other_randomness_as_it_was() -> None:
 
 
 def random_parts(flight: Flight) -> tuple[object, ...]:
-    return flight.plant.flow_W.tolist(), flight.board.imu, flight.radio.up.sent
+    return flight.robot.plant.flow_W.tolist(), flight.robot.board.imu, flight.line.radio.up.sent

@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 from test_firmware import LEVEL, Bench
 
 from firmware_py.firmware import Firmware
-from firmware_py.supervisor import Cause, State
 from firmware_py.wire import telemetry
+from firmware_py.wire.supervisor import Cause, State
 from hil.config import load_config
+from hil.devices.board import VirtualBoard
+from hil.devices.config import SerialConfig
+from hil.devices.uart import VirtualSerial
 from hil.events import EventQueue
-from hil.virtual_board import VirtualBoard
-from hil.virtual_serial import SerialConfig, VirtualSerial
 
 DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
 IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
@@ -170,7 +171,7 @@ def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us
     line = VirtualSerial(SerialConfig(baud=baud), events, np.random.default_rng(1))
     board = VirtualBoard(lambda *servo: None, lambda *radio: True, lambda *console: None, line)
     firmware = Firmware(load_config(), board, mavlink=True)
-    board.run_on(firmware.kernel, events)
+    board.run_on(firmware.kernel, events, 0)
     station, parser, ages_ms = codec(255, 190), codec(0, 0), []
     lag_us, ahead_us = 20_000, 123_456_789_000
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mavlink_client import STATION, Client, codec
 
-from firmware_py.supervisor import State
+from firmware_py.wire.supervisor import State
 
 BATCH = 4  # messages per millisecond: twice what 921600 baud can carry
 COMMANDS = (185, 245, 400, 410, 510, 511, 512, 519, 520)

@@ -14,15 +14,16 @@ from scipy.spatial.transform import Rotation
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import BLOCKS
+from ground_station.config import StationConfig
 from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
 from ground_station.mocap import MocapFrame
-from ground_station.station import GroundStation, StationConfig
+from ground_station.station import GroundStation
 from ground_station.trajectory import Goal, Hold
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.harness import MAVLINK, Flight
+from hil.laboratory.lockstep import MAVLINK, lockstep_flight
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
@@ -346,13 +347,13 @@ def test_the_budget_of_the_uplink_is_what_the_link_sends():
 
 @pytest.mark.parametrize("baud", [57_600, 921_600])
 def test_the_budget_of_the_downlink_is_what_the_board_sends(baud):
-    flight = Flight(
+    flight = lockstep_flight(
         load_config("floaty", (f"serial.baud={baud}",)), EXPERIMENTS["hover"], 6.0, 1, None, link=MAVLINK
     )
     begun = []
-    flight.events.at(2_000_000, lambda now_us: begun.append(flight.serial.uart.down.sent_bytes))
+    flight.events.at(2_000_000, lambda now_us: begun.append(flight.robot.uart.down.sent_bytes))
     assert flight.run().lost is None
-    sent = flight.serial.uart.down.sent_bytes - begun[0]
+    sent = flight.robot.uart.down.sent_bytes - begun[0]
     assert sent / 5.0 == pytest.approx(link_budget(baud, 50.0).down_load * baud / 10, rel=0.04)
 
 

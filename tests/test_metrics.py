@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx
-from hil.metrics import attitude_error, position_error
+from hil.laboratory.metrics import attitude_error, position_error
 
 length, angle, tilt = st.floats(-3.0, 3.0), st.floats(-pi, pi), st.floats(-1.2, 1.2)
 place = st.tuples(length, length, length)

@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from natnet_packets import VERSIONS
 
+from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.natnet import Echo, Frame, ModelDefinition, Other, ServerInfo, decode
 from ground_station.natnet_stream import NatnetStream
 from ground_station.sources.alignment import Alignment
-from ground_station.sources.config import CaptureConfig
 
 PACKETS = int(os.environ.get("FLOATY_FUZZ", "20000"))
 TICKS = (100, 200, 300)

@@ -6,15 +6,15 @@ from pathlib import Path
 import natnet_packets as packets
 import numpy as np
 
+from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapFrame
 from ground_station.natnet_stream import NatnetStream
 from ground_station.sources.alignment import Alignment
-from ground_station.sources.config import CaptureConfig
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.harness import Flight
-from hil.metrics import judge, measure
-from hil.recorder import Recorder, load_log
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.metrics import judge, measure
+from hil.laboratory.recorder import Recorder, load_log
 
 V = (4, 1)
 AHEAD_US = 7_000_000_000  # of Motive's clock
@@ -28,7 +28,9 @@ class NatnetFlight:
     """Hover on frames that go through `network` as NatNet, in axes with z up; the station's requests are answered."""
 
     def __init__(self, network: Network, duration_s: float, *overrides: str) -> None:
-        self.flight = Flight(load_config("floaty", overrides), EXPERIMENTS["hover"], duration_s, 1, None)
+        self.flight = lockstep_flight(
+            load_config("floaty", overrides), EXPERIMENTS["hover"], duration_s, 1, None
+        )
         self.stream = NatnetStream("floaty", Alignment(CaptureConfig(axes="z-up")))
         self.stream.on_packet(packets.server_info(V), 0)
         self.stream.on_packet(packets.model_definition({"wand": 3, "floaty": 7}, V), 0)
@@ -36,12 +38,12 @@ class NatnetFlight:
         self.exposed_us: list[int] = []
         self._network = network
         self._number = 0
-        self._on_frame = self.flight.station.on_frame
-        self.flight.station.on_frame = self._transmit  # type: ignore[method-assign]
+        self._on_frame = self.flight.line.station.on_frame
+        self.flight.line.station.on_frame = self._transmit  # type: ignore[method-assign]
         self.flight.events.every(10_000, 5_000, self._look)
 
     def _look(self, now_us: int) -> None:
-        state = self.flight.firmware.signals.supervisor.state.name
+        state = self.flight.robot.firmware.signals.supervisor.state.name
         if not self.states or self.states[-1][1] != state:
             self.states.append((now_us, state))
 
@@ -125,7 +127,7 @@ def test_a_body_that_is_taken_out_in_flight_is_failsafe_and_one_line(tmp_path: P
     lab = NatnetFlight(lambda now_us, data: [data], 3.0, "flight.release_us=5000000")
     rename = packets.model_definition({"wand": 3}, V)
     lab.flight.events.at(2_000_000, lambda now_us: lab.stream.on_packet(rename, now_us) and None)
-    lab.flight.end_us = 3_000_000
+    lab.flight.lab.end_us = 3_000_000
     lab.fly(tmp_path)
     assert lab.states[-1][1] == FAILSAFE
     assert lab.stream.notices == ["motion capture: no body 'floaty'; there are: wand"]

@@ -11,13 +11,13 @@ from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
 
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.experiments.experiment import Experiment
-from hil.harness import Flight
-from hil.perfetto import write_perfetto
-from hil.recorder import load_events, load_log
-from hil.report import write_report
-from hil.run import Request, Result, fly, prepare
-from hil.schedule import load_schedule, runs
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.flight import Flight
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.schedule import load_schedule, runs
+from hil.pictures.perfetto import write_perfetto
+from hil.pictures.report import write_report
 
 
 def go(
@@ -74,7 +74,7 @@ def test_without_costs_no_time_is_spent(tmp_path: Path) -> None:
 
 def test_a_task_that_never_ends_with_interrupts_off_is_named_by_the_watchdog(tmp_path: Path) -> None:
     def seize(flight: Flight) -> None:
-        kernel = flight.firmware.kernel
+        kernel = flight.robot.firmware.kernel
 
         def rogue() -> Generator[int, None, None]:
             yield from kernel.delay(1500)
@@ -94,7 +94,7 @@ def test_a_task_that_never_ends_with_interrupts_off_is_named_by_the_watchdog(tmp
 
 def test_a_critical_section_that_ends_costs_samples_and_nothing_else(tmp_path: Path) -> None:
     def pause(flight: Flight) -> None:
-        kernel = flight.firmware.kernel
+        kernel = flight.robot.firmware.kernel
 
         def rude() -> Generator[int, None, None]:
             yield from kernel.delay(1500)
@@ -114,10 +114,10 @@ def test_a_critical_section_that_ends_costs_samples_and_nothing_else(tmp_path: P
 def test_a_task_that_raises_is_named_and_the_log_is_there(tmp_path: Path) -> None:
     def plant_bug(flight: Flight) -> None:
         def buggy() -> Generator[int, None, None]:
-            yield from flight.firmware.kernel.delay(1205)
+            yield from flight.robot.firmware.kernel.delay(1205)
             raise ZeroDivisionError("bug")
 
-        flight.firmware.kernel.create_task("BUGGY", 1, buggy)
+        flight.robot.firmware.kernel.create_task("BUGGY", 1, buggy)
 
     result = go(tmp_path, hover(plant_bug), 5.0)
     assert result.outcome == "error"
@@ -128,7 +128,7 @@ def test_a_task_that_raises_is_named_and_the_log_is_there(tmp_path: Path) -> Non
 
 def test_an_overflowing_queue_is_counted_with_its_time(tmp_path: Path) -> None:
     def starve(flight: Flight) -> None:
-        flight.firmware.add_thief().share = 0.93
+        flight.robot.thief.share = 0.93
 
     result = go(tmp_path, hover(starve), 2.0)
     queue = next(queue for queue in result.queues if queue.name == "measurements")
@@ -143,7 +143,7 @@ def test_a_full_queue_is_noted_again_only_when_it_dropped_more(tmp_path: Path) -
     """Starved from 0.5 s to 2.5 s, then never again; each note says more than the last, and the last says it all."""
 
     def starve(flight: Flight) -> None:
-        thief = flight.thief
+        thief = flight.robot.thief
         flight.events.at(500_000, lambda _: setattr(thief, "share", 0.93))
         flight.events.at(2_500_000, lambda _: setattr(thief, "share", 0.0))
 

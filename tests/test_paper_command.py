@@ -16,11 +16,11 @@ from command import floaty
 from test_report import Page
 
 from hil.experiments import EXPERIMENTS
-from hil.metrics import METRICS, Verdict
-from hil.paper import Paper, Spread, Trials
-from hil.paper_rows import OUTSIDE, ROWS, Claim, Row
-from hil.run import Request, Result, fly, prepare
-from hil.studies import PROFILES
+from hil.laboratory.metrics import METRICS, Verdict
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.studies.catalogue import PROFILES
+from hil.studies.paper import Paper, Spread, Trials
+from hil.studies.paper_rows import OUTSIDE, ROWS, Claim, Row
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +195,7 @@ def test_ctrl_c_keeps_what_was_flown_and_writes_the_report(tmp_path: Path) -> No
     command = [
         sys.executable,
         "-m",
-        "hil.cli",
+        "hil.commands",
         "paper",
         "--only",
         "hover",

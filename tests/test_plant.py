@@ -13,9 +13,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from hil.errors import LabError
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.plant.plant import Plant
-from hil.tunnel import TunnelConfig
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
 
 VECTORS = json.loads((Path(__file__).parent / "vectors" / "plant.json").read_text())
 CALM = TunnelConfig(turbulence="none")

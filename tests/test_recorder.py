@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 from hil.errors import LabError
-from hil.recorder import Channel, Quantity, Recorder, load_events, load_log
+from hil.laboratory.recorder import Channel, Quantity, Recorder, load_events, load_log
 
 
 def make(folder: Path, values: np.ndarray) -> Recorder:

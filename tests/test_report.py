@@ -11,19 +11,19 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-import hil.report
+import hil.pictures.report
 from ground_station.latency import STAGES
 from ground_station.telemetry_log import TELEMETRY
-from hil import ages
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.figures import PICTURES, way
-from hil.metrics import METRICS
-from hil.recorder import load_log
-from hil.report import metric_rows, write_report
-from hil.run import Request, fly, prepare, read_result
-from hil.schedule import load_schedule
+from hil.laboratory import ages
+from hil.laboratory.metrics import METRICS
+from hil.laboratory.recorder import load_log
+from hil.laboratory.run import Request, fly, prepare, read_result
+from hil.laboratory.schedule import load_schedule
+from hil.pictures.figures import PICTURES, way
+from hil.pictures.report import metric_rows, write_report
 
 
 class Page(HTMLParser):
@@ -69,7 +69,9 @@ class Page(HTMLParser):
 
 def report(folder: Path) -> Page:
     page = Page(write_report(folder).read_text(encoding="utf-8"))
-    drawn = [picture for picture in hil.report.PICTURES if picture.needs in load_log(folder).column_names]
+    drawn = [
+        picture for picture in hil.pictures.report.PICTURES if picture.needs in load_log(folder).column_names
+    ]
     others = [table for table in (ages.told(folder), load_schedule(folder)) if table.num_rows]
     assert len(page.pictures) == len(drawn) + len(others)
     assert all(picture.startswith(b"\x89PNG\r\n\x1a\n") for picture in page.pictures)
@@ -96,7 +98,7 @@ def folder(flown: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """For pages whose figures are another test's subject."""
-    monkeypatch.setattr(hil.report, "PICTURES", PICTURES[:1])
+    monkeypatch.setattr(hil.pictures.report, "PICTURES", PICTURES[:1])
 
 
 def change_result(folder: Path, **changes: Any) -> None:

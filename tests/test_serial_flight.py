@@ -10,13 +10,13 @@ import pytest
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.figures import PICTURES
-from hil.harness import MAVLINK
-from hil.metrics import column
-from hil.recorder import load_events, load_log
-from hil.run import Request, Result, fly, prepare
+from hil.laboratory.lockstep import MAVLINK
+from hil.laboratory.metrics import column
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.pictures.figures import PICTURES
 
-FLOATY = (sys.executable, "-m", "hil.cli")
+FLOATY = (sys.executable, "-m", "hil.commands")
 KEY = "5a" * 32
 
 

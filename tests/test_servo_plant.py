@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.plant.plant import Plant
-from hil.plant.servos import commanded_angles, next_period_us
-from hil.tunnel import TunnelConfig
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
+from hil.world.servos import commanded_angles, next_period_us
 
 ROWS = json.loads((Path(__file__).parent / "vectors" / "servo_angles.json").read_text())["rows"]
 HOVER = math.radians(25) * np.array([1, -1, 1, -1])

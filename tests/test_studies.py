@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from hil.cli import main
+from hil.commands.app import main
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.faults import parse
-from hil.run import Request, Result, fly, prepare
-from hil.studies import STUDIES
-from hil.study import Change, Expected, Study, Variant
-from hil.study_figures import picture
-from hil.study_run import OUTCOMES, Cell, Curve, StudyResult, flights_of, outcome_of, summarise
+from hil.laboratory.faults import parse
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.studies.catalogue import STUDIES
+from hil.studies.study import Change, Expected, Study, Variant
+from hil.studies.study_figures import picture
+from hil.studies.study_run import OUTCOMES, Cell, Curve, StudyResult, flights_of, outcome_of, summarise
 
 
 def flight(

@@ -10,8 +10,9 @@ from crtp_client import LOC, LOG, PARAM, SUPERVISOR, Client
 from test_firmware import HOVER_COUNTS, LEVEL
 
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
-from firmware_py.supervisor import Cause, Manual, State, Supervisor
+from firmware_py.supervisor import Manual, Supervisor
 from firmware_py.wire import crtp
+from firmware_py.wire.supervisor import Cause, State
 from hil.config import load_config
 
 OFF_CENTRE = (0.0, 0.04, 0.02)

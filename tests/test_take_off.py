@@ -9,12 +9,11 @@ from scipy.integrate import solve_ivp
 
 from hil.experiments import EXPERIMENTS
 from hil.experiments.take_off import CONTROLLER_ON, FANS_OFF, LANDING_FROM, STANDING_Z
-from hil.metrics import column, free_flight
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.plant.plant import Plant
-from hil.recorder import load_events, load_log
-from hil.run import Request, Result, fly, prepare
-from hil.tunnel import TunnelConfig
+from hil.laboratory.metrics import column, free_flight
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 GROUND = PlantConfig().ground

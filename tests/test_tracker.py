@@ -14,9 +14,10 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from ground_station.config import TrackerConfig
 from ground_station.mocap import MocapFrame
 from ground_station.pose_filter import PoseFilter
-from ground_station.tracker import FIT_US, Quality, Tracker, TrackerConfig, tracker_of
+from ground_station.tracker import FIT_US, Quality, Tracker, tracker_of
 
 PERIOD_US = 5000
 CONFIG = TrackerConfig()

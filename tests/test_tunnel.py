@@ -7,10 +7,9 @@ import pytest
 from pydantic import ValidationError
 
 from hil.errors import LabError
-from hil.plant import layout as at
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.plant.plant import Plant
-from hil.tunnel import TunnelConfig
+from hil.world import layout as at
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 

@@ -21,21 +21,21 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
-from firmware_py.supervisor import State
-from hil import curves, scene, viewer, window
+from firmware_py.wire.supervisor import State
 from hil.config import load_config
+from hil.devices.markers import marker_places
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.fault_kinds import MARKERS_ON
-from hil.faults import parse
-from hil.markers import marker_places
-from hil.metrics import column
-from hil.plant import layout as at
-from hil.plant.body import place_plates
-from hil.plant.config import PlantConfig
-from hil.recorder import load_events, load_log
-from hil.run import Request, fly, prepare
-from hil.schedule import SCHEMA
+from hil.laboratory.fault_kinds import MARKERS_ON
+from hil.laboratory.faults import parse
+from hil.laboratory.metrics import column
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.schedule import SCHEMA
+from hil.pictures import curves, scene, viewer, window
+from hil.world import layout as at
+from hil.world.body import place_plates
+from hil.world.config import PlantConfig
 
 angles = st.floats(-1.5, 1.5)
 
@@ -191,9 +191,9 @@ def test_without_a_display_the_error_says_so(folder: Path, monkeypatch: pytest.M
 
 def test_without_rerun_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "hil.viewer")
+    monkeypatch.delitem(sys.modules, "hil.pictures.viewer")
     with pytest.raises(LabError, match=r"pip install .*rerun-sdk"):
-        importlib.import_module("hil.viewer")
+        importlib.import_module("hil.pictures.viewer")
 
 
 def test_a_full_feed_drops_the_oldest_and_never_waits() -> None:

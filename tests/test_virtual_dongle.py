@@ -8,10 +8,11 @@ import pytest
 from cflib.crtp.radiodriver import _RadioDriverThread
 from cflib.drivers.crazyradio import _radio_ack
 
+from hil.devices.config import RadioConfig
+from hil.devices.dongle import VirtualDongle
+from hil.devices.nrf51 import RESET_DELAY_US, Nrf51, Power, RadioSettings
+from hil.devices.radio import Air, exchange_us
 from hil.events import EventQueue
-from hil.nrf51 import RESET_DELAY_US, Nrf51, Power, RadioSettings
-from hil.virtual_dongle import VirtualDongle
-from hil.virtual_radio import RadioConfig, exchange_us
 
 ADDRESS = bytes.fromhex("E7E7E7E7E7")
 CHIP = bytes.fromhex("0110A7F10AC0")
@@ -55,7 +56,14 @@ class Bench:
         self.events = EventQueue()
         self.stms = [Stm() for _ in range(boards)]
         self.boards = [
-            Nrf51(RadioSettings(80, 2_000_000, ADDRESS[:4] + bytes((0xE7 - n,))), CHIP, 8, self.events, stm)
+            Nrf51(
+                RadioSettings(80, 2_000_000, ADDRESS[:4] + bytes((0xE7 - n,))),
+                CHIP,
+                8,
+                self.events,
+                stm,
+                Air.of(config),
+            )
             for n, stm in enumerate(self.stms)
         ]
         self.dongle = VirtualDongle(config, self.events, np.random.default_rng(seed), self.boards)

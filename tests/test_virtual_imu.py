@@ -7,11 +7,11 @@ import pytest
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
+from hil.devices.config import ImuConfig
+from hil.devices.imu import VirtualImu
 from hil.errors import LabError
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.plant.plant import Plant
-from hil.tunnel import TunnelConfig
-from hil.virtual_imu import ImuConfig, VirtualImu
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
 
 GYRO_LSB = math.radians(2000 / 32768)  # [rad/s] data sheet
 ACCEL_LSB = 24 * 9.81 / 32768  # [m/s2] data sheet

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ground_station.mocap import MocapFrame
-from hil.plant.config import PlantConfig, ServoConfig
-from hil.plant.plant import Plant
-from hil.tunnel import TunnelConfig
-from hil.virtual_mocap import MocapConfig, VirtualMocap
+from hil.devices.cameras import VirtualMocap
+from hil.devices.config import MocapConfig
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
 
 TURN = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
 PLACE = (0.1, 0.2, 0.3)
@@ -25,7 +25,7 @@ def make_plant() -> Plant:
 
 def frames(count: int, config: MocapConfig, seed: int = 1) -> list[MocapFrame]:
     plant, mocap = make_plant(), VirtualMocap(config, np.random.default_rng(seed))
-    return [mocap.expose(5000 * i, plant) for i in range(count)]
+    return [mocap.expose(5000 * i, plant)[0] for i in range(count)]
 
 
 def test_frames_carry_the_exposure_and_white_noise_of_the_specification() -> None:
@@ -70,18 +70,18 @@ def test_lost_frames_leave_the_wrong_ones_as_they_were() -> None:
 def test_wrong_positions_lie_off_by_their_size_in_all_directions() -> None:
     plant, mocap = make_plant(), VirtualMocap(MocapConfig(), np.random.default_rng(1))
     mocap.wrong_by = 0.3
-    off = np.array([mocap.expose(5000 * i, plant).p_WB for i in range(500)]) - PLACE
+    off = np.array([mocap.expose(5000 * i, plant)[0].p_WB for i in range(500)]) - PLACE
     assert np.linalg.norm(off, axis=1) == pytest.approx(np.full(500, 0.3), abs=0.004)
     assert np.abs(off.mean(axis=0)).max() < 0.03
     mocap.wrong_by = 0.0
-    assert math.dist(mocap.expose(2_500_000, plant).p_WB, PLACE) < 0.004
+    assert math.dist(mocap.expose(2_500_000, plant)[0].p_WB, PLACE) < 0.004
 
 
 def test_swapped_markers_turn_the_pose_about_its_own_z_and_shift_it_along_its_x() -> None:
     plant = make_plant()
     plain, swapped = (VirtualMocap(MocapConfig(), np.random.default_rng(1)) for _ in range(2))
     swapped.swapped_by = 0.1
-    right, wrong = plain.expose(0, plant), swapped.expose(0, plant)
+    right, wrong = plain.expose(0, plant)[0], swapped.expose(0, plant)[0]
     q_WB, q_WS = (Rotation.from_quat(frame.q_WB, scalar_first=True) for frame in (right, wrong))
     between = (q_WB.inv() * q_WS).as_rotvec()
     assert np.abs(between) == pytest.approx([0, 0, math.pi], abs=1e-7)
@@ -89,12 +89,18 @@ def test_swapped_markers_turn_the_pose_about_its_own_z_and_shift_it_along_its_x(
 
 
 def test_frames_arrive_later_and_never_out_of_order() -> None:
-    mocap = VirtualMocap(MocapConfig(latency_us=38_000), np.random.default_rng(1))
-    assert mocap.arrival_us(0) == 38_000
+    plant, mocap = make_plant(), VirtualMocap(MocapConfig(latency_us=38_000), np.random.default_rng(1))
+
+    def arrival_us(now_us: int) -> int:
+        frame, arrival_us = mocap.expose(now_us, plant)
+        assert (frame.t_us, frame.received_us, frame.transmitted_us) == (now_us, now_us + 20_000, arrival_us)
+        return arrival_us
+
+    assert arrival_us(0) == 38_000
     mocap.more_latency_us = 20_000.0
-    assert mocap.arrival_us(5_000) == 63_000
+    assert arrival_us(5_000) == 63_000
     mocap.more_latency_us = 0.0
-    assert [mocap.arrival_us(t) for t in (10_000, 20_000, 30_000)] == [63_000, 63_000, 68_000]
+    assert [arrival_us(t) for t in (10_000, 20_000, 30_000)] == [63_000, 63_000, 68_000]
 
 
 def test_same_seed_same_frames() -> None:

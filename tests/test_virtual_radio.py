@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ground_station.station import StationConfig
+from ground_station.config import StationConfig
+from hil.devices.config import RadioConfig
+from hil.devices.radio import VirtualRadio, air_us, exchange_us
 from hil.events import EventQueue
-from hil.virtual_radio import RadioConfig, VirtualRadio, air_us, exchange_us
 
 QUIET = {"uplink_loss": 0.0, "downlink_loss": 0.0, "usb_jitter_us": 0}
 POSE = 31  # bytes of a correction
@@ -215,7 +216,7 @@ def test_packets_arrive_at_most_once_and_in_order(seed, up_loss, down_loss, jitt
 
 def test_dead_air_bounds_both_queues_and_the_newest_corrections_survive():
     bench = Bench(**QUIET)
-    bench.radio.uplink_loss = 1.0
+    bench.radio.medium.uplink_loss = 1.0
     bench.pose_every(20_000, 50)
     bench.telemetry_every(20_000, 200, burst=4)
     bench.events.run(999_999)
@@ -224,7 +225,7 @@ def test_dead_air_bounds_both_queues_and_the_newest_corrections_survive():
     assert (radio.up.queue_high_water, radio.down.queue_high_water) == (4, 8)
     assert radio.down.dropped == 192
     assert not radio.downlink(999_999, bytes(TELEMETRY))
-    radio.uplink_loss = 0.0
+    radio.medium.uplink_loss = 0.0
     bench.events.run(2_000_000)
     assert numbers(bench.on_board)[-4:] == [46, 47, 48, 49]
     assert len(bench.on_board) <= 5  # and the one that was under way
@@ -233,14 +234,14 @@ def test_dead_air_bounds_both_queues_and_the_newest_corrections_survive():
 
 def test_uplink_jitter_delays_within_its_bound_and_can_be_switched_in_flight():
     bench = Bench(**QUIET)
-    bench.radio.uplink_jitter_us = 15_000
+    bench.radio.medium.uplink_jitter_us = 15_000
     bench.pose_every(20_000, 500)
     bench.events.run(9_999_999)
     latencies = [arrived_us - 20_000 * number for number, (arrived_us, _) in enumerate(bench.on_board)]
     assert max(latencies) < 15_000 + 2000
     assert np.std(latencies) == pytest.approx(15_000 / np.sqrt(12), rel=0.1)
     assert bench.radio.air.exchanges == 500
-    bench.radio.uplink_jitter_us = 0
+    bench.radio.medium.uplink_jitter_us = 0
     bench.radio.uplink(9_999_999, bytes(POSE))
     bench.events.run(10_002_000)
     assert len(bench.on_board) == 501

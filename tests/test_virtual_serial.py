@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.config import load_config
+from hil.devices.config import SerialConfig
+from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue
-from hil.virtual_serial import SerialConfig, VirtualSerial
 
 
 class Bench:

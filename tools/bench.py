@@ -25,10 +25,10 @@ from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.harness import Flight
-from hil.plant.plant import Plant
-from hil.recorder import Recorder
-from hil.run import Request, fly
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.recorder import Recorder
+from hil.laboratory.run import Request, fly
+from hil.world.plant import Plant
 
 ROOT = Path(__file__).parent.parent
 FLIGHT_S = 30.0
@@ -56,7 +56,7 @@ def flight_s(recorded: bool) -> float:
     def measure() -> float:
         with tempfile.TemporaryDirectory() as folder:
             telemetry = Path(folder) / "telemetry.csv" if recorded else None
-            flight = Flight(load_config(), EXPERIMENTS["hover"], FLIGHT_S, 1, telemetry)
+            flight = lockstep_flight(load_config(), EXPERIMENTS["hover"], FLIGHT_S, 1, telemetry)
             if recorded:
                 flight.recorder = Recorder(Path(folder), flight.channels(), {})
             start = time.perf_counter()
@@ -111,8 +111,10 @@ def plant_us() -> float:
 def start_up_s(cache: Path | None) -> float:
     """Wall time of a process that flies until its first tick; with a cache folder: compiling everything."""
     code = (
-        "from hil.config import load_config; from hil.experiments import EXPERIMENTS; from hil.harness import Flight;"
-        "flight = Flight(load_config(), EXPERIMENTS['hover'], 1.0, 1, None); flight.end_us = 30_000; flight.run()"
+        "from hil.config import load_config; from hil.experiments import EXPERIMENTS;"
+        "from hil.laboratory.lockstep import lockstep_flight;"
+        "flight = lockstep_flight(load_config(), EXPERIMENTS['hover'], 1.0, 1, None);"
+        "flight.lab.end_us = 30_000; flight.run()"
     )
     environment = dict(os.environ)
     if cache is not None:

@@ -2,7 +2,7 @@
 
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.rtos import Queue
-from firmware_py.supervisor import State, Supervisor
+from firmware_py.supervisor import Supervisor
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import (
     MAX_DATA,
@@ -14,6 +14,7 @@ from firmware_py.wire.crtp import (
     Packet,
     encode,
 )
+from firmware_py.wire.supervisor import State
 
 PROTOCOL_VERSION = 12
 FIRMWARE_VERSION = "2026.11 Floaty"

@@ -65,31 +65,35 @@ class Scheduler:
         self._next_tick_us = TICK_US
         self._work_end_us = 0  # of the running task, when it has work left
         self._calls = 0  # of the kernel at this instant
-        self.until_us = 0  # how far `run` goes
+        self._until_us = 0  # how far `run` goes
 
     def run(self, now_us: int) -> None:
         """Does all that falls due up to and including `now_us`, until every task waits or works.
 
-        Hardware that a task sets going may lower `until_us` meanwhile: then the run ends there, and `now_us` before its
-        argument.
+        Hardware that a task sets going may `stop_before` an instant meanwhile: then the run ends there.
         """
         if not self._started:
             raise KernelError("run before start")
         if now_us < self.now_us:
             raise KernelError(f"time runs backwards: from {self.now_us} us to {now_us} us")
-        self.until_us = now_us
+        self._until_us = now_us
         wake_us = self.next_wake_us
         if self._interrupted and (wake_us is None or wake_us > now_us):
             wake_us = now_us
-        while wake_us is not None and wake_us <= self.until_us:
+        while wake_us is not None and wake_us <= self._until_us:
             self.now_us = wake_us
             self._interrupted = False
             if wake_us >= self._next_tick_us:
                 self._pass_ticks()
             self._dispatch()
             wake_us = self.next_wake_us
-        if self.until_us > self.now_us:
-            self.now_us = self.until_us
+        if self._until_us > self.now_us:
+            self.now_us = self._until_us
+
+    def stop_before(self, now_us: int) -> None:
+        """Lets the present run go no further than to just before an instant, at which hardware acts first."""
+        if now_us <= self._until_us:
+            self._until_us = now_us - 1
 
     def set_trace(self, trace: Trace | None) -> None:
         """Begins or ends tracing, between two runs; the tasks notice nothing of it."""

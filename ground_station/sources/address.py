@@ -3,16 +3,15 @@
 from pathlib import Path
 from typing import Any, get_args
 
+from ground_station.config import CaptureConfig, System
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapSource
-from ground_station.sources.config import CaptureConfig, System
 from ground_station.sources.motioncapture_client import MotioncaptureSource, settings_of
 from ground_station.sources.optitrack import OptitrackSource
 from ground_station.sources.replay import ReplaySource
-from ground_station.sources.virtual import VirtualSource
 
 FORMS = (
-    "virtual[:PORT], optitrack:HOST[:PORT], vicon:HOST[:PORT], qualisys:HOST or vrpn:HOST[:PORT], "
+    "optitrack:HOST[:PORT], vicon:HOST[:PORT], qualisys:HOST or vrpn:HOST[:PORT], "
     "with ,multicast ,body=NAME ,z-up or ,y-up; or replay:PATH"
 )
 REPLAY = "replay:"
@@ -25,8 +24,6 @@ def find_source(text: str | None, capture: CaptureConfig) -> MocapSource:
     chosen = capture if text is None else override(text, capture)
     if chosen.system == "qualisys" and chosen.port is not None:
         raise MocapError("qualisys: its client knows no port but 22222")
-    if chosen.system == "virtual":
-        return VirtualSource(chosen.port)
     if chosen.system == "optitrack":
         return OptitrackSource(chosen)
     return MotioncaptureSource(chosen.system, settings_of(chosen), chosen)
@@ -38,9 +35,9 @@ def override(text: str, capture: CaptureConfig) -> CaptureConfig:
     system, colon, where = place.partition(":")
     if system not in get_args(System):
         raise MocapError(f"expected {FORMS}")
-    host, second_colon, port = ("", colon, where) if system == "virtual" else where.partition(":")
+    host, second_colon, port = where.partition(":")
     another = system != capture.system
-    if system != "virtual" and not host and (colon or another):
+    if not host and (colon or another):
         raise MocapError(f"expected {FORMS}")
     values: dict[str, Any] = {"system": system}
     if another:
@@ -55,13 +52,12 @@ def override(text: str, capture: CaptureConfig) -> CaptureConfig:
 
 
 def _option(option: str, system: str) -> dict[str, Any]:
-    if system != "virtual":  # that one is a stream of one body, in W
-        if option.startswith("body=") and len(option) > 5:
-            return {"body": option[5:]}
-        if option in ("z-up", "y-up"):
-            return {"axes": option}
-        if option == "multicast" and system == "optitrack":
-            return {"multicast": True}
+    if option.startswith("body=") and len(option) > 5:
+        return {"body": option[5:]}
+    if option in ("z-up", "y-up"):
+        return {"axes": option}
+    if option == "multicast" and system == "optitrack":
+        return {"multicast": True}
     raise MocapError(f"{option!r}: expected {FORMS}")
 
 

@@ -5,7 +5,7 @@ its axes turned z up like those of M, B the robot. C is W turned by `yaw` and mo
 """
 
 from firmware_py.geometry import Quaternion, Vector, conjugate, multiply, rotate, yaw_quaternion
-from ground_station.sources.config import Axes, CaptureConfig
+from ground_station.config import Axes, CaptureConfig
 
 
 def with_z_up(p: Vector, q: Quaternion) -> tuple[Vector, Quaternion]:

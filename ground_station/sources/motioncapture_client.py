@@ -11,11 +11,12 @@ import subprocess
 import sys
 
 from ground_station.clock import clock_us
+from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame, is_pose
 from ground_station.sources.alignment import Alignment
+from ground_station.sources.bodies import choose_body
 from ground_station.sources.capture_lines import Arrival, Body, decode_line
-from ground_station.sources.config import CaptureConfig, choose_body
 
 CONNECT_TIMEOUT_US = 5_500_000  # the process gives up after 5 s without a frame
 SETTLE_US = 1_000_000  # from the first frame on, in which all bodies should have been seen

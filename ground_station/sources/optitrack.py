@@ -5,12 +5,12 @@ import socket
 from contextlib import suppress
 
 from ground_station.clock import clock_us
+from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
 from ground_station.natnet import COMMAND_PORT, MessageId, packet
 from ground_station.natnet_stream import NatnetStream
 from ground_station.sources.alignment import Alignment
-from ground_station.sources.config import CaptureConfig
 
 CONNECT_TIMEOUT_US = 3_000_000
 PACKET_MAX = 65_536

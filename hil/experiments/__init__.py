@@ -4,7 +4,6 @@ import difflib
 
 from hil.errors import LabError
 from hil.experiments.airspeed import AIRSPEEDS
-from hil.experiments.experiment import Experiment
 from hil.experiments.hover import HOVER
 from hil.experiments.overload import OVERLOAD
 from hil.experiments.position import HEIGHT_SINE, Y_SQUARE
@@ -13,6 +12,7 @@ from hil.experiments.pushes import PUSHED
 from hil.experiments.take_off import TAKE_OFF_LANDING
 from hil.experiments.wind import OCCLUSION, SIDE_WINDS
 from hil.experiments.yaw import YAW_SINES, YAW_STEP, YAW_STEP_0
+from hil.laboratory.experiment import Experiment
 
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment

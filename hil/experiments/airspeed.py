@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hil.experiments import pictures
-from hil.experiments.experiment import Experiment
-from hil.metrics import BOX, column, position_error
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.metrics import BOX, column, position_error
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -68,7 +67,7 @@ def airspeed(speed: float) -> Experiment:
             f"tunnel.speed={speed:g}", f"allocation.hover_angle={angle:.4f}", f"allocation.opening_min={OPENING_MIN}",
         ),
         measure=partial(holding, speed),
-        pictures=(pictures.AIRSPEED,),
+        pictures=("airspeed",),
     )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Hover: hold one point of the flow, the paper's figure Hover_figure (30 s at 1.15 m, 20 cm box, 6 cm, 20 deg)."""
 
-from hil.experiments.experiment import Experiment
+from hil.laboratory.experiment import Experiment
 
 HOVER = Experiment(
     name="hover",

@@ -1,7 +1,7 @@
 """What the experiments measure beside the errors of every flight: steps, sines, recoveries; truth against goal.
 
 Every function takes the rows after the release, of a flight that may have ended early; what cannot be told is NaN, which
-no limit accepts. The names of the results are those of `hil.metrics.METRICS`.
+no limit accepts. The names of the results are those of `hil.laboratory.metrics.METRICS`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from firmware_py.geometry import euler_zyx_of
-from hil.faults import Fault
-from hil.metrics import BOX, column, position_error
+from hil.laboratory.faults import Fault
+from hil.laboratory.metrics import BOX, column, position_error
 
 BAND = 0.05  # of a step: settled; physics.md section 8
 RISEN = 0.90  # of a step

@@ -15,17 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil import curves
-from hil.experiments.experiment import Experiment
-from hil.metrics import BOX, column, free_flight, position_error
-from hil.picture import Picture
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.metrics import BOX, column, position_error
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from matplotlib.figure import Figure
 
     from firmware_py.firmware import Thief
-    from hil.harness import Flight
+    from hil.laboratory.flight import Flight
 
 STEP_PERCENT = 5
 STEP_US = 1_500_000
@@ -34,7 +31,7 @@ ROWS_PER_SECOND = 100  # of the log
 
 def steal_more_and_more(flight: Flight) -> None:
     """Plan the steps of the thief's share."""
-    thief = flight.thief
+    thief = flight.robot.thief
     for index, percent in enumerate(range(0, 101, STEP_PERCENT)):
         flight.events.at(flight.release_us + index * STEP_US, partial(_take, thief, flight, percent))
 
@@ -66,40 +63,6 @@ def loads_that_hurt(flight: pa.Table) -> Mapping[str, float]:
     }
 
 
-def draw(rows: pa.Table, *trials: pa.Table) -> Figure:
-    """Draw late tasks and position error over the thief's share, of the first flight."""
-    from hil.figures import stack
-
-    flight = free_flight(rows)
-    load = 5 * np.round(20 * thief_load(flight)).astype(int)  # the steps of the experiment
-    shares = np.unique(load)
-    figure, axes = stack((2.1, 2.1))
-    late = [name for name in flight.column_names if name.startswith("late.")]
-    for name in late:
-        misses = np.diff(column(flight, name), prepend=0.0)
-        per_second = [misses[load == share].mean() * ROWS_PER_SECOND for share in shares]
-        axes[0].plot(shares, per_second, "o-", label=name.removeprefix("late."))
-    axes[0].set_ylabel("missed deadlines [1/s]")
-    axes[0].set_yscale("symlog", linthresh=1.0)
-    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    error = 100 * np.abs(position_error(flight))
-    for axis, name, colour in zip(range(3), "xyz", curves.POSITION.colours, strict=True):
-        worst = [error[load == share, axis].max() for share in shares]
-        axes[1].plot(shares, worst, "o-", color=colour, label=name)
-    axes[1].axhline(100 * BOX, color="black", linestyle="--", linewidth=0.8)
-    axes[1].set_ylabel("largest error [cm]")
-    axes[1].set_yscale("log")
-    axes[1].set_xlabel("share of every tick that the thief takes [%]")
-    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
-
-
-PICTURE = Picture(
-    "Overload",
-    "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
-    "Dashed: the 20 cm box. A task that starves completes nothing, late or not.",
-    draw,
-)
 OVERLOAD = Experiment(
     name="overload",
     summary="hover while a task above all others takes 0 to 100 % of the processor",
@@ -107,5 +70,5 @@ OVERLOAD = Experiment(
     limits={"estimator_late_from": 0.10, "controller_late_from": 0.60, "held_up_to": 0.60},
     script=steal_more_and_more,
     measure=loads_that_hurt,
-    pictures=(PICTURE,),
+    pictures=("overload",),
 )

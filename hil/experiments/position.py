@@ -7,9 +7,8 @@ no hover lasts (paper, Horizontal tracking performance).
 from functools import partial
 
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
-from hil.experiments import pictures
-from hil.experiments.experiment import Experiment
 from hil.experiments.measures import height_sine, y_steps
+from hil.laboratory.experiment import Experiment
 
 BEGIN_S = 1.0  # the robot has come to rest after its release
 HEIGHT_HZ, SQUARE_HZ = 0.05, 0.1
@@ -32,7 +31,7 @@ HEIGHT_SINE = Experiment(
     limits={"lost": 0.0, "gain": 0.90, "lag": 0.20, "rms_z": 0.05, "rms_x": 0.03, "rms_y": 0.02},
     trajectory=rise_and_sink,
     measure=partial(height_sine, HEIGHT_HZ),
-    pictures=(pictures.HEIGHT_SINE,),
+    pictures=("height-sine",),
 )
 Y_SQUARE = Experiment(
     name="y-square",
@@ -41,5 +40,5 @@ Y_SQUARE = Experiment(
     limits={"lost": 0.0, "rise": 1.25, "overshoot": 0.20, "hold_rms": 0.01, "rms_x": 0.03, "rms_z": 0.05},
     trajectory=jump_sideways,
     measure=y_steps,
-    pictures=(pictures.Y_SQUARE,),
+    pictures=("y-square",),
 )

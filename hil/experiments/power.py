@@ -11,21 +11,18 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from hil.experiments.experiment import Experiment
-from hil.metrics import column, free_flight
-from hil.picture import Picture
-from hil.plant.battery import BatteryConfig, endurance
+from firmware_py.wire.supervisor import Cause, State
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.metrics import column
+from hil.world.battery import endurance
+from hil.world.config import BatteryConfig
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from matplotlib.figure import Figure
 
-    from hil.harness import Flight
+    from hil.laboratory.flight import Flight
 
 WATCH_US = 100_000
-FAILSAFE = 3  # supervisor.state
 LONGEST_S = 3000.0
 
 
@@ -35,9 +32,9 @@ def end_with_the_battery(flight: Flight) -> None:
 
 
 def _watch(flight: Flight, now_us: int) -> None:
-    if flight.firmware.signals.supervisor.cause.name == "LOW_BATTERY":
-        flight.note("lab", f"the battery is empty: {flight.battery.charge:.1%} left")
-        flight.end_us = now_us
+    if flight.robot.firmware.signals.supervisor.cause is Cause.LOW_BATTERY:
+        flight.note("lab", f"the battery is empty: {flight.robot.battery.charge:.1%} left")
+        flight.lab.end_us = now_us
         return
     flight.events.at(now_us + WATCH_US, partial(_watch, flight))
 
@@ -60,7 +57,7 @@ def estimate(flight: pa.Table) -> Mapping[str, float]:
 def until_empty(flight: pa.Table) -> Mapping[str, float]:
     """Return power, and the minutes until the failsafe; NaN when the flight ended before it."""
     times = column(flight, "t")
-    stopped = column(flight, "supervisor.state")[-1] == FAILSAFE
+    stopped = column(flight, "supervisor.state")[-1] == State.FAILSAFE
     return power(flight) | {
         "endurance": float(times[-1] - times[0]) * 1e-6 / 60.0 if stopped else float("nan")
     }
@@ -71,37 +68,6 @@ def _configuration(flight: pa.Table) -> dict[str, Any]:
     return config
 
 
-def compare(*flights: pa.Table) -> Figure:
-    """Draw the specific power of Floaty, from the flights, beside that of other vehicles."""
-    from hil.power_figures import compare
-
-    means = [power(free_flight(flight)) for flight in flights]
-    mean, specific = (
-        float(np.mean([values[name] for values in means])) for name in ("power", "specific_power")
-    )
-    return compare(mean, mean / specific)
-
-
-def discharge(*flights: pa.Table) -> Figure:
-    """Draw voltage, power and charge over time."""
-    from hil.power_figures import discharge
-
-    return discharge(*flights)
-
-
-COMPARISON = Picture(
-    "Specific power",
-    "Left: power in hover per mass. Right: power over mass; grey: 100 to 250 W/kg, which the paper calls typical. Stars: in "
-    "an updraft. Bars on helicopters: the paper's range of hover power, as a share of the rated one. Red: this flight.",
-    compare,
-    needs="battery.power",
-)
-DISCHARGE = Picture(
-    "Battery",
-    "Voltage of one cell under load, with the supervisor's limit; power, mean over 1 s, and over the flight; charge left.",
-    discharge,
-    needs="battery.power",
-)
 # The paper: about 33 min, 3.4 W, 10 W/kg
 LIMITS = {"lost": 0.0, "power": 3.6, "specific_power": 10.5, "endurance": 31.0}
 POWER = Experiment(
@@ -110,7 +76,7 @@ POWER = Experiment(
     duration_s=60.0,
     limits=LIMITS,
     measure=estimate,
-    pictures=(COMPARISON, DISCHARGE),
+    pictures=("specific-power", "discharge"),
 )
 ENDURANCE = Experiment(
     name="endurance",
@@ -119,5 +85,5 @@ ENDURANCE = Experiment(
     limits=LIMITS,
     script=end_with_the_battery,
     measure=until_empty,
-    pictures=(COMPARISON, DISCHARGE),
+    pictures=("specific-power", "discharge"),
 )

@@ -6,10 +6,9 @@ more than the 4 s to climb back, because attitude goes before height). The last 
 
 from functools import partial
 
-from hil.experiments import pictures
-from hil.experiments.experiment import Experiment
 from hil.experiments.measures import recoveries
-from hil.faults import Fault
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.faults import Fault
 
 BEGIN_S, EVERY_S, PUSH_S = 2.0, 4.0, 0.1
 PUSHES = (
@@ -29,5 +28,5 @@ PUSHED = Experiment(
     limits={"lost": 0.0, "recovered": float(len(PUSHES)), "excursion": 0.70, "back_in_box": 3.5},
     faults=FAULTS,
     measure=partial(recoveries, FAULTS, DURATION_S),
-    pictures=(pictures.DISTURBED,),
+    pictures=("disturbances",),
 )

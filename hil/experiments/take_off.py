@@ -18,15 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from firmware_py.wire.crtp import PORT_PLATFORM, Packet, encode
-from hil.experiments.experiment import Experiment
-from hil.metrics import BOX, column, free_flight, position_error
-from hil.picture import Picture
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.metrics import BOX, column, position_error
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from matplotlib.figure import Figure
 
-    from hil.harness import Flight
+    from hil.laboratory.flight import Flight
 
 TAKE_OFF, FLIGHT, LANDING = 0.93, 1.0, 0.88  # of the flight speed
 STANDING_Z = 0.049  # [m] of the centre of mass: feet, less what they sink in
@@ -46,10 +44,11 @@ BOOTED_US = 500_000
 
 def operate(flight: Flight) -> None:
     """Plan what the operator does."""
-    flight.plant.tunnel.set_fan_factor(0.0)
-    flight.events.at(BOOTED_US, partial(_switch, flight, False))
-    flight.events.at(flight.release_us + _us(CONTROLLER_ON), partial(_switch, flight, True))
-    flight.events.at(flight.release_us + _us(FANS_OFF), partial(_switch, flight, False))
+    flight.robot.plant.tunnel.set_fan_factor(0.0)
+    release_us = flight.release_us
+    flight.events.at(max(BOOTED_US, flight.now_us), partial(_switch, flight, False))
+    flight.events.at(release_us + _us(CONTROLLER_ON), partial(_switch, flight, True))
+    flight.events.at(release_us + _us(FANS_OFF), partial(_switch, flight, False))
     speed = 0.0
     for start, factor in (
         (SPIN_UP, TAKE_OFF),
@@ -57,7 +56,7 @@ def operate(flight: Flight) -> None:
         (LANDING_FROM, LANDING),
         (FANS_OFF, 0.0),
     ):
-        _ramp(flight, flight.release_us + _us(start), speed, factor)
+        _ramp(flight, release_us + _us(start), speed, factor)
         speed = factor
 
 
@@ -67,7 +66,7 @@ def _us(seconds: float) -> int:
 
 def _switch(flight: Flight, on: bool, now_us: int) -> None:
     """Ask the board to close or open the loop, as a Crazyflie client arms and disarms."""
-    flight.radio.uplink(now_us, encode(Packet(PORT_PLATFORM, 0, bytes((1, on)))))
+    flight.line.command(now_us, encode(Packet(PORT_PLATFORM, 0, bytes((1, on)))))
     flight.note("lab", f"controller {'on' if on else 'off'}")
 
 
@@ -83,7 +82,7 @@ def _ramp(flight: Flight, start_us: int, before: float, after: float) -> None:
 
 
 def _setter(flight: Flight, factor: float) -> Callable[[int], None]:
-    return lambda now_us: flight.plant.tunnel.set_fan_factor(factor)
+    return lambda now_us: flight.robot.plant.tunnel.set_fan_factor(factor)
 
 
 def measure(flight: pa.Table) -> Mapping[str, float]:
@@ -114,49 +113,6 @@ def measure(flight: pa.Table) -> Mapping[str, float]:
     return values
 
 
-def draw(*flights: pa.Table) -> Figure:
-    """Draw height, vertical speed and the air at the robot over time; the first flight dark, further ones light."""
-    from hil.curves import BLUE, GREY
-    from hil.figures import stack
-
-    figure, axes = stack((2.2, 1.5, 1.5))
-    for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
-        times = 1e-6 * (column(flight, "t") - column(flight, "t")[0])
-        curves = (
-            100 * (column(flight, "truth.z") - STANDING_Z),
-            100 * column(flight, "truth.vz"),
-            column(flight, "flow.z"),
-        )
-        for one, curve in zip(axes, curves, strict=True):
-            one.plot(times, curve, color=BLUE, alpha=0.3 if index else 1.0)
-    goal = 100 * (column(flight, "goal.z") - STANDING_Z)
-    axes[0].plot(times, goal, color="black", linestyle="--", linewidth=0.8, label="goal")
-    axes[0].legend(loc="center right")
-    for one, label in zip(
-        axes, ("height over the net [cm]", "climb [cm/s]", "air, upwards [m/s]"), strict=True
-    ):
-        one.set_ylabel(label)
-        one.axvspan(CONTROLLER_ON, FANS_OFF, color=GREY, alpha=0.12, linewidth=0)
-        for start in (SPIN_UP, FLIGHT_FROM, LANDING_FROM, FANS_OFF):
-            one.axvline(start, color="black", linewidth=0.6)
-        one.margins(x=0)
-    stages = (
-        (SPIN_UP, f"take-off {TAKE_OFF:.0%}"),
-        (FLIGHT_FROM, f"flight {FLIGHT:.0%}"),
-        (LANDING_FROM, f"landing {LANDING:.0%}"),
-        (FANS_OFF, "fans off"),
-    )
-    for start, name in stages:
-        axes[2].text(start + 0.15, 0.3, name, fontsize=8)
-    axes[2].set_xlabel("time after the release [s]")
-    return figure
-
-
-PICTURE = Picture(
-    "Take-off and landing",
-    "Height over the net, vertical speed and the air at the robot. Lines: a new speed of the fans; grey: controller on.",
-    draw,
-)
 TAKE_OFF_LANDING = Experiment(
     name="take-off-landing",
     summary="stand on the net, take off, hover and land by the speed of the tunnel (the original's operator menu)",
@@ -177,5 +133,5 @@ TAKE_OFF_LANDING = Experiment(
         "plant.tether.length=2.65",  # slack on the net
     ),
     measure=measure,
-    pictures=(PICTURE,),
+    pictures=("take-off",),
 )

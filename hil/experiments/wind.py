@@ -10,10 +10,9 @@ to set against 1 m/s2 per m/s of wind (physics.md section 8): a quarter of a met
 from collections.abc import Mapping
 from functools import partial
 
-from hil.experiments import pictures
-from hil.experiments.experiment import Experiment
 from hil.experiments.measures import leaning, recoveries
-from hil.faults import Fault
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.faults import Fault
 
 BEGIN_S, SPIN_UP_S, END_S = 2.0, 0.5, 12.0
 DURATION_S = END_S + 2.0
@@ -37,7 +36,7 @@ def side_wind(
         settings=settings,
         faults=fan("wind.side_y", speed, speed),
         measure=partial(leaning, 1, END_S),
-        pictures=(pictures.SIDE_WIND,),
+        pictures=("side-wind",),
     )
 
 
@@ -57,7 +56,7 @@ SIDE_WINDS = (
         limits={"lost": 0.0, "wind_offset": 0.09},
         faults=fan("wind.side_x", 0.25, 1),
         measure=partial(leaning, 0, END_S),
-        pictures=(pictures.SIDE_WIND,),
+        pictures=("side-wind",),
     ),
 )  # fmt: skip
 
@@ -76,5 +75,5 @@ OCCLUSION = Experiment(
     },
     faults=SHADOW,
     measure=partial(recoveries, SHADOW, 8.0),
-    pictures=(pictures.DISTURBED,),
+    pictures=("disturbances",),
 )

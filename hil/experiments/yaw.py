@@ -13,9 +13,8 @@ from functools import partial
 from math import radians, sqrt, tau
 
 from ground_station.trajectory import Goal, Offsets, Sine, Step, Trajectory
-from hil.experiments import pictures
-from hil.experiments.experiment import Experiment
 from hil.experiments.measures import yaw_sine, yaw_step
+from hil.laboratory.experiment import Experiment
 
 BEGIN_S = 1.0  # the robot has come to rest after its release
 STEP = radians(110.0)  # paper, Yaw tracking performance
@@ -43,7 +42,7 @@ YAW_STEP = Experiment(
     trajectory=step_yaw,
     settings=(OPENED, "controller.limit_u3=0.6", "controller.gain_yaw=1.0", "controller.gain_r=0.09"),
     measure=yaw_step,
-    pictures=(pictures.YAW_STEP,),
+    pictures=("yaw-step",),
 )
 YAW_STEP_0 = Experiment(
     name="yaw-step-0",
@@ -52,7 +51,7 @@ YAW_STEP_0 = Experiment(
     limits={"lost": 0.0, "settle": 0.65, "overshoot": 0.05, "max_x": 0.06, "max_y": 0.06},
     trajectory=step_yaw,
     measure=yaw_step,
-    pictures=(pictures.YAW_STEP,),
+    pictures=("yaw-step",),
 )
 
 
@@ -67,7 +66,7 @@ def follow_sine(frequency_hz: float, periods: int, more: Mapping[str, float]) ->
         limits={**limits, "max_x": 0.10, "max_y": 0.06, **more},
         trajectory=partial(swing_yaw, frequency_hz),
         measure=partial(yaw_sine, frequency_hz),
-        pictures=(pictures.YAW_SINE,),
+        pictures=("yaw-sine",),
     )
 
 

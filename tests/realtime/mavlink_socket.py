@@ -15,7 +15,7 @@ GAIN = "EXT_Z_P"  # extCtrl.z_P, the parameter that tests tune
 
 
 class Client:
-    """A ground station (system 255, component 190) on an end as `floaty board serve --mavlink` prints it."""
+    """A ground station (system 255, component 190) on an end as `floaty serve --mavlink` prints it."""
 
     def __init__(self, master: str) -> None:
         kind, _, where = master.partition(":")

@@ -75,7 +75,7 @@ def by_motioncapture(port: int, count: int) -> None:
 
 
 def by_ground_station(port: int, multicast: bool, count: int) -> None:
-    from ground_station.sources.config import CaptureConfig
+    from ground_station.config import CaptureConfig
     from ground_station.sources.optitrack import OptitrackSource
 
     as_they_come = CaptureConfig(

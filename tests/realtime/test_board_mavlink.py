@@ -1,4 +1,4 @@
-"""`floaty board serve --mavlink` and a bare pymavlink program: what ground tools rely on, over pty, udp and tcp."""
+"""`floaty serve --mavlink` and a bare pymavlink program: what ground tools rely on, over pty, udp and tcp."""
 
 import itertools
 import math
@@ -17,7 +17,9 @@ from mavlink_socket import GAIN, Client
 from serving import Served, free_port, serve
 from test_board_server import plug
 
-from ground_station.mocap_udp import PoseReceiver, decode_frame
+from ground_station.config import CaptureConfig
+from ground_station.mocap import MocapSource
+from ground_station.sources.address import find_source
 
 
 def masters(served: Served) -> list[str]:
@@ -26,7 +28,7 @@ def masters(served: Served) -> list[str]:
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
-    with serve("--mavlink", "tcp:0", "--poses", "0") as served:
+    with serve("--mavlink", "tcp:0") as served:
         yield served
 
 
@@ -103,7 +105,7 @@ def test_a_message_comes_as_often_as_it_was_asked_for(client: Client) -> None:
 
 
 def test_the_baud_rate_limits_what_comes_through() -> None:
-    with serve("--mavlink", "tcp:0", "--poses", "0", "--baud", "9600") as served:
+    with serve("--mavlink", "tcp:0", "--baud", "9600") as served:
         client = Client(masters(served)[0])
         client.wait("HEARTBEAT")
         for message in (dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
@@ -119,9 +121,7 @@ def test_the_baud_rate_limits_what_comes_through() -> None:
 
 
 def test_wrong_bits_spoil_frames_and_nothing_else() -> None:
-    with serve(
-        "--mavlink", "tcp:0", "--poses", "0", "--set", "serial.downlink_bit_error_rate=1e-3"
-    ) as served:
+    with serve("--mavlink", "tcp:0", "--set", "serial.downlink_bit_error_rate=1e-3") as served:
         client = Client(masters(served)[0])
         client.wait("HEARTBEAT", timeout_s=20)
         client.codec.command_long_send(
@@ -140,7 +140,7 @@ def test_wrong_bits_spoil_frames_and_nothing_else() -> None:
 
 
 def test_several_boards_have_ends_and_system_ids_of_their_own(tmp_path: Path) -> None:
-    with serve("--mavlink", f"pty:{tmp_path / 'line'}", "--boards", "2", "--poses", "0") as served:
+    with serve("--mavlink", f"pty:{tmp_path / 'line'}", "--boards", "2") as served:
         assert not any(line.startswith("udp") for line in served.lines)
         assert masters(served) == [str(tmp_path / "line"), str(tmp_path / "line-2")]
         for number, master in enumerate(masters(served), 1):
@@ -154,7 +154,7 @@ def test_several_boards_have_ends_and_system_ids_of_their_own(tmp_path: Path) ->
 class Pilot:
     """Sends a served board's true poses as ATT_POS_MOCAP, every fourth of 200 per second, until stopped."""
 
-    def __init__(self, client: Client, poses: PoseReceiver) -> None:
+    def __init__(self, client: Client, poses: MocapSource) -> None:
         self._client, self._poses = client, poses
         self._stopping = False
         self._thread = threading.Thread(target=self._run)
@@ -170,18 +170,18 @@ class Pilot:
     def _run(self) -> None:
         count = 0
         while not self._stopping:
-            data = self._poses.receive(0.1)
+            frame = self._poses.receive(0.1)
             count += 1
-            if data is None or count % 4:
+            if frame is None or count % 4:
                 continue
-            frame = decode_frame(data)
             (w, x, y, z), (px, py, pz) = frame.q_WB, frame.p_WB
             self._client.codec.att_pos_mocap_send(frame.t_us, [w, x, -y, -z], px, -py, -pz)
 
 
 def test_poses_fly_the_board_and_a_pulled_pty_ends_in_failsafe_until_it_is_plugged_in_again() -> None:
-    poses = PoseReceiver(0)
-    with serve("--mavlink", "pty", "--poses", str(poses.port)) as served:
+    with serve("--mavlink", "pty", motive=True) as served:
+        poses = find_source(served.motive, CaptureConfig())
+        poses.open()
         client = Client(masters(served)[0])
         with Pilot(client, poses):
             served.wait_for("board 1: released", 15)
@@ -196,11 +196,11 @@ def test_poses_fly_the_board_and_a_pulled_pty_ends_in_failsafe_until_it_is_plugg
             served.wait_for("supervisor: flying", 5)
             served.wait_for("board 1: released", 5)
         client.close()
-    poses.close()
+        poses.close()
 
 
 def test_a_reboot_by_radio_keeps_the_end_and_forgets_what_came_while_the_board_was_off() -> None:
-    with serve("--mavlink", "tcp:0", "--radio", "--radio-port", "0", "--poses", "0") as served:
+    with serve("--mavlink", "tcp:0", "--radio", "--radio-port", "0") as served:
         plug(served)
         client = Client(masters(served)[0])
         before_ms = client.wait("ATTITUDE", lambda message: message.time_boot_ms > 1000).time_boot_ms
@@ -226,7 +226,7 @@ def test_a_reboot_by_radio_keeps_the_end_and_forgets_what_came_while_the_board_w
     ],
 )
 def test_bad_values_end_in_one_line(arguments: list[str], complaint: str) -> None:
-    command = [sys.executable, "-m", "hil.cli", "board", "serve", *arguments]
+    command = [sys.executable, "-m", "hil.commands", "serve", *arguments]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert ended.returncode == 2
     assert complaint in ended.stderr.splitlines()[-1]

@@ -1,4 +1,4 @@
-"""`floaty board serve` and unmodified cflib: by radio with and without losses, by UDP, in this and in other processes."""
+"""`floaty serve` and unmodified cflib: by radio with and without losses, by UDP, in this and in other processes."""
 
 import gc
 import random
@@ -27,7 +27,7 @@ from cflib.utils.power_switch import PowerSwitch
 from cflib_client import Client
 from serving import Served, serve
 
-from hil.dongle_plugin import VARIABLE, Backend
+from hil.servers.dongle_plugin import VARIABLE, Backend
 
 PATIENCE_S = 30.0
 
@@ -46,10 +46,16 @@ def plug(served: Served) -> None:
         cflib.crtp.init_drivers()
 
 
-@pytest.fixture(scope="module", params=["loss=0", "loss=0.1"], ids=["no loss", "10 % loss"])
+@pytest.fixture(scope="module", params=["0", "0.1"], ids=["no loss", "10 % loss"])
 def served(request: pytest.FixtureRequest) -> Iterator[Served]:
     with serve(
-        "--radio", "--radio-port", "0", "--udp", "0", "--poses", "0", "--faults", request.param
+        "--radio",
+        "--radio-port",
+        "0",
+        "--udp",
+        "0",
+        f"--set=radio.uplink_loss={request.param}",
+        f"--set=radio.downlink_loss={request.param}",
     ) as served:
         plug(served)
         yield served
@@ -282,7 +288,7 @@ def test_the_pytest_plugin_does_the_same(served: Served, tmp_path: Path) -> None
         "from cflib.drivers.crazyradio import get_serials\ndef test_it(): assert get_serials() == ('F10A7Y0001',)\n"
     )
     environment = {**served.environment, "PYTHONPATH": ""}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "hil.dongle_plugin", str(tmp_path)]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "hil.servers.dongle_plugin", str(tmp_path)]
     shown = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert shown.returncode == 0, shown.stdout
 
@@ -292,7 +298,7 @@ def test_without_a_server_there_is_no_dongle() -> None:
 
 
 def test_ten_boards_on_one_dongle(cache: Path) -> None:
-    with serve("--radio", "--radio-port", "0", "--boards", "10", "--poses", "0") as served:
+    with serve("--radio", "--radio-port", "0", "--boards", "10") as served:
         plug(served)
         Client(served.radio_uris[0], cache).ready().close()  # fills the cache
         clients = [Client(uri, cache) for uri in served.radio_uris]
@@ -310,7 +316,7 @@ def test_ten_boards_on_one_dongle(cache: Path) -> None:
 
 
 def test_the_built_in_station_flies_and_ctrl_c_ends_in_order() -> None:
-    with serve("--udp", "0", "--poses", "0", "--station") as served:
+    with serve("--udp", "0", "--station") as served:
         served.wait_for("board 1: released", PATIENCE_S)
         assert served.interrupt() == 0
         served.wait_for("^stopped", PATIENCE_S)
@@ -320,15 +326,13 @@ def test_the_built_in_station_flies_and_ctrl_c_ends_in_order() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--faults", "loss"], "--faults loss: expected NAME=VALUE"),
-        (["--faults", "los=0.1"], "out of loss, uplink_loss"),
-        (["--faults", "uplink_loss=2,downlink_loss=0"], "radio.uplink_loss = 2"),
+        (["--set", "radio.uplink_loss=2"], "radio.uplink_loss = 2"),
         (["--boards", "11"], "11"),
         (["--udp", "65530", "--boards", "10"], "--udp 65530"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_two(arguments: list[str], message: str) -> None:
-    command = [sys.executable, "-m", "hil.cli", "board", "serve", *arguments]
+    command = [sys.executable, "-m", "hil.commands", "serve", *arguments]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert shown.returncode == 2
     assert message in shown.stderr
@@ -339,7 +343,7 @@ def test_a_taken_port_is_one_line_and_exit_code_two() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        command = [sys.executable, "-m", "hil.cli", "board", "serve", "--udp", str(port)]
+        command = [sys.executable, "-m", "hil.commands", "serve", "--udp", str(port)]
         shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert shown.returncode == 2
     assert shown.stderr == f"floaty: udp port {port}: Address already in use\n"

@@ -19,7 +19,7 @@ from cflib.utils.encoding import compress_quaternion
 from cflib_client import Client
 from udp_pump import UdpBoard
 
-from firmware_py.supervisor import State
+from firmware_py.wire.supervisor import State
 
 PATIENCE_S = 20.0
 

@@ -17,11 +17,9 @@ from cflib.crtp.radiodriver import RadioManager
 from cflib.utils.power_switch import PowerSwitch
 from serving import Served, serve
 
-from ground_station.mocap import MocapFrame
-from ground_station.mocap_udp import PoseReceiver, decode_frame, encode_frame
-from hil.dongle_plugin import VARIABLE, Backend
+from hil.servers.dongle_plugin import VARIABLE, Backend
 
-FLOATY = (sys.executable, "-m", "hil.cli")
+FLOATY = (sys.executable, "-m", "hil.commands")
 URI = "radio://0/80/2M/E7E7E7E7E7"
 PATIENCE_S = 40.0
 
@@ -99,19 +97,8 @@ def test_a_port_without_a_board_is_one_line_within_ten_seconds() -> None:
     refused(station(without_dongle(), "--link", uri, "--mocap", f"virtual:{free_port()}"), begin_s, uri)
 
 
-def test_a_pose_survives_its_datagram() -> None:
-    frame = MocapFrame(123_456_789, (1.0, -2.0, 3.0), (0.5, -0.5, 0.5, -0.5), True)
-    assert decode_frame(encode_frame(frame)) == frame
-
-
-def test_no_pose_is_no_datagram() -> None:
-    receiver = PoseReceiver(0)
-    assert receiver.receive(0.01) is None
-    receiver.close()
-
-
-def start_station(served: Served, uri: str, poses: int, *arguments: str) -> Served:
-    command = [*FLOATY, "station", "--link", uri, "--mocap", f"virtual:{poses}", *arguments]
+def start_station(served: Served, uri: str, *arguments: str) -> Served:
+    command = [*FLOATY, "station", "--link", uri, "--mocap", served.motive, *arguments]
     return Served(
         subprocess.Popen(command, env=served.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     )
@@ -126,12 +113,10 @@ def finish(station: Served) -> int:
 
 
 def test_it_flies_reconnects_after_a_reboot_and_leaves_the_board_in_failsafe(tmp_path: Path) -> None:
-    poses = free_port()
-    with serve(
-        "--radio", "--radio-port", "0", "--poses", str(poses), "--faults", "uplink_loss=0.1,downlink_loss=0.1"
-    ) as served:
+    losses = ("--set=radio.uplink_loss=0.1", "--set=radio.downlink_loss=0.1")
+    with serve("--radio", "--radio-port", "0", *losses, motive=True) as served:
         log = tmp_path / "telemetry.csv"
-        station = start_station(served, URI, poses, "--log", str(log))
+        station = start_station(served, URI, "--log", str(log))
         try:
             served.wait_for("board 1: released", PATIENCE_S)
             backend = Backend(served.environment[VARIABLE])
@@ -174,9 +159,8 @@ def fly(folder: Path, *arguments: str) -> dict[str, object]:
 
 def test_the_complete_laboratory_flies_hover_within_its_limits(tmp_path: Path) -> None:
     """Motive, station process and virtual dongle for 10 s; the limits leave a busy machine room, the ages less."""
-    result = fly(tmp_path / "run", "--link", URI, "--mocap", "natnet", "--duration", "10")
+    result = fly(tmp_path / "run", "--link", URI, "--duration", "10")
     assert result["passed"]
-    assert result["mocap"] == "natnet"
     assert result["metrics"]["flown"] == pytest.approx(10.0, abs=0.1)
     assert 0.1 < result["real_time_factor"] < 1.1
     assert len((tmp_path / "run" / "telemetry.csv").read_text().splitlines()) > 300
@@ -185,7 +169,7 @@ def test_the_complete_laboratory_flies_hover_within_its_limits(tmp_path: Path) -
     assert (ages_ms["camera"], ages_ms["processing"]) == pytest.approx((20.0, 18.0), abs=0.1)
     assert 38.5 < ages_ms["pose"] < 50.0
     said = [json.loads(line)["text"] for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
-    budgets = [line for line in said if line.startswith("station: pose ")]
+    budgets = [line for line in said if line.startswith("pose ")]
     assert budgets
     assert all("camera 20.0 + processing 18.0" in line and "assumed" not in line for line in budgets)
     assert not any("Traceback" in line or "connecting again" in line for line in said)
@@ -208,9 +192,9 @@ def test_hover_holds_its_limits_when_a_third_of_the_packets_is_lost(tmp_path: Pa
     assert fly(tmp_path / "run", "--link", URI, "--duration", "8", *losses, *others)["passed"]
 
 
-def test_hover_over_udp_and_without_motive_holds_its_limits(tmp_path: Path) -> None:
+def test_hover_over_udp_holds_its_limits(tmp_path: Path) -> None:
     link = ("--link", f"udp://127.0.0.1:{free_port()}")
-    result = fly(tmp_path / "run", *link, "--mocap", "virtual", "--duration", "8")
+    result = fly(tmp_path / "run", *link, "--duration", "8")
     assert result["passed"]
     assert [stage["name"] for stage in result["ages"]][-1] == "udp"
 
@@ -219,9 +203,7 @@ def test_hover_over_udp_and_without_motive_holds_its_limits(tmp_path: Path) -> N
     ("arguments", "message"),
     [
         (["--link", "radio://0/81/2M/E7E7E7E7E7"], "expected radio, mavlink, radio://0/80/2M/E7E7E7E7E7"),
-        (["--link", URI, "--seeds", "2"], "--seeds and --perfetto are for flights in lockstep"),
-        (["--mocap", "natnet"], "--mocap natnet: --link radio: a flight in lockstep has its own poses"),
-        (["--link", URI, "--mocap", "vicon"], "--mocap vicon: expected natnet or virtual"),
+        (["--link", URI, "--seeds", "2"], "--seeds is for flights in lockstep"),
     ],
 )
 def test_fly_refuses_a_link_that_leads_nowhere(tmp_path: Path, arguments: list[str], message: str) -> None:

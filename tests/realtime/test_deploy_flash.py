@@ -20,7 +20,7 @@ NOBODY = "radio://0/11/2M/E7E7E7E7AA"
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
-    with serve("--radio", "--radio-port", "0", "--poses", "0") as served:
+    with serve("--radio", "--radio-port", "0") as served:
         yield served
 
 
@@ -32,7 +32,7 @@ def image(tmp_path: Path) -> Path:
 
 
 def flash(served: Served, *arguments: object) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "hil.cli", "deploy", "flash", *map(str, arguments)]
+    command = [sys.executable, "-m", "hil.commands", "deploy", "flash", *map(str, arguments)]
     dongle, here = served.environment["PYTHONPATH"], str(Path(__file__).parents[2])
     environment = {**served.environment, "PYTHONPATH": os.pathsep.join((dongle, here))}
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)

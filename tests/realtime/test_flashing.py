@@ -16,10 +16,10 @@ from serving import Served, serve
 
 from ground_station.errors import LinkError
 from ground_station.flashing import check_image, flash
-from hil.dongle_plugin import VARIABLE, Backend
+from hil.servers.dongle_plugin import VARIABLE, Backend
 
 START = 0x0800_4000
-LOSSES = ["loss=0", pytest.param("loss=0.1", marks=pytest.mark.long)]
+LOSSES = ["0", pytest.param("0.1", marks=pytest.mark.long)]
 
 
 def image_of(size: int, seed: int = 1) -> bytes:
@@ -28,7 +28,12 @@ def image_of(size: int, seed: int = 1) -> bytes:
 
 @pytest.fixture(scope="module", params=LOSSES)
 def served(request: pytest.FixtureRequest) -> Iterator[Served]:
-    with serve("--radio", "--radio-port", "0", "--poses", "0", "--faults", request.param) as served:
+    with serve(
+        "--radio",
+        "--radio-port",
+        "0",
+        *(f"--set=radio.{way}_loss={request.param}" for way in ("uplink", "downlink")),
+    ) as served:
         backend = Backend(served.environment[VARIABLE])
         libusb_package.get_libusb1_backend = lambda: backend
         RadioManager._radios.clear()

@@ -1,4 +1,4 @@
-"""`floaty lab serve` as a process of its own: what Motive says there, and flights that need nothing but what it says."""
+"""`floaty serve` as a process of its own: what Motive says there, and flights that need nothing but what it says."""
 
 import json
 import re
@@ -17,7 +17,8 @@ from serving import Served, free_port, serve
 from test_mavlink_clients import MavProxy, mavproxy_here
 from test_virtual_motive import FROM_MOTIVE, needs
 
-from ground_station.mocap_udp import PoseReceiver, decode_frame
+from ground_station.config import CaptureConfig
+from ground_station.sources.address import find_source
 
 START_S = 20.0
 HOVER = 0.1  # off home at most [m]; the paper hovers within centimetres
@@ -26,22 +27,23 @@ AGE_MS = 5.0  # off the cameras' latency at most: the loopback interface and a b
 
 @needs("natnet")
 def test_the_cameras_pose_is_what_a_client_gets() -> None:
-    """Against the poses that the same cameras send to `--mocap virtual`; the noise makes each frame one of a kind.
+    """Against what our own client makes of the same stream; the noise makes each frame one of a kind.
 
     The body is tracked by markers here, with noise that Motive would refuse.
     """
-    receiver = PoseReceiver(free_port())
     noise = ("--set", "markers.noise=0.02", "--set", "markers.max_error=1")
-    with serve("--udp", "0", "--natnet-port", "0", "--poses", str(receiver.port), *noise, what="lab") as lab:
-        port = lab.line("motive ")[0].split(":")[2]
+    with serve("--udp", "0", *noise, motive=True) as lab:
+        port = lab.motive.split(":")[2]
+        receiver = find_source(lab.motive, CaptureConfig())
+        receiver.open()
         script = str(Path(__file__).with_name("natnet_clients.py"))
         command = [sys.executable, script, "natnet", port, "unicast", "50"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE)
         frames = []
         deadline = time.monotonic() + START_S
         while process.poll() is None and time.monotonic() < deadline:
-            if (data := receiver.receive(0.1)) is not None:
-                frames.append(decode_frame(data))
+            if (frame := receiver.receive(0.1)) is not None:
+                frames.append(frame)
         process.kill()
         out, _ = process.communicate()
         markers = subprocess.run(
@@ -82,9 +84,7 @@ def assert_markers(out: bytes) -> None:
 
 @needs("natnet")
 def test_markers_can_be_taken_off() -> None:
-    with serve(
-        "--udp", "0", "--natnet-port", "0", "--poses", "0", "--set", "markers.enabled=false", what="lab"
-    ) as lab:
+    with serve("--udp", "0", "--natnet-port", "0", "--set", "markers.enabled=false", what="lab") as lab:
         port = lab.line("motive ")[0].split(":")[2]
         script = str(Path(__file__).with_name("natnet_clients.py"))
         command = [sys.executable, script, "natnet-markers", port, "unicast", "1"]
@@ -108,7 +108,7 @@ def test_mavproxy_flies_the_robot_from_what_motive_says(tmp_path: Path) -> None:
     """Its optitrack module knows no ports but 1510 and 1511."""
     if any(map(is_taken, (1510, 1511))):
         pytest.skip("MAVProxy's optitrack IS NOT TESTED: another program has UDP port 1510 or 1511")
-    with serve("--mavlink", "pty", "--poses", "0", what="lab") as lab:
+    with serve("--mavlink", "pty", motive=True) as lab:
         proxy = MavProxy(lab.line("mavlink ")[0], tmp_path)
         proxy.sees("Detected vehicle 1:1")
         for line in ("module load optitrack", "optitrack set multicast False", "optitrack set msg_intvl_ms 18",
@@ -160,10 +160,10 @@ class Network:
 
 
 def test_a_station_in_another_process_flies_and_flies_again_when_motive_is_back() -> None:
-    with serve("--mavlink", "pty", "--natnet-port", "0", "--poses", "0", what="lab") as lab:
+    with serve("--mavlink", "pty", motive=True) as lab:
         uri = "mavlink:" + lab.line("mavlink ")[0]
         network = Network(int(lab.line("motive ")[0].split(":")[2]))
-        command = [sys.executable, "-m", "hil.cli", "station", "--link", uri]
+        command = [sys.executable, "-m", "hil.commands", "station", "--link", uri]
         command += ["--mocap", f"optitrack:127.0.0.1:{network.port}"]
         station = Served(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT))
         try:
@@ -196,13 +196,22 @@ def test_a_station_in_another_process_flies_and_flies_again_when_motive_is_back(
 
 @pytest.mark.parametrize("body", ["wand", None])
 def test_a_wrong_body_or_no_motive_is_one_line_and_exit_code_two(body: str | None) -> None:
-    with serve("--udp", "0", "--natnet-port", "0", "--poses", "0", what="lab") as lab:
+    with serve("--udp", "0", motive=True) as lab:
         mocap = f"optitrack:127.0.0.1:{free_port()}"
         message = f"{mocap.removeprefix('optitrack:')}: no NatNet server answers"
         if body is not None:
             mocap = f"{lab.line('motive ')[0]},body={body}"
             message = "no body 'wand'; there are: floaty"
-        command = [sys.executable, "-m", "hil.cli", "station", "--link", lab.udp_uris[0], "--mocap", mocap]
+        command = [
+            sys.executable,
+            "-m",
+            "hil.commands",
+            "station",
+            "--link",
+            lab.udp_uris[0],
+            "--mocap",
+            mocap,
+        ]
         shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (shown.returncode, shown.stdout) == (2, "")
     assert shown.stderr == f"floaty: --mocap {mocap}: {message}\n"
@@ -218,7 +227,7 @@ def test_a_taken_natnet_port_is_one_line_and_exit_code_two() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = str(taken.getsockname()[1])
-        command = [sys.executable, "-m", "hil.cli", "lab", "serve", "--udp", "0", "--natnet-port", port]
+        command = [sys.executable, "-m", "hil.commands", "serve", "--udp", "0", "--natnet-port", port]
         shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert shown.returncode == 2
     assert shown.stderr.strip().endswith(f"natnet port {port}: Address already in use")

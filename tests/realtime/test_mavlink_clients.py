@@ -1,4 +1,4 @@
-"""Unmodified ground tools against `floaty board serve --mavlink`: MAVProxy and MAVSDK, each as a program of its own."""
+"""Unmodified ground tools against `floaty serve --mavlink`: MAVProxy and MAVSDK, each as a program of its own."""
 
 import hashlib
 import importlib.util
@@ -89,7 +89,7 @@ class MavProxy:
 
 @pytest.fixture(params=["pty", "udp"])
 def proxied(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Served, MavProxy]]:
-    with serve("--mavlink", address(request.param), "--poses", "0") as served:
+    with serve("--mavlink", address(request.param)) as served:
         proxy = MavProxy(served.line("mavlink ")[0], tmp_path)
         yield served, proxy
         proxy.kill()
@@ -128,7 +128,7 @@ def test_mavproxy_watches_tunes_and_commands(proxied: tuple[Served, MavProxy], t
 @mavproxy_here
 def test_a_signed_board_obeys_mavproxy_once_it_has_the_key(tmp_path: Path) -> None:
     key = hashlib.sha256(b"floaty").hexdigest()
-    with serve("--mavlink", address("pty"), "--poses", "0", "--set", f"mavlink.signing_key={key}") as served:
+    with serve("--mavlink", address("pty"), "--set", f"mavlink.signing_key={key}") as served:
         proxy = MavProxy(served.line("mavlink ")[0], tmp_path)
         try:
             proxy.sees("Detected vehicle 1:1")  # it listens to who signs, and is not listened to
@@ -145,7 +145,7 @@ def test_a_signed_board_obeys_mavproxy_once_it_has_the_key(tmp_path: Path) -> No
 @pytest.fixture(params=["udp", "pty", "tcp"])
 def url(request: pytest.FixtureRequest) -> Iterator[str]:
     """An end of a served board, in MAVSDK's words."""
-    with serve("--mavlink", address(request.param), "--poses", "0") as served:
+    with serve("--mavlink", address(request.param)) as served:
         master = served.line("mavlink ")[0]
         if request.param == "pty":
             yield f"serial://{master}:921600"

@@ -31,7 +31,7 @@ from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
-FLOATY = (sys.executable, "-m", "hil.cli")
+FLOATY = (sys.executable, "-m", "hil.commands")
 PATIENCE_S = 40.0
 KEY = hashlib.sha256(b"floaty").hexdigest()
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
@@ -372,8 +372,8 @@ class Cable:
 
 
 @contextmanager
-def station(link: str, poses: int, *arguments: str) -> Iterator[Served]:
-    command = [*FLOATY, "station", "--link", link, "--mocap", f"virtual:{poses}", *arguments]
+def station(link: str, poses: str, *arguments: str) -> Iterator[Served]:
+    command = [*FLOATY, "station", "--link", link, "--mocap", poses, *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     try:
         yield Served(process)
@@ -398,11 +398,11 @@ def end_of(served: Served) -> str:
 
 
 def test_a_pulled_cable_is_failsafe_on_board_and_the_flight_goes_on_when_it_is_back(tmp_path: Path) -> None:
-    poses, log = free_port(), tmp_path / "telemetry.csv"
-    with serve("--mavlink", "pty", "--poses", str(poses)) as served:
+    log = tmp_path / "telemetry.csv"
+    with serve("--mavlink", "pty", motive=True) as served:
         cable = Cable(end_of(served), tmp_path / "ttyUSB0")
         try:
-            with station(f"mavlink:{cable.device}", poses, "--log", str(log)) as ground:
+            with station(f"mavlink:{cable.device}", served.motive, "--log", str(log)) as ground:
                 served.wait_for("board 1: released", PATIENCE_S)
                 served.forget()
                 cable.pull()
@@ -440,10 +440,10 @@ def assert_steady(rows: list[dict[str, str]]) -> None:
 
 
 def test_it_flies_over_tcp_signed_at_57600_baud(tmp_path: Path) -> None:
-    poses, log = free_port(), tmp_path / "telemetry.csv"
+    log = tmp_path / "telemetry.csv"
     profile = (f"--set=mavlink.signing_key={KEY}", "--set=serial.baud=57600")
-    with serve("--mavlink", "tcp:0", "--poses", str(poses), *profile) as served:
-        with station(f"mavlink:{end_of(served)}", poses, "--log", str(log), *profile) as ground:
+    with serve("--mavlink", "tcp:0", *profile, motive=True) as served:
+        with station(f"mavlink:{end_of(served)}", served.motive, "--log", str(log), *profile) as ground:
             ground.wait_for("^57600 baud: uplink ", PATIENCE_S)
             served.wait_for("board 1: released", PATIENCE_S)
             ground.wait_for(" 0 lost, .* round trip ", PATIENCE_S)

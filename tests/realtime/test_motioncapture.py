@@ -21,11 +21,11 @@ from test_virtual_motive import Laboratory, needs, seen
 from vrpn_server import vrpn_server
 
 from ground_station.clock import clock_us
+from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame, MocapSource
 from ground_station.sources.address import find_source
 from ground_station.sources.capture_lines import Arrival, decode_line, encode_arrival, encode_error
-from ground_station.sources.config import CaptureConfig
 from ground_station.sources.motioncapture_client import MotioncaptureSource, settings_of
 
 names = st.text(max_size=10)

@@ -10,7 +10,7 @@ import serial
 from serving import free_port
 
 from hil.errors import LabError
-from hil.serial_server import Address, parse_addresses
+from hil.servers.serial_server import Address, parse_addresses
 
 PATIENCE_S = 5.0
 

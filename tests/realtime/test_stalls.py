@@ -10,9 +10,18 @@ from serving import serve
 
 
 def test_a_robot_flown_from_outside_survives_a_stall_of_its_world() -> None:
-    with serve("--udp", "0", "--natnet-port", "0", "--poses", "0", what="lab") as lab:
+    with serve("--udp", "0", motive=True) as lab:
         motive = lab.line("motive ")[0]
-        command = [sys.executable, "-m", "hil.cli", "station", "--mocap", motive, "--link", lab.udp_uris[0]]
+        command = [
+            sys.executable,
+            "-m",
+            "hil.commands",
+            "station",
+            "--mocap",
+            motive,
+            "--link",
+            lab.udp_uris[0],
+        ]
         station = subprocess.Popen([*command, "--duration", "15"], stdout=subprocess.PIPE, text=True)
         try:
             lab.wait_for("released", 60.0)

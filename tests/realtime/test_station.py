@@ -10,18 +10,19 @@ import pytest
 from serving import serve
 from test_motioncapture import moving
 
+from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import Sample
+from ground_station.config import CaptureConfig, StationConfig
 from ground_station.frame_rate import FrameRate
 from ground_station.latency import LinkLatency
-from ground_station.live import FAILSAFE, LiveStation
+from ground_station.live import LiveStation
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
-from ground_station.sources.config import CaptureConfig
 from ground_station.sources.replay import read_frames
-from ground_station.station import GroundStation, StationConfig
+from ground_station.station import GroundStation
 from ground_station.trajectory import Goal, Hold
 
-FLOATY = (sys.executable, "-m", "hil.cli")
+FLOATY = (sys.executable, "-m", "hil.commands")
 
 
 class SlowLink:
@@ -29,7 +30,7 @@ class SlowLink:
 
     uri = "slow"
     latency = LinkLatency("air", 0, measured=False)
-    supervisor_state = FAILSAFE
+    supervisor_state = State.FAILSAFE
     sent = 0
 
     def open(self, give_up: Callable[[], bool]) -> None:
@@ -85,7 +86,7 @@ def station(*arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.long
 def test_a_flight_is_recorded_and_its_record_flown_again(tmp_path: Path) -> None:
     profile, frames = tmp_path / "lab.toml", tmp_path / "frames.csv"
-    with serve("--mavlink", "pty", "--natnet-port", "0", "--poses", "0", what="lab") as lab:
+    with serve("--mavlink", "pty", motive=True) as lab:
         link = "mavlink:" + lab.line("mavlink ")[0]
         port = lab.line("motive ")[0].split(":")[2]
         profile.write_text(

@@ -32,12 +32,12 @@ from ground_station.natnet import (
     decode,
     packet,
 )
-from hil.dongle_server import Readers
+from hil.devices.markers import NO_POINTS, Sighting, marker_places
 from hil.errors import LabError
-from hil.markers import NO_POINTS, Sighting, marker_places
-from hil.natnet_bytes import encode_frame, encode_models, encode_server_info
-from hil.plant.config import PlantConfig
-from hil.virtual_motive import MAX_CLIENTS, Streaming, VirtualMotive, with_y_up
+from hil.servers.dongle_server import Readers
+from hil.servers.motive import MAX_CLIENTS, Streaming, VirtualMotive, with_y_up
+from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
+from hil.world.config import PlantConfig
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
 FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world

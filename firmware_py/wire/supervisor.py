@@ -1,0 +1,23 @@
+"""The supervisor's states and causes, as they travel in telemetry."""
+
+from enum import IntEnum
+
+
+class State(IntEnum):
+    """What the robot is allowed to do."""
+
+    CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
+    WAITING = 1  # no pose has come yet: flaps at hover
+    FLYING = 2  # loop closed
+    FAILSAFE = 3  # flaps at hover, see the cause
+
+
+class Cause(IntEnum):
+    """Why the robot is in failsafe."""
+
+    NONE = 0
+    SILENCE = 1
+    OUT_OF_BOUNDS = 2
+    EMERGENCY_STOP = 3
+    LOW_BATTERY = 4
+    DISARMED = 5

@@ -1,0 +1,99 @@
+"""The ground station as a program: cameras, link, tracker, trajectory and records wired together, until told to stop.
+
+It knows nothing of the laboratory: what a profile says of it arrives as `GroundSettings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ground_station.clock import clock_us
+from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
+from ground_station.errors import MocapError
+from ground_station.frame_rate import FrameRate
+from ground_station.links.schemes import LinkSettings, find_link
+from ground_station.live import LiveStation
+from ground_station.mocap import MocapSource
+from ground_station.sources.address import find_source
+from ground_station.sources.record import RecordingSource
+from ground_station.sources.replay import ReplaySource
+from ground_station.station import GroundStation
+from ground_station.telemetry_log import TelemetryLog
+from ground_station.tracker import tracker_of
+from ground_station.trajectory import Goal, Trajectory, Waiting
+
+
+@dataclass(frozen=True, slots=True)
+class GroundSettings:
+    """What a profile says of the ground station."""
+
+    station: StationConfig
+    tracker: TrackerConfig
+    capture: CaptureConfig
+    frame_period_us: int  # of the cameras
+    home: tuple[float, float, float]  # of the goal, W [m]
+    link: LinkSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What is flown. `start_s`: when the trajectory's clock begins, after the board first flies."""
+
+    uri: str
+    mocap: str | None  # on top of the settings' capture
+    trajectory: Callable[[Goal, int], Trajectory]  # (home, start [us])
+    start_s: float = 0.0
+    log: Path | None = None  # telemetry
+    record: Path | None = None  # frames of motion capture
+
+
+def fly(
+    settings: GroundSettings, session: Session, say: Callable[[str], None], stopping: Callable[[], bool]
+) -> None:
+    """Fly until told to stop, or to the end of a replay.
+
+    Raises `LinkError` or `MocapError` when there is no board or there are no poses, `OSError` for a file that cannot be
+    written, `ImportError` for a package that is missing.
+    """
+    link = find_link(session.uri, settings.link)
+    tracker = tracker_of(settings.tracker, settings.frame_period_us)
+    played = source = _open_source(session.mocap, settings.capture)
+    telemetry = None
+    try:
+        telemetry = TelemetryLog(session.log) if session.log else None
+        source = RecordingSource(source, session.record) if session.record else source
+        trajectory = Waiting(Goal(settings.home, 0.0), session.trajectory)
+        ground = GroundStation(link, trajectory, telemetry, settings.station, tracker)
+
+        def over() -> bool:
+            return stopping() or (isinstance(played, ReplaySource) and played.over)
+
+        def flying(now_us: int) -> None:
+            if not trajectory.started:
+                trajectory.start(now_us + round(session.start_s * 1e6))
+
+        rate = FrameRate(settings.frame_period_us, settings.station.corrections_hz)
+        LiveStation(link, ground, source, rate, say, over, flying).run()
+    finally:
+        source.close()
+        if telemetry is not None:
+            telemetry.close()
+
+
+def run_until(stopping: Callable[[], bool], duration_s: float | None) -> Callable[[], bool]:
+    """Return what says when to end: when told to, or after a while from now on."""
+    start_us = clock_us()
+    return lambda: stopping() or (duration_s is not None and clock_us() - start_us > duration_s * 1e6)
+
+
+def _open_source(mocap: str | None, capture: CaptureConfig) -> MocapSource:
+    """Return where poses come from, connected."""
+    try:
+        source = find_source(mocap, capture)
+        source.open()
+    except MocapError as error:
+        what = f"--mocap {mocap}" if mocap is not None else f"capture.system = {capture.system}"
+        raise MocapError(f"{what}: {error}") from None
+    return source

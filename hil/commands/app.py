@@ -1,0 +1,53 @@
+"""`floaty`: the commands together.
+
+Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C in 130 with the log kept.
+"""
+
+import sys
+
+import click
+
+from hil.commands.compare import compare
+from hil.commands.deploy import deploy
+from hil.commands.drag_model import drag_model
+from hil.commands.fly import fly
+from hil.commands.listing import list_experiments
+from hil.commands.options import INTERRUPTED
+from hil.commands.paper import paper, study
+from hil.commands.pictures import report, view
+from hil.commands.serve import serve
+from hil.commands.station import station
+from hil.errors import LabError
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="floaty-hil", prog_name="floaty")
+def app() -> None:
+    """Floaty virtual laboratory: firmware, ground station and wind tunnel, joined by real bytes."""
+
+
+for command in (
+    fly, list_experiments, view, report, serve, station, compare, paper, study, drag_model, deploy,
+):  # fmt: skip
+    app.add_command(command)
+
+
+def main() -> None:
+    """Run the command line and leave with its exit code."""
+    try:
+        code = app.main(standalone_mode=False)
+    except LabError as error:
+        sys.exit(_refuse(str(error)))
+    except click.exceptions.NoArgsIsHelpError as error:
+        print(error.format_message(), file=sys.stderr)
+        sys.exit(2)
+    except click.ClickException as error:
+        sys.exit(_refuse(error.format_message()))
+    except (click.Abort, KeyboardInterrupt):
+        sys.exit(INTERRUPTED)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _refuse(text: str) -> int:
+    print("floaty:", " ".join(text.split()), file=sys.stderr)
+    return 2

@@ -1,0 +1,208 @@
+"""`floaty deploy export | check | flash`: the flight core as C for a Crazyflie, proof that it is the one that flew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+
+from hil.commands.options import INTERRUPTED, announce_compilation, notices, profile_option, set_option
+from hil.errors import LabError
+
+if TYPE_CHECKING:
+    from hil.deploy.check import Checked
+    from hil.deploy.targets import MachineCode
+    from hil.laboratory.flight import Flight
+
+console = Console(highlight=False, markup=False)
+
+
+@click.group()
+def deploy() -> None:
+    """Bring the flight core to a Crazyflie-class board."""
+
+
+@deploy.command()
+@click.argument("experiment", required=False)
+@click.option("--all", "every", is_flag=True, help="Every experiment, the first minute of each.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**63 - 1), default=1, show_default=True, help="Of everything random."
+)
+@click.option(
+    "--duration",
+    type=click.FloatRange(0, 86_400, min_open=True),
+    metavar="S",
+    help="Free flight [s]; default: the experiment's.",
+)
+@profile_option
+@set_option
+@click.option(
+    "--fault", "fault_texts", multiple=True, metavar="KIND@START[:DURATION][=SIZE]", help="As for fly; repeatable.",
+)  # fmt: skip
+@click.option(
+    "--targets", "target_text", metavar="NAME,...",
+    help="What to compare with numba: plain, c-O0, c-O2, cortex-m4.  [default: all]",
+)  # fmt: skip
+@click.option(
+    "--source", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Check this floaty_core.c, as exported before, instead of what would be exported now.",
+)  # fmt: skip
+@click.option(
+    "--elf", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Check the core inside this linked firmware, like the build/cf2.elf that is flashed, as cortex-m4.",
+)  # fmt: skip
+def check(
+    experiment: str | None,
+    every: bool,
+    seed: int,
+    duration: float | None,
+    profile: str,
+    overrides: tuple[str, ...],
+    fault_texts: tuple[str, ...],
+    target_text: str | None,
+    source: Path | None,
+    elf: Path | None,
+) -> int:
+    """Fly with numba, plain Python, C and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
+
+    Without EXPERIMENT: hover, yaw step and a hover with faults, 10 000 ticks of 10 ms. Exit code 0: no bit differs; 1: one
+    does; 2: bad input; 130: interrupted.
+    """
+    from hil.deploy.check import check_flight, plan
+    from hil.deploy.targets import Toolbox, target_names
+    from hil.laboratory.faults import parse
+
+    if source and elf:
+        raise LabError("--source and --elf: one or the other")
+    names = target_names(target_text)
+    flights = plan(
+        experiment, every, profile, overrides, seed, duration, [parse(text) for text in fault_texts]
+    )
+    toolbox = Toolbox(names, _read(source) if source else None, elf)
+    announce_compilation()
+    checked: list[Checked] = []
+    for request in flights:
+        with _progress(str(request.experiment.name)) as show:
+            checked.append(check_flight(request, toolbox.factories, show))
+        _print_flight(checked[-1])
+        if checked[-1].outcome == "interrupted":
+            break
+    _print_sum(checked)
+    if toolbox.machine_code is not None:
+        _print_machine_code(toolbox.machine_code)
+    if checked[-1].outcome == "interrupted":
+        return INTERRUPTED
+    return 0 if all(one.equal for one in checked) else 1
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Callable[[int, Flight], None]]:
+    """Show how far a flight is."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+        bar = progress.add_task(name, total=None)
+        yield lambda now_us, flight: progress.update(bar, completed=now_us, total=flight.end_us)
+
+
+def _print_flight(checked: Checked) -> None:
+    request = checked.request
+    faults = f", {len(request.faults)} faults" if request.faults else ""
+    console.print(
+        f"{request.experiment.name}, seed {request.seed}{faults}: {checked.outcome}", soft_wrap=True
+    )
+    for target in checked.targets:
+        verdict = "equal" if target.divergence is None else f"DIFFERS first in {target.divergence}"
+        console.print(
+            f"  {target.name:<10}{target.ticks:>7} ticks {target.calls:>7} calls  {verdict}", soft_wrap=True
+        )
+
+
+def _print_sum(checked: list[Checked]) -> None:
+    every = [target for one in checked for target in one.targets]
+    names = list(dict.fromkeys(target.name for target in every))
+    ticks = min(sum(target.ticks for target in every if target.name == name) for name in names)
+    different = [name for name in names if any(target.divergence for target in every if target.name == name)]
+    verdict = f"{', '.join(different)} DIFFERS" if different else "no bit differs"
+    console.print(f"{ticks} ticks, numba beside {', '.join(names)}: {verdict}", soft_wrap=True)
+
+
+def _print_machine_code(code: MachineCode) -> None:
+    from firmware_py.export.cortex_m4 import CLOCK_MHZ
+
+    ticks = code.ticks
+    flash = "" if code.flash_bytes is None else f"flash {code.flash_bytes} B, "
+    console.print(
+        f"Cortex-M4 code: {flash}RAM {code.ram_bytes} B, stack {code.stack_bytes} B",
+        soft_wrap=True,
+    )
+    mean, worst = code.loads
+    console.print(
+        f"instructions per tick: mean {ticks.instructions / max(ticks.calls, 1):.0f}, worst {ticks.worst_instructions}; "
+        f"load at {CLOCK_MHZ} MHz: mean {mean:.1%}, worst tick {worst:.1%} ({ticks.worst_us:.0f} us of 10 ms)",
+        soft_wrap=True,
+    )
+
+
+def _read(source: Path) -> str:
+    try:
+        return source.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise LabError(f"--source {source}: {getattr(error, 'strerror', None) or error}") from None
+
+
+@deploy.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
+@profile_option
+@set_option
+def export(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
+    """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the folder DIR."""
+    from firmware_py.export.crazyflie import write_app
+    from firmware_py.export.errors import ExportError
+    from hil.config import load_config
+
+    config = load_config(profile, overrides)
+    try:
+        files = write_app(config, " ".join((profile, *overrides)), folder)
+    except ExportError as error:
+        raise LabError(str(error)) from None
+    for file in files:
+        console.print(file, soft_wrap=True)
+
+
+@deploy.command()
+@click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path, dir_okay=False))
+@click.option("--uri", required=True, metavar="radio://…", help="The board, as in `floaty station`.")
+def flash(image: Path, uri: str) -> None:
+    """Flash IMAGE, the .bin of a Crazyflie build, over the radio, read it back and start it."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    try:
+        from ground_station.flashing import flash as flash_board
+    except ImportError as error:
+        from firmware_py.extras import install_command
+
+        raise LabError(f"deploy flash: {error}: {install_command('radio')}") from None
+    from ground_station.errors import LinkError
+
+    try:
+        content = image.read_bytes()
+    except OSError as error:
+        raise LabError(f"{image}: {error.strerror or error}") from None
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+        bar = progress.add_task("", total=None)
+
+        def show(what: str, done: int, size: int) -> None:
+            progress.update(bar, description=what, completed=done, total=size)
+
+        try:
+            flash_board(uri, content, show)
+        except LinkError as error:
+            raise LabError(f"{image}: {error}") from None
+    console.print(f"{len(content)} bytes written and read back; the board starts")

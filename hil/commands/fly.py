@@ -1,0 +1,180 @@
+"""`floaty fly`: one experiment, one seed with pictures or many in parallel, in lockstep or over a real link."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from hil.commands.options import (
+    INTERRUPTED,
+    announce_compilation,
+    console,
+    fault_option,
+    notices,
+    profile_option,
+    seed_option,
+    set_option,
+)
+from hil.commands.tables import print_result, print_seeds
+from hil.errors import LabError
+
+if TYPE_CHECKING:
+    from hil.laboratory.flight import Flight
+    from hil.laboratory.run import Request
+    from hil.pictures.viewer import LiveViewer
+
+DURATION_MAX_S = 86_400.0
+SEEDS_MAX = 10_000
+
+
+@click.command()
+@click.argument("experiment")
+@seed_option
+@click.option(
+    "--seeds", type=click.IntRange(1, SEEDS_MAX), default=1, metavar="N",
+    help="Fly N seeds from --seed on, in parallel; logs without pictures.",
+)  # fmt: skip
+@click.option("--duration", type=float, metavar="S", help="Free flight [s]; default: the experiment's.")
+@profile_option
+@set_option
+@fault_option
+@click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
+@click.option("--view", "watch", is_flag=True, help="Watch live in the rerun viewer.")
+@click.option("--perfetto", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace.")
+@click.option(
+    "--link", metavar="LINK", default="radio", show_default=True,
+    help="radio or mavlink: in lockstep; radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:PORT or mavlink:/dev/NAME: over "
+    "cflib or a serial port, in real time, the ground station in a process of its own.",
+)  # fmt: skip
+@click.option(
+    "--board", metavar="BOARD", default="python", show_default=True,
+    help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated).",
+)  # fmt: skip
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
+)
+def fly(
+    experiment: str,
+    seed: int,
+    seeds: int,
+    duration: float | None,
+    profile: str,
+    overrides: tuple[str, ...],
+    fault_texts: tuple[str, ...],
+    realtime: bool,
+    watch: bool,
+    perfetto: bool,
+    link: str,
+    board: str,
+    out: Path | None,
+) -> int:
+    """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
+
+    Exit code 0: all limits hold; 1: a limit fails; 2: bad input; 130: interrupted.
+    """
+    from hil.experiments import find_experiment
+
+    chosen = find_experiment(experiment)
+    flown_s = chosen.duration_s if duration is None else duration
+    if not 0.0 < flown_s <= DURATION_MAX_S:
+        raise LabError(f"--duration {flown_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}")
+    if seeds > 1 and (realtime or watch or perfetto):
+        raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
+    if perfetto:
+        import hil.pictures.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
+    from hil.laboratory.faults import parse
+    from hil.laboratory.run import Request
+
+    faults = [parse(text) for text in fault_texts]
+    requests = [
+        Request.of(chosen, profile, overrides, seed + index, flown_s, link, faults, board)
+        for index in range(seeds)
+    ]
+    announce_compilation()
+    if seeds > 1 and not requests[0].in_lockstep:
+        raise LabError(f"--link {link}: --seeds is for flights in lockstep")
+    if seeds > 1:
+        return _fly_many(requests, out or Path("runs"))
+    folder = out or Path("runs") / f"{chosen.name}-{seed}"
+    return _fly_one(requests[0], folder, realtime, watch, perfetto)
+
+
+def _fly_one(request: Request, folder: Path, realtime: bool, watch: bool, perfetto: bool) -> int:
+    """Fly one seed with all its pictures; returns the exit code."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from hil.clock import FreeRunning, Paced
+    from hil.laboratory.run import fly, prepare
+    from hil.servers.linked import linked_flight
+
+    prepare(folder)
+    viewer = _live_viewer(folder) if watch else None
+    clock = Paced() if realtime else FreeRunning()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[now]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+        bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
+
+        def show(now_us: int, flight: Flight) -> None:
+            progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
+
+        make = None if request.in_lockstep else linked_flight
+        result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto, make)
+        progress.update(bar, description="writing recording and report", total=None, now="")
+        _write_pictures(folder)
+        if perfetto:
+            from hil.pictures.perfetto import write_perfetto
+
+            write_perfetto(folder)
+        missed = viewer.close() if viewer else 0
+    print_result(result)
+    if missed:
+        console.print(
+            f"the live viewer was too slow for {missed} of the flight's seconds; the recording has them all"
+        )
+    if result.stood_still_us:
+        console.print(
+            f"this machine was too slow: time stood still for {result.stood_still_us / 1000:.0f} ms"
+        )
+    if result.outcome == "interrupted":
+        return INTERRUPTED
+    return 0 if result.passed else 1
+
+
+def _live_viewer(folder: Path) -> LiveViewer:
+    """Open the live viewer."""
+    from hil.pictures.viewer import LiveViewer
+
+    return LiveViewer(folder)
+
+
+def _write_pictures(folder: Path) -> None:
+    """Write recording and report; what cannot be written is said, for the log is there and can be shown later."""
+    try:
+        from hil.pictures.viewer import write_run_rrd
+
+        write_run_rrd(folder)
+    except LabError as error:
+        notices.print(f"floaty: no recording: {error}", soft_wrap=True)
+    from hil.pictures.report import write_report
+
+    write_report(folder)
+
+
+def _fly_many(requests: list[Request], parent: Path) -> int:
+    """Fly seeds in parallel processes; one row per seed, a summary at the end; returns the exit code."""
+    from hil.studies.sweep import Job, fly_all
+
+    jobs = [Job(request, parent / f"{request.experiment.name}-{request.seed}") for request in requests]
+    rows, interrupted = fly_all(jobs, notices)
+    print_seeds(rows)
+    if interrupted:
+        notices.print(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
+        return INTERRUPTED
+    return 0 if all(result.passed for result in rows) else 1

@@ -1,0 +1,49 @@
+"""`floaty list`: what can be flown."""
+
+import math
+
+import click
+from rich.console import Console
+
+from hil.commands.options import console
+
+
+@click.command("list")
+@click.option("--faults", is_flag=True, help="List the kinds of faults for `floaty fly --fault`.")
+def list_experiments(faults: bool) -> None:
+    """List the experiments, the robustness studies and the profiles, or the kinds of faults."""
+    if faults:
+        return _list_faults()
+    from hil.config import DEFAULT_PROFILE, profile_names
+    from hil.experiments import EXPERIMENTS
+    from hil.studies.catalogue import STUDIES
+
+    width = max(map(len, EXPERIMENTS))
+    for experiment in EXPERIMENTS.values():
+        console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
+    bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
+    console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
+    console.print("\nrobustness, for `floaty study`:")
+    for one in STUDIES.values():
+        console.print(f"{one.name:{width}}  {one.question}", soft_wrap=True)
+    names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
+    console.print(f"\nprofiles: {', '.join(names)}")
+    console.print("faults: floaty list --faults")
+
+
+def _list_faults() -> None:
+    from rich.table import Table
+
+    from hil.laboratory.fault_kinds import KINDS
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("kind", "size", "from..to", "lasts", "hover"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("meaning")
+    for name, kind in KINDS.items():
+        unit = f" {kind.unit}".rstrip()
+        size, bounds = (f"{kind.size:g}{unit}", f"{kind.low:g}..{kind.high:g}") if kind.sized else ("", "")
+        lasts = f"{kind.duration_s:g} s" if math.isfinite(kind.duration_s) else "to the end"
+        only = f" ({kind.needs})" if kind.needs else ""
+        table.add_row(name, size, bounds, lasts, kind.outcome, f"{kind.meaning}{only}")
+    Console(highlight=False, width=max(console.width, 150)).print(table)

@@ -1,0 +1,128 @@
+"""`floaty paper | study`: many flights and what they come to."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+
+from hil.commands.options import INTERRUPTED, announce_compilation, console, notices
+from hil.errors import LabError
+
+if TYPE_CHECKING:
+    from hil.studies.paper import Paper
+    from hil.studies.study import Study
+
+folder_type = click.Path(path_type=Path)
+seeds_option = click.option(
+    "--seeds",
+    type=click.IntRange(1, 1000),
+    default=5,
+    show_default=True,
+    metavar="N",
+    help="Of every flight.",
+)
+
+
+@click.command()
+@seeds_option
+@click.option(
+    "--out",
+    type=folder_type,
+    metavar="DIR",
+    default=Path("runs/paper"),
+    show_default=True,
+    help="Report and logs.",
+)
+@click.option("--only", metavar="PATTERN", help="Experiments, like hover or yaw-*, and nothing else.")
+@click.option("--no-studies", is_flag=True, help="Leave the robustness studies out.")
+def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
+    """Fly the paper's experiments on both profiles, and the robustness studies; write one report.
+
+    Exit code 0: every verdict holds for the default profile; 1: one fails; 2: bad input; 130: interrupted, with a report
+    of what was flown.
+    """
+    from hil.studies.catalogue import STUDIES
+    from hil.studies.paper import select
+
+    studies = [] if only or no_studies else list(STUDIES.values())
+    return _fly(select(only), studies, seeds, out, mounted=not only)
+
+
+@click.command()
+@click.argument("name")
+@seeds_option
+@click.option("--out", type=folder_type, metavar="DIR", help="Report and picture [runs/study-NAME].")
+def study(name: str, seeds: int, out: Path | None) -> int:
+    """Fly one robustness study (see `floaty list`): faults of growing size, several variants, one picture.
+
+    Exit code 0: every outcome is the expected one; 1: one is not; 2: bad input; 130: interrupted.
+    """
+    from hil.studies.catalogue import find_study
+
+    return _fly([], [find_study(name)], seeds, out or Path("runs") / f"study-{name}")
+
+
+def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted: bool = False) -> int:
+    from hil.config import load_config
+    from hil.studies import drag_model
+    from hil.studies.paper import fly_paper
+    from hil.studies.paper_report import write_paper
+
+    announce_compilation()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        flown = fly_paper(rows, studies, seeds, out, notices)
+        bench = list(drag_model.measure(load_config(), 1)) if mounted and not flown.interrupted else []
+        report = write_paper(out, flown, bench)
+    except OSError as error:
+        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
+    _print_rows(flown)
+    _print_studies(flown)
+    console.print(f"  {report}", soft_wrap=True)
+    if flown.interrupted:
+        notices.print("interrupted: the report has the flights that were complete")
+        return INTERRUPTED
+    holds = flown.holds if rows else all(result.holds for result in flown.studies)
+    return 0 if holds else 1
+
+
+def _print_rows(flown: "Paper") -> None:
+    from rich.table import Table
+
+    from hil.studies.catalogue import PROFILES
+    from hil.studies.paper import Spread
+
+    if not flown.rows:
+        return
+    table = Table(title="paper and laboratory: mean ± deviation over the seeds")
+    for heading in ("result", "figure", "paper", *PROFILES):
+        table.add_column(heading)
+    for _, row, both in flown.rows:
+        table.add_section()
+        for index, (metric, claim) in enumerate(row.claims.items()):
+            cells = (f"{Spread.of(metric, one.results)} {_marked(one.missed(row, metric))}" for one in both)
+            table.add_row(row.title if index == 0 else "", metric, claim.text, *cells)
+        verdicts = (
+            f"{one.passed} of {len(one.results)}{'' if one.holds else _marked(' FAILS')}" for one in both
+        )
+        table.add_row("", "limits held", "", *verdicts)
+    Console(highlight=False, width=max(console.width, 160)).print(table)
+    for row, profile, what in flown.misses:
+        console.print(f"{row.title}, {profile}: {'; '.join(what)}", soft_wrap=True)
+    whys = dict.fromkeys(row.why for row, _, _ in flown.misses if row.why)
+    for why in whys:
+        console.print(f"\n{why}", soft_wrap=True)
+
+
+def _marked(text: str) -> str:
+    return f"[red]{text}[/red]" if text else ""
+
+
+def _print_studies(flown: "Paper") -> None:
+    for result in flown.studies:
+        surprises = [
+            f"{curve.variant.name}: {one}" for curve in result.curves for one in result.surprises(curve)
+        ]
+        verdict = "as expected" if result.holds else "; ".join(surprises) or "not complete"
+        console.print(f"study {result.study.name}: {verdict}", soft_wrap=True)

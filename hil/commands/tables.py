@@ -1,0 +1,97 @@
+"""What `floaty fly` prints of its flights: one flight's verdicts, or a row per seed."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from hil.commands.options import console
+
+if TYPE_CHECKING:
+    from hil.laboratory.run import Result
+
+SEED_COLUMNS = (
+    ("rms x y z [cm]", ("rms_x", "rms_y", "rms_z"), 100.0, 2),
+    ("max x y z [cm]", ("max_x", "max_y", "max_z"), 100.0, 1),
+    ("< 6 cm x y z [%]", ("within_6cm_x", "within_6cm_y", "within_6cm_z"), 100.0, 1),
+    ("in box [%]", ("in_box",), 100.0, 1),
+    ("attitude max [deg]", ("attitude_max",), math.degrees(1.0), 1),
+)
+
+
+def print_seeds(rows: list[Result]) -> None:
+    """Print one row per seed and the summary."""
+    from rich.table import Table
+
+    if not rows:
+        return
+    table = Table(title=f"{rows[0].request.experiment.name}, profile {rows[0].request.profile}")
+    for heading in ("seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict"):
+        table.add_column(heading, justify="right")
+    for result in rows:
+        failed = ", ".join(verdict.metric for verdict in result.verdicts if not verdict.holds)
+        verdict = "ok" if result.passed else result.cause or f"fails: {failed}"
+        table.add_row(
+            str(result.request.seed),
+            *(
+                " ".join(f"{result.metrics[name] * scale:.{digits}f}" for name in names)
+                for _, names, scale, digits in SEED_COLUMNS
+            ),
+            result.hash[:12],
+            verdict,
+        )
+    wide = Console(highlight=False, width=max(console.width, 140))
+    wide.print(table)
+    completed = [result.metrics for result in rows if result.outcome == "completed"]
+    lost = sum(result.outcome == "lost" for result in rows)
+    passed = sum(result.passed for result in rows)
+    console.print(f"{len(rows)} seeds: {passed} hold all limits, {lost} lost")
+    if completed:
+        shares, rms = (
+            " ".join(
+                f"{axis} {100.0 * sum(metrics[name + axis] for metrics in completed) / len(completed):.{digits}f}"
+                for axis in "xyz"
+            )
+            for name, digits in (("within_6cm_", 1), ("rms_", 2))
+        )
+        console.print(f"mean of the completed: rms {rms} cm; < 6 cm {shares} % of the time", soft_wrap=True)
+
+
+def print_result(result: Result) -> None:
+    """Print the verdicts of one flight and where to look."""
+    from rich.table import Table
+
+    from ground_station.latency import budget_line
+    from hil.laboratory.metrics import METRICS
+
+    request = result.request
+    table = Table(title=f"{request.experiment.name}, seed {request.seed}, profile {request.profile}")
+    table.add_column("metric")
+    for heading in ("value", "limit", "verdict"):
+        table.add_column(heading, justify="right")
+    verdicts = {verdict.metric: verdict for verdict in result.verdicts}
+    for name, value in result.metrics.items():
+        if math.isnan(value) and name not in verdicts:
+            continue
+        metric = METRICS[name]
+        limit = mark = ""
+        if name in verdicts:
+            limit = f"{'<=' if metric.bound == 'max' else '>='} {metric.show(verdicts[name].bound)}"
+            mark = "ok" if verdicts[name].holds else "FAILS"
+        table.add_row(name, metric.show(value), limit, mark)
+    console.print(table)
+    cause = f": {result.cause}" if result.cause else ""
+    console.print(
+        f"{result.outcome}{cause}; {result.real_time_factor:.0f} times real time; hash {result.hash[:16]}"
+    )
+    if result.ages:
+        console.print(budget_line(result.ages), soft_wrap=True)
+    if result.usage is not None:
+        for name, load in result.usage.entries.items():
+            console.print(f"  {request.board} {name:9} {load}", soft_wrap=True)
+    for name in ("report.html", "flight.rrd", "flight.perfetto-trace", "log.parquet"):
+        if (result.folder / name).is_file():
+            hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""
+            console.print(f"  {result.folder / name}{hint}", soft_wrap=True)

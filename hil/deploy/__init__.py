@@ -1,0 +1,1 @@
+"""The check that all targets are equal, and the tools that it needs."""

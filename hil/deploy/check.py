@@ -1,0 +1,105 @@
+"""Flights in which every implementation of the flight core runs beside the one that flies, compared after every call.
+
+The reference is the board of every other flight: the core's Python compiled by numba. The targets are the same source as
+plain Python, as C for this machine, and as machine code of the Cortex-M4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
+from firmware_py.export.errors import ExportError
+from firmware_py.export.side_by_side import SideBySide, Target
+from firmware_py.firmware import WatchdogError
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS, find_experiment
+from hil.laboratory.faults import Fault, parse
+from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.run import Request
+
+DEFAULT = ("hover", "yaw-step")  # and the one with faults: 10 000 ticks in all
+LONGEST_S = 60.0  # of an experiment with --all: `endurance` takes half an hour
+FAULTY_S = 65.0
+FAULTS = (
+    "mocap.dropout@2:0.5", "mocap.outlier@5", "mocap.swap@8", "radio.cut@11:0.3", "push.y@14=2", "push.yaw@17=0.05",
+    "imu.freeze@20", "imu.bias.r@23:3=10", "radio.loss@28:4=0.5", "mocap.latency@35:4=70", "servo.slow.2@42:4=0.5",
+    "radio.jitter@48:4=15", "wind.occlusion@54=0.1", "imu.saturation@57:3=20",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """One flight and how the targets did."""
+
+    request: Request
+    outcome: str  # completed, lost (and why), interrupted
+    targets: tuple[Target, ...]
+
+    @property
+    def equal(self) -> bool:
+        """Whether no target has differed in any bit."""
+        return all(target.divergence is None for target in self.targets)
+
+
+def check_flight(
+    request: Request,
+    factories: Callable[[ExitStack], dict[str, RunnerFactory]],
+    progress: Callable[[int, Flight], None],
+) -> Checked:
+    """Fly once with all targets beside the board; Ctrl-C ends the flight early with the outcome "interrupted".
+
+    Raises `LabError` when a target cannot be started.
+    """
+    made: list[SideBySide] = []
+    with ExitStack() as stack:
+        targets = factories(stack)
+
+        def side_by_side(blocks: CoreBlocks) -> CoreRunner:
+            try:
+                made.append(SideBySide(blocks, targets))
+            except ExportError as error:
+                raise LabError(str(error)) from None
+            return made[0]
+
+        flight = lockstep_flight(
+            request.config, request.experiment, request.duration_s, request.seed, None,
+            link=request.link, faults=request.faults, runner=side_by_side,
+        )  # fmt: skip
+        try:
+            end = flight.run(lambda now_us: progress(now_us, flight))
+            outcome = "interrupted" if end.interrupted else f"lost: {end.lost}" if end.lost else "completed"
+        except WatchdogError as error:
+            outcome = f"lost: {error}"
+        finally:
+            flight.close()
+    return Checked(request, outcome, tuple(made[0].targets))
+
+
+def plan(
+    experiment: str | None, every: bool, profile: str, overrides: Sequence[str], seed: int, duration_s: float | None,
+    faults: Sequence[Fault],
+) -> list[Request]:  # fmt: skip
+    """Return the flights to check: one experiment, every one, or by default hover, yaw step and a hover with faults."""
+    if every and experiment is not None:
+        raise LabError(f"{experiment} and --all: one or the other")
+    if faults and experiment is None:
+        raise LabError(f"--fault {faults[0]}: for which EXPERIMENT?")
+
+    def request(name: str, length_s: float | None, faults: Sequence[Fault] = ()) -> Request:
+        return Request.of(find_experiment(name), profile, overrides, seed, length_s, faults=faults)
+
+    if experiment is not None:
+        return [request(experiment, duration_s, faults)]
+    if every:
+        flights = [
+            request(one.name, duration_s or min(one.duration_s, LONGEST_S)) for one in EXPERIMENTS.values()
+        ]
+    else:
+        flights = [request(name, duration_s) for name in DEFAULT]
+    length_s = duration_s or FAULTY_S
+    faulty = [fault for fault in map(parse, FAULTS) if fault.start_s < length_s]
+    return [*flights, request("hover", length_s, faulty)]

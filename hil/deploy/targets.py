@@ -1,0 +1,121 @@
+"""The implementations of the flight core that `floaty deploy check` can put beside the one that flies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
+from firmware_py.export.arm_image import Image, build_image, build_meter, read_image
+from firmware_py.export.c99 import translate
+from firmware_py.export.cortex_m4 import CortexM4Runner, Load
+from firmware_py.export.errors import ExportError
+from firmware_py.export.native import NativeRunner, build
+from firmware_py.export.plain import PlainRunner
+from hil.errors import LabError
+from hil.laboratory.run import BUILD
+
+PLAIN, C_O0, C_O2, CORTEX_M4 = TARGETS = ("plain", "c-O0", "c-O2", "cortex-m4")
+OPTIMISATION = {C_O0: "-O0", C_O2: "-O2"}
+TICK_HZ = 100
+
+
+def target_names(text: str | None) -> tuple[str, ...]:
+    """Return the targets that a comma-separated text names; None: all. Raises `LabError`."""
+    if text is None:
+        return TARGETS
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
+    for name in names:
+        if name not in TARGETS:
+            raise LabError(f"--targets {text}: {name!r} is none of {', '.join(TARGETS)}")
+    return names
+
+
+class Metered(CortexM4Runner):
+    """Machine code whose ticks are counted: the poses, the estimator and the controller of each."""
+
+    def __init__(self, blocks: CoreBlocks, image: Image, meter: Path, ticks: Load) -> None:
+        super().__init__(blocks, image, meter)
+        self._ticks = ticks
+        self._so_far: tuple[int, int] | None = None  # instructions, cycles at the last tick's end; None: boot
+
+    def control(self) -> None:
+        """Run the controller, with which a tick ends."""
+        super().control()
+        loads = self.load.values()
+        now = sum(load.instructions for load in loads), sum(load.cycles for load in loads)
+        if self._so_far is not None:
+            self._ticks.add(now[0] - self._so_far[0], now[1] - self._so_far[1])
+        self._so_far = now
+
+
+@dataclass(slots=True)
+class MachineCode:
+    """What the machine code takes of the board, over all flights of a check: memory, and processor time per tick."""
+
+    flash_bytes: int | None  # None: with a firmware around it
+    ticks: Load
+    ram_bytes: int = 0
+    stack_bytes: int = 0
+
+    @property
+    def loads(self) -> tuple[float, float]:
+        """The share of the processor that a mean and the worst tick take."""
+        return self.ticks.mean_us * 1e-6 * TICK_HZ, self.ticks.worst_us * 1e-6 * TICK_HZ
+
+
+class Toolbox:
+    """Builds what the targets need, once.
+
+    `source` is the text of a floaty_core.c in place of the exported one, `elf` a linked firmware whose core is the
+    machine code.
+
+    Raises `LabError` for a compiler or package that is missing and for C that cannot be compiled.
+    """
+
+    def __init__(self, names: Sequence[str], source: str | None = None, elf: Path | None = None) -> None:
+        self.machine_code: MachineCode | None = None
+        self._native: dict[str, RunnerFactory] = {}
+        self._names = names
+        if elf and CORTEX_M4 not in names:
+            raise LabError(f"--elf {elf}: nothing to check it with: --targets has no {CORTEX_M4}")
+        try:
+            c = translate()
+            c = c if source is None else replace(c, source=source)
+            for name in names:
+                if name in OPTIMISATION:
+                    library = build(c, BUILD, OPTIMISATION[name])
+                    self._native[name] = partial(NativeRunner, library=library)
+                elif name == CORTEX_M4:
+                    self._image = read_image(elf, False) if elf else build_image(c.source, c.header, BUILD)
+                    self._meter = build_meter(BUILD)
+                    flash = None if elf else len(self._image.code)
+                    self.machine_code = MachineCode(flash, Load())
+        except ExportError as error:
+            raise LabError(str(error)) from None
+
+    def factories(self, stack: ExitStack) -> dict[str, RunnerFactory]:
+        """Return how to make the targets' runners, which end with the stack."""
+
+        def plain(blocks: CoreBlocks) -> CoreRunner:
+            runner = PlainRunner(blocks)
+            stack.callback(runner.close)
+            return runner
+
+        def cortex_m4(blocks: CoreBlocks) -> CoreRunner:
+            assert self.machine_code is not None
+            runner = Metered(blocks, self._image, self._meter, self.machine_code.ticks)
+            stack.callback(self._measure, runner)
+            return runner
+
+        factories = {**self._native, PLAIN: plain, CORTEX_M4: cortex_m4}
+        return {name: factories[name] for name in self._names}
+
+    def _measure(self, runner: Metered) -> None:
+        """Note what memory a flight took."""
+        assert self.machine_code is not None
+        self.machine_code.ram_bytes = runner.ram_bytes
+        self.machine_code.stack_bytes = max(self.machine_code.stack_bytes, runner.stack_bytes)

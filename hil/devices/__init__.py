@@ -1,0 +1,1 @@
+"""Hardware at the board's pins, in the air and on the ceiling."""

@@ -1,0 +1,110 @@
+"""The board's pins, joined to the virtual world: IMU registers, servo timers, radio chip, UART, debug console."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
+from firmware_py.firmware import Kernel
+from hil.events import EventQueue
+
+STILL: ImuCounts = (0, 0, 0, 0, 0, 0)
+
+
+class Uart(Protocol):
+    """The board's end of a serial line."""
+
+    @property
+    def overruns(self) -> int:
+        """Bytes that found the receive buffer full."""
+        ...
+
+    def read(self) -> bytes:
+        """Return what has been received since the last time."""
+        ...
+
+    def write(self, now_us: int, data: bytes) -> bool:
+        """Send bytes; False when they do not fit into the transmit buffer."""
+        ...
+
+
+class VirtualBoard:
+    """Implements `firmware_py.board.Board`; `servo`, `radio`, `console` and `uart` are where the pins lead to.
+
+    `run_on` tells it whose time it is, and which hardware its pins may set going.
+    """
+
+    def __init__(
+        self,
+        servo: Callable[[int, Sequence[int]], None],
+        radio: Callable[[int, bytes], bool],
+        console: Callable[[int, str], None],
+        uart: Uart | None = None,
+    ) -> None:
+        self.imu: ImuCounts = STILL
+        self.battery_mv = 3900
+        self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
+        self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
+        self._servo = servo
+        self._radio = radio
+        self._console = console
+        self._uart = uart
+        self._kernel: Kernel | None = None
+        self._events: EventQueue | None = None
+        self._booted_us = 0
+
+    def forget_processor(self) -> None:
+        """Lose the kernel that ran so far: the next one boots at its time 0."""
+        self._kernel = None
+
+    def run_on(self, kernel: Kernel, events: EventQueue, booted_us: int) -> None:
+        """Join the pins to a processor that booted at an instant of the hardware's events."""
+        self._kernel, self._events, self._booted_us = kernel, events, booted_us
+
+    @property
+    def now_us(self) -> int:
+        """The processor's present instant; 0 while it boots."""
+        return self._kernel.now_us if self._kernel else 0
+
+    def read_imu(self) -> ImuCounts:
+        """Return the last sample."""
+        return self.imu
+
+    def read_battery_mv(self) -> int:
+        """Return the supply voltage."""
+        return self.battery_mv
+
+    def write_compare(self, counts: Sequence[int]) -> None:
+        """Hand the compare counts to the servo timers."""
+        self._servo(self.now_us, counts)
+
+    def radio_send(self, data: bytes) -> bool:
+        """Hand a packet to the radio chip."""
+        accepted = self._radio(self.now_us, data)
+        self._let_hardware_go_first()
+        return accepted
+
+    @property
+    def uart_overruns(self) -> int:
+        """Bytes that found the UART's receive buffer full."""
+        return self._uart.overruns if self._uart else 0
+
+    def uart_read(self) -> bytes:
+        """Return what the UART has received since the last time."""
+        return self._uart.read() if self._uart else b""
+
+    def uart_write(self, data: bytes) -> bool:
+        """Hand bytes to the UART; where nothing is connected they are gone."""
+        if self._uart is None:
+            return True
+        accepted = self._uart.write(self.now_us, data)
+        self._let_hardware_go_first()
+        return accepted
+
+    def _let_hardware_go_first(self) -> None:
+        """Let the tasks run no further than to the instant before the hardware's next event."""
+        if self._kernel and self._events and self._events.next_us is not None:
+            self._kernel.stop_before(self._events.next_us - self._booted_us)
+
+    def debug_write(self, text: str) -> None:
+        """Hand a line to the console."""
+        self._console(self.now_us, text)

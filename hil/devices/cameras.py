@@ -1,0 +1,128 @@
+"""The motion capture cameras: noisy poses of the plant, late, sometimes missing or wrong.
+
+A pose is the truth with noise on it or, with `markers.enabled`, what eight markers make of it (`hil.devices.rigid_body`).
+Computes frames and when they arrive; the harness exposes at `period_us` and delivers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from firmware_py.geometry import IDENTITY, Quaternion, Vector, multiply, rotate
+from ground_station.mocap import MocapFrame
+from hil.devices.config import MocapConfig
+from hil.devices.markers import Sighting
+from hil.world.noise import normal
+from hil.world.plant import Plant
+
+if TYPE_CHECKING:
+    from hil.devices.rigid_body import VirtualMarkers
+
+NOISE_ROWS = 512  # frames of noise drawn at once
+
+NOWHERE: Vector = (0.0, 0.0, 0.0)
+FORWARD: Vector = (1.0, 0.0, 0.0)
+HALF_TURN = (0.0, 0.0, 0.0, 1.0)  # about z, w x y z
+
+
+class VirtualMocap:
+    """The cameras. Plain attributes that may change in flight:
+
+    `dropout`, `outlier` (0..1) share of frames; `wrong_by` [m] how far every position is off, in random directions;
+    `swapped_by` [m] markers are swapped: poses turned by 180 degrees about z of B and shifted along its x; 0: they are not;
+    `more_latency_us` on top of the configured one. `sighting` is what the last exposure saw of the markers, None without.
+    """
+
+    def __init__(
+        self, config: MocapConfig, rng: np.random.Generator, markers: VirtualMarkers | None = None
+    ) -> None:
+        """With `markers`, poses come from them."""
+        self._config = config
+        self._camera_us = max(0, config.latency_us - config.processing_us)
+        self._rng = rng
+        # Streams of their own, so that faults leave the noise of the other frames as it was, and one another alone.
+        self._rng_outlier, self._rng_dropout, self._rng_wrong = rng.spawn(3)
+        self._draws: list[list[float]] = []
+        self.dropout = config.dropout
+        self.outlier = config.outlier
+        self.wrong_by = 0.0
+        self.swapped_by = 0.0
+        self.more_latency_us = 0.0
+        self.markers = markers
+        self.sighting: Sighting | None = None
+        self._arrival_us = 0  # of the last frame
+
+    def expose(self, now_us: int, plant: Plant) -> tuple[MocapFrame, int]:
+        """Return what the cameras see of the plant as it is now, and when that is at the ground station.
+
+        Frames do not overtake one another. Whatever is late is late in the cameras' computer, the network takes no time.
+        """
+        latency_us = self._config.latency_us + round(self.more_latency_us)
+        self._arrival_us = arrival_us = max(self._arrival_us, now_us + latency_us)
+        pose = self._pose(plant)
+        p_WB, q_WB = pose or (NOWHERE, IDENTITY)
+        received_us = now_us + self._camera_us
+        frame = MocapFrame(now_us, p_WB, q_WB, pose is not None, received_us, arrival_us)
+        return frame, arrival_us
+
+    def _pose(self, plant: Plant) -> tuple[Vector, Quaternion] | None:
+        """Return the pose with all that is wrong with it, None when the body is not tracked."""
+        pose = self._noisy_pose(plant) if self.markers is None else self._solved_pose(self.markers, plant)
+        outlier = self.outlier > 0.0 and self._rng_outlier.random() < self.outlier
+        offset = _direction(self._rng_outlier) if outlier else NOWHERE
+        dropped = self.dropout > 0.0 and self._rng_dropout.random() < self.dropout
+        if dropped or pose is None:
+            if self.sighting is not None:
+                self.sighting = replace(self.sighting, pose=None)
+            return None
+        p_WB, q_WB = pose
+        if outlier:
+            p_WB = _shifted(p_WB, self._config.outlier_size, offset)
+        if self.wrong_by > 0.0:
+            p_WB = _shifted(p_WB, self.wrong_by, _direction(self._rng_wrong))
+        if self.swapped_by > 0.0:
+            p_WB = _shifted(p_WB, self.swapped_by, rotate(q_WB, FORWARD))
+            q_WB = multiply(q_WB, HALF_TURN)
+        return p_WB, q_WB
+
+    def _noisy_pose(self, plant: Plant) -> tuple[Vector, Quaternion]:
+        """Return the truth with the configured noise."""
+        if not self._draws:
+            self._draws = normal(self._rng, (NOISE_ROWS, 6)).tolist()
+        x, y, z, a, b, c = self._draws.pop()
+        px, py, pz = plant.p_WB.tolist()
+        s, half = self._config.position_noise, 0.5 * self._config.rotation_noise
+        q_WB = turned(plant.q_WB.tolist(), half * a, half * b, half * c)
+        return (px + s * x, py + s * y, pz + s * z), q_WB
+
+    def _solved_pose(self, markers: VirtualMarkers, plant: Plant) -> tuple[Vector, Quaternion] | None:
+        """Return what the markers say, None when they do not say enough."""
+        self.sighting = markers.look(plant.p_WB, plant.q_WB)
+        return self.sighting.pose
+
+
+def _direction(rng: np.random.Generator) -> Vector:
+    """Return a random unit vector."""
+    x, y, z = normal(rng, 3).tolist()
+    s = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return (s * x, s * y, s * z)
+
+
+def _shifted(p: Vector, distance: float, direction: Vector) -> Vector:
+    return (p[0] + distance * direction[0], p[1] + distance * direction[1], p[2] + distance * direction[2])
+
+
+def turned(q: list[float], a: float, b: float, c: float) -> Quaternion:
+    """Return q (1, a, b, c) of unit length: `q` turned by the small rotation 2 (a, b, c) [rad] in its own frame."""
+    w, x, y, z = q
+    n = 1.0 / math.sqrt((w * w + x * x + y * y + z * z) * (1.0 + a * a + b * b + c * c))
+    return (
+        n * (w - x * a - y * b - z * c),
+        n * (x + w * a + y * c - z * b),
+        n * (y + w * b + z * a - x * c),
+        n * (z + w * c + x * b - y * a),
+    )

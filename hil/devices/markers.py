@@ -1,0 +1,116 @@
+"""Eight reflective markers on the robot, and which of them the cameras around the tunnel see.
+
+Where the markers of the real robot sit is published nowhere; here they sit on what is rigid, which the flaps are not: four
+on the flap axes, which stay where they are when the flaps turn, two on posts over the base plate, two on the frame below.
+No two arms are alike, so that no other assignment of labels fits (the closest misses by 19 mm, tests/test_markers.py), any
+three markers are far from one line, and they spread far enough for both noise figures of physics.md to come out of one:
+1.1 mm per marker and axis makes 0.4 mm and 0.004 rad of the pose. `hil.devices.rigid_body` makes points and poses of
+what is seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.elementary import cos, sin
+from firmware_py.geometry import Quaternion, Vector
+from hil.devices.config import MARKERS, MarkersConfig
+from hil.world.config import PlantConfig
+from hil.world.fixed_order import product
+
+COUNT = MARKERS
+DIAMETER = 0.014  # [m]; chosen, a common size
+TRUNK_RADIUS = 0.03  # [m] of what hangs around the centre of mass: batteries and boards; chosen
+TRUNK_AREA = TRUNK_RADIUS * TRUNK_RADIUS  # [m2]
+
+Points = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+NO_POINTS: Points = np.zeros((0, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """What was seen of one robot's markers in one exposure; row k belongs to label k + 1."""
+
+    points: Points  # (8, 3) [m] in W; of labels that are not seen: where the body that was fitted has them
+    seen: Mask  # (8,)
+    residuals: Points  # (8,) [m] distance from the body that was fitted; 0 where nothing is seen or fitted
+    ghosts: Points  # (N, 3) [m] in W
+    error: float  # [m] mean residual of what is seen
+    pose: tuple[Vector, Quaternion] | None  # p_WB [m], q_WB w x y z; None: not tracked
+
+    @property
+    def bits(self) -> int:
+        """Bit k is set when label k + 1 is seen."""
+        return int(np.packbits(self.seen, bitorder="little")[0])
+
+    @property
+    def unlabelled(self) -> Points:
+        """Points that belong to no body, (N, 3) [m] in W: ghosts, and all the markers when the body is not tracked."""
+        return self.ghosts if self.pose else np.vstack((self.points[self.seen], self.ghosts))
+
+
+def marker_places(plant: PlantConfig) -> Points:
+    """Return the markers' places in B, (8, 3) [m]."""
+    corner, base, axis = plant.footprint / 2, plant.base_side, plant.axis_height
+    spread, below = plant.ground.foot_spread, plant.ground.foot_below
+    return np.array(
+        [
+            (1.00 * corner, -1.00 * corner, axis),  # on the axes of flaps 1 to 4
+            (0.85 * corner, 0.85 * corner, axis),
+            (-0.95 * corner, 0.95 * corner, axis),
+            (-0.70 * corner, -0.70 * corner, axis),
+            (0.375 * base, 0.0, axis + 0.02),  # on posts over the base plate
+            (-0.375 * base, 0.25 * base, axis + 0.06),
+            (spread, 0.0, -0.4 * below),  # on the frame that holds batteries and feet
+            (-0.5 * spread, -spread, -below),
+        ]
+    )
+
+
+class Cameras:
+    """Where the cameras stand, and what the robot itself hides from them.
+
+    Base plate and flaps are one flat square for that, whatever the flaps do; what hangs below them is a ball around the
+    centre of mass. A marker is placed when enough cameras have it in sight.
+    """
+
+    def __init__(self, config: MarkersConfig, plant: PlantConfig) -> None:
+        azimuths = [2.0 * math.pi * camera / config.cameras for camera in range(config.cameras)]
+        self._p_WC = np.array(
+            [
+                (*(config.camera_distance * f(azimuth) for f in (cos, sin)), config.camera_height)
+                for azimuth in azimuths
+            ]
+        )
+        self._needed = config.min_cameras
+        self._plate_height = plant.axis_height
+        self._plate_half = plant.footprint / 2
+        self._places = marker_places(plant)
+        self._squares = (self._places**2).sum(axis=1)[:, None]
+        self._over_plate = self._places[:, 2:] - plant.axis_height
+
+    def see(self, p_WB: Points, R_WB: Points) -> Mask:
+        """Return which markers enough cameras see, (8,), at a pose: (3,) [m] and (3, 3)."""
+        p_BC = product(self._p_WC - p_WB, R_WB)
+        in_sight = ~(self._behind_plate(p_BC) | self._behind_trunk(p_BC))
+        return np.asarray(in_sight.sum(axis=1) >= self._needed)
+
+    def _behind_plate(self, p_BC: Points) -> Mask:
+        """Which rays, marker by camera, pass through the square; markers in its plane are seen from both sides."""
+        over, camera_over = self._over_plate, p_BC[:, 2] - self._plate_height
+        reach = self._plate_half * np.abs(camera_over - over)
+        # The ray is in the plane at (marker * camera_over - camera * over) / (camera_over - over).
+        x = np.abs(self._places[:, :1] * camera_over - p_BC[:, 0] * over)
+        y = np.abs(self._places[:, 1:2] * camera_over - p_BC[:, 1] * over)
+        return np.asarray((over * camera_over < 0.0) & (x < reach) & (y < reach))
+
+    def _behind_trunk(self, p_BC: Points) -> Mask:
+        """Which rays, marker by camera, pass through the ball on their way to the camera, which is outside."""
+        along = product(self._places, p_BC.T) - self._squares  # marker times ray
+        rays = (p_BC**2).sum(axis=1) - self._squares - 2.0 * along  # squared lengths
+        return np.asarray((along < 0.0) & (self._squares * rays - along**2 < TRUNK_AREA * rays))

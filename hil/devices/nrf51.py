@@ -1,0 +1,225 @@
+"""The board's radio chip, which is also the master of its power: Enhanced ShockBurst with safelink, power switch, reset.
+
+Every packet heard is acknowledged with the head of a queue of 8. Safelink adds one bit per direction: a packet that
+repeats the last bit is not passed on again, and an answer is repeated until the host's bit says that it arrived.
+With nothing else to say the firmware acknowledges with its signal strength, the bootloader with nothing at all.
+Facts: Bitcraze's nRF51 firmware and bootloader, reference/crazyflie-clients-and-protocol.md 3.3 and 3.5.
+"""
+
+import struct
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum, auto
+from functools import partial
+from typing import Protocol
+
+from hil.devices.bootloader import HEADER, NRF51, Bootloader
+from hil.devices.radio import Air, syslink_us
+from hil.events import EventQueue
+
+NULL, NULL_MASK = 0xF3, 0xF3  # an empty packet's header; the other bits are safelink's
+SIGNAL_STRENGTH = 1  # type of the answer that carries it
+SIGNAL_DBM = 40  # below 0 dBm: a board in the same room
+SAFELINK = 5  # type of the packet that switches it
+RESET_DELAY_US = 100_000
+
+ALL_OFF, SYSTEM_OFF, SYSTEM_ON, BATTERY, RESET, RESET_INIT = 0x01, 0x02, 0x03, 0x04, 0xF0, 0xFF
+
+
+@dataclass(frozen=True, slots=True)
+class RadioSettings:
+    """What two radios must have in common to hear each other."""
+
+    channel: int  # 0..125, 2400 MHz + channel
+    bits_per_second: int
+    address: bytes  # 5 bytes
+
+
+class Power(Enum):
+    """Which parts of the board run what."""
+
+    OFF = auto()
+    RADIO_ONLY = auto()  # the STM32 is off
+    RUNNING = auto()
+    BOOTLOADER = auto()  # both processors
+
+
+class Processor(Protocol):
+    """The STM32 behind the radio chip."""
+
+    @property
+    def battery_V(self) -> float:
+        """Supply voltage."""
+        ...
+
+    def start(self, now_us: int) -> None:
+        """Boot the firmware."""
+        ...
+
+    def stop(self, now_us: int) -> None:
+        """Lose power."""
+        ...
+
+    def greet(self, now_us: int) -> None:
+        """Notice that a new client is on the radio."""
+        ...
+
+    def received(self, now_us: int, data: bytes) -> None:
+        """Take a packet from the radio."""
+        ...
+
+
+class Nrf51:
+    """One board's radio chip; `settings` are those of its firmware, `chip` the 6 bytes of its factory address.
+
+    `air` is what happens to packets between it and whoever talks to it.
+    """
+
+    def __init__(
+        self,
+        settings: RadioSettings,
+        chip: bytes,
+        queue: int,
+        events: EventQueue,
+        processor: Processor,
+        air: Air,
+    ) -> None:
+        self.air = air
+        self.power = Power.RUNNING
+        self.settings = settings  # while the firmware runs, which may change them
+        self.bootloader = Bootloader()
+        self.heard_us = 0  # the last packet
+        self._bootloader_settings = RadioSettings(0, 2_000_000, bytes((0xB1, *chip[3::-1])))
+        self._chip = chip
+        self._capacity = queue
+        self._events = events
+        self._processor = processor
+        self._forget()
+
+    def _forget(self) -> None:
+        """Lose what was in memory."""
+        self._queue: deque[bytes] = deque()
+        self._service = b""
+        self._answer = b""  # sent last, to be repeated
+        self._safelink = False
+        self._up = self._down = 1
+        self._reset_armed = False
+
+    def hears(self, settings: RadioSettings) -> bool:
+        """Whether a packet sent with these settings reaches this board."""
+        if self.power is Power.OFF:
+            return False
+        booting = self.power is Power.BOOTLOADER
+        return settings == (self._bootloader_settings if booting else self.settings)
+
+    def send(self, data: bytes) -> bool:
+        """Take a packet of the STM32 for the ground; False when the queue is full."""
+        if len(self._queue) >= self._capacity:
+            return False
+        self._queue.append(data)
+        return True
+
+    def hear(self, now_us: int, data: bytes) -> bytes:
+        """Take a packet from the air and return the acknowledgement's payload."""
+        self.heard_us = now_us
+        if self.power is Power.BOOTLOADER:
+            answer = self._next_answer()
+            self._bootload(now_us, data)
+            return answer
+        kind = data[1] if len(data) > 1 and data[0] & NULL_MASK == NULL else None
+        if kind == NRF51:
+            answer = self._next_answer()
+            self._command(now_us, data)
+            return answer
+        if kind == SAFELINK and len(data) == 3:
+            self._safelink, self._service = bool(data[2]), data
+            answer = self._next_answer()
+            self._up = self._down = 1
+            self._processor.greet(now_us)
+            return answer
+        if not self._safelink or data[0] >> 3 & 1 != self._up:
+            self._up ^= 1
+            if len(data) > 1 or data[0] & NULL_MASK != NULL:
+                self._events.at(now_us + syslink_us(data), partial(self._pass_on, data))
+        if not self._safelink or data[0] >> 2 & 1 != self._down:
+            self._down ^= 1
+            return self._next_answer()
+        return self._answer
+
+    def _next_answer(self) -> bytes:
+        """Return what comes after the answer that has arrived."""
+        if self._service:
+            self._answer, self._service = self._service, b""
+        elif self._queue:
+            packet = self._queue.popleft()
+            self._answer = (
+                bytes((packet[0] & NULL_MASK | self._down << 2,)) + packet[1:] if self._safelink else packet
+            )
+        elif self.power is Power.BOOTLOADER:
+            self._answer = b""
+        else:
+            self._answer = bytes((NULL | self._down << 2, SIGNAL_STRENGTH, SIGNAL_DBM))
+        return self._answer
+
+    def _pass_on(self, data: bytes, now_us: int) -> None:
+        if self.power is Power.RUNNING:
+            self._processor.received(now_us, data)
+
+    # Power and resets
+
+    def _command(self, now_us: int, data: bytes) -> None:
+        """Execute a command to the nRF51 itself."""
+        command = data[2] if len(data) > 2 else None
+        if command == RESET_INIT:
+            self._reset_armed = True
+            self.send(bytes((HEADER, NRF51, RESET_INIT)) + self._chip)
+        elif command == RESET and len(data) == 4 and self._reset_armed:
+            self._reset_later(now_us, data)
+        elif command == ALL_OFF:
+            self._stop_processor(now_us)
+            self.power = Power.OFF
+        elif command == SYSTEM_OFF and self.power is Power.RUNNING:
+            self._stop_processor(now_us)
+            self.power = Power.RADIO_ONLY
+        elif command == SYSTEM_ON and self.power is Power.RADIO_ONLY:
+            self._start(now_us)
+        elif command == BATTERY:
+            self.send(bytes((HEADER, NRF51, BATTERY)) + struct.pack("<f", self._processor.battery_V))
+
+    def _bootload(self, now_us: int, data: bytes) -> None:
+        """Execute a packet in the bootloader."""
+        if data[:3] == bytes((HEADER, NRF51, RESET_INIT)):
+            self.send(data[:3] + self._chip)
+        elif data[:3] == bytes((HEADER, NRF51, RESET)):
+            self._reset_later(now_us, data)
+        elif (reply := self.bootloader.answer(data)) is not None:
+            self.send(reply)
+
+    def _reset_later(self, now_us: int, data: bytes) -> None:
+        """Reset, into the bootloader if the command's argument is 0."""
+        into_bootloader = len(data) > 3 and data[3] == 0
+        self._events.at(now_us + RESET_DELAY_US, partial(self._reset, into_bootloader))
+
+    def _reset(self, into_bootloader: bool, now_us: int) -> None:
+        if self.power is Power.OFF:
+            return
+        self._stop_processor(now_us)
+        self._forget()
+        if into_bootloader:
+            self.power = Power.BOOTLOADER
+        else:
+            self._start(now_us)
+
+    def _stop_processor(self, now_us: int) -> None:
+        if self.power is Power.RUNNING:
+            self._processor.stop(now_us)
+
+    def _start(self, now_us: int) -> None:
+        self.power = Power.RUNNING
+        self._processor.start(now_us)
+
+    def press_button(self, now_us: int) -> None:
+        """Start the firmware of a board that is off or in its bootloader."""
+        if self.power in (Power.OFF, Power.BOOTLOADER):
+            self._forget()
+            self._start(now_us)

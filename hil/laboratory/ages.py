@@ -1,0 +1,63 @@
+"""Where the age of a flight's poses came from, out of what its ground station wrote: `telemetry.csv`.
+
+Of a radio in lockstep the station knows no more than what is usual; there its share comes from the flight log.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from ground_station.latency import STAGES, Row, Stage, budget_of
+from ground_station.telemetry_log import AGE_COLUMNS, TELEMETRY, TIME_COLUMN
+from hil.laboratory.metrics import column
+
+
+def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
+    """The budget of a flight over `link`; empty when no telemetry came."""
+    rows: list[Row] = list(zip(*(_us(told_ages, stage) for stage in STAGES), strict=True))
+    radio_us = _on_air(log)
+    if rows and len(radio_us):
+        rows = [
+            (*row[:-1], us) for row, us in zip(rows, np.resize(radio_us, len(rows)).tolist(), strict=True)
+        ]
+    medium = link.partition(":")[0]
+    return budget_of(rows, "serial" if medium == "mavlink" else medium)
+
+
+def told(folder: Path) -> pa.Table:
+    """What the station said of the poses that it sent: `t` [s] by its clock, from the first one on, and each stage [ms].
+
+    A stage of which it does not know is NaN. The last line of the file may be cut.
+    """
+    titles = (TIME_COLUMN, *AGE_COLUMNS)
+    convert = csv.ConvertOptions(
+        include_columns=titles,
+        column_types=dict.fromkeys(titles, pa.float64()),
+        include_missing_columns=True,
+    )
+    parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
+    try:
+        table = csv.read_csv(folder / TELEMETRY, parse_options=parse, convert_options=convert)
+        times = np.column_stack([table.column(title).to_numpy() for title in titles])
+    except (FileNotFoundError, pa.ArrowInvalid):  # nothing came, not even a whole line
+        times = np.empty((0, len(titles)))
+    times = times[~np.isnan(times[:, -1])]
+    times[:, 0] -= times[:1, 0].sum()
+    times[:, 1:] *= 1e3
+    return pa.table(dict(zip(("t", *STAGES), times.T, strict=True)))
+
+
+def _us(told_ages: pa.Table, stage: str) -> list[float]:
+    return [1e3 * age for age in told_ages.column(stage).to_pylist()]
+
+
+def _on_air(log: pa.Table) -> NDArray[np.float64]:
+    """The time of each uplink packet from sender to board [us], as far as a radio was simulated."""
+    if "link.retried" not in log.column_names or log.num_rows < 2:
+        return np.empty(0)
+    delivered, sum_us = np.diff(column(log, "link.up_delivered", "link.up_latency_sum"), axis=0).T
+    times: NDArray[np.float64] = sum_us[delivered > 0] / delivered[delivered > 0]
+    return times

@@ -1,0 +1,156 @@
+"""What a flight log holds: names, units, frames and where each value comes from.
+
+Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, like in the filter's state.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from firmware_py.firmware import DEADLINES_US
+from firmware_py.signals import COUNTERS
+from ground_station.tracker import Tracker
+from ground_station.trajectory import Trajectory
+from hil.devices.cameras import VirtualMocap
+from hil.devices.radio import VirtualRadio
+from hil.laboratory.faults import Fault
+from hil.laboratory.recorder import Channel, Quantity
+from hil.laboratory.robot import Robot
+from hil.world.battery import Battery
+
+
+def quantity(prefix: str, names: str, unit: str = "", frame: str = "") -> Quantity:
+    return Quantity(tuple(f"{prefix}.{name}" for name in names.split()), unit, frame)
+
+
+def radio_channel(radio: VirtualRadio) -> Channel:
+    """Return what the radio counts."""
+    up, down, air = radio.up, radio.down, radio.air
+    names = "up_sent up_delivered up_dropped down_sent down_delivered down_dropped retried unanswered"
+    return Channel(
+        "int64",
+        lambda: (
+            up.sent, up.delivered, up.dropped, down.sent, down.delivered, down.dropped,
+            air.retried, air.unanswered, up.latency_sum_us, down.latency_sum_us,
+        ),
+        (quantity("link", names), quantity("link", "up_latency_sum down_latency_sum", "us")),
+    )  # fmt: skip
+
+
+def battery_channel(battery: Battery) -> Channel:
+    """Return voltage of a cell, power and charge of the battery."""
+    return Channel(
+        "float32",
+        lambda: (battery.voltage, battery.power, battery.charge),
+        (
+            quantity("battery", "voltage", "V"),
+            quantity("battery", "power", "W"),
+            quantity("battery", "charge"),
+        ),
+    )
+
+
+def tracker_channel(tracker: Tracker) -> Channel:
+    """Return what the tracker makes of frames."""
+    counters = tracker.counters
+    return Channel(
+        "int32",
+        lambda: (tracker.quality, counters.refused, counters.bridged, counters.restarts),
+        (quantity("tracker", "quality refused bridged restarts"),),
+    )
+
+
+def fault_channel(active: Sequence[Fault]) -> Channel:
+    """Return how many faults are in force."""
+    return Channel("int8", lambda: len(active), (quantity("fault", "active"),))
+
+
+def marker_channel(mocap: VirtualMocap) -> Channel:
+    """Return which markers the last exposure saw (bit 0: marker 1), how many points have no label, how well all fit."""
+
+    def read() -> tuple[float, ...]:
+        seen = mocap.sighting
+        if seen is None:
+            return (0.0, 0.0, 0.0)
+        return (seen.bits, len(seen.unlabelled), seen.error)
+
+    return Channel(
+        "float32", read, (quantity("markers", "visible unlabelled"), quantity("markers", "error", "m"))
+    )
+
+
+def _view(array: Any) -> Callable[[], Any]:
+    return lambda: array
+
+
+def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]:
+    """Return the channels of any flight; the first column, `t`, is the recorder's own."""
+    plant, board, firmware = robot.plant, robot.board, robot.firmware
+    signals, queue = firmware.signals, firmware.measurements
+    kernel = firmware.kernel
+    tasks = kernel.tasks
+    timed = [task for task in tasks if task.name in DEADLINES_US]
+
+    def goal() -> tuple[float, ...]:
+        at = trajectory.at(robot.booted_us + board.now_us)
+        return (*at.p_WG, at.yaw)
+
+    def counts() -> tuple[int, ...]:
+        return (
+            queue.high_water, queue.dropped,
+            *[task.deadline_misses for task in timed], *[kernel.run_time_us(task) for task in tasks],
+        )  # fmt: skip
+
+    flaps = "flap_1 flap_2 flap_3 flap_4"
+    forces = " ".join(
+        f"{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz"
+    )
+    return (
+        Channel(
+            "int8",
+            lambda: (robot.free, signals.supervisor.state),
+            (quantity("flight", "free"), quantity("supervisor", "state")),
+        ),
+        Channel(
+            "float64",
+            _view(plant.state),
+            (
+                quantity("truth", "x y z", "m", "W"),
+                quantity("truth", "vx vy vz", "m/s", "W"),
+                quantity("truth", "qw qx qy qz", "", "W"),
+                quantity("truth", "p q r", "rad/s", "B"),
+                quantity("truth", flaps, "rad", "B"),
+            ),
+        ),
+        Channel("float32", _view(plant.plate_forces_W.reshape(15)), (quantity("force", forces, "N", "W"),)),
+        Channel("float32", _view(plant.flow_W), (quantity("flow", "x y z", "m/s", "W"),)),
+        Channel("float64", goal, (quantity("goal", "x y z", "m", "W"), quantity("goal", "yaw", "rad", "W"))),
+        Channel(
+            "float32",
+            _view(signals.estimate),
+            (
+                quantity("estimate", "x y z", "m", "G"),
+                quantity("estimate", "vx vy vz", "m/s", "G"),
+                quantity("estimate", "roll pitch yaw", "rad", "G"),
+                quantity("estimate", "p q r", "rad/s", "B"),
+                quantity("estimate", flaps, "rad", "B"),
+            ),
+        ),
+        Channel("float32", _view(signals.u), (quantity("control", "u1 u2 u3 u4", "rad"),)),
+        Channel("float32", _view(signals.flap), (quantity("control", flaps, "rad", "B"),)),
+        Channel("int32", _view(signals.count), (quantity("motor", "m1 m2 m3 m4", "counts"),)),
+        Channel("int16", lambda: board.imu, (quantity("imu", "gx gy gz ax ay az", "counts", "S"),)),
+        Channel(
+            "int32",
+            _view(signals.counters),
+            (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us")),
+        ),
+        Channel(
+            "int64",
+            counts,
+            (
+                quantity("rtos", "measurements_high_water measurements_dropped"),
+                quantity("late", " ".join(task.name for task in timed)),
+                Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),
+            ),
+        ),
+    )

@@ -1,0 +1,325 @@
+"""What can go wrong in a flight: for every kind of fault the knob of the world that it turns, its size, and its outcome.
+
+A size is written as people say it (deg, ms); `scale` brings it to SI. Several faults may turn one knob at once: its value
+is then what it was before the first of them, blended with the size of each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from hil.devices.radio import Air
+    from hil.devices.rigid_body import VirtualMarkers
+    from hil.devices.uart import VirtualSerial
+    from hil.laboratory.robot import Robot
+
+Outcome = Literal["holds", "degrades", "failsafe", "lost"]
+OCCLUSION_RADIUS = 0.3  # [m] around the axis: the robot is inside the shadow wherever it is in its box
+PUSH_S = 0.1  # physics.md section 8, and the sizes of pushes and shadow
+MARKERS_ON = "markers.enabled=true"
+GLIMPSE_S = 0.3  # shorter than the supervisor's patience of 0.5 s
+
+Read = Callable[["Robot"], float]
+Turn = Callable[["Robot", float], None]
+Blend = Callable[[float, float], float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Knob:
+    """One number of the world. To `read` it builds whatever it needs; `blend` takes its value and a fault's size."""
+
+    read: Read
+    turn: Turn
+    blend: Blend
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of fault. `low` and `high` bound its size; where they are the same, there is nothing to choose.
+
+    `outcome` is that of the hover with the default profile, for the default size and duration, 6 s after the begin:
+
+        holds     all limits of the hover hold
+        degrades  a limit fails, the robot flies on
+        failsafe  the supervisor opens the loop, the robot flies on
+        lost      the flight ends there
+    """
+
+    meaning: str
+    unit: str  # of the size
+    size: float  # default
+    low: float
+    high: float
+    knobs: tuple[Knob, ...]
+    outcome: Outcome
+    scale: float = 1.0  # from the unit to SI
+    duration_s: float = math.inf  # default; inf: to the end of the flight
+    link: str = ""  # the only one on which it acts
+    markers: bool = False  # acts on markers: only with `markers.enabled`
+
+    @property
+    def sized(self) -> bool:
+        """Whether there is a size to choose."""
+        return self.low < self.high
+
+    @property
+    def needs(self) -> str:
+        """What the flight must have for it, as options of `floaty fly`; empty: nothing special."""
+        return f"--link {self.link}" if self.link else f"--set {MARKERS_ON}" if self.markers else ""
+
+
+def add(value: float, size: float) -> float:
+    """Both act."""
+    return value + size
+
+
+def times(value: float, size: float) -> float:
+    """One factor after the other."""
+    return value * size
+
+
+def either(value: float, size: float) -> float:
+    """The chance of one or the other."""
+    return 1.0 - (1.0 - value) * (1.0 - size)
+
+
+def _knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
+    """Return the knob that is a plain attribute."""
+    return Knob(
+        lambda robot: float(getattr(owner(robot), name)),
+        lambda robot, value: setattr(owner(robot), name, value),
+        blend,
+    )
+
+
+def _uart(robot: Robot) -> VirtualSerial:
+    assert robot.uart is not None  # the kind's link says so
+    return robot.uart
+
+
+def _of_robot(robot: Robot) -> VirtualMarkers:
+    assert robot.mocap.markers is not None  # the kind says so
+    return robot.mocap.markers
+
+
+def _markers(name: str, blend: Blend) -> tuple[Knob, ...]:
+    return (_knob(_of_robot, name, blend),)
+
+
+def _mocap(name: str, blend: Blend) -> Knob:
+    return _knob(lambda robot: robot.mocap, name, blend)
+
+
+def _air(robot: Robot) -> Air:
+    assert robot.air is not None  # the kind's link says so
+    return robot.air
+
+
+def _radio(name: str, blend: Blend = either) -> Knob:
+    return _knob(_air, name, blend)
+
+
+def _bias(axis: int) -> Knob:
+    def turn(robot: Robot, value: float) -> None:
+        bias = list(robot.imu.rate_bias)
+        bias[axis] = value
+        robot.imu.set_rate_bias(*bias)
+
+    return Knob(lambda robot: robot.imu.rate_bias[axis], turn, add)
+
+
+def _trim(servo: int) -> Knob:
+    return Knob(
+        lambda robot: float(robot.plant.servo_trim[servo]),
+        lambda robot, value: robot.plant.set_servo_fault(servo, value, robot.plant.servo_speed[servo]),
+        add,
+    )
+
+
+def _pace(servo: int) -> Knob:
+    return Knob(
+        lambda robot: float(robot.plant.servo_speed[servo]),
+        lambda robot, value: robot.plant.set_servo_fault(servo, robot.plant.servo_trim[servo], value),
+        times,
+    )
+
+
+def _side_wind(axis: int) -> Knob:
+    def turn(robot: Robot, value: float) -> None:
+        wind = list(robot.plant.tunnel.side_wind)
+        wind[axis] = max(-20.0, min(value, 20.0))
+        robot.plant.tunnel.set_side_wind(*wind)
+
+    return Knob(lambda robot: robot.plant.tunnel.side_wind[axis], turn, add)
+
+
+def _push(part: int) -> Knob:
+    def turn(robot: Robot, value: float) -> None:
+        pushes = robot.plant.pushes.tolist()
+        pushes[part] = value
+        robot.plant.push(pushes[:3], pushes[3:])
+
+    return Knob(lambda robot: float(robot.plant.pushes[part]), turn, add)
+
+
+UPLINK_LOSS, DOWNLINK_LOSS = _radio("uplink_loss"), _radio("downlink_loss")
+RADIO_BITS = (_radio("uplink_bit_error_rate"), _radio("downlink_bit_error_rate"))
+SERIAL_BITS = (_knob(_uart, "uplink_bit_error_rate", either), _knob(_uart, "downlink_bit_error_rate", either))
+CABLE = Knob(
+    lambda robot: float(_uart(robot).connected),
+    lambda robot, value: setattr(_uart(robot), "connected", value > 0.5),
+    times,
+)
+GYRO_NOISE = Knob(
+    lambda robot: robot.imu.noise_scale,
+    lambda robot, value: robot.imu.set_noise_scale(min(value, 1000.0)),
+    times,
+)
+GYRO_RANGE = Knob(
+    lambda robot: robot.imu.rate_range, lambda robot, value: robot.imu.set_rate_range(value), min
+)
+FREEZE = Knob(lambda robot: float(robot.imu.frozen), lambda robot, value: robot.imu.freeze(value > 0.5), max)
+FANS = Knob(
+    lambda robot: robot.plant.tunnel.fan_factor,
+    lambda robot, value: robot.plant.tunnel.set_fan_factor(min(value, 2.0)),
+    times,
+)
+SHADOW = Knob(
+    lambda robot: robot.plant.tunnel.shadow,
+    lambda robot, value: robot.plant.tunnel.block(0.0, 0.0, OCCLUSION_RADIUS, value),
+    either,
+)
+GUSTS = Knob(
+    lambda robot: robot.plant.tunnel.gust_scale,
+    lambda robot, value: robot.plant.tunnel.set_gust_scale(min(value, 5.0)),
+    times,
+)
+LOAD = _knob(lambda robot: robot.thief, "share", lambda value, size: min(value + size, 1.0))
+SAG = _knob(lambda robot: robot.battery, "sag_V", add)
+PACES = tuple(_pace(servo) for servo in range(4))
+
+DEG = math.radians(1.0)
+MS = 1e3  # us: times stay whole microseconds
+
+KINDS: Mapping[str, Kind] = {
+    "mocap.dropout": Kind(
+        "share of the frames in which the body is not tracked", "", 1.0, 0.0, 1.0,
+        (_mocap("dropout", either),), "holds", duration_s=GLIMPSE_S,
+    ),
+    "mocap.outlier": Kind(
+        "every frame is this far off, each in a direction of its own", "m", 0.3, 0.0, 5.0,
+        (_mocap("wrong_by", max),), "holds", duration_s=GLIMPSE_S,
+    ),
+    "mocap.swap": Kind(
+        "markers swapped: every pose is turned by 180 deg about z and shifted by this along x of B", "m", 0.1, 0.001, 1.0,
+        (_mocap("swapped_by", max),), "holds", duration_s=GLIMPSE_S,
+    ),
+    "mocap.latency": Kind(
+        "the cameras' computer needs this much longer", "ms", 40.0, 0.0, 500.0,
+        (_mocap("more_latency_us", add),), "holds", MS,
+    ),
+    "marker.hidden": Kind(
+        "this many markers are covered, from the first one on", "", 4.0, 0.0, 8.0,
+        _markers("hidden", max), "holds", markers=True,
+    ),
+    "marker.swap": Kind(
+        "markers 1 and 3 have each other's label: a pose turned over, or none where it is seen to fit badly",
+        "", 1.0, 1.0, 1.0, _markers("swapped", max), "holds", duration_s=GLIMPSE_S, markers=True,
+    ),
+    "marker.noise": Kind(
+        "factor on the noise of every marker", "", 2.0, 0.0, 100.0,
+        _markers("noise_scale", times), "holds", markers=True,
+    ),
+    "marker.ghosts": Kind(
+        "this many reflections more, which are no markers", "", 5.0, 0.0, 50.0,
+        _markers("ghosts", add), "holds", markers=True,
+    ),
+    "radio.loss": Kind(
+        "packets lost on the air, per try, both ways", "", 0.5, 0.0, 1.0,
+        (UPLINK_LOSS, DOWNLINK_LOSS), "holds", link="radio",
+    ),
+    "radio.uplink_loss": Kind(
+        "packets to the board lost on the air, per try", "", 0.5, 0.0, 1.0, (UPLINK_LOSS,), "holds", link="radio"
+    ),
+    "radio.downlink_loss": Kind(
+        "answers of the board lost on the air, per try", "", 0.5, 0.0, 1.0, (DOWNLINK_LOSS,), "holds", link="radio"
+    ),
+    "radio.bit_errors": Kind(
+        "wrong bits on the air, both ways; one of them costs the packet", "", 1e-3, 0.0, 0.5, RADIO_BITS, "holds",
+        link="radio",
+    ),
+    "radio.jitter": Kind(
+        "packets to the board wait up to this long at the host", "ms", 15.0, 0.0, 500.0,
+        (_radio("uplink_jitter_us", add),), "holds", MS, link="radio",
+    ),
+    "radio.cut": Kind(
+        "nothing passes, either way", "", 1.0, 1.0, 1.0, (UPLINK_LOSS, DOWNLINK_LOSS), "holds",
+        duration_s=GLIMPSE_S, link="radio",
+    ),
+    "serial.bit_errors": Kind(
+        "wrong bits on the line, both ways", "", 1e-4, 0.0, 0.5, SERIAL_BITS, "holds", link="mavlink"
+    ),
+    "serial.cut": Kind(
+        "the cable is out", "", 0.0, 0.0, 0.0, (CABLE,), "holds", duration_s=GLIMPSE_S, link="mavlink"
+    ),
+    **{
+        f"imu.bias.{name}": Kind(
+            f"the gyro's zero about {axis} has moved", "deg/s", 5.0, -200.0, 200.0, (_bias(index),), "holds", DEG
+        )
+        for index, (name, axis) in enumerate(zip("pqr", "xyz", strict=True))
+    },
+    "imu.noise": Kind(
+        "factor on the white noise of gyro and accelerometer", "", 10.0, 0.0, 1000.0, (GYRO_NOISE,), "holds"
+    ),
+    "imu.saturation": Kind(
+        "the gyro's range ends here", "deg/s", 20.0, 1.0, 2000.0, (GYRO_RANGE,), "holds", DEG
+    ),
+    "imu.freeze": Kind("the IMU repeats its last sample", "", 1.0, 1.0, 1.0, (FREEZE,), "holds", duration_s=GLIMPSE_S),
+    **{
+        f"servo.stuck.{number}": Kind(
+            f"flap {number} stays where it is", "", 0.0, 0.0, 0.0, (PACES[number - 1],), "degrades"
+        )
+        for number in (1, 2, 3, 4)
+    },
+    **{
+        f"servo.slow.{number}": Kind(
+            f"factor on the pace of servo {number}", "", 0.5, 0.01, 4.0, (PACES[number - 1],), "holds"
+        )
+        for number in (1, 2, 3, 4)
+    },
+    **{
+        f"servo.trim.{number}": Kind(
+            f"flap {number} stands this far from its command", "deg", 5.0, -45.0, 45.0, (_trim(number - 1),), "holds",
+            DEG,
+        )
+        for number in (1, 2, 3, 4)
+    },
+    "wind.side_x": Kind("side wind along x of W", "m/s", 0.25, -20.0, 20.0, (_side_wind(0),), "degrades"),
+    "wind.side_y": Kind("side wind along y of W", "m/s", 2.0, -20.0, 20.0, (_side_wind(1),), "degrades"),
+    "wind.fan": Kind("factor on all that the fans blow", "", 0.95, 0.0, 2.0, (FANS,), "degrades"),
+    "wind.occlusion": Kind(
+        "share of the flow that something below the robot takes away", "", 0.2, 0.0, 1.0, (SHADOW,), "degrades",
+        duration_s=0.4,
+    ),
+    "wind.gusts": Kind("factor on the gusts", "", 2.0, 0.0, 5.0, (GUSTS,), "degrades"),
+    **{
+        f"push.{axis}": Kind(
+            f"force along {axis} of W", "N", size, -20.0, 20.0, (_push(part),), "degrades", duration_s=PUSH_S
+        )
+        for part, (axis, size) in enumerate((("x", 1.0), ("y", 2.0), ("z", 2.0)))
+    },
+    **{
+        f"push.{angle}": Kind(
+            f"torque about {axis} of B", "N m", 0.02, -1.0, 1.0, (_push(3 + part),), "holds", duration_s=PUSH_S
+        )
+        for part, (angle, axis) in enumerate(zip(("roll", "pitch", "yaw"), "xyz", strict=True))
+    },
+    "cpu.load": Kind(
+        "share of every tick that a task above all others takes", "", 0.3, 0.0, 1.0, (LOAD,), "holds"
+    ),
+    "battery.sag": Kind("the supply is this much lower", "V", 1.0, 0.0, 4.0, (SAG,), "failsafe"),
+}  # fmt: skip

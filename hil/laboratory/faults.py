@@ -1,0 +1,195 @@
+"""Faults as data: what goes wrong, from when, for how long, how much; `hil.laboratory.fault_kinds.KINDS` has the kinds.
+
+As text a fault is KIND@START[:DURATION][=SIZE], start in seconds after the release, duration in seconds (`inf`: to the
+end), size in the kind's unit: `mocap.dropout@10:0.5`, `push.y@3=2`, `servo.stuck.2@5`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from hil.errors import LabError
+from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
+
+if TYPE_CHECKING:
+    from hil.laboratory.robot import Robot
+
+SHAPE = re.compile(r"([^@:=]+)@([^@:=]+)(?::([^@:=]+))?(?:=([^@:=]+))?")
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault. `size` is in the unit of its kind. Raises `LabError` for an unknown kind or an impossible number."""
+
+    kind: str
+    start_s: float  # after the release
+    duration_s: float  # inf: to the end
+    size: float
+
+    def __post_init__(self) -> None:
+        kind = _kind(self.kind, self.kind)
+        if not 0.0 <= self.start_s < math.inf:
+            raise LabError(f"fault {self}: it begins 0 or more seconds after the release")
+        if not self.duration_s > 0.0:
+            raise LabError(f"fault {self}: it lasts more than 0 seconds, or inf")
+        if not kind.low <= self.size <= kind.high:
+            unit = f" {kind.unit}".rstrip()
+            allowed = (
+                f"{kind.low:g}..{kind.high:g}{unit}" if kind.sized else "this kind has no size to choose"
+            )
+            raise LabError(f"fault {self.kind}: size {self.size:g}: expected {allowed}")
+
+    def __str__(self) -> str:
+        kind = KINDS[self.kind]
+        duration = "" if self.duration_s == kind.duration_s else f":{_number(self.duration_s)}"
+        size = f"={_number(self.size)}" if kind.sized else ""
+        return f"{self.kind}@{_number(self.start_s)}{duration}{size}"
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """When a fault acts, in simulated time; `end_us` is inf when it has no end."""
+
+    fault: Fault
+    begin_us: float
+    end_us: float
+
+
+def parse(text: str) -> Fault:
+    """Return the fault that a text means; what it leaves out is the kind's default. Raises `LabError`."""
+    match = SHAPE.fullmatch(text.strip())
+    if match is None:
+        raise LabError(f"fault {text!r}: expected KIND@START[:DURATION][=SIZE], like mocap.dropout@10:0.5")
+    name, *numbers = match.groups()
+    kind = _kind(name, text)
+    try:
+        start_s, duration_s, size = (None if number is None else float(number) for number in numbers)
+    except ValueError:
+        raise LabError(f"fault {text!r}: start, duration and size are numbers") from None
+    assert start_s is not None
+    return Fault(
+        name, start_s, kind.duration_s if duration_s is None else duration_s, kind.size if size is None else size
+    )  # fmt: skip
+
+
+def check(faults: Iterable[Fault], duration_s: float, link: str, markers: bool) -> None:
+    """Raise `LabError` when a fault begins after the flight, or acts on a link or on markers that the flight has not."""
+    for fault in faults:
+        if fault.start_s >= duration_s:
+            raise LabError(
+                f"fault {fault}: the flight ends {duration_s:g} s after the release, before it begins"
+            )
+        needed = KINDS[fault.kind].link
+        if needed and (needed == "mavlink") != link.startswith("mavlink"):
+            raise LabError(f"fault {fault}: acts with --link {needed} only; this flight has --link {link}")
+        if KINDS[fault.kind].markers and not markers:
+            raise LabError(f"fault {fault}: needs --set {MARKERS_ON}")
+
+
+def spans(faults: Iterable[Fault], release_us: int) -> list[Span]:
+    """Return when faults act in a flight that is released at `release_us`."""
+    times = [(fault, release_us + round(fault.start_s * 1e6)) for fault in faults]
+    return [
+        Span(fault, begin_us, begin_us + round(fault.duration_s * 1e6) if math.isfinite(fault.duration_s) else math.inf)
+        for fault, begin_us in times
+    ]  # fmt: skip
+
+
+def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
+    """Return when the faults of a flight act, from the metadata of its log."""
+    known = metadata or {}
+    faults = [parse(text) for text in json.loads(known.get(b"faults", b"[]"))]
+    if not faults:
+        return []
+    return spans(faults, json.loads(known[b"config"])["flight"]["release_us"])
+
+
+class Switchboard:
+    """Turns the knobs of one robot as faults begin and end; nobody else may turn a knob while a fault does.
+
+    `active` has the faults in force, and changes as time goes on.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.active: list[Fault] = []
+        self._robot = robot
+        self._before: dict[Knob, float] = {}  # of the knobs that are turned
+
+    def plan(self, faults: Iterable[Fault], release_us: int, end_us: int) -> None:
+        """Plan begin and end of faults that begin before `end_us`; those that do not concern the robot are left out."""
+        for span in spans(faults, release_us):
+            kind = KINDS[span.fault.kind]
+            if why_not(kind, self._robot) or span.begin_us >= end_us:
+                continue
+            for knob in kind.knobs:
+                knob.read(self._robot)  # so that what it needs is there from the start
+            self._robot.events.at(int(span.begin_us), partial(self.begin, span.fault))
+            if span.end_us < end_us:
+                self._robot.events.at(int(span.end_us), partial(self.end, span.fault))
+
+    def act(self, fault: Fault, now_us: int) -> None:
+        """Let a fault begin now, whatever its start says. Raises `LabError` for one that cannot act on this robot."""
+        if reason := why_not(KINDS[fault.kind], self._robot):
+            raise LabError(f"fault {fault.kind}: {reason}")
+        self.begin(fault, now_us)
+        if math.isfinite(fault.duration_s):
+            self._robot.events.at(now_us + round(fault.duration_s * 1e6), partial(self.end, fault))
+
+    def begin(self, fault: Fault, now_us: int) -> None:
+        """Turn the knobs of a fault."""
+        self._robot.say("lab", f"fault {fault} begins")
+        self._switch(fault, [*self.active, fault], now_us)
+
+    def end(self, fault: Fault, now_us: int) -> None:
+        """Turn them back, if the fault is still in force."""
+        if fault not in self.active:
+            return
+        self._robot.say("lab", f"fault {fault} ends")
+        remaining = self.active.copy()
+        remaining.remove(fault)
+        self._switch(fault, remaining, now_us)
+
+    def _switch(self, fault: Fault, active: list[Fault], now_us: int) -> None:
+        """Turn the knobs of `fault` to what the active faults make of them."""
+        robot = self._robot
+        robot.plant.advance(now_us)
+        self.active[:] = active
+        for knob in KINDS[fault.kind].knobs:
+            value = self._before.setdefault(knob, knob.read(robot))
+            turning = [other for other in active if knob in KINDS[other.kind].knobs]
+            for other in turning:
+                value = knob.blend(value, KINDS[other.kind].scale * other.size)
+            knob.turn(robot, value)
+            if not turning:
+                del self._before[knob]
+
+
+def why_not(kind: Kind, robot: Robot) -> str:
+    """Return why a kind of fault cannot act on a robot, empty when it can."""
+    if kind.link == "mavlink" and robot.uart is None:
+        return "acts on a serial line; this robot has none"
+    if kind.link == "radio" and robot.air is None:
+        return "acts on a radio; this robot flies without"
+    if kind.markers and robot.mocap.markers is None:
+        return f"needs --set {MARKERS_ON}"
+    return ""
+
+
+def _kind(name: str, text: str) -> Kind:
+    if name not in KINDS:
+        near = difflib.get_close_matches(name, KINDS, 1)
+        hint = f"did you mean {near[0]}?" if near else "floaty list --faults shows them all"
+        raise LabError(f"fault {text!r}: unknown kind {name!r}; {hint}")
+    return KINDS[name]
+
+
+def _number(value: float) -> str:
+    """Return a number that reads back as the same."""
+    return repr(float(value)).removesuffix(".0")

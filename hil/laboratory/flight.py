@@ -1,0 +1,228 @@
+"""One flight of one robot: an experiment's script and faults, what is recorded and noted, how it ends.
+
+How the robot is talked to is its line's matter: `hil.laboratory.lockstep` models link and ground station on the same time
+line, `hil.laboratory.linked` leads the robot out to a ground station in a process of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from firmware_py.core_runner import PythonRunner, RunnerFactory
+from ground_station.trajectory import Goal, Trajectory
+from hil.clock import Clock
+from hil.config import LabConfig
+from hil.events import EventQueue
+from hil.laboratory.channels import battery_channel, fault_channel, flight_channels, marker_channel
+from hil.laboratory.faults import Fault, Switchboard
+from hil.laboratory.laboratory import Laboratory, Progress
+from hil.laboratory.recorder import Channel, Recorder
+from hil.laboratory.robot import Robot, Streams
+from hil.laboratory.schedule import WINDOW_US, ScheduleTrace
+
+RECORD_PERIOD_US = 10_000
+RECORD_PHASE_US = 250  # just after the controller
+DROP_NOTE_PERIOD_US = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a flight ended."""
+
+    end_us: int
+    lost: str | None  # cause of a crash
+    interrupted: bool
+
+
+class Line(Protocol):
+    """What is between the robot and the ground, both ends included."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """What the ground station flies."""
+        ...
+
+    def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
+        """What there is to record: of the line itself, and of the ground station."""
+        ...
+
+    def command(self, now_us: int, packet: bytes) -> None:
+        """Hand the board a CRTP packet of the operator."""
+        ...
+
+    def look(self, now_us: int) -> list[tuple[str, str]]:
+        """What it has to say since the last time: (source, text)."""
+        ...
+
+    def finish(self, lab: Laboratory) -> None:
+        """Let the ground station leave in order; the flight is over."""
+        ...
+
+    def close(self) -> None:
+        """Give everything back."""
+        ...
+
+
+class Programme(Protocol):
+    """What a flight needs of an experiment."""
+
+    @property
+    def name(self) -> str:
+        """What `floaty station --trajectory` calls it."""
+        ...
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Its own faults."""
+        ...
+
+    @property
+    def trajectory(self) -> Callable[[Goal, int], Trajectory]:
+        """(home, release instant [us]) to the goals."""
+        ...
+
+    @property
+    def script(self) -> Callable[[Flight], None]:
+        """Plans what shall happen."""
+        ...
+
+
+class Flight:
+    """A robot in its tunnel, ready to be released; `faults` come on top of the experiment's own.
+
+    `line` is set first; `release_us` exists once the release is planned.
+    """
+
+    line: Line
+    release_us: int
+
+    def __init__(
+        self,
+        config: LabConfig,
+        experiment: Programme,
+        duration_s: float,
+        seed: int,
+        clock: Clock,
+        radio: bool,
+        mavlink: bool,
+        faults: Sequence[Fault] = (),
+        runner: RunnerFactory = PythonRunner,
+        trace_all: bool = False,
+    ) -> None:
+        self.config = config
+        self.experiment = experiment
+        self.faults = (*experiment.faults, *faults)
+        self.streams = Streams.of_seed(seed)
+        self.lab = Laboratory(clock)
+        self.recorder: Recorder | None = None
+        self.lost: str | None = None
+        self.over = False
+        self._duration_us = round(duration_s * 1e6)
+        self._trace_all = trace_all
+        self._drops_noted: dict[str, int] = {}
+        self._next_drop_note_us = 0
+        self.robot = Robot(config, self.events, self.streams, self.note, radio, mavlink, runner)
+        self.robot.boot(0)
+        self.lab.robots.append(self.robot)
+        self.robot.plant.hold()
+        self.switchboard = Switchboard(self.robot)
+        self.schedule = ScheduleTrace(self.robot.firmware.kernel)
+
+    @property
+    def events(self) -> EventQueue:
+        """What hardware does next."""
+        return self.lab.events
+
+    @property
+    def now_us(self) -> int:
+        """The present instant of the simulation."""
+        return max(self.lab.now_us, self.events.now_us)
+
+    @property
+    def end_us(self) -> int:
+        """When the flight ends, as far as that is known."""
+        return self.lab.end_us
+
+    def plan(self, release_us: int) -> None:
+        """Plan everything that counts from the release; it may be now."""
+        self.release_us = release_us
+        self.lab.end_us = end_us = release_us + self._duration_us
+        self.events.at(release_us, self._release)
+        self.experiment.script(self)
+        self.switchboard.plan(self.faults, release_us, end_us)
+        start_us = 0 if self._trace_all and release_us > self.now_us else release_us
+        self.events.at(start_us, self.schedule.begin)
+        self.events.at(end_us if self._trace_all else start_us + WINDOW_US, self.schedule.end)
+
+    def watch(self) -> None:
+        """Set sensors, cameras and recorder going; the last step before `run`."""
+        self.robot.watch(0)
+        self.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._record)
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return what there is to record."""
+        robot = self.robot
+        channels = flight_channels(robot, self.line.trajectory)
+        markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
+        faults = (fault_channel(self.switchboard.active),) if self.faults else ()
+        line, tracker = self.line.channels()
+        return (*channels, *line, battery_channel(robot.battery), *tracker, *markers, *faults)
+
+    def run(self, progress: Progress | None = None) -> Outcome:
+        """Fly to the end, the crash, or Ctrl-C; the log is left open for the caller to close."""
+        interrupted = False
+        try:
+            self.lab.run(progress)
+        except KeyboardInterrupt:
+            interrupted = True
+            self.note("lab", "interrupted by the user")
+        outcome = Outcome(self.now_us, self.lost, interrupted)
+        self.over = True
+        self.line.finish(self.lab)
+        return outcome
+
+    def _release(self, now_us: int) -> None:
+        self.robot.release()
+        self.note("lab", "released")
+
+    def _record(self, now_us: int) -> None:
+        if self.over:
+            return
+        lost = self.robot.look(now_us)
+        if self.recorder is not None:
+            self.recorder.row(now_us)
+        self.robot.firmware.check_watchdog()
+        self._note_drops(now_us)
+        for source, text in self.line.look(now_us):
+            self.note(source, text)
+        for line in self.lab.clock.notices():
+            self.note("lab", line)
+        if lost is not None:
+            self.lost = lost
+            self.lab.end_us = now_us
+            self.note("lab", f"lost: {lost}")
+
+    def _note_drops(self, now_us: int) -> None:
+        """Say which queue drops, once per second at most."""
+        for queue in self.robot.firmware.kernel.queues:
+            if queue.dropped > self._drops_noted.get(queue.name, 0) and now_us >= self._next_drop_note_us:
+                self.note("board", f"queue {queue.name} is full: {queue.dropped} dropped so far")
+                self._drops_noted[queue.name] = queue.dropped
+                self._next_drop_note_us = now_us + DROP_NOTE_PERIOD_US
+
+    def note(self, source: str, text: str) -> None:
+        """Put a line into the event log."""
+        if self.recorder is not None:
+            self.recorder.note(self.now_us, source, text)
+
+    def write_schedule(self, folder: Path) -> None:
+        """Write what was traced of the scheduler."""
+        self.schedule.end(self.now_us)
+        self.schedule.write(folder)
+
+    def close(self) -> None:
+        """Close what the flight itself opened."""
+        self.line.close()

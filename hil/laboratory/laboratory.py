@@ -1,0 +1,80 @@
+"""The time line on which robots, cameras, lines and stations live: hardware events own time, then firmware runs.
+
+Without a wall clock the firmware runs by itself up to the next thing that hardware does. With one, every instant waits
+for its turn, and bytes from outside arrive in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from hil.clock import Clock, FreeRunning
+from hil.events import EventQueue
+from hil.laboratory.robot import Robot
+
+NEVER_US = 1 << 62
+WARM_UP_US = 20_000  # run before any clock starts: the first run on a machine compiles
+FREE = FreeRunning()
+PROGRESS_PERIOD_US = 250_000
+
+Progress = Callable[[int], None]  # (now_us)
+
+
+class Laboratory:
+    """Robots on one time line; `add` them before `run`. `end_us` may be changed while it runs."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self.events = EventQueue()
+        self.robots: list[Robot] = []
+        self.now_us = 0
+        self.end_us = NEVER_US
+
+    def run(self, progress: Progress | None = None) -> None:
+        """Go from one instant at which anything happens to the next, until `end_us`; may be called again."""
+        clock, next_progress_us = self.clock, self.now_us
+        while self.now_us < min(WARM_UP_US, self.end_us):
+            self._step(FREE)
+        clock.start(self.now_us)
+        while self.now_us < self.end_us:
+            self._step(clock)
+            if progress is not None and self.now_us >= next_progress_us:
+                progress(self.now_us)
+                next_progress_us = self.now_us + PROGRESS_PERIOD_US
+
+    def stop(self) -> None:
+        """End `run` after the present instant."""
+        self.end_us = self.now_us
+
+    def _step(self, clock: Clock) -> None:
+        events = self.events
+        now_us = self.end_us if events.next_us is None else min(events.next_us, self.end_us)
+        robot, wake_us, other_us = self._first_to_wake()
+        if robot is not None and wake_us < now_us:
+            if clock.paced:
+                now_us = wake_us
+            else:
+                robot.run(max(wake_us, min(now_us, other_us) - 1))
+                if other_us < now_us or (events.next_us is not None and events.next_us < now_us):
+                    return  # another one comes first, or a task has set hardware going that acts earlier
+        now_us = clock.wait_until(now_us)
+        for robot in self.robots:
+            robot.advance(now_us)
+        clock.serve(now_us)
+        events.run(now_us)
+        for robot in self.robots:
+            robot.run(now_us)
+        self.now_us = now_us
+
+    def _first_to_wake(self) -> tuple[Robot | None, int, int]:
+        """Return the robot whose firmware acts first, when, and when the next one does."""
+        first, first_us, next_us = None, NEVER_US, NEVER_US
+        for robot in self.robots:
+            wake_us = robot.next_wake_us
+            if wake_us is None:
+                continue
+            if wake_us < first_us:
+                first, first_us, next_us = robot, wake_us, first_us
+            elif wake_us < next_us:
+                next_us = wake_us
+        return first, first_us, next_us

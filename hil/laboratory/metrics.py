@@ -1,0 +1,185 @@
+"""From a flight log to figures and verdicts: computed from the truth, after the release, never from the estimate."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from firmware_py.geometry import euler_zyx_of
+from firmware_py.wire.supervisor import State
+from hil.errors import LabError
+
+NEAR = 0.06  # [m] "less than 6 cm over each axis"
+BOX = 0.10  # [m] half of the 20 cm box
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A figure of a flight; a limit on it is an upper or a lower bound."""
+
+    unit: str
+    bound: Literal["max", "min"]
+    meaning: str
+
+    def show(self, value: float) -> str:
+        """Return a value as people read it: lengths in cm, angles in deg, shares in percent."""
+        scale, unit = SHOWN.get(self.unit, (1.0, self.unit))
+        return f"{value * scale:.4g} {unit}".strip()
+
+
+SHOWN = {
+    "m": (100.0, "cm"),
+    "rad": (180.0 / np.pi, "deg"),
+    "rad/s": (180.0 / np.pi, "deg/s"),
+    "share": (100.0, "%"),
+}
+
+METRICS: Mapping[str, Metric] = {
+    "lost": Metric("", "max", "1 when the flight ended as a crash"),
+    "flown": Metric("s", "min", "free flight, from the release to the end"),
+    "rms_x": Metric("m", "max", "root mean square of the x error, goal frame"),
+    "rms_y": Metric("m", "max", "root mean square of the y error"),
+    "rms_z": Metric("m", "max", "root mean square of the z error"),
+    "max_x": Metric("m", "max", "largest x error"),
+    "max_y": Metric("m", "max", "largest y error"),
+    "max_z": Metric("m", "max", "largest z error"),
+    "within_6cm_x": Metric("share", "min", "share of the time with |x error| < 6 cm"),
+    "within_6cm_y": Metric("share", "min", "share of the time with |y error| < 6 cm"),
+    "within_6cm_z": Metric("share", "min", "share of the time with |z error| < 6 cm"),
+    "in_box": Metric("share", "min", "share of the time inside the 20 cm box around the goal"),
+    "attitude_max": Metric("rad", "max", "largest roll, pitch or yaw error"),
+    "y_over_x": Metric("", "min", "rms of y over rms of x"),
+    "settle": Metric("s", "max", "from a step of the goal until the error stays within 5 % of it"),
+    "rise": Metric("s", "max", "from a step of the goal to 90 % of it, the slowest"),
+    "overshoot": Metric("share", "max", "largest way beyond a step of the goal, of the step"),
+    "hold_rms": Metric("m", "max", "root mean square of the y error in the last 3 s before a step"),
+    "peak_rate": Metric("rad/s", "min", "largest yaw rate"),
+    "gain": Metric("", "min", "amplitude of the sine flown over that of the goal"),
+    "lag": Metric("rad", "max", "phase by which the sine flown is behind the goal"),
+    "rms_yaw": Metric("rad", "max", "root mean square of the yaw error"),
+    "recovered": Metric(
+        "", "min", "disturbances after which the robot was back in the 20 cm box before the next"
+    ),
+    "excursion": Metric("m", "max", "largest error on an axis from the first disturbance on"),
+    "back_in_box": Metric(
+        "s", "max", "longest time after a disturbance until the robot stays in the 20 cm box"
+    ),
+    "wind_offset": Metric("m", "max", "mean error along the wind in its last 5 s"),
+    "height_off": Metric("m", "max", "mean error in height over the second half of the flight"),
+    "as_computed": Metric("", "min", "1 when the height is held exactly if the lift of the flaps allows it"),
+    "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
+    "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
+    "frames_refused": Metric("", "max", "frames that the ground station's tracker refused"),
+    "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
+    "line_up": Metric("share", "max", "mean load of the serial line to the board"),
+    "line_down": Metric("share", "max", "mean load of the serial line from the board"),
+    "line_overrun": Metric("bytes", "max", "lost because the board's receive buffer was full"),
+    "estimator_late_from": Metric("share", "min", "thief's load at which KALMAN first misses a deadline"),
+    "controller_late_from": Metric(
+        "share", "min", "thief's load at which STABILIZER first misses a deadline"
+    ),
+    "held_up_to": Metric("share", "min", "thief's load up to which the robot stays inside the 20 cm box"),
+    "power": Metric("W", "max", "mean power from the battery"),
+    "specific_power": Metric("W/kg", "max", "that power over the robot's mass"),
+    "endurance": Metric("min", "min", "flight until the supervisor finds the battery empty"),
+    "lift_off": Metric("s", "max", "from the controller's start until the robot is 2 cm off the net"),
+    "reached_box": Metric(
+        "s", "max", "from the start of the flight speed until the robot is in the 20 cm box"
+    ),
+    "hover_in_box": Metric("share", "min", "from then to the landing speed: share of the time in that box"),
+    "touch_down_speed": Metric(
+        "m/s", "max", "fastest descent in the last 0.1 s before the feet touch the net"
+    ),
+    "landed_off_axis": Metric("m", "max", "distance from the tunnel's axis at the end"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One limit, judged."""
+
+    metric: str
+    value: float
+    bound: float
+    holds: bool
+
+    def __str__(self) -> str:
+        metric = METRICS[self.metric]
+        relation = "<=" if metric.bound == "max" else ">="
+        return f"{self.metric} = {metric.show(self.value)} (limit {relation} {metric.show(self.bound)})"
+
+
+def column(table: pa.Table, *names: str) -> NDArray[np.float64]:
+    """Return columns of a log as an array (N,) or (N, len(names))."""
+    arrays = [table.column(name).to_numpy().astype(np.float64) for name in names]
+    return arrays[0] if len(arrays) == 1 else np.stack(arrays, axis=1)
+
+
+def position_error(table: pa.Table) -> NDArray[np.float64]:
+    """Return the body's position in the goal frame, (N, 3) [m]."""
+    offset = column(table, "truth.x", "truth.y", "truth.z") - column(table, "goal.x", "goal.y", "goal.z")
+    yaw = column(table, "goal.yaw")
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack(
+        (c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]), axis=1
+    )
+
+
+def attitude_error(table: pa.Table) -> NDArray[np.float64]:
+    """Return roll, pitch and yaw relative to the goal, (N, 3) [rad], yaw in -pi..pi."""
+    angles = euler_zyx_of(column(table, "truth.qw", "truth.qx", "truth.qy", "truth.qz"))
+    angles[:, 2] = np.angle(np.exp(1j * (angles[:, 2] - column(table, "goal.yaw"))))
+    return angles
+
+
+def free_flight(table: pa.Table) -> pa.Table:
+    """Return the rows after the release."""
+    return table.filter(np.asarray(column(table, "flight.free")) > 0.5)
+
+
+def measure(table: pa.Table, lost: bool) -> dict[str, float]:
+    """Return every metric of METRICS; NaN where the flight was too short to tell."""
+    flight = free_flight(table)
+    values = dict.fromkeys(METRICS, float("nan"))
+    values["lost"] = float(lost)
+    values["flown"] = 0.0
+    if flight.num_rows < 2:
+        return values
+    error = np.abs(position_error(flight))
+    times = column(flight, "t")
+    rms = np.sqrt((error**2).mean(axis=0))
+    for index, axis in enumerate("xyz"):
+        values[f"rms_{axis}"] = float(rms[index])
+        values[f"max_{axis}"] = float(error[:, index].max())
+        values[f"within_6cm_{axis}"] = float((error[:, index] < NEAR).mean())
+    values["flown"] = float(times[-1] - times[0]) * 1e-6
+    values["in_box"] = float((error <= BOX).all(axis=1).mean())
+    values["attitude_max"] = float(np.abs(attitude_error(flight)).max())
+    values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
+    values["age_mean"] = float(column(flight, "estimator.pose_age_us").mean()) * 1e-6
+    in_failsafe = column(flight, "supervisor.state") == State.FAILSAFE
+    values["failsafe"] = float(in_failsafe.mean()) * values["flown"]
+    if "serial.up_busy" in table.schema.names:
+        busy = column(flight, "serial.up_busy", "serial.down_busy")
+        values["line_up"], values["line_down"] = (busy[-1] - busy[0]) * 1e-6 / values["flown"]
+        values["line_overrun"] = float(column(flight, "serial.overrun")[-1])
+    refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
+    values["poses_refused"] = float(refused[-1])
+    if "tracker.refused" in table.schema.names:
+        values["frames_refused"] = float(column(flight, "tracker.refused")[-1])
+    return values
+
+
+def judge(values: Mapping[str, float], limits: Mapping[str, float]) -> list[Verdict]:
+    """Return the verdict on each limit; a metric that is not a number fails. Unknown metrics raise `LabError`."""
+    verdicts = []
+    for name, bound in limits.items():
+        if name not in METRICS:
+            raise LabError(f"limit on {name!r}: no such metric, there are {', '.join(METRICS)}")
+        value = values[name]
+        holds = value <= bound if METRICS[name].bound == "max" else value >= bound
+        verdicts.append(Verdict(name, value, bound, bool(holds)))
+    return verdicts

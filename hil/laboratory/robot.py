@@ -1,0 +1,222 @@
+"""One Floaty in its tunnel: plant, battery, IMU, the cameras that see it, and a board whose firmware boots and reboots.
+
+All instants are the laboratory's, but those of the firmware, which counts from its boot. Where the board's radio packets
+go and what stands at the other end of its UART is handed in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.firmware import Firmware, Thief
+from ground_station.mocap import MocapFrame
+from hil.config import LabConfig
+from hil.devices.board import VirtualBoard
+from hil.devices.cameras import VirtualMocap
+from hil.devices.imu import VirtualImu
+from hil.devices.markers import Sighting
+from hil.devices.radio import Air
+from hil.devices.rigid_body import make_markers
+from hil.devices.uart import VirtualSerial
+from hil.errors import LabError
+from hil.events import EventQueue
+from hil.world.battery import Battery
+from hil.world.plant import Plant
+
+IMU_PERIOD_US = 1_000
+MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms before its step
+
+See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, what was seen of the markers)
+Say = Callable[[str, str], None]  # (source, text)
+SendPacket = Callable[[int, bytes], bool]  # (now_us, packet): False when it has to wait
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """One random stream per component, all from one seed."""
+
+    gusts: np.random.Generator
+    imu: np.random.Generator
+    mocap: np.random.Generator
+    radio: np.random.Generator
+    serial: np.random.Generator
+    markers: np.random.Generator
+
+    @classmethod
+    def of_seed(cls, seed: int) -> Streams:
+        """Split a seed."""
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)))
+
+
+class Robot:
+    """Built at rest in its holder at home, with the firmware running; `watch` sets IMU and cameras going.
+
+    `air` (of its radio) and `uart` are what faults of its lines turn, None for a line that it has not. `firmware` is that
+    of the present boot.
+    """
+
+    def __init__(
+        self,
+        config: LabConfig,
+        events: EventQueue,
+        streams: Streams,
+        say: Say,
+        radio: bool = True,
+        mavlink: bool = False,
+        runner: RunnerFactory = PythonRunner,
+    ) -> None:
+        home, offset = config.flight.home, config.flight.start_offset
+        self.start_W = (home[0] + offset[0], home[1] + offset[1], home[2] + offset[2])
+        self.config = config
+        self.events = events
+        self.say = say
+        self.free = False
+        self.powered = True
+        self.plant = Plant(config.plant, config.tunnel, config.actuators, streams.gusts, self.start_W)
+        self.battery: Battery = Battery(config.battery)
+        self.imu = VirtualImu(config.imu, streams.imu)
+        self.mocap = VirtualMocap(
+            config.mocap, streams.mocap, make_markers(config.markers, config.plant, streams.markers)
+        )
+        self.air = Air.of(config.radio) if radio else None
+        self.uart = VirtualSerial(config.serial, events, streams.serial) if mavlink else None
+        self.send_packet: SendPacket = _nobody_listens
+        self._runner = runner
+        self._thief: Thief | None = None
+        self._seen_by: list[See] = []
+        self.booted_us = 0
+        self.board = VirtualBoard(self._set_counts, self._send, self._console, self.uart)
+        self.board.battery_mv = self.battery.millivolts
+
+    def boot(self, now_us: int) -> None:
+        """Start the firmware; its clock begins here. EEPROM and deck memory are as they were left."""
+        self.booted_us = now_us
+        self.powered = True
+        if self.uart is not None:
+            self.uart.read()  # a booted processor begins with an empty buffer
+        self.board.forget_processor()
+        self.firmware = Firmware(self.config, self.board, mavlink=self.uart is not None, runner=self._runner)
+        self.board.run_on(self.firmware.kernel, self.events, now_us)
+        if self._thief is not None:
+            share, self._thief = self._thief.share, self.firmware.add_thief()
+            self._thief.share = share
+
+    def cut_power(self) -> None:
+        """Stop the firmware: the servos keep their last pulse."""
+        self.powered = False
+
+    def watch(self, start_us: int) -> None:
+        """Set IMU and cameras going, for ever."""
+        self.events.every(IMU_PERIOD_US, start_us + IMU_PERIOD_US, self._sample)
+        self.events.every(self.config.mocap.period_us, start_us + MOCAP_PHASE_US, self._expose)
+
+    def seen_by(self, see: See) -> None:
+        """Hand every frame of the cameras to `see` when their computer has it."""
+        self._seen_by.append(see)
+
+    @property
+    def thief(self) -> Thief:
+        """A task on the board above all others, there from the first use on; it takes nothing until told to."""
+        if self._thief is None:
+            self._thief = self.firmware.add_thief()
+        return self._thief
+
+    # Time
+
+    @property
+    def next_wake_us(self) -> int | None:
+        """The next instant at which the firmware acts without an interrupt."""
+        if not self.powered:
+            return None
+        wake_us = self.firmware.kernel.next_wake_us
+        return None if wake_us is None else wake_us + self.booted_us
+
+    def run(self, now_us: int) -> None:
+        """Run the firmware's tasks up to this instant, until all are blocked or busy."""
+        if self.powered:
+            self.firmware.kernel.run(now_us - self.booted_us)
+
+    def advance(self, now_us: int) -> None:
+        """Bring the processor's clock to this instant, before hardware acts; nothing was due before it."""
+        if self.powered and now_us - self.booted_us > self.firmware.kernel.now_us:
+            self.firmware.kernel.advance(now_us - self.booted_us)
+
+    # Body
+
+    def release(self) -> None:
+        """Let go of the body."""
+        self.plant.release()
+        self.free = True
+
+    def put_back(self, now_us: int) -> None:
+        """Put the body into the holder, as at the start; flaps, air and faults stay."""
+        self.plant.advance(now_us)
+        self.plant.put_back(self.start_W)
+        self.free = False
+
+    def look(self, now_us: int) -> str | None:
+        """Bring the truth and the battery up to this instant; returns why the flight is over, None while it is not."""
+        self.plant.advance(now_us)
+        self.battery.draw(now_us, self.plant.flap_travel)
+        self.board.battery_mv = self.battery.millivolts
+        return self.plant.lost
+
+    # Interrupts
+
+    def packet_received(self, now_us: int, data: bytes) -> None:
+        """The radio chip has a packet."""
+        if self.powered:
+            self.firmware.radio_received(data)
+
+    def uart_ready(self, now_us: int) -> None:
+        """The UART has bytes."""
+        if self.powered:
+            self.firmware.uart_ready()
+
+    def _sample(self, now_us: int) -> None:
+        self.plant.advance(now_us)
+        if self.powered:
+            self.board.imu = self.imu.sample(self.plant)
+            self.firmware.imu_ready()
+
+    def _expose(self, now_us: int) -> None:
+        self.plant.advance(now_us)
+        frame, arrival_us = self.mocap.expose(now_us, self.plant)
+        sighting = self.mocap.sighting
+
+        def deliver(now_us: int) -> None:
+            for see in self._seen_by:
+                see(frame, now_us, sighting)
+
+        self.events.at(arrival_us, deliver)
+
+    # Pins
+
+    def _set_counts(self, local_us: int, counts: Sequence[int]) -> None:
+        self.plant.set_counts(self.booted_us + local_us, counts)
+
+    def _send(self, local_us: int, data: bytes) -> bool:
+        return self.send_packet(self.booted_us + local_us, data)
+
+    def _console(self, local_us: int, text: str) -> None:
+        self.say("board", text)
+
+
+def with_system(config: LabConfig, system: int) -> LabConfig:
+    """Return the configuration with another MAVLink system id. Raises `LabError` for one that does not exist."""
+    if system > MAX_SYSTEM:
+        raise LabError(f"mavlink.system = {system}: ids end at {MAX_SYSTEM}")
+    mavlink = config.mavlink.model_copy(update={"system": system})
+    return config.model_copy(update={"mavlink": mavlink})
+
+
+MAX_SYSTEM = 255
+
+
+def _nobody_listens(now_us: int, data: bytes) -> bool:
+    """Lose a packet."""
+    return True

@@ -1,0 +1,181 @@
+"""One flight against another: where their logs first differ, their metrics side by side, what was configured otherwise.
+
+Logs are compared bit for bit, row by row, in the columns that both have; a NaN equals a NaN.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from hil.errors import LabError
+from hil.laboratory.metrics import METRICS, SHOWN
+from hil.laboratory.recorder import load_log
+from hil.laboratory.run import read_result
+from hil.pictures.overlays import pair
+from hil.pictures.pages import data_uri, write_page
+
+PICTURE, PAGE = "compare.png", "compare.html"
+ORIGIN = (
+    "experiment",
+    "profile",
+    "seed",
+    "duration_s",
+    "link",
+    "board",
+    "outcome",
+    "commit",
+)  # of a result
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run folder's log and result."""
+
+    folder: Path
+    log: pa.Table
+    result: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The first place at which two logs differ; a value is None where that log has ended."""
+
+    row: int
+    t_us: int
+    column: str
+    values: tuple[float | None, float | None]
+
+    def __str__(self) -> str:
+        a, b = ("the log has ended" if value is None else f"{value!r}" for value in self.values)
+        return f"row {self.row}, {self.t_us * 1e-6:.6f} s, {self.column}: {a} | {b}"
+
+
+@dataclass(frozen=True, slots=True)
+class MetricPair:
+    """A metric of both flights, in the unit that people read."""
+
+    name: str
+    unit: str
+    values: tuple[float, float]  # NaN: none
+
+    @property
+    def difference(self) -> float:
+        """Second less first."""
+        return self.values[1] - self.values[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What two runs have and have not in common."""
+
+    first: Difference | None  # None: identical
+    missing: tuple[
+        tuple[str, ...], tuple[str, ...]
+    ]  # columns of the other one that the first, the second lacks
+    metrics: tuple[MetricPair, ...]
+    settings: tuple[tuple[str, str, str], ...]  # name, first, second: those that differ
+
+    @property
+    def identical(self) -> bool:
+        """Whether both logs hold the same columns with the same bits."""
+        return self.first is None and self.missing == ((), ())
+
+
+def load_run(folder: Path) -> Run:
+    """Return what a run folder holds. Raises `LabError` when it cannot be read."""
+    try:
+        run = Run(folder, load_log(folder), read_result(folder))
+    except (ValueError, KeyError, OSError) as error:  # pyarrow's and json's errors are ValueErrors
+        raise LabError(f"{folder}: not a readable run ({error})") from None
+    if "flight.free" not in run.log.column_names:
+        raise LabError(f"{folder}: its log is not that of a flight")
+    return run
+
+
+def compare(a: Run, b: Run) -> Comparison:
+    """Compare two runs."""
+    names_a, names_b = a.log.column_names, b.log.column_names
+    common = [name for name in names_a if name in names_b]
+    return Comparison(
+        _first_difference(a.log, b.log, common),
+        (
+            tuple(name for name in names_b if name not in common),
+            tuple(name for name in names_a if name not in common),
+        ),
+        tuple(_metric_pairs(a.result, b.result)),
+        tuple(_differing_settings(a, b)),
+    )
+
+
+def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Path:
+    """Write `compare.png` and `compare.html` into a folder; returns the page. Raises `LabError`."""
+    png = pair((a.log, b.log), (str(a.folder), str(b.folder)))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / PICTURE).write_bytes(png)
+        return write_page(
+            folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, picture=data_uri(png)
+        )
+    except OSError as error:
+        raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
+
+
+def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Difference | None:
+    rows = min(a.num_rows, b.num_rows)
+    row, column = rows, ""
+    for name in columns:
+        x, y = (table.column(name).to_numpy()[:row] for table in (a, b))
+        differs = ~((x == y) | ((x != x) & (y != y)))
+        if differs.any():
+            row, column = int(np.argmax(differs)), name
+    if column:
+        x, y = (table.column(column)[row].as_py() for table in (a, b))
+        return Difference(row, a.column("t")[row].as_py(), column, (x, y))
+    if a.num_rows == b.num_rows:
+        return None
+    times = [table.column("t")[rows].as_py() if table.num_rows > rows else None for table in (a, b)]
+    return Difference(rows, next(t for t in times if t is not None), "t", (times[0], times[1]))
+
+
+def _metric_pairs(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[MetricPair]:
+    pairs = []
+    for name, metric in METRICS.items():
+        values = [result["metrics"].get(name) for result in (a, b)]
+        if values == [None, None]:
+            continue
+        scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
+        first, second = (math.nan if value is None else value * scale for value in values)
+        pairs.append(MetricPair(name, unit, (first, second)))
+    return pairs
+
+
+def _differing_settings(a: Run, b: Run) -> list[tuple[str, str, str]]:
+    trees = [
+        {name: run.result.get(name) for name in ORIGIN}
+        | {f"versions.{name}": number for name, number in run.result.get("versions", {}).items()}
+        | _flat(json.loads((run.log.schema.metadata or {}).get(b"config", b"{}")))
+        for run in (a, b)
+    ]
+    names = [*trees[0], *(name for name in trees[1] if name not in trees[0])]
+    shown = [(name, *(_text(tree.get(name)) for tree in trees)) for name in names]
+    return [(name, x, y) for name, x, y in shown if x != y]
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _text(value: Any) -> str:
+    return "–" if value is None else str(value)

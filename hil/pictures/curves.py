@@ -1,0 +1,144 @@
+"""What is plotted of a flight, for the viewer and the report alike: curves from log rows, in units for the eye.
+
+Lengths in cm, angles in degrees, times in ms. Colours are those of Okabe and Ito, told apart with every colour vision.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from hil.laboratory.faults import Span
+from hil.laboratory.metrics import attitude_error, column, position_error
+
+ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
+    "#e69f00", "#56b4e9", "#009e73", "#b8a900", "#0072b2", "#d55e00", "#cc79a7", "#888888",
+)  # fmt: skip
+AXIS_COLOURS = (RED, GREEN, BLUE)  # x, y, z; roll, pitch, yaw
+FLAP_COLOURS = (BLUE, ORANGE, GREEN, PINK)
+TASK_COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, YELLOW, GREY, "#332288", "#882255", "#117733", "#000000")
+
+NEAR_CM, ATTITUDE_DEG = 6.0, 20.0  # paper, Hover_figure: errors below 6 cm most of the time, below 20 degrees
+TICK_MS = 10.0  # of the estimator's horizon
+
+Read = Callable[[pa.Table], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Curves on one axis; `read` returns (N, number of curves) from N rows of a log."""
+
+    names: tuple[str, ...]
+    colours: tuple[str, ...]
+    unit: str
+    read: Read
+    needs: str = "t"  # a column that only some logs have
+
+
+@dataclass(frozen=True, slots=True)
+class States:
+    """A quantity with named values 0, 1, …"""
+
+    column: str
+    names: tuple[str, ...]
+    colours: tuple[str, ...]
+
+
+def _degrees(*names: str) -> Read:
+    return lambda rows: np.degrees(column(rows, *names))
+
+
+def _four(prefix: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}{number}" for number in (1, 2, 3, 4))
+
+
+_XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
+POSITION = Curves(_XYZ, AXIS_COLOURS, "cm", lambda rows: 100 * position_error(rows))
+ATTITUDE = Curves(_RPY, AXIS_COLOURS, "deg", lambda rows: np.degrees(attitude_error(rows)))
+POSITION_ESTIMATE = Curves(
+    _XYZ, AXIS_COLOURS, "cm", lambda rows: 100 * column(rows, "estimate.x", "estimate.y", "estimate.z")
+)
+ATTITUDE_ESTIMATE = Curves(_RPY, AXIS_COLOURS, "deg", _degrees(*(f"estimate.{name}" for name in _RPY)))
+POSITION_MISS = Curves(
+    _XYZ, AXIS_COLOURS, "cm", lambda rows: POSITION_ESTIMATE.read(rows) - POSITION.read(rows)
+)
+ATTITUDE_MISS = Curves(
+    _RPY,
+    AXIS_COLOURS,
+    "deg",
+    lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
+)
+FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _degrees(*_four("truth.flap_")))
+FLAPS_COMMAND = Curves(_four("command "), FLAP_COLOURS, "deg", _degrees(*_four("control.flap_")))
+INPUTS = Curves(_four("u"), FLAP_COLOURS, "deg", _degrees(*_four("control.u")))
+AGE = Curves(
+    ("age of the pose", "horizon"), (BLUE, ORANGE), "ms",
+    lambda rows: column(rows, "estimator.pose_age_us", "estimator.horizon") * (1e-3, TICK_MS),
+)  # fmt: skip
+PACKETS = Curves(
+    ("lost up", "lost down", "sent again"), (RED, ORANGE, BLUE), "packets",
+    lambda rows: column(rows, "link.up_dropped", "link.down_dropped", "link.retried"),
+    needs="link.retried",
+)  # fmt: skip
+SERIAL_FAULTS = Curves(
+    ("overrun", "no room", "bad up", "bad down"), (RED, ORANGE, BLUE, SKY), "so far",
+    lambda rows: column(rows, "serial.overrun", "serial.no_room", "serial.up_bad", "serial.down_bad"),
+    needs="serial.overrun",
+)  # fmt: skip
+QUEUE = Curves(
+    ("longest so far", "dropped"), (BLUE, RED), "poses",
+    lambda rows: column(rows, "rtos.measurements_high_water", "rtos.measurements_dropped"),
+)  # fmt: skip
+SUPERVISOR = States(
+    "supervisor.state", ("calibrating", "waiting", "flying", "failsafe"), (ORANGE, SKY, GREEN, RED)
+)  # firmware_py.supervisor.State
+FAULT_STATES, FAULT_COLOURS = ("-", "acts"), (GREY, RED)
+RELEASE = States("flight.free", ("held", "free"), (GREY, BLUE))
+
+
+def processor(names: Iterable[str]) -> Curves:
+    """Return the tasks' shares of the processor between rows: (N - 1, tasks) from N rows; the idle task is left out."""
+    tasks = [name for name in names if name.startswith("cpu.") and name != "cpu.IDLE"]
+
+    def load(rows: pa.Table) -> NDArray[np.float64]:
+        spent = np.diff(column(rows, *tasks), axis=0).reshape(-1, len(tasks))
+        return np.asarray(100 * spent / np.diff(column(rows, "t"))[:, None])
+
+    colours = tuple(TASK_COLOURS[index % len(TASK_COLOURS)] for index in range(len(tasks)))
+    return Curves(tuple(name.removeprefix("cpu.") for name in tasks), colours, "%", load)
+
+
+def latency(rows: pa.Table) -> NDArray[np.float64]:
+    """Return the mean time in the air, up and down [ms], of the packets between rows: (N - 1, 2); NaN where none came."""
+    total = np.diff(column(rows, "link.up_latency_sum", "link.down_latency_sum"), axis=0)
+    arrived = np.diff(column(rows, "link.up_delivered", "link.down_delivered"), axis=0)
+    return np.asarray(1e-3 * total / np.where(arrived > 0, arrived, np.nan))
+
+
+def line_load(rows: pa.Table) -> NDArray[np.float64]:
+    """Return the load of the serial line, up and down [%], between rows: (N - 1, 2) from N rows."""
+    busy = np.diff(column(rows, "serial.up_busy", "serial.down_busy"), axis=0)
+    return np.asarray(100.0 * busy / np.diff(column(rows, "t"))[:, None])
+
+
+def changes(rows: pa.Table, states: States) -> tuple[NDArray[np.float64], list[str]]:
+    """Return when [us] which state began; the first row begins one."""
+    return _changes(rows, column(rows, states.column).astype(np.int64), states.names)
+
+
+def fault_changes(rows: pa.Table, spans: Iterable[Span]) -> tuple[NDArray[np.float64], list[str]]:
+    """Return when [us] any of some faults began or ceased to act; the first row begins one."""
+    times = column(rows, "t")
+    acts = np.zeros(len(times), np.int64)
+    for span in spans:
+        acts[(times >= span.begin_us) & (times < span.end_us)] = 1
+    return _changes(rows, acts, FAULT_STATES)
+
+
+def _changes(
+    rows: pa.Table, codes: NDArray[np.int64], names: Sequence[str]
+) -> tuple[NDArray[np.float64], list[str]]:
+    begins = np.flatnonzero(np.diff(codes, prepend=-1)) if len(codes) else np.empty(0, np.int64)
+    return column(rows, "t")[begins], [names[code] for code in codes[begins]]

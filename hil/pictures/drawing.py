@@ -1,0 +1,39 @@
+"""How every figure is drawn: its size, its style, and the way to PNG. matplotlib is loaded here."""
+
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import matplotlib
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+WIDTH, DPI = 9.2, 115  # [in], 1/in
+STYLE: Any = {
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "agg.path.chunksize": 10_000,  # a long flight's noise overflows the renderer otherwise
+    "font.size": 8.5,
+    "grid.alpha": 0.3,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "lines.linewidth": 0.9,
+}
+
+
+def png(draw: Callable[..., Figure], *flights: pa.Table) -> bytes:
+    """Return the figure that `draw` makes of flight logs, or of a schedule."""
+    with matplotlib.rc_context(STYLE):
+        file = io.BytesIO()
+        draw(*flights).savefig(file, format="png", dpi=DPI)
+    return file.getvalue()
+
+
+def stack(heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
+    """Return a figure of axes one above the other [in] that share their time axis."""
+    figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
+    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0].tolist()
+    axes[-1].set_xlabel("time [s]")
+    return figure, axes

@@ -1,0 +1,27 @@
+"""What a picture of the report is; drawing itself is loaded when the first one is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure of the report. An experiment's own takes several flights, the trials, and brings out the first."""
+
+    title: str
+    caption: str
+    draw: Callable[..., Figure]  # of the log of a flight, of several, or of a schedule
+    needs: str = "t"  # a column without which there is nothing to draw
+
+    def png(self, *flights: pa.Table) -> bytes:
+        """Return the figure."""
+        from hil.pictures.drawing import png
+
+        return png(self.draw, *flights)

@@ -1,0 +1,116 @@
+"""Figures of power: the comparison of vehicles (paper, figure robustness a and b) and the discharge of the battery."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from hil.experiments.power import power
+from hil.experiments.specific_power import CONVENTIONAL_W_PER_KG, VEHICLES
+from hil.laboratory.metrics import column, free_flight
+from hil.pictures import curves
+from hil.pictures.drawing import WIDTH, stack
+from hil.pictures.figures import SECOND
+from hil.pictures.picture import Picture
+
+KIND_COLOURS = {"quadcopter": curves.SKY, "drone": curves.BLUE, "helicopter": curves.GREEN}
+
+
+def compare(*flights: pa.Table) -> Figure:
+    """Draw specific power as bars, and power over mass, with Floaty as it flew in red."""
+    means = [power(free_flight(flight)) for flight in flights]
+    mean, specific = (
+        float(np.mean([values[name] for values in means])) for name in ("power", "specific_power")
+    )
+    return _beside_others(mean, mean / specific)
+
+
+def _beside_others(power: float, mass: float) -> Figure:
+    """Draw it with `power` [W] and `mass` [kg] of Floaty."""
+    figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
+    bars, scatter = figure.subplots(1, 2, width_ratios=(1.15, 1))
+    names = ["Floaty", *(vehicle.name for vehicle in VEHICLES)]
+    values = [power / mass, *(vehicle.specific_power for vehicle in VEHICLES)]
+    spreads = [0.0, *(np.ptp(vehicle.power_range) / 2 / vehicle.mass for vehicle in VEHICLES)]
+    colours = [curves.RED, *(KIND_COLOURS[vehicle.kind] for vehicle in VEHICLES)]
+    stars = [True, *(vehicle.updraft for vehicle in VEHICLES)]
+    rows = np.arange(len(names))
+    bars.barh(
+        rows, values, color=colours, xerr=[spread or np.nan for spread in spreads], ecolor="black", capsize=2
+    )
+    for row, (value, spread, star) in enumerate(zip(values, spreads, stars, strict=True)):
+        bars.text(value + spread + 6, row, f"{value:.0f}{' ★' if star else ''}", va="center", fontsize=8)
+    bars.set_yticks(rows, names)
+    bars.invert_yaxis()
+    bars.set_xlim(0.0, 1.12 * max(values))
+    bars.set_xlabel("specific power [W/kg]")
+    bars.grid(visible=False, axis="y")
+
+    masses = np.array([0.01, 30_000.0])
+    low, high = CONVENTIONAL_W_PER_KG
+    scatter.fill_between(masses, low * masses, high * masses, color=curves.GREY, alpha=0.3, linewidth=0)
+    for vehicle in VEHICLES:
+        marker = "*" if vehicle.updraft else "o"
+        scatter.plot(
+            vehicle.mass,
+            vehicle.power,
+            marker,
+            color=KIND_COLOURS[vehicle.kind],
+            markersize=9 if vehicle.updraft else 5,
+        )
+    for kind, colour in KIND_COLOURS.items():
+        scatter.plot([], [], "o", color=colour, markersize=5, label=kind)
+    scatter.plot(mass, power, "*", color=curves.RED, markersize=13, label="Floaty")
+    scatter.set(xscale="log", yscale="log", xlim=masses, xlabel="mass [kg]", ylabel="power in hover [W]")
+    scatter.legend(loc="upper left")
+    return figure
+
+
+def discharge(*flights: pa.Table) -> Figure:
+    """Draw voltage, power and charge; the first flight dark, further ones light."""
+    figure, axes = stack((1.6, 1.6, 1.2))
+    for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
+        look: Any = {"color": curves.BLUE, "alpha": 0.35 if index else 1.0}
+        times, power = column(flight, "t") * 1e-6, column(flight, "battery.power")
+        axes[0].plot(times, column(flight, "battery.voltage"), **look)
+        axes[1].plot(*_seconds_mean(times, power), **look)
+        axes[2].plot(times, 100 * column(flight, "battery.charge"), **look)
+    axes[1].axhline(float(power.mean()), color="black", linewidth=0.8, label=f"mean {power.mean():.2f} W")
+    axes[1].legend(loc="lower right")
+    config = json.loads((flights[0].schema.metadata or {}).get(b"config", b"{}"))
+    if config:
+        axes[0].axhline(
+            1e-3 * config["supervisor"]["low_battery_mv"], color="black", linestyle="--", linewidth=0.8
+        )
+    axes[0].set_ylabel("cell [V]")
+    axes[1].set_ylabel("power [W]")
+    axes[1].set_ylim(bottom=0.0)
+    axes[2].set_ylabel("charge [%]")
+    axes[2].margins(x=0)
+    return figure
+
+
+def _seconds_mean(
+    times: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return means over whole seconds: times and values, (N // 100,)."""
+    rows = len(times) // SECOND * SECOND
+    return times[:rows].reshape(-1, SECOND).mean(axis=1), values[:rows].reshape(-1, SECOND).mean(axis=1)
+
+
+COMPARISON = Picture(
+    "Specific power",
+    "Left: power in hover per mass. Right: power over mass; grey: 100 to 250 W/kg, which the paper calls typical. Stars: in "
+    "an updraft. Bars on helicopters: the paper's range of hover power, as a share of the rated one. Red: this flight.",
+    compare,
+    needs="battery.power",
+)
+DISCHARGE = Picture(
+    "Battery",
+    "Voltage of one cell under load, with the supervisor's limit; power, mean over 1 s, and over the flight; charge left.",
+    discharge,
+    needs="battery.power",
+)

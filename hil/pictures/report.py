@@ -1,0 +1,120 @@
+"""The report of a flight: `report.html` in its run folder, one file that needs nothing else.
+
+From `result.json`, `log.parquet` and `events.jsonl`; a flight that was lost, interrupted or killed has a report as well.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from firmware_py.firmware import LATENCY_BOUNDS_US
+from hil.laboratory.ages import told
+from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.faults import Span, spans_of
+from hil.laboratory.metrics import METRICS, SHOWN
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import read_result
+from hil.laboratory.schedule import load_schedule
+from hil.pictures.figures import PICTURES, SCHEDULE, WAY
+from hil.pictures.gallery import pictures_of
+from hil.pictures.pages import data_uri, write_page
+from hil.pictures.picture import Picture
+
+REPORT = "report.html"
+TEMPLATE = "report.html.j2"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table of metrics, ready to print; `holds` is None where there is no limit."""
+
+    name: str
+    meaning: str
+    value: str
+    unit: str
+    limit: str
+    holds: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class FaultRow:
+    """One line of the table of faults, ready to print; times in simulated seconds."""
+
+    kind: str
+    begin_s: str
+    end_s: str
+    size: str
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A figure with its picture as a data URI."""
+
+    title: str
+    caption: str
+    source: str
+
+
+def write_report(folder: Path) -> Path:
+    """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log."""
+    log, result = load_log(folder), read_result(folder)
+    own = pictures_of(result["experiment"])
+    shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
+    shown += [
+        _show(picture, table)
+        for picture, table in ((WAY, told(folder)), (SCHEDULE, load_schedule(folder)))
+        if table.num_rows
+    ]
+    config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
+    return write_page(
+        folder / REPORT,
+        TEMPLATE,
+        result=result,
+        rows=metric_rows(result),
+        faults=fault_rows(spans_of(log.schema.metadata)),
+        events=load_events(folder),
+        pictures=shown,
+        latency_bounds=LATENCY_BOUNDS_US,
+        log_rows=log.num_rows,
+        config=json.dumps(config, indent=2),
+    )
+
+
+def metric_rows(result: Mapping[str, Any]) -> list[Row]:
+    """Return one row per metric of a `result.json` that has a value or a limit, those with a limit first."""
+    verdicts = {verdict["metric"]: verdict for verdict in result["verdicts"]}
+    rows = []
+    for name, metric in METRICS.items():
+        value = result["metrics"].get(name)
+        scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
+        verdict = verdicts.get(name)
+        if value is None and verdict is None:
+            continue
+        sign = "≤" if metric.bound == "max" else "≥"
+        limit = "" if verdict is None else f"{sign} {verdict['bound'] * scale:.4g}"
+        text = "–" if value is None else f"{value * scale:.4g}"
+        rows.append(Row(name, metric.meaning, text, unit, limit, verdict and verdict["holds"]))
+    return sorted(rows, key=lambda row: row.holds is None)
+
+
+def fault_rows(spans: Iterable[Span]) -> list[FaultRow]:
+    """Return one row per fault."""
+    rows = []
+    for span in spans:
+        kind = KINDS[span.fault.kind]
+        size = f"{span.fault.size:g} {kind.unit}".strip() if kind.sized else ""
+        begin, end = f"{1e-6 * span.begin_us:.3f}", f"{1e-6 * span.end_us:.3f}"
+        if span.end_us == math.inf:
+            end = "with the flight"
+        rows.append(FaultRow(span.fault.kind, begin, end, size, kind.meaning))
+    return rows
+
+
+def _show(picture: Picture, rows: pa.Table) -> Shown:
+    return Shown(picture.title, picture.caption, data_uri(picture.png(rows)))

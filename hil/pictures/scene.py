@@ -1,0 +1,122 @@
+"""The shape of what is drawn: the robot's plates as triangles, and where the drag acts.
+
+Lengths in m, angles in rad. Geometry G0 as in `hil.world.body`: a flap is drawn in its own frame F, which has its origin on
+the body's z axis at the height of the flap axes and is parallel to B when the flap angle is 0; the flap turns about the
+outward radial `FLAP_AXES[flap]` by its signed angle. Nothing here knows the viewer.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.world.body import AXIS, MIRRORS
+from hil.world.config import PlantConfig
+
+Points = NDArray[np.float64]
+
+FLAP_AXES: Points = AXIS * MIRRORS  # (4, 3) unit vectors in B; azimuths -45, 45, 135, -135 deg
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A surface of triangles."""
+
+    vertices: Points  # (N, 3) [m]
+    triangles: NDArray[np.int64]  # (M, 3) indices of vertices
+
+    def normals(self) -> Points:
+        """Return the unit normal at each vertex, (N, 3), upwards."""
+        a, b, c = np.moveaxis(self.vertices[self.triangles], 1, 0)
+        normals = np.empty_like(self.vertices)
+        normals[self.triangles] = np.cross(b - a, c - a)[:, None]
+        return np.asarray(normals * (np.sign(normals[:, 2]) / np.linalg.norm(normals, axis=1))[:, None])
+
+
+def _quads(*corners: list[tuple[float, float, float]]) -> Mesh:
+    """Return quadrilaterals, each of four corners in turn, as triangles with corners of their own."""
+    first = 4 * np.arange(len(corners))
+    triangles = np.concatenate([(first, first + 1, first + 2), (first, first + 2, first + 3)], axis=1).T
+    return Mesh(np.array(corners).reshape(-1, 3), triangles)
+
+
+def base_mesh(plant: PlantConfig) -> Mesh:
+    """Return the base plate in F."""
+    c = plant.base_side / 2
+    return _quads([(-c, -c, 0.0), (c, -c, 0.0), (c, c, 0.0), (-c, c, 0.0)])
+
+
+def flap_mesh(plant: PlantConfig, flap: int) -> Mesh:
+    """Return flap 0..3 in F: vertices 0-7 are the flat part, 8-11 the kinked strip."""
+    side, corner, fold = plant.footprint / 2, plant.base_side / 2, plant.footprint / 2 - plant.strip_width
+    edge, rise = (
+        fold + plant.strip_width * np.cos(plant.kink_angle),
+        plant.strip_width * np.sin(plant.kink_angle),
+    )
+    mesh = _quads(
+        [(corner, 0.0, 0.0), (side, 0.0, 0.0), (side, fold, 0.0), (corner, fold, 0.0)],
+        [(0.0, corner, 0.0), (corner, corner, 0.0), (corner, fold, 0.0), (0.0, fold, 0.0)],
+        [(0.0, fold, 0.0), (side, fold, 0.0), (side, edge, rise), (0.0, edge, rise)],
+    )
+    return Mesh(mesh.vertices * MIRRORS[flap], mesh.triangles)
+
+
+def mesh_centre(mesh: Mesh) -> Points:
+    """Return the centre of a surface, (3,)."""
+    corners = mesh.vertices[mesh.triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    centre: Points = areas @ corners.mean(axis=1) / areas.sum()
+    return centre
+
+
+def outline(plant: PlantConfig) -> list[Points]:
+    """Return the lines of the robot's ghost in B: the footprint, the base plate and the rod to the centre of mass."""
+    turn = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
+    halves = plant.footprint / 2, plant.base_side / 2
+    squares = [np.column_stack((turn * half, np.full(5, plant.axis_height))) for half in halves]
+    return [*squares, np.array([(0.0, 0.0, 0.0), (0.0, 0.0, plant.axis_height)])]
+
+
+def stand_lines(plant: PlantConfig) -> list[Points]:
+    """Return the stand in B: from each corner of the base plate to a foot, and around the feet."""
+    corner, foot = plant.base_side / 2, plant.ground.foot_spread
+    turn = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
+    feet = np.array([(foot * x, foot * y, -plant.ground.foot_below) for x, y in turn])
+    corners = np.array([(corner * x, corner * y, plant.axis_height) for x, y in turn])
+    return [feet, *np.stack((corners[:4], feet[:4]), axis=1)]
+
+
+def box_lines(half: float) -> list[Points]:
+    """Return the edges of a cube around the origin as five closed or straight lines."""
+    low, high = (
+        np.array(
+            [
+                (x, y, z)
+                for x, y in ((-half, -half), (half, -half), (half, half), (-half, half), (-half, -half))
+            ]
+        )
+        for z in (-half, half)
+    )
+    return [low, high, *(np.array((low[i], high[i])) for i in range(4))]
+
+
+def turn_quaternion(axis: Points, angle: Points) -> Points:
+    """Return the quaternions w x y z (N, 4) that turn about the unit `axis` (3,) by each `angle` (N,)."""
+    return np.column_stack((np.cos(angle / 2), np.sin(angle / 2)[:, None] * axis))
+
+
+def rotated(q_AB: Points, v_B: Points) -> Points:
+    """Return v_A (N, 3): v_B, (N, 3) or (3,), turned by each quaternion w x y z of q_AB (N, 4)."""
+    w, u = q_AB[:, :1], q_AB[:, 1:]
+    t = 2.0 * np.cross(u, v_B)
+    return np.asarray(v_B + w * t + np.cross(u, t))
+
+
+def drag_origins(plant: PlantConfig, p_WB: Points, q_WB: Points, flaps: Points) -> Points:
+    """Return where the drag of the base plate and of the four flaps acts, (N, 5, 3) in W, for flap angles (N, 4)."""
+    top = np.array([0.0, 0.0, plant.axis_height])
+    points = [np.broadcast_to(top, p_WB.shape)]
+    for flap in range(4):
+        centre = mesh_centre(flap_mesh(plant, flap))
+        points.append(top + rotated(turn_quaternion(FLAP_AXES[flap], flaps[:, flap]), centre))
+    return np.stack([p_WB + rotated(q_WB, point) for point in points], axis=1)

@@ -1,0 +1,225 @@
+"""Gives unmodified cflib programs a Crazyradio that is really a running `floaty serve --radio`.
+
+This file needs nothing but the standard library: it is a pytest plugin (`pytest -p hil.servers.dongle_plugin`), and the
+folder `dongle_site` beside it loads it into any Python program by PYTHONPATH, also where this package is not installed. The
+environment variable FLOATY_DONGLE=127.0.0.1:PORT says where the server listens. It replaces
+`libusb_package.get_libusb1_backend` by a back end for pyusb that sends each USB transfer over a socket.
+
+A frame on the socket: kind (1 byte), sequence number (1), length (1), data. The client sends `C` (vendor request:
+request, value low and high, then its data) and `W` (packet for the air); the server answers `W` with `R`.
+"""
+
+import array
+import errno
+import os
+import socket
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+VARIABLE = "FLOATY_DONGLE"
+DEFAULT_SERVER = "127.0.0.1:19840"
+SERIAL = "F10A7Y0001"
+CONNECT_TIMEOUT_S = 2.0
+
+CONTROL, WRITE, READ = b"C", b"W", b"R"
+HEAD_SIZE = 3
+
+_DEVICE = SimpleNamespace(
+    bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
+    bMaxPacketSize0=64, idVendor=0x1915, idProduct=0x7777, bcdDevice=0x0504, iManufacturer=1, iProduct=2,
+    iSerialNumber=3, bNumConfigurations=1, address=1, bus=1, port_number=1, port_numbers=(1,), speed=2,
+)  # fmt: skip
+_CONFIGURATION = SimpleNamespace(
+    bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=1, bConfigurationValue=1, iConfiguration=0,
+    bmAttributes=0x80, bMaxPower=50, extra_descriptors=[],
+)  # fmt: skip
+_INTERFACE = SimpleNamespace(
+    bLength=9, bDescriptorType=4, bInterfaceNumber=0, bAlternateSetting=0, bNumEndpoints=2, bInterfaceClass=0xFF,
+    bInterfaceSubClass=0, bInterfaceProtocol=0, iInterface=0, extra_descriptors=[],
+)  # fmt: skip
+_ENDPOINTS = tuple(
+    SimpleNamespace(
+        bLength=7, bDescriptorType=5, bEndpointAddress=address, bmAttributes=2, wMaxPacketSize=64, bInterval=0,
+        bRefresh=0, bSynchAddress=0, extra_descriptors=[],
+    )
+    for address in (0x81, 0x01)
+)  # fmt: skip
+_STRINGS = ("", "Bitcraze AB", "Crazyradio (Floaty virtual laboratory)", SERIAL)
+
+
+def frame(kind: bytes, sequence: int, data: bytes) -> bytes:
+    """Return one frame of the socket."""
+    return kind + bytes((sequence, len(data))) + data
+
+
+class Connection:
+    """An opened dongle: one socket, one transfer at a time."""
+
+    def __init__(self, server: tuple[str, int]) -> None:
+        self._socket = socket.create_connection(server, CONNECT_TIMEOUT_S)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._sequence = 0
+        self._received = b""
+
+    def send(self, kind: bytes, data: bytes) -> None:
+        """Send one frame."""
+        self._sequence = (self._sequence + 1) & 0xFF
+        self._socket.sendall(frame(kind, self._sequence, data))
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return the answer to the last frame; `TimeoutError` when none comes."""
+        self._socket.settimeout(timeout_s)
+        while True:
+            size = HEAD_SIZE + self._received[2] if len(self._received) >= HEAD_SIZE else HEAD_SIZE
+            if len(self._received) >= HEAD_SIZE and len(self._received) >= size:
+                answer, self._received = self._received[:size], self._received[size:]
+                if answer[1] == self._sequence:  # an older one belongs to a transfer that was given up
+                    return answer[HEAD_SIZE:]
+                continue
+            data = self._socket.recv(4096)
+            if not data:
+                raise ConnectionResetError("the server is gone")
+            self._received += data
+
+    def close(self) -> None:
+        """Unplug."""
+        self._socket.close()
+
+
+class Backend:
+    """What pyusb asks of a back end (`usb.backend.IBackend`), for one Crazyradio that is present while a server runs."""
+
+    def __init__(self, server: str) -> None:
+        host, _, port = server.rpartition(":")
+        self._server = (host, int(port))
+
+    def enumerate_devices(self) -> Iterator[object]:
+        """Yield the dongle if the server answers."""
+        try:
+            socket.create_connection(self._server, CONNECT_TIMEOUT_S).close()
+        except OSError:
+            return
+        yield self
+
+    def get_parent(self, device: object) -> None:
+        """A dongle has no hub."""
+
+    def get_device_descriptor(self, device: object) -> object:
+        """Return the descriptor of a Crazyradio 2 with firmware 5.4."""
+        return _DEVICE
+
+    def get_configuration_descriptor(self, device: object, configuration: int) -> object:
+        """Return the only configuration."""
+        if configuration:
+            raise IndexError(configuration)
+        return _CONFIGURATION
+
+    def get_interface_descriptor(
+        self, device: object, interface: int, setting: int, configuration: int
+    ) -> object:
+        """Return the only interface."""
+        if interface or setting:
+            raise IndexError(interface)
+        return _INTERFACE
+
+    def get_endpoint_descriptor(
+        self, device: object, endpoint: int, interface: int, setting: int, configuration: int
+    ) -> object:
+        """Return bulk in or bulk out."""
+        return _ENDPOINTS[endpoint]
+
+    def open_device(self, device: object) -> Connection:
+        """Connect to the server."""
+        try:
+            return Connection(self._server)
+        except OSError as error:
+            raise _usb_error(error) from None
+
+    def close_device(self, handle: Connection) -> None:
+        """Disconnect."""
+        handle.close()
+
+    def set_configuration(self, handle: Connection, value: int) -> None:
+        """There is only one."""
+
+    def get_configuration(self, handle: Connection) -> int:
+        """Return its number."""
+        return 1
+
+    def set_interface_altsetting(self, handle: Connection, interface: int, setting: int) -> None:
+        """There is only one."""
+
+    def claim_interface(self, handle: Connection, interface: int) -> None:
+        """The connection is the claim."""
+
+    def release_interface(self, handle: Connection, interface: int) -> None:
+        """The connection is the claim."""
+
+    def reset_device(self, handle: Connection) -> None:
+        """Nothing to reset: the host sets everything afterwards."""
+
+    def is_kernel_driver_active(self, handle: Connection, interface: int) -> bool:
+        """No driver of the kernel wants it."""
+        return False
+
+    def bulk_write(self, handle: Connection, endpoint: int, interface: int, data: Any, timeout: int) -> int:
+        """Hand a packet to the dongle."""
+        try:
+            handle.send(WRITE, bytes(data))
+        except OSError as error:
+            raise _usb_error(error) from None
+        return len(data)
+
+    def bulk_read(self, handle: Connection, endpoint: int, interface: int, buffer: Any, timeout: int) -> int:
+        """Wait for the acknowledgement."""
+        try:
+            answer = handle.read(timeout / 1000.0)
+        except OSError as error:
+            raise _usb_error(error) from None
+        buffer[: len(answer)] = array.array("B", answer)
+        return len(answer)
+
+    intr_write = iso_write = (
+        bulk_write  # looked up by pyusb, never called: the dongle has bulk endpoints only
+    )
+    intr_read = iso_read = bulk_read
+
+    def ctrl_transfer(
+        self, handle: Connection, kind: int, request: int, value: int, index: int, data: Any, timeout: int
+    ) -> int:
+        """Execute a vendor request, or read a string descriptor."""
+        if kind == 0x80 and request == 6:
+            text = _STRINGS[value & 0xFF].encode("utf-16-le") if value & 0xFF else b"\x09\x04"
+            descriptor = bytes((2 + len(text), 3)) + text
+            data[: len(descriptor)] = array.array("B", descriptor)
+            return len(descriptor)
+        try:
+            handle.send(CONTROL, bytes((request, value & 0xFF, value >> 8 & 0xFF)) + bytes(data))
+        except OSError as error:
+            raise _usb_error(error) from None
+        return len(data)
+
+
+def _usb_error(error: OSError) -> Any:
+    """Return what pyusb raises: a time-out, or a device that was pulled."""
+    import usb.core
+
+    if isinstance(error, TimeoutError):
+        return usb.core.USBTimeoutError("Operation timed out", errno=errno.ETIMEDOUT)
+    return usb.core.USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
+
+
+def install() -> None:
+    """Put the virtual dongle in the place of the USB bus, in this process."""
+    try:
+        import libusb_package
+    except ImportError:  # this program does not use Crazyradios
+        return
+    backend = Backend(os.environ.get(VARIABLE) or DEFAULT_SERVER)
+    setattr(libusb_package, "get_libusb1_backend", lambda: backend)  # noqa: B010
+
+
+def pytest_configure() -> None:
+    """Entry point for `pytest -p hil.servers.dongle_plugin`."""
+    install()

@@ -1,0 +1,42 @@
+"""Who stands beside the tunnel: lets a robot go once it flies in its holder, and puts it back when it is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from firmware_py.wire.supervisor import State
+from hil.laboratory.robot import Robot
+
+HOLD_US = 1_000_000  # flying in the holder before the release
+PUT_BACK_US = 1_000_000  # after a loss
+WATCH_PERIOD_US = 10_000
+
+
+class Holder:
+    """Watches one robot. `let_go` is called when it has flown in its holder for a second."""
+
+    def __init__(self, robot: Robot, let_go: Callable[[int], None]) -> None:
+        self._robot = robot
+        self._let_go = let_go
+        self._flying_since_us: int | None = None
+        robot.events.every(WATCH_PERIOD_US, WATCH_PERIOD_US, self._watch)
+
+    def put_back_later(self, now_us: int) -> None:
+        """Put the robot back into the holder after a while."""
+        self._robot.free = False
+        self._robot.events.at(now_us + PUT_BACK_US, self._put_back)
+
+    def _put_back(self, now_us: int) -> None:
+        self._robot.put_back(now_us)
+        self._flying_since_us = None
+
+    def _watch(self, now_us: int) -> None:
+        robot = self._robot
+        if robot.free or robot.plant.lost is not None:
+            return
+        if not robot.powered or robot.firmware.signals.supervisor.state is not State.FLYING:
+            self._flying_since_us = None
+        elif self._flying_since_us is None:
+            self._flying_since_us = now_us
+        elif now_us - self._flying_since_us >= HOLD_US:
+            self._let_go(now_us)

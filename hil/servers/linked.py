@@ -1,0 +1,219 @@
+"""A flight over a real link, in real time: the robot in its tunnel here, `floaty station` in another process.
+
+The station is the one that flies a real board. It sees the virtual dongle, the UDP port or a serial port (a pty), and
+has its poses from a virtual Motive, as in the laboratory. The robot is released when the board has flown in its holder
+for a second; then the experiment's script and faults begin to count, and the station's trajectory as well.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from ground_station.trajectory import Goal, Trajectory
+from hil.clock import Clock, Paced
+from hil.errors import LabError
+from hil.laboratory.channels import radio_channel
+from hil.laboratory.flight import Flight
+from hil.laboratory.laboratory import WARM_UP_US, Laboratory
+from hil.laboratory.recorder import Channel
+from hil.laboratory.run import Request
+from hil.servers.dongle_plugin import VARIABLE
+from hil.servers.holder import HOLD_US, Holder
+from hil.servers.motive import Streaming
+from hil.servers.serial_server import Address
+from hil.servers.served_robot import ServedRobot
+from hil.servers.server import Ends, name_of
+
+SITE = Path(__file__).parent / "dongle_site"
+RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder
+STATION_EXIT_TIMEOUT_US = 15_000_000
+LISTEN_PERIOD_US = 250_000
+OUTPUT_MAX = 65_536  # bytes of the station that are read at once
+SERIAL = "mavlink:"
+ALIGNED = [
+    f"--set=capture.{value}"
+    for value in ("origin=[0,0,0]", "yaw=0", "body_offset=[0,0,0]", "body_yaw=0", "multicast=false")
+]  # whatever the profile says of the real cameras
+
+
+class StationProcess:
+    """`hil.laboratory.flight.Line` with `floaty station` at its far end; starts it when the flight begins.
+
+    `uri` is `radio://…` (the board's own), `udp://127.0.0.1:PORT` or `mavlink:PATH`; `arguments` are those of the
+    station's command line that say which profile it has.
+    """
+
+    def __init__(
+        self, flight: Flight, uri: str, seed: int, telemetry: Path, arguments: Sequence[str]
+    ) -> None:
+        clock = flight.lab.clock
+        assert isinstance(clock, Paced)
+        self._flight = flight
+        self._served = ServedRobot(
+            1, flight.robot, flight.streams.radio, lambda text: flight.note("lab", text)
+        )
+        self._ends = Ends(flight.lab, clock.readers, flight.config, seed)
+        self._ends.robots.append(self._served)
+        self._experiment = flight.experiment
+        self._home = Goal(flight.config.flight.home, 0.0)
+        self.released = False
+        self._next_listen_us = 0
+        self._heard = 0  # bytes of the station's output
+        self._said = ""  # its last line
+        station_uri, self._environment = self._serve(uri, flight.config.serial.baud)
+        motive = self._ends.serve_motive(Streaming(0, (4, 1), multicast=False))
+        self._command = [
+            sys.executable, "-m", "hil.commands", "station", "--link", station_uri,
+            "--mocap", f"optitrack:127.0.0.1:{motive.port},body={name_of(1)},y-up",
+            "--trajectory", flight.experiment.name, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
+            *arguments, *ALIGNED,
+        ]  # fmt: skip
+        self._output = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - closed with the line
+        self._station: subprocess.Popen[bytes] | None = None
+
+    def _serve(self, uri: str, baud: int) -> tuple[str, dict[str, str]]:
+        """Open the side of the board that a URI means; returns the station's URI and what its environment needs."""
+        if uri == self._served.uri:
+            paths = [str(SITE), os.environ.get("PYTHONPATH", "")]
+            server = self._ends.serve_radio(0)
+            return uri, {"PYTHONPATH": os.pathsep.join(filter(None, paths)), VARIABLE: server}
+        if uri.startswith(SERIAL):
+            (master,) = self._ends.serve_mavlink([_pty(uri)])
+            return f"{SERIAL}{master},{baud}", {}
+        prefix, _, port = uri.rpartition(":")
+        if prefix == "udp://127.0.0.1" and port.isdigit() and 0 < int(port) < 65536:
+            self._ends.serve_udp(int(port))
+            return uri, {}
+        raise LabError(
+            f"--link {uri}: expected radio, mavlink, {self._served.uri}, udp://127.0.0.1:PORT, mavlink:pty or mavlink:PATH"
+        )
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The goals that the station is expected to send; what it really sent is in its telemetry."""
+        return self
+
+    def at(self, t_us: int) -> Goal:
+        """The goal at an instant of the laboratory."""
+        if not self.released:
+            return self._home
+        return self._experiment.trajectory(self._home, self._flight.release_us).at(t_us)
+
+    def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
+        """What line and board count; the station keeps its own record."""
+        robot = self._flight.robot
+        if robot.uart is not None:
+            from hil.laboratory.serial_line import serial_channel  # needs pymavlink
+
+            return (serial_channel(robot.uart, robot.firmware, None),), ()
+        return ((radio_channel(self._served.udp_radio),) if self._served.udp else ()), ()
+
+    def command(self, now_us: int, packet: bytes) -> None:
+        """Hand the operator's packet to the board as its radio does."""
+        self._flight.robot.packet_received(now_us, packet)
+
+    def look(self, now_us: int) -> list[tuple[str, str]]:
+        """Raise `LabError` when the station has ended, or nothing flies for too long; return what it said."""
+        if now_us < WARM_UP_US:
+            return []
+        station = self._running_station()
+        if station.poll() is not None:
+            self._give_up(f"the station ended with {station.returncode}")
+        if not self.released and now_us >= RELEASE_TIMEOUT_US:
+            self._give_up(f"no flight within {RELEASE_TIMEOUT_US * 1e-6:.0f} s")
+        if now_us < self._next_listen_us:
+            return []
+        self._next_listen_us = now_us + LISTEN_PERIOD_US
+        return self._listen()
+
+    def _running_station(self) -> subprocess.Popen[bytes]:
+        """Return the station's process; it starts when the laboratory already runs, which may take a while to compile."""
+        if self._station is None:
+            self._station = subprocess.Popen(
+                self._command, env={**os.environ, **self._environment}, stdout=self._output,
+                stderr=subprocess.STDOUT, start_new_session=True,
+            )  # fmt: skip
+        return self._station
+
+    def _give_up(self, why: str) -> None:
+        for source, text in self._listen():
+            self._flight.note(source, text)
+        raise LabError(f"{why}: {self._said or 'no output'}")
+
+    def _listen(self) -> list[tuple[str, str]]:
+        """Return what the station said since the last time."""
+        fresh = os.pread(self._output.fileno(), OUTPUT_MAX, self._heard)
+        lines = fresh[: fresh.rfind(b"\n") + 1]
+        self._heard += len(lines)
+        texts = lines.decode(errors="replace").splitlines()
+        self._said = texts[-1] if texts else self._said
+        return [("station", text) for text in texts]
+
+    def finish(self, lab: Laboratory) -> None:
+        """Let the station leave in order, with the board still there, or kill it."""
+        station = self._running_station()
+
+        def progress(now_us: int) -> None:
+            if station.poll() is not None:
+                lab.stop()
+
+        station.terminate()
+        lab.end_us = lab.now_us + STATION_EXIT_TIMEOUT_US
+        try:
+            lab.run(progress)
+        finally:
+            self._kill()
+        for source, text in self._listen():
+            self._flight.note(source, text)
+
+    def _kill(self) -> None:
+        if self._station is not None:
+            self._station.kill()
+            self._station.wait()
+
+    def close(self) -> None:
+        """Close what was opened."""
+        self._kill()
+        self._output.close()
+        self._ends.close()
+
+
+def linked_flight(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
+    """Return a flight over a real link, always paced; it is released when its board flies."""
+    flight = Flight(
+        request.config, request.experiment, request.duration_s, request.seed, Paced(), radio=True,
+        mavlink=request.link.startswith(SERIAL), faults=request.faults, trace_all=trace_all,
+    )  # fmt: skip
+    arguments = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
+    line = StationProcess(flight, request.link, request.seed, telemetry, arguments)
+    flight.line = line
+
+    def let_go(now_us: int) -> None:
+        flight.plan(now_us)
+        line.released = True
+
+    Holder(flight.robot, let_go)
+    flight.watch()
+    return flight
+
+
+def _pty(uri: str) -> Address:
+    """Return the pty of `mavlink:pty` or `mavlink:PATH`, where nothing may be yet: a line needs two ends."""
+    path = uri.removeprefix(SERIAL)
+    if path == "pty":
+        return Address("pty")
+    if not path.startswith(("/", ".")) or "," in path:
+        raise LabError(
+            f"--link {uri}: expected mavlink, mavlink:pty or mavlink:PATH with a name for a new pty"
+        )
+    if Path(path).exists():
+        raise LabError(
+            f"--link {uri}: {path} exists; a new pty gets that name. The board behind a line that is there is flown with "
+            f"floaty station --link {uri}"
+        )
+    return Address("pty", path=Path(path))

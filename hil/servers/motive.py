@@ -1,0 +1,257 @@
+"""A virtual Motive: a NatNet server on the loopback interface that streams what the virtual cameras see.
+
+It answers connect, model definitions, echo, keep-alive and the bitstream request on its command port, and sends every
+frame either to the multicast group or to each client: to the data port of its computer and, once it keeps alive, to
+where it speaks from, because clients differ in where they listen. Nothing here blocks: the board server calls it.
+What it cannot read is counted. Its clock counts from its own start, as that of another computer would; its axes are y up.
+"""
+
+import socket
+import struct
+from contextlib import suppress
+from dataclasses import dataclass
+
+from firmware_py.geometry import Quaternion, Vector
+from ground_station.clock import clock_us
+from ground_station.mocap import MocapFrame
+from ground_station.natnet import (
+    HEADER_SIZE,
+    MULTICAST_GROUP,
+    BodyDescription,
+    BodyPose,
+    Frame,
+    LabelledMarker,
+    MarkerDescription,
+    MessageId,
+    ModelDefinition,
+    ServerInfo,
+    packet,
+)
+from ground_station.natnet_reader import Version
+from hil.clock import Readers
+from hil.devices.markers import DIAMETER, NO_POINTS, Points, Sighting
+from hil.errors import LabError
+from hil.servers.dongle_server import HOST
+from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
+
+MAX_CLIENTS = 16  # one more displaces the one that has been silent for longest
+MAX_COMMAND = 256  # bytes of a request that are looked at
+
+_RELEASES: dict[Version, tuple[int, int, int, int]] = {
+    (3, 1): (2, 2, 0, 0),
+    (4, 1): (3, 1, 0, 0),
+}  # of Motive
+_TICKS_PER_US = 10  # the performance counter of its computer
+_NO_PARENT = 0xFFFF_FFFF  # -1 as the unsigned number that clients read
+_PASSIVE = 0  # label of a marker that does not shine by itself
+_OCCLUDED, _RECONSTRUCTED, _FILLED, _OF_MODEL = 1, 2, 4, 8  # bits of a labelled marker
+_SEEN, _UNSEEN = _RECONSTRUCTED | _OF_MODEL, _OCCLUDED | _FILLED | _OF_MODEL
+_HEADER = struct.Struct("<HH")  # kind, length
+_ECHO = struct.Struct("<QQ")
+_ECHO_REQUEST_SIZE = 8
+_ACCEPTED, _REFUSED = (
+    packet(MessageId.RESPONSE, code.to_bytes(4, "little", signed=True)) for code in (0, -1)
+)
+
+Address = tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Streaming:
+    """What Motive's streaming pane says."""
+
+    port: int  # of commands, 0: any; frames go to the next one, which clients are told
+    version: Version
+    multicast: bool  # to the group, else to each client
+
+
+@dataclass(frozen=True, slots=True)
+class _Client:
+    """Who has connected."""
+
+    version: Version
+    keeps_alive: bool  # then it takes frames where it speaks from; others would take them for answers
+
+
+def with_y_up(p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
+    """A pose in axes with y up, for world and body alike: x_M = x, y_M = z, z_M = -y."""
+    w, a, b, c = q_WB
+    return _turned(*p_WB), (w, *_turned(a, b, c))
+
+
+def _turned(x: float, y: float, z: float) -> Vector:
+    return (x, z, -y)
+
+
+def _all_turned(points: Points) -> list[Vector]:
+    """Points (N, 3) in axes with y up."""
+    return [_turned(x, y, z) for x, y, z in points.tolist()]
+
+
+class VirtualMotive:
+    """Tracks `bodies` (names by id), each with the same `markers`, (N, 3) [m] in B."""
+
+    def __init__(
+        self, settings: Streaming, bodies: dict[int, str], readers: Readers, markers: Points = NO_POINTS
+    ) -> None:
+        self.malformed = 0
+        self._version = settings.version
+        self._multicast = settings.multicast
+        described = tuple(
+            MarkerDescription(place, _PASSIVE, f"Marker{number}")
+            for number, place in enumerate(_all_turned(markers), 1)
+        )
+        self._models = ModelDefinition(
+            tuple(
+                BodyDescription(name, number, _NO_PARENT, (0.0, 0.0, 0.0), described)
+                for number, name in bodies.items()
+            )
+        )
+        self._readers = readers
+        self._clients: dict[Address, _Client] = {}  # who spoke last comes last
+        self._number = 0
+        # Of the frame that is being put together.
+        self._seen: list[BodyPose] = []
+        self._labelled: list[LabelledMarker] = []
+        self._unlabelled: list[Vector] = []
+        self._start_us = clock_us()
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind((HOST, settings.port))
+        except OSError as error:
+            self._socket.close()
+            raise LabError(f"natnet port {settings.port}: {error.strerror or error}") from None
+        self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(HOST))
+        self.port: int = self._socket.getsockname()[1]
+        self.data_port = self.port + 1
+        readers[self._socket] = self._read
+
+    def close(self) -> None:
+        """Stop serving."""
+        del self._readers[self._socket]
+        self._socket.close()
+
+    def take(self, body: int, frame: MocapFrame, now_us: int, sighting: Sighting | None = None) -> None:
+        """Take what was seen of a body, of another clock, on which it is `now_us`; the last body completes a frame."""
+        p, q = with_y_up(frame.p_WB, frame.q_WB)
+        error = 0.0 if sighting is None else sighting.error
+        self._seen.append(BodyPose(body, p, q, error, frame.valid))
+        if sighting is not None:
+            self._unlabelled += _all_turned(sighting.unlabelled)
+            self._labelled += _labelled(body, sighting) if frame.valid else ()
+        if len(self._seen) < len(self._models.bodies):
+            return
+        bodies, labelled, unlabelled = tuple(self._seen), tuple(self._labelled), tuple(self._unlabelled)
+        self._seen, self._labelled, self._unlabelled = [], [], []
+        self._number += 1
+        sent = self._ticks()
+        exposed, received = (
+            max(0, sent - (now_us - t_us) * _TICKS_PER_US)  # nothing lies before the start
+            for t_us in (frame.t_us, now_us if frame.received_us is None else frame.received_us)
+        )
+        whole = Frame(
+            self._number,
+            bodies,
+            unlabelled,
+            labelled,
+            exposed * 1e-6 / _TICKS_PER_US,
+            exposed,
+            received,
+            sent,
+            parameters=0,
+        )
+        targets = self._targets()
+        encoded = {version: encode_frame(whole, version) for version in set(targets.values())}
+        for target, version in targets.items():
+            self._send(encoded[version], target)
+
+    def _ticks(self) -> int:
+        """What Motive's clock shows."""
+        return (clock_us() - self._start_us) * _TICKS_PER_US
+
+    def _targets(self) -> dict[Address, Version]:
+        """Where frames go, and in which version."""
+        if self._multicast:
+            return {(MULTICAST_GROUP, self.data_port): self._version}
+        ports = {(host, self.data_port): client.version for (host, _), client in self._clients.items()}
+        return ports | {at: client.version for at, client in self._clients.items() if client.keeps_alive}
+
+    def _send(self, data: bytes, to: Address) -> None:
+        with suppress(OSError):  # a full buffer, nobody there: UDP loses packets then
+            self._socket.sendto(data, to)
+
+    def _read(self, now_us: int) -> None:
+        """Take one datagram and answer it."""
+        try:
+            data, client = self._socket.recvfrom(2048)
+        except OSError:  # the report of an earlier packet that a client did not want
+            return
+        kind, size = _HEADER.unpack_from(data) if len(data) >= HEADER_SIZE else (None, 0)
+        payload = data[HEADER_SIZE:]
+        if kind == MessageId.CONNECT:  # clients differ in what follows
+            self._admit(client, _Client(self._version, keeps_alive=False))
+            self._send(self._info(), client)
+        elif kind == MessageId.KEEPALIVE:
+            if client in self._clients:
+                self._admit(client, _Client(self._version_of(client), keeps_alive=True))
+        elif kind == MessageId.REQUEST_MODELDEF:
+            self._send(encode_models(self._models, self._version_of(client)), client)
+        elif kind == MessageId.DISCONNECT:
+            self._clients.pop(client, None)
+        elif kind == MessageId.ECHO_REQUEST and len(payload) == _ECHO_REQUEST_SIZE:
+            asked = int.from_bytes(payload, "little")
+            self._send(packet(MessageId.ECHO_RESPONSE, _ECHO.pack(asked, self._ticks())), client)
+        elif kind == MessageId.REQUEST and size <= len(payload) <= MAX_COMMAND:
+            self._send(self._obey(payload.partition(b"\0")[0], client), client)
+        else:
+            self.malformed += 1
+
+    def _info(self) -> bytes:
+        major, minor = self._version
+        return encode_server_info(
+            ServerInfo(
+                "Motive",
+                _RELEASES[self._version],
+                (major, minor, 0, 0),
+                _TICKS_PER_US * 1_000_000,
+                self.data_port,
+                self._multicast,
+                MULTICAST_GROUP if self._multicast else "0.0.0.0",
+            )
+        )
+
+    def _admit(self, address: Address, client: _Client) -> None:
+        """Note that a client is there."""
+        self._clients.pop(address, None)
+        self._clients[address] = client
+        if len(self._clients) > MAX_CLIENTS:
+            del self._clients[next(iter(self._clients))]
+
+    def _version_of(self, client: Address) -> Version:
+        """The version that a client is spoken to in."""
+        return self._clients[client].version if client in self._clients else self._version
+
+    def _obey(self, command: bytes, client: Address) -> bytes:
+        """Return the answer to a command: only the one about the version is known."""
+        name, comma, wanted = command.partition(b",")
+        if name != b"Bitstream":
+            return packet(MessageId.UNRECOGNIZED)
+        if not comma:
+            major, minor = self._version_of(client)
+            return packet(MessageId.RESPONSE, b"Bitstream,%d.%d.0\0" % (major, minor))
+        for version in _RELEASES:
+            same = wanted.split(b".")[:2] == [b"%d" % number for number in version]
+            if same and client in self._clients and not self._multicast:
+                self._admit(client, _Client(version, self._clients[client].keeps_alive))
+                return _ACCEPTED
+        return _REFUSED
+
+
+def _labelled(body: int, sighting: Sighting) -> list[LabelledMarker]:
+    """All the markers of a body that is tracked: those that nobody sees stand where the body has them."""
+    rows = zip(_all_turned(sighting.points), sighting.seen.tolist(), sighting.residuals.tolist(), strict=True)
+    return [
+        LabelledMarker(body << 16 | number, p, DIAMETER, _SEEN if seen else _UNSEEN, residual)
+        for number, (p, seen, residual) in enumerate(rows, 1)
+    ]

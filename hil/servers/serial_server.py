@@ -1,0 +1,222 @@
+"""Where the serial line of a served board comes out: a pty, a UDP socket that talks first, or a TCP port.
+
+The line itself (baud rate, buffers, wrong bits) is `hil.devices.uart`; here bytes are only passed on. Nothing here
+blocks: what a client does not take is lost, as on a line without flow control, and a client that leaves is not noticed
+on board.
+"""
+
+import os
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+from hil.clock import Readers
+from hil.errors import LabError
+from hil.servers.dongle_server import HOST
+
+Received = Callable[[int, bytes], object]  # (now_us, data)
+
+READ_SIZE = 4096
+UDP_PORT = 14550  # where ground stations listen
+TCP_PORT = 5760  # where vehicles listen
+PTYS = "/dev/pts/"
+EXPECTED = "expected pty, pty:PATH, udp, udp:PORT, udp:HOST:PORT, tcp, tcp:PORT or tcp:HOST:PORT"
+
+
+class Endpoint(Protocol):
+    """One open end."""
+
+    master: str  # what MAVProxy calls it, after `--master=`
+
+    def send(self, data: bytes) -> None:
+        """Pass bytes of the board on to the client, if there is one."""
+        ...
+
+    def close(self) -> None:
+        """Give everything back."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """An end that can be opened."""
+
+    kind: str  # pty, udp, tcp
+    host: str = HOST
+    port: int = 0
+    path: Path | None = None  # of a link to the pty
+
+    def open(self, readers: Readers, received: Received) -> Endpoint:
+        """Open it; `received` gets what clients send. `LabError` when that is impossible."""
+        where = self.path or f"{self.host}:{self.port}"
+        try:
+            if self.kind == "pty":
+                return PtyEnd(self.path, readers, received)
+            if self.kind == "udp":
+                return UdpEnd(self.host, self.port, readers, received)
+            return TcpEnd(self.host, self.port, readers, received)
+        except OSError as error:
+            raise LabError(f"mavlink {self.kind} {where}: {error.strerror or error}") from None
+
+
+def parse_addresses(text: str, count: int) -> list[Address]:
+    """Return one address per board: ports count up, links to ptys get `-2`, `-3`, ..."""
+    kind, _, rest = text.partition(":")
+    if kind == "pty":
+        if not rest:
+            return [Address("pty")] * count
+        return [Address("pty", path=Path(rest + (f"-{n}" if n > 1 else ""))) for n in range(1, count + 1)]
+    if kind not in ("udp", "tcp"):
+        raise LabError(f"--mavlink {text}: {EXPECTED}")
+    host, _, number = rest.rpartition(":")
+    default = UDP_PORT if kind == "udp" else TCP_PORT
+    if number and not (number.isascii() and number.isdigit()):
+        raise LabError(f"--mavlink {text}: {EXPECTED}")
+    port = int(number) if number else default
+    if port + count - 1 > 65535 or (kind == "udp" and port == 0):
+        raise LabError(f"--mavlink {text}: port {port} is not possible for {count} boards")
+    return [Address(kind, host or HOST, port + n if port else 0) for n in range(count)]
+
+
+class PtyEnd:
+    """A pseudo terminal: for a client a serial port, of which it may set the baud rate without effect."""
+
+    def __init__(self, link: Path | None, readers: Readers, received: Received) -> None:
+        import termios  # not on every system
+        import tty
+
+        self._readers = readers
+        self._received = received
+        self._link = link
+        if link is not None and link.is_symlink() and os.readlink(link).startswith(PTYS):
+            link.unlink()  # left behind by a server that was killed
+        self._master, self._slave = os.openpty()  # the slave stays open, so that clients may come and go
+        self._forget_unread = partial(termios.tcflush, self._slave, termios.TCIFLUSH)
+        device = os.ttyname(self._slave)
+        self.master = device if link is None else str(link)
+        try:
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            if link is not None:
+                link.symlink_to(device)
+        except OSError:
+            os.close(self._master)
+            os.close(self._slave)
+            raise
+        readers[self._master] = self._read
+
+    def send(self, data: bytes) -> None:
+        """Pass bytes on; when nobody reads, those that wait are given up."""
+        try:
+            written = os.write(self._master, data)
+        except BlockingIOError:
+            written = 0
+        if written < len(data):
+            self._forget_unread()
+
+    def _read(self, now_us: int) -> None:
+        with suppress(BlockingIOError):
+            self._received(now_us, os.read(self._master, READ_SIZE))
+
+    def close(self) -> None:
+        """Remove the pty and the link to it."""
+        if self._link is not None:
+            with suppress(OSError):
+                self._link.unlink()
+        del self._readers[self._master]
+        os.close(self._master)
+        os.close(self._slave)
+
+
+class UdpEnd:
+    """Sends to a ground station and takes its answers."""
+
+    def __init__(self, host: str, port: int, readers: Readers, received: Received) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.connect((host, port))
+            self._socket.setblocking(False)
+        except OSError:
+            self._socket.close()
+            raise
+        self.master = f"udpin:{host}:{port}"
+        self._readers = readers
+        self._received = received
+        readers[self._socket] = self._read
+
+    def send(self, data: bytes) -> None:
+        """Send a datagram; it is lost when nobody listens."""
+        with suppress(OSError):
+            self._socket.send(data)
+
+    def _read(self, now_us: int) -> None:
+        with suppress(OSError):  # the report of a datagram that nobody wanted
+            self._received(now_us, self._socket.recv(READ_SIZE))
+
+    def close(self) -> None:
+        """Close the socket."""
+        del self._readers[self._socket]
+        self._socket.close()
+
+
+class TcpEnd:
+    """Listens for one client at a time; another one waits until the first has left."""
+
+    def __init__(self, host: str, port: int, readers: Readers, received: Received) -> None:
+        self._listener = socket.create_server((host, port))
+        self.master = f"tcp:{host}:{self._listener.getsockname()[1]}"
+        self._readers = readers
+        self._received = received
+        self._client: socket.socket | None = None
+        readers[self._listener] = self._accept
+
+    def _accept(self, now_us: int) -> None:
+        client, _ = self._listener.accept()
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client = client
+        self._readers[client] = self._read
+        del self._readers[self._listener]
+
+    def send(self, data: bytes) -> None:
+        """Pass bytes on; what a slow client does not take is lost."""
+        if self._client is None:
+            return
+        try:
+            self._client.send(data)
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._leave()
+
+    def _read(self, now_us: int) -> None:
+        assert self._client is not None
+        try:
+            data = self._client.recv(READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            self._received(now_us, data)
+        else:
+            self._leave()
+
+    def _leave(self) -> None:
+        """Wait for the next client."""
+        assert self._client is not None
+        del self._readers[self._client]
+        self._client.close()
+        self._client = None
+        self._readers[self._listener] = self._accept
+
+    def close(self) -> None:
+        """Stop listening; the client notices."""
+        if self._client is not None:
+            self._leave()
+        del self._readers[self._listener]
+        self._listener.close()

@@ -1,0 +1,171 @@
+"""Robots for real clients, paced: one laboratory whose time follows the wall clock and that answers sockets in between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from firmware_py.firmware import WatchdogError
+from hil.clock import Paced, Readers
+from hil.config import LabConfig
+from hil.devices.dongle import VirtualDongle
+from hil.devices.markers import NO_POINTS, marker_places
+from hil.devices.nrf51 import Power
+from hil.errors import LabError
+from hil.laboratory.faults import Fault, Switchboard
+from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
+from hil.laboratory.laboratory import NEVER_US, Laboratory
+from hil.laboratory.robot import Robot, Streams, with_system
+from hil.servers.dongle_server import DongleServer
+from hil.servers.holder import Holder
+from hil.servers.motive import Streaming, VirtualMotive
+from hil.servers.serial_server import Address
+from hil.servers.served_robot import ServedRobot
+
+DONGLE_SEED = 10_000  # random streams of dongles: apart from those of the robots
+BUTTON_US = 5_000_000  # off, or in the bootloader with nobody talking to it: then somebody presses the button
+
+
+class Ends:
+    """What leads the robots of a laboratory out; open what is wanted, `close` at the end."""
+
+    def __init__(self, lab: Laboratory, readers: Readers, config: LabConfig, seed: int) -> None:
+        self.robots: list[ServedRobot] = []
+        self.motive: VirtualMotive | None = None
+        self._lab = lab
+        self._readers = readers
+        self._config = config
+        self._seed = seed + DONGLE_SEED
+        self._dongles: DongleServer | None = None
+
+    def serve_radio(self, port: int) -> str:
+        """Offer Crazyradios on a port (0: any); returns the address for FLOATY_DONGLE."""
+        self._dongles = DongleServer(port, self._readers, self._new_dongle)
+        return self._dongles.address
+
+    def serve_udp(self, port: int) -> list[str]:
+        """Offer every robot on UDP, from this port on; returns their URIs."""
+        return [
+            robot.serve_udp(port + robot.number - 1 if port else 0, self._readers) for robot in self.robots
+        ]
+
+    def serve_mavlink(self, addresses: Sequence[Address]) -> list[str]:
+        """Lead out the serial line of every robot; returns what MAVProxy calls their ends."""
+        try:
+            return [
+                robot.serve_mavlink(address, self._readers)
+                for robot, address in zip(self.robots, addresses, strict=True)
+            ]
+        except LabError:
+            self.close()
+            raise
+
+    def serve_motive(self, settings: Streaming) -> VirtualMotive:
+        """Let Motive see every robot, under its number."""
+        names = {robot.number: name_of(robot.number) for robot in self.robots}
+        markers = marker_places(self._config.plant) if self._config.markers.enabled else NO_POINTS
+        self.motive = VirtualMotive(settings, names, self._readers, markers)
+        for served in self.robots:
+            served.robot.seen_by(partial(self.motive.take, served.number))
+        return self.motive
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for robot in self.robots:
+            robot.close()
+        if self._dongles is not None:
+            self._dongles.close()
+        if self.motive is not None:
+            self.motive.close()
+
+    def _new_dongle(self) -> VirtualDongle:
+        self._seed += 1
+        rng = Streams.of_seed(self._seed).radio
+        return VirtualDongle(
+            self._config.radio, self._lab.events, rng, [robot.nrf51 for robot in self.robots]
+        )
+
+
+def name_of(number: int) -> str:
+    """What Motive calls a body."""
+    return "floaty" if number == 1 else f"floaty{number}"
+
+
+class Server:
+    """`count` robots that are let go when they fly, and put back when they are lost; `run` them after opening ends.
+
+    `faults` act from the first release of each robot on. `say` gets lines for the user.
+    """
+
+    def __init__(
+        self,
+        config: LabConfig,
+        count: int,
+        seed: int,
+        say: Callable[[str], None],
+        mavlink: bool = False,
+        faults: Sequence[Fault] = (),
+    ) -> None:
+        self.clock = Paced()
+        self.lab = Laboratory(self.clock)
+        self.ends = Ends(self.lab, self.clock.readers, config, seed)
+        self.switchboards: list[Switchboard] = []
+        self._say = say
+        self._faults = faults
+        self._holders: list[Holder] = []
+        for number in range(1, count + 1):
+            own = with_system(config, config.mavlink.system + number - 1) if mavlink else config
+            self._add(number, own, Streams.of_seed(seed + number - 1), mavlink)
+
+    def _add(self, number: int, config: LabConfig, streams: Streams, mavlink: bool) -> None:
+        def say(source: str, text: str) -> None:
+            self._say(f"board {number}: {text}")
+
+        robot = Robot(config, self.lab.events, streams, say, radio=True, mavlink=mavlink)
+        served = ServedRobot(number, robot, streams.radio, self._say)
+        robot.plant.hold()
+        self.lab.robots.append(robot)
+        self.ends.robots.append(served)
+        switchboard = Switchboard(robot)
+        self.switchboards.append(switchboard)
+        planned = False
+
+        def let_go(now_us: int) -> None:
+            nonlocal planned
+            robot.release()
+            say("lab", "released")
+            if not planned:
+                switchboard.plan(self._faults, now_us, NEVER_US)
+            planned = True
+
+        holder = Holder(robot, let_go)
+        robot.watch(0)
+        self.lab.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, partial(self._look, served, holder))
+
+    def run(self, stopping: Callable[[], bool]) -> None:
+        """Go on until told to stop; may be called again."""
+
+        def progress(now_us: int) -> None:
+            for line in self.clock.notices():
+                self._say(line)
+            if stopping():
+                self.lab.stop()
+
+        self.lab.end_us = NEVER_US
+        self.lab.run(progress)
+
+    def _look(self, served: ServedRobot, holder: Holder, now_us: int) -> None:
+        robot, nrf51 = served.robot, served.nrf51
+        lost = robot.look(now_us)
+        if nrf51.power in (Power.OFF, Power.BOOTLOADER) and now_us - nrf51.heard_us > BUTTON_US:
+            robot.say("lab", "power button pressed")
+            nrf51.press_button(now_us)
+        if robot.powered:
+            try:
+                robot.firmware.check_watchdog()
+            except WatchdogError as error:
+                robot.say("lab", str(error))
+                served.start(now_us)
+        if lost is not None and robot.free:
+            robot.say("lab", f"lost: {lost}; it is put back")
+            holder.put_back_later(now_us)

@@ -1,0 +1,162 @@
+"""The paper's test of its drag model: forces and torques on the robot mounted in the tunnel, over the flaps' angles.
+
+The model is the paper's simplified one ("Force analysis"): base and flaps as isolated flat plates in a uniform flow, pushed
+along their normals. What is measured is the plant, clamped level at the hover point of the tunnel, with its profile and
+its gusts, through a force sensor, for 10 s at each angle: means and standard deviations. The plant's plates are isolated
+too, so what the paper sees at extreme angles, flaps in each other's wake, is not to be found here.
+
+Torques are about the centre of mass. Two sweeps as in the paper's figure drag_model_evaluation: (a) flaps 2 and 3 turned by
+the same angle in opposite directions, (b) flaps 1 and 3 in the same direction; the others stay at the hover angle.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.elementary import cos, sin
+from hil.config import LabConfig
+from hil.laboratory.robot import Streams
+from hil.world.body import AXIS, MIRRORS, SIGNS, flap_plates
+from hil.world.config import PlantConfig
+from hil.world.layout import STEP_US
+from hil.world.motion import GRAVITY
+from hil.world.noise import normal
+from hil.world.plant import Plant
+
+Wrench = NDArray[np.float64]  # (6,): force [N] and torque [N m] in B
+
+ANGLES_DEG = tuple(range(-60, 65, 5))
+SECONDS = 10  # per angle; paper
+SAMPLES = 1_000_000 // STEP_US * SECONDS  # paper: 35000; here on the grid of the truth
+SENSOR_NOISE = (
+    0.01,
+    0.01,
+    0.02,
+    0.00025,
+    0.00025,
+    0.00025,
+)  # N, N m: resolution of an ATI mini40; assumed white
+QUANTITIES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One sequence of flap angles; `turn` sets them from the angle in radians, starting from the hover angles."""
+
+    name: str
+    title: str
+    turn: Callable[[NDArray[np.float64], float], None]
+
+
+def _adjacent(flaps: NDArray[np.float64], angle: float) -> None:
+    flaps[1], flaps[2] = -angle, angle
+
+
+def _opposite(flaps: NDArray[np.float64], angle: float) -> None:
+    flaps[0] = flaps[2] = angle
+
+
+SWEEPS = (
+    Sweep("adjacent", "(a) flaps 2 and 3, opposite directions", _adjacent),
+    Sweep("opposite", "(b) flaps 1 and 3, same direction", _opposite),
+)
+ROBOTS = ("flat", "kinked")
+ROWS = len(ROBOTS) * len(SWEEPS) * len(ANGLES_DEG)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Model and measurement at one angle."""
+
+    robot: str  # flat or kinked flaps
+    sweep: str
+    angle_deg: int
+    model: Wrench
+    mean: Wrench
+    deviation: Wrench
+
+
+class SimplifiedModel:
+    """The paper's plates in a uniform flow. The drag coefficient is the one with which the robot hovers."""
+
+    def __init__(self, config: PlantConfig) -> None:
+        self._config = config
+        self._parts = flap_plates(config)
+        self._pressure = 1.0  # [kg/m3] rho C_D / 2
+        lift = self.wrench(SIGNS * config.hover_angle)[2]
+        self._pressure = config.mass * GRAVITY / lift
+
+    def wrench(self, flaps: NDArray[np.float64]) -> Wrench:
+        """Return force and torque in B, (6,), for flap angles (4,) [rad]."""
+        up = np.array([0.0, 0.0, 1.0])
+        lift = np.array([0.0, 0.0, self._config.axis_height])
+        total = self._push(self._config.base_side * self._config.base_side, up, lift)
+        for mirror, sign, angle in zip(MIRRORS, SIGNS, flaps, strict=True):
+            for part in self._parts:
+                n, r = (mirror * _turned(v, -sign * angle) for v in (part.normal, part.centre))
+                total += self._push(part.area, n, r + lift)
+        return total
+
+    def _push(self, area: float, normal: NDArray[np.float64], centre: NDArray[np.float64]) -> Wrench:
+        """Return what the flow does to one plate (eq. flaps_drag_force_simplified, drag_torque_equation)."""
+        across = self._config.airspeed * normal[2]
+        force = self._pressure * area * across * abs(across) * normal
+        return np.concatenate([force, np.cross(centre, force)])
+
+
+def _turned(vector: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    """Return a vector turned about the axis of flap 2."""
+    along = AXIS * math.fsum(AXIS * vector)
+    return np.asarray(along + (vector - along) * cos(angle) + np.cross(AXIS, vector) * sin(angle))
+
+
+def measure(config: LabConfig, seed: int) -> Iterator[Row]:
+    """Yield the ROWS rows, robot by robot and sweep by sweep."""
+    streams = Streams.of_seed(seed)
+    for robot, kink in zip(ROBOTS, (0.0, config.plant.kink_angle), strict=True):
+        body = config.plant.model_copy(
+            update={"variant": "plate", "constant_factors": {}, "kink_angle": kink}
+        )
+        model = SimplifiedModel(body)
+        plant = Plant(body, config.tunnel, config.actuators, streams.gusts)
+        plant.hold()
+        for servo in range(4):
+            plant.set_servo_fault(servo, speed=0.0)  # the flaps stay where they are put
+        for index, (sweep, angle_deg) in enumerate(product(SWEEPS, ANGLES_DEG)):
+            flaps = SIGNS * body.hover_angle
+            sweep.turn(flaps, math.radians(angle_deg))
+            noise = normal(streams.imu, (SAMPLES, 6)) * SENSOR_NOISE
+            samples = _measure(plant, flaps, index * SAMPLES * STEP_US) + noise
+            mean, deviation = samples.mean(axis=0), samples.std(axis=0)
+            yield Row(robot, sweep.name, angle_deg, model.wrench(flaps), mean, deviation)
+
+
+def _measure(plant: Plant, flaps: NDArray[np.float64], start_us: int) -> NDArray[np.float64]:
+    """Return what the flow does to the clamped robot, (SAMPLES, 6), every millisecond after `start_us`."""
+    plant.place(plant.p_WB.tolist(), plant.q_WB.tolist(), flaps=flaps.tolist())
+    samples = np.empty((SAMPLES, 6))
+    for index in range(SAMPLES):
+        plant.advance(start_us + (index + 1) * STEP_US)
+        samples[index] = plant.wrench_B
+    return samples
+
+
+def write_csv(rows: list[Row], path: Path) -> None:
+    """Write one line per angle: model, mean and standard deviation of each force [N] and torque [N m]."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        kinds = ("model", "mean", "deviation")
+        writer.writerow(
+            ["robot", "sweep", "angle_deg", *(f"{q}_{kind}" for q in QUANTITIES for kind in kinds)]
+        )
+        for row in rows:
+            values = np.stack([row.model, row.mean, row.deviation], axis=1).ravel()
+            writer.writerow([row.robot, row.sweep, row.angle_deg, *(f"{value:.6g}" for value in values)])

@@ -1,0 +1,188 @@
+"""Flying the whole paper: every row's experiment on both profiles with several seeds, and the studies.
+
+Flights of rows keep their logs in `OUT/EXPERIMENT-PROFILE-SEED`, those of studies leave nothing but their result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from hil.errors import LabError
+from hil.experiments import find_experiment
+from hil.laboratory.metrics import METRICS, SHOWN
+from hil.laboratory.run import Request, Result
+from hil.studies.catalogue import PROFILES
+from hil.studies.paper_rows import ROWS, Row
+from hil.studies.study import Study
+from hil.studies.study_run import StudyResult, flights_of, summarise
+from hil.studies.sweep import Job, fly_all
+
+KEPT = ("log.parquet", "events.jsonl", "result.json")
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """A metric over the seeds, in the unit that people read; flights without the figure are left out."""
+
+    unit: str
+    count: int
+    mean: float
+    deviation: float  # standard, of a single flight; NaN of one
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, metric: str, results: Sequence[Result]) -> Spread:
+        """Return the spread of a metric over some flights."""
+        scale, unit = SHOWN.get(METRICS[metric].unit, (1.0, METRICS[metric].unit))
+        found = np.array([result.metrics.get(metric, math.nan) * scale for result in results])
+        found = found[np.isfinite(found)]
+        if not len(found):
+            return cls(unit, 0, *4 * (math.nan,))
+        deviation = float(found.std(ddof=1)) if len(found) > 1 else math.nan
+        return cls(unit, len(found), float(found.mean()), deviation, float(found.min()), float(found.max()))
+
+    def __str__(self) -> str:
+        if not self.count:
+            return "–"
+        spread = f" ± {self.deviation:.2g}" if self.deviation > 0 else ""
+        return f"{self.mean:.3g}{spread} {self.unit}".strip()
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """A row on one profile: its flights by seed."""
+
+    profile: str
+    results: tuple[Result, ...]
+
+    @property
+    def passed(self) -> int:
+        """How many held every limit."""
+        return sum(result.passed for result in self.results)
+
+    @property
+    def holds(self) -> bool:
+        """Whether all did."""
+        return self.passed == len(self.results) > 0
+
+    @property
+    def failed(self) -> list[str]:
+        """Limits that failed, with how often, and why flights were lost."""
+        failures = [
+            verdict.metric for result in self.results for verdict in result.verdicts if not verdict.holds
+        ]
+        return [f"{name} {failures.count(name)}×" for name in dict.fromkeys(failures)]
+
+    @property
+    def lost(self) -> int:
+        """How many were lost."""
+        return sum(result.outcome == "lost" for result in self.results)
+
+    def missed(self, row: Row, metric: str) -> str:
+        """Return by how much the mean misses the paper's value; empty when it does not, or the paper has none."""
+        bound, spread = row.claims[metric].bound, Spread.of(metric, self.results)
+        if bound is None or not spread.count:
+            return ""
+        scale, unit = SHOWN.get(METRICS[metric].unit, (1.0, METRICS[metric].unit))
+        beyond = (
+            spread.mean - bound * scale if METRICS[metric].bound == "max" else bound * scale - spread.mean
+        )
+        return f"misses by {beyond:.2g} {unit}".strip() if beyond > 1e-9 else ""
+
+    def representative_first(self) -> list[Result]:
+        """Return the flights, the one with the median error first."""
+        ranked = sorted(self.results, key=_error)
+        return [ranked.pop((len(ranked) - 1) // 2), *ranked] if ranked else []
+
+
+@dataclass(frozen=True, slots=True)
+class Paper:
+    """All that was flown."""
+
+    rows: tuple[tuple[str, Row, tuple[Trials, ...]], ...]  # experiment, row, per profile
+    studies: tuple[StudyResult, ...]
+    interrupted: bool
+
+    @property
+    def misses(self) -> list[tuple[Row, str, list[str]]]:
+        """Rows and profiles that miss a value of the paper, or hold not every limit, and what."""
+        found = []
+        for _, row, both in self.rows:
+            for trials in both:
+                gaps = [f"{metric} {gap}" for metric in row.claims if (gap := trials.missed(row, metric))]
+                if gaps or trials.failed:
+                    failed = [f"limits fail: {', '.join(trials.failed)}"] if trials.failed else []
+                    found.append((row, trials.profile, [*gaps, *failed]))
+        return found
+
+    @property
+    def holds(self) -> bool:
+        """Whether every verdict holds for the default profile; the other profile and the studies show what they show."""
+        return not self.interrupted and all(trials[0].holds for _, _, trials in self.rows)
+
+
+def select(pattern: str | None) -> list[str]:
+    """Return the experiments of the rows that match a pattern like `yaw-*`. Raises `LabError` when none does."""
+    chosen = [name for name in ROWS if pattern is None or fnmatch(name, pattern)]
+    if not chosen:
+        raise LabError(f"--only {pattern}: no row matches; there are {', '.join(ROWS)}")
+    return chosen
+
+
+def fly_paper(
+    rows: Sequence[str], studies: Sequence[Study], seeds: int, out: Path, notices: Console
+) -> Paper:
+    """Fly rows and studies; after Ctrl-C the result holds what is complete."""
+    jobs: dict[Hashable, Job] = {}
+    trials: dict[tuple[str, str], list[Hashable]] = {}
+    for name in rows:
+        for profile in PROFILES:
+            requests = [Request.of(find_experiment(name), profile, seed=seed) for seed in range(1, seeds + 1)]
+            trials[name, profile] = [_key(request) for request in requests]
+            for request in requests:
+                jobs[_key(request)] = Job(request, out / f"{name}-{profile}-{request.seed}", KEPT)
+    cells = {study.name: list(flights_of(study, seeds)) for study in studies}
+    for study_name, planned in cells.items():
+        for number, (_, _, request) in enumerate(planned):
+            jobs.setdefault(_key(request), Job(request, out / f"study-{study_name}-{number}", ()))
+    results, interrupted = fly_all(list(jobs.values()), notices)
+    flown = {_key(result.request): result for result in results}
+
+    def of(name: str, profile: str) -> Trials:
+        return Trials(profile, tuple(flown[key] for key in trials[name, profile] if key in flown))
+
+    return Paper(
+        tuple((name, ROWS[name], tuple(of(name, profile) for profile in PROFILES)) for name in rows),
+        tuple(
+            summarise(
+                study,
+                [
+                    (variant, size, flown[_key(request)])
+                    for variant, size, request in cells[study.name]
+                    if _key(request) in flown
+                ],
+            )
+            for study in studies
+        ),
+        interrupted,
+    )
+
+
+def _key(request: Request) -> Hashable:
+    """Return what makes a flight the same flight: studies share the healthy ones."""
+    return (
+        request.experiment.name, request.profile, request.overrides, request.faults, request.seed, request.duration_s
+    )  # fmt: skip
+
+
+def _error(result: Result) -> tuple[bool, float]:
+    """Return an order of flights from good to bad."""
+    return result.outcome != "completed", sum(result.metrics[f"rms_{axis}"] ** 2 for axis in "xyz")

@@ -1,0 +1,68 @@
+"""Many flights at once: one process per core, results in the order of the jobs, a progress bar meanwhile."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from hil.laboratory.run import Request, Result, fly, prepare
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A flight, its folder, and what of it is kept: None for everything, no name for nothing, not even the folder."""
+
+    request: Request
+    folder: Path
+    keep: tuple[str, ...] | None = None
+
+
+def fly_all(jobs: Sequence[Job], notices: Console) -> tuple[list[Result], bool]:
+    """Fly every job; return the results in the order of the jobs, and whether Ctrl-C ended it early.
+
+    After Ctrl-C the flights in the air land first: every complete flight is among the results.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), context, _leave_interrupts_to_the_parent)
+    futures = [pool.submit(_fly, job) for job in jobs]
+    interrupted = False
+    try:
+        with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+            bar = progress.add_task("flying", total=len(jobs))
+            for future in as_completed(futures):
+                future.result()  # an error ends the sweep
+                progress.advance(bar)
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    landed = [future for future in futures if not future.cancelled() and future.exception() is None]
+    return [future.result() for future in landed], interrupted
+
+
+def _fly(job: Job) -> Result:
+    prepare(job.folder)
+    result = fly(job.request, job.folder)
+    if job.keep is not None:
+        for file in job.folder.iterdir():
+            if file.name not in job.keep:
+                file.unlink()
+        if not job.keep:
+            job.folder.rmdir()
+    return result
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,1 @@
+"""Physics: the rigid body, its plates, servos and battery, the tunnel and its gusts."""

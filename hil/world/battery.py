@@ -1,0 +1,82 @@
+"""The battery: what the robot draws, what is left, and the voltage under that load.
+
+The cells are alike and in series. Voltages are those of one cell; the board measures the mean of its cells.
+"""
+
+from __future__ import annotations
+
+import math
+
+from firmware_py.elementary import exp
+from hil.world.config import BatteryConfig
+
+SERVOS = 4
+
+
+def open_circuit_voltage(charge: float) -> float:
+    """Return the voltage [V] of a cell without load at a `charge` of 0..1.
+
+    A lithium polymer cell: Chen and Rincon-Mora, IEEE Transactions on Energy Conversion 21(2), 2006, equation 2.
+    """
+    return 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * exp(-35.0 * charge)
+
+
+class Battery:
+    """Charge and voltage over time; `draw` is called at every row of the log.
+
+    Attributes: charge 0..1; voltage [V] of one cell under load, as it reaches the board; power [W] of the whole robot since
+    the last call; sag_V [V] lost between each cell and the board, for a fault.
+    """
+
+    def __init__(self, config: BatteryConfig) -> None:
+        self.sag_V = 0.0
+        self.charge = config.charge
+        self.power = config.electronics_power + SERVOS * config.servo_power
+        self._config = config
+        self._at_rest = self.power
+        self._time_us = 0
+        self._travel = 0.0
+        self.voltage = self._loaded()
+
+    @property
+    def millivolts(self) -> int:
+        """What the board measures: one cell [mV]."""
+        return round(1000.0 * self.voltage)
+
+    def draw(self, now_us: int, flap_travel: float) -> None:
+        """Take what was needed until now; `flap_travel` [rad] is what all flaps have turned since the start."""
+        duration = 1e-6 * (now_us - self._time_us)
+        if duration > 0.0:
+            turned, self._time_us, self._travel = flap_travel - self._travel, now_us, flap_travel
+            self.spend(self._at_rest + self._config.servo_energy * turned / duration, duration)
+
+    def spend(self, power: float, duration: float) -> None:
+        """Draw `power` [W] for `duration` [s]."""
+        self.power = power
+        loaded = self._loaded()
+        self.voltage = max(loaded - self.sag_V, 0.0)
+        current = power / (self._config.cells * loaded)
+        self.charge = max(self.charge - current * duration / self._config.capacity, 0.0)
+
+    def _loaded(self) -> float:
+        """Return the voltage V at which V (OCV - V) / R is the power of a cell; half of OCV when it cannot give that."""
+        open_circuit = open_circuit_voltage(self.charge)
+        per_cell = self.power / self._config.cells
+        return 0.5 * (
+            open_circuit
+            + math.sqrt(max(open_circuit * open_circuit - 4.0 * self._config.resistance * per_cell, 0.0))
+        )
+
+
+def endurance(config: BatteryConfig, power: float, empty_V: float, step: float = 1.0) -> float:
+    """Return for how long [s] the battery gives `power` [W] until a cell falls below `empty_V`; inf for no power."""
+    if power <= 0.0:
+        return math.inf
+    battery = Battery(config)
+    elapsed = 0.0
+    while battery.charge > 0.0:
+        battery.spend(power, step)
+        if battery.voltage < empty_V:
+            break
+        elapsed += step
+    return elapsed

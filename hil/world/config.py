@@ -1,0 +1,219 @@
+"""The robot as it really is in this world: body, tether, limits, servos. Every default names its source.
+
+Section numbers without a name are those of physics.md, the specification of the plant; "paper" is the Floaty paper.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+Four = tuple[float, float, float, float]
+Factor = Annotated[float, Field(ge=0.25, le=4)]
+Variant = Literal["plate", "methods", "table", "methods_open", "table_open"]
+ConstantName = Literal[
+    "roll_u1", "roll_roll", "roll_rate", "y_u1", "y_roll",
+    "pitch_u2", "pitch_pitch", "pitch_rate", "x_u2", "x_pitch",
+    "yaw_u3", "yaw_rate", "z_u4",
+]  # fmt: skip
+
+
+class TetherConfig(BaseModel):
+    """The safety line from an anchor above: slack in flight, a spring and damper that only pulls when taut."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    anchor_height: float = Field(
+        1.5, gt=0, le=5, description="above the hover point [m]; chosen (paper: thread over pulleys)"
+    )
+    length: float = Field(
+        2.3, gt=0, le=8, description="to the base plate [m]; catches 0.87 m below hover; chosen"
+    )
+    stiffness: float = Field(100.0, gt=0, le=2000, description="[N/m]; chosen: 3 cm under the weight")
+    damping: float = Field(
+        5.0, ge=0, le=50, description="[N s/m]; chosen: about critical with the counter-weight"
+    )
+
+
+class GroundConfig(BaseModel):
+    """The net over the tunnel's exit and the robot's four feet on it; the paper names neither: all chosen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    height: float = Field(0.0, ge=-2, le=2, description="z of the net in W [m]; the tunnel's exit; chosen")
+    foot_spread: float = Field(
+        0.06, gt=0, le=0.3, description="|x| = |y| of each foot in B [m]; beyond the base plate; chosen"
+    )
+    foot_below: float = Field(
+        0.05, gt=0, le=0.3, description="feet below the centre of mass [m]; under the batteries; chosen"
+    )
+    stiffness: float = Field(
+        800.0, gt=0, le=5000, description="under one foot [N/m]; chosen: 1 mm under the weight"
+    )
+    damping: float = Field(8.0, ge=0, le=50, description="under one foot [N s/m]; chosen: half of critical")
+    friction: float = Field(0.5, ge=0, le=2, description="coefficient [1]; chosen")
+
+
+class LimitsConfig(BaseModel):
+    """Where a flight counts as lost."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    radius: float = Field(
+        0.45, gt=0, le=0.6, description="from the tunnel's axis [m]; half the flow is left (section 6)"
+    )
+    below: float = Field(
+        0.8, gt=0, le=1.2, description="below the hover point [m]; section 8 has recoveries from 0.65"
+    )
+    above: float = Field(
+        0.85, gt=0, le=5, description="above the hover point [m]; paper: cameras see 2 m over the tunnel"
+    )
+    tilt: float = Field(
+        math.pi / 2, gt=0, lt=math.pi, description="of the body's z from the vertical [rad]; chosen"
+    )
+
+
+class PlantConfig(BaseModel):
+    """The body in the flow: geometry G0 of section 3, corrected to a set of identified constants (section 4).
+
+    The drag coefficient is not a free constant: it is trimmed so that `mass` hovers at `airspeed` and `hover_angle`
+    (C_D = 1.353 at 1.225 kg/m3). Model errors are the factors, true over design: they act after the trim.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    variant: Variant = Field(
+        "methods",
+        description="plate: isolated plates; else their linearisation is corrected to the paper's Table; section 1",
+    )
+    mass: float = Field(0.340, gt=0.05, le=2, description="design mass [kg]; paper, Setup specifications")
+    inertia: tuple[Positive, Positive, Positive] = Field(
+        (1.30e-3, 1.30e-3, 1.47e-3), description="design inertia about x, y, z of B [kg m2]; section 3"
+    )
+    airspeed: float = Field(
+        10.0, gt=1, le=30, description="design airspeed of the hover [m/s]; paper, Setup specifications"
+    )
+    hover_angle: float = Field(
+        math.radians(25), gt=0, le=1.2, description="flap angle of the design hover [rad]; paper: 25 deg"
+    )
+    footprint: float = Field(
+        0.23, gt=0.05, le=1, description="side of the square of four quadrants [m]; paper"
+    )
+    base_side: float = Field(
+        0.08, gt=0, le=0.5, description="side of the base plate [m]; original firmware, baseArea"
+    )
+    strip_width: float = Field(
+        0.0198, gt=0, le=0.1, description="width of the kinked strip along the y edges [m]; section 3"
+    )
+    kink_angle: float = Field(
+        math.radians(42.5), ge=0, le=1.5, description="upward bend of the strip [rad]; paper"
+    )
+    axis_height: float = Field(
+        0.07, ge=0, le=0.3, description="flap axes above the centre of mass [m]; paper"
+    )
+    flow_point: float = Field(
+        0.0627, gt=0, le=0.5, description="|x| = |y| where a flap's flow is taken [m]; section 3"
+    )
+    mass_factor: Factor = Field(1.0, description="true mass over design mass")
+    inertia_factor: Factor = Field(1.0, description="true inertia over design inertia")
+    drag_factor: Factor = Field(1.0, description="true force and torque of the flow over the design's")
+    constant_factors: dict[ConstantName, Annotated[float, Field(ge=0, le=4)]] = Field(
+        {}, description="true over tabulated value of single constants of a corrected variant"
+    )
+    tether: TetherConfig = Field(default_factory=TetherConfig)
+    ground: GroundConfig = Field(default_factory=GroundConfig)
+    limits: LimitsConfig = Field(default_factory=LimitsConfig)
+
+    @model_validator(mode="after")
+    def _plates_fit(self) -> PlantConfig:
+        if self.base_side >= self.footprint or self.strip_width >= (self.footprint - self.base_side) / 2:
+            raise ValueError("base_side and strip_width leave no flat part of the flaps inside the footprint")
+        if self.variant == "plate" and self.constant_factors:
+            raise ValueError("constant_factors act on corrected variants only, not on 'plate'")
+        return self
+
+
+class ServoConfig(BaseModel):
+    """The four servos of the world, as the board was trimmed for them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    zero_offset: Four = Field(
+        (-3600 / 31290, -5000 / 31290, -9000 / 31290, 6200 / 31290),
+        description="pulse of a level flap, from the middle pulse of 1.5 ms [rad]; original firmware, motorShifts",
+    )
+    tau: float = Field(
+        0.050, gt=0.001, le=0.5, description="first-order lag [s]; original firmware, flapTimeConst = 20 1/s"
+    )
+    rate_limit: float = Field(10.5, gt=0, le=100, description="[rad/s]; section 6, assumed: 0.1 s for 60 deg")
+    dead_band: float = Field(
+        math.radians(0.1), ge=0, le=0.1, description="error that moves nothing [rad]; section 6, assumed"
+    )
+    trim_error: Four = Field(
+        (0.0, 0.0, 0.0, 0.0), description="wrong mounting: flap angle minus intended angle [rad]"
+    )
+    speed: tuple[Annotated[float, Field(ge=0, le=4)], ...] = Field(
+        (1.0, 1.0, 1.0, 1.0),
+        min_length=4,
+        max_length=4,
+        description="factor on the servo's pace: 1 healthy, 0 stuck",
+    )
+
+
+class TunnelConfig(BaseModel):
+    """The flow of one flight; physics.md section 6 is the source where none is named."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    speed: float = Field(
+        10.0, gt=0, le=30, description="mean flow at the hover point [m/s]; paper, Setup specifications"
+    )
+    profile_radius: float = Field(
+        0.45, gt=0.05, le=5, description="w(r) = speed / (1 + (r / profile_radius)^6) [m]; assumed"
+    )
+    height_slope: float = Field(0.05, ge=0, le=0.5, description="loss of speed with height [1/m]; assumed")
+    hover_height: float = Field(
+        1.15, gt=0, le=3, description="hover point above the exit [m]; paper, Hover: 115 cm"
+    )
+    turbulence: Literal["none", "T0", "T1"] = Field(
+        "T0", description="gust level; T0 gives the paper's hover"
+    )
+    gust_scale: float = Field(1.0, ge=0, le=5, description="factor on the gusts of that level")
+    side_wind: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="added everywhere, x y z of W [m/s]"
+    )
+    fan_factor: float = Field(1.0, ge=0, le=2, description="factor on everything that the fans blow")
+
+
+class BatteryConfig(BaseModel):
+    """Two small lithium polymer cells, and what empties them.
+
+    The paper gives 0.925 Wh per cell (3.7 V) and 7.6 V for both (3.8 V each). Both are true of one cell here: 3.80 V is the
+    mean open-circuit voltage, and 0.925 Wh is what is left of 0.951 Wh at the paper's 3.4 W.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    cells: int = Field(2, ge=1, le=6, description="in series; paper, Robot design and fabrication")
+    capacity: float = Field(
+        900.0, gt=1, le=1e5, description="charge of a full cell [A s]; paper: 250 mAh, single cell"
+    )
+    resistance: float = Field(
+        0.22, ge=0, le=2, description="of a cell with its leads [ohm]; chosen: 0.925 Wh per cell at 3.4 W"
+    )
+    charge: float = Field(1.0, ge=0, le=1, description="at the start, as a share of the capacity")
+    electronics_power: float = Field(
+        0.3, ge=0, le=50, description="board and inertial sensors [W]; paper, Energy efficiency"
+    )
+    servo_power: float = Field(
+        0.50, ge=0, le=10, description="of each servo at rest, holding [W]; physics.md section 10, calibrated"
+    )
+    servo_energy: float = Field(
+        0.33,
+        ge=0,
+        le=10,
+        description="of each servo per angle turned [J/rad]; physics.md section 10, calibrated",
+    )

@@ -1,0 +1,153 @@
+"""Trim, linearisation and the identified correction of the plate model (physics.md sections 3 and 4).
+
+Everything that depends on the plate model (trim, its own constants L, its lift ratio l) is computed here once from the
+compiled model itself; only the target constants T are typed, with their source.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from firmware_py.elementary import cos, sin
+from hil.world import layout as at
+from hil.world.body import MIX
+from hil.world.config import PlantConfig
+from hil.world.fixed_order import fit_polynomial
+from hil.world.motion import GRAVITY, evaluate
+from hil.world.plates import LIFT_U4_MAX, State
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Constants:
+    """The linearised dynamics at hover: f_{affected, cause}; SI, W axes for x y z, the paper's u1..u4 [rad]."""
+
+    roll_u1: float
+    roll_roll: float
+    roll_rate: float
+    y_u1: float
+    y_roll: float
+    pitch_u2: float
+    pitch_pitch: float
+    pitch_rate: float
+    x_u2: float
+    x_pitch: float
+    yaw_u3: float
+    yaw_rate: float
+    z_u4: float
+    # Couplings that the Table omits or that no variant changes; they follow from the others (section 3, identities)
+    z_vz: float = math.nan
+    y_vy: float = math.nan
+    x_vx: float = math.nan
+    roll_vy: float = math.nan
+    pitch_vx: float = math.nan
+
+
+# Paper, Table "Empirical estimation of dynamics constants"
+TABLE = Constants(
+    roll_u1=230.0, roll_roll=-16.0, roll_rate=-40.0, y_u1=-4.8, y_roll=-6.5,
+    pitch_u2=1100.0, pitch_pitch=-1560.0, pitch_rate=-29.0, x_u2=-0.8, x_pitch=2.5,
+    yaw_u3=110.0, yaw_rate=-7.7, z_u4=2.3, z_vz=-2.0,
+)  # fmt: skip
+PITCH_INPUT_METHODS = (
+    -1066.0
+)  # [1/s2] paper, Methods: contradicts the Table's +1100; section 5 decides for it
+
+LIFT_SAMPLES = np.linspace(-LIFT_U4_MAX, LIFT_U4_MAX, 45)  # [rad] u4 at which l is fitted, every 0.025
+LIFT_ORDER = 6
+DIFFERENCE = 1e-3  # [rad, rad/s, m/s] step of the five-point difference
+
+
+def calm(s: State, speed: float) -> State:
+    """Return a copy of the plant, level and at rest at the hover point, in a uniform flow of `speed` [m/s]."""
+    c = s.copy()
+    c[at.P : at.P + 3] = 0.0, 0.0, s[at.HOVER_HEIGHT]
+    c[at.Q : at.Q + 4] = 1.0, 0.0, 0.0, 0.0
+    c[at.V : at.V + 3] = c[at.OMEGA : at.OMEGA + 3] = c[at.SIDE_WIND : at.SIDE_WIND + 3] = 0.0
+    c[at.PUSH : at.PUSH + 3] = c[at.PUSH_TORQUE : at.PUSH_TORQUE + 3] = 0.0
+    c[at.FLAPS : at.FLAPS + 4] = s[at.HOVER_FLAPS : at.HOVER_FLAPS + 4]
+    c[at.SPEED], c[at.PROFILE_RADIUS], c[at.FAN] = speed, math.inf, 1.0
+    c[at.HEIGHT_SLOPE] = c[at.GUST_SCALE] = c[at.OCCLUSION + 3] = c[at.HELD] = 0.0
+    c[at.TETHER_LENGTH] = math.inf
+    c[at.NET_HEIGHT] = -math.inf
+    return c
+
+
+def _accelerations(c: State, cause: str, amount: float) -> State:
+    """Return ACC (W) and ALPHA (B), (6,), of a calm plant with one cause changed by `amount`."""
+    s = c.copy()
+    if cause[0] == "u":
+        s[at.FLAPS : at.FLAPS + 4] += amount * MIX[:, int(cause[1]) - 1]
+    elif cause[0] == "v":
+        s[at.V + "xyz".index(cause[1])] = amount
+    elif cause[0] == "q":
+        s[at.Q], s[at.Q + 1 + "xyz".index(cause[1])] = cos(amount / 2), sin(amount / 2)
+    else:
+        s[at.OMEGA + "xyz".index(cause[1])] = amount
+    evaluate(s)
+    return np.concatenate([s[at.ACC : at.ACC + 3], s[at.ALPHA : at.ALPHA + 3]])
+
+
+def linearise(s: State, speed: float) -> Constants:
+    """Return the constants of the plant in `s` about the level hover in a uniform flow of `speed` [m/s]."""
+    c = calm(s, speed)
+
+    def slope(cause: str) -> State:
+        h = DIFFERENCE
+        near = _accelerations(c, cause, h) - _accelerations(c, cause, -h)
+        far = _accelerations(c, cause, 2 * h) - _accelerations(c, cause, -2 * h)
+        return (8 * near - far) / (12 * h)
+
+    u1, u2, u3, u4 = (slope(cause).tolist() for cause in ("u1", "u2", "u3", "u4"))
+    roll, pitch, vx, vy, vz = (slope(cause).tolist() for cause in ("qx", "qy", "vx", "vy", "vz"))
+    p, q, r = (slope(cause).tolist() for cause in ("ox", "oy", "oz"))
+    return Constants(
+        roll_u1=u1[3], roll_roll=roll[3], roll_rate=p[3], y_u1=u1[1], y_roll=roll[1],
+        pitch_u2=u2[4], pitch_pitch=pitch[4], pitch_rate=q[4], x_u2=u2[0], x_pitch=pitch[0],
+        yaw_u3=u3[5], yaw_rate=r[5], z_u4=u4[2],
+        z_vz=vz[2], y_vy=vy[1], x_vx=vx[0], roll_vy=vy[3], pitch_vx=vx[4],
+    )  # fmt: skip
+
+
+def target_constants(config: PlantConfig, plate: Constants) -> Constants:
+    """Return what the linearisation of the configured variant shall be; `plate` are the plate model's own constants."""
+    changes: dict[str, Any] = {}
+    if config.variant.startswith("methods"):
+        changes["pitch_u2"] = PITCH_INPUT_METHODS
+    if config.variant.endswith("_open"):
+        changes |= {rate: getattr(plate, rate) for rate in ("roll_rate", "pitch_rate", "yaw_rate")}
+    target = dataclasses.replace(TABLE, **changes)
+    factors = config.constant_factors
+    return dataclasses.replace(target, **{name: factors[name] * getattr(target, name) for name in factors})
+
+
+def trim_and_correct(s: State, config: PlantConfig) -> None:
+    """Write the trimmed drag, then the correction of the configured variant; needs the plates and the true mass in `s`."""
+    design = calm(s, config.airspeed)
+    design[at.MASS], design[at.DRAG_FACTOR], design[at.CORRECTED] = config.mass, 1.0, 0.0
+    design[at.INERTIA : at.INERTIA + 3] = config.inertia
+    weight = config.mass * GRAVITY
+    design[at.PRESSURE] = 1.0
+    evaluate(design)
+    s[at.PRESSURE] = design[at.PRESSURE] = weight / design[at.DRAG + 2]
+    s[at.AIRSPEED] = config.airspeed
+    s[at.CORRECTED] = float(config.variant != "plate")
+    if config.variant == "plate":
+        return
+
+    lift = [_accelerations(design, "u4", u4)[2] / GRAVITY + 1.0 for u4 in LIFT_SAMPLES.tolist()]
+    s[at.LIFT_FIT : at.LIFT_FIT + LIFT_ORDER + 1] = fit_polynomial(LIFT_SAMPLES, np.array(lift), LIFT_ORDER)
+    L = linearise(design, config.airspeed)
+    T = target_constants(config, L)
+    m, (ix, iy, iz) = config.mass, config.inertia
+    s[at.X_INPUT], s[at.X_TILT] = T.x_u2 / L.x_u2, m * (T.x_pitch - L.x_pitch)
+    s[at.Y_INPUT], s[at.Y_TILT] = T.y_u1 / L.y_u1, m * (T.y_roll - L.y_roll)
+    s[at.Z_INPUT] = T.z_u4 / GRAVITY
+    s[at.ROLL_INPUT], s[at.ROLL_TILT] = T.roll_u1 / L.roll_u1, ix * (T.roll_roll - L.roll_roll)
+    s[at.ROLL_RATE] = ix * (T.roll_rate - L.roll_rate)
+    s[at.PITCH_INPUT], s[at.PITCH_TILT] = iy * T.pitch_u2, iy * (T.pitch_pitch - L.pitch_pitch)
+    s[at.PITCH_RATE] = iy * (T.pitch_rate - L.pitch_rate)
+    s[at.YAW_INPUT], s[at.YAW_RATE] = T.yaw_u3 / L.yaw_u3, iz * (T.yaw_rate - L.yaw_rate)

@@ -1,0 +1,198 @@
+"""The robot in the tunnel, as the harness sees it: time passes, pulses arrive, truth can be read.
+
+The truth lives on a grid of whole milliseconds from time 0: `advance(now_us)` does every step that ends at or before
+`now_us`. The same generator and the same calls give the same bits however the way to an instant is cut into calls.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.elementary import cos
+from hil.errors import LabError
+from hil.world import layout as at
+from hil.world.body import SIGNS, place_plates
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.correction import Constants, calm, linearise, trim_and_correct
+from hil.world.motion import advance, evaluate
+from hil.world.noise import normal
+from hil.world.servos import commanded_angles, next_period_us
+from hil.world.tunnel import Tunnel
+
+NOISE_ROWS = 2048  # steps of gusts drawn at once
+Vector = Sequence[float]
+View = NDArray[np.float64]
+
+LOSS_TEXTS = {
+    at.LEFT_SIDEWAYS: "left the flow: {:.2f} m from the axis",
+    at.ROSE: "left the flow: {:.2f} m above the hover point",
+    at.FELL: "fell: {:.2f} m below the hover point",
+    at.TETHER_TAUT: "tether taut, {:.2f} m below the hover point",
+    at.TUMBLED: "tumbled: tilt {:.2f} rad",
+}
+
+
+class Plant:
+    """Body, servos, tether and the air around them.
+
+    Attributes (read-only numpy views of the present truth, SI):
+        state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
+        p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
+        wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
+        servo_trim (4,) [rad] and servo_speed (4,), pushes (6,) force [N, W] and torque [N m, B]: as they were last set;
+        specific_force_B (3,) at the centre of mass; flow_W (3,) air there; plate_forces_W (5, 3) base and four flaps as
+        isolated plates (without the identified correction, so they do not add up to the whole force).
+    """
+
+    def __init__(
+        self,
+        config: PlantConfig,
+        tunnel: TunnelConfig,
+        servos: ServoConfig,
+        rng_gust: np.random.Generator,
+        p_WB: Vector | None = None,
+        q_WB: Vector = (1.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        """Start at rest with the flaps at the hover angle, at the hover point unless `p_WB` [m] says otherwise."""
+        self._s = s = np.zeros(at.SIZE)
+        self.tunnel = Tunnel(tunnel, s)
+        place_plates(s, config)
+        s[at.MASS] = config.mass * config.mass_factor
+        s[at.INERTIA : at.INERTIA + 3] = np.array(config.inertia) * config.inertia_factor
+        s[at.DRAG_FACTOR] = config.drag_factor
+        self._airspeed = config.airspeed
+        trim_and_correct(s, config)
+
+        tether, ground, limits = config.tether, config.ground, config.limits
+        s[at.TETHER_ANCHOR + 2] = tunnel.hover_height + tether.anchor_height
+        s[at.TETHER_LENGTH], s[at.TETHER_STIFFNESS] = tether.length, tether.stiffness
+        s[at.TETHER_DAMPING] = tether.damping
+        s[at.NET_HEIGHT], s[at.FRICTION] = ground.height, ground.friction
+        s[at.NET_STIFFNESS], s[at.NET_DAMPING] = ground.stiffness, ground.damping
+        s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = ground.foot_spread, ground.foot_below
+        s[at.FOOT_REACH] = math.sqrt(
+            2.0 * ground.foot_spread * ground.foot_spread + ground.foot_below * ground.foot_below
+        )
+        s[at.LIMIT_RADIUS], s[at.LIMIT_BELOW], s[at.LIMIT_ABOVE] = limits.radius, limits.below, limits.above
+        s[at.LIMIT_COS_TILT] = cos(limits.tilt)
+
+        s[at.SERVO_TAU], s[at.SERVO_RATE], s[at.DEAD_BAND] = servos.tau, servos.rate_limit, servos.dead_band
+        self._zero_offset = servos.zero_offset
+        self.servo_trim, self.servo_speed = self._view(at.SERVO_TRIM, 4), self._view(at.SERVO_SPEED, 4)
+        self.pushes = self._view(at.PUSH, 6)
+        for servo in range(4):
+            self.set_servo_fault(servo, servos.trim_error[servo], servos.speed[servo])
+        self._counts: Sequence[int] = ()
+        self._commanded = (SIGNS * config.hover_angle).tolist()
+        s[at.COMMAND : at.COMMAND + 4] = self._commanded
+        s[at.NEXT_US] = s[at.AFTER_US] = math.inf
+
+        self._rng = rng_gust
+        self._draws = normal(rng_gust, (NOISE_ROWS, 14))
+        self.state = self._view(at.P, 17)
+        self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
+        self.omega_B, self.flaps = self._view(at.OMEGA, 3), self._view(at.FLAPS, 4)
+        self.specific_force_B, self.flow_W = self._view(at.SPECIFIC_FORCE, 3), self._view(at.FLOW, 3)
+        self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
+        self.wrench_B = self._view(at.DRAG, 6)
+        self.plate_forces_W = self._view(at.PLATE_FORCES, 15).reshape(5, 3)
+        self.place((0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB, q_WB, flaps=self._commanded)
+
+    def _view(self, start: int, count: int) -> View:
+        view = self._s[start : start + count]
+        view.flags.writeable = False
+        return view
+
+    def place(
+        self,
+        p_WB: Vector,
+        q_WB: Vector,
+        v_WB: Vector = (0.0, 0.0, 0.0),
+        omega_B: Vector = (0.0, 0.0, 0.0),
+        flaps: Vector | None = None,
+    ) -> None:
+        """Put the body into a state; `q_WB` is normalised, `flaps` None leaves them as they are. Raises LabError."""
+        s = self._s
+        length = math.sqrt(math.fsum(component * component for component in q_WB))
+        if not (
+            length > 0.0
+            and all(map(math.isfinite, (*p_WB, *q_WB, *v_WB, *omega_B, *(() if flaps is None else flaps))))
+        ):
+            raise LabError(f"cannot place the plant at p_WB = {p_WB}, q_WB = {q_WB}: not a finite pose")
+        s[at.P : at.P + 3], s[at.Q : at.Q + 4] = p_WB, np.asarray(q_WB) / length
+        s[at.V : at.V + 3], s[at.OMEGA : at.OMEGA + 3] = v_WB, omega_B
+        if flaps is not None:
+            s[at.FLAPS : at.FLAPS + 4] = flaps
+        evaluate(s)
+
+    def advance(self, now_us: int) -> None:
+        """Bring the truth to the last whole millisecond at or before `now_us`."""
+        while advance(self._s, self._draws, now_us):
+            self._draws = normal(self._rng, self._draws.shape)
+
+    def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
+        """Take over what the four timer registers hold; it reaches the servos at the next PWM period."""
+        counts = tuple(counts)
+        if counts == self._counts:
+            return
+        self._counts = counts
+        self.advance(now_us)
+        self._commanded = commanded_angles(counts, self._zero_offset, self._commanded)
+        s = self._s
+        # An earlier change may have been latched since the last millisecond: then this one queues behind it.
+        at_us, angles = (at.AFTER_US, at.AFTER) if s[at.NEXT_US] <= now_us else (at.NEXT_US, at.NEXT)
+        s[at_us], s[angles : angles + 4] = next_period_us(now_us), self._commanded
+
+    @property
+    def lost(self) -> str | None:
+        """The first reason for which the flight is over; None while it flies."""
+        cause = int(self._s[at.LOST])
+        if cause == 0:
+            return None
+        return f"{LOSS_TEXTS[cause].format(self._s[at.LOST_VALUE])} at {self._s[at.LOST_US] * 1e-6:.3f} s"
+
+    def hold(self) -> None:
+        """Clamp the body where it is, at rest; flaps, air and sensors go on."""
+        s = self._s
+        s[at.HELD] = 1.0
+        s[at.V : at.V + 3] = s[at.OMEGA : at.OMEGA + 3] = 0.0
+        evaluate(s)
+
+    def put_back(self, p_WB: Vector) -> None:
+        """Clamp the body upright at a place, as if nothing had happened; the flaps stay as they are."""
+        self._s[at.LOST] = 0.0
+        self.place(p_WB, (1.0, 0.0, 0.0, 0.0))
+        self.hold()
+
+    def release(self) -> None:
+        """Let go."""
+        self._s[at.HELD] = 0.0
+        evaluate(self._s)
+
+    def push(self, force_W: Vector, torque_B: Vector = (0.0, 0.0, 0.0)) -> None:
+        """Apply a force [N, W] at the centre of mass and a torque [N m, B] until the next call."""
+        self._s[at.PUSH : at.PUSH + 3], self._s[at.PUSH_TORQUE : at.PUSH_TORQUE + 3] = force_W, torque_B
+
+    def set_servo_fault(self, servo: int, trim_error: float = 0.0, speed: float = 1.0) -> None:
+        """Mount servo 0..3 `trim_error` [rad] off and run it at `speed` times its pace, 0: stuck; defaults heal it."""
+        self._s[at.SERVO_TRIM + servo], self._s[at.SERVO_SPEED + servo] = trim_error, speed
+
+    @property
+    def flap_travel(self) -> float:
+        """By how much all flaps together have turned since the start [rad]."""
+        return float(self._s[at.TRAVEL])
+
+    def linearise(self) -> Constants:
+        """Return the linearised dynamics about the level hover in the uniform flow of the design."""
+        return linearise(self._s, self._airspeed)
+
+    def mounted_wrench(self, flaps: Vector) -> tuple[View, View]:
+        """Return force [N] and torque [N m], (3,) each in B, on the robot fixed level in the design's uniform flow."""
+        s = calm(self._s, self._airspeed)
+        s[at.FLAPS : at.FLAPS + 4] = flaps
+        evaluate(s)
+        return s[at.DRAG : at.DRAG + 3], s[at.DRAG + 3 : at.DRAG + 6]

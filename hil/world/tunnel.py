@@ -1,0 +1,77 @@
+"""The wind tunnel: mean profile, gusts, side wind, fans, a blocked patch; constants, and what may change in flight.
+
+The air is computed inside the plant's kernel (`hil.world.plates`); `Tunnel` writes that kernel's inputs. World frame: z
+up, origin in the middle of the tunnel's exit, hover point `hover_height` above it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.elementary import exp
+from hil.errors import LabError
+from hil.world import layout as at
+from hil.world.config import TunnelConfig
+
+# physics.md section 6. Rows as in layout.GUSTS: time constant [s]; then rms [m/s] per level.
+GUST_TAU = (0.015, 0.015, 0.015, 0.4, 0.4, 0.4, *4 * (0.010,), *4 * (0.15,))
+GUST_RMS = {
+    "none": 14 * (0.0,),
+    "T0": (0.35, 0.35, 0.20, 0.05, 0.05, 0.03, *4 * (0.40,), *4 * (0.10,)),  # as rough as the paper's hover
+    "T1": (0.40, 0.40, 0.20, 0.06, 0.06, 0.03, *4 * (0.50,), *4 * (0.15,)),  # harder
+}
+GUST_RADIUS = 0.25  # [m] gusts grow as 1 + (r / GUST_RADIUS)^4 ...
+GUST_GROWTH_MAX = 6.0  # ... up to this
+
+
+class Tunnel:
+    """The knobs of the tunnel during a flight; a change acts from the next millisecond on.
+
+    `fan_factor`, `gust_scale`, `side_wind` (x, y, z) and `shadow` (the share that is blocked) are as they were last set.
+    """
+
+    def __init__(self, config: TunnelConfig, state: NDArray[np.float64]) -> None:
+        self._s = s = state
+        s[at.SPEED] = config.speed
+        s[at.PROFILE_RADIUS] = config.profile_radius
+        s[at.HEIGHT_SLOPE] = config.height_slope
+        s[at.HOVER_HEIGHT] = config.hover_height
+        s[at.GUST_RADIUS], s[at.GUST_GROWTH_MAX] = GUST_RADIUS, GUST_GROWTH_MAX
+        decay = np.array([exp(-at.STEP_US * 1e-6 / tau) for tau in GUST_TAU])
+        s[at.GUST_DECAY : at.GUST_DECAY + 14] = decay  # exact discretisation of an Ornstein-Uhlenbeck process
+        s[at.GUST_KICK : at.GUST_KICK + 14] = np.array(GUST_RMS[config.turbulence]) * np.sqrt(1.0 - decay**2)
+        self.set_gust_scale(config.gust_scale)
+        self.set_side_wind(*config.side_wind)
+        self.set_fan_factor(config.fan_factor)
+        self.block(0.0, 0.0, 1.0, 0.0)
+
+    def set_fan_factor(self, factor: float) -> None:
+        """Scale the mean flow and the gusts: 1 as configured, 0 fans off."""
+        self._s[at.FAN] = self.fan_factor = _inside("fan factor", factor, 0.0, 2.0)
+
+    def set_gust_scale(self, scale: float) -> None:
+        """Scale the gusts of the configured level."""
+        self._s[at.GUST_SCALE] = self.gust_scale = _inside("gust scale", scale, 0.0, 5.0)
+
+    def set_side_wind(self, x: float, y: float, z: float = 0.0) -> None:
+        """Add a wind [m/s, W] everywhere; a fan beside the tunnel."""
+        wind = tuple(_inside("side wind", component, -20.0, 20.0) for component in (x, y, z))
+        self._s[at.SIDE_WIND : at.SIDE_WIND + 3] = self.side_wind = wind
+
+    def block(self, x: float, y: float, radius: float, depth: float) -> None:
+        """Take the share `depth` of the flow away around (x, y) [m, W], half of it at `radius` [m]; depth 0 clears."""
+        self._s[at.OCCLUSION : at.OCCLUSION + 4] = (
+            _inside("occlusion x", x, -2.0, 2.0),
+            _inside("occlusion y", y, -2.0, 2.0),
+            _inside("occlusion radius", radius, 0.01, 5.0),
+            _inside("occlusion depth", depth, 0.0, 1.0),
+        )
+        self.shadow = depth
+
+
+def _inside(what: str, value: float, low: float, high: float) -> float:
+    """Return `value`, or raise LabError when it is not a number inside [low, high]."""
+    if not low <= value <= high:
+        raise LabError(f"{what} = {value}: outside {low:g}..{high:g}")
+    return value
