@@ -20,6 +20,7 @@ FLUSH_PERIOD_US = 1_000_000
 
 TELEMETRY = "telemetry.csv"  # in a run folder
 TIME_COLUMN = "ground.t [s]"
+GOAL_COLUMNS = ("goal.x [m]", "goal.y [m]", "goal.z [m]", "goal.yaw [rad]")
 POSE_COLUMNS = (
     "mocap.t [s]", "mocap.x [m]", "mocap.y [m]", "mocap.z [m]", "mocap.roll [rad]", "mocap.pitch [rad]", "mocap.yaw [rad]",
 )  # fmt: skip
@@ -27,10 +28,7 @@ AGE_COLUMNS = tuple(f"age.{stage} [s]" for stage in STAGES)
 
 _GROUND_COLUMNS = (
     TIME_COLUMN,
-    "goal.x [m]",
-    "goal.y [m]",
-    "goal.z [m]",
-    "goal.yaw [rad]",
+    *GOAL_COLUMNS,
     *POSE_COLUMNS,
     "mocap.vx [m/s]",
     "mocap.vy [m/s]",

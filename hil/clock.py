@@ -85,6 +85,11 @@ class Paced:
         assert self._start_ns is not None
         return (time.monotonic_ns() - self._start_ns) // 1000
 
+    @staticmethod
+    def wall_us() -> int:
+        """The wall clock, the same for all processes of this computer [us]."""
+        return time.monotonic_ns() // 1000
+
     def ahead_us(self, now_us: int) -> int:
         """How long it is until the simulated instant may happen, 0 when it may; the first call sets the start."""
         if self._start_ns is None:

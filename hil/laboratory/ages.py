@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from ground_station.latency import STAGES, Row, Stage, budget_of
-from ground_station.telemetry_log import AGE_COLUMNS, TELEMETRY, TIME_COLUMN
+from ground_station.telemetry_log import AGE_COLUMNS, GOAL_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.laboratory.metrics import column
 
 
 def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
     """The budget of a flight over `link`; empty when no telemetry came."""
     rows: list[Row] = list(zip(*(_us(told_ages, stage) for stage in STAGES), strict=True))
-    radio_us = _on_air(log)
+    radio_us = _on_air(log) if link == "radio" else np.empty(0)
     if rows and len(radio_us):
         rows = [
             (*row[:-1], us) for row, us in zip(rows, np.resize(radio_us, len(rows)).tolist(), strict=True)
@@ -32,7 +32,23 @@ def told(folder: Path) -> pa.Table:
 
     A stage of which it does not know is NaN. The last line of the file may be cut.
     """
-    titles = (TIME_COLUMN, *AGE_COLUMNS)
+    times = _read(folder / TELEMETRY, (TIME_COLUMN, *AGE_COLUMNS))
+    times = times[~np.isnan(times[:, -1])]
+    times[:, 0] -= times[:1, 0].sum()
+    times[:, 1:] *= 1e3
+    return pa.table(dict(zip(("t", *STAGES), times.T, strict=True)))
+
+
+def goals_sent(telemetry: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    """When the station recorded which goal: (N,) [us] by its clock, (N, 4) x, y, z [m] and yaw [rad] in W; None: never."""
+    rows = _read(telemetry, (TIME_COLUMN, *GOAL_COLUMNS))
+    if not len(rows):
+        return None
+    return np.round(1e6 * rows[:, 0]).astype(np.int64), rows[:, 1:]
+
+
+def _read(telemetry: Path, titles: tuple[str, ...]) -> NDArray[np.float64]:
+    """Return columns of a telemetry record, (N, columns); the last line of the file may be cut."""
     convert = csv.ConvertOptions(
         include_columns=titles,
         column_types=dict.fromkeys(titles, pa.float64()),
@@ -40,14 +56,10 @@ def told(folder: Path) -> pa.Table:
     )
     parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
     try:
-        table = csv.read_csv(folder / TELEMETRY, parse_options=parse, convert_options=convert)
-        times = np.column_stack([table.column(title).to_numpy() for title in titles])
+        table = csv.read_csv(telemetry, parse_options=parse, convert_options=convert)
     except (FileNotFoundError, pa.ArrowInvalid):  # nothing came, not even a whole line
-        times = np.empty((0, len(titles)))
-    times = times[~np.isnan(times[:, -1])]
-    times[:, 0] -= times[:1, 0].sum()
-    times[:, 1:] *= 1e3
-    return pa.table(dict(zip(("t", *STAGES), times.T, strict=True)))
+        return np.empty((0, len(titles)))
+    return np.column_stack([table.column(title).to_numpy() for title in titles])
 
 
 def _us(told_ages: pa.Table, stage: str) -> list[float]:

@@ -108,7 +108,8 @@ def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
     faults = [parse(text) for text in json.loads(known.get(b"faults", b"[]"))]
     if not faults:
         return []
-    return spans(faults, json.loads(known[b"config"])["flight"]["release_us"])
+    planned_us = json.loads(known[b"config"])["flight"]["release_us"]
+    return spans(faults, int(known.get(b"release_us", planned_us)))
 
 
 class Switchboard:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import pyarrow as pa
+
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock
@@ -59,6 +61,10 @@ class Line(Protocol):
 
     def finish(self, lab: Laboratory) -> None:
         """Let the ground station leave in order; the flight is over."""
+        ...
+
+    def corrected(self, log: pa.Table) -> pa.Table:
+        """The log with what is known only now that the flight is over."""
         ...
 
     def close(self) -> None:
@@ -186,6 +192,8 @@ class Flight:
 
     def _release(self, now_us: int) -> None:
         self.robot.release()
+        if self.recorder is not None:
+            self.recorder.release_us = now_us
         self.note("lab", "released")
 
     def _record(self, now_us: int) -> None:

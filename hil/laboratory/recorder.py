@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hil.errors import LabError
 
 ROWS_PER_BATCH = 100
+RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
 
 
@@ -56,6 +57,7 @@ class Recorder:
         on_batch: Callable[[pa.RecordBatch], None] | None = None,
     ) -> None:
         self.folder = folder
+        self.release_us: int | None = None  # of the robot, once it is known
         self._sources: list[tuple[Callable[[], Any], NDArray[Any]]] = []
         self._times = np.zeros(ROWS_PER_BATCH, np.int64)
         self._row = 0
@@ -88,13 +90,16 @@ class Recorder:
         self._events.write(json.dumps({"t_us": now_us, "source": source, "text": text}) + "\n")
         self._events.flush()
 
-    def close(self) -> str:
-        """Finish the files; returns the SHA-256 over times, names and values of all columns."""
+    def close(self, correct: Callable[[pa.Table], pa.Table] | None = None) -> str:
+        """Finish the files; returns the SHA-256 over times, names and values of all columns as they were recorded.
+
+        `correct` may put in what became known only after the flight.
+        """
         if self._row:
             self._write_batch()
         self._stream.close()
         self._events.close()
-        finish_log(self.folder)
+        finish_log(self.folder, self.release_us, correct)
         return self._hash.hexdigest()
 
     def _write_batch(self) -> None:
@@ -111,10 +116,18 @@ class Recorder:
             self._on_batch(batch)
 
 
-def finish_log(folder: Path) -> None:
+def finish_log(
+    folder: Path, release_us: int | None = None, correct: Callable[[pa.Table], pa.Table] | None = None
+) -> None:
     """Turn what the stream holds into `log.parquet`, even when the flight ended in the middle of a batch."""
     stream = folder / STREAM
     table = _read_stream(stream)
+    if correct is not None:
+        table = correct(table)
+    if release_us is not None:
+        table = table.replace_schema_metadata(
+            {**(table.schema.metadata or {}), RELEASE_US: str(release_us).encode()}
+        )
     partial = folder / (PARQUET + ".partial")
     pa.parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
     partial.replace(folder / PARQUET)

@@ -169,7 +169,7 @@ def fly(
         recorder.note(flight.now_us, "lab", cause)
     finally:
         factor = pace.end(flight.now_us)
-        digest = recorder.close()
+        digest = recorder.close(flight.line.corrected)
         flight.close()
         flight.write_schedule(folder)
     log = load_log(folder)

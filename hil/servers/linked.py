@@ -14,13 +14,17 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock, Paced
 from hil.errors import LabError
+from hil.laboratory.ages import goals_sent
 from hil.laboratory.channels import radio_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
-from hil.laboratory.recorder import Channel
+from hil.laboratory.recorder import Channel, Quantity
 from hil.laboratory.run import Request
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.holder import HOLD_US, Holder
@@ -33,6 +37,8 @@ SITE = Path(__file__).parent / "dongle_site"
 RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder
 STATION_EXIT_TIMEOUT_US = 15_000_000
 LISTEN_PERIOD_US = 250_000
+WALL = "station.clock"  # of the computer, by which the station stamps its record
+GOALS = ("goal.x", "goal.y", "goal.z", "goal.yaw")
 OUTPUT_MAX = 65_536  # bytes of the station that are read at once
 SERIAL = "mavlink:"
 ALIGNED = [
@@ -60,6 +66,7 @@ class StationProcess:
         self._ends = Ends(flight.lab, clock.readers, flight.config, seed)
         self._ends.robots.append(self._served)
         self._experiment = flight.experiment
+        self._telemetry = telemetry
         self._home = Goal(flight.config.flight.home, 0.0)
         self.released = False
         self._next_listen_us = 0
@@ -110,8 +117,11 @@ class StationProcess:
         if robot.uart is not None:
             from hil.laboratory.serial_line import serial_channel  # needs pymavlink
 
-            return (serial_channel(robot.uart, robot.firmware, None),), ()
-        return ((radio_channel(self._served.udp_radio),) if self._served.udp else ()), ()
+            line: tuple[Channel, ...] = (serial_channel(robot.uart, robot.firmware, None),)
+        else:
+            line = (radio_channel(self._served.udp_radio),) if self._served.udp else ()
+        clock = Channel("int64", Paced.wall_us, (Quantity((WALL,), "us"),))
+        return line, (clock,)
 
     def command(self, now_us: int, packet: bytes) -> None:
         """Hand the operator's packet to the board as its radio does."""
@@ -175,6 +185,19 @@ class StationProcess:
         if self._station is not None:
             self._station.kill()
             self._station.wait()
+
+    def corrected(self, log: pa.Table) -> pa.Table:
+        """The log with the goals that the station really sent, by its own record."""
+        sent = goals_sent(self._telemetry)
+        if sent is None:
+            return log
+        times_us, goals = sent
+        latest = np.searchsorted(times_us, log.column(WALL).to_numpy(), side="right") - 1
+        for index, name in enumerate(GOALS):
+            place = log.schema.get_field_index(name)
+            values = np.where(latest < 0, log.column(place).to_numpy(), goals[np.maximum(latest, 0), index])
+            log = log.set_column(place, log.schema.field(place), pa.array(values))
+        return log
 
     def close(self) -> None:
         """Close what was opened."""

@@ -1,0 +1,204 @@
+"""Robots on one time line, without a wall clock: let go, lost, put back, rebooted, faulted; alone and beside others."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from firmware_py.wire.crtp import PORT_CONSOLE
+from hil.clock import FreeRunning, Paced
+from hil.config import load_config
+from hil.devices.nrf51 import Power
+from hil.errors import LabError
+from hil.laboratory.faults import Fault, Switchboard, parse
+from hil.laboratory.laboratory import Laboratory
+from hil.laboratory.robot import Robot, Streams
+from hil.servers.holder import Holder
+from hil.servers.live_faults import LiveFaults
+from hil.servers.served_robot import ServedRobot
+from hil.servers.server import Server
+
+SECOND_US = 1_000_000
+
+
+class Bench:
+    """Robots that fly with stations of their own, served, on a free-running clock."""
+
+    def __init__(self, count: int = 1, seed: int = 1, faults: tuple[Fault, ...] = (), *settings: str) -> None:
+        self.said: list[str] = []
+        self.server = Server(load_config("floaty", settings), count, seed, self.said.append, faults=faults)
+        self.server.lab.clock = FreeRunning()
+        for robot in self.server.ends.robots:
+            robot.fly()
+
+    def fly(self, duration_s: float) -> list[str]:
+        """Go on for a while; returns what was said meanwhile."""
+        before = len(self.said)
+        lab = self.server.lab
+        lab.end_us = lab.now_us + round(duration_s * SECOND_US)
+        lab.run()
+        return self.said[before:]
+
+    def robot(self, number: int = 1) -> Robot:
+        return self.server.lab.robots[number - 1]
+
+
+def test_a_robot_is_let_go_when_it_has_flown_in_its_holder_for_a_second_and_hovers() -> None:
+    bench = Bench()
+    said = bench.fly(6.0)
+    flying, released = (
+        next(i for i, text in enumerate(said) if words in text)
+        for words in ("supervisor: flying", "released")
+    )
+    assert flying < released
+    assert bench.robot().free
+    assert not any("lost" in text for text in said)
+    assert np.abs(bench.robot().plant.p_WB - np.array([0.0, 0.0, 1.15])).max() < 0.1
+
+
+def test_a_robot_that_is_lost_is_put_back_after_a_second_and_flies_again_among_the_same_faults() -> None:
+    bench = Bench(1, 1, (parse("push.x@0.5:0.5=20"), parse("servo.slow.1@0.2=0.9")))
+    said = bench.fly(12.0)
+    assert sum("it is put back" in text for text in said) == 1
+    assert sum(text.endswith("released") for text in said) == 2
+    assert bench.robot().free
+    assert bench.robot().plant.servo_speed[0] == pytest.approx(0.9)  # the servo is as slow as before
+
+
+def test_robots_on_one_time_line_fly_as_each_does_alone() -> None:
+    together = Bench(3, 5)
+    together.fly(3.0)
+    for number in (1, 2, 3):
+        alone = Bench(1, 4 + number)
+        alone.fly(3.0)
+        ours, theirs = together.robot(number), alone.robot()
+        assert ours.plant.state.tolist() == theirs.plant.state.tolist()
+        assert ours.firmware.signals.estimate.tolist() == theirs.firmware.signals.estimate.tolist()
+
+
+def test_firmware_that_waits_for_every_instant_flies_as_one_that_runs_ahead() -> None:
+    """What a wall clock does to the time line, on one that never sleeps."""
+
+    class Instant(Paced):
+        def ahead_us(self, now_us: int) -> int:
+            return 0
+
+    ahead, waiting = Bench(), Bench()
+    waiting.server.lab.clock = Instant()
+    ahead.fly(2.5)
+    waiting.fly(2.5)
+    assert ahead.robot().plant.state.tolist() == waiting.robot().plant.state.tolist()
+    assert (
+        ahead.robot().firmware.signals.estimate.tolist() == waiting.robot().firmware.signals.estimate.tolist()
+    )
+
+
+def test_a_board_without_power_rests_and_boots_with_its_memories_and_a_clock_that_begins_anew() -> None:
+    bench = Bench()
+    bench.fly(3.0)
+    served, robot = bench.server.ends.robots[0], bench.robot()
+    robot.board.eeprom[100:103] = b"abc"
+    before, counts = robot.firmware, robot.firmware.signals.count.tolist()
+    served.nrf51.hear(bench.server.lab.now_us, b"\xff\xfe\x02")  # the power switch: system off
+    assert served.nrf51.power is Power.RADIO_ONLY
+    assert robot.next_wake_us is None
+    bench.fly(0.5)
+    assert before.signals.count.tolist() == counts
+    served.nrf51.hear(bench.server.lab.now_us, b"\xff\xfe\x03")  # system on
+    bench.fly(0.05)
+    assert robot.firmware is not before
+    assert bytes(robot.board.eeprom[100:103]) == b"abc"
+    assert 0 < robot.firmware.kernel.now_us <= 60_000
+    assert robot.booted_us > 3 * SECOND_US
+
+
+def test_a_processor_that_hangs_is_reset_by_its_watchdog_and_goes_on_under_the_same_load() -> None:
+    bench = Bench(1, 1, (parse("cpu.load@0.5:0.4=1"),))
+    said = bench.fly(8.0)
+    assert sum("watchdog" in text for text in said) == 1
+    assert sum("gyro zero found" in text for text in said) == 2  # it booted again
+    assert bench.robot().thief.share == 0.0
+
+
+def test_the_battery_of_a_served_robot_empties() -> None:
+    bench = Bench()
+    full = bench.robot().battery.charge
+    bench.fly(4.0)
+    assert bench.robot().battery.charge < full
+    assert bench.robot().board.battery_mv == bench.robot().battery.millivolts
+
+
+def live(bench: Bench) -> tuple[Callable[[str], None], list[str]]:
+    answers: list[str] = []
+    faults = LiveFaults(bench.server, answers.append)
+    return lambda line: faults.take(line, bench.server.lab.now_us), answers
+
+
+def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
+    bench = Bench(2)
+    type_line, answers = live(bench)
+    bench.fly(3.0)
+    type_line("2 push.y:0.2=0.5")
+    assert bench.robot(2).plant.pushes.tolist() == [0.0, 0.5, 0.0, 0.0, 0.0, 0.0]
+    assert bench.robot(1).plant.pushes.tolist() == [0.0] * 6
+    bench.fly(0.3)
+    assert bench.robot(2).plant.pushes.tolist() == [0.0] * 6
+    type_line("wind.side_y=0.5")
+    type_line("wind.side_y=0.25")
+    assert bench.robot(1).plant.tunnel.side_wind[1] == pytest.approx(0.75)
+    type_line("clear")
+    assert bench.robot(1).plant.tunnel.side_wind[1] == 0.0
+    assert answers == []
+    assert any("fault push.y" in text and "ends" in text for text in bench.said)
+
+
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        ("push.w=2", "unknown kind 'push.w'; did you mean push"),
+        ("push.y=200", "size 200: expected -20..20 N"),
+        ("push.y=a", "start, duration and size are numbers"),
+        ("3 push.y", "robot 3: expected 1..1"),
+        ("serial.cut", "acts on a serial line; this robot has none"),
+        ("marker.swap", "needs --set markers.enabled=true"),
+        ("help", "lets a fault act on robot N"),
+        ("kinds", "mocap.dropout"),
+    ],
+)
+def test_a_typed_line_that_says_nothing_possible_is_answered_and_changes_nothing(
+    line: str, answer: str
+) -> None:
+    bench = Bench()
+    type_line, answers = live(bench)
+    type_line(line)
+    assert answer in " ".join(answers)
+    assert bench.server.switchboards[0].active == []
+
+
+def test_a_fault_that_does_not_concern_a_robot_is_refused_when_it_shall_act_now() -> None:
+    bench = Bench()
+    board = Switchboard(bench.robot())
+    with pytest.raises(LabError, match="serial line"):
+        board.act(parse("serial.cut@0"), 0)
+
+
+def test_a_packet_to_a_board_without_power_is_lost() -> None:
+    bench = Bench()
+    bench.robot().cut_power()
+    bench.robot().packet_received(0, bytes((PORT_CONSOLE << 4,)))
+    bench.robot().uart_ready(0)
+    assert bench.fly(0.1) == []
+
+
+def test_a_holder_lets_nobody_go_who_does_not_fly() -> None:
+    lab = Laboratory(FreeRunning())
+    robot = Robot(load_config(), lab.events, Streams.of_seed(1), lambda source, text: None)
+    ServedRobot(1, robot, np.random.default_rng(1), print)
+    robot.plant.hold()
+    lab.robots.append(robot)
+    gone: list[int] = []
+    Holder(robot, gone.append)
+    robot.watch(0)
+    lab.end_us = 3 * SECOND_US
+    lab.run()
+    assert gone == []
