@@ -202,3 +202,21 @@ def test_a_holder_lets_nobody_go_who_does_not_fly() -> None:
     lab.end_us = 3 * SECOND_US
     lab.run()
     assert gone == []
+
+
+def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() -> None:
+    lab = Laboratory(FreeRunning())
+    robot = Robot(load_config(), lab.events, Streams.of_seed(1), lambda source, text: None, mavlink=True)
+    heard: list[int] = []
+    assert robot.uart is not None
+    robot.uart.connect(robot.uart_ready, lambda now_us, data: heard.append(now_us))
+    lab.robots.append(robot)
+    robot.boot(0)
+    robot.watch(0)
+    lab.events.at(2 * SECOND_US, lambda _: robot.cut_power())
+    lab.events.at(3 * SECOND_US, robot.boot)
+    lab.end_us = 5 * SECOND_US
+    lab.run()
+    assert sum(now_us < 2 * SECOND_US for now_us in heard) > 20
+    assert [now_us for now_us in heard if 2_010_000 < now_us < 3 * SECOND_US] == []
+    assert sum(now_us > 3 * SECOND_US for now_us in heard) > 20

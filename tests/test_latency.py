@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,7 +19,7 @@ from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.laboratory.ages import ages_of, told
+from hil.laboratory.ages import STATION_CLOCK, ages_of, told, with_goals_sent
 from hil.laboratory.lockstep import MAVLINK, RADIO, lockstep_flight
 from hil.laboratory.recorder import load_log
 from hil.laboratory.run import Request, fly, prepare
@@ -176,3 +177,17 @@ def test_instants_of_the_way_survive_motive_and_the_clock_of_its_computer() -> N
         for instant, ahead_us in zip(instants, (latency_us, processing_us, 0), strict=True):
             assert instant is not None
             assert before_us - ahead_us - 1000 <= instant <= after_us - ahead_us + 1000
+
+
+def test_a_log_gets_the_goals_that_the_station_recorded_at_their_time(tmp_path: Path) -> None:
+    record = tmp_path / "telemetry.csv"
+    titles = ("board.t [ms]", "ground.t [s]", "goal.x [m]", "goal.y [m]", "goal.z [m]", "goal.yaw [rad]")
+    rows = ("1,7.000020,1,2,3,0.1", "2,7.000040,4,5,6,0.2", "3,7.0000")
+    record.write_text("\n".join((",".join(titles), *rows)))
+    columns = {"goal.x": 0.0, "goal.y": 0.0, "goal.z": 1.15, "goal.yaw": 0.0}
+    clock = [7_000_010, 7_000_020, 7_000_039, 7_000_040, 9_000_000]
+    log = pa.table({STATION_CLOCK: clock, **{name: [value] * 5 for name, value in columns.items()}})
+    told = with_goals_sent(record, log)
+    assert told.column("goal.z").to_pylist() == [1.15, 3.0, 3.0, 6.0, 6.0]
+    assert told.column("goal.yaw").to_pylist() == [0.0, 0.1, 0.1, 0.2, 0.2]
+    assert with_goals_sent(tmp_path / "none.csv", log).equals(log)

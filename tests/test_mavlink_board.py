@@ -171,7 +171,7 @@ def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us
     line = VirtualSerial(SerialConfig(baud=baud), events, np.random.default_rng(1))
     board = VirtualBoard(lambda *servo: None, lambda *radio: True, lambda *console: None, line)
     firmware = Firmware(load_config(), board, mavlink=True)
-    board.run_on(firmware.kernel, events, 0)
+    board.run_on(firmware.kernel, events)
     station, parser, ages_ms = codec(255, 190), codec(0, 0), []
     lag_us, ahead_us = 20_000, 123_456_789_000
 

@@ -30,7 +30,8 @@ class Uart(Protocol):
 class VirtualBoard:
     """Implements `firmware_py.board.Board`; `servo`, `radio`, `console` and `uart` are where the pins lead to.
 
-    `run_on` tells it whose time it is, and which hardware its pins may set going.
+    Those are told the instant by the clock of the hardware. `run_on` tells whose time it is, and which hardware pins may set
+    going.
     """
 
     def __init__(
@@ -52,18 +53,18 @@ class VirtualBoard:
         self._events: EventQueue | None = None
         self._booted_us = 0
 
-    def forget_processor(self) -> None:
-        """Lose the kernel that ran so far: the next one boots at its time 0."""
-        self._kernel = None
+    def boot(self, now_us: int) -> None:
+        """Begin a processor's time at an instant of the hardware's; `run_on` follows when it has booted."""
+        self._kernel, self._booted_us = None, now_us
 
-    def run_on(self, kernel: Kernel, events: EventQueue, booted_us: int) -> None:
-        """Join the pins to a processor that booted at an instant of the hardware's events."""
-        self._kernel, self._events, self._booted_us = kernel, events, booted_us
+    def run_on(self, kernel: Kernel, events: EventQueue) -> None:
+        """Join the pins to a booted processor and to the queue of hardware events."""
+        self._kernel, self._events = kernel, events
 
     @property
     def now_us(self) -> int:
-        """The processor's present instant; 0 while it boots."""
-        return self._kernel.now_us if self._kernel else 0
+        """The processor's present instant, by the hardware's clock."""
+        return self._booted_us + (self._kernel.now_us if self._kernel else 0)
 
     def read_imu(self) -> ImuCounts:
         """Return the last sample."""

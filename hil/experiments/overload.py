@@ -23,10 +23,16 @@ if TYPE_CHECKING:
 
     from firmware_py.firmware import Thief
     from hil.laboratory.flight import Flight
+    from hil.laboratory.robot import Robot
 
 STEP_PERCENT = 5
 STEP_US = 1_500_000
 ROWS_PER_SECOND = 100  # of the log
+
+
+def with_a_thief(robot: Robot) -> None:
+    """Let the thief be on board, taking nothing."""
+    robot.thief.share = 0.0
 
 
 def steal_more_and_more(flight: Flight) -> None:
@@ -68,6 +74,7 @@ OVERLOAD = Experiment(
     summary="hover while a task above all others takes 0 to 100 % of the processor",
     duration_s=21 * STEP_US * 1e-6,
     limits={"estimator_late_from": 0.10, "controller_late_from": 0.60, "held_up_to": 0.60},
+    prepare=with_a_thief,
     script=steal_more_and_more,
     measure=loads_that_hurt,
     pictures=("overload",),

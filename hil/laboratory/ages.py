@@ -14,6 +14,10 @@ from ground_station.latency import STAGES, Row, Stage, budget_of
 from ground_station.telemetry_log import AGE_COLUMNS, GOAL_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.laboratory.metrics import column
 
+STATION_CLOCK = (
+    "station.clock"  # column of the log: the clock of the computer, by which a station stamps its record
+)
+
 
 def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
     """The budget of a flight over `link`; empty when no telemetry came."""
@@ -45,6 +49,20 @@ def goals_sent(telemetry: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]
     if not len(rows):
         return None
     return np.round(1e6 * rows[:, 0]).astype(np.int64), rows[:, 1:]
+
+
+def with_goals_sent(telemetry: Path, log: pa.Table) -> pa.Table:
+    """Return a flight log with the goals that the station really sent, by its own record."""
+    sent = goals_sent(telemetry)
+    if sent is None:
+        return log
+    times_us, goals = sent
+    latest = np.searchsorted(times_us, log.column(STATION_CLOCK).to_numpy(), side="right") - 1
+    for index, name in enumerate(("goal.x", "goal.y", "goal.z", "goal.yaw")):
+        place = log.schema.get_field_index(name)
+        values = np.where(latest < 0, log.column(place).to_numpy(), goals[np.maximum(latest, 0), index])
+        log = log.set_column(place, log.schema.field(place), pa.array(values))
+    return log
 
 
 def _read(telemetry: Path, titles: tuple[str, ...]) -> NDArray[np.float64]:

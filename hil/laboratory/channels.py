@@ -91,7 +91,7 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
     timed = [task for task in tasks if task.name in DEADLINES_US]
 
     def goal() -> tuple[float, ...]:
-        at = trajectory.at(robot.booted_us + board.now_us)
+        at = trajectory.at(board.now_us)
         return (*at.p_WG, at.yaw)
 
     def counts() -> tuple[int, ...]:

@@ -13,11 +13,16 @@ if TYPE_CHECKING:
 
     from hil.laboratory.faults import Fault
     from hil.laboratory.flight import Flight
+    from hil.laboratory.robot import Robot
 
 
 def stay(home: Goal, release_us: int) -> Trajectory:
     """Hold the home goal."""
     return Hold(home)
+
+
+def need_nothing(robot: Robot) -> None:
+    """Need nothing special on board."""
 
 
 def leave_alone(flight: Flight) -> None:
@@ -33,8 +38,8 @@ def nothing(flight: pa.Table) -> Mapping[str, float]:
 class Experiment:
     """One experiment; `limits` maps names of `hil.laboratory.metrics.METRICS` to bounds in that metric's unit.
 
-    `script` is called once with the flight before it begins and plans what shall happen as events. Everything in here
-    can be pickled: flights are flown in parallel processes.
+    `script` is called once with the flight, at the release or before it, and plans what shall happen as events. Everything
+    in here can be pickled: flights are flown in parallel processes.
     """
 
     name: str
@@ -42,6 +47,7 @@ class Experiment:
     duration_s: float  # of free flight, after the release
     limits: Mapping[str, float]  # of the default profile; another one has its own in [limits.NAME]
     trajectory: Callable[[Goal, int], Trajectory] = stay  # (home, release instant [us])
+    prepare: Callable[[Robot], None] = need_nothing  # lets be there from the start what the script will need
     script: Callable[[Flight], None] = leave_alone
     settings: tuple[str, ...] = ()  # "section.key=value", on top of the profile
     faults: tuple[Fault, ...] = ()  # those of the command line come on top

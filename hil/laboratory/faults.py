@@ -123,14 +123,19 @@ class Switchboard:
         self._robot = robot
         self._before: dict[Knob, float] = {}  # of the knobs that are turned
 
+    def prepare(self, faults: Iterable[Fault]) -> None:
+        """Let everything be there from the start that faults will need."""
+        for fault in faults:
+            kind = KINDS[fault.kind]
+            if not why_not(kind, self._robot):
+                for knob in kind.knobs:
+                    knob.read(self._robot)
+
     def plan(self, faults: Iterable[Fault], release_us: int, end_us: int) -> None:
         """Plan begin and end of faults that begin before `end_us`; those that do not concern the robot are left out."""
         for span in spans(faults, release_us):
-            kind = KINDS[span.fault.kind]
-            if why_not(kind, self._robot) or span.begin_us >= end_us:
+            if why_not(KINDS[span.fault.kind], self._robot) or span.begin_us >= end_us:
                 continue
-            for knob in kind.knobs:
-                knob.read(self._robot)  # so that what it needs is there from the start
             self._robot.events.at(int(span.begin_us), partial(self.begin, span.fault))
             if span.end_us < end_us:
                 self._robot.events.at(int(span.end_us), partial(self.end, span.fault))

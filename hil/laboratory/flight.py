@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import pyarrow as pa
-
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock
@@ -42,6 +40,8 @@ class Outcome:
 class Line(Protocol):
     """What is between the robot and the ground, both ends included."""
 
+    record: Path | None  # of the ground station, where that alone knows which goals it sent
+
     @property
     def trajectory(self) -> Trajectory:
         """What the ground station flies."""
@@ -61,10 +61,6 @@ class Line(Protocol):
 
     def finish(self, lab: Laboratory) -> None:
         """Let the ground station leave in order; the flight is over."""
-        ...
-
-    def corrected(self, log: pa.Table) -> pa.Table:
-        """The log with what is known only now that the flight is over."""
         ...
 
     def close(self) -> None:
@@ -88,6 +84,11 @@ class Programme(Protocol):
     @property
     def trajectory(self) -> Callable[[Goal, int], Trajectory]:
         """(home, release instant [us]) to the goals."""
+        ...
+
+    @property
+    def prepare(self) -> Callable[[Robot], None]:
+        """Lets be there from the start what the script will need."""
         ...
 
     @property
@@ -135,6 +136,8 @@ class Flight:
         self.lab.robots.append(self.robot)
         self.robot.plant.hold()
         self.switchboard = Switchboard(self.robot)
+        experiment.prepare(self.robot)
+        self.switchboard.prepare(self.faults)
         self.schedule = ScheduleTrace(self.robot.firmware.kernel)
 
     @property

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import pyarrow as pa
-
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from firmware_py.extras import install_command
 from ground_station.links.loopback import LoopbackLink
@@ -34,6 +32,7 @@ class ModelledLine:
 
     def __init__(self, flight: Flight, link: str, telemetry_path: Path | None) -> None:
         config, robot = flight.config, flight.robot
+        self.record: Path | None = None  # the log has the goals already
         self._robot = robot
         self.trajectory = flight.experiment.trajectory(
             Goal(config.flight.home, 0.0), config.flight.release_us
@@ -82,10 +81,6 @@ class ModelledLine:
 
     def finish(self, lab: Laboratory) -> None:
         """Nothing: the station ends with its time line."""
-
-    def corrected(self, log: pa.Table) -> pa.Table:
-        """The log as it is: everything was known at once."""
-        return log
 
     def close(self) -> None:
         """Close the telemetry log."""

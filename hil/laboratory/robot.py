@@ -6,7 +6,7 @@ go and what stands at the other end of its UART is handed in.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +89,7 @@ class Robot:
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
         self.booted_us = 0
-        self.board = VirtualBoard(self._set_counts, self._send, self._console, self.uart)
+        self.board = VirtualBoard(self.plant.set_counts, self._send, self._console, self.uart)
         self.board.battery_mv = self.battery.millivolts
 
     def boot(self, now_us: int) -> None:
@@ -98,9 +98,9 @@ class Robot:
         self.powered = True
         if self.uart is not None:
             self.uart.read()  # a booted processor begins with an empty buffer
-        self.board.forget_processor()
+        self.board.boot(now_us)
         self.firmware = Firmware(self.config, self.board, mavlink=self.uart is not None, runner=self._runner)
-        self.board.run_on(self.firmware.kernel, self.events, now_us)
+        self.board.run_on(self.firmware.kernel, self.events)
         if self._thief is not None:
             share, self._thief = self._thief.share, self.firmware.add_thief()
             self._thief.share = share
@@ -196,13 +196,10 @@ class Robot:
 
     # Pins
 
-    def _set_counts(self, local_us: int, counts: Sequence[int]) -> None:
-        self.plant.set_counts(self.booted_us + local_us, counts)
+    def _send(self, now_us: int, data: bytes) -> bool:
+        return self.send_packet(now_us, data)
 
-    def _send(self, local_us: int, data: bytes) -> bool:
-        return self.send_packet(self.booted_us + local_us, data)
-
-    def _console(self, local_us: int, text: str) -> None:
+    def _console(self, now_us: int, text: str) -> None:
         self.say("board", text)
 
 

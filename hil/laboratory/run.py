@@ -14,6 +14,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.errors import LabError
-from hil.laboratory.ages import ages_of, told
+from hil.laboratory.ages import ages_of, told, with_goals_sent
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.faults import Fault, check
 from hil.laboratory.flight import Flight
@@ -169,7 +170,8 @@ def fly(
         recorder.note(flight.now_us, "lab", cause)
     finally:
         factor = pace.end(flight.now_us)
-        digest = recorder.close(flight.line.corrected)
+        record = flight.line.record
+        digest = recorder.close(None if record is None else partial(with_goals_sent, record))
         flight.close()
         flight.write_schedule(folder)
     log = load_log(folder)

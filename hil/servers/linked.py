@@ -14,13 +14,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
-
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock, Paced
 from hil.errors import LabError
-from hil.laboratory.ages import goals_sent
+from hil.laboratory.ages import STATION_CLOCK
 from hil.laboratory.channels import radio_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
@@ -37,8 +34,6 @@ SITE = Path(__file__).parent / "dongle_site"
 RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder
 STATION_EXIT_TIMEOUT_US = 15_000_000
 LISTEN_PERIOD_US = 250_000
-WALL = "station.clock"  # of the computer, by which the station stamps its record
-GOALS = ("goal.x", "goal.y", "goal.z", "goal.yaw")
 OUTPUT_MAX = 65_536  # bytes of the station that are read at once
 SERIAL = "mavlink:"
 ALIGNED = [
@@ -66,7 +61,7 @@ class StationProcess:
         self._ends = Ends(flight.lab, clock.readers, flight.config, seed)
         self._ends.robots.append(self._served)
         self._experiment = flight.experiment
-        self._telemetry = telemetry
+        self.record: Path | None = telemetry
         self._home = Goal(flight.config.flight.home, 0.0)
         self.released = False
         self._next_listen_us = 0
@@ -120,7 +115,7 @@ class StationProcess:
             line: tuple[Channel, ...] = (serial_channel(robot.uart, robot.firmware, None),)
         else:
             line = (radio_channel(self._served.udp_radio),) if self._served.udp else ()
-        clock = Channel("int64", Paced.wall_us, (Quantity((WALL,), "us"),))
+        clock = Channel("int64", Paced.wall_us, (Quantity((STATION_CLOCK,), "us"),))
         return line, (clock,)
 
     def command(self, now_us: int, packet: bytes) -> None:
@@ -185,19 +180,6 @@ class StationProcess:
         if self._station is not None:
             self._station.kill()
             self._station.wait()
-
-    def corrected(self, log: pa.Table) -> pa.Table:
-        """The log with the goals that the station really sent, by its own record."""
-        sent = goals_sent(self._telemetry)
-        if sent is None:
-            return log
-        times_us, goals = sent
-        latest = np.searchsorted(times_us, log.column(WALL).to_numpy(), side="right") - 1
-        for index, name in enumerate(GOALS):
-            place = log.schema.get_field_index(name)
-            values = np.where(latest < 0, log.column(place).to_numpy(), goals[np.maximum(latest, 0), index])
-            log = log.set_column(place, log.schema.field(place), pa.array(values))
-        return log
 
     def close(self) -> None:
         """Close what was opened."""

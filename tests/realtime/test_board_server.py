@@ -82,7 +82,7 @@ def test_a_client_does_what_clients_do(uri: str, cache: Path) -> None:
     rows = client.rows(100, 10, "stateEstimate.x", "pm.vbat", "motor.m1")
     steps = [later[0] - earlier[0] for earlier, later in pairwise(rows)]
     assert steps == [10] * 99
-    assert all(values["pm.vbat"] == pytest.approx(3.9, abs=0.1) for _, values in rows)
+    assert all(3.6 < values["pm.vbat"] < 4.2 for _, values in rows)
 
     assert client.set("extCtrl.z_P", 2.5) == 2.5
     assert client.set("extCtrl.z_P", 99) == 2.5  # outside its range

@@ -1,6 +1,5 @@
 """A server whose machine stalls: time goes on from where it stood, and the robot that is flown from outside is not lost."""
 
-import re
 import signal
 import subprocess
 import sys
@@ -28,13 +27,10 @@ def test_a_robot_flown_from_outside_survives_a_stall_of_its_world() -> None:
             lab.process.send_signal(signal.SIGSTOP)
             time.sleep(1.0)
             lab.process.send_signal(signal.SIGCONT)
-            stood = lab.wait_for("time stood still", 10.0)
+            lab.wait_for(r"time stood still for (9|1\d)\d\d ms", 10.0)
             said, _ = station.communicate(timeout=60)
         finally:
             station.kill()
         assert station.returncode == 0, said
         assert lab.interrupt() == 0
-        told = re.fullmatch(r"this machine was too slow: time stood still for (\d+) ms", stood)
-        assert told is not None
-        assert 900 < int(told[1]) < 2000
         assert not any("lost" in line for line in lab.lines)

@@ -1,0 +1,81 @@
+"""Whole flights over real links: a goal that moves, faults of every layer, and what the record says of them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from serving import free_port, serve
+
+from hil.laboratory.metrics import column
+from hil.laboratory.recorder import load_events, load_log
+
+DONGLE = "radio://0/80/2M/E7E7E7E7E7"
+
+
+def fly(folder: Path, *arguments: str) -> dict[str, object]:
+    command = [sys.executable, "-m", "hil.commands", "fly", *arguments, "--out", str(folder)]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert shown.returncode in (0, 1), shown.stdout + shown.stderr
+    result: dict[str, object] = json.loads((folder / "result.json").read_text())
+    assert result["outcome"] in ("completed", "lost"), result["cause"]
+    return result
+
+
+@pytest.mark.parametrize("link", [DONGLE, pytest.param("mavlink:pty", marks=pytest.mark.long)])
+def test_the_goal_moves_when_the_board_flies_and_the_flight_is_judged_by_what_the_station_sent(
+    tmp_path: Path, link: str
+) -> None:
+    result = fly(tmp_path / "run", "yaw-step", "--link", link)
+    assert result["passed"], result["verdicts"]
+    log = load_log(tmp_path / "run")
+    times, goal = column(log, "t") * 1e-6, column(log, "goal.yaw")
+    released = times[np.argmax(column(log, "flight.free"))]
+    (stepped,) = times[1:][np.diff(goal) != 0.0]
+    assert (
+        0.5 < stepped - released < 1.3
+    )  # 1 s after the trajectory's begin, which the station sees by telemetry
+    assert goal[-1] == pytest.approx(np.radians(110.0))
+
+
+@pytest.mark.parametrize(
+    ("link", "faults"),
+    [
+        (DONGLE, ("radio.cut@1:0.7", "cpu.load@3=0.3", "imu.freeze@4")),
+        ("udp", ("radio.loss@1:1=0.3", "mocap.dropout@3:0.7", "servo.slow.1@1=0.5")),
+        ("mavlink:pty", ("serial.cut@1:0.7", "push.y@3=0.5", "battery.sag@4:0.5=0.2")),
+    ],
+)
+def test_faults_of_every_layer_act_on_every_link(tmp_path: Path, link: str, faults: tuple[str, ...]) -> None:
+    link = f"udp://127.0.0.1:{free_port()}" if link == "udp" else link
+    arguments = [f"--fault={fault}" for fault in faults]
+    result = fly(tmp_path / "run", "hover", "--seed", "2", "--link", link, "--duration", "6", *arguments)
+    assert result["outcome"] == "completed"
+    texts = [event["text"] for event in load_events(tmp_path / "run")]
+    for fault in faults:
+        kind = fault.partition("@")[0]
+        assert any(text.startswith(f"fault {kind}@") and text.endswith("begins") for text in texts)
+    log = load_log(tmp_path / "run")
+    assert column(log, "fault.active").max() >= 1
+    state, free = column(log, "supervisor.state"), column(log, "flight.free") == 1
+    blind = any("cut" in fault or "dropout" in fault for fault in faults)
+    assert (state[free] == 3).any() == blind  # 0.7 s of silence is the failsafe, and it ends by itself
+    assert state[-1] == 2
+
+
+def test_a_fault_typed_at_a_running_server_acts_at_once() -> None:
+    with serve("--udp", "0", "--station") as served:
+        served.wait_for("board 1: released", 60.0)
+        served.type("push.w=1")
+        served.wait_for("unknown kind 'push.w'", 20.0)
+        served.type("push.z:0.2=20")
+        served.wait_for(r"fault push\.z@0:0\.2=20 begins", 20.0)
+        served.wait_for("it is put back", 60.0)
+
+
+def test_faults_of_the_command_line_begin_after_the_release() -> None:
+    with serve("--udp", "0", "--station", "--fault", "imu.freeze@0.5:0.1") as served:
+        served.wait_for("board 1: released", 60.0)
+        served.wait_for(r"fault imu\.freeze@0\.5:0\.1 ends", 60.0)
