@@ -44,6 +44,7 @@ def sensors_task(
         counts = board.read_imu()
         if zero.bias is None and zero.add(counts):
             zero_found()
+            yield from kernel.yield_if_pending()
         yield from measurements.send_nowait((GYRO, counts))
         yield from measurements.send_nowait((ACCELEROMETER, counts))
         yield from data_ready.give()
@@ -71,6 +72,7 @@ def stabilizer_task(
             control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
             yield from kernel.work(costs.control_us())
             core.data.fields.mode = supervisor.mode(kernel.now_us)
+            yield from kernel.yield_if_pending()
             core.run.control()
             board.write_compare(core.control.fields.count.tolist())
 

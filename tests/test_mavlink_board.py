@@ -648,6 +648,25 @@ def test_with_a_key_nothing_unsigned_is_accepted_and_everything_sent_is_signed()
     assert not client.firmware.signals.supervisor.armed
 
 
+def test_the_trace_names_no_interrupt_that_the_hardware_did_not_raise() -> None:
+    client = Client()
+    raised: list[None] = []
+    traced: list[tuple[int, str, str, int, int]] = []
+    for name in ("imu_ready", "uart_ready", "radio_received"):
+        interrupt = getattr(client.firmware, name)
+        setattr(client.firmware, name, lambda *data, _raise=interrupt: raised.append(_raise(*data)))
+    client.firmware.kernel.set_trace(lambda *line: traced.append(line))
+    client.poses(100_000, 900_000)
+    client.stream(200_000)  # a parameter that wakes the telemetry task
+    client.run(700_000)  # the gyro's zero is found, the loop closes: lines on the console
+    assert len(client.texts()) == len(client.console) == 2
+    client.ask("param_request_list", 1, 1)
+    client.command(511, 30, 10_000)
+    client.run(900_000)
+    interrupts = [event for _, event, *_ in traced if "_ISR" in event]
+    assert len(interrupts) == len(raised)
+
+
 def test_counters_are_log_variables(client: Client) -> None:
     client.receive(b"\xfd\x01\x00\x00\x00\x01\x01\x00\x00\x00\x00\x12\x34" + bytes(300))
     client.ask("ping", 1, 1, 0, 0)
@@ -670,8 +689,13 @@ def test_without_mavlink_there_is_no_task_and_no_variable_of_it() -> None:
 def test_a_message_that_fits_no_frame_is_dropped_and_the_next_one_sent(client: Client) -> None:
     dropped = client.stack.dropped
     client.messages.clear()
-    client.stack.reply(dialect.MAVLink_heartbeat_message(999, 0, 0, 0, 0, 3))  # a byte of 999
-    client.stack.reply(dialect.MAVLink_ping_message(1, 77, 255, 190))
+
+    def answer(_: object) -> None:
+        client.stack.reply(dialect.MAVLink_heartbeat_message(999, 0, 0, 0, 0, 3))  # a byte of 999
+        client.stack.reply(dialect.MAVLink_ping_message(1, 77, 255, 190))
+
+    client.stack.handle(dialect.MAVLINK_MSG_ID_PING, answer)
+    client.send("ping", 1, 76, 0, 0)
     client.run(client.now_us + 3000)
     assert client.stack.dropped == dropped + 1
     assert [message.seq for _, message in client.messages if message.get_type() == "PING"] == [77]

@@ -552,16 +552,13 @@ LOOPS = {
     "overwrite": lambda o: (o.queue.overwrite("item"),),
     "take what was not given": lambda o: (o.semaphore.take(0),),
     "give what was not taken": lambda o: (o.semaphore.give(),),
+    "give what was not taken without waiting": lambda o: (o.semaphore.give_nowait(),),
     "give and take": lambda o: (o.semaphore.give(), o.semaphore.take()),
     "take and give a mutex": lambda o: (o.mutex.take(), o.mutex.give()),
     "give a free mutex": lambda o: (o.mutex.give(),),
     "notify": lambda o: (o.kernel.current.notify(),),
     "notify_take": lambda o: (o.kernel.notify_take(True, 0),),
     "notify and notify_take": lambda o: (o.kernel.current.notify(), o.kernel.notify_take(True, 5)),
-    "notification by an interrupt": lambda o: (
-        o.kernel.current.notify_from_isr() or (),
-        o.kernel.notify_take(True, 5),
-    ),
     "suspend another": lambda o: (o.other.suspend(),),
     "resume another": lambda o: (o.other.resume(),),
     "suspend and resume another": lambda o: (o.other.suspend(), o.other.resume()),
@@ -666,12 +663,6 @@ def give_a_mutex_of_another(kernel):
     yield from mutex.give()
 
 
-def give_a_held_mutex_as_an_interrupt(kernel):
-    mutex = kernel.create_mutex("lock")
-    yield from mutex.take()
-    mutex.give_from_isr()
-
-
 def given(semaphore):
     for _ in semaphore.give():
         pass
@@ -698,7 +689,6 @@ NO_WAIT = "must not wait while the scheduler is suspended"
         (in_suspend_all(lambda kernel: ()), "ended while the scheduler was suspended"),
         (doing(lambda kernel: kernel.resume_all()), "resume_all without suspend_all"),
         (give_a_mutex_of_another, "mutex lock: given by task, held by other"),
-        (give_a_held_mutex_as_an_interrupt, "mutex lock: given from an interrupt, held by task"),
         (doing(lambda kernel: kernel.create_queue(1, "q").send(None)), "queue q: None cannot be sent"),
         (doing(lambda kernel: kernel.create_queue(1, "q").send_nowait(None)), "queue q: None cannot be sent"),
         (doing(lambda kernel: kernel.create_queue(1, "q").overwrite(None)), "queue q: None cannot be sent"),
@@ -747,13 +737,160 @@ def test_a_free_mutex_cannot_be_given():
 
     def body():
         results.append((yield from mutex.give()))
-        results.append(mutex.give_from_isr())
 
     kernel.create_task("task", 1, body)
     kernel.start()
     kernel.run(0)
+    results.append(mutex.give_from_isr())
     assert results == [False, False]
     assert mutex.holder is None
+
+
+def test_a_held_mutex_cannot_be_given_from_an_interrupt():
+    kernel = Kernel()
+    mutex = kernel.create_mutex("lock")
+    kernel.create_task("task", 1, doing(lambda _: mutex.take()), kernel)
+    kernel.start()
+    kernel.run(0)
+    with pytest.raises(KernelError, match=r"^mutex lock: given from an interrupt, held by task$"):
+        mutex.give_from_isr()
+
+
+def objects_of(kernel):
+    """One of each, with a task that waits for ever, on a kernel that was not started."""
+    return SimpleNamespace(
+        kernel=kernel,
+        queue=kernel.create_queue(1, "q"),
+        semaphore=kernel.create_binary_semaphore("s"),
+        mutex=kernel.create_mutex("m"),
+        other=kernel.create_task("other", 1, sleeper, kernel),
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "who"),
+    [
+        (lambda o: o.queue.send_from_isr("item"), "queue q: send_from_isr"),
+        (lambda o: o.semaphore.give_from_isr(), "semaphore s: give_from_isr"),
+        (lambda o: o.mutex.give_from_isr(), "mutex m: give_from_isr"),
+        (lambda o: o.other.notify_from_isr(), "task other: notify_from_isr"),
+    ],
+)
+def test_a_task_cannot_make_the_calls_of_interrupts(call, who):
+    kernel = Kernel()
+    objects = objects_of(kernel)
+    kernel.create_task("task", 2, doing(lambda _: call(objects) and ()), kernel)
+    kernel.start()
+    with pytest.raises(
+        TaskError, match=f"KernelError: {who} is for interrupts, and was called by task task$"
+    ):
+        kernel.run(0)
+    assert (len(objects.queue), objects.semaphore.count, objects.other.notification) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda o: o.queue.send_nowait("item"),
+        lambda o: o.queue.overwrite("item"),
+        lambda o: o.queue.receive_nowait(),
+        lambda o: o.queue.wait_for_item(FOREVER),
+        lambda o: o.semaphore.give_nowait(),
+        lambda o: o.kernel.delay(1),
+        lambda o: o.kernel.delay_until(5),
+        lambda o: o.kernel.suspend_all(),
+        lambda o: o.kernel.enter_critical(),
+        lambda o: o.other.suspend(),
+        lambda o: o.other.resume(),
+        lambda o: o.other.priority_set(2),
+    ],
+)
+@pytest.mark.parametrize("traced", [False, True])
+def test_an_interrupt_cannot_make_the_calls_of_tasks(call, traced):
+    kernel = Kernel(trace=(lambda *line: None) if traced else None)
+    objects = objects_of(kernel)
+    kernel.start()
+    for instant_us in (0, 300):  # the first one comes before any task ran
+        with pytest.raises(KernelError, match=r"is for tasks, and was called from an interrupt$"):
+            call(objects)
+        kernel.run(instant_us)
+
+
+def test_a_board_whose_task_has_raised_still_takes_interrupts():
+    kernel = Kernel()
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    kernel.create_task("task", 1, doing(lambda kernel: kernel.resume_all()), kernel)
+    kernel.start()
+    with pytest.raises(TaskError):
+        kernel.run(0)
+    assert semaphore.give_from_isr()
+
+
+@pytest.mark.parametrize(
+    "give",
+    [
+        lambda kernel, semaphore: semaphore.give_nowait(),
+        lambda kernel, semaphore: (semaphore.give_nowait(), kernel.yield_if_pending())[-1],
+        lambda kernel, semaphore: semaphore.give(),
+    ],
+)
+def test_a_give_lets_a_taker_of_higher_priority_run_at_once(give):
+    order = []
+    lines = []
+    kernel = Kernel(trace=lambda *line: lines.append(line))
+    semaphore = kernel.create_binary_semaphore("semaphore")
+
+    def low():
+        yield from kernel.delay(1)
+        yield from give(kernel, semaphore)
+        order.append("low")
+
+    def high():
+        yield from semaphore.take()
+        order.append("high")
+
+    kernel.create_task("low", 1, low)
+    kernel.create_task("high", 2, high)
+    kernel.start()
+    kernel.run(1_000)
+    assert order == ["high", "low"]
+    assert [who for _, event, who, *_ in lines if event == "Q_SEND"] == ["low"]
+
+
+def test_a_give_without_waiting_that_finds_the_semaphore_full_is_counted_and_wakes_nobody():
+    lines = []
+    kernel = Kernel(trace=lambda *line: lines.append(line))
+    semaphore = kernel.create_binary_semaphore("semaphore")
+
+    def body():
+        yield from semaphore.give_nowait()
+        yield from semaphore.give_nowait()
+
+    kernel.create_task("task", 1, body)
+    kernel.start()
+    kernel.run(0)
+    assert (semaphore.count, semaphore.overruns) == (1, 1)
+    assert [event for _, event, who, *_ in lines if who == "task" and event.startswith("Q_")] == [
+        "Q_SEND",
+        "Q_SEND_FAIL",
+    ]
+
+
+def test_nothing_pends_for_a_task_that_woke_nobody_above_itself():
+    kernel = Kernel()
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    pending = []
+
+    def high():
+        yield from kernel.delay(1)
+        semaphore.give_nowait()
+        pending.append(tuple(kernel.yield_if_pending()))
+
+    kernel.create_task("high", 2, high)
+    kernel.create_task("low", 1, doing(lambda _: semaphore.take()), kernel)
+    kernel.start()
+    kernel.run(2_000)
+    assert pending == [()]
 
 
 def test_a_task_that_waits_for_a_mutex_it_holds_is_an_error_when_a_lent_priority_would_be_taken_back():

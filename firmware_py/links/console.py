@@ -22,9 +22,12 @@ class Console:
         stack.kernel.create_task("CONSOLE", 0, self._task)
 
     def write(self, line: str) -> None:
-        """Take a line without its end. A plain call: also code that cannot wait has something to say."""
+        """Take a line without its end. A plain call: also code that cannot wait has something to say.
+
+        A task that has let something write gives way with `yield_if_pending`.
+        """
         self._board.debug_write(line)
-        self._lines.send_from_isr(line)
+        self._lines.send_nowait(line)
         for listen in self.listeners:
             listen(line)
 

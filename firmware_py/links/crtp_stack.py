@@ -75,6 +75,7 @@ class CrtpStack:
         except WireError:
             self.malformed += 1
             return
+        yield from self.kernel.yield_if_pending()
         for data in replies:
             reply = crtp.encode(Packet(packet.port, packet.channel, data))
             yield from self._transmit.send(reply, timeout)

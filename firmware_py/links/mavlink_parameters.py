@@ -40,7 +40,7 @@ class MavlinkParameters:
 
     def _start_list(self, message: Message) -> None:
         self._next = 0
-        self._listing.give_from_isr()
+        self._listing.give_nowait()
 
     def _list_task(self) -> Task:
         stack, end = self._stack, len(self._parameters)

@@ -58,7 +58,7 @@ class PoseService:
         p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self.goal)
         self.age_us = self._age_us(now_us, pose.t_us)
         self._localisation.last = PoseMessage(p_GB, q_GB, self.age_us)
-        self._measurements.send_from_isr((POSE, PoseMeasurement(now_us, self._localisation.last)))
+        self._measurements.send_nowait((POSE, PoseMeasurement(now_us, self._localisation.last)))
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """How long ago the sender's clock showed `t_us`; None when that is not known."""

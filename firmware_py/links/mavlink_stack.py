@@ -34,7 +34,7 @@ class MavlinkStack:
         self.component = config.component
         self.refused = 0  # messages that no service could use
         self.unserved = 0  # messages that nobody here reads, or that are for others
-        self.dropped = 0  # messages for which the line had no time, or that say what no frame can hold
+        self._unsent = 0  # messages that nobody asked for and the line had no time for, or that fit no frame
         self._cost_us = cost.mavlink_us
         self._board = board
         signing = Signing(bytes.fromhex(config.signing_key)) if config.signing_key else None
@@ -66,6 +66,11 @@ class MavlinkStack:
         return counters.bad_crc + counters.bad_signature + counters.unsigned + counters.replayed
 
     @property
+    def dropped(self) -> int:
+        """Messages for which the line had no time, or that say what no frame can hold."""
+        return self._unsent + self._transmit.dropped
+
+    @property
     def overruns(self) -> int:
         """Bytes that the UART lost because nobody fetched them in time."""
         return self._board.uart_overruns
@@ -80,12 +85,12 @@ class MavlinkStack:
 
     def reply(self, message: Message) -> None:
         """Queue what somebody asked for. A plain call, for handlers; dropped when the queue is full."""
-        self.dropped += not self._transmit.send_from_isr(message)
+        self._transmit.send_nowait(message)
 
     def offer(self, message: Message) -> Iterable[int]:
         """Queue what nobody asked for, if there is time for it."""
         if len(self._transmit) >= UNASKED_LIMIT:
-            self.dropped += 1
+            self._unsent += 1
             return GO_ON
         return self._transmit.send_nowait(message)
 
@@ -106,6 +111,7 @@ class MavlinkStack:
             for message in receiver.feed(kernel.now_us, board.uart_read()):
                 yield from kernel.work(self._cost_us)
                 self._dispatch(message)
+                yield from kernel.yield_if_pending()
 
     def _dispatch(self, message: Message) -> None:
         if (message.get_srcSystem(), message.get_srcComponent()) == (self.system, self.component):
@@ -135,7 +141,7 @@ class MavlinkStack:
             try:
                 frame = sender.encode(kernel.now_us, message)
             except WireError:
-                self.dropped += 1
+                self._unsent += 1
                 frame = b""
             while not board.uart_write(frame):
                 yield from kernel.delay(1)

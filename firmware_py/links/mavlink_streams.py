@@ -77,7 +77,7 @@ class StreamService:
         else:
             ticks = min(LONGEST_TICKS, max(1, round(interval_us / TICK_US)))
         stream.start(ticks, self._stack.kernel.tick_count)
-        self._changed.give_from_isr()
+        self._changed.give_nowait()
         return True
 
     def interval_us(self, number: int) -> int:

@@ -26,7 +26,7 @@ class TelemetryStream:
     def switch(self, on: bool) -> None:
         """Begin or end."""
         if on and not self._on:
-            self._switched.give_from_isr()
+            self._switched.give_nowait()
         self._on = on
 
     def _task(self) -> Task:

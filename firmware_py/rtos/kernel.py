@@ -72,6 +72,7 @@ class Kernel(Scheduler):
         self.create_task("Tmr Svc", SERVICE_PRIORITY, self._timers.run)
         assert self._first is not None
         self._started = True
+        self.leave_tasks()
         self.current = self._first
         self.next_wake_us = self.now_us
         self.current.fresh = False
@@ -95,6 +96,10 @@ class Kernel(Scheduler):
     def task_yield(self) -> Iterable[int]:
         """Lets the next task of the same priority run."""
         return SWITCH
+
+    def yield_if_pending(self) -> Iterable[int]:
+        """Lets a task of higher priority run that a plain call woke: after callbacks, which cannot yield themselves."""
+        return SWITCH if self._switch_pending and not self.suspended else GO_ON
 
     def delay(self, ticks: int) -> Iterable[int]:
         """Waits until the tick count has risen by `ticks`; 0 is `task_yield`."""

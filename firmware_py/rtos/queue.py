@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 
 from firmware_py.rtos.control_block import ControlBlock
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.scheduler import FOREVER, GO_ON, Scheduler
+from firmware_py.rtos.scheduler import FOREVER, GO_ON, IN_INTERRUPT, IN_TASK, Scheduler
 
 T = TypeVar("T")
 
@@ -86,6 +86,8 @@ class Queue(Generic[T]):
         items = self._items
         if item is None:
             raise self._null_item()
+        if kernel.context == IN_INTERRUPT:
+            raise kernel.misplaced(f"queue {self.name}: send_nowait")
         if len(items) >= self.length:
             self.dropped += 1
             kernel.failed("Q_SEND_FAIL", self.number)
@@ -176,6 +178,8 @@ class Queue(Generic[T]):
         if item is None:
             raise self._null_item()
         kernel = self._kernel
+        if kernel.context == IN_TASK:
+            raise kernel.misplaced(f"queue {self.name}: send_from_isr")
         items = self._items
         if len(items) >= self.length:
             if kernel.trace is not None:

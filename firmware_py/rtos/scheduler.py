@@ -31,6 +31,9 @@ STUCK_CALLS = 10_000
 _STUCK_SWITCHES = range(STUCK_CALLS)
 _FOR_EVER_US = 1 << 50
 
+# Whose code runs at the moment: whoever makes the tasks before the start, a task, or an interrupt between two runs.
+BEFORE_START, IN_TASK, IN_INTERRUPT = range(3)
+
 # Instant [us], event, who, and two numbers that depend on the event; as in tests/vectors/README.md, without CALL and RET.
 Trace = Callable[[int, str, str, int, int], None]
 
@@ -54,6 +57,7 @@ class Scheduler:
         self._idle = self.current
         self._idle_slept = False
         self._started = False
+        self.context = BEFORE_START
         self._ready_bits = 0  # bit n is set when ring n holds a task
         self._wake_ticks: list[int] = []  # ascending, parallel to _delayed
         self._delayed: list[ControlBlock] = []
@@ -113,6 +117,8 @@ class Scheduler:
 
         The caller has checked that it may wait.
         """
+        if self.context == IN_INTERRUPT:
+            raise self.misplaced("waiting")
         task = self.current
         if waiters is not None:
             if waiters:
@@ -217,12 +223,23 @@ class Scheduler:
             return SWITCH
         return GO_ON
 
+    def misplaced(self, call: str) -> KernelError:
+        """What to raise for a call that is for interrupts and came from a task, or the other way round."""
+        if self.context == IN_TASK:
+            return KernelError(f"{call} is for interrupts, and was called by task {self.current.name}")
+        return KernelError(f"{call} is for tasks, and was called from an interrupt")
+
     def interrupted(self, task_woken: bool) -> None:
         """Ends every call from an interrupt."""
         self._interrupted = True
         self.task_woken = task_woken
         if task_woken:
             self._switch_pending = True
+
+    def leave_tasks(self) -> None:
+        """From here on interrupts may come, and calls of tasks may not."""
+        self.context = IN_INTERRUPT
+        self._calls = STUCK_CALLS
 
     def record(self, event: str, a: int = 0, b: int = 0) -> None:
         """Traces what the running task does; only with a trace."""
@@ -238,10 +255,13 @@ class Scheduler:
     def count_call(self) -> None:
         """Counts a call that returns at once, because a task might make it for ever while no time passes.
 
-        Of two calls that can only follow each other, like giving and taking, the one that takes is counted.
+        Of two calls that can only follow each other, like giving and taking, the one that takes is counted. Interrupts
+        have no calls of this kind: there the first one is one too many.
         """
         self._calls += 1
         if self._calls > STUCK_CALLS:
+            if self.context == IN_INTERRUPT:
+                raise self.misplaced("this call of the kernel")
             what = f"{STUCK_CALLS} calls of the kernel at one instant"
             raise StuckTaskError(self.current.name, self.now_us, what)
 
@@ -285,6 +305,7 @@ class Scheduler:
         trace = self.trace
         switch = self._switch_pending and not self.suspended
         self._calls = 0
+        self.context = IN_TASK
         if task.work_left_us:  # every interrupt ends the sleep of the idle task
             task.work_left_us = 0 if task is idle else self._work_end_us - now_us
         result: Any = 0
@@ -337,6 +358,8 @@ class Scheduler:
             if not isinstance(result, int):
                 what = f"yielded a {type(result).__name__}; kernel calls need `yield from`"
             raise TaskError(task.name, now_us, what) from error
+        finally:
+            self.leave_tasks()
         wake_us: int | None = None
         if self.trace is not None or (len(task.ring) > 2 and self.preemption):
             wake_us = self._next_tick_us

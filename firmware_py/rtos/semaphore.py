@@ -5,11 +5,11 @@ To the trace they are queues, as they are in FreeRTOS: take is Q_RECV, give is Q
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 
 from firmware_py.rtos.control_block import ControlBlock
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.scheduler import FOREVER, Scheduler
+from firmware_py.rtos.scheduler import FOREVER, GO_ON, IN_INTERRUPT, IN_TASK, Scheduler
 
 
 class Semaphore:
@@ -66,9 +66,29 @@ class Semaphore:
             yield 0
         return True
 
+    def give_nowait(self) -> Iterable[int]:
+        """Raises the count by one and wakes the first taker, unless the count is at its maximum.
+
+        `yield from` it lets a taker of higher priority run at once; after the plain call it runs at the caller's next
+        `yield from` that blocks, yields or works, at the latest at `Kernel.yield_if_pending`.
+        """
+        kernel = self._kernel
+        if kernel.context == IN_INTERRUPT:
+            raise kernel.misplaced(f"semaphore {self.name}: give_nowait")
+        if self.count >= self.maximum:
+            self.overruns += 1
+            kernel.failed("Q_SEND_FAIL", self.number)
+            return GO_ON
+        if kernel.trace is not None:
+            kernel.record("Q_SEND", self.number, self.count)
+        self.count += 1
+        return kernel.switch_if(kernel.wake(self._takers.pop(0))) if self._takers else GO_ON
+
     def give_from_isr(self) -> bool:
         """Like `give`, from an interrupt."""
         kernel = self._kernel
+        if kernel.context == IN_TASK:
+            raise kernel.misplaced(f"semaphore {self.name}: give_from_isr")
         if self.count >= self.maximum:
             self.overruns += 1
             if kernel.trace is not None:
@@ -153,6 +173,8 @@ class Mutex:
     def give_from_isr(self) -> bool:
         """Finds a free mutex, and is False; that a task holds it is an error, because only that task may give it."""
         kernel = self._kernel
+        if kernel.context == IN_TASK:
+            raise kernel.misplaced(f"mutex {self.name}: give_from_isr")
         if self.holder is not None:
             raise KernelError(f"mutex {self.name}: given from an interrupt, held by {self.holder.name}")
         if kernel.trace is not None:

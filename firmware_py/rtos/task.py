@@ -11,7 +11,7 @@ from typing import Any
 
 from firmware_py.rtos.control_block import SUSPENDED, ControlBlock
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.scheduler import GO_ON, MAX_PRIORITIES, SWITCH, Scheduler
+from firmware_py.rtos.scheduler import GO_ON, IN_TASK, MAX_PRIORITIES, SWITCH, Scheduler
 
 
 class Task(ControlBlock):
@@ -43,6 +43,8 @@ class Task(ControlBlock):
     def notify_from_isr(self) -> None:
         """Like `notify`, from an interrupt."""
         kernel = self.kernel
+        if kernel.context == IN_TASK:
+            raise kernel.misplaced(f"task {self.name}: notify_from_isr")
         if kernel.trace is not None:
             kernel.trace(kernel.now_us, "NOTIFY_ISR", self.name, 0, 0)
         self.notification += 1
