@@ -3,7 +3,7 @@
 No value has a default here: a profile states them all, with their reasons. Units are SI, angles in radians.
 """
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -195,10 +195,10 @@ class FirmwareConfig(Section):
 GYRO_SCALE = 2000.0 / 32768.0 * 3.141592653589793 / 180.0  # [rad/s per count] BMI088 at +-2000 deg/s
 
 
-def parameters_of(config: FirmwareConfig) -> Block:
+def parameters_of(config: FirmwareConfig) -> Block[Parameters]:
     """Return the core's parameter block for a configuration."""
     block = Parameters.allocate()
-    values: dict[str, Any] = {"gyro_scale": GYRO_SCALE}
+    values: dict[str, object] = {"gyro_scale": GYRO_SCALE}
     for section in (config.model, config.estimator, config.controller, config.allocation, config.servo):
         values.update(section.model_dump())
     predictor = config.predictor

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 from firmware_py.config import CpuConfig
 from firmware_py.core import entry
-from firmware_py.core.structs import Control, Estimator, Input
+from firmware_py.core.structs import Control, Estimator, Input, Parameters
 from firmware_py.core.subset import Block
 
 
@@ -48,7 +48,7 @@ class CoreBlocks:
 
     __slots__ = ("control", "data", "estimator", "parameters", "run", "watchdog_fed_us")
 
-    def __init__(self, parameters: Block, runner: RunnerFactory) -> None:
+    def __init__(self, parameters: Block[Parameters], runner: RunnerFactory) -> None:
         self.parameters = parameters
         self.data = Input.allocate()  # written by the estimator task, but for the mode: the stabilizer
         self.estimator = Estimator.allocate()  # by the estimator task; its `now` is the stabilizer's mailbox

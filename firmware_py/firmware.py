@@ -115,7 +115,6 @@ class Firmware:
         if all(byte == 0xFF for byte in board.deck_memory):
             board.deck_memory[:] = encode_one_wire(*DECK)
         tester = Tester()
-        read = telemetry_reader(core.estimator.fields, core.control.fields, lambda: supervisor.state)
         running = Running(
             board=board,
             core=core,
@@ -126,11 +125,11 @@ class Firmware:
             localisation=LocalisationService(link, self.measurements, supervisor, settings.address & 0xFF),
             platform=PlatformService(link, supervisor),
             tester=tester,
-            stream=TelemetryStream(link, read),
             mavlink=self.mavlink,
         )
         self.variables = log_variables(running)
-        self.parameters = parameters(running)
+        read = telemetry_reader(self.variables)
+        self.parameters = parameters(running, TelemetryStream(link, read))
         LogService(link, self.variables)
         storage = ParameterStorage(board.eeprom)
         ParameterService(link, self.parameters, storage)

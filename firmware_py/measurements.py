@@ -1,13 +1,14 @@
 """What travels in the measurement queue, from the sensors and the radio to the estimator."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Final, Literal
 
+from firmware_py.board import ImuCounts
 from firmware_py.wire.crtp import PoseMessage
 
-GYRO = 0
-ACCELEROMETER = 1  # not used by the filter, as in the original, but it takes its place in the queue
-POSE = 2
+GYRO: Final = 0
+ACCELEROMETER: Final = 1  # not used by the filter, as in the original, but it takes its place in the queue
+POSE: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,4 +19,5 @@ class PoseMeasurement:
     message: PoseMessage
 
 
-Measurement = tuple[int, Any]  # kind, and ImuCounts or PoseMeasurement; a plain tuple: two are made every ms
+# Kind and value; plain tuples, because two are made every millisecond.
+Measurement = tuple[Literal[0, 1], ImuCounts] | tuple[Literal[2], PoseMeasurement]

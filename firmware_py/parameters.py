@@ -6,8 +6,9 @@ Names are the Crazyflie's and the original Floaty's. Limits are those of the con
 
 from collections.abc import Iterator
 from math import pi, sqrt
-from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from firmware_py.config import (
@@ -18,7 +19,10 @@ from firmware_py.config import (
     PredictorConfig,
     SupervisorConfig,
 )
+from firmware_py.core.structs import Parameters
+from firmware_py.core.subset import F32s
 from firmware_py.links.parameters import Parameter
+from firmware_py.links.stream import TelemetryStream
 from firmware_py.supervisor import Manual
 from firmware_py.variables import F32, I16, U8, U16, U32, Running
 from firmware_py.wire.scalars import Scalar
@@ -36,8 +40,10 @@ TRIM_LIMIT = 12_000  # as in ServoConfig
 SETPOINT_LIMIT = 5.0  # [m]
 STD_LIMITS = (1e-4, 1.0)  # [m], [rad]
 
+FloatArray = F32s | NDArray[np.float64]
 
-def parameters(running: Running) -> tuple[Parameter, ...]:
+
+def parameters(running: Running, stream: TelemetryStream) -> tuple[Parameter, ...]:
     """Return the table, in the order of the parameter TOC."""
     core = running.core.parameters.fields
     return (
@@ -59,7 +65,7 @@ def parameters(running: Running) -> tuple[Parameter, ...]:
         ),
         _field("delayComp.horizon", "10 ms", core, "horizon", PredictorConfig, U8),
         *_kalman(running),
-        *_supervision(running),
+        *_supervision(running, stream),
         *_test_subjects(running),
         *_identity(),
     )  # fmt: skip
@@ -77,7 +83,7 @@ def configured_limits(section: type[BaseModel], field: str) -> tuple[float, floa
 def _field(
     name: str,
     unit: str,
-    fields: Any,
+    fields: Parameters,
     field: str,
     section: type[BaseModel],
     scalar: Scalar = F32,
@@ -92,7 +98,7 @@ def _field(
     )  # fmt: skip
 
 
-def _element(name: str, unit: str, array: Any, index: int, limit: float) -> Parameter:
+def _element(name: str, unit: str, array: F32s, index: int, limit: float) -> Parameter:
     """An element of an array, between -limit and limit."""
     return Parameter(
         name,
@@ -109,7 +115,7 @@ def _attribute(
     name: str,
     scalar: Scalar,
     unit: str,
-    owner: Any,
+    owner: object,
     attribute: str,
     low: float,
     high: float,
@@ -128,7 +134,7 @@ def _manual(running: Running) -> Iterator[Parameter]:
     manual, trim = running.manual, running.core.parameters.fields.trim
 
     def element(
-        name: str, scalar: Scalar, unit: str, array: Any, index: int, low: float, high: float
+        name: str, scalar: Scalar, unit: str, array: FloatArray, index: int, low: float, high: float
     ) -> Parameter:
         def write(value: float) -> None:
             array[index] = value
@@ -176,9 +182,9 @@ def _kalman(running: Running) -> Iterator[Parameter]:
     yield deviation("locSrv.extQuatStdDev", "rad", "measured_attitude")
 
 
-def _supervision(running: Running) -> Iterator[Parameter]:
+def _supervision(running: Running, stream: TelemetryStream) -> Iterator[Parameter]:
     """Failsafe and telemetry."""
-    supervisor, stream, kernel = running.supervisor, running.stream, running.stack.kernel
+    supervisor, kernel = running.supervisor, running.stack.kernel
 
     def stop(value: float) -> None:
         if value:

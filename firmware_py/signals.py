@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.core.structs import Estimator
+from firmware_py.core.structs import Control, Estimator
 from firmware_py.core.subset import Block
 from firmware_py.supervisor import Supervisor
 
@@ -25,7 +25,7 @@ class Signals:
     supervisor: Supervisor
 
     @classmethod
-    def of(cls, estimator: Block, control: Block, supervisor: Supervisor) -> "Signals":
+    def of(cls, estimator: Block[Estimator], control: Block[Control], supervisor: Supervisor) -> "Signals":
         """Look into the blocks of a running core."""
         start = dict(Estimator.dtype.fields or {})[COUNTERS[0]][1]
         counters = np.ndarray(len(COUNTERS), np.int32, estimator.memory.data, start)

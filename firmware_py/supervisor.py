@@ -15,10 +15,9 @@ The board arms itself at boot. One outlier pose is refused by the estimator's ga
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any
 
 from firmware_py.config import SupervisorConfig
-from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
+from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL, Estimator
 from firmware_py.wire.supervisor import Cause, State
 
 WATCHDOG_US = 1_000_000  # Crazyflie firmware
@@ -40,7 +39,9 @@ class Manual(IntEnum):
 class Supervisor:
     """State machine over the facts in its attributes; `estimator` is the core's fields, read for its bounds."""
 
-    def __init__(self, config: SupervisorConfig, estimator: Any, announce: Callable[[str], None]) -> None:
+    def __init__(
+        self, config: SupervisorConfig, estimator: Estimator, announce: Callable[[str], None]
+    ) -> None:
         self.state = State.CALIBRATING
         self.cause = Cause.NONE
         self.calibrated = False

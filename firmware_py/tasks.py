@@ -6,14 +6,14 @@ before the controller, so that a pose reaches the flaps in 1 to 11 ms.
 """
 
 from collections.abc import Callable, Generator
-from typing import Any
 
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig
 from firmware_py.core.structs import POSE_ON_TIME
+from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts
 from firmware_py.drivers.imu import GyroZero
-from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement
+from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement, PoseMeasurement
 from firmware_py.rtos import TICK_US, Kernel, Queue, Semaphore
 from firmware_py.supervisor import Supervisor
 
@@ -71,7 +71,7 @@ def stabilizer_task(
         if kernel.tick_count >= control_tick:
             control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
             yield from kernel.work(costs.control_us())
-            core.data.fields.mode = supervisor.mode(kernel.now_us)
+            core.data.fields.mode = i32(supervisor.mode(kernel.now_us))
             yield from kernel.yield_if_pending()
             core.run.control()
             board.write_compare(core.control.fields.count.tolist())
@@ -94,18 +94,18 @@ def estimator_task(
         yield from estimator_run.take()
         yield from kernel.work(cost.kalman_us)
         while (measurement := measurements.receive_nowait()) is not None:
-            kind, value = measurement
-            if kind == GYRO:
+            if measurement[0] == GYRO:
+                counts = measurement[1]
                 samples += 1
-                x += value[0]
-                y += value[1]
-                z += value[2]
-            elif kind == POSE:
-                file_pose(kernel, value, supervisor, core)
+                x += counts[0]
+                y += counts[1]
+                z += counts[2]
+            elif measurement[0] == POSE:
+                file_pose(kernel, measurement[1], supervisor, core)
         if kernel.tick_count >= step_tick:
             step_tick = next_step(kernel.tick_count, ESTIMATOR_PHASE)
             data.gyro_sum[:] = x, y, z
-            data.gyro_samples = samples
+            data.gyro_samples = i32(samples)
             samples = x = y = z = 0
             yield from kernel.work(costs.estimate_us())
             core.run.estimate()
@@ -143,16 +143,17 @@ def next_step(tick: int, phase: int) -> int:
     return tick + 1 + (phase - tick - 1) % TICKS_PER_STEP
 
 
-def file_pose(kernel: Kernel, measurement: Any, supervisor: Supervisor, core: CoreBlocks) -> None:
+def file_pose(kernel: Kernel, measurement: PoseMeasurement, supervisor: Supervisor, core: CoreBlocks) -> None:
     """Hand a pose to the core with the age that it will have at the estimator's next step."""
     data = core.data.fields
     message = measurement.message
     data.pose_position[:] = message.p_GB
     data.pose_quaternion[:] = message.q_GB
     if message.age_us is None:
-        data.pose_age_us = -1
+        data.pose_age_us = i32(-1)
     else:
         ticks_to_step = (ESTIMATOR_PHASE - kernel.tick_count) % TICKS_PER_STEP
-        data.pose_age_us = kernel.now_us - measurement.t_us + message.age_us + ticks_to_step * TICK_US
+        waited_us = kernel.now_us - measurement.t_us
+        data.pose_age_us = i32(waited_us + message.age_us + ticks_to_step * TICK_US)
     if core.run.file_pose() == POSE_ON_TIME:
         supervisor.last_pose_us = measurement.t_us

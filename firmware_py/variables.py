@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import degrees, sqrt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
 from firmware_py.config import GYRO_SCALE
 from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, Control, Estimator
+from firmware_py.core.subset import F32s, I32s
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.links.crtp_stack import CrtpStack
@@ -21,14 +22,14 @@ from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
 from firmware_py.links.memories import Tester
 from firmware_py.links.platform import PlatformService, supervisor_bits
-from firmware_py.links.stream import TelemetryStream
+from firmware_py.links.stream import ReadBlock
 from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import State
-from firmware_py.wire.telemetry import FIRST_ID, LEGACY_DEGREES, Block
+from firmware_py.wire.telemetry import BLOCKS, LEGACY_DEGREES
 
 if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
@@ -55,7 +56,6 @@ class Running:
     localisation: LocalisationService
     platform: PlatformService
     tester: Tester
-    stream: TelemetryStream
     mavlink: "MavlinkStack | None"
 
 
@@ -90,61 +90,59 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
 
 
 def _each(
-    group: str, names: str, scalar: Scalar, unit: str, array: Any, first: int = 0
+    group: str, names: str, scalar: Scalar, unit: str, array: F32s | I32s, first: int = 0
 ) -> Iterator[LogVariable]:
     """Name elements of an array, from `first` on."""
     for index, name in enumerate(names.split(), first):
         yield LogVariable(f"{group}.{name}", scalar, unit, partial(array.item, index))
 
 
-def _fields(group: str, names: str, scalar: Scalar, unit: str, fields: Any) -> Iterator[LogVariable]:
+def _fields(group: str, names: str, scalar: Scalar, unit: str, fields: object) -> Iterator[LogVariable]:
     """Name attributes by their own names."""
     for name in names.split():
         yield LogVariable(f"{group}.{name}", scalar, unit, partial(getattr, fields, name))
 
 
-def _parts(group: str, names: str, unit: str, read: Callable[[], Sequence[float]]) -> Iterator[LogVariable]:
-    """Name the parts of a vector that is computed when it is asked for."""
+def _parts(group: str, names: str, unit: str, read: Callable[[int], float]) -> Iterator[LogVariable]:
+    """Name the parts of a vector that are computed when they are asked for, each by its index."""
     for index, name in enumerate(names.split()):
-        yield LogVariable(f"{group}.{name}", F32, unit, lambda index=index: read()[index])  # type: ignore[misc]
+        yield LogVariable(f"{group}.{name}", F32, unit, partial(read, index))
 
 
-def _state_estimate(estimator: Any, control: Any) -> Iterator[LogVariable]:
-    now = estimator.now
+def _state_estimate(estimator: Estimator, control: Control) -> Iterator[LogVariable]:
+    now, flap, command = estimator.now, control.flap, control.command
+    angles = "flap_1 flap_2 flap_3 flap_4"
     yield from _each("stateEstimate", "x y z", F32, "m", now, POSITION)
     yield from _each("stateEstimate", "vx vy vz", F32, "m/s", now, VELOCITY)
-    yield from _parts("stateEstimate", "roll pitch yaw", "deg", partial(_legacy_attitude, estimator))
+    yield from _parts("stateEstimate", "roll pitch yaw", "deg", partial(_legacy_angle, estimator))
     yield from _each("stateEstimate", "roll_rate pitch_rate yaw_rate", F32, "rad/s", now, RATE)
+    yield from _parts("stateEstimate", angles, "rad", lambda i: now[FLAP + i] + (flap[i] - command[i]))
     yield from _parts(
         "stateEstimate",
-        "flap_1 flap_2 flap_3 flap_4",
-        "rad",
-        lambda: now[FLAP:] + (control.flap - control.command),
-    )
-    yield from _parts(
-        "stateEstimate", "qw qx qy qz", "", lambda: from_euler_zyx(*now[ATTITUDE : ATTITUDE + 3].tolist())
+        "qw qx qy qz",
+        "",
+        lambda i: from_euler_zyx(*now[ATTITUDE : ATTITUDE + 3].tolist())[i],
     )
 
 
-def _legacy_attitude(estimator: Any) -> Sequence[float]:
-    angles = estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
-    return [scale * angle for scale, angle in zip(LEGACY_DEGREES, angles, strict=True)]
+def _legacy_angle(estimator: Estimator, axis: int) -> float:
+    return LEGACY_DEGREES[axis] * estimator.now.item(ATTITUDE + axis)
 
 
-def _crazyflie(running: Running, estimator: Any) -> Iterator[LogVariable]:
+def _crazyflie(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
     """What only Crazyflie's own programs look at."""
     board, bias = running.board, running.core.data.fields.gyro_bias
 
-    def gyro() -> Sequence[float]:
+    def gyro(axis: int) -> float:
         x, y, z = (
             degrees((counts - zero) * GYRO_SCALE)
             for counts, zero in zip(board.read_imu()[:3], bias.tolist(), strict=True)
         )
-        return SQRT_HALF * (x + y), SQRT_HALF * (y - x), z
+        return (SQRT_HALF * (x + y), SQRT_HALF * (y - x), z)[axis]
 
-    def acceleration() -> Sequence[float]:
+    def acceleration(axis: int) -> float:
         x, y, z = (counts * ACCELERATION_SCALE for counts in board.read_imu()[3:])
-        return SQRT_HALF * (x + y), SQRT_HALF * (y - x), z
+        return (SQRT_HALF * (x + y), SQRT_HALF * (y - x), z)[axis]
 
     def battery_level() -> float:
         low = running.supervisor.low_battery_mv
@@ -154,7 +152,7 @@ def _crazyflie(running: Running, estimator: Any) -> Iterator[LogVariable]:
     def battery_state() -> float:
         return PM_LOW if board.read_battery_mv() < running.supervisor.low_battery_mv else PM_BATTERY
 
-    yield from _parts("stabilizer", "roll pitch yaw", "deg", partial(_legacy_attitude, estimator))
+    yield from _parts("stabilizer", "roll pitch yaw", "deg", partial(_legacy_angle, estimator))
     yield LogVariable("stabilizer.thrust", F32, "", lambda: 0.0)
     yield from _parts("gyro", "x y z", "deg/s", gyro)
     yield from _parts("acc", "x y z", "g", acceleration)
@@ -164,16 +162,16 @@ def _crazyflie(running: Running, estimator: Any) -> Iterator[LogVariable]:
     yield LogVariable("pm.batteryLevel", U8, "%", battery_level)
 
 
-def _localisation(service: LocalisationService, estimator: Any) -> Iterator[LogVariable]:
-    yield from _parts("locSrv", "x y z", "m", lambda: service.last.p_GB)
-    yield from _parts("locSrv", "qw qx qy qz", "", lambda: service.last.q_GB)
+def _localisation(service: LocalisationService, estimator: Estimator) -> Iterator[LogVariable]:
+    yield from _parts("locSrv", "x y z", "m", lambda axis: service.last.p_GB[axis])
+    yield from _parts("locSrv", "qw qx qy qz", "", lambda part: service.last.q_GB[part])
     yield LogVariable("locSrv.age", U16, "0.1 ms", lambda: int(estimator.pose_age_us) // AGE_UNIT_US)
-    yield LogVariable("locSrv.poses", U16, "", lambda: _received(estimator))
-    yield LogVariable("locSrv.rejected", U16, "", lambda: _rejected(estimator))
+    yield LogVariable("locSrv.poses", U16, "", lambda: _received(estimator) & 0xFFFF)
+    yield LogVariable("locSrv.rejected", U16, "", lambda: _rejected(estimator) & 0xFFFF)
     yield LogVariable("locSrv.positions", U32, "", partial(getattr, service, "positions"))
 
 
-def _kalman(estimator: Any) -> Iterator[LogVariable]:
+def _kalman(estimator: Estimator) -> Iterator[LogVariable]:
     covariance = estimator.P.reshape(-1)
     variances = estimator.P.diagonal()
     yield from _each("kalman", "stateX stateY stateZ", F32, "m", estimator.now, POSITION)
@@ -197,36 +195,16 @@ def _counters(running: Running) -> Iterator[LogVariable]:
     yield LogVariable("memTst.errCntW", U32, "", partial(getattr, running.tester, "errors"))
 
 
-def _rejected(estimator: Any) -> int:
+def _rejected(estimator: Estimator) -> int:
     return int(estimator.refused + estimator.too_old + estimator.invalid)
 
 
-def _received(estimator: Any) -> int:
+def _received(estimator: Estimator) -> int:
     return int(estimator.fused + estimator.jumps) + _rejected(estimator)
 
 
-def telemetry_reader(
-    estimator: Estimator, control: Control, supervisor_state: Callable[[], int]
-) -> Callable[[Block], Sequence[float]]:
-    """Return the function that reads a telemetry block; estimator and control are the core's fields.
-
-    The same values as in the table, but whole blocks at a time: this runs in every flight.
-    """
-
-    def motion() -> Sequence[float]:
-        return list(estimator.now[POSITION : VELOCITY + 3].tolist())
-
-    def attitude() -> Sequence[float]:
-        return list(estimator.now[ATTITUDE : RATE + 3].tolist())
-
-    def flaps() -> Sequence[float]:
-        hover = control.flap - control.command
-        return [*(estimator.now[FLAP:] + hover).tolist(), *control.count.tolist()]
-
-    def health() -> Sequence[float]:
-        age = int(estimator.pose_age_us) // AGE_UNIT_US
-        received, rejected = _received(estimator) & 0xFFFF, _rejected(estimator) & 0xFFFF
-        return [*control.u.tolist(), supervisor_state(), age, received, rejected]
-
-    readers = (motion, attitude, flaps, health)
-    return lambda block: readers[block.id - FIRST_ID]()
+def telemetry_reader(variables: Sequence[LogVariable]) -> ReadBlock:
+    """Return the function that reads a telemetry block from the log table."""
+    read = {variable.name: variable.read for variable in variables}
+    blocks = {block.id: [read[variable.name] for variable in block.variables] for block in BLOCKS}
+    return lambda block: [read() for read in blocks[block.id]]

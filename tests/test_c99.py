@@ -158,7 +158,8 @@ REFUSED_KERNELS = [
     ("@kernel\ndef f(x: f32) -> None:\n    y = x\n", 1, "no docstring"),
     ("@kernel\ndef f(x: f32) -> None:\n    '''Do.'''\n    return\n", 1, "argument x is not used"),
     ("@kernel\ndef f(x: f32) -> f32:\n    '''Do.'''\n    if x > LIMIT:\n        return x\n", 1, "may end without a result"),
-    ("@kernel\ndef f(a: Memory) -> None:\n    '''Do.'''\n", 1, "a[0] is not passed on"),
+    ("@kernel\ndef f(a: Memory) -> None:\n    '''Do.'''\n", 1, "argument a of f has no type of the subset"),
+    ("@kernel\ndef f(a: Memory[f32]) -> None:\n    '''Do.'''\n", 1, "argument a of f has no type of the subset"),
     ("def f(x: f32) -> f32:\n    '''Do.'''\n    return x\n", 0, "function f is not marked @kernel alone"),
     ("@kernel\nasync def f(x: f32) -> f32:\n    '''Do.'''\n", 1, "AsyncFunctionDef at the top of a module"),
     ("@kernel\ndef f(x: f32) -> f32:\n    '''Do.'''\n    return g(x)\n\n@kernel\ndef g(x: f32) -> f32:\n    '''Do.'''\n"

@@ -193,6 +193,8 @@ def test_telemetry_leaves_at_fifty_hertz_with_the_running_values(bench: Bench) -
     assert motion.values[:3] == pytest.approx((0.01, 0.02, -0.03), abs=2e-3)
     flaps = [sample for sample in samples if sample.block is telemetry.BLOCKS[2]][-1]
     assert list(flaps.values[4:]) == pytest.approx(bench.writes[-2][1], abs=600)
+    turned = [sample for sample in samples if sample.block is telemetry.BLOCKS[1]][-1]
+    assert turned.values == pytest.approx(bench.firmware.signals.estimate[6:12].tolist(), abs=2e-3)
     health = [sample for sample in samples if sample.block is telemetry.BLOCKS[3]][-1]
     assert health.values[4] == State.FLYING
 

@@ -185,7 +185,8 @@ def test_telemetry_is_asked_for_at_the_first_frame_and_after_half_a_second_witho
 
 def telemetry_packets(timestamp_ms, blocks=telemetry.BLOCKS):
     for block in blocks:
-        yield telemetry.encode_sample(block, timestamp_ms, [0.5 + block.id] * len(block.variables))
+        shown = [(variable.scale or 1) * (0.5 + block.id) for variable in block.variables]
+        yield telemetry.encode_block(block, timestamp_ms, shown)
 
 
 def rows(path):

@@ -361,6 +361,12 @@ def test_the_flight_array_holds_the_telemetry_blocks() -> None:
     assert values[14] == pytest.approx(now["locSrv.poses"], abs=2)
 
 
+def test_counters_in_the_flight_array_wrap_as_those_of_the_log_do(client: Client) -> None:
+    client.firmware.signals.counters[0] = (1 << 16) + 7  # poses that were fused
+    (array,) = client.command(512, 350)[1:]
+    assert array.data[14] == 7
+
+
 def test_a_message_can_be_asked_for_once(client: Client) -> None:
     ack, answer = client.command(512, 32)
     assert (ack.get_type(), ack.result) == ("COMMAND_ACK", 0)

@@ -13,8 +13,9 @@ NUMBA_DISABLE_JIT=1 they stay plain Python that a debugger can step through.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, Generic, Self, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,22 +32,25 @@ kernel = compiling.compiler(Path(__file__).parent)
 F32s: TypeAlias = NDArray[np.float32]
 I32s: TypeAlias = NDArray[np.int32]
 Integer: TypeAlias = int | np.int32
-Memory: TypeAlias = Any  # a one-element array of structs: what an entry kernel takes
+S = TypeVar("S", bound="Struct")
+S_co = TypeVar("S_co", bound="Struct", covariant=True)
+Memory: TypeAlias = Sequence[S]  # a one-element array of structs: what an entry kernel takes
 
 
-class Block:
+class Block(Generic[S_co]):
     """The memory of one struct instance.
 
-    `memory` is a structured array of shape (1,), `fields` gives attribute access to it from outside the core
-    (array fields are views), `arg` is what an entry kernel takes: the memory, or the fields when nothing is compiled.
+    `memory` is a structured array of shape (1,), `fields` gives attribute access to it from outside the core, as if it
+    were the struct (array fields are views), `arg` is what an entry kernel takes: the memory, or the fields when nothing
+    is compiled.
     """
 
     __slots__ = ("arg", "fields", "memory")
 
     def __init__(self, dtype: np.dtype[Any], view: type[Any]) -> None:
         self.memory: NDArray[Any] = np.zeros(1, dtype)
-        self.fields: Any = view(self.memory)
-        self.arg: Any = [self.fields] if compiling.PLAIN else self.memory
+        self.fields = cast(S_co, view(self.memory))
+        self.arg = cast(Memory[S_co], [self.fields] if compiling.PLAIN else self.memory)
 
     def bytes(self) -> bytes:
         """Return the struct as the bytes that lie in memory."""
@@ -96,6 +100,6 @@ class Struct:
         cls._view = type(cls.__name__ + "View", (), body)
 
     @classmethod
-    def allocate(cls) -> Block:
+    def allocate(cls) -> Block[Self]:
         """Return a zeroed instance."""
         return Block(cls.dtype, cls._view)

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.core.structs import Control, Estimator, Input, Parameters
-from firmware_py.core.subset import Block, f32, i32
+from firmware_py.core.subset import Block, Struct, f32, i32
 from firmware_py.core_runner import CoreBlocks
 
 STRUCTS = (Parameters, Input, Estimator, Control)
 WORD = np.dtype(np.uint32)
 
 
-def blocks_of(blocks: CoreBlocks) -> tuple[Block, Block, Block, Block]:
+def blocks_of(blocks: CoreBlocks) -> tuple[Block[Struct], Block[Struct], Block[Struct], Block[Struct]]:
     """Return the blocks in the order of `STRUCTS`."""
     return blocks.parameters, blocks.data, blocks.estimator, blocks.control
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from firmware_py.core.subset import Block
+from firmware_py.core.subset import Block, Struct
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.c99 import Translation
 from firmware_py.export.errors import ExportError
@@ -126,5 +126,5 @@ class NativeRunner:
         )
 
 
-def _address(block: Block) -> ctypes.c_void_p:
+def _address(block: Block[Struct]) -> ctypes.c_void_p:
     return ctypes.c_void_p(block.memory.ctypes.data)

@@ -176,28 +176,20 @@ class _Reader:
         return Kernel(c_name, self.module.path, node, arguments, result, public, self.module)
 
     def _argument_kind(self, argument: ast.arg, node: ast.FunctionDef) -> Kind:
-        name = argument.annotation.id if isinstance(argument.annotation, ast.Name) else ""
-        if name in SCALARS:
-            return SCALARS[name]
-        if name in ARRAYS:
-            return Kind(ARRAYS[name], 1)
-        if name == "Memory":
-            return Kind(self._memory_struct(argument.arg, node), memory=True)
-        if isinstance(self.module.names.get(name), StructType):
-            return Kind(name)
+        match argument.annotation:
+            case ast.Name(id=name) if name in SCALARS:
+                return SCALARS[name]
+            case ast.Name(id=name) if name in ARRAYS:
+                return Kind(ARRAYS[name], 1)
+            case ast.Name(id=name) if isinstance(self.module.names.get(name), StructType):
+                return Kind(name)
+            case ast.Subscript(value=ast.Name(id="Memory"), slice=ast.Name(id=name)) if isinstance(
+                self.module.names.get(name), StructType
+            ):
+                return Kind(name, memory=True)
         raise refusal(
             self.module.path, argument, f"argument {argument.arg} of {node.name} has no type of the subset"
         )
-
-    def _memory_struct(self, name: str, node: ast.FunctionDef) -> str:
-        """Return the struct as which a block of memory is passed on."""
-        for call in ast.walk(node):
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name):
-                callee = self.module.names.get(call.func.id)
-                texts = [ast.unparse(argument) for argument in call.args]
-                if isinstance(callee, Kernel) and f"{name}[0]" in texts:
-                    return list(callee.arguments.values())[texts.index(f"{name}[0]")].base
-        raise refusal(self.module.path, node, f"{name}[0] is not passed on")
 
     def _identifier(self, name: str, node: ast.AST) -> str:
         if name in C_KEYWORDS:

@@ -36,7 +36,7 @@ class Target:
 
     __slots__ = ("blocks", "calls", "divergence", "name", "ticks")
 
-    def __init__(self, name: str, parameters: Block, factory: RunnerFactory) -> None:
+    def __init__(self, name: str, parameters: Block[Parameters], factory: RunnerFactory) -> None:
         self.name = name
         self.blocks = CoreBlocks(parameters, factory)
         self.divergence: Divergence | None = None
@@ -110,7 +110,7 @@ def _answer(runner: CoreRunner, name: str) -> int:
     return int(answer) if name == "file_pose" else 0
 
 
-def _copy_of(parameters: Block) -> Block:
+def _copy_of(parameters: Block[Parameters]) -> Block[Parameters]:
     copy = Parameters.allocate()
     copy.memory[:] = parameters.memory
     return copy

@@ -6,10 +6,9 @@ here.
 
 from collections.abc import Sequence
 from math import sqrt
-from typing import Any
 
 from firmware_py.config import StreamRates
-from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY
+from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY, Control, Estimator
 from firmware_py.geometry import from_euler_zyx, rotate, wrap_angle, yaw_quaternion
 from firmware_py.links.mavlink_poses import PoseService
 from firmware_py.links.mavlink_stack import MavlinkStack
@@ -31,8 +30,8 @@ class FlightMessages:
         stack: MavlinkStack,
         supervisor: Supervisor,
         poses: PoseService,
-        estimator: Any,
-        control: Any,
+        estimator: Estimator,
+        control: Control,
         read_block: ReadBlock,
     ) -> None:
         self._stack = stack

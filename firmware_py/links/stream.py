@@ -9,7 +9,7 @@ ReadBlock = Callable[[telemetry.Block], Sequence[float]]
 
 
 class TelemetryStream:
-    """`read_block` returns the present values of a telemetry block, in the order of its variables."""
+    """`read_block` returns what the log variables of a telemetry block show now."""
 
     def __init__(self, stack: CrtpStack, read_block: ReadBlock) -> None:
         self._on = False
@@ -40,5 +40,5 @@ class TelemetryStream:
             stamp_ms = kernel.tick_count
             yield from kernel.work(cost.log_us * len(telemetry.BLOCKS))
             for block in telemetry.BLOCKS:
-                packet = telemetry.encode_sample(block, stamp_ms, self._read_block(block))
+                packet = telemetry.encode_block(block, stamp_ms, self._read_block(block))
                 yield from self._stack.offer(packet)

@@ -59,13 +59,9 @@ class Block:
         object.__setattr__(self, "layout", layout)
 
     def pack(self, values: Sequence[float]) -> bytes:
-        """The bytes of a sample's values; integers wrap at their width."""
+        """The bytes of what the log variables show; integers wrap at their width."""
         if len(values) != len(self.variables):
             raise WireError(f"log block {self.id}: {len(values)} values for {len(self.variables)} variables")
-        values = [
-            value if variable.scale is None else variable.scale * value
-            for variable, value in zip(self.variables, values, strict=True)
-        ]
         try:
             return self.layout.pack(*values)
         except struct.error:
@@ -78,9 +74,13 @@ class Block:
             raise WireError(
                 f"log block {self.id}: {len(packed)} bytes of values instead of {self.layout.size}"
             )
+        return self.si_of(self.layout.unpack(packed))
+
+    def si_of(self, values: Sequence[float]) -> tuple[float, ...]:
+        """The values of a sample, of what the log variables show."""
         return tuple(
             value if variable.scale is None else value / variable.scale
-            for variable, value in zip(self.variables, self.layout.unpack(packed), strict=True)
+            for variable, value in zip(self.variables, values, strict=True)
         )
 
 
@@ -129,8 +129,8 @@ BLOCKS = (
 _BLOCK_OF_ID = {block.id: block for block in BLOCKS}
 
 
-def encode_sample(block: Block, timestamp_ms: int, values: Sequence[float]) -> bytes:
-    """The complete packet with `values` in the order of `block.variables`; integers wrap at their width."""
+def encode_block(block: Block, timestamp_ms: int, values: Sequence[float]) -> bytes:
+    """The complete packet with what the log variables of a block show; integers wrap at their width."""
     return encode_log_data(block.id, timestamp_ms, block.pack(values))
 
 
