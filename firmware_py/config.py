@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from firmware_py.core.structs import HORIZON_LIMIT, Parameters
 from firmware_py.core.subset import Block
+from firmware_py.drivers.imu import GYRO_SCALE
 
 Gain = Annotated[float, Field(ge=-20, le=20)]
 Coupling = Annotated[float, Field(ge=-5000, le=5000)]
@@ -190,9 +191,6 @@ class FirmwareConfig(Section):
     supervisor: SupervisorConfig
     cpu: CpuConfig
     mavlink: MavlinkConfig
-
-
-GYRO_SCALE = 2000.0 / 32768.0 * 3.141592653589793 / 180.0  # [rad/s per count] BMI088 at +-2000 deg/s
 
 
 def parameters_of(config: FirmwareConfig) -> Block[Parameters]:

@@ -8,14 +8,14 @@ frame: what the board knows is its error.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import degrees, sqrt
+from math import degrees
 from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
-from firmware_py.config import GYRO_SCALE
 from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, Control, Estimator
 from firmware_py.core.subset import F32s, I32s
 from firmware_py.core_runner import CoreBlocks
+from firmware_py.drivers.imu import acceleration, rates
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.links.localisation import LocalisationService
@@ -35,10 +35,8 @@ if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
 
 AGE_UNIT_US = 100  # locSrv.age counts tenths of a millisecond
-ACCELERATION_SCALE = 24 / 32768  # [g per count] BMI088 at +-24 g
 BATTERY_FULL_MV = 4200
 PM_BATTERY, PM_LOW = 0, 3  # pm.state
-SQRT_HALF = sqrt(0.5)
 
 F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
 
@@ -133,16 +131,8 @@ def _crazyflie(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
     """What only Crazyflie's own programs look at."""
     board, bias = running.board, running.core.data.fields.gyro_bias
 
-    def gyro(axis: int) -> float:
-        x, y, z = (
-            degrees((counts - zero) * GYRO_SCALE)
-            for counts, zero in zip(board.read_imu()[:3], bias.tolist(), strict=True)
-        )
-        return (SQRT_HALF * (x + y), SQRT_HALF * (y - x), z)[axis]
-
-    def acceleration(axis: int) -> float:
-        x, y, z = (counts * ACCELERATION_SCALE for counts in board.read_imu()[3:])
-        return (SQRT_HALF * (x + y), SQRT_HALF * (y - x), z)[axis]
+    def rate(axis: int) -> float:
+        return degrees(rates(board.read_imu(), bias.tolist())[axis])
 
     def battery_level() -> float:
         low = running.supervisor.low_battery_mv
@@ -154,8 +144,8 @@ def _crazyflie(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
 
     yield from _parts("stabilizer", "roll pitch yaw", "deg", partial(_legacy_angle, estimator))
     yield LogVariable("stabilizer.thrust", F32, "", lambda: 0.0)
-    yield from _parts("gyro", "x y z", "deg/s", gyro)
-    yield from _parts("acc", "x y z", "g", acceleration)
+    yield from _parts("gyro", "x y z", "deg/s", rate)
+    yield from _parts("acc", "x y z", "g", lambda axis: acceleration(board.read_imu())[axis])
     yield LogVariable("pm.vbat", F32, "V", lambda: board.read_battery_mv() * 1e-3)
     yield LogVariable("pm.vbatMV", U16, "mV", board.read_battery_mv)
     yield LogVariable("pm.state", I8, "", battery_state)

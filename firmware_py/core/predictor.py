@@ -30,9 +30,8 @@ from firmware_py.core.subset import Integer, f32, i32, kernel
 QUIET_TICKS = 100  # 1 s of younger poses before the horizon shrinks by a tick
 CATCH_UP = 2  # filter ticks per tick at most, so that the time of a tick stays bounded
 SECONDS_PER_US = f32(1e-6)
-COS_45 = f32(
-    0.707106781186548
-)  # the board sits at 45 deg in the body: p = cos45 (gx + gy), q = cos45 (gy - gx)
+# The sensor sits at -45 deg in the body, as in drivers/imu.py: p = cos45 (gx + gy), q = cos45 (gy - gx).
+COS_45 = f32(0.707106781186548)
 UNIT_TOLERANCE = f32(0.2)  # on the squared length of a quaternion
 POSE_LIMIT = f32(100.0)  # [m]
 

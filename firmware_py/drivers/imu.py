@@ -1,11 +1,41 @@
-"""The gyro's zero: found at start, in counts, while the robot is held still."""
+"""The BMI088: how it is mounted, what a count is, and the gyro's zero, found at start while the robot is held still.
+
+Counts come in the sensor frame S, which lies at -45 deg about z in the body B. The flight core turns the gyro's counts
+itself, because it is what is flashed; the tests hold it to `body_of`.
+"""
+
+from collections.abc import Sequence
+from math import pi, sqrt
 
 from firmware_py.board import ImuCounts
+from firmware_py.geometry import Vector
+
+GYRO_SCALE = 2000.0 / 32768.0 * pi / 180.0  # [rad/s per count] at +-2000 deg/s
+ACCELEROMETER_SCALE = 24 / 32768  # [g per count] at +-24 g
+COS_45 = sqrt(0.5)
 
 SAMPLES = 512  # original firmware
 VARIANCE_LIMIT = (
     10_000.0  # [counts^2] 0.1 rad/s rms: more than sensor noise in the flow, less than a moving robot
 )
+
+
+def body_of(v_S: Vector) -> Vector:
+    """Return a vector of the sensor frame in the body frame."""
+    x, y, z = v_S
+    return COS_45 * (x + y), COS_45 * (y - x), z
+
+
+def rates(counts: ImuCounts, zero: Sequence[float]) -> Vector:
+    """Return the body rates p, q, r [rad/s, B]; `zero` is the gyro's [counts, S]."""
+    x, y, z = (GYRO_SCALE * (count - at_rest) for count, at_rest in zip(counts[:3], zero, strict=True))
+    return body_of((x, y, z))
+
+
+def acceleration(counts: ImuCounts) -> Vector:
+    """Return the specific force [g, B]."""
+    x, y, z = (ACCELEROMETER_SCALE * count for count in counts[3:])
+    return body_of((x, y, z))
 
 
 class GyroZero:
