@@ -23,17 +23,11 @@ from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.parameters import parameters
 from firmware_py.rtos import Kernel, Queue, WatchdogError
-from firmware_py.rtos.statistics import LATENCY_BOUNDS_US, Statistics, TaskReport
+from firmware_py.rtos.statistics import Statistics
 from firmware_py.signals import Signals
 from firmware_py.supervisor import Supervisor
-from firmware_py.tasks import (
-    Thief,
-    estimator_task,
-    power_task,
-    sensors_task,
-    stabilizer_task,
-    thief_task,
-)
+from firmware_py.tasks import estimator_task, power_task, sensors_task, stabilizer_task
+from firmware_py.thief import PRIORITY, Thief, thief_task
 from firmware_py.variables import Running, log_variables, telemetry_reader
 from firmware_py.wire import WireError
 from firmware_py.wire.memories import (
@@ -47,8 +41,6 @@ from firmware_py.wire.memories import (
 if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
 
-__all__ = ["DEADLINES_US", "LATENCY_BOUNDS_US", "Firmware", "Kernel", "TaskReport", "Thief", "WatchdogError"]
-
 MEASUREMENT_QUEUE = 20  # original firmware
 DEADLINES_US = {  # of each activation: whatever the flight path does in a tick is over before the next one
     "SENSORS": 1000,
@@ -57,7 +49,6 @@ DEADLINES_US = {  # of each activation: whatever the flight path does in a tick 
 }
 WATCHDOG_US = 353_000  # the longest that the Crazyflie's independent watchdog may take
 DECK = (0xBC, 0xF1, "bcFloaty", "A")  # vendor, product, name, revision of the deck with the servo connectors
-THIEF_PRIORITY = 6  # above every task, like interrupts that do not end
 
 
 class Firmware:
@@ -204,7 +195,7 @@ class Firmware:
     def add_thief(self) -> Thief:
         """Add a task that takes a share of every tick before all others; it takes nothing until told to."""
         thief = Thief()
-        self.kernel.create_task("THIEF", THIEF_PRIORITY, thief_task, self.kernel, thief)
+        self.kernel.create_task("THIEF", PRIORITY, thief_task, self.kernel, thief)
         return thief
 
     def _zero_found(self) -> None:

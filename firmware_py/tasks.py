@@ -120,24 +120,6 @@ def power_task(kernel: Kernel, board: Board, supervisor: Supervisor) -> Task:
         yield from kernel.delay_until(wake_tick)
 
 
-class Thief:
-    """How much of every tick the thief takes, 0..1; may change while it runs."""
-
-    __slots__ = ("share",)
-
-    def __init__(self) -> None:
-        self.share = 0.0
-
-
-def thief_task(kernel: Kernel, thief: Thief) -> Task:
-    """Take a share of every tick: a load to test the others with."""
-    wake_tick = kernel.tick_count
-    while True:
-        wake_tick += 1
-        yield from kernel.delay_until(wake_tick)
-        yield from kernel.work(round(thief.share * TICK_US))
-
-
 def next_step(tick: int, phase: int) -> int:
     """Return the first tick of a phase after `tick`: a step that is late does not move the next one."""
     return tick + 1 + (phase - tick - 1) % TICKS_PER_STEP

@@ -24,7 +24,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "hil": (
         "hil", "ground_station",
         "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
-        "firmware_py.config", "firmware_py.signals",
+        "firmware_py.config", "firmware_py.signals", "firmware_py.rtos", "firmware_py.thief",
         "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.compiling",
         "firmware_py.errors", "firmware_py.extras",
     ),
@@ -219,6 +219,7 @@ def test_file_keeps_to_its_room(path: Path) -> None:
         ("hil/deploy/check.py", "from hil.studies.paper import fly_paper"),
         ("hil/clock.py", "from hil.config import LabConfig"),
         ("hil/laboratory/run.py", "import click"),
+        ("hil/devices/imu.py", "from firmware_py.drivers.imu import body_of"),
         ("hil/world/plates.py", "from firmware_py.core.model import derivative"),
         ("hil/events.py", "import threading"),
         ("hil/pictures/report.py", "import rerun as rr"),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
 from firmware_py.export.errors import ExportError
 from firmware_py.export.side_by_side import SideBySide, Target
-from firmware_py.firmware import WatchdogError
+from firmware_py.rtos import WatchdogError
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.faults import Fault, parse

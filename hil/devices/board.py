@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
-from firmware_py.firmware import Kernel
+from firmware_py.rtos import Kernel
 from hil.events import EventQueue
 
 STILL: ImuCounts = (0, 0, 0, 0, 0, 0)

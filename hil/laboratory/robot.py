@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.core_runner import PythonRunner, RunnerFactory
-from firmware_py.firmware import Firmware, Thief
+from firmware_py.firmware import Firmware
+from firmware_py.thief import Thief
 from ground_station.mocap import MocapFrame
 from hil.config import LabConfig
 from hil.devices.board import VirtualBoard

@@ -24,7 +24,7 @@ import pyarrow as pa
 from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.cortex_m4 import CortexM4Runner, Usage
 from firmware_py.export.errors import ExportError
-from firmware_py.firmware import TaskReport, WatchdogError
+from firmware_py.rtos import TaskReport, WatchdogError
 from ground_station.latency import Stage
 from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Clock

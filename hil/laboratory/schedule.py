@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet
 
-from firmware_py.firmware import Kernel
+from firmware_py.rtos import Kernel
 
 FILE = "schedule.parquet"
 WINDOW_US = 50_000

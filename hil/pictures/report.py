@@ -12,7 +12,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from firmware_py.firmware import LATENCY_BOUNDS_US
+from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
 from hil.laboratory.ages import told
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Span, spans_of
