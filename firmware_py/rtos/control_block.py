@@ -39,7 +39,7 @@ class ControlBlock:
     )
 
     def __init__(
-        self, name: str, priority: int, body: Generator[int, None, Any], ring: list[Any], now_us: int
+        self, name: str, priority: int, body: Generator[int, None, object], ring: list[Any], now_us: int
     ) -> None:
         self.name = name
         self.step = body.send

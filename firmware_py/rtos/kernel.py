@@ -6,16 +6,16 @@ Waiting and working calls are used with `yield from`. Times are ticks of 1 ms, e
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
-from typing import Any
+from typing import Any, TypeVarTuple
 
 from firmware_py.rtos.errors import KernelError
-from firmware_py.rtos.queue import Queue
+from firmware_py.rtos.queue import Queue, T
 from firmware_py.rtos.scheduler import FOREVER, GO_ON, SWITCH, TICK_US, Scheduler, Trace
 from firmware_py.rtos.semaphore import Mutex, Semaphore
 from firmware_py.rtos.task import Task
 from firmware_py.rtos.timer import SERVICE_PRIORITY, Callback, Timer, TimerService
 
-TaskFunction = Callable[..., Generator[int, None, Any]]
+Arguments = TypeVarTuple("Arguments")
 
 
 class Kernel(Scheduler):
@@ -31,7 +31,13 @@ class Kernel(Scheduler):
         self._timers = TimerService(self)
         self._first: Task | None = None  # the task that `start` runs first
 
-    def create_task(self, name: str, priority: int, function: TaskFunction, *args: Any) -> Task:
+    def create_task(
+        self,
+        name: str,
+        priority: int,
+        function: Callable[[*Arguments], Generator[int, None, object]],
+        *args: *Arguments,
+    ) -> Task:
         """Makes a ready task that runs the generator `function(*args)`; higher numbers are more urgent."""
         task = Task(self, name, priority, function(*args))
         self.tasks.append(task)
@@ -42,9 +48,9 @@ class Kernel(Scheduler):
             self._first = task
         return task
 
-    def create_queue(self, length: int, name: str) -> Queue[Any]:
+    def create_queue(self, length: int, name: str) -> Queue[T]:
         """Makes an empty queue for at most `length` items."""
-        queue: Queue[Any] = Queue(self, length, name)
+        queue: Queue[T] = Queue(self, length, name)
         self.queues.append(queue)
         return queue
 

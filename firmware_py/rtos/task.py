@@ -7,7 +7,6 @@ yielding n; tasks never do this themselves but through `yield from` a kernel cal
 from __future__ import annotations
 
 from collections.abc import Generator, Iterable
-from typing import Any
 
 from firmware_py.rtos.control_block import SUSPENDED, ControlBlock
 from firmware_py.rtos.errors import KernelError
@@ -19,7 +18,9 @@ class Task(ControlBlock):
 
     __slots__ = ("kernel",)
 
-    def __init__(self, kernel: Scheduler, name: str, priority: int, body: Generator[int, None, Any]) -> None:
+    def __init__(
+        self, kernel: Scheduler, name: str, priority: int, body: Generator[int, None, object]
+    ) -> None:
         if not isinstance(body, Generator):
             raise KernelError(f"task {name}: its function returned {type(body).__name__}, not a generator")
         _check_priority(name, priority)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import Any
 
 from firmware_py.rtos.errors import KernelError
 from firmware_py.rtos.queue import Queue
@@ -19,7 +18,7 @@ RELOAD, START, RESET, STOP, CHANGE_PERIOD = range(5)  # FreeRTOS's command numbe
 COMMAND_QUEUE_LENGTH = 20  # crazyflie-firmware, FreeRTOSConfig.h
 SERVICE_PRIORITY = 1  # the same
 
-Callback = Callable[["Timer"], Generator[int, None, Any]]
+Callback = Callable[["Timer"], Generator[int, None, object]]
 
 
 class Timer:
