@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from firmware_py.firmware import WatchdogError
+from firmware_py.rtos import WatchdogError
 from hil.clock import Paced, Readers
 from hil.config import LabConfig
 from hil.devices.dongle import VirtualDongle
