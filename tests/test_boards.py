@@ -67,6 +67,7 @@ def test_measured_costs_are_the_processor_time_of_the_tasks(tmp_path: Path) -> N
     )
 
 
+@pytest.mark.long
 def test_the_report_shows_what_the_board_takes(tmp_path: Path) -> None:
     from hil.pictures.report import write_report
 

@@ -84,6 +84,7 @@ def test_list_names_experiments_and_profiles(
     assert "profiles: as-flown, floaty (default)" in shown
 
 
+@pytest.mark.long
 def test_perfetto_writes_its_trace(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -92,6 +93,7 @@ def test_perfetto_writes_its_trace(
     assert Path("run/flight.perfetto-trace").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_report_can_be_written_again(monkeypatch: pytest.MonkeyPatch) -> None:
     floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--out", "run")
     Path("run/report.html").unlink()
@@ -147,6 +149,7 @@ def test_a_killed_flight_can_still_be_reported(monkeypatch: pytest.MonkeyPatch, 
     assert floaty(monkeypatch, "report", "run") == 0
 
 
+@pytest.mark.long
 def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

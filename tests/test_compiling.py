@@ -35,7 +35,9 @@ def half(x):
 """
 
 
-@pytest.mark.parametrize("kept", ["beside the sources", "NUMBA_CACHE_DIR"])
+@pytest.mark.parametrize(
+    "kept", [pytest.param("beside the sources", marks=pytest.mark.long), "NUMBA_CACHE_DIR"]
+)
 def test_what_is_compiled_is_kept_until_any_source_changes(kept: str, tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     environment.pop("NUMBA_CACHE_DIR", None)

@@ -170,7 +170,7 @@ class Watch(PythonRunner):
         return answer
 
 
-@pytest.mark.parametrize("target", ["c-O2", "cortex-m4"])
+@pytest.mark.parametrize("target", ["c-O2", pytest.param("cortex-m4", marks=pytest.mark.long)])
 def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path, target: str
 ) -> None:

@@ -232,6 +232,7 @@ def test_listing_experiments_draws_nothing() -> None:
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
 
 
+@pytest.mark.long
 def test_trials_are_drawn_behind_the_first_flight(tmp_path: Path) -> None:
     logs = [load_log(flown(tmp_path / str(seed), "yaw-step", seed=seed).folder) for seed in (1, 2, 3)]
     picture: Picture = pictures_of("yaw-step")[0]

@@ -525,6 +525,7 @@ def test_the_watchdog_ends_a_flight_whose_processor_is_taken(tmp_path: Path) -> 
 # Where they are shown
 
 
+@pytest.mark.long
 def test_report_and_recording_show_the_faults(tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 

@@ -33,13 +33,14 @@ def explain(result: Result) -> str:
     return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
 
 
-@pytest.mark.parametrize("seed", [1, 10, 1234])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (10, 1234))])
 def test_hover_holds_its_limits(tmp_path: Path, seed: int) -> None:
     result = hover(tmp_path / "run", seed=seed)
     assert result.passed, explain(result)
     assert {verdict.metric for verdict in result.verdicts} == set(HOVER.limits)
 
 
+@pytest.mark.long
 def test_hover_with_the_authors_gains_swings_in_y_and_survives(tmp_path: Path) -> None:
     results = [hover(tmp_path / str(seed), profile="as-flown", seed=seed) for seed in (1, 2, 3, 4)]
     for result in results:

@@ -410,6 +410,7 @@ def disturbed(frame: bytes, rng: np.random.Generator) -> bytes:
     return frame
 
 
+@pytest.mark.long
 def test_fuzzed_frames_never_raise_and_the_next_good_frame_is_received() -> None:
     rng = np.random.default_rng(13)
     signed = golden(peer(KEY), conversation(rng, 200))

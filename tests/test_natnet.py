@@ -104,6 +104,7 @@ def test_any_payload_is_read_or_refused(payload: bytes, message: int, version: V
         decode(packets.packet(message, payload), version)
 
 
+@pytest.mark.long
 def test_no_mutated_packet_harms_the_stream() -> None:
     rng = np.random.default_rng(8)
     version: Version = (4, 1)

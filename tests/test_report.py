@@ -193,6 +193,7 @@ def test_a_failed_limit_is_told_first(folder: Path) -> None:
     assert "lost: fell" in (folder / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows", [1, *(pytest.param(rows, marks=pytest.mark.long) for rows in (0, 15))])
 def test_a_flight_that_never_began_has_a_report(folder: Path, rows: int) -> None:
     keep_rows(folder, rows)
@@ -201,6 +202,7 @@ def test_a_flight_that_never_began_has_a_report(folder: Path, rows: int) -> None
     assert told == []
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_a_killed_flight_has_a_report(folder: Path) -> None:
     (folder / "result.json").unlink()

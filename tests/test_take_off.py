@@ -117,6 +117,7 @@ def test_take_off_and_landing_hold_their_limits(tmp_path: Path, profile: str, se
     assert result.passed, [str(verdict) for verdict in result.verdicts if not verdict.holds]
 
 
+@pytest.mark.long
 def test_the_operator_closes_the_loop_and_opens_it_again(tmp_path: Path) -> None:
     flown(tmp_path / "run")
     log = free_flight(load_log(tmp_path / "run"))

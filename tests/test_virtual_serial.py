@@ -153,7 +153,7 @@ def test_a_deaf_board_overruns_and_counts_it():
     assert bench.line.read() == b""
 
 
-@pytest.mark.parametrize("rate", [1e-4, 1e-2, 0.5])
+@pytest.mark.parametrize("rate", [1e-4, 1e-2, pytest.param(0.5, marks=pytest.mark.long)])
 @pytest.mark.parametrize("direction", ["uplink", "downlink"])
 def test_wrong_bits_follow_the_binomial_law_and_are_counted(direction, rate):
     bench = Bench(**{f"{direction}_bit_error_rate": rate}, baud=3_000_000)
