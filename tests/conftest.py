@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
-from serving import SERVED
+
+from support.serving import SERVED
 
 settings.register_profile("reproducible", derandomize=True, deadline=None)  # a first call compiles
 if "FLOATY_FUZZ" not in os.environ:

@@ -2,7 +2,7 @@
 
 Where the markers of the real robot sit is published nowhere; here they sit on what is rigid, which the flaps are not: four
 on the flap axes, which stay where they are when the flaps turn, two on posts over the base plate, two on the frame below.
-No two arms are alike, so that no other assignment of labels fits (the closest misses by 19 mm, tests/test_markers.py), any
+No two arms are alike, so that no other assignment of labels fits (the closest misses by 19 mm, test_markers.py), any
 three markers are far from one line, and they spread far enough for both noise figures of physics.md to come out of one:
 1.1 mm per marker and axis makes 0.4 mm and 0.004 rad of the pose. `hil.devices.rigid_body` makes points and poses of
 what is seen.

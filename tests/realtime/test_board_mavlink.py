@@ -13,13 +13,13 @@ from pathlib import Path
 import pymavlink.dialects.v20.common as dialect
 import pytest
 from cflib.utils.power_switch import PowerSwitch
-from mavlink_socket import GAIN, Client
-from serving import Served, free_port, serve
-from test_board_server import plug
 
 from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapSource
 from ground_station.sources.address import find_source
+from support.mavlink_socket import GAIN, Client
+from support.plugged_dongle import plug
+from support.serving import Served, free_port, serve
 
 
 def masters(served: Served) -> list[str]:

@@ -14,20 +14,19 @@ from itertools import pairwise
 from pathlib import Path
 
 import cflib.crtp
-import libusb_package
 import pytest
 from cflib.bootloader import Bootloader, FlashArtifact, Target
 from cflib.bootloader.boottypes import TargetTypes
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.mem import MemoryElement
 from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
-from cflib.crtp.radiodriver import RadioManager
 from cflib.utils.encoding import compress_quaternion
 from cflib.utils.power_switch import PowerSwitch
-from cflib_client import Client
-from serving import Served, serve
 
-from hil.servers.dongle_plugin import VARIABLE, Backend
+from hil.servers.dongle_plugin import Backend
+from support.cflib_client import Client
+from support.plugged_dongle import plug
+from support.serving import Served, serve
 
 PATIENCE_S = 30.0
 
@@ -35,15 +34,6 @@ PATIENCE_S = 30.0
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("toc")
-
-
-def plug(served: Served) -> None:
-    """Put the dongle of a server into this process."""
-    backend = Backend(served.environment[VARIABLE])
-    libusb_package.get_libusb1_backend = lambda: backend
-    RadioManager._radios.clear()
-    if not cflib.crtp.CLASSES:
-        cflib.crtp.init_drivers()
 
 
 @pytest.fixture(scope="module", params=["0", "0.1"], ids=["no loss", "10 % loss"])

@@ -16,10 +16,10 @@ import pytest
 from cflib.crazyflie.mem import MemoryElement
 from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
 from cflib.utils.encoding import compress_quaternion
-from cflib_client import Client
-from udp_pump import UdpBoard
 
 from firmware_py.wire.supervisor import State
+from support.cflib_client import Client
+from support.udp_pump import UdpBoard
 
 PATIENCE_S = 20.0
 

@@ -15,9 +15,9 @@ import libusb_package
 import pytest
 from cflib.crtp.radiodriver import RadioManager
 from cflib.utils.power_switch import PowerSwitch
-from serving import Served, serve
 
 from hil.servers.dongle_plugin import VARIABLE, Backend
+from support.serving import Served, serve
 
 FLOATY = (sys.executable, "-m", "hil.commands")
 URI = "radio://0/80/2M/E7E7E7E7E7"

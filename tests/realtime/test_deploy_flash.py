@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 from cflib.bootloader import Bootloader
 from cflib.bootloader.boottypes import TargetTypes
-from serving import Served, serve
-from test_board_server import plug
+
+from support.paths import ROOT
+from support.plugged_dongle import plug
+from support.serving import Served, serve
 
 PAGE = 1024
 NOBODY = "radio://0/11/2M/E7E7E7E7AA"
@@ -33,7 +35,7 @@ def image(tmp_path: Path) -> Path:
 
 def flash(served: Served, *arguments: object) -> "subprocess.CompletedProcess[str]":
     command = [sys.executable, "-m", "hil.commands", "deploy", "flash", *map(str, arguments)]
-    dongle, here = served.environment["PYTHONPATH"], str(Path(__file__).parents[2])
+    dongle, here = served.environment["PYTHONPATH"], str(ROOT)
     environment = {**served.environment, "PYTHONPATH": os.pathsep.join((dongle, here))}
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
 

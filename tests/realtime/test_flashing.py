@@ -12,11 +12,11 @@ from cflib.bootloader import Bootloader
 from cflib.bootloader.boottypes import TargetTypes
 from cflib.bootloader.cloader import Cloader
 from cflib.crtp.radiodriver import RadioManager
-from serving import Served, serve
 
 from ground_station.errors import LinkError
 from ground_station.flashing import check_image, flash
 from hil.servers.dongle_plugin import VARIABLE, Backend
+from support.serving import Served, serve
 
 START = 0x0800_4000
 LOSSES = ["0", pytest.param("0.1", marks=pytest.mark.long)]

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from serving import Served, free_port, serve
-from test_mavlink_clients import MavProxy, mavproxy_here
-from test_virtual_motive import FROM_MOTIVE, needs
 
 from ground_station.config import CaptureConfig
 from ground_station.sources.address import find_source
+from support.mavproxy_program import MavProxy, mavproxy_here
+from support.motive_bench import FROM_MOTIVE, needs
+from support.paths import SUPPORT
+from support.serving import Served, free_port, serve
 
 START_S = 20.0
 HOVER = 0.1  # off home at most [m]; the paper hovers within centimetres
@@ -36,7 +37,7 @@ def test_the_cameras_pose_is_what_a_client_gets() -> None:
         port = lab.motive.split(":")[2]
         receiver = find_source(lab.motive, CaptureConfig())
         receiver.open()
-        script = str(Path(__file__).with_name("natnet_clients.py"))
+        script = str(SUPPORT / "natnet_clients.py")
         command = [sys.executable, script, "natnet", port, "unicast", "50"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE)
         frames = []
@@ -86,7 +87,7 @@ def assert_markers(out: bytes) -> None:
 def test_markers_can_be_taken_off() -> None:
     with serve("--udp", "0", "--natnet-port", "0", "--set", "markers.enabled=false", what="lab") as lab:
         port = lab.line("motive ")[0].split(":")[2]
-        script = str(Path(__file__).with_name("natnet_clients.py"))
+        script = str(SUPPORT / "natnet_clients.py")
         command = [sys.executable, script, "natnet-markers", port, "unicast", "1"]
         out = subprocess.run(command, capture_output=True, timeout=START_S).stdout
     described, (_, error, *markers) = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]

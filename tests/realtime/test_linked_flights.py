@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from serving import free_port, serve
 
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
+from support.serving import free_port, serve
 
 DONGLE = "radio://0/80/2M/E7E7E7E7E7"
 

@@ -21,7 +21,6 @@ import pymavlink.dialects.v20.common as dialect
 import pytest
 import serial
 from serial.rfc2217 import PortManager
-from serving import Served, serve
 
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
@@ -30,6 +29,7 @@ from ground_station.links.mavlink import MavlinkLinkConfig
 from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
+from support.serving import Served, serve
 
 FLOATY = (sys.executable, "-m", "hil.commands")
 PATIENCE_S = 40.0

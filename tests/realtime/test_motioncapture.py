@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -15,10 +14,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from qualisys_server import qualisys_server
 from scipy.spatial.transform import Rotation
-from test_virtual_motive import Laboratory, needs, seen
-from vrpn_server import vrpn_server
 
 from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig
@@ -27,6 +23,10 @@ from ground_station.mocap import MocapFrame, MocapSource
 from ground_station.sources.address import find_source
 from ground_station.sources.capture_lines import Arrival, decode_line, encode_arrival, encode_error
 from ground_station.sources.motioncapture_client import MotioncaptureSource, settings_of
+from support.motive_bench import MotiveBench, moving, needs, seen
+from support.paths import ROOT
+from support.qualisys_server import qualisys_server
+from support.vrpn_server import vrpn_server
 
 names = st.text(max_size=10)
 body = st.tuples(*[st.floats()] * 7)
@@ -96,27 +96,7 @@ def await_notice(source: MocapSource, words: str, timeout_s: float = 10.0) -> li
     return frames
 
 
-@contextlib.contextmanager
-def moving(stands: Callable[[], bool] = lambda: False) -> Iterator[Laboratory]:
-    """A Motive that streams in a thread, without the body while it `stands`."""
-    lab, stop = Laboratory(), threading.Event()
-
-    def pump() -> None:
-        while not stop.wait(0.005):
-            lab.expose(valid=not stands())
-            lab.answer()
-
-    thread = threading.Thread(target=pump)
-    thread.start()
-    try:
-        yield lab
-    finally:
-        stop.set()
-        thread.join()
-        lab.motive.close()
-
-
-def from_motive(lab: Laboratory, **options: object) -> MotioncaptureSource:
+def from_motive(lab: MotiveBench, **options: object) -> MotioncaptureSource:
     """The backend of the package that can be tried here, which follows the same rules as those that cannot."""
     settings = {"hostname": "localhost", "interface_ip": "127.0.0.1", "port_command": str(lab.motive.port)}
     capture = CaptureConfig(system="vicon", axes="y-up", latency_us=7000).model_copy(update=options)
@@ -241,7 +221,7 @@ def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., M
 
     def make(text: str, body: str = "") -> MotioncaptureSource:
         (tmp_path / "motioncapture.py").write_text(text)
-        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}")
+        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{ROOT}")
         capture = CaptureConfig(system="qualisys", body=body)
         return MotioncaptureSource(capture.system, settings_of(capture), capture)
 

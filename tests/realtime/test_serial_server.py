@@ -7,15 +7,15 @@ import time
 
 import pytest
 import serial
-from serving import free_port
 
 from hil.errors import LabError
 from hil.servers.serial_server import Address, parse_addresses
+from support.serving import free_port
 
 PATIENCE_S = 5.0
 
 
-class Bench:
+class OpenEnd:
     """An open end and the bytes that came in."""
 
     def __init__(self, address):
@@ -81,7 +81,7 @@ class UdpClient:
 def pair(request):
     """An end, and a class whose objects are clients of it."""
     kind, client = request.param
-    bench = Bench(Address(kind, port=free_port() if kind == "udp" else 0))
+    bench = OpenEnd(Address(kind, port=free_port() if kind == "udp" else 0))
     yield bench, client
     bench.close()
 
@@ -125,7 +125,7 @@ def test_a_client_that_does_not_read_holds_nobody_up(pair):
 
 
 def test_a_second_tcp_client_waits_for_the_first_to_leave():
-    bench = Bench(Address("tcp"))
+    bench = OpenEnd(Address("tcp"))
     where = bench.end._listener.getsockname()
     with socket.create_connection(where) as first, socket.create_connection(where) as second:
         first.sendall(b"1")
@@ -142,7 +142,7 @@ def test_a_second_tcp_client_waits_for_the_first_to_leave():
 
 def test_the_link_to_a_pty_is_made_and_removed(tmp_path):
     path = tmp_path / "floaty"
-    bench = Bench(Address("pty", path=path))
+    bench = OpenEnd(Address("pty", path=path))
     assert bench.end.master == str(path)
     with serial.Serial(str(path), 921_600) as client:
         client.write(b"through the link")
@@ -154,7 +154,7 @@ def test_the_link_to_a_pty_is_made_and_removed(tmp_path):
 def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path):
     stale, file, other = tmp_path / "stale", tmp_path / "file", tmp_path / "other"
     stale.symlink_to("/dev/pts/99999")
-    Bench(Address("pty", path=stale)).close()
+    OpenEnd(Address("pty", path=stale)).close()
     file.write_text("mine")
     other.symlink_to(file)
     for path in (file, other, tmp_path / "no" / "folder"):
@@ -165,7 +165,7 @@ def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path):
 
 
 def test_a_port_in_use_is_named():
-    bench = Bench(Address("tcp"))
+    bench = OpenEnd(Address("tcp"))
     port = bench.end._listener.getsockname()[1]
     with pytest.raises(LabError, match=f"mavlink tcp 127.0.0.1:{port}: Address already in use"):
         Address("tcp", port=port).open({}, lambda now_us, data: None)

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 
-from serving import serve
+from support.serving import serve
 
 
 def test_a_robot_flown_from_outside_survives_a_stall_of_its_world() -> None:

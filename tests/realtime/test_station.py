@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from serving import serve
-from test_motioncapture import moving
 
 from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import Sample
@@ -21,6 +19,8 @@ from ground_station.sources.address import find_source
 from ground_station.sources.replay import read_frames
 from ground_station.station import GroundStation
 from ground_station.trajectory import Goal, Hold
+from support.motive_bench import moving
+from support.serving import serve
 
 FLOATY = (sys.executable, "-m", "hil.commands")
 

@@ -1,15 +1,12 @@
 """The virtual Motive: every client, ours and unmodified ones, sees the poses that the cameras saw."""
 
-import importlib.util
 import json
 import select
 import socket
 import struct
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +15,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ground_station.mocap import MocapFrame
 from ground_station.natnet import (
     BodyDescription,
     BodyPose,
@@ -32,19 +28,21 @@ from ground_station.natnet import (
     decode,
     packet,
 )
-from hil.devices.markers import NO_POINTS, Sighting, marker_places
 from hil.errors import LabError
-from hil.servers.dongle_server import Readers
 from hil.servers.motive import MAX_CLIENTS, Streaming, VirtualMotive, with_y_up
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
-from hil.world.config import PlantConfig
+from support.motive_bench import (
+    FROM_MOTIVE,
+    LATENCY_US,
+    PLACES,
+    MotiveBench,
+    needs,
+    seen,
+    sighted,
+)
+from support.paths import SUPPORT
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1)]
-FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
-PERIOD_S = 0.005
-LATENCY_US = 38_000
-PLACES = marker_places(PlantConfig())
-NO_POSE = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))  # Motive looks at the frame's
 
 single = st.floats(-100, 100, width=32)
 vector = st.tuples(single, single, single)
@@ -94,61 +92,9 @@ def test_motives_axes_have_y_up() -> None:
     assert Rotation.from_quat([x, y, z, w]).as_matrix() == pytest.approx(expected)
 
 
-def seen(number: int) -> MocapFrame:
-    """The pose of the body in a frame: all over the place."""
-    rng = np.random.default_rng(number)
-    q = rng.standard_normal(4)
-    q /= np.linalg.norm(q)
-    return MocapFrame(number, tuple(rng.uniform(-1, 1, 3).tolist()), tuple(q.tolist()), valid=True)
-
-
-def sighted(number: int, tracked: bool = True) -> Sighting:
-    """What is seen of the markers in a frame: anything, anywhere."""
-    rng = np.random.default_rng(number)
-    points, ghosts = rng.uniform(-1, 1, (8, 3)), rng.uniform(-1, 1, (number % 3, 3))
-    shown = rng.random(8) < 0.7
-    residuals = 0.01 * rng.random(8) * shown
-    return Sighting(points, shown, residuals, ghosts, 0.001 * number, NO_POSE if tracked else None)
-
-
-class Laboratory:
-    """A Motive that sees one body move, without a plant."""
-
-    def __init__(
-        self, version: tuple[int, int] = (4, 1), multicast: bool = False, markers: bool = False
-    ) -> None:
-        self.readers: Readers = {}
-        places = PLACES if markers else NO_POINTS
-        self.motive = VirtualMotive(Streaming(0, version, multicast), {1: "floaty"}, self.readers, places)
-        self.number = 0
-        self.markers = markers
-
-    def expose(self, valid: bool = True) -> None:
-        self.number += 1
-        frame = seen(self.number)
-        shown = MocapFrame(7_000_000, frame.p_WB, frame.q_WB, valid)
-        sighting = sighted(self.number, valid) if self.markers else None
-        self.motive.take(1, shown, 7_000_000 + LATENCY_US, sighting)
-
-    def answer(self) -> None:
-        """Answer what clients have asked by now."""
-        while ready := select.select(self.readers, (), (), 0)[0]:
-            for reader in ready:
-                self.readers[reader](0)
-
-    def run(self, stopping: Callable[[], bool]) -> None:
-        """Expose at 200 Hz and answer."""
-        deadline = time.monotonic() + 10.0
-        while not stopping():
-            assert time.monotonic() < deadline, "10 s have gone by"
-            self.expose()
-            select.select(self.readers, (), (), PERIOD_S)
-            self.answer()
-
-
 @pytest.fixture
-def lab() -> Iterator[Laboratory]:
-    lab = Laboratory()
+def lab() -> Iterator[MotiveBench]:
+    lab = MotiveBench()
     yield lab
     lab.motive.close()
 
@@ -156,7 +102,7 @@ def lab() -> Iterator[Laboratory]:
 class Client:
     """A bare socket that speaks NatNet."""
 
-    def __init__(self, lab: Laboratory) -> None:
+    def __init__(self, lab: MotiveBench) -> None:
         self._lab = lab
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
@@ -187,7 +133,7 @@ class Client:
 
 
 @pytest.fixture
-def client(lab: Laboratory) -> Iterator[Client]:
+def client(lab: MotiveBench) -> Iterator[Client]:
     client = Client(lab)
     yield client
     client.close()
@@ -195,7 +141,7 @@ def client(lab: Laboratory) -> Iterator[Client]:
 
 @pytest.mark.parametrize("payload", [b"", b"Ping\0", bytes(271)], ids=["empty", "Ping", "with the sender"])
 def test_every_form_of_connect_is_answered_and_frames_follow(
-    lab: Laboratory, client: Client, payload: bytes
+    lab: MotiveBench, client: Client, payload: bytes
 ) -> None:
     client.say(MessageId.CONNECT, payload)
     info = decode(client.hear(), (4, 1))
@@ -209,7 +155,7 @@ def test_every_form_of_connect_is_answered_and_frames_follow(
     assert frame.bodies[0].p == pytest.approx(FROM_MOTIVE.T @ seen(2).p_WB, abs=1e-6)
 
 
-def test_a_frame_is_stamped_with_its_exposure(lab: Laboratory, client: Client) -> None:
+def test_a_frame_is_stamped_with_its_exposure(lab: MotiveBench, client: Client) -> None:
     hz = client.connect().clock_hz
     lab.run(lambda: lab.number >= 20)  # Motive is older than its cameras' latency then
     frames = [decode(client.hear(), (4, 1)) for _ in range(20)]
@@ -222,14 +168,14 @@ def test_a_frame_is_stamped_with_its_exposure(lab: Laboratory, client: Client) -
     assert frames[-1].transmitted <= echo.server < frames[-1].transmitted + hz
 
 
-def test_a_body_that_is_not_tracked_is_marked(lab: Laboratory, client: Client) -> None:
+def test_a_body_that_is_not_tracked_is_marked(lab: MotiveBench, client: Client) -> None:
     client.connect()
     lab.expose(valid=False)
     assert not decode(client.hear(), (4, 1)).bodies[0].valid
 
 
 def test_markers_of_a_body_that_is_not_tracked_have_no_label() -> None:
-    lab = Laboratory(markers=True)
+    lab = MotiveBench(markers=True)
     client = Client(lab)
     client.connect()
     lab.expose(valid=False)
@@ -243,7 +189,7 @@ def test_markers_of_a_body_that_is_not_tracked_have_no_label() -> None:
 
 
 def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
-    lab = Laboratory()
+    lab = MotiveBench()
     lab.motive.close()
     names = {1: "floaty", 2: "floaty2"}
     lab.motive = VirtualMotive(Streaming(0, (3, 1), False), names, lab.readers, PLACES)
@@ -264,7 +210,7 @@ def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
 
 
 def test_bodies_of_one_exposure_share_a_frame() -> None:
-    lab = Laboratory()
+    lab = MotiveBench()
     lab.motive.close()
     lab.motive = VirtualMotive(Streaming(0, (3, 1), False), {1: "floaty", 2: "floaty2"}, lab.readers)
     client = Client(lab)
@@ -280,7 +226,7 @@ def test_bodies_of_one_exposure_share_a_frame() -> None:
     lab.motive.close()
 
 
-def test_the_bitstream_is_changed_for_the_client_that_asks(lab: Laboratory, client: Client) -> None:
+def test_the_bitstream_is_changed_for_the_client_that_asks(lab: MotiveBench, client: Client) -> None:
     client.connect()
     client.say(MessageId.REQUEST, b"Bitstream\0")
     assert client.hear() == packet(MessageId.RESPONSE, b"Bitstream,4.1.0\0")
@@ -294,14 +240,14 @@ def test_the_bitstream_is_changed_for_the_client_that_asks(lab: Laboratory, clie
     assert client.hear() == packet(MessageId.UNRECOGNIZED)
 
 
-def test_frames_end_with_the_disconnect(lab: Laboratory, client: Client) -> None:
+def test_frames_end_with_the_disconnect(lab: MotiveBench, client: Client) -> None:
     client.connect()
     client.say(MessageId.DISCONNECT)
     lab.expose()
     assert client.hears_nothing()
 
 
-def test_one_client_too_many_displaces_the_most_silent_one(lab: Laboratory) -> None:
+def test_one_client_too_many_displaces_the_most_silent_one(lab: MotiveBench) -> None:
     clients = [Client(lab) for _ in range(MAX_CLIENTS + 1)]
     for client in clients[:-1]:
         client.connect()
@@ -313,7 +259,7 @@ def test_one_client_too_many_displaces_the_most_silent_one(lab: Laboratory) -> N
         client.close()
 
 
-def test_what_cannot_be_read_is_counted_and_not_answered(lab: Laboratory, client: Client) -> None:
+def test_what_cannot_be_read_is_counted_and_not_answered(lab: MotiveBench, client: Client) -> None:
     broken = [b"", b"\0", packet(MessageId.FRAME), packet(MessageId.ECHO_REQUEST, b"short")]
     for data in (*broken, packet(MessageId.REQUEST, b"Bitstream")[:-1], b"\xff" * 2048):
         client.send(data)
@@ -321,7 +267,7 @@ def test_what_cannot_be_read_is_counted_and_not_answered(lab: Laboratory, client
     assert client.hears_nothing()
 
 
-def test_no_bytes_stop_the_server(lab: Laboratory, client: Client) -> None:
+def test_no_bytes_stop_the_server(lab: MotiveBench, client: Client) -> None:
     @settings(max_examples=300, deadline=None)
     @given(st.sampled_from([*MessageId, 3000]), st.binary(max_size=40), st.integers(-3, 3))
     def fuzz(message: int, payload: bytes, wrong: int) -> None:
@@ -335,15 +281,9 @@ def test_no_bytes_stop_the_server(lab: Laboratory, client: Client) -> None:
     assert decode(client.hear(), (4, 1)).name == "Motive"
 
 
-def test_a_taken_port_is_said_in_one_line(lab: Laboratory) -> None:
+def test_a_taken_port_is_said_in_one_line(lab: MotiveBench) -> None:
     with pytest.raises(LabError, match=rf"^natnet port {lab.motive.port}: Address already in use$"):
         VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
-
-
-def needs(client: str) -> pytest.MarkDecorator:
-    """Skip where a client is not installed."""
-    missing = importlib.util.find_spec(client) is None
-    return pytest.mark.skipif(missing, reason=f"{client} IS NOT TESTED: `make clients` installs it")
 
 
 @pytest.mark.parametrize(
@@ -352,14 +292,14 @@ def needs(client: str) -> pytest.MarkDecorator:
 @pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
 @pytest.mark.parametrize("version", [(3, 1), (4, 1)], ids=["3.1", "4.1"])
 def test_every_client_sees_the_pose(name: str, multicast: bool, version: tuple[int, int]) -> None:
-    lab = Laboratory(version, multicast, markers=True)
+    lab = MotiveBench(version, multicast, markers=True)
     assert_poses(lab, name, "multicast" if multicast else "unicast", "20")
 
 
 @needs("natnet")
 @pytest.mark.parametrize("version", [(3, 1), (4, 1)], ids=["3.1", "4.1"])
 def test_an_unmodified_client_sees_the_markers(version: tuple[int, int]) -> None:
-    lab = Laboratory(version, markers=True)
+    lab = MotiveBench(version, markers=True)
     (described,), *rows = rows_of_client(lab, "natnet-markers", "unicast", "10")
     names = [f"Marker{number}" if version >= (4, 0) else None for number in range(1, 9)]
     assert [name for name, _ in described] == names
@@ -377,9 +317,9 @@ def test_an_unmodified_client_sees_the_markers(version: tuple[int, int]) -> None
         assert ghosts == pytest.approx(expected.ghosts, abs=1e-6)
 
 
-def rows_of_client(lab: Laboratory, name: str, how: str, count: str) -> list[list[Any]]:
+def rows_of_client(lab: MotiveBench, name: str, how: str, count: str) -> list[list[Any]]:
     """Run a client until it has what it wants; returns what it printed."""
-    script = str(Path(__file__).with_name("natnet_clients.py"))
+    script = str(SUPPORT / "natnet_clients.py")
     command = [sys.executable, script, name, str(lab.motive.port), how, count]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
@@ -393,7 +333,7 @@ def rows_of_client(lab: Laboratory, name: str, how: str, count: str) -> list[lis
     return [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]  # clients chat
 
 
-def assert_poses(lab: Laboratory, name: str, how: str, count: str) -> None:
+def assert_poses(lab: MotiveBench, name: str, how: str, count: str) -> None:
     """The poses that a client has; each is that of the frame that it names, or of one at all."""
     rows = rows_of_client(lab, name, how, count)
     assert len(rows) == int(count)

@@ -1,0 +1,285 @@
+"""The exporter: C that strict compilers accept, laid out as numpy does, and refusals with file, line and reason."""
+
+import ctypes
+import re
+
+import numpy as np
+import pytest
+
+from firmware_py.config import parameters_of
+from firmware_py.core import structs
+from firmware_py.export.c99 import ExportError, Translation, core_texts, translate
+from firmware_py.export.native import Compiler, build, compilers
+from firmware_py.export.profile_c import profile_hash, profile_source
+from firmware_py.export.reading import float_literal
+from hil.config import load_config
+from support.core_streams import BUILD
+
+COMPILERS = [compiler for compiler in compilers() if compiler.name != "cc"]
+IDS = [compiler.name for compiler in COMPILERS]
+C = translate()
+
+PROBE = """\
+from firmware_py.core.structs import Control, Estimator
+from firmware_py.core.subset import F32s, I32s, Integer, Memory, f32, i32, kernel, sqrt
+
+LIMIT = f32(2.0)
+COUNT = 3
+
+
+@kernel
+def written(control: Control) -> bool:
+    \"\"\"Write.\"\"\"
+    control.integral_z = LIMIT
+    return True
+
+
+@kernel
+def probe(x: f32, n: Integer, control: Control) -> f32:
+    \"\"\"Probe.\"\"\"
+    y = x * control.integral_z * f32(n)
+    {body}
+    return y
+"""
+
+
+def translated(body: str, kernel: str = "") -> Translation:
+    """Translate a probe with that body, or with that kernel behind it."""
+    text = PROBE.replace("{body}", body.replace("\n", "\n    ")) + kernel
+    return translate(core_texts() | {"entry": text})
+
+
+def test_the_probe_itself_is_inside_the_subset() -> None:
+    assert (
+        "float floaty_core_probe(float x, int32_t n, const FloatyControl *control)"
+        in translated("y = -y").source
+    )
+
+
+REFUSED = [
+    ("while n > COUNT:\n    y = x", "While statement"),
+    ("a = [x, y]", "List expression"),
+    ("a = (x, y)", "Tuple expression"),
+    ("a = {}", "Dict expression"),
+    ('a = "text"', "literal 'text'"),
+    ("y = x * 0.5", "float literal 0.5 without f32"),
+    ("y = x + n", "Add of f32 and i32"),
+    ("y = x * 2", "Mult of f32 and i32"),
+    ("y = x // y", "FloorDiv of f32"),
+    ("y = x % y", "Mod of f32"),
+    ("y = x ** y", "Pow of f32"),
+    ("a = n / 2", "Div of i32"),
+    ("a = n << 2", "LShift of i32"),
+    ("a = n & 1", "BitAnd of i32"),
+    ("a = ~n", "Invert of i32"),
+    ("a = not n", "Not of i32"),
+    ("y += x", "AugAssign statement"),
+    ("z: f32 = x", "AnnAssign statement"),
+    ("a = b = x", "Assign statement"),
+    ("y = x if n > 0 else y", "IfExp expression"),
+    ("a = 0 < n < 3", "comparison 0 < n < 3"),
+    ("a = x is y", "comparison x is y"),
+    ("a = x < n", "comparison of f32 and i32"),
+    ("if n:\n    y = x", "the condition is i32, not bool"),
+    ("if x > y and n:\n    y = x", "an operand of and/or is i32, not bool"),
+    ("y = n", "y changes its type to i32"),
+    ("if n > 0:\n    z = x\ny = z", "z gets its first value inside a block"),
+    ("y = z\nz = x", "z is read before it has a value"),
+    ("x = y", "x is an argument or a loop variable and is assigned"),
+    ("for i in range(4):\n    i = 2", "i is an argument or a loop variable and is assigned"),
+    ("for i in range(4):\n    y = x\ny = f32(i)", "i is no value here"),
+    ("for i in range(4):\n    for i in range(2):\n        y = x", "loop variable i is in use"),
+    ("for i in range(0, 4, 2):\n    y = x", "a loop runs over range"),
+    ("for i in control.u:\n    y = x", "a loop runs over range"),
+    ("for i in range(4):\n    y = x\nelse:\n    y = -x", "a loop runs over range"),
+    ("for i in range(4):\n    break", "Break statement"),
+    ("try:\n    y = x\nexcept ValueError:\n    y = -x", "Try statement"),
+    ("with x:\n    y = x", "With statement"),
+    ("raise ValueError", "Raise statement"),
+    ("assert x > y", "Assert statement"),
+    ("pass", "Pass statement"),
+    ("global y", "Global statement"),
+    ("del y", "Delete statement"),
+    ("import math", "Import statement"),
+    ("y = lambda: x", "Lambda expression"),
+    ("y = math.sin(x)", "call math.sin(..) is no plain call of a kernel"),
+    ("y = sin(x)", "call of sin, which is no kernel"),
+    ("y = float(x)", "call of float, which is no kernel"),
+    ("y = max(x, y)", "call of max, which is no kernel"),
+    ("y = abs(n)", "abs of is i32, not f32"),
+    ("y = sqrt(n)", "sqrt of is i32, not f32"),
+    ("y = f32(x > y)", "f32(..) of bool"),
+    ("a = bool(n)", "bool(..) of i32"),
+    ("y = f32(1e39)", "f32(1e+39) is no finite 32-bit number"),
+    ("a = i32(3000000000)", "i32(3000000000) is no finite 32-bit number"),
+    ("a = n + 3000000000", "literal 3000000000"),
+    ("y = control.u[0:2]", "slice"),
+    ("y = control.u[-1]", "index -1 is negative or beyond 3"),
+    ("y = control.u[4]", "index 4 is negative or beyond 3"),
+    ("y = control.u[x]", "an index is f32, not i32"),
+    ("y = control.u[0, 1]", "2 indices on f32 array"),
+    ("y = control.integral_z[0]", "1 indices on f32"),
+    ("y = control.nothing", "control.nothing is no field of a struct"),
+    ("y = control.u", "y changes its type to f32 array"),
+    ("control.u[0] = n", "f32 = i32"),
+    ("control.u = control.flap", "f32 array = f32 array"),
+    ("a = control", "local a of type Control"),
+    ("a = written(control) and x > y", "written writes through its arguments"),
+    ("a = written(x)", "control of written gets f32"),
+    ("a = written(control, x)", "written takes 1 arguments"),
+    ("a = written(control=control)", "is no plain call of a kernel"),
+    ("y = probe(x, n, control)", "probe calls itself: recursion"),
+    ("return", "return without f32"),
+    ("return n", "returns i32, not f32"),
+    ("if n > 0:\n    double = x\n    y = double", "double is a word of C"),
+    ("for short in range(4):\n    y = x", "short is a word of C"),
+    ("i_end = n\nfor i in range(i_end):\n    i_end = n + 1", "i_end is a word of C or the end of a loop"),
+]
+
+
+@pytest.mark.parametrize(("body", "reason"), REFUSED, ids=[body for body, _ in REFUSED])
+def test_what_is_outside_the_subset_is_refused_with_file_line_and_reason(body: str, reason: str) -> None:
+    with pytest.raises(ExportError) as refusal:
+        translated(body)
+    match = re.fullmatch(r"firmware_py/core/entry\.py:(\d+): (.*)", str(refusal.value))
+    assert match, refusal.value
+    assert reason in match[2]
+    assert 19 <= int(match[1]) <= 19 + body.count("\n")
+
+
+REFUSED_KERNELS = [
+    ("@kernel\ndef f(x) -> None:\n    '''Do.'''\n", 1, "argument x of f has no type of the subset"),
+    ("@kernel\ndef f(x: float) -> None:\n    '''Do.'''\n", 1, "argument x of f has no type of the subset"),
+    ("@kernel\ndef f(x: f32):\n    '''Do.'''\n", 1, "f has no result type"),
+    ("@kernel\ndef f(x: f32) -> float:\n    '''Do.'''\n", 1, "f has no result type"),
+    ("@kernel\ndef f(x: f32 = LIMIT) -> None:\n    '''Do.'''\n", 1, "f: only plain arguments without defaults"),
+    ("@kernel\ndef f(*x: f32) -> None:\n    '''Do.'''\n", 1, "f: only plain arguments without defaults"),
+    ("@kernel\ndef f(register: f32) -> None:\n    '''Do.'''\n", 1, "register is a word of C"),
+    ("@kernel\ndef f(x: f32) -> None:\n    y = x\n", 1, "no docstring"),
+    ("@kernel\ndef f(x: f32) -> None:\n    '''Do.'''\n    return\n", 1, "argument x is not used"),
+    ("@kernel\ndef f(x: f32) -> f32:\n    '''Do.'''\n    if x > LIMIT:\n        return x\n", 1, "may end without a result"),
+    ("@kernel\ndef f(a: Memory) -> None:\n    '''Do.'''\n", 1, "argument a of f has no type of the subset"),
+    ("@kernel\ndef f(a: Memory[f32]) -> None:\n    '''Do.'''\n", 1, "argument a of f has no type of the subset"),
+    ("def f(x: f32) -> f32:\n    '''Do.'''\n    return x\n", 0, "function f is not marked @kernel alone"),
+    ("@kernel\nasync def f(x: f32) -> f32:\n    '''Do.'''\n", 1, "AsyncFunctionDef at the top of a module"),
+    ("@kernel\ndef f(x: f32) -> f32:\n    '''Do.'''\n    return g(x)\n\n@kernel\ndef g(x: f32) -> f32:\n    '''Do.'''\n"
+     "    return f(x)\n", 3, "g is defined below its caller"),
+    ("HALF = 0.5\n", 0, "constant HALF is neither f32(number) nor a 32-bit integer"),
+    ("HALF = f32(1e39)\n", 0, "constant HALF is neither f32(number) nor a 32-bit integer"),
+    ("class Thing:\n    pass\n", 0, "class Thing is not a Struct"),
+    ("class Thing(Struct):\n    x: float\n", 1, "field type float"),
+    ("class Thing(Struct):\n    x: f32 = 0\n", 1, "a struct has nothing but fields"),
+    ("import math\n", 0, "Import at the top of a module"),
+    ("from math import pi\n", 0, "import from math"),
+    ("from firmware_py.core import entry\n", 0, "cannot import entry"),
+    ("from firmware_py.core.maths import sin as sine\n", 0, "import under another name"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "reason"), REFUSED_KERNELS, ids=[case[2] for case in REFUSED_KERNELS]
+)
+def test_what_is_no_kernel_struct_or_constant_is_refused(text: str, line: int, reason: str) -> None:
+    with pytest.raises(ExportError) as refusal:
+        translated("y = x", text)
+    first = PROBE.count("\n") + 1
+    assert str(refusal.value).startswith(f"firmware_py/core/entry.py:{first + line}: {reason}")
+
+
+@pytest.mark.parametrize("standard", ["-std=c99", "-std=gnu11"])
+@pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
+def test_strict_compilers_accept_the_core_without_a_warning(compiler: Compiler, standard: str) -> None:
+    build(C, BUILD, "-Os", compiler, (standard,))
+    warned = C.source + "\nstatic int32_t never(void) { return 1; }\n"
+    with pytest.raises(ExportError, match="never"):
+        build(Translation(C.header, warned, ()), BUILD, "-Os", compiler, (standard,))
+
+
+def test_the_c_has_no_double_no_library_and_no_memory_of_its_own() -> None:
+    code = re.sub(r"/\*.*?\*/|//[^\n]*", "", C.header + C.source, flags=re.S)
+    assert not re.search(r"\bdouble\b|\bmalloc\b|\bmath\.h|\bsqrtf?\(|\d\.\d+(e-?\d+)?(?![\de.f])", code)
+    assert not re.search(r"^(static (?!const)|(?!typedef|extern|static|#|\}|enum)\w)[^(\n]*;", code, re.M)
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+def test_a_struct_that_is_laid_out_otherwise_does_not_compile() -> None:
+    swapped = C.header.replace("int32_t tick;", "int32_t spare;\n    int32_t tick;")
+    with pytest.raises(ExportError, match="layout_FloatyEstimator"):
+        build(Translation(swapped, C.source, ()), BUILD)
+    for struct in (structs.Parameters, structs.Input, structs.Estimator, structs.Control):
+        assert f"sizeof(Floaty{struct.__name__}) == {struct.dtype.itemsize})" in C.source
+
+
+def test_units_comments_and_docstrings_come_along() -> None:
+    assert "float opening_min;  // [rad]" in C.header
+    assert "/* Start the estimator. */\nvoid floaty_core_reset(" in C.header
+    assert "// eq. (input_signals) inverted: its columns are orthogonal and of length 2" in C.source
+    assert "} else {  // the sensor is silent: the last rates are the best guess" in C.source
+    assert "#define FLOATY_HORIZON_LIMIT 12  // ticks, 120 ms" in C.header
+
+
+def test_arguments_that_are_only_read_are_const_and_private_functions_static() -> None:
+    assert (
+        "void floaty_core_reset(const FloatyParameters *parameters, FloatyEstimator *estimator);" in C.header
+    )
+    assert (
+        "int32_t floaty_core_file_pose(const FloatyParameters *parameters, const FloatyInput *data,\n"
+        in C.header
+    )
+    assert "const FloatyControl *control);" in C.header
+    assert (
+        "static void controller_allocate(const FloatyParameters *parameters, FloatyControl *control) {"
+        in C.source
+    )
+    assert re.findall(r"^\w+ floaty_core_\w+\(|^(?!static)\w+ \w+\(", C.source, re.M) == [
+        "void floaty_core_reset(",
+        "int32_t floaty_core_file_pose(",
+        "void floaty_core_estimate(",
+        "void floaty_core_control(",
+    ]
+
+
+def test_what_is_not_reached_is_left_out_and_the_version_follows_the_sources() -> None:
+    texts = core_texts()
+    texts["servo"] += (
+        '\nSPARE = f32(7.0)\n\n\n@kernel\ndef spare(x: f32) -> f32:\n    """Spare."""\n    return x * SPARE\n'
+    )
+    changed = translate(texts)
+    assert changed.source == C.source
+    assert changed.header != C.header
+
+
+def test_the_end_of_a_range_is_looked_at_once_as_in_python() -> None:
+    source = translated("end = n\nfor i in range(end):\n    end = end - 1\n    y = y + f32(i)").source
+    assert "for (int32_t i = 0, i_end = end; i < i_end; i++) {" in source
+
+
+def test_constants_that_two_modules_define_get_the_modules_name() -> None:
+    assert "static const float MODEL_DT = 0.01f;" in C.source
+    assert "static const float CONTROLLER_DT = 0.01f;" in C.source
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+def test_every_float_literal_is_read_by_the_compiler_as_that_float() -> None:
+    bits = np.random.default_rng(4).integers(0, 2**32, 20_000, np.uint32)
+    values = bits.view(np.float32)[np.isfinite(bits.view(np.float32))]
+    values = np.concatenate([values, np.array([0.0, -0.0, 1e-45, 3.4028235e38, 16777216.0], np.float32)])
+    table = ",\n".join(map(float_literal, values))
+    source = f"extern const float table[];\nconst float table[] = {{\n{table}}};\n"
+    library = ctypes.CDLL(str(build(Translation("", source, ()), BUILD, "-O0")))
+    got = np.ctypeslib.as_array((ctypes.c_float * values.size).in_dll(library, "table"))
+    assert got.tobytes() == values.tobytes()
+
+
+@pytest.mark.parametrize("overrides", [[], ["servo.trim=[1.5, -0.1, 0.3333, 1e-7]", "predictor.age=fixed"]])
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+def test_a_profile_in_c_has_the_bits_of_the_emulators_parameters(overrides: list[str]) -> None:
+    config = load_config(overrides=overrides)
+    library = ctypes.CDLL(str(build(Translation(C.header, profile_source(config), ()), BUILD)))
+    expected, got = parameters_of(config), structs.Parameters.allocate()
+    got.memory.view(np.uint8)[:] = 0xAA
+    library.floaty_core_init(ctypes.c_void_p(got.memory.ctypes.data))
+    assert got.bytes() == expected.bytes()
+    text = profile_hash(config).encode()
+    assert ctypes.string_at(ctypes.addressof(ctypes.c_char.in_dll(library, "floaty_profile_hash"))) == text
+    assert profile_hash(config) != profile_hash(load_config(overrides=["servo.trim=[9, 9, 9, 9]"]))

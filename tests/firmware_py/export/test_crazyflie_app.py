@@ -1,0 +1,573 @@
+"""The Crazyflie app: the same flight as the laboratory's board, on a board of memory and through Debian's ARM compiler."""
+
+import ctypes
+import math
+import os
+import re
+import shutil
+import struct
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
+
+from firmware_py import supervisor as reference
+from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
+from firmware_py.config import SupervisorConfig
+from firmware_py.core.structs import Estimator
+from firmware_py.drivers.imu import GyroZero as PythonGyroZero
+from firmware_py.export.crazyflie import write_app
+from firmware_py.export.errors import ExportError
+from firmware_py.firmware import Firmware
+from firmware_py.wire import WireError, crtp, telemetry
+from hil.config import load_config
+from support.crazyflie_app import STUBS, App, GyroZero, Pose, Supervisor, build_app
+
+ARM = "arm-none-eabi-gcc"
+ARM_FLAGS = (  # of the Crazyflie firmware
+    "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-std=gnu11", "-Os", "-g3", "-Wall",
+    "-Wmissing-braces", "-fno-strict-aliasing", "-ffunction-sections", "-fdata-sections", "-Wdouble-promotion",
+    "-Werror", "-fno-math-errno", "-fno-delete-null-pointer-checks",
+)  # fmt: skip
+BIAS = np.array((12, -7, 3))  # [counts]
+STABILIZER_STACK = 3 * 150 * 4  # [B] of the task that calls the hooks, in an unmodified firmware
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_app(tmp_path_factory.mktemp("app"))
+
+
+@pytest.fixture
+def app(library: Path, tmp_path: Path) -> App:
+    return App(library, tmp_path / "copy.so")
+
+
+@pytest.fixture(scope="module")
+def functions(library: Path) -> App:
+    """An app that no step runs on: for its pure functions."""
+    functions = App(library, library.with_name("functions.so"))
+    functions.boot()
+    return functions
+
+
+class Laboratory:
+    """The laboratory's firmware on plain numbers, without computing time, as the app's stabilizer has none."""
+
+    uart_overruns = 0
+
+    def __init__(self) -> None:
+        self.imu: ImuCounts = (0, 0, 0, 0, 0, 1365)
+        self.battery_mv = 3900
+        self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
+        self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
+        self.counts: list[int] = []
+        config = load_config()
+        costs = dict.fromkeys(type(config.cpu).model_fields, 0)
+        self.firmware = Firmware(config.model_copy(update={"cpu": config.cpu.model_copy(update=costs)}), self)
+        self.parameters = {parameter.name: parameter for parameter in self.firmware.parameters}
+
+    def read_imu(self) -> ImuCounts:
+        return self.imu
+
+    def read_battery_mv(self) -> int:
+        return self.battery_mv
+
+    def write_compare(self, counts: Sequence[int]) -> None:
+        self.counts = list(counts)
+
+    def radio_send(self, data: bytes) -> bool:
+        return True
+
+    def uart_read(self) -> bytes:
+        return b""
+
+    def uart_write(self, data: bytes) -> bool:
+        return True
+
+    def debug_write(self, text: str) -> None:
+        pass
+
+    def advance(self, now_us: int) -> None:
+        while (wake_us := self.firmware.next_wake_us) is not None and wake_us <= now_us:
+            self.firmware.run(wake_us)
+        self.firmware.run(now_us)
+
+
+Event = Callable[[App, Laboratory], None]
+
+
+def pose(data: bytes) -> Event:
+    """A packet with a pose: the whole CRTP packet for the laboratory, its data for the app."""
+
+    def arrive(app: App, laboratory: Laboratory) -> None:
+        app.radio(data[1:])
+        laboratory.firmware.radio_received(data)
+
+    return arrive
+
+
+def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
+    """Poses at 50 Hz along a walk: with ages, without, too old, garbage, jumps, out of bounds; silence and stops."""
+    events: dict[int, list[Event]] = defaultdict(list)
+    p = np.zeros(3)
+    for step in range(600, steps, 20):
+        if 3000 <= step < 3800:  # silence
+            continue
+        p += rng.normal(0, 0.004, 3)
+        p += {1600: (0.0, 1.9, 0.0), 2200: (0.0, -1.9, 0.0), 4500: (0.6, 0.0, 0.2)}.get(step, (0.0, 0.0, 0.0))
+        roll, yaw = rng.normal(0, 0.03, 2)
+        q = (math.sqrt(1 - 0.25 * (roll**2 + yaw**2)), roll / 2, 0.0, yaw / 2)
+        age_us = int(rng.choice([25_000, 40_000, 41_500, 60_000, 126_000]))
+        data = crtp.encode_ext_pose(tuple(p), q, None if rng.random() < 0.1 else age_us)
+        if rng.random() < 0.03:
+            data = data[:2] + bytes(29)
+        just_before_control = step in (600, 3800)  # the first one, and the one that ends the silence
+        events[step + (0 if just_before_control else int(rng.integers(0, 20)))].append(pose(data))
+    header = bytes((crtp.header(6, 1),))
+    events[5207] = [pose(header + b"\x03")]  # emergency stop
+    events[5603] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
+    events[6009] += [pose(header + b"\x04")]  # emergency stop watchdog, not fed again
+    events[7301] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
+    for name, value in (
+        ("extCtrl.x_P", 3.5),
+        ("extCtrl.y_P", 99.0),
+        ("setpoint.Z", 0.2),
+        ("motorShifts.m2", -4000),
+    ):
+        events[2505].append(
+            lambda app, lab, name=name, value=value: (app.set(name, value), lab.parameters[name].set(value))
+        )  # type: ignore[list-item]
+    return events
+
+
+def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -> None:
+    rng = np.random.default_rng(7)
+    laboratory, steps = Laboratory(), 9000
+    events = scenario(rng, steps)
+    app.boot()
+    assert app.counts() == laboratory.counts
+    counts, states, compared, rates = set(), set(), 0, np.zeros(3)
+    for step in range(1, steps):
+        before_us = (step - 1) * 1000
+        if step > 700:
+            rates = 0.98 * rates + rng.normal(0, 30, 3)
+        sample = [int(v) for v in np.rint(rates + BIAS + rng.normal(0, 2, 3))]
+        laboratory.imu = (*sample, 0, 0, 1365)  # type: ignore[assignment]
+        app.gyro[:] = sample
+        laboratory.battery_mv = 3000 if step > 3500 else 3900
+        app.battery.value = laboratory.battery_mv * 1e-3
+        laboratory.advance(before_us + 100)
+        laboratory.firmware.imu_ready()
+        laboratory.advance(before_us + 100)
+        laboratory.advance(before_us + 200)
+        app.now.value = before_us + 200
+        for event in events[step]:
+            event(app, laboratory)
+        laboratory.advance(before_us + 200)
+        laboratory.advance(step * 1000)
+        app.step(step)
+        assert app.counts() == laboratory.counts, f"step {step}"
+        if step % 10 == 9:
+            assert app.estimator() == laboratory.firmware._core.estimator.bytes(), f"step {step}"
+            compared += 1
+        assert (app.supervisor.state, app.supervisor.cause) == (
+            laboratory.firmware._supervisor.state, laboratory.firmware._supervisor.cause,
+        ), f"step {step}"  # fmt: skip
+        counts.add(tuple(app.counts()))
+        states.add((app.supervisor.state, app.supervisor.cause))
+    assert compared > 890
+    assert len(counts) > 300
+    assert states == {(0, 0), (1, 0), (2, 0), (3, 1), (3, 2), (3, 3), (3, 4)}
+    for name in ("fused", "refused", "jumps", "too_old", "bounded"):
+        value = getattr(laboratory.firmware._core.estimator.fields, name)
+        assert app.log(f"kalman.{name}") == value > 0, name
+    shown = {variable.name: variable.read() for variable in laboratory.firmware.variables}
+    state = app.state()
+    assert state == pytest.approx({name: shown[name] for name in state}, rel=1e-6)
+    assert abs(state["stateEstimate.pitch"]) > 0.5  # [deg]
+
+
+def test_servos_hang_on_the_originals_pins_at_400_hz(app: App) -> None:
+    app.boot()
+    tim3, tim5 = app.timers
+    for timer in (tim3, tim5):
+        assert 84e6 / (timer.PSC + 1) == 21e6
+        assert timer.ARR == 52500
+        assert timer.CR1 == 0x81  # counting, reload preloaded
+    assert (tim3.CCMR1, tim5.CCMR2) == (0x6868, 0x6868)  # PWM mode 1 with preload
+    assert (tim3.CCER, tim5.CCER) == (0x0011, 0x1100)  # active high
+    a, b = app.pins
+    for port, pin in ((a, 2), (a, 3), (b, 4), (b, 5)):
+        assert port.MODER >> 2 * pin & 3 == 2  # alternate function
+        assert port.OTYPER >> pin & 1 == 1  # open drain
+        assert port.AFR[0] >> 4 * pin & 15 == 2  # TIM3..5
+    assert a.MODER == 0b10100000  # no other pin
+
+
+def flying(app: App, until: int = 1200) -> None:
+    app.boot()
+    data = crtp.encode_ext_pose((0.01, -0.02, 0.05), (1.0, 0.0, 0.0, 0.0), 40_000)[1:]
+    for step in range(1, until):
+        if step % 20 == 1:
+            app.radio(data)
+        app.step(step)
+    assert app.supervisor.state == reference.State.FLYING
+
+
+def test_a_loop_that_stands_still_puts_the_servos_to_hover(app: App) -> None:
+    app.boot()
+    hover = app.counts()
+    flying(app)
+    assert app.counts() != hover
+    app.now.value += 30_000
+    app.c.stub_run_app(1)
+    assert app.counts() != hover
+    app.now.value += 30_000
+    app.c.stub_run_app(3)
+    assert app.counts() == hover
+    assert app.log("floaty.staleHovers") == 1
+
+
+def test_the_firmwares_own_emergency_stop_stops_floaty(app: App) -> None:
+    app.boot()
+    hover = app.counts()
+    flying(app)
+    app.locked.value = 1
+    for step in range(1200, 1211):
+        app.step(step)
+    assert app.counts() == hover
+    app.c.stub_run_app(1)
+    assert app.console().endswith("supervisor: failsafe, emergency stop\n")
+
+
+def test_poses_come_through_the_app_channel_too(app: App) -> None:
+    app.boot()
+    for step in range(1, 100):
+        if step == 53:
+            app.app_channel(crtp.encode_ext_pose((0.1, 0.2, 0.3), (1.0, 0.0, 0.0, 0.0), 20_000)[1:])
+        app.step(step)
+    assert app.log("kalman.fused") == 1
+    assert app.log("locSrv.age") == pytest.approx(270)  # 20 ms, and 7 to the next step
+
+
+def test_a_gyro_without_raw_counts_leaves_the_flaps_at_hover(app: App) -> None:
+    app.gyro_known.value = 0
+    app.boot()
+    assert not app.c.estimatorOutOfTreeTest()
+    hover = app.counts()
+    for step in range(1, 700):
+        app.step(step)
+    assert app.supervisor.state == reference.State.CALIBRATING
+    assert app.counts() == hover
+    assert "no raw gyro counts" in app.console()
+
+
+RENAMED = {
+    "floaty.stop": "stabilizer.stop", "floaty.armed": None, "floaty.reset": "FloatyKalm.resetKalman",
+    "FloatyKalm.maxPos": "kalman.maxPos", "FloatyKalm.maxVel": "kalman.maxVel",
+}  # fmt: skip
+
+
+def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App) -> None:
+    laboratory = Laboratory()
+    app.boot()
+    for name, index in app.params.items():
+        twin = laboratory.parameters.get(RENAMED.get(name, name) or "")
+        if twin is None:
+            assert name == "floaty.armed"
+            continue
+        assert app.c.stub_param_type(index) == twin.scalar.parameter_number, name
+        assert app.get(name) == twin.read(), name
+        if name != "floaty.reset":
+            assert app.c.stub_param_persistent(index) == twin.persistent, name
+
+
+@given(data=st.data())
+def test_the_board_takes_just_the_parameter_values_that_the_laboratory_takes(
+    functions: App, data: st.DataObject
+) -> None:
+    laboratory = LABORATORY
+    names = sorted(name for name in functions.params if name in laboratory.parameters)
+    name = data.draw(st.sampled_from(names))
+    twin = laboratory.parameters[name]
+    if twin.scalar.parameter_number == 6:
+        value = data.draw(st.floats(width=32) | st.sampled_from([twin.minimum, twin.maximum]))
+        value = float(np.float32(value))
+    else:
+        value = data.draw(st.integers(0, 255) if twin.scalar.size == 1 else st.integers(0, 32767))
+    assume(not (twin.minimum != value and abs(value - twin.minimum) < 1e-6))
+    assume(not (twin.maximum != value and abs(value - twin.maximum) < 1e-6))
+    before = functions.get(name)
+    functions.set(name, value)
+    accepted = twin.minimum <= value <= twin.maximum
+    assert functions.get(name) == (value if accepted else before)
+
+
+def test_two_names_of_one_parameter_follow_each_other(app: App) -> None:
+    app.boot()
+    app.set("setpoint.Yaw", 0.5)
+    assert app.get("extCtrl.target_yaw") == 0.5
+    app.set("extCtrl.target_yaw", -1.0)
+    assert app.get("setpoint.Yaw") == -1.0
+    app.set("setpoint.Yaw", math.nan)
+    assert app.get("setpoint.Yaw") == -1.0
+
+
+def test_log_variables_have_names_of_the_laboratory(app: App) -> None:
+    known = {variable.name for variable in Laboratory().firmware.variables}
+    assert {name for name in app.logs if not name.startswith("floaty.")} <= known
+    stock = "stateEstimate.x y z vx vy vz roll pitch yaw".replace(" ", " stateEstimate.").split()
+    of_the_firmware = {*stock, "motor.m1", "motor.m2", "motor.m3", "motor.m4"}
+    wanted = {variable.name for block in telemetry.BLOCKS for variable in block.variables}
+    assert wanted - of_the_firmware <= set(app.logs)
+    assert not of_the_firmware & set(app.logs)  # no name twice
+
+
+# The pure parts against their Python originals
+
+OPERATIONS = st.one_of(
+    st.tuples(st.just("mode"), st.integers(0, 600_000), st.integers(0, 1)),
+    st.tuples(st.just("bounded"), st.sampled_from([10_000, 49_000, 50_000, 51_000]), st.integers(1, 24)),
+    st.tuples(st.just("pose"), st.integers(0, 300_000), st.just(0)),
+    st.tuples(st.just("calibrated"), st.just(0), st.just(0)),
+    st.tuples(st.just("stop"), st.just(0), st.just(0)),
+    st.tuples(st.just("feed"), st.integers(0, 300_000), st.just(0)),
+    st.tuples(st.just("arm"), st.just(0), st.integers(0, 1)),
+    st.tuples(st.just("recover"), st.integers(0, 10_000), st.just(0)),
+    st.tuples(st.just("battery"), st.integers(0, 3_000_000), st.integers(3000, 3400)),
+    st.tuples(st.just("manual"), st.just(0), st.integers(0, 2)),
+)
+
+
+FLIGHT = [("calibrated", 0, 0), ("pose", 0, 0)]
+
+
+@example([*FLIGHT, ("bounded", 10_000, 24), ("pose", 0, 0), *[("mode", 50_000, 0)] * 11])
+@example([*FLIGHT, ("bounded", 50_000, 7), *[("mode", 50_000, 0)] * 2])
+@example([*FLIGHT, ("bounded", 51_000, 7), *[("mode", 50_000, 0)] * 2])
+@given(st.lists(OPERATIONS, max_size=60))
+def test_supervisor_decides_as_the_laboratorys(
+    functions: App, operations: list[tuple[str, int, int]]
+) -> None:
+    config = SupervisorConfig(pose_timeout_us=500_000, low_battery_mv=3200)
+    estimator = SimpleNamespace(bounded=0)
+    python = reference.Supervisor(config, estimator, lambda text: None)
+    c, here = functions.c, Supervisor()
+    c.floaty_supervisor_init(ctypes.byref(here), config.pose_timeout_us, config.low_battery_mv)
+    now = 0
+    steps = (
+        step
+        for name, wait_us, value in operations
+        for step in ([("mode", wait_us, 1)] * value if name == "bounded" else [(name, wait_us, value)])
+    )
+    for name, wait_us, value in steps:
+        now += wait_us
+        this = ctypes.byref(here)
+        if name == "mode":
+            estimator.bounded += value
+            assert c.floaty_supervisor_mode(this, now, estimator.bounded) == python.mode(now)
+            assert (here.state, here.cause) == (python.state, python.cause)
+        elif name == "pose":
+            python.last_pose_us = here.last_pose_us = now
+            here.pose_seen = 1
+        elif name == "calibrated":
+            python.calibrated, here.calibrated = True, 1
+        elif name == "stop":
+            python.emergency_stop()
+            here.stopped = 1
+        elif name == "feed":
+            python.feed_watchdog(now)
+            c.floaty_supervisor_feed_watchdog(this, now)
+        elif name == "arm":
+            assert c.floaty_supervisor_arm(this, bool(value)) == python.arm(bool(value))
+        elif name == "recover":
+            assert c.floaty_supervisor_recover(this, now) == python.recover(now)
+        elif name == "battery":
+            python.see_battery(now, value)
+            c.floaty_supervisor_see_battery(this, now, value)
+        else:
+            python.manual, here.manual = reference.Manual(value), value
+
+
+FLOATS = st.floats(width=32) | st.floats(-1.25, 1.25, width=32)
+
+
+@given(
+    st.binary(max_size=31)
+    | st.builds(
+        lambda floats, rest: struct.pack("<B7f", 8, *floats) + rest,
+        st.lists(FLOATS, min_size=7, max_size=7),
+        st.binary(max_size=2),
+    )
+)
+def test_poses_are_read_as_the_laboratory_reads_them(functions: App, data: bytes) -> None:
+    here = Pose()
+    if len(data) >= 29:
+        norm2 = sum(value * value for value in struct.unpack_from("<4f", data, 13))
+        assume(not any(abs(norm2 - limit) < 1e-5 for limit in (0.81, 1.21)))
+    understood = functions.c.floaty_pose_decode(data, len(data), 123, ctypes.byref(here))
+    try:
+        there = crtp.decode_ext_pose(data)
+    except WireError:
+        assert not understood
+        return
+    assert understood
+    assert (tuple(here.position), tuple(here.quaternion)) == (there.p_GB, there.q_GB)
+    assert here.age_us == (-1 if there.age_us is None else there.age_us)
+    assert here.arrival_us == 123
+
+
+@pytest.mark.parametrize("noise", [0.0, 3.0, 95.0, 99.0, 101.0, 105.0, 4000.0])
+def test_the_gyros_zero_is_that_of_the_laboratory(functions: App, noise: float) -> None:
+    rng = np.random.default_rng(3)
+    here, there, bias = GyroZero(), PythonGyroZero(), (ctypes.c_float * 3)()
+    for _ in range(1600):
+        sample = [int(v) for v in np.clip(rng.normal((40, -3, 7), noise + 1e-9), -32768, 32767)]
+        expected = there.bias is None and there.add((*sample, 0, 0, 0))  # type: ignore[arg-type]
+        assert (
+            functions.c.floaty_gyro_zero_add(ctypes.byref(here), (ctypes.c_int32 * 3)(*sample), bias)
+            == expected
+        )
+    assert tuple(bias) == (there.bias or (0.0, 0.0, 0.0))
+    assert here.windows_refused == there.windows_refused
+
+
+# The folder and its build for the board
+
+
+def test_only_an_empty_folder_or_an_app_is_written_to(tmp_path: Path) -> None:
+    config = load_config()
+    assert len(write_app(config, "floaty", tmp_path / "new")) == len(
+        write_app(config, "floaty", tmp_path / "new")
+    )
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("mine")
+    with pytest.raises(ExportError, match="neither empty nor an app"):
+        write_app(config, "floaty", tmp_path / "full")
+    with pytest.raises(ExportError, match=r"thesis\.tex"):
+        write_app(config, "floaty", tmp_path / "full" / "thesis.tex")
+
+
+def test_every_source_is_built_and_every_include_is_there(tmp_path: Path) -> None:
+    write_app(load_config(), "floaty", tmp_path)
+    kbuild = (tmp_path / "src" / "Kbuild").read_text()
+    objects = {name.removesuffix(".o") for name in re.findall(r"^obj-y \+= (\S+)$", kbuild, re.M)}
+    assert objects == {path.stem for path in (tmp_path / "src").glob("*.c")}
+    for path in (tmp_path / "src").iterdir():
+        for name in re.findall(r'#include "(\S+)"', path.read_text()):
+            assert (tmp_path / "src" / name).is_file() or (STUBS / name).is_file(), name
+
+
+def test_the_stubs_are_as_the_firmwares_headers(tmp_path: Path) -> None:
+    zig = (sys.executable, "-m", "ziglang", "cc", "-target", "thumb-freestanding-eabihf", "-fshort-enums")
+    caches = dict.fromkeys(("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR"), str(tmp_path))
+    built = subprocess.run(
+        (*zig, "-std=gnu11", "-Wall", "-Werror", "-c", STUBS / "facts.c", "-o", tmp_path / "facts.o"),
+        env=os.environ | caches, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+
+
+@pytest.mark.parametrize("header", sorted(STUBS.glob("*.h")), ids=lambda header: header.name)
+def test_the_stubs_declare_nothing_that_the_facts_do_not_state(header: Path) -> None:
+    words_of_c = "typedef enum union extern inline return packed section used aligned format printf opaque"
+    only_in_stubs = (
+        r"stub_\w+|\w+_PLACE|(LOG|PARAM)_ADD_(GROUP|FULL)|(sensorData|setpoint)_s|__(logs|params)_|stop_"
+    )
+    declared = {
+        name
+        for name in names_in(header.read_text()) - names_in((STUBS / "facts.c").read_text())
+        if not re.fullmatch(only_in_stubs, name)
+    }
+    assert declared - set(words_of_c.split()) == set()
+
+
+def names_in(c: str) -> set[str]:
+    """The identifiers of a C source, without those of comments, texts, directives and macros' parameters."""
+    c = re.sub(r'/\*(.|\n)*?\*/|"[^"\n]*"|#(pragma|include|if|else|endif).*', "", c)
+    parameters = {
+        name for listed in re.findall(r"#define \w+\(([^)]*)\)", c) for name in re.findall(r"\w+", listed)
+    }
+    return set(re.findall(r"(?<!\w)[A-Za-z_]\w*", c)) - parameters
+
+
+@pytest.fixture(scope="module")
+def arm_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if shutil.which(ARM) is None:
+        pytest.skip(f"no {ARM} here: apt-get install gcc-arm-none-eabi")
+    folder = tmp_path_factory.mktemp("arm")
+    write_app(load_config(), "floaty", folder)
+    kbuild = (folder / "src" / "Kbuild").read_text()
+    for name in re.findall(r"^obj-y \+= (\S+)$", kbuild, re.M):
+        own = re.findall(rf"^CFLAGS_{re.escape(name)} := (.*)$", kbuild, re.M)
+        flags = (*ARM_FLAGS, *" ".join(own).split(), "-fcallgraph-info=su", f"-I{STUBS}")
+        subprocess.run((ARM, *flags, "-c", name.replace(".o", ".c")), cwd=folder / "src", check=True)
+    return folder / "src"
+
+
+def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) -> None:
+    objects = sorted(map(str, arm_build.glob("*.o")))
+    lines = subprocess.run(
+        ("arm-none-eabi-size", "-t", *objects), capture_output=True, text=True, check=True
+    ).stdout
+    text, data, bss = map(int, lines.splitlines()[-1].split()[:3])
+    sections = subprocess.run(
+        ("arm-none-eabi-objdump", "-h", *objects), capture_output=True, text=True, check=True
+    ).stdout
+    stack = {
+        name: deepest_stack(arm_build)[name]
+        for name in ("estimatorOutOfTree", "controllerOutOfTree", "appMain")
+    }
+    print(f"flash {text + data} B, RAM {data + bss} B, stack {stack} B")
+    assert text + data < 20_000
+    assert data + bss < 10_000
+    assert "ccm" not in sections.lower()
+    assert max(stack.values()) < STABILIZER_STACK // 2
+
+
+def test_the_core_on_arm_neither_fuses_nor_computes_in_double(arm_build: Path) -> None:
+    code = subprocess.run(
+        ("arm-none-eabi-objdump", "-d", str(arm_build / "floaty_core.o")), capture_output=True, text=True, check=True
+    ).stdout  # fmt: skip
+    assert "vsqrt.f32" in code
+    assert not re.findall(r"vfn?m[as]\.", code)
+    everything = sorted(map(str, arm_build.glob("*.o")))
+    symbols = subprocess.run(
+        ("arm-none-eabi-nm", "-u", *everything), capture_output=True, text=True, check=True
+    ).stdout
+    assert not re.findall(
+        r"__aeabi_[dfl]?2?d\w*", symbols.replace("__aeabi_ldivmod", "").replace("__aeabi_idiv", "")
+    )
+
+
+def deepest_stack(folder: Path) -> dict[str, int]:
+    """Bytes of stack from each function of the app down, from gcc's call graphs; unknown functions count nothing."""
+    frames: dict[str, int] = {}
+    calls: dict[str, set[str]] = defaultdict(set)
+    for path in folder.glob("*.ci"):
+        text = path.read_text()
+        for title, label in re.findall(r'node: \{ title: "([^"]+)" label: "([^"]+)"', text):
+            size = re.search(r"(\d+) bytes", label)
+            if size:
+                frames[title] = int(size[1])
+        for caller, callee in re.findall(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"', text):
+            calls[caller].add(callee)
+
+    def depth(name: str) -> int:
+        return frames.get(name, 0) + max(
+            (depth(callee) for callee in calls[name] if callee in frames), default=0
+        )
+
+    return {name.split(":")[-1]: depth(name) for name in frames}
+
+
+LABORATORY = Laboratory()
+assert Estimator.dtype.itemsize % 4 == 0

@@ -1,0 +1,151 @@
+"""The exported C gives Python's bits in whole flights and on arbitrary bits, and a changed operator shows."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_py.core.structs import Control
+from firmware_py.export.c99 import Translation, translate
+from firmware_py.export.errors import ExportError
+from firmware_py.export.native import Compiler, build, compilers, find_compiler
+from support import core_streams
+from support.core_streams import (
+    BUILD,
+    Recording,
+    first_difference,
+    record_flight,
+    record_plausible,
+    record_wild,
+)
+from support.paths import ROOT, TESTS
+
+LONG = bool(os.environ.get("FLOATY_LONG"))
+C = translate()
+COMPILERS = [compiler for compiler in compilers() if compiler.name != "cc"]
+IDS = [compiler.name for compiler in COMPILERS]
+GCC = next((compiler for compiler in COMPILERS if compiler.name == "gcc"), None)
+gcc_only = pytest.mark.skipif(GCC is None, reason="no gcc")
+
+pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+
+
+@pytest.fixture(scope="module")
+def flight() -> Recording:
+    return record_flight(6.0)
+
+
+@pytest.fixture(scope="module")
+def wild() -> Recording:
+    return record_wild(2026, 2_000)
+
+
+@pytest.fixture(scope="module")
+def plausible() -> Recording:
+    return record_plausible(2027, 1_000)
+
+
+@pytest.mark.parametrize("optimisation", ["-O0", "-O2", "-O3"])
+@pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
+def test_c_gives_the_bits_of_python_in_every_call_of_a_flight_and_on_arbitrary_bits(
+    compiler: Compiler, optimisation: str, flight: Recording, plausible: Recording, wild: Recording
+) -> None:
+    library = build(C, BUILD, optimisation, compiler)
+    assert len(flight.steps) > 1500
+    assert first_difference(flight, library) is None
+    assert first_difference(plausible, library) is None
+    assert first_difference(wild, library) is None
+
+
+@gcc_only
+@pytest.mark.skipif("fma" not in Path("/proc/cpuinfo").read_text(), reason="this processor cannot fuse")
+def test_the_file_itself_forbids_fused_multiplications(flight: Recording) -> None:
+    fusing = ("-std=gnu11", "-mfma", "-ffp-contract=fast")
+    assert first_difference(flight, build(C, BUILD, "-O2", GCC, fusing)) is None
+    free = C.source.replace('#pragma GCC optimize("fp-contract=off")', "")
+    assert free != C.source
+    assert (
+        first_difference(flight, build(Translation(C.header, free, ()), BUILD, "-O2", GCC, fusing))
+        is not None
+    )
+
+
+ARITHMETIC = re.compile(r" ([-+*/]) ")
+INTEGERS = re.compile(r"tick|turns|int32_t|row|word|LAYOUT|enum|^[#/ ]\*|\+ 1;|COUNT")
+
+
+def changeable(source: str) -> list[int]:
+    """Return where the float operators stand: outside indices, and not in lines of integer arithmetic."""
+    places, start = [], 0
+    for line in source.splitlines(keepends=True):
+        code = line.split("//")[0]
+        if code.startswith("    ") and not INTEGERS.search(code):
+            operators = (match.start(1) for match in ARITHMETIC.finditer(code))
+            places += [start + at for at in operators if code[:at].count("[") == code[:at].count("]")]
+        start += len(line)
+    return places
+
+
+@pytest.mark.parametrize("count", [8, pytest.param(60, marks=pytest.mark.long)])
+def test_a_changed_operator_is_caught(plausible: Recording, wild: Recording, count: int) -> None:
+    places = changeable(C.source)
+    assert len(places) > 100
+    chosen = np.random.default_rng(7).choice(places, count, replace=False)
+    for place in map(int, chosen):
+        other = {"+": "-", "-": "+", "*": "+", "/": "*"}[C.source[place]]
+        changed = Translation(C.header, C.source[:place] + other + C.source[place + 1 :], C.functions)
+        library = build(changed, BUILD, "-O0")
+        caught = any(first_difference(recording, library) is not None for recording in (plausible, wild))
+        line = C.source.count("\n", 0, place) + 1
+        assert caught, f"floaty_core.c:{line}: {C.source.splitlines()[line - 1].strip()} with {other}"
+
+
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_arbitrary_bits_give_equal_bits_and_counts_inside_the_servo_limits(seed: int) -> None:
+    recording = record_wild(seed, 120)
+    assert first_difference(recording, build(C, BUILD, "-O2")) is None
+    at = Control.dtype.fields["count"][1] - Control.dtype.itemsize  # from the end
+    for step, after in zip(recording.steps, recording.after, strict=True):
+        if step.call == "control":
+            counts = np.frombuffer(after[at : at + 16], np.int32)
+            assert ((counts >= 21_000) & (counts <= 42_000)).all(), counts
+
+
+def in_a_process(library: Path, seed: int) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "ignore", core_streams.__file__, str(library), str(seed)]
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{TESTS}"}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+@gcc_only
+def test_arbitrary_bits_meet_no_undefined_behaviour_and_an_unclamped_conversion_is_one() -> None:
+    flags = ("-fsanitize=undefined,float-cast-overflow,bounds-strict", "-fsanitize-undefined-trap-on-error")
+    done = in_a_process(build(C, BUILD, "-O0", GCC, flags), 3)
+    assert done.stdout == "done\n", done.stderr
+    start = C.source.index("(int32_t)maths_clamp(")
+    end = C.source.index(", 0.0f", start)
+    close = C.source.index(");", end)
+    free = C.source[:start] + "(int32_t)(" + C.source[start:end].split("maths_clamp(")[1] + C.source[close:]
+    broken = Translation(C.header, free, C.functions)
+    done = in_a_process(build(broken, BUILD, "-O0", GCC, (*flags, "-Wno-unused")), 3)
+    assert done.returncode < 0
+    assert done.stdout == ""
+
+
+def test_a_missing_compiler_is_one_line_that_says_what_to_install() -> None:
+    with pytest.raises(ExportError, match=r"no C compiler tcc on this machine: .*pip install .*ziglang"):
+        find_compiler("tcc")
+
+
+def test_a_library_that_is_there_is_not_compiled_again(tmp_path: Path) -> None:
+    library = build(C, tmp_path, "-O0")
+    made = library.stat().st_mtime_ns
+    assert build(C, tmp_path, "-O0").stat().st_mtime_ns == made
+    assert build(C, tmp_path, "-O1") != library

@@ -1,0 +1,693 @@
+"""The CRTP services on board, byte for byte; cflib's own classes read the tables and memories."""
+
+import ctypes
+import errno
+import json
+import struct
+from collections import Counter
+from math import inf, nan
+from zlib import crc32
+
+import numpy as np
+import pytest
+from cflib.crazyflie.log import LogTocElement
+from cflib.crazyflie.mem.i2c_element import I2CElement
+from cflib.crazyflie.mem.ow_element import OWElement
+from cflib.crazyflie.param import ParamTocElement
+from cflib.utils.encoding import compress_quaternion
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from firmware_py.config import parameters_of
+from firmware_py.links.console import pieces
+from firmware_py.links.crtp_stack import PORT_QUEUE
+from firmware_py.links.storage import ParameterStorage
+from firmware_py.wire import crtp, telemetry
+from firmware_py.wire.localisation import unpack_quaternion
+from firmware_py.wire.scalars import LOG_SCALARS, Scalar
+from firmware_py.wire.toc import Toc
+from hil.config import load_config
+from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, Client
+from support.firmware_bench import HOVER_COUNTS
+from support.paths import VECTORS
+
+C_TYPES = {
+    Scalar.U8: ctypes.c_uint8, Scalar.U16: ctypes.c_uint16, Scalar.U32: ctypes.c_uint32,
+    Scalar.I8: ctypes.c_int8, Scalar.I16: ctypes.c_int16, Scalar.I32: ctypes.c_int32,
+}  # fmt: skip
+
+
+IDLE_TASKS = (
+    "SYSLINK",
+    "CRTP-RX",
+    "CRTP-TX",
+    "LOG",
+    "PARAM",
+    "MEM",
+    "TELEMETRY",
+    "CONSOLE",
+    "CRTP-SRV",
+    "APP",
+)
+
+
+@pytest.fixture
+def client() -> Client:
+    return Client()
+
+
+@pytest.fixture(scope="module")
+def params() -> dict[str, tuple[int, int]]:
+    return Client().toc(PARAM)
+
+
+@pytest.fixture(scope="module")
+def logs() -> dict[str, tuple[int, int]]:
+    return Client().toc(LOG)
+
+
+# Link and platform
+
+
+@given(st.binary(max_size=30))
+@settings(max_examples=20, deadline=None)
+def test_echo_is_exact(data: bytes) -> None:
+    assert Client().one(LINK, 0, data) == data
+
+
+def test_a_client_finds_the_crazyflie_protocol_version_12(client: Client) -> None:
+    assert client.one(LINK, 1, b"\0") == b"Bitcraze Crazyflie".ljust(30, b"\0")
+    assert client.one(PLATFORM, 1, b"\0") == b"\0\x0c\0\0\0"
+    assert client.one(PLATFORM, 1, b"\2") == b"\2C21F\0"
+    assert client.ask(LINK, 2, b"swallowed") == client.ask(LINK, 3, b"") == []
+
+
+def test_application_channel_echoes_and_counts_what_it_loses(client: Client) -> None:
+    assert client.one(PLATFORM, 2, bytes(range(30))) == bytes(range(30))
+    client.radio_open = False
+    for number in range(200):  # 120 wait for the radio, 10 for the application
+        client.send(PLATFORM, 2, bytes((number,)))
+        client.run(client.now_us + 2000)
+    client.radio_open = True
+    client.run(client.now_us + 200_000)
+    echoed = [data[0] for data in client.packets(PLATFORM, 2)][1:]
+    assert echoed == list(range(len(echoed)))
+    assert 130 <= len(echoed) < 200
+    assert client.log(client.toc(LOG), "app.overflows") == [200 - len(echoed)]
+
+
+def test_setpoints_and_notify_stop_are_accepted_without_effect(client: Client) -> None:
+    before = client.writes[-1][1]
+    for port, channel, data in ((3, 0, bytes(14)), (7, 1, b"\0" * 5), (7, 0, b"\0")):
+        assert client.ask(port, channel, data) == []
+    client.run(client.now_us + 20_000)
+    assert client.writes[-1][1] == before
+    assert client.firmware.link.malformed == client.firmware.link.unserved == 0
+
+
+# Tables of contents
+
+
+@pytest.mark.parametrize(("port", "element"), [(LOG, LogTocElement), (PARAM, ParamTocElement)])
+def test_cflib_reads_every_entry_of_the_table(client: Client, port: int, element: type) -> None:
+    count = struct.unpack_from("<H", client.one(port, 0, b"\3"), 1)[0]
+    names = []
+    for number in range(count):
+        entry = element(number, client.one(port, 0, struct.pack("<BH", 2, number))[3:])
+        names.append(f"{entry.group}.{entry.name}")
+        assert len(entry.group) + len(entry.name) <= 24
+    assert count > 60
+    assert max(Counter(names).values()) == 1
+    assert client.one(port, 0, struct.pack("<BH", 2, count)) == b"\2"
+
+
+def test_the_two_tables_have_different_checksums(client: Client) -> None:
+    log, param = (struct.unpack_from("<I", client.one(port, 0, b"\3"), 3)[0] for port in (LOG, PARAM))
+    assert log != param
+    assert Toc.of(LOG, [(1, "a.b")]).crc != Toc.of(PARAM, [(1, "a.b")]).crc  # even of equal tables
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("stateEstimate." + name for name in ("x", "vz", "roll", "roll_rate", "qw", "flap_1")),
+        *("stabilizer." + name for name in ("roll", "pitch", "yaw", "thrust")),
+        *("pm.vbat", "pm.state", "motor.m1", "motor.m4", "supervisor.info", "sys.canfly", "gyro.x", "acc.z"),
+        *(
+            "controller.m1",
+            "motors_ctrp.m1",
+            "kalman.stateX",
+            "locSrv.x",
+            "memTst.errCntW",
+            "Error.int_z_err",
+        ),
+    ],
+)
+def test_log_variable_that_clients_look_for_is_there(logs, name: str) -> None:
+    assert name in logs
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("extCtrl." + name for name in ("manual", "target_yaw", "x_P", "yaw_rate_P", "m1")),
+        *("delayComp.activate", "motorShifts.m1", "motorPowerSet.enable", "kalman.maxPos", "setpoint.X"),
+        *("RandConsts.flapHoverAng", "stabilizer.stop", "FloatyKalm.resetKalman", "system.selftestPassed"),
+        *("deck.bcFloaty", "firmware.revision0", "cpu.flash", "imu_sensors.BMP3XX", "sound.effect"),
+        *("ring.effect", "memTst.resetW", "telemetry.stream"),
+    ],
+)
+def test_parameter_that_clients_look_for_is_there(params, name: str) -> None:
+    assert name in params
+
+
+# Log
+
+
+def test_the_stream_is_byte_for_byte_what_the_same_log_blocks_give(client: Client, logs) -> None:
+    client.poses(605_000, 1_500_000, (0.01, 0.02, -0.03))
+    client.stream(900_000)
+    client.run(1_000_000)
+    for number, block in enumerate(telemetry.BLOCKS):
+        for variable in block.variables:
+            assert logs[variable.name][1] == variable.type.log_number
+            unit = "deg" if variable.scale else variable.unit
+            assert client.firmware.variables[logs[variable.name][0]].unit == unit
+        assert client.create(number, *(logs[variable.name][::-1] for variable in block.variables[:8])) == 0
+        rest = b"".join(struct.pack("<BH", *logs[variable.name][::-1]) for variable in block.variables[8:])
+        assert client.one(LOG, 1, bytes((7, number)) + rest) == bytes((7, number, 0))
+    client.run(1_200_000)
+    for number in range(len(telemetry.BLOCKS)):
+        client.send(LOG, 1, bytes((3, number, 2)))
+    client.sent.clear()
+    client.run(1_400_000)
+    rows = client.packets(LOG, 2)
+    for number, block in enumerate(telemetry.BLOCKS):
+        ours = [row[1:] for row in rows if row[0] == number]
+        streamed = [row[1:] for row in rows if row[0] == block.id]
+        assert len(ours) >= 9
+        assert ours == [row for row in streamed if row[:3] in {other[:3] for other in ours}]
+
+
+def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_firmware_shows_them(
+    client: Client,
+) -> None:
+    qx, qy, qz, qw = (
+        Rotation.from_euler("ZYX", (15, 10, 5), degrees=True).as_quat().tolist()
+    )  # the nose is down
+    data = crtp.encode_ext_pose((0.0, 0.0, 0.0), (qw, qx, qy, qz), 40_000)
+    client.events.at(605_000, lambda now_us: client.firmware.radio_received(data))
+    client.run(650_000)
+    shown = {variable.name: variable.read() for variable in client.firmware.variables}
+    quaternion = [shown[f"stateEstimate.{name}"] for name in ("qx", "qy", "qz", "qw")]
+    yaw, pitch, roll = Rotation.from_quat(quaternion).as_euler("ZYX", degrees=True)
+    assert min(yaw, pitch, roll) > 4
+    for group in ("stateEstimate", "stabilizer"):
+        angles = [shown[f"{group}.{name}"] for name in ("roll", "pitch", "yaw")]
+        assert angles == pytest.approx([roll, -pitch, yaw], rel=1e-5)
+
+
+def test_stream_is_a_parameter_that_can_be_switched_off_and_on(client: Client, params) -> None:
+    for value, count in ((1, 25), (0, 0), (1, 25)):
+        assert client.write(params, telemetry.STREAM, value) == value
+        client.run(client.now_us // 20_000 * 20_000 + 30_000)
+        client.sent.clear()
+        client.run(client.now_us + 500_000)
+        assert len(client.packets(LOG, 2)) == count * len(telemetry.BLOCKS)
+
+
+def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: Client, logs) -> None:
+    client.poses(605_000, 2_000_000, (0.01, 0.02, -0.03))
+    client.run(1_000_000)
+    names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "pm.vbat")
+    assert client.create(7, *(logs[name][::-1] for name in names)) == 0
+    assert client.one(LOG, 1, bytes((3, 7, 1))) == bytes((3, 7, 0))
+    client.sent.clear()
+    client.run(client.now_us + 1_000_000)
+    rows = client.packets(LOG, 2)
+    stamps = [int.from_bytes(row[1:4], "little") for row in rows]
+    assert len(rows) == 100
+    assert set(np.diff(stamps)) == {10}
+    x, y, z, volts = struct.unpack("<4f", rows[-1][4:])
+    assert (x, y, z) == pytest.approx((0.01, 0.02, -0.03), abs=2e-3)
+    assert volts == pytest.approx(3.9)
+    assert client.one(LOG, 1, bytes((4, 7))) == bytes((4, 7, 0))
+    client.sent.clear()
+    client.run(client.now_us + 100_000)
+    assert client.packets(LOG, 2) == []
+
+
+def test_newer_start_counts_in_milliseconds_and_period_zero_sends_once(client: Client, logs) -> None:
+    assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
+    assert client.one(LOG, 1, struct.pack("<BBH", 8, 1, 4)) == bytes((8, 1, 0))
+    client.sent.clear()
+    client.run(client.now_us + 100_000)
+    assert len(client.packets(LOG, 2)) == 25
+    assert client.one(LOG, 1, struct.pack("<BBH", 8, 1, 0)) == bytes((8, 1, 0))
+    client.sent.clear()
+    client.run(client.now_us + 100_000)
+    assert len(client.packets(LOG, 2)) <= 1
+
+
+def test_refused_log_requests_have_the_crazyflies_errors_and_change_nothing(client: Client, logs) -> None:
+    number, kind = logs["stateEstimate.x"]
+    item, count = (kind, number), len(logs)
+    assert client.create(1, item) == 0
+    assert client.create(1, item) == errno.EEXIST
+    assert client.create(2, *[item] * 7) == errno.E2BIG
+    assert client.create(2, (kind, count)) == errno.ENOENT
+    assert client.create(2, (kind, 0xFFFF)) == errno.ENOENT  # memory is not for logging
+    assert client.create(2, (9, number)) == errno.ENOENT
+    assert client.one(LOG, 1, bytes((3, 2, 1))) == bytes((3, 2, errno.ENOENT))
+    assert client.one(LOG, 1, bytes((2, 2))) == bytes((2, 2, errno.ENOENT))
+    assert client.one(LOG, 1, bytes((99, 2))) == bytes((99, 2, errno.ENOEXEC))
+    assert client.one(LOG, 1, bytes((7, 1)) + struct.pack("<BH", *item) * 6) == bytes((7, 1, errno.E2BIG))
+    assert client.one(LOG, 1, bytes((7, 1)) + struct.pack("<BH", *item) * 5) == bytes((7, 1, 0))
+    for block in range(2, 17):
+        assert client.create(block, item) == 0
+    assert client.create(17, item) == errno.ENOMEM
+    assert client.one(LOG, 1, b"\5")[::2] == b"\5\0"
+    assert client.create(17, item) == 0
+
+
+def test_at_most_128_variables_are_in_blocks(client: Client, logs) -> None:
+    number = logs["supervisor.state"][0]
+    for block in range(16):
+        assert client.create(block, *[(1, number)] * 8) == 0
+    assert client.one(LOG, 1, bytes((7, 3)) + struct.pack("<BH", 1, number)) == bytes((7, 3, errno.ENOMEM))
+
+
+def test_a_full_request_of_cflibs_ends_in_the_middle_of_an_item(client: Client, logs) -> None:
+    number, kind = logs["stateEstimate.x"]
+    data = bytes((6, 1)) + struct.pack("<BH", 1, logs["supervisor.state"][0]) * 9 + bytes((kind,))
+    assert len(data) == 30
+    assert client.one(LOG, 1, data) == bytes((6, 1, 0))
+    assert client.one(LOG, 1, bytes((7, 1)) + struct.pack("<BH", kind, number)) == bytes((7, 1, 0))
+
+
+def test_a_block_that_the_processor_kept_waiting_returns_to_its_grid(client: Client, logs) -> None:
+    thief = client.firmware.add_thief()
+    assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
+    client.one(LOG, 1, bytes((3, 1, 2)))
+    client.sent.clear()
+    client.run(client.now_us + 200_000)
+    thief.share = 47.0  # ticks at once
+    client.run(client.now_us + 2000)
+    thief.share = 0.0
+    client.run(client.now_us + 250_000)
+    stamps = [int.from_bytes(row[1:4], "little") for row in client.packets(LOG, 2)]
+    off_grid = [stamp for stamp in stamps if (stamp - stamps[0]) % 20]
+    assert len(off_grid) == 1
+    assert max(np.diff(stamps)) > 40
+
+
+@given(
+    st.sampled_from(sorted(C_TYPES, key=lambda scalar: scalar.log_number)), st.integers(-(2**31), 2**32 - 1)
+)
+def test_integers_are_cast_as_in_c(scalar: Scalar, value: int) -> None:
+    assert scalar.cast(value) == C_TYPES[scalar](value).value
+    assert scalar.unpack(scalar.pack(float(value))) == C_TYPES[scalar](value).value
+
+
+@given(st.floats(allow_nan=False))
+def test_floats_are_rounded_as_numpy_does(value: float) -> None:
+    with np.errstate(over="ignore"):
+        assert Scalar.F32.unpack(Scalar.F32.pack(value)) == np.float32(value)
+        assert Scalar.F16.unpack(Scalar.F16.pack(value)) == np.float16(value)
+    assert Scalar.U8.pack(inf) == Scalar.U8.pack(nan) == b"\0"
+
+
+def test_a_variable_can_be_fetched_as_every_type(client: Client, logs) -> None:
+    number = logs["pm.vbatMV"][0]
+    for kind, scalar in LOG_SCALARS.items():
+        assert client.create(kind, (kind, number)) == 0
+        client.one(LOG, 1, bytes((3, kind, 0)))
+        client.run(client.now_us + 3000)
+        data = client.packets(LOG, 2)[-1]
+        with np.errstate(over="ignore"):
+            expected = C_TYPES[scalar](3900).value if scalar in C_TYPES else 3900.0
+        assert scalar.unpack(data[4:]) == expected
+
+
+# Parameters
+
+
+def test_writing_a_parameter_changes_the_running_core(client: Client, params) -> None:
+    core = client.firmware._core.parameters.fields
+    assert client.write(params, "RandConsts.flapHoverAng", 0.3) == pytest.approx(0.3)
+    assert core.hover_angle == np.float32(0.3)
+    assert client.write(params, "motorShifts.m2", -4000) == -4000
+    assert list(core.trim) == [-3600, -4000, -9000, 6200]
+    assert client.write(params, "delayComp.activate", 0) == core.predict == 0
+    client.run(client.now_us + 20_000)
+    assert client.writes[-1][1] != HOVER_COUNTS
+
+
+def test_the_authors_gains_by_their_own_names_are_the_profile_as_flown(client: Client, params) -> None:
+    head = {
+        "x": 3.5, "y": 3.5, "z": 3.0, "vx": 0.8, "vy": 0.8, "vz": 0.6, "roll": -0.2, "pitch": -0.15, "yaw": 0.4,
+        "roll_rate": -0.18, "pitch_rate": -0.03, "yaw_rate": 0.07,
+    }  # fmt: skip
+    for name, gain in head.items():
+        assert client.write(params, f"extCtrl.{name}_P", gain) == pytest.approx(gain)
+    flown = parameters_of(load_config("as-flown")).memory
+    ours = client.firmware._core.parameters.memory
+    for name in flown.dtype.names:
+        if name.startswith("gain_"):
+            assert ours[name] == flown[name], name
+
+
+def test_every_parameter_refuses_what_is_no_number_or_outside_and_says_what_is_in_force(
+    client: Client, params
+) -> None:
+    refused = 0
+    for name, (number, kind) in params.items():
+        before = client.read(params, name)
+        if kind & 0x40:
+            assert client.ask(PARAM, 2, struct.pack("<HB", number, 1)) == []
+            assert client.read(params, name) == before
+        elif kind & 0x0F == 0x06:
+            for value in (nan, inf, -inf, 3e38):
+                assert client.write(params, name, value) == before, name
+                refused += 1
+    assert refused > 80
+    assert client.write(params, "extCtrl.manual", 3) == 0
+    assert client.write(params, "supervisor.poseTimeout", 10) == 500
+    assert client.write(params, "motorShifts.m1", 12_001) == -3600
+    assert client.write(params, "extCtrl.x_P", 20.5) == client.read(params, "extCtrl.x_P")
+
+
+@pytest.mark.parametrize("channel", [1, 2])
+def test_unknown_parameter_is_enoent(client: Client, channel: int) -> None:
+    assert client.one(PARAM, channel, b"\xff\xff") == bytes((0xFF, 0xFF, errno.ENOENT))
+
+
+def test_set_by_name_acts_answers_and_tells_the_new_value(client: Client, params) -> None:
+    number = params["extCtrl.z_P"][0]
+    request = b"\0extCtrl\0z_P\0\x06" + struct.pack("<f", 2.5)
+    reply, update = client.ask(PARAM, 3, request)
+    assert reply == b"\0extCtrl\0z_P\0\0"
+    assert update == b"\1" + struct.pack("<Hf", number, 2.5)
+    assert client.read(params, "extCtrl.z_P") == 2.5
+    assert client.one(PARAM, 3, b"\0extCtrl\0nix\0\x06" + bytes(4)) == b"\0extCtrl\0nix\0\2"
+    assert client.one(PARAM, 3, b"\0extCtrl\0z_P\0\x08\1") == b"\0extCtrl\0z_P\0" + bytes((errno.EINVAL,))
+    nan_request = b"\0extCtrl\0z_P\0\x06" + struct.pack("<f", nan)
+    assert client.one(PARAM, 3, nan_request) == b"\0extCtrl\0z_P\0" + bytes((errno.EINVAL,))
+    read_only = b"\0cpu\0flash\0\x09\0\0"
+    assert client.one(PARAM, 3, read_only) == b"\0cpu\0flash\0" + bytes((errno.EACCES,))
+    assert client.read(params, "extCtrl.z_P") == 2.5
+
+
+def test_stored_parameter_survives_a_reboot_and_cleared_one_does_not(client: Client, params) -> None:
+    number, kind = params["extCtrl.z_P"]
+    ident = struct.pack("<H", number)
+    assert kind & 0x10
+    assert client.one(PARAM, 3, b"\7" + ident) == b"\7" + ident + b"\0\1"
+    default = struct.pack("<f", 3.0)
+    assert client.one(PARAM, 3, b"\4" + ident) == b"\4" + ident + b"\0" + default
+    client.write(params, "extCtrl.z_P", 2.0)
+    client.write(params, "extCtrl.yaw_P", 0.5)
+    assert client.one(PARAM, 3, b"\3" + ident) == b"\3" + ident + b"\0"
+    client.write(params, "extCtrl.z_P", 2.25)
+    client.reboot()
+    assert client.read(params, "extCtrl.z_P") == 2.0
+    assert client.read(params, "extCtrl.yaw_P") == pytest.approx(1.2)
+    stored = struct.pack("<f", 2.0)
+    assert client.one(PARAM, 3, b"\4" + ident) == b"\4" + ident + b"\1" + default + stored
+    assert client.one(PARAM, 3, b"\6" + ident) == b"\6" + ident + default
+    assert client.one(PARAM, 3, b"\x08" + ident) == b"\x08" + ident + b"\0" + default
+    assert client.one(PARAM, 3, b"\5" + ident) == b"\5" + ident + b"\0"
+    assert client.one(PARAM, 3, b"\5" + ident) == b"\5" + ident + bytes((errno.ENOENT,))
+    client.reboot()
+    assert client.read(params, "extCtrl.z_P") == 3.0
+
+
+def test_only_persistent_parameters_can_be_stored(client: Client, params) -> None:
+    number, kind = params["stabilizer.stop"]
+    ident = struct.pack("<H", number)
+    assert not kind & 0x10
+    for command in (3, 4, 5, 7):
+        request = bytes((command,)) + ident
+        assert client.one(PARAM, 3, request) == request + bytes((errno.ENOENT,))
+
+
+@given(st.binary(max_size=80), st.integers(0, 200))
+@settings(deadline=None)
+def test_a_spoilt_store_is_an_empty_one(noise: bytes, place: int) -> None:
+    eeprom = bytearray(b"\xff" * 8192)
+    storage = ParameterStorage(eeprom)
+    assert storage.load() == {}
+    values = {f"group.name{k}": bytes((k,) * 4) for k in range(8)}
+    assert all(storage.store(name, value) for name, value in values.items())
+    assert storage.load() == values
+    before = bytes(eeprom)
+    eeprom[1024 + place : 1024 + place + len(noise)] = noise
+    end = 1024 + 10 + 8 * 17
+    assert storage.load() == (values if eeprom[1024:end] == before[1024:end] else {})
+
+
+def test_a_store_that_somebody_else_filled_with_strange_names_can_be_written() -> None:
+    eeprom = bytearray(b"\xff" * 8192)
+    records = b"\4\xff\x80\0\xe9\2ab"
+    eeprom[1024 : 1034 + len(records)] = struct.pack("<4sHI", b"FPS1", len(records), crc32(records)) + records
+    storage = ParameterStorage(eeprom)
+    assert storage.store("a.b", b"\1")
+    assert storage.load()["a.b"] == b"\1"
+    assert len(storage.load()) == 2
+
+
+def test_a_full_store_refuses_and_keeps_what_it_has(client: Client) -> None:
+    storage = ParameterStorage(bytearray(b"\xff" * 1124))
+    stored = 0
+    while storage.store(f"g.{stored:02}", b"1234"):
+        stored += 1
+    assert len(storage.load()) == stored == (100 - 10) // 10
+
+
+# Memories
+
+
+class Handler:
+    """What cflib's memory elements read and write through."""
+
+    def __init__(self, client: Client) -> None:
+        self.client = client
+
+    def read(self, element, address: int, length: int) -> None:
+        data = b""
+        while len(data) < length:
+            step = min(20, length - len(data))
+            reply = self.client.one(MEM, 1, struct.pack("<BIB", element.id, address + len(data), step))
+            assert reply[:6] == struct.pack("<BIB", element.id, address + len(data), 0)
+            data += reply[6:]
+        element.new_data(element, address, data)
+
+    def write(self, element, address: int, data, **options) -> None:
+        for offset in range(0, len(data), 24):
+            piece = bytes(data[offset : offset + 24])
+            reply = self.client.one(MEM, 2, struct.pack("<BI", element.id, address + offset) + piece)
+            assert reply == struct.pack("<BIB", element.id, address + offset, 0)
+        element.write_done(element, address)
+
+
+def test_three_memories_announce_themselves(client: Client) -> None:
+    assert client.one(MEM, 0, b"\1") == b"\1\3"
+    kinds = [struct.unpack_from("<BBBI", client.one(MEM, 0, bytes((2, number)))) for number in range(3)]
+    assert kinds == [(2, 0, 0x00, 8192), (2, 1, 0x01, 112), (2, 2, 0x15, 0x1000)]
+    assert all(len(client.one(MEM, 0, bytes((2, number)))) == 15 for number in range(3))
+    assert client.one(MEM, 0, b"\2\3") == b"\2\3"
+
+
+def test_cflib_reads_and_writes_the_configuration_block(client: Client) -> None:
+    element, done = I2CElement(0, 0, 8192, Handler(client)), []
+    element.update(done.append)
+    assert element.valid
+    assert element.elements["radio_address"] == 0xE7E7E7E7E7
+    assert (element.elements["radio_channel"], element.elements["radio_speed"]) == (80, 2)
+    element.elements["radio_address"] = 0xE7E7E7E701
+    element.write_data(lambda *arguments: done.append(arguments))
+    client.reboot()
+    again = I2CElement(0, 0, 8192, Handler(client))
+    again.update(done.append)
+    assert again.valid
+    assert again.elements["radio_address"] == 0xE7E7E7E701
+
+
+def test_cflib_reads_the_decks_one_wire_memory_and_rewrites_it(client: Client) -> None:
+    element, done = OWElement(1, 1, 112, bytes(8), Handler(client)), []
+    element.update(done.append)
+    assert element.valid
+    assert (element.vid, element.elements["Board name"]) == (0xBC, "bcFloaty")
+    element.elements["Board revision"] = "B7"
+    element.write_data(lambda *arguments: done.append(arguments))
+    again = OWElement(1, 1, 112, bytes(8), Handler(client))
+    again.update(done.append)
+    assert again.valid
+    assert again.elements == {"Board name": "bcFloaty", "Board revision": "B7"}
+
+
+def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: Client, logs, params) -> None:
+    assert client.one(MEM, 1, struct.pack("<BIB", 2, 0x1FA, 10))[6:] == bytes(
+        (0xFA, 0xFB, 0xFC, 0xFD, 0xFE, 0xFF, 0, 1, 2, 3)
+    )
+    assert client.one(MEM, 2, struct.pack("<BI", 2, 0x10) + b"\x10\x11\x12")[-1] == 0
+    assert client.log(logs, "memTst.errCntW") == [0]
+    assert client.one(MEM, 2, struct.pack("<BI", 2, 0x10) + b"\x10\x99\x98")[-1] == 0
+    assert client.log(logs, "memTst.errCntW") == [2]
+    client.write(params, "memTst.resetW", 1)
+    assert client.log(logs, "memTst.errCntW") == [0]
+
+
+@pytest.mark.parametrize(
+    ("number", "address", "length"), [(0, 8192, 1), (0, 8190, 3), (1, 100, 13), (9, 0, 1), (0, 2**32 - 1, 2)]
+)
+def test_memory_access_outside_is_an_error(client: Client, number: int, address: int, length: int) -> None:
+    head = struct.pack("<BI", number, address)
+    assert client.one(MEM, 1, head + bytes((length,))) == head + bytes((errno.EIO,))
+    before = bytes(client.eeprom)
+    assert client.one(MEM, 2, head + bytes(length)) == head + bytes((errno.EIO,))
+    assert client.eeprom == before
+
+
+# Localisation
+
+
+unit = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q) > 0.01)
+
+
+@given(unit)
+def test_packed_quaternion_is_cflibs(xyzw: tuple[float, ...]) -> None:
+    q = np.array(xyzw) / np.linalg.norm(xyzw)
+    w, x, y, z = unpack_quaternion(compress_quaternion(xyzw))
+    assert abs(np.dot((x, y, z, w), q)) > 1 - 2e-5
+
+
+def test_packed_pose_with_our_address_is_flown_and_others_are_not(client: Client, logs) -> None:
+    client.run(610_000)
+    upright = compress_quaternion((0, 0, 0, 1))
+    theirs = struct.pack("<BhhhI", 0x01, 900, 900, 900, upright)
+    for at_us in range(620_000, 900_000, 20_000):
+        client.run(at_us)
+        client.send(LOC, 1, b"\x09" + struct.pack("<BhhhI", 0xE7, 20, -30, 40, upright) + theirs)
+    client.run(905_000)
+    assert client.firmware.signals.supervisor.state.name == "FLYING"
+    assert client.log(logs, "stateEstimate.x", "stateEstimate.y", "stateEstimate.z") == pytest.approx(
+        [0.02, -0.03, 0.04], abs=2e-3
+    )
+
+
+def test_position_without_attitude_is_logged_and_not_flown(client: Client, logs) -> None:
+    client.run(610_000)
+    client.send(LOC, 0, struct.pack("<3f", 1, 2, 3))
+    client.run(620_000)
+    assert client.log(logs, "locSrv.x", "locSrv.y", "locSrv.z") == [1, 2, 3]
+    client.send(LOC, 2, struct.pack("<Bhhh", 0xE7, 100, 200, 300) + struct.pack("<Bhhh", 3, 1, 1, 1))
+    client.run(client.now_us + 5000)
+    assert client.log(logs, "locSrv.x", "locSrv.y", "locSrv.z", "locSrv.positions") == pytest.approx(
+        [0.1, 0.2, 0.3, 2]
+    )
+    assert client.firmware.signals.supervisor.state.name == "WAITING"
+
+
+# Flaps from outside
+
+
+def test_manual_angles_move_the_flaps_and_zero_gives_them_back(client: Client, params) -> None:
+    for flap, angle in enumerate((0.1, -0.2, 0.3, -0.4), 1):
+        client.write(params, f"extCtrl.m{flap}", angle)
+    client.run(client.now_us + 20_000)
+    assert client.writes[-1][1] == HOVER_COUNTS
+    client.write(params, "extCtrl.manual", 1)
+    client.run(client.now_us + 20_000)
+    trims = (-3600, -5000, -9000, 6200)
+    words = [
+        int(angle * 31290 + 32767 + trim) for angle, trim in zip((0.1, -0.2, 0.3, -0.4), trims, strict=True)
+    ]
+    assert client.writes[-1][1] == [21000 + word * 21000 // 65535 for word in words]
+    client.write(params, "extCtrl.manual", 0)
+    client.run(client.now_us + 20_000)
+    assert client.writes[-1][1] == HOVER_COUNTS
+
+
+def test_power_set_words_reach_the_timers_as_in_the_original(client: Client, params) -> None:
+    vector = json.loads((VECTORS / "servo_word_to_count.json").read_text())
+    count_of = dict(zip(vector["words"], vector["counts"], strict=True))
+    client.write(params, "motorPowerSet.enable", 1)
+    for words in [[0, 65534, 0, 65534], *np.random.default_rng(5).choice(vector["words"], (50, 4)).tolist()]:
+        for flap, word in enumerate(words, 1):
+            client.write(params, f"motorPowerSet.m{flap}", word)
+        client.run(client.now_us + 20_000)
+        assert client.writes[-1][1] == [count_of.get(word, 21000 + word * 21000 // 65535) for word in words]
+
+
+# Console
+
+
+@given(st.text(max_size=120))
+def test_console_pieces_are_whole_characters_of_at_most_thirty_bytes(text: str) -> None:
+    parts = list(pieces(text))
+    assert all(len(part) <= 30 for part in parts)
+    assert "".join(part.decode() for part in parts) == text.encode("utf-8", "replace").decode()
+
+
+def test_console_tells_on_the_radio_what_it_tells_on_the_debug_pins(client: Client) -> None:
+    client.run(700_000)
+    text = b"".join(client.packets(0, 0)).decode()
+    assert text.splitlines() == client.console
+    assert client.console[-1] == "supervisor: waiting"
+
+
+# What it costs
+
+
+def test_idle_services_do_not_run(client: Client) -> None:
+    client.run(1_000_000)
+    before = {report.name: report.activations for report in client.firmware.statistics.reports()}
+    client.run(2_000_000)
+    after = {report.name: report.activations for report in client.firmware.statistics.reports()}
+    for name in [
+        "SYSLINK",
+        "CRTP-RX",
+        "CRTP-TX",
+        "LOG",
+        "PARAM",
+        "MEM",
+        "TELEMETRY",
+        "CONSOLE",
+        "CRTP-SRV",
+        "PLATFORM-SRV",
+        "APP",
+    ]:
+        assert after[name] == before[name], name
+    assert after["PWRMGNT"] - before["PWRMGNT"] == 10
+
+
+def test_a_burst_of_requests_is_cut_to_the_queues_and_counted(client: Client) -> None:
+    for number in range(100):
+        client.send(PARAM, 1, struct.pack("<H", number % 10))
+    client.run(client.now_us + 50_000)
+    answered = len(client.packets(PARAM, 1))
+    assert 0 < answered <= PORT_QUEUE
+    assert client.firmware.link.dropped == 100 - answered
+
+
+def test_poses_come_in_while_nothing_goes_out(client: Client) -> None:
+    client.poses(605_000, 2_000_000)
+    client.radio_open = False
+    for at_us in range(610_000, 1_990_000, 5000):
+        client.run(at_us)
+        client.send(SUPERVISOR, 0, b"\x0c")
+        client.send(PARAM, 1, b"\0\0")
+    assert client.firmware.signals.supervisor.state.name == "FLYING"
+    assert client.firmware.link.dropped > 100
+
+
+def test_supervisor_port_answers_state_and_commands(client: Client) -> None:
+    client.run(610_000)
+    assert client.one(SUPERVISOR, 0, b"\x0c") == b"\x8c" + (0b1110).to_bytes(2, "little")
+    assert client.one(SUPERVISOR, 1, b"\1\0") == b"\x81\1\0"
+    assert client.one(SUPERVISOR, 0, b"\x0c") == b"\x8c" + (0b0101).to_bytes(2, "little")
+    assert client.one(SUPERVISOR, 1, b"\1\1") == b"\x81\1\1"
+    assert client.one(PLATFORM, 0, b"\1\0") == b"\1\1\0"  # protocols before 12
+    assert client.one(SUPERVISOR, 1, b"\2") == b"\x82\1\1"

@@ -1,0 +1,707 @@
+"""The board's MAVLink services, asked by pymavlink's own codec."""
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pymavlink.dialects.v20.common as dialect
+import pytest
+from scipy.spatial.transform import Rotation
+
+from firmware_py.firmware import Firmware
+from firmware_py.wire import telemetry
+from firmware_py.wire.supervisor import Cause, State
+from hil.config import load_config
+from hil.devices.board import VirtualBoard
+from hil.devices.config import SerialConfig
+from hil.devices.uart import VirtualSerial
+from hil.events import EventQueue
+from support.firmware_bench import LEVEL, FirmwareBench
+from support.mavlink_client import GYRO_ZERO_US, Client, codec, count
+
+DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
+IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
+
+
+@pytest.fixture
+def client() -> Client:
+    made = Client()
+    made.run(20_000)
+    return made
+
+
+def target(
+    client: Client, p_NED: tuple[float, float, float], yaw_NED: float, mask: int = IGNORE_REST
+) -> None:
+    client.send("set_position_target_local_ned", 0, 1, 1, 1, mask, *p_NED, 0, 0, 0, 0, 0, 0, yaw_NED, 0)
+    client.run(client.now_us + 2000)
+
+
+def last_pose(client: Client) -> tuple[Any, Any, int | None]:
+    """Position, quaternion and age of the last pose as the log variables show them."""
+    values = {variable.name: variable.read for variable in client.firmware.variables}
+    p = [values[f"locSrv.{axis}"]() for axis in "xyz"]
+    q = [values[f"locSrv.{axis}"]() for axis in ("qx", "qy", "qz", "qw")]
+    return np.array(p), Rotation.from_quat(q), values["locSrv.age"]()
+
+
+# Poses and goals
+
+
+def test_the_correction_is_the_pose_as_seen_from_the_goal(client: Client) -> None:
+    target(client, (1.0, -2.0, -3.0), -0.5)  # that is (1, 2, 3) with z up, 0.5 rad to the left
+    R_WB = Rotation.from_euler("ZYX", (0.8, 0.2, 0.1))
+    x, y, z, w = R_WB.as_quat()
+    client.pose(((1.1, 2.3, 3.6), (w, x, y, z)))
+    client.run(client.now_us + 2000)
+    p_GB, R_GB, _ = last_pose(client)
+    R_GW = Rotation.from_euler("z", 0.5).inv()
+    assert p_GB == pytest.approx(R_GW.apply((0.1, 0.3, 0.6)), abs=1e-6)
+    assert (R_GB.inv() * (R_GW * R_WB)).magnitude() < 1e-6
+
+
+def test_without_a_goal_the_board_flies_to_its_home(client: Client) -> None:
+    client.pose(((0.1, 0.2, 1.45), LEVEL))
+    client.run(client.now_us + 2000)
+    assert last_pose(client)[0] == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
+
+
+def test_what_a_goal_masks_out_stays_as_it_was(client: Client) -> None:
+    target(client, (1.0, -2.0, -3.0), -math.pi / 2)
+    target(client, (0.0, 0.0, 0.0), math.pi / 2, IGNORE_REST | IGNORE_POSITION)
+    client.pose(((2.0, 2.0, 3.0), LEVEL))
+    client.run(client.now_us + 2000)
+    assert last_pose(client)[0] == pytest.approx((0.0, 1.0, 0.0), abs=1e-6)
+    target(client, (2.0, -2.0, -3.0), 1.0, IGNORE_REST | IGNORE_YAW)
+    client.pose(((2.0, 2.5, 3.0), LEVEL))
+    client.run(client.now_us + 2000)
+    assert last_pose(client)[0] == pytest.approx((-0.5, 0.0, 0.0), abs=1e-6)
+
+
+def test_a_visual_pose_is_a_pose(client: Client) -> None:
+    client.send("vision_position_estimate", 0, 0.1, -0.2, -1.45, 0.3, -0.2, -0.5)
+    client.run(client.now_us + 2000)
+    p_GB, R_GB, _ = last_pose(client)
+    assert p_GB == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
+    assert R_GB.as_euler("ZYX") == pytest.approx((0.5, 0.2, 0.3), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("p_NED", "yaw", "mask", "frame"),
+    [
+        ((math.nan, 0.0, 0.0), 0.0, IGNORE_REST, 1),
+        ((0.0, 0.0, 0.0), math.inf, IGNORE_REST, 1),
+        ((1e6, 0.0, 0.0), 0.0, IGNORE_REST, 1),
+        ((0.0, 0.0, 0.0), 0.0, IGNORE_POSITION | IGNORE_YAW, 1),
+        ((0.0, 0.0, 0.0), 0.0, IGNORE_REST, 5),
+    ],
+)
+def test_an_impossible_goal_changes_nothing(
+    client: Client, p_NED: tuple[float, float, float], yaw: float, mask: int, frame: int
+) -> None:
+    client.send("set_position_target_local_ned", 0, 1, 1, frame, mask, *p_NED, 0, 0, 0, 0, 0, 0, yaw, 0)
+    client.pose(((0.1, 0.2, 1.45), LEVEL))
+    client.run(client.now_us + 2000)
+    assert last_pose(client)[0] == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
+    assert client.stack.refused == 1
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        (0, (math.nan, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0),
+        (0, (0.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0),
+        (0, (1.0, 0.0, 0.0, 0.0), math.inf, 0.0, 0.0),
+        (0, (1.0, 0.0, 0.0, 0.0), 3e38, 0.0, 0.0),
+    ],
+)
+def test_an_impossible_pose_is_refused(client: Client, fields: tuple[Any, ...]) -> None:
+    client.run(GYRO_ZERO_US)
+    client.send("att_pos_mocap", *fields)
+    client.run(client.now_us + 20_000)
+    assert client.stack.refused == 1
+    assert client.firmware.signals.supervisor.state is State.WAITING
+
+
+def test_poses_close_the_loop_and_silence_opens_it() -> None:
+    client = Client()
+    client.poses(GYRO_ZERO_US, 1_000_000)
+    client.run(1_000_000)
+    assert client.firmware.signals.supervisor.state is State.FLYING
+    client.run(1_600_000)
+    assert client.firmware.signals.supervisor.cause is Cause.SILENCE
+    assert [text for text in client.texts() if text.startswith("supervisor")] == [
+        "supervisor: waiting",
+        "supervisor: flying",
+        "supervisor: failsafe, silence",
+    ]
+    assert [message.severity for message in client.of("STATUSTEXT")][-1] == dialect.MAV_SEVERITY_WARNING
+
+
+# Ages
+
+
+@pytest.mark.parametrize("ahead_us", [0, 1_700_000_000_000_000, -90_000])
+def test_the_age_of_a_pose_is_true_whatever_the_stations_clock_shows(ahead_us: int) -> None:
+    client = Client()
+    client.clock_ahead_us = ahead_us
+    client.poses(200_000, 1_500_000, lag_us=35_000)
+    client.run(1_500_000)
+    assert len(client.of("TIMESYNC")) >= 6
+    assert client.firmware.signals.counters[-1] == pytest.approx(
+        35_000, abs=20_000
+    )  # at the estimator's tick
+    (age_ms,) = [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"][-1:]
+    assert age_ms == pytest.approx(35.0, abs=1.0)
+
+
+def test_the_clock_is_asked_ten_times_a_second_until_five_answers_came_then_twice() -> None:
+    client = Client()
+    client.clock_ahead_us = 0
+    client.send("heartbeat", 6, 8, 0, 0, 4, 3)
+    client.run(3_000_000)
+    asked_ms = [t_us // 1000 for t_us, message in client.messages if message.get_type() == "TIMESYNC"]
+    assert asked_ms == [97, 194, 291, 388, 485, 582, 1069, 1556, 2043, 2530]
+
+
+@pytest.mark.parametrize(("baud", "interval_us"), [(57_600, 50_000), (115_200, 20_000), (921_600, 20_000)])
+def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us: int) -> None:
+    events = EventQueue()
+    line = VirtualSerial(SerialConfig(baud=baud), events, np.random.default_rng(1))
+    board = VirtualBoard(lambda *servo: None, lambda *radio: True, lambda *console: None, line)
+    firmware = Firmware(load_config(), board, mavlink=True)
+    board.run_on(firmware.kernel, events)
+    station, parser, ages_ms = codec(255, 190), codec(0, 0), []
+    lag_us, ahead_us = 20_000, 123_456_789_000
+
+    def on_ground(now_us: int, data: bytes) -> None:
+        for message in parser.parse_buffer(bytearray(data)) or ():
+            if message.get_type() == "TIMESYNC":
+                answer = station.timesync_encode((now_us + ahead_us) * 1000, message.ts1)
+                line.uplink(now_us, answer.pack(station))
+            elif message.get_type() == "NAMED_VALUE_FLOAT" and message.name == "age_ms":
+                ages_ms.append(message.value)
+
+    def pose(now_us: int) -> None:
+        taken_us = now_us + ahead_us - lag_us
+        line.uplink(now_us, station.att_pos_mocap_encode(taken_us, LEVEL, 0, 0, -1.15).pack(station))
+        events.at(now_us + 20_000, pose)
+
+    line.connect(lambda now_us: firmware.uart_ready(), on_ground)
+    for number in (30, 32, 350):
+        request = station.command_long_encode(1, 1, 511, 0, number, interval_us, 0, 0, 0, 0, 0)
+        line.uplink(0, request.pack(station))
+    events.at(103_700, pose)
+    now_us = 0
+    while now_us < 9_050_000:
+        now_us = min(wake for wake in (9_050_000, events.next_us, firmware.next_wake_us) if wake is not None)
+        events.run(now_us)
+        firmware.run(now_us)
+    assert line.down.busy_us > 0.09 * now_us
+    on_line_us = 1000 + 10_000_000 * (48 + 1) / baud  # the adapter, the frame, and the silence that ends it
+    age_ms = float(np.median(ages_ms[-5:]))  # now and then a pose has to wait for an answer before it
+    assert age_ms == pytest.approx((lag_us + on_line_us) * 1e-3, abs=0.3)
+
+
+@pytest.mark.parametrize("lag_us", [600_000, -20_000])
+def test_an_age_that_cannot_be_is_no_age(lag_us: int) -> None:
+    client = Client()
+    client.clock_ahead_us = 5_000_000
+    client.poses(GYRO_ZERO_US, 2_000_000, lag_us=lag_us)
+    client.run(2_100_000)
+    assert [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"][-1] == -1.0
+    assert client.firmware.signals.supervisor.state is State.FLYING
+
+
+def test_only_the_clock_of_who_sends_poses_counts() -> None:
+    client = Client()
+    client.clock_ahead_us = 5_000_000
+    client.poses(100_000, 1_500_000, lag_us=30_000)
+    other = codec(7, 7)
+
+    def lie(now_us: int) -> None:  # just when the next request leaves, and in time for the answer
+        requests = [message for message in client.of("TIMESYNC") if message.tc1 == 0]
+        if requests:
+            client.receive(other.timesync_encode(1, requests[-1].ts1).pack(other))
+
+    for at_us in range(100_000, 1_500_000, 1000):
+        client.events.at(at_us, lie)
+    client.run(1_500_000)
+    (age_ms,) = [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"][-1:]
+    assert age_ms == pytest.approx(30.0, abs=1.0)
+
+
+# Streams
+
+
+def test_after_boot_every_stream_keeps_its_rate() -> None:
+    client = Client()
+    client.run(5_100_000)
+    counts = count(message for _, message in client.messages)
+    counts.pop("STATUSTEXT")
+    assert counts == {
+        "HEARTBEAT": 5, "SYS_STATUS": 5, "BATTERY_STATUS": 5, "ATTITUDE": 20, "ATTITUDE_QUATERNION": 20,
+        "LOCAL_POSITION_NED": 20, "SERVO_OUTPUT_RAW": 10, "ESTIMATOR_STATUS": 5, "NAMED_VALUE_FLOAT": 25,
+    }  # fmt: skip
+    assert client.of("HEARTBEAT")[0].autopilot == dialect.MAV_AUTOPILOT_GENERIC
+    assert client.of("HEARTBEAT")[0].get_srcComponent() == 1
+
+
+def test_an_interval_is_set_told_switched_off_and_returned_to_its_default(client: Client) -> None:
+    def interval() -> int:
+        ack, answer = [a for a in client.command(510, 30) if a.get_type() != "ATTITUDE"]
+        assert (ack.command, ack.result) == (510, 0)
+        assert answer.message_id == 30
+        return int(answer.interval_us)
+
+    def attitudes() -> int:
+        client.messages.clear()
+        client.run(client.now_us + 1_000_000)
+        return len(client.of("ATTITUDE"))
+
+    assert interval() == 250_000
+    assert client.command(511, 30, 20_000)[0].result == 0
+    assert (interval(), attitudes()) == (20_000, 50)
+    assert client.command(511, 30, -1)[0].result == 0
+    assert (interval(), attitudes()) == (-1, 0)
+    assert client.command(511, 30, 0)[0].result == 0
+    assert (interval(), attitudes()) == (250_000, 4)
+    assert client.command(511, 30, 1)[0].result == 0  # faster than a tick
+    assert interval() == 1000
+
+
+@pytest.mark.parametrize(
+    "params", [(30, math.nan), (30, -2), (30, 0.5), (math.nan, 1000), (1e30, 1000), (2, 1000)]
+)
+def test_an_interval_that_cannot_be_is_denied(client: Client, params: tuple[float, float]) -> None:
+    assert client.command(511, *params)[0].result == DENIED
+
+
+def test_a_message_that_is_never_sent_has_interval_zero(client: Client) -> None:
+    assert client.command(510, 2)[1].interval_us == 0
+
+
+def test_messages_of_one_period_carry_one_time_stamp(client: Client) -> None:
+    for number in (30, 32, 350):
+        client.command(511, number, 20_000)
+    thief = client.firmware.add_thief()
+    thief.share = 0.3
+    client.messages.clear()
+    client.run(1_000_000)
+    stamps_ms = [m.time_boot_ms for m in client.of("ATTITUDE")]
+    assert stamps_ms == list(range(stamps_ms[0], 1000, 20))
+    assert stamps_ms[0] % 20 == 0
+    assert [m.time_boot_ms for m in client.of("LOCAL_POSITION_NED")] == stamps_ms
+    assert [m.time_usec for m in client.of("DEBUG_FLOAT_ARRAY")] == [1000 * stamp for stamp in stamps_ms]
+
+
+def test_position_and_attitude_are_those_in_the_world() -> None:
+    client = Client()
+    target(client, (1.0, -2.0, -3.0), -0.5)
+    R_WB = Rotation.from_euler("ZYX", (0.6, 0.05, -0.04))
+    x, y, z, w = R_WB.as_quat()
+    for at_us in range(100_000, 1_500_000, 20_000):
+        client.events.at(at_us, lambda now_us: client.pose(((1.02, 2.03, 3.04), (w, x, y, z)), now_us))
+    client.run(1_510_000)
+    position, attitude = client.of("LOCAL_POSITION_NED")[-1], client.of("ATTITUDE")[-1]
+    quaternion = client.of("ATTITUDE_QUATERNION")[-1]
+    assert (position.x, position.y, position.z) == pytest.approx((1.02, -2.03, -3.04), abs=5e-3)
+    NED, FRD = Rotation.from_euler("x", math.pi), Rotation.from_euler("x", math.pi)
+    expected = NED.inv() * R_WB * FRD
+    yaw, pitch, roll = expected.as_euler("ZYX")
+    assert (attitude.roll, attitude.pitch, attitude.yaw) == pytest.approx((roll, pitch, yaw), abs=0.05)
+    sent = Rotation.from_quat((quaternion.q2, quaternion.q3, quaternion.q4, quaternion.q1))
+    assert (sent.inv() * expected).magnitude() < 0.05
+
+
+@pytest.mark.parametrize("goal_yaw", [-0.5, 2.0])
+def test_the_reported_velocity_is_the_derivative_of_the_reported_position(goal_yaw: float) -> None:
+    client = Client()
+    client.command(511, 32, 20_000)
+    client.command(400, 0)  # disarmed: no flap moves the model elsewhere than the poses go
+    target(client, (0.1, -0.2, -1.15), goal_yaw)
+    start, v_WB = np.array((-0.3, -0.2, 1.25)), np.array((0.3, 0.2, -0.1))
+    x, y, z, w = Rotation.from_euler("z", -goal_yaw).as_quat()
+    for at_us in range(100_000, 2_000_000, 20_000):
+        p_WB = tuple(start + v_WB * (at_us * 1e-6))
+        client.events.at(at_us, lambda now_us, p=p_WB: client.pose((p, (w, x, y, z)), now_us))
+    client.run(2_000_000)
+    late = [message for message in client.of("LOCAL_POSITION_NED") if message.time_boot_ms > 1000]
+    p = np.array([(message.x, message.y, message.z) for message in late])
+    derivative = (p[-1] - p[0]) / (1e-3 * (late[-1].time_boot_ms - late[0].time_boot_ms))
+    assert derivative == pytest.approx((0.3, -0.2, 0.1), abs=0.01)
+    assert np.mean([(message.vx, message.vy, message.vz) for message in late], 0) == pytest.approx(
+        derivative, abs=0.06
+    )
+
+
+def test_a_new_goal_does_not_move_the_robot() -> None:
+    client = Client()
+    client.poses(100_000, 1_000_000)
+    client.run(1_000_000)
+    target(client, (1.0, 1.0, -2.0), 1.0)
+    position, attitude = client.command(512, 32)[-1], client.command(512, 30)[-1]
+    assert (position.x, position.y, position.z) == pytest.approx((0.0, 0.0, -1.15), abs=1e-3)
+    assert attitude.yaw == pytest.approx(0.0, abs=0.01)
+
+
+def test_the_flight_array_holds_the_telemetry_blocks() -> None:
+    client = Client()
+    client.command(511, 350, 20_000)
+    client.poses(GYRO_ZERO_US, 1_000_000, (0.02, -0.03, 1.2))
+    client.run(1_000_000)
+    values = client.of("DEBUG_FLOAT_ARRAY")[-1].data[:16]
+    now = {variable.name: variable.read() for variable in client.firmware.variables}
+    names = [variable.name for block in telemetry.BLOCKS[2:] for variable in block.variables]
+    assert len(names) == 16
+    assert values[:4] == pytest.approx([now[name] for name in names[:4]], abs=0.3)
+    assert values[4:8] == pytest.approx([now[name] for name in names[4:8]], abs=2000)
+    assert values[12] == State.FLYING
+    assert values[14] == pytest.approx(now["locSrv.poses"], abs=2)
+
+
+def test_counters_in_the_flight_array_wrap_as_those_of_the_log_do(client: Client) -> None:
+    client.firmware.signals.counters[0] = (1 << 16) + 7  # poses that were fused
+    (array,) = client.command(512, 350)[1:]
+    assert array.data[14] == 7
+
+
+def test_a_message_can_be_asked_for_once(client: Client) -> None:
+    ack, answer = client.command(512, 32)
+    assert (ack.get_type(), ack.result) == ("COMMAND_ACK", 0)
+    assert answer.get_type() == "LOCAL_POSITION_NED"
+    assert client.command(512, 2)[0].result == DENIED
+
+
+def test_the_older_request_sets_groups_of_streams(client: Client) -> None:
+    client.send("request_data_stream", 1, 1, dialect.MAV_DATA_STREAM_EXTRA1, 10, 1)
+    client.send("request_data_stream", 1, 1, dialect.MAV_DATA_STREAM_POSITION, 5, 0)
+    client.run(client.now_us + 2000)
+    client.messages.clear()
+    client.run(client.now_us + 1_000_000)
+    counts = count(message for _, message in client.messages)
+    assert (counts["ATTITUDE"], counts["ATTITUDE_QUATERNION"]) == (10, 10)
+    assert "LOCAL_POSITION_NED" not in counts
+
+
+def test_when_the_line_is_full_replies_wait_and_what_nobody_asked_for_is_dropped(client: Client) -> None:
+    client.uart_room = 0
+    client.command(511, 30, 1000)
+    client.run(client.now_us + 1_000_000)
+    dropped = client.stack.dropped
+    assert dropped > 900
+    assert client.ask("param_request_read", 1, 1, b"EXT_Z_P", -1) == []
+    client.uart_room = 1 << 30
+    client.run(client.now_us + 20_000)
+    (answer,) = client.of("PARAM_VALUE")
+    assert answer.param_id == "EXT_Z_P"
+    attitudes = [message.time_boot_ms for message in client.of("ATTITUDE")]
+    assert attitudes == sorted(attitudes)
+    sequence = [message.get_seq() for _, message in client.messages]
+    assert all((b - a) % 256 == 1 for a, b in pairwise(sequence))
+
+
+# Parameters
+
+
+def parameter_list(client: Client) -> dict[str, Any]:
+    answers = client.ask("param_request_list", 1, 1, wait_us=200_000)
+    return {answer.param_id: answer for answer in answers if answer.get_type() == "PARAM_VALUE"}
+
+
+def test_the_list_is_complete_and_every_value_is_real32(client: Client) -> None:
+    table = parameter_list(client)
+    writable = [parameter for parameter in client.firmware.parameters if parameter.write is not None]
+    assert len(table) == len(writable) > 40
+    assert {answer.param_index for answer in table.values()} == set(range(len(writable)))
+    assert {answer.param_count for answer in table.values()} == {len(writable)}
+    assert {answer.param_type for answer in table.values()} == {dialect.MAV_PARAM_TYPE_REAL32}
+    for parameter, answer in zip(writable, sorted(table.values(), key=lambda a: a.param_index), strict=True):
+        assert answer.param_value == pytest.approx(float(parameter.read()), rel=1e-6)
+
+
+def test_a_parameter_is_read_by_index_and_by_name(client: Client) -> None:
+    table = parameter_list(client)
+    for name, listed in list(table.items())[::7]:
+        by_name = client.one("param_request_read", 1, 1, name.encode(), -1)
+        by_index = client.one("param_request_read", 1, 1, b"", listed.param_index)
+        assert by_name.to_dict() == by_index.to_dict() == listed.to_dict()
+
+
+def test_a_parameter_that_was_set_is_in_force_and_echoed_each_time(client: Client) -> None:
+    for _ in range(2):
+        answer = client.one("param_set", 1, 1, b"EXT_Z_P", 2.5, dialect.MAV_PARAM_TYPE_REAL32)
+        assert (answer.param_id, answer.param_value) == ("EXT_Z_P", 2.5)
+    assert client.firmware.parameters[2].name == "extCtrl.z_P"
+    assert client.firmware.parameters[2].read() == 2.5
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        (b"EXT_Z_P", math.nan, 9),
+        (b"EXT_Z_P", -math.inf, 9),
+        (b"EXT_Z_P", 1e9, 9),
+        (b"EXT_Z_P", 1.0, 6),
+        (b"DLY_ACTIVATE", 2.0, 9),
+        (b"DLY_ACTIVATE", 0.5, 9),
+        (b"DLY_ACTIVATE", math.nan, 9),
+        (b"DLY_ACTIVATE", math.inf, 9),
+    ],
+)
+def test_a_value_that_is_not_allowed_is_refused_and_the_one_in_force_is_echoed(
+    client: Client, name: bytes, value: float, kind: int
+) -> None:
+    before = client.one("param_request_read", 1, 1, name, -1).param_value
+    answers = client.ask("param_set", 1, 1, name, value, kind)
+    again = client.ask("param_set", 1, 1, name, value, kind)
+    assert [a.param_value for a in answers + again if a.get_type() == "PARAM_VALUE"] == [before, before]
+    assert [a.get_type() for a in answers + again].count("STATUSTEXT") == 1
+    assert client.stack.refused == 2
+
+
+def test_an_unknown_parameter_is_not_answered(client: Client) -> None:
+    assert [a.get_type() for a in client.ask("param_set", 1, 1, b"NONE", 1.0, 9)] == ["STATUSTEXT"]
+    assert client.ask("param_request_read", 1, 1, b"NONE", -1) == []  # said that before
+    assert client.ask("param_request_read", 1, 1, b"", 1000) == []
+    assert client.ask("param_request_read", 1, 1, b"\xff\xfe", -1)[0].get_type() == "STATUSTEXT"
+    assert client.stack.refused == 4
+
+
+def test_the_hash_changes_with_any_value_and_back(client: Client) -> None:
+    def digest() -> float:
+        answer = client.one("param_request_read", 1, 1, b"_HASH_CHECK", -1)
+        assert answer.param_index == 0xFFFF
+        return float(answer.param_value)
+
+    first = digest()
+    client.one("param_set", 1, 1, b"EXT_Z_P", 2.5, 9)
+    second = digest()
+    client.one("param_set", 1, 1, b"EXT_Z_P", 3.0, 9)
+    assert digest() == first != second
+
+
+def slow_line(client: Client) -> None:
+    """From now on 57600 baud, with a buffer of 120 bytes."""
+
+    def fill(now_us: int) -> None:
+        client.uart_room = min(120, client.uart_room + 6)
+        client.events.at(now_us + 1000, fill)
+
+    client.uart_room = 0
+    fill(client.now_us)
+
+
+def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client: Client) -> None:
+    slow_line(client)
+    client.send("param_request_list", 1, 1)
+    client.run(client.now_us + 100_000)
+    assert 0 < len(client.of("PARAM_VALUE")) < 30
+    client.send("param_request_list", 1, 1)
+    client.run(client.now_us + 2_000_000)
+    indices = [message.param_index for message in client.of("PARAM_VALUE")]
+    assert indices[-1] == max(indices)
+    assert indices.count(0) == 2
+    assert set(indices) == set(range(client.of("PARAM_VALUE")[0].param_count))
+    assert client.stack.dropped == 0
+
+
+def test_a_list_comes_through_on_a_line_full_of_telemetry(client: Client) -> None:
+    slow_line(client)
+    client.command(511, 30, 5000)  # 8 kB/s
+    client.send("param_request_list", 1, 1)
+    client.run(client.now_us + 20_000_000)
+    assert client.stack.dropped > 100
+    indices = {message.param_index for message in client.of("PARAM_VALUE")}
+    assert indices == set(range(client.of("PARAM_VALUE")[0].param_count))
+
+
+# Commands
+
+
+@pytest.mark.parametrize("kind", ["command_long", "command_int"])
+def test_every_command_is_acknowledged_to_its_sender(client: Client, kind: str) -> None:
+    for number in (400, 185, 245, 410, 510, 511, 512, 520, 1, 0, 65535):
+        fields = (number, 0) if kind == "command_long" else (0, number, 0, 0)
+        answers = client.ask(
+            kind, 1, 1, *fields, *(math.nan,) * 4, *((0, 0, 0) if kind == "command_int" else (0.0,) * 3)
+        )
+        (ack,) = [answer for answer in answers if answer.get_type() == "COMMAND_ACK"]
+        assert (ack.command, ack.target_system, ack.target_component) == (number, 255, 190)
+        assert (ack.result == UNSUPPORTED) == (number in (1, 0, 65535))
+
+
+@pytest.mark.parametrize("target", [(2, 1), (1, 2), (7, 0)])
+def test_a_command_for_somebody_else_is_ignored(client: Client, target: tuple[int, int]) -> None:
+    assert client.command(400, 0, target=target) == []
+    assert client.stack.unserved == 1
+    assert client.firmware.signals.supervisor.armed
+
+
+@pytest.mark.parametrize("target", [(0, 0), (1, 0), (0, 1)])
+def test_a_command_for_all_is_obeyed(client: Client, target: tuple[int, int]) -> None:
+    assert client.command(400, 0, target=target)[0].result == 0
+    assert not client.firmware.signals.supervisor.armed
+
+
+def test_arming_and_disarming_twice_is_acknowledged_twice(client: Client) -> None:
+    for _ in range(2):
+        assert client.command(400, 0)[0].result == 0
+    assert not client.firmware.signals.supervisor.armed
+    client.run(client.now_us + 1_100_000)
+    assert client.of("HEARTBEAT")[-1].base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED == 0
+    for _ in range(2):
+        assert client.command(400, 1)[0].result == 0
+    assert client.firmware.signals.supervisor.armed
+
+
+@pytest.mark.parametrize("params", [(185, 1), (400, 0, 21196)])
+def test_a_forced_stop_is_latched(client: Client, params: tuple[float, ...]) -> None:
+    assert client.command(*params)[0].result == 0  # type: ignore[arg-type]
+    client.run(client.now_us + 20_000)
+    assert client.firmware.signals.supervisor.cause is Cause.EMERGENCY_STOP
+    assert client.command(400, 1)[0].result == TEMPORARILY_REJECTED
+
+
+@pytest.mark.parametrize("params", [(400, 2), (400, math.nan), (185, 0), (245, 0), (245, 2)])
+def test_a_parameter_that_cannot_be_is_denied(client: Client, params: tuple[float, ...]) -> None:
+    assert client.command(*params)[0].result == DENIED  # type: ignore[arg-type]
+    assert client.firmware.signals.supervisor.armed
+
+
+def test_stored_parameters_are_in_force_after_the_next_boot(client: Client) -> None:
+    client.one("param_set", 1, 1, b"EXT_Z_P", 2.5, 9)
+    assert client.command(245, 1)[0].result == 0
+    after = Firmware(load_config(), client)
+    assert after.parameters[2].read() == 2.5
+
+
+@pytest.mark.parametrize("params", [(410,), (512, 242)])
+def test_home_is_where_the_configuration_says(client: Client, params: tuple[float, ...]) -> None:
+    answers = {answer.get_type(): answer for answer in client.command(*params)}  # type: ignore[arg-type]
+    home = answers["HOME_POSITION"]
+    assert (home.x, home.y, home.z) == pytest.approx((0.0, 0.0, -1.15))
+    assert answers["COMMAND_ACK"].result == 0
+
+
+@pytest.mark.parametrize("params", [(520, 1), (512, 148)])
+def test_the_version_is_told(client: Client, params: tuple[float, ...]) -> None:
+    answers = {answer.get_type(): answer for answer in client.command(*params)}  # type: ignore[arg-type]
+    version = answers["AUTOPILOT_VERSION"]
+    assert version.flight_sw_version.to_bytes(4, "big")[:2] == bytes((26, 11))
+    assert version.uid == 0x00F10A71
+
+
+# The rest
+
+
+def test_ping_timesync_and_file_transfer_are_answered(client: Client) -> None:
+    ping = client.one("ping", 1234, 5, 0, 0)
+    assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (1234, 5, 255, 190)
+    assert client.ask("ping", 1234, 5, 1, 1) == []  # an answer
+    sync = client.one("timesync", 0, 77)
+    assert (sync.ts1, sync.tc1 // 1_000_000_000) == (77, 0)
+    assert sync.tc1 > 20_000_000
+    nak = client.one("file_transfer_protocol", 0, 1, 1, [9, 0, 0, 4] + [0] * 247)
+    assert (nak.payload[0], nak.payload[3], nak.payload[12]) == (10, 129, 6)
+    assert (nak.target_system, nak.target_component) == (255, 190)
+
+
+def test_the_boards_own_frames_are_ignored_when_they_come_back(client: Client) -> None:
+    echo = codec(1, 1)
+    client.messages.clear()
+    client.receive(echo.command_long_encode(0, 0, 400, 0, 0, 0, 0, 0, 0, 0, 0).pack(echo))
+    client.run(client.now_us + 3000)
+    assert client.messages == []
+    assert client.firmware.signals.supervisor.armed
+
+
+def test_half_a_frame_does_not_hold_back_the_last_command(client: Client) -> None:
+    client.receive(
+        bytes.fromhex("fd fc 00 00 00 ff be 5e 01 00")
+    )  # so a DEBUG_FLOAT_ARRAY of 264 bytes begins
+    assert client.command(400, 0) == []
+    client.run(client.now_us + 160_000)
+    assert [message.command for message in client.of("COMMAND_ACK")] == [400]
+
+
+KEY = bytes(range(32))
+
+
+def signed(client: Client) -> None:
+    """Give the station and what reads for it the key."""
+    for made in (client.codec, client.parser):
+        made.signing.secret_key = KEY
+        made.signing.sign_outgoing = True
+        made.signing.timestamp = 1000
+
+
+def test_with_a_key_nothing_unsigned_is_accepted_and_everything_sent_is_signed() -> None:
+    client = Client(f'mavlink.signing_key="{KEY.hex()}"')
+    client.parser.signing.secret_key = KEY
+    client.run(20_000)
+    assert client.command(400, 0) == []
+    assert client.stack.counters.unsigned == 1
+    signed(client)
+    assert [answer.command for answer in client.command(400, 0)] == [400]
+    client.codec.signing.secret_key = bytes(32)
+    assert client.command(400, 1) == []
+    assert client.stack.bad == 2
+    client.run(2_100_000)
+    assert len(client.of("HEARTBEAT")) == 2
+    assert all(message.get_signed() for _, message in client.messages)
+    assert not client.firmware.signals.supervisor.armed
+
+
+def test_the_trace_names_no_interrupt_that_the_hardware_did_not_raise() -> None:
+    client = Client()
+    raised: list[None] = []
+    traced: list[tuple[int, str, str, int, int]] = []
+    for name in ("imu_ready", "uart_ready", "radio_received"):
+        interrupt = getattr(client.firmware, name)
+        setattr(client.firmware, name, lambda *data, _raise=interrupt: raised.append(_raise(*data)))
+    client.firmware.kernel.set_trace(lambda *line: traced.append(line))
+    client.poses(100_000, 900_000)
+    client.stream(200_000)  # a parameter that wakes the telemetry task
+    client.run(700_000)  # the gyro's zero is found, the loop closes: lines on the console
+    assert len(client.texts()) == len(client.console) == 2
+    client.ask("param_request_list", 1, 1)
+    client.command(511, 30, 10_000)
+    client.run(900_000)
+    interrupts = [event for _, event, *_ in traced if "_ISR" in event]
+    assert len(interrupts) == len(raised)
+
+
+def test_counters_are_log_variables(client: Client) -> None:
+    client.receive(b"\xfd\x01\x00\x00\x00\x01\x01\x00\x00\x00\x00\x12\x34" + bytes(300))
+    client.ask("ping", 1, 1, 0, 0)
+    client.uart_overruns = 3
+    values = {v.name: v.read() for v in client.firmware.variables if v.name.startswith("mavlink.")}
+    assert set(values) == {
+        f"mavlink.{name}" for name in ("frames", "lost", "bad", "refused", "dropped", "overruns")
+    }
+    assert (values["mavlink.frames"], values["mavlink.bad"], values["mavlink.overruns"]) == (1, 1, 3)
+
+
+def test_without_mavlink_there_is_no_task_and_no_variable_of_it() -> None:
+    firmware = FirmwareBench().firmware
+    assert firmware.mavlink is None
+    assert not [task.name for task in firmware.kernel.tasks if task.name.startswith("MAV")]
+    assert not [variable.name for variable in firmware.variables if variable.name.startswith("mavlink")]
+    firmware.uart_ready()  # an interrupt that nobody waits for
+
+
+def test_a_message_that_fits_no_frame_is_dropped_and_the_next_one_sent(client: Client) -> None:
+    dropped = client.stack.dropped
+    client.messages.clear()
+
+    def answer(_: object) -> None:
+        client.stack.reply(dialect.MAVLink_heartbeat_message(999, 0, 0, 0, 0, 3))  # a byte of 999
+        client.stack.reply(dialect.MAVLink_ping_message(1, 77, 255, 190))
+
+    client.stack.handle(dialect.MAVLINK_MSG_ID_PING, answer)
+    client.send("ping", 1, 76, 0, 0)
+    client.run(client.now_us + 3000)
+    assert client.stack.dropped == dropped + 1
+    assert [message.seq for _, message in client.messages if message.get_type() == "PING"] == [77]

@@ -1,0 +1,155 @@
+"""Whatever arrives on the serial line, the board neither raises nor grows nor stops flying; counters tell what it dropped.
+
+FLOATY_FUZZ is the number of messages of the long run (default 20,000).
+"""
+
+from typing import Any
+
+import numpy as np
+import pymavlink.dialects.v20.common as dialect
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_py.wire.supervisor import State
+from support.mavlink_client import STATION, Client, codec
+
+BATCH = 4  # messages per millisecond: twice what 921600 baud can carry
+COMMANDS = (185, 245, 400, 410, 510, 511, 512, 519, 520)
+SERVED = (0, 4, 20, 21, 23, 66, 75, 76, 84, 102, 110, 111, 138)
+NAMES = (b"EXT_Z_P", b"DLY_ACTIVATE", b"_HASH_CHECK", b"TLM_STREAM", b"KAL_MAXPOS", b"\xff\xfe\x00", b"")
+FLOATS = (0.0, 1.0, -1.0, 0.5, np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 30.0, 1000.0, 21196.0)
+SIZES = {"int8_t": 8, "int16_t": 16, "int32_t": 32, "int64_t": 64}
+SIZES |= {f"u{kind}": -bits for kind, bits in SIZES.items()}
+
+
+def number(rng: np.random.Generator, kind: str) -> float:
+    """A value of a C type, often at its limits."""
+    if kind in ("float", "double"):
+        return float(rng.choice(FLOATS)) if rng.random() < 0.7 else float(rng.normal())
+    bits = SIZES[kind]
+    low, high = (0, (1 << -bits) - 1) if bits < 0 else (-(1 << bits - 1), (1 << bits - 1) - 1)
+    if rng.random() < 0.6:
+        return int(rng.choice(np.array((0, 1, low, high), dtype=object)))
+    return int.from_bytes(rng.bytes(8), "little") % (high - low + 1) + low
+
+
+def message(rng: np.random.Generator) -> Any:
+    """A message with any contents; most are of kinds that the board serves, and for it."""
+    kinds = SERVED if rng.random() < 0.7 else tuple(dialect.mavlink_map)
+    cls = dialect.mavlink_map[int(rng.choice(kinds))]
+    fields: dict[str, Any] = {}
+    for name, kind, length in zip(cls.fieldnames, cls.fieldtypes, array_lengths(cls), strict=True):
+        if kind == "char":
+            fields[name] = NAMES[rng.integers(len(NAMES))][: max(1, length)]
+        elif length:
+            fields[name] = [number(rng, kind) for _ in range(length)]
+        else:
+            fields[name] = number(rng, kind)
+    if rng.random() < 0.8:
+        fields |= {name: 1 for name in ("target_system", "target_component") if name in fields}
+    if cls.id in (75, 76) and rng.random() < 0.9:
+        fields["command"] = int(rng.choice(COMMANDS))
+    return cls(**fields)
+
+
+def array_lengths(cls: Any) -> list[int]:
+    """In the order of the fields; 0 for a plain one."""
+    by_name = dict(zip(cls.ordered_fieldnames, cls.array_lengths, strict=True))
+    return [by_name[name] for name in cls.fieldnames]
+
+
+def spoilt(rng: np.random.Generator, frame: bytes) -> bytes:
+    """The frame with bytes changed, cut or added."""
+    data = bytearray(frame)
+    kind = rng.integers(3)
+    if kind == 0:
+        data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+    elif kind == 1:
+        del data[int(rng.integers(len(data))) :]
+    else:
+        data += rng.bytes(int(rng.integers(1, 40)))
+    return bytes(data)
+
+
+def recover(client: Client) -> None:
+    """Undo what the fuzz did to the supervisor and its parameters, as a ground station would."""
+    for name, value in (
+        (b"STAB_STOP", 1.0),
+        (b"STAB_STOP", 0.0),
+        (b"EXT_MANUAL", 0.0),
+        (b"SUP_LOWBATTERY", 3200.0),
+    ):
+        client.ask("param_set", 1, 1, name, value, 9)
+    client.command(400, 1)
+
+
+@pytest.mark.parametrize("messages", [4_000, pytest.param(100_000, marks=pytest.mark.long)])
+def test_the_board_survives_messages_of_every_kind_with_any_contents(messages: int) -> None:
+    rng = np.random.default_rng(5)
+    client = Client()
+    client.run(700_000)  # the gyro's zero is known
+    client.imu_alive = False
+    sender, sent = codec(*STATION), 0
+    while sent < messages:
+        frames = [message(rng).pack(sender) for _ in range(BATCH)]
+        sent += BATCH
+        if rng.random() < 0.2:
+            frames[0] = spoilt(rng, frames[0])
+        client.receive(b"".join(frames))
+        client.run(client.now_us + 1000)
+        client.writes.clear()
+        client.console.clear()
+        if len(client.messages) > 10_000:
+            client.messages.clear()
+    stack, counters = client.stack, client.stack.counters
+    for queue in client.firmware.kernel.queues:
+        assert queue.high_water <= queue.length, queue.name
+    assert counters.frames > 0.9 * messages
+    assert stack.refused > messages // 20
+    assert stack.unserved > messages // 20
+    assert stack.bad > 0
+    assert np.isfinite(client.firmware.signals.estimate).all()
+    client.send("request_data_stream", 1, 1, 0, 1, 0)
+    client.command(511, 350, -1)
+    client.run(client.now_us + 200_000)
+    fresh = Client()
+    for asked in (client, fresh):
+        asked.ask("param_request_list", 1, 1, wait_us=200_000)
+    names = [[answer.param_id for answer in asked.of("PARAM_VALUE")] for asked in (client, fresh)]
+    assert names[0] == names[1] != []
+    recover(client)
+    client.imu_alive = True
+    client.send("set_position_target_local_ned", 0, 1, 1, 1, 0x9F8, 0, 0, -1.15, 0, 0, 0, 0, 0, 0, 0, 0)
+    client.poses(client.now_us + 5000, client.now_us + 2_000_000)
+    client.run(client.now_us + 2_000_000)
+    assert client.firmware.signals.supervisor.state is State.FLYING, client.console
+
+
+@pytest.fixture(scope="module")
+def board() -> Client:
+    client = Client()
+    client.imu_alive = False
+    return client
+
+
+@given(st.lists(st.binary(max_size=300), max_size=4), st.booleans())
+@settings(max_examples=300, deadline=None)
+def test_any_bytes_leave_the_board_alive(board: Client, bursts: list[bytes], magic: bool) -> None:
+    for data in bursts:
+        board.receive(b"\xfd" + data if magic else data)
+        board.run(board.now_us + 1000)
+    board.run(board.now_us + 200_000)  # half a frame is given up
+    assert board.one("ping", 1, 2, 0, 0).seq == 2
+
+
+def test_a_board_with_a_key_learns_nothing_from_a_hundred_thousand_unsigned_bytes() -> None:
+    rng = np.random.default_rng(6)
+    client = Client(f'mavlink.signing_key="{bytes(32).hex()}"')
+    sender = codec(*STATION)
+    for _ in range(1000):
+        client.receive(message(rng).pack(sender) + rng.bytes(50))
+        client.run(client.now_us + 1000)
+    assert client.stack.counters.unsigned > 900
+    assert client.stack.counters.frames == 0
+    assert client.stack.refused == client.stack.unserved == 0

@@ -1,0 +1,222 @@
+"""The failsafe on board: every cause leads to the hover angles, is announced, and ends only as documented."""
+
+import struct
+from collections.abc import Callable
+from itertools import pairwise
+from types import SimpleNamespace
+
+import pytest
+
+from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
+from firmware_py.supervisor import Manual, Supervisor
+from firmware_py.wire import crtp
+from firmware_py.wire.supervisor import Cause, State
+from hil.config import load_config
+from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, Client
+from support.firmware_bench import HOVER_COUNTS, LEVEL
+
+OFF_CENTRE = (0.0, 0.04, 0.02)
+
+
+@pytest.fixture
+def flying() -> Client:
+    """A board that flies at 1 s and gets poses until 20 s."""
+    client = Client()
+    client.poses(605_000, 20_000_000, OFF_CENTRE)
+    client.run(1_000_000)
+    assert state(client) == (State.FLYING, Cause.NONE)
+    assert client.writes[-1][1] != HOVER_COUNTS
+    client.console.clear()
+    return client
+
+
+def state(client: Client) -> tuple[State, Cause]:
+    supervisor = client.firmware.signals.supervisor
+    return supervisor.state, supervisor.cause
+
+
+def after(client: Client, wait_us: int) -> tuple[State, Cause]:
+    client.run(client.now_us + wait_us)
+    return state(client)
+
+
+def stop(client: Client) -> None:
+    client.send(LOC, 1, b"\3")
+
+
+def stop_on_the_supervisors_port(client: Client) -> None:
+    client.send(SUPERVISOR, 1, b"\3")
+
+
+def stop_by_parameter(client: Client) -> None:
+    client.send(PARAM, 3, b"\0stabilizer\0stop\0\x08\1")
+
+
+@pytest.mark.parametrize("stop", [stop, stop_on_the_supervisors_port, stop_by_parameter])
+def test_emergency_stop_acts_within_eleven_milliseconds_and_ends_only_by_recovery(
+    flying: Client, stop
+) -> None:
+    stop(flying)
+    assert after(flying, 11_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
+    assert flying.writes[-1][1] == HOVER_COUNTS
+    assert flying.console == ["supervisor: failsafe, emergency stop"]
+    assert after(flying, 3_000_000)[1] is Cause.EMERGENCY_STOP
+    assert flying.one(SUPERVISOR, 1, b"\1\1") == b"\x81\0\1"  # arming is refused
+    assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\1\1"
+    assert after(flying, 11_000) == (State.FLYING, Cause.NONE)
+
+
+def test_emergency_stop_beats_flaps_from_outside(flying: Client) -> None:
+    flying.send(PARAM, 3, b"\0extCtrl\0manual\0\x08\1")
+    flying.run(flying.now_us + 20_000)
+    assert flying.writes[-1][1] != HOVER_COUNTS
+    stop(flying)
+    flying.run(flying.now_us + 20_000)
+    assert flying.writes[-1][1] == HOVER_COUNTS
+
+
+def fell_silent(supervisor: Supervisor) -> None:
+    supervisor.last_pose_us = 0
+
+
+def was_held_at_its_bounds(supervisor: Supervisor) -> None:
+    for now_us in range(5_000_000, 6_000_000, 10_000):
+        supervisor._estimator.bounded += 1
+        supervisor.mode(now_us)
+
+
+def ran_down(supervisor: Supervisor) -> None:
+    for now_us in range(0, 6_000_000, 100_000):
+        supervisor.see_battery(now_us, 3000)
+
+
+@pytest.mark.parametrize(
+    ("happen", "cause", "flown_by"),
+    [
+        (lambda supervisor: None, Cause.NONE, (MODE_FLY, MODE_MANUAL, MODE_HOVER)),
+        (fell_silent, Cause.SILENCE, (MODE_HOVER, MODE_MANUAL, MODE_HOVER)),
+        (was_held_at_its_bounds, Cause.OUT_OF_BOUNDS, (MODE_HOVER, MODE_MANUAL, MODE_HOVER)),
+        (Supervisor.emergency_stop, Cause.EMERGENCY_STOP, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (ran_down, Cause.LOW_BATTERY, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (lambda supervisor: supervisor.arm(False), Cause.DISARMED, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+    ],
+)
+@pytest.mark.parametrize("manual", Manual)
+def test_angles_from_outside_move_the_flaps_unless_somebody_or_the_battery_stopped_the_robot(
+    happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int], manual: Manual
+) -> None:
+    supervisor = Supervisor(load_config().supervisor, SimpleNamespace(bounded=0), lambda text: None)
+    supervisor.calibrated, supervisor.last_pose_us = True, 6_000_000
+    supervisor.manual = manual
+    happen(supervisor)
+    assert supervisor.mode(6_000_000) == flown_by[manual]
+    assert supervisor.cause is cause
+
+
+@pytest.mark.parametrize(("port", "data"), [(LOC, b"\4"), (SUPERVISOR, b"\4")])
+def test_watchdog_bites_one_second_after_its_last_meal_and_not_before_the_first(flying, port, data) -> None:
+    assert after(flying, 2_000_000)[0] is State.FLYING
+    for _ in range(3):
+        flying.send(port, 1, data)
+        assert after(flying, 900_000)[0] is State.FLYING
+    assert after(flying, 95_000)[0] is State.FLYING
+    assert after(flying, 16_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
+    flying.send(port, 1, data)
+    assert after(flying, 100_000)[1] is Cause.EMERGENCY_STOP
+    flying.one(SUPERVISOR, 1, b"\2")
+    assert after(flying, 3_000_000)[0] is State.FLYING  # recovery ends the watchdog, too
+
+
+def test_disarmed_board_does_not_fly_until_it_is_armed(flying: Client) -> None:
+    flying.one(SUPERVISOR, 1, b"\1\0")
+    assert after(flying, 11_000) == (State.FAILSAFE, Cause.DISARMED)
+    assert flying.writes[-1][1] == HOVER_COUNTS
+    flying.one(SUPERVISOR, 1, b"\1\1")
+    assert after(flying, 11_000)[0] is State.FLYING
+
+
+def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage(flying: Client) -> None:
+    flying.battery_mv = 3100
+    flying.run(flying.now_us + 4_000_000)
+    flying.battery_mv = 3300  # a sag
+    flying.run(flying.now_us + 200_000)
+    flying.battery_mv = 3100
+    assert after(flying, 4_800_000)[0] is State.FLYING
+    assert after(flying, 400_000) == (State.FAILSAFE, Cause.LOW_BATTERY)
+    assert flying.writes[-1][1] == HOVER_COUNTS
+    assert flying.console == ["supervisor: failsafe, low battery"]
+    flying.battery_mv = 3800
+    assert after(flying, 1_000_000)[1] is Cause.LOW_BATTERY
+    flying.one(SUPERVISOR, 1, b"\2")
+    assert after(flying, 11_000)[0] is State.FLYING
+    assert after(flying, 1_000_000)[0] is State.FLYING
+
+
+def test_recovery_is_refused_while_the_battery_is_low(flying: Client) -> None:
+    flying.battery_mv = 3100
+    assert after(flying, 5_300_000)[1] is Cause.LOW_BATTERY
+    assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\0\0"
+
+
+def test_silence_is_a_parameter(flying: Client) -> None:
+    flying.send(PARAM, 3, b"\0supervisor\0poseTimeout\0\x09" + struct.pack("<H", 100))
+    flying.events = type(flying.events)()  # no more poses
+    flying.events.at(flying.now_us // 1000 * 1000 + 1000, flying._sample)
+    assert after(flying, 80_000)[0] is State.FLYING
+    assert after(flying, 40_000) == (State.FAILSAFE, Cause.SILENCE)
+    assert flying.console == ["supervisor: failsafe, silence"]
+
+
+def test_one_outlier_pose_changes_neither_the_state_nor_the_estimate(flying: Client) -> None:
+    counters = flying.firmware.signals.counters
+    resets = counters[6]
+    flying.run(flying.now_us + 18_000)  # of two poses that were true in one tick the later counts
+    for outlier in ((1.0, 0.0, 0.0), (0.0, -1.4, 0.5), (0.3, 0.3, 0.3)):
+        flying.send(LOC, 1, crtp.encode_ext_pose(outlier, LEVEL, 40_000)[1:])
+        for _ in range(20):
+            flying.run(flying.now_us + 10_000)
+            assert state(flying)[0] is State.FLYING
+            assert flying.firmware.signals.estimate[:3] == pytest.approx(OFF_CENTRE, abs=5e-3)
+    assert counters[6] == resets
+    assert counters[1] == 3
+    assert flying.console == []
+
+
+def test_an_estimator_at_its_bounds_is_a_failsafe_that_ends_half_a_second_after_it_is_back(
+    flying: Client,
+) -> None:
+    flying.send(PARAM, 3, b"\0kalman\0maxPos\0\x06" + struct.pack("<f", 0.03))  # the robot is at y = 0.04
+    begin_us = flying.now_us
+    while state(flying)[0] is State.FLYING:
+        flying.run(flying.now_us + 10_000)
+    assert 200_000 <= flying.now_us - begin_us <= 250_000
+    assert state(flying) == (State.FAILSAFE, Cause.OUT_OF_BOUNDS)
+    assert after(flying, 2_000_000)[1] is Cause.OUT_OF_BOUNDS
+    assert flying.writes[-1][1] == HOVER_COUNTS
+    flying.send(PARAM, 3, b"\0kalman\0maxPos\0\x06" + struct.pack("<f", 1.5))
+    begin_us = flying.now_us
+    while state(flying)[0] is State.FAILSAFE:
+        flying.run(flying.now_us + 10_000)
+    assert 490_000 <= flying.now_us - begin_us <= 520_000
+    assert flying.console == ["supervisor: failsafe, out of bounds", "supervisor: flying"]
+
+
+def test_state_and_cause_are_log_variables(flying: Client) -> None:
+    table = flying.toc(LOG)
+    assert flying.log(table, "supervisor.state", "supervisor.cause", "sys.canfly", "sys.isFlying") == [
+        2,
+        0,
+        1,
+        1,
+    ]
+    stop(flying)
+    flying.run(flying.now_us + 20_000)
+    names = ("supervisor.state", "supervisor.cause", "sys.canfly", "sys.isFlying", "supervisor.info")
+    assert flying.log(table, *names) == [3, 3, 0, 0, 0b1000110]
+
+
+def test_flaps_never_rest_whatever_the_supervisor_says(flying: Client) -> None:
+    stop(flying)
+    flying.run(flying.now_us + 500_000)
+    times = [t for t, _ in flying.writes]
+    assert max(later - earlier for earlier, later in pairwise(times[1:])) <= 11_000

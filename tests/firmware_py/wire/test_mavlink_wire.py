@@ -1,0 +1,333 @@
+"""MAVLink's units and frames against scipy and pymavlink: north-east-down outside, z up inside."""
+
+from math import inf, nan
+from typing import Any
+
+import numpy as np
+import pymavlink.dialects.v20.common as dialect
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from firmware_py.wire import WireError, mavlink, telemetry
+from firmware_py.wire.mavlink_frames import FrameSender
+from support.crtp_client import PARAM, Client
+
+# NED seen from W and FRD seen from B: x stays, y and z turn over.
+D = np.diag([1.0, -1.0, -1.0])
+V = (1.0, 2.0, 3.0)
+U = (-4.0, 5.0, -6.0)
+ANGLES = (0.1, 0.2, 0.3)  # roll, pitch, yaw
+R_WB = Rotation.from_euler("ZYX", ANGLES[::-1])
+R_NED_FRD = Rotation.from_matrix(D @ R_WB.as_matrix() @ D)
+Q_WB = tuple(R_WB.as_quat(scalar_first=True).tolist())
+SMALL = 1e-6  # float32
+
+
+def over_the_wire(message: Any) -> Any:
+    """What pymavlink reads from our frame."""
+    return dialect.MAVLink(None).decode(bytearray(FrameSender(1, 1).encode(0, message)))
+
+
+def vector(message: Any, names: str) -> list[float]:
+    return [getattr(message, name) for name in names.split()]
+
+
+def near(expected: Any) -> Any:
+    return pytest.approx(np.asarray(expected).tolist(), abs=SMALL)
+
+
+# Uplink
+
+
+def test_pose_is_the_standards_and_comes_back() -> None:
+    message = over_the_wire(mavlink.pose(1_234_567, V, Q_WB))
+    assert message.get_msgId() == mavlink.MSG_ATT_POS_MOCAP
+    assert message.time_usec == 1_234_567
+    assert vector(message, "x y z") == near(D @ V)
+    assert message.q == near(R_NED_FRD.as_quat(scalar_first=True))
+    assert message.covariance == [0.0] * 21
+    pose = mavlink.read_pose(message)
+    assert (pose.t_us, pose.p_WB, pose.q_WB) == (1_234_567, near(V), near(Q_WB))
+
+
+def test_visual_pose_is_read() -> None:
+    yaw, pitch, roll = R_NED_FRD.as_euler("ZYX")
+    message = over_the_wire(dialect.MAVLink_vision_position_estimate_message(99, *(D @ V), roll, pitch, yaw))
+    pose = mavlink.read_pose(message)
+    assert (pose.t_us, pose.p_WB, pose.q_WB) == (99, near(V), near(Q_WB))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        dialect.MAVLink_att_pos_mocap_message(0, (1, 0, 0, 0), 0, nan, 0),
+        dialect.MAVLink_att_pos_mocap_message(0, (1, 0, 0, 0), inf, 0, 0),
+        dialect.MAVLink_att_pos_mocap_message(0, (0, 0, 0, 0), 0, 0, 0),
+        dialect.MAVLink_att_pos_mocap_message(0, (nan, 0, 0, 1), 0, 0, 0),
+        dialect.MAVLink_vision_position_estimate_message(0, 0, 0, 0, inf, 0, 0),
+        dialect.MAVLink_vision_position_estimate_message(0, 0, inf, 0, 0, 0, 0),
+    ],
+)
+def test_impossible_pose_is_refused(message: Any) -> None:
+    with pytest.raises(WireError):
+        mavlink.read_pose(over_the_wire(message))
+
+
+def test_target_is_the_standards_and_comes_back() -> None:
+    message = over_the_wire(mavlink.target(5000, V, 0.5, system=3, component=4))
+    assert (message.time_boot_ms, message.target_system, message.target_component) == (5000, 3, 4)
+    assert message.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
+    ignored = dialect.enums["POSITION_TARGET_TYPEMASK"]
+    names = " ".join(entry.name for bit, entry in ignored.items() if bit & message.type_mask)
+    for part in ("VX", "VY", "VZ", "AX", "AY", "AZ", "YAW_RATE"):
+        assert f"{part}_IGNORE" in names
+    assert vector(message, "x y z") == near(D @ V)
+    assert message.yaw == near(-0.5)  # clockwise from above
+    target = mavlink.read_target(message)
+    assert (target.p_WG, target.yaw) == (near(V), near(0.5))
+
+
+def test_masked_parts_of_a_target_are_none() -> None:
+    only_yaw = mavlink.read_target(over_the_wire(mavlink.target(0, None, 0.5)))
+    assert (only_yaw.p_WG, only_yaw.yaw) == (None, near(0.5))
+    only_position = mavlink.read_target(over_the_wire(mavlink.target(0, V, None)))
+    assert (only_position.p_WG, only_position.yaw) == (near(V), None)
+
+
+X, Y, Z = 1, 2, 4
+FORCE, NO_YAW = 512, 1024
+
+
+@pytest.mark.parametrize(
+    ("frame", "mask", "x"),
+    [
+        (dialect.MAV_FRAME_BODY_NED, 0, 1.0),
+        (dialect.MAV_FRAME_LOCAL_OFFSET_NED, 0, 1.0),
+        (dialect.MAV_FRAME_GLOBAL, 0, 1.0),
+        (dialect.MAV_FRAME_LOCAL_NED, X, 1.0),
+        (dialect.MAV_FRAME_LOCAL_NED, Y | Z, 1.0),
+        (dialect.MAV_FRAME_LOCAL_NED, X | Y | Z | NO_YAW, 1.0),  # velocity only
+        (dialect.MAV_FRAME_LOCAL_NED, FORCE, 1.0),
+        (dialect.MAV_FRAME_LOCAL_NED, 0, nan),
+        (dialect.MAV_FRAME_LOCAL_NED, 0, inf),
+    ],
+)
+def test_target_that_cannot_be_served_is_refused(frame: int, mask: int, x: float) -> None:
+    message = dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, frame, mask, x, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0
+    )
+    with pytest.raises(WireError, match="target"):
+        mavlink.read_target(over_the_wire(message))
+
+
+def test_a_masked_part_may_hold_anything() -> None:
+    message = dialect.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, NO_YAW, *V, nan, nan, nan, nan, nan, nan, nan, nan
+    )
+    assert mavlink.read_target(over_the_wire(message)) == mavlink.Target((1.0, -2.0, -3.0), None)
+
+
+def test_command_pads_its_parameters() -> None:
+    message = over_the_wire(mavlink.command(3, 4, 511, 30, 20_000))
+    assert (message.target_system, message.target_component, message.command) == (3, 4, 511)
+    assert vector(message, "param1 param2 param3 param4 param5 param6 param7") == [30, 20_000, 0, 0, 0, 0, 0]
+
+
+def test_station_is_a_station() -> None:
+    message = over_the_wire(mavlink.station_heartbeat())
+    assert (message.type, message.autopilot) == (dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID)
+    assert not message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED
+
+
+# Downlink
+
+
+def test_attitude_is_the_standards_and_comes_back() -> None:
+    message = over_the_wire(mavlink.attitude(77, *ANGLES, *U))
+    assert vector(message, "yaw pitch roll") == near(R_NED_FRD.as_euler("ZYX"))
+    assert vector(message, "rollspeed pitchspeed yawspeed") == near(D @ U)
+    sample = mavlink.read_attitude(message)
+    assert (sample.t_ms, sample.attitude, sample.rates_B) == (77, near(ANGLES), near(U))
+
+
+def test_attitude_quaternion_is_the_standards() -> None:
+    message = over_the_wire(mavlink.attitude_quaternion(77, Q_WB, *U))
+    assert vector(message, "q1 q2 q3 q4") == near(R_NED_FRD.as_quat(scalar_first=True))
+    assert vector(message, "rollspeed pitchspeed yawspeed") == near(D @ U)
+
+
+def test_position_is_the_standards_and_comes_back() -> None:
+    message = over_the_wire(mavlink.local_position(77, V, U))
+    assert vector(message, "x y z") == near(D @ V)
+    assert vector(message, "vx vy vz") == near(D @ U)
+    sample = mavlink.read_local_position(message)
+    assert (sample.t_ms, sample.p_WB, sample.v_W) == (77, near(V), near(U))
+
+
+def test_home_is_the_standards() -> None:
+    message = over_the_wire(mavlink.home_position(88, V))
+    assert vector(message, "x y z") == near(D @ V)
+    assert (message.q, message.time_usec) == ([1.0, 0.0, 0.0, 0.0], 88)
+
+
+def test_servo_counts_become_microseconds() -> None:
+    message = over_the_wire(mavlink.servo_outputs((1 << 32) + 5, (21_000, 31_500, 42_000, 31_511)))
+    assert vector(message, "servo1_raw servo2_raw servo3_raw servo4_raw") == [1000, 1500, 2000, 1501]
+    assert message.time_usec == 5  # 32 bits, wraps
+
+
+@pytest.mark.parametrize(
+    ("state", "status"), list(enumerate(("CALIBRATING", "STANDBY", "ACTIVE", "CRITICAL")))
+)
+def test_heartbeat_tells_state_and_arming(state: int, status: str) -> None:
+    for armed in (False, True):
+        message = over_the_wire(mavlink.heartbeat(armed, state))
+        assert (
+            message.autopilot == dialect.MAV_AUTOPILOT_GENERIC
+        )  # with INVALID no client takes us for a vehicle
+        assert message.custom_mode == state
+        assert message.system_status == getattr(dialect, f"MAV_STATE_{status}")
+        assert bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED) == armed
+        assert message.base_mode & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
+def test_status_has_the_standards_units() -> None:
+    message = over_the_wire(mavlink.sys_status(3900, 0.05, 70_000, 0.25))
+    assert (message.voltage_battery, message.drop_rate_comm, message.load) == (3900, 500, 250)
+    assert message.errors_comm == 65_535
+    present = message.onboard_control_sensors_present
+    assert present == message.onboard_control_sensors_enabled == message.onboard_control_sensors_health
+    assert present & dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    assert not present & dialect.MAV_SYS_STATUS_GEOFENCE
+
+
+def test_battery_is_one_cell() -> None:
+    message = over_the_wire(mavlink.battery(3900))
+    assert message.voltages == [3900] + [65_535] * 9
+    assert (message.current_battery, message.battery_remaining) == (-1, -1)
+
+
+def test_estimator_tells_health_and_accuracy() -> None:
+    message = over_the_wire(mavlink.estimator_status(9, True, 0.25, 0.5))
+    assert message.flags & dialect.ESTIMATOR_POS_HORIZ_ABS
+    assert not message.flags & dialect.ESTIMATOR_PRED_POS_HORIZ_REL
+    assert (message.pos_horiz_accuracy, message.pos_vert_accuracy) == (0.25, 0.5)
+    assert over_the_wire(mavlink.estimator_status(9, False, 0.25, 0.5)).flags == 0
+
+
+def test_flight_array_carries_the_telemetry_blocks() -> None:
+    values = tuple(float(i) for i in range(1, 17))
+    assert (
+        len(telemetry.BLOCKS[2].variables) + len(telemetry.BLOCKS[3].variables) == mavlink.FLIGHT_ARRAY_SIZE
+    )
+    message = over_the_wire(mavlink.flight_array(12_000, values))
+    assert (message.name, message.time_usec, message.data[16:]) == ("floaty", 12_000, [0.0] * 42)
+    assert mavlink.read_flight_array(message) == values
+    with pytest.raises(WireError, match="other"):
+        mavlink.read_flight_array(
+            over_the_wire(dialect.MAVLink_debug_float_array_message(0, b"other", 0, [0.0] * 58))
+        )
+
+
+def test_texts_are_cut_to_their_fields() -> None:
+    assert over_the_wire(mavlink.status_text(4, "ö" + "x" * 60)).text == "?" + "x" * 49
+    assert over_the_wire(mavlink.named_value(1, "abcdefghijklm", 2.5)).name == "abcdefghij"
+    assert over_the_wire(mavlink.parameter("A" * 16, 2.5, 3, 60)).param_id == "A" * 16
+
+
+def test_parameters_are_real32() -> None:
+    message = over_the_wire(mavlink.parameter("EXT_X_P", -2.5, 3, 60))
+    assert message.param_type == dialect.MAV_PARAM_TYPE_REAL32
+    assert (message.param_value, message.param_index, message.param_count) == (-2.5, 3, 60)
+
+
+def test_version_is_packed_in_bytes() -> None:
+    message = over_the_wire(mavlink.autopilot_version((1, 2, 3), b"abcdefghij", 0x1234))
+    assert message.flight_sw_version.to_bytes(4, "big")[:3] == bytes((1, 2, 3))
+    assert bytes(message.flight_custom_version) == b"abcdefgh"
+    assert message.uid == 0x1234
+    assert message.capabilities & dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    assert not message.capabilities & dialect.MAV_PROTOCOL_CAPABILITY_FTP
+
+
+def test_answers_go_to_who_asked() -> None:
+    station = dialect.MAVLink(None, 255, 230)
+
+    def from_station(message: Any) -> Any:
+        return dialect.MAVLink(None).decode(bytearray(message.pack(station)))
+
+    ping = over_the_wire(mavlink.ping_answer(from_station(dialect.MAVLink_ping_message(123, 45, 0, 0))))
+    assert vector(ping, "time_usec seq target_system target_component") == [123, 45, 255, 230]
+    # sequence 0xFFFF, session 7, opcode 4 (open for reading), size, request opcode, burst, padding, offset
+    asked = [0xFF, 0xFF, 7, 4, 12, 0, 0, 0, 1, 2, 3, 4, *b"@PARAM/param.pck"]
+    asked += [0] * (251 - len(asked))
+    nak = over_the_wire(
+        mavlink.ftp_nak(from_station(dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, asked)))
+    )
+    assert (nak.target_system, nak.target_component) == (255, 230)
+    assert nak.payload == [0, 0, 7, 129, 1, 4, 0, 0, 1, 2, 3, 4, 6] + [0] * 238
+    ack = over_the_wire(mavlink.command_ack(400, 3, 255, 230))
+    assert vector(ack, "command result target_system target_component") == [400, 3, 255, 230]
+    assert vector(over_the_wire(mavlink.timesync(5, 6)), "tc1 ts1") == [5, 6]
+    assert vector(over_the_wire(mavlink.message_interval(30, -1)), "message_id interval_us") == [30, -1]
+
+
+big = st.integers(-(1 << 70), 1 << 70)
+real = st.floats(width=32)
+
+
+@given(big, big, real, real, st.text(max_size=80))
+def test_nothing_that_goes_down_raises(n: int, m: int, a: float, b: float, text: str) -> None:
+    t = abs(n) % (1 << 64)
+    v = (a, b, a)
+    for message in (
+        mavlink.sys_status(n, a, m, b),
+        mavlink.battery(n),
+        mavlink.attitude(n, *v, *v),
+        mavlink.attitude_quaternion(n, (a, b, a, b), *v),
+        mavlink.local_position(n, v, v),
+        mavlink.servo_outputs(n, (n, m, n, m)),
+        mavlink.estimator_status(t, a > b, a, b),
+        mavlink.home_position(t, v),
+        mavlink.flight_array(t, (a, b) * 8),
+        mavlink.named_value(n, text, a),
+        mavlink.status_text(6, text),
+        mavlink.parameter(text, a, n, m),
+        mavlink.message_interval(n, m),
+    ):
+        FrameSender(1, 1).encode(0, message)
+
+
+# Names and sizes
+
+
+def test_parameter_names_are_unique_and_fit() -> None:
+    ours = list(Client().toc(PARAM))
+    names = [mavlink.mavlink_name(name) for name in ours]
+    assert len(set(names)) == len(ours) > 60
+    for name in names:
+        assert len(name) <= 16
+        assert set(name) <= set("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
+    assert mavlink.mavlink_name("extCtrl.pitch_rate_P") == "EXT_PITCH_RATE_P"
+    assert mavlink.mavlink_name("sound.effect") == "SOUND_EFFECT"
+
+
+@pytest.mark.parametrize(
+    ("message", "size"),
+    [
+        (mavlink.pose(10**12, V, Q_WB), 48),
+        (mavlink.target(10**6, V, 0.5), 65),
+        (mavlink.station_heartbeat(), 21),
+        (mavlink.attitude(10**6, *ANGLES, *U), 40),
+        (mavlink.attitude_quaternion(10**6, Q_WB, *U), 44),
+        (mavlink.local_position(10**6, V, U), 40),
+        (mavlink.servo_outputs(10**9, (31_500,) * 4), 24),
+        (mavlink.parameter("ABC", 1.0, 0, 60), 37),
+        (mavlink.command_ack(400, 0, 255, 190), 22),
+        (mavlink.status_text(6, "hello"), 18),
+    ],
+)
+def test_frame_sizes_are_those_of_the_line_budget(message: Any, size: int) -> None:
+    assert len(FrameSender(1, 1).encode(0, message)) == size

@@ -1,0 +1,283 @@
+"""Frames in, corrections out, telemetry into the log."""
+
+import csv
+from math import isnan, nan, pi
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from firmware_py.geometry import from_euler_zyx
+from firmware_py.wire import crtp, telemetry
+from firmware_py.wire.scalars import Scalar
+from ground_station.config import StationConfig, TrackerConfig
+from ground_station.corrections import correct
+from ground_station.links.loopback import LoopbackLink
+from ground_station.mocap import MocapFrame
+from ground_station.station import GroundStation
+from ground_station.telemetry_log import TelemetryLog
+from ground_station.tracker import Quality, Tracker
+from ground_station.trajectory import Goal, Hold, Offsets, Sine, Square, Step
+
+HOME = Goal((0.0, 0.0, 1.15), 0.0)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+metres = st.floats(-2.0, 2.0)
+angle = st.floats(-pi, pi)
+
+
+class StationWithPackets:
+    """A ground station whose packets end in a list."""
+
+    def __init__(self, corrections_hz=50.0, latency_us=1000, log=None, trajectory=None, tracker=None):
+        self.sent = []  # corrections
+        self.requests = []  # for telemetry
+        link = LoopbackLink(self._transmit, latency_us)
+        self.station = GroundStation(
+            link, trajectory or Hold(HOME), log, StationConfig(corrections_hz=corrections_hz), tracker
+        )
+
+    def _transmit(self, now_us, data):
+        (self.sent if data[0] >> 4 == crtp.PORT_LOCALISATION else self.requests).append((now_us, data))
+
+    def frames(
+        self, count, valid=lambda number: True, p=lambda number: (0.001 * number, 0.0, 1.15), period_us=5000
+    ):
+        for number in range(count):
+            frame = MocapFrame(round(period_us * number), p(number), UPRIGHT, valid(number))
+            self.station.on_frame(frame, frame.t_us + 38_000)
+
+    def numbers(self):
+        """Which frames were sent, by their x."""
+        return [round(crtp.decode_ext_pose(data[1:]).p_GB[0] * 1000) for _, data in self.sent]
+
+
+def test_correction_of_one_two_three_seen_from_a_goal_that_looks_left():
+    # The goal looks along +y, so world x is to its right and world y ahead.
+    correction = correct(
+        MocapFrame(1000, (1.0, 2.0, 3.0), UPRIGHT, True), Goal((0.0, 0.0, 0.0), pi / 2), 41_000
+    )
+    assert correction.p_GB == pytest.approx((2.0, -1.0, 3.0))
+    assert correction.q_GB == pytest.approx((np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)))
+    assert correction.age_us == 40_000
+
+
+@given(st.tuples(metres, metres, metres), st.tuples(metres, metres, metres), angle, angle, angle, angle)
+def test_correction_is_scipys_pose_in_the_goal_frame(p, goal, goal_yaw, roll, pitch, yaw):
+    correction = correct(MocapFrame(0, p, from_euler_zyx(roll, pitch, yaw), True), Goal(goal, goal_yaw), 0)
+    R_GW = Rotation.from_euler("z", goal_yaw).inv()
+    R_WB = Rotation.from_euler("ZYX", (yaw, pitch, roll))
+    assert correction.p_GB == pytest.approx(R_GW.apply(np.subtract(p, goal)), abs=1e-9)
+    ours = Rotation.from_quat(correction.q_GB, scalar_first=True)
+    assert (ours.inv() * R_GW * R_WB).magnitude() < 1e-7
+
+
+def test_every_fourth_frame_is_sent_at_once():
+    bench = StationWithPackets()
+    bench.frames(20)
+    assert bench.numbers() == [0, 4, 8, 12, 16]
+    assert [now_us for now_us, _ in bench.sent] == [38_000 + 20_000 * k for k in range(5)]
+    assert (bench.station.counters.frames, bench.station.counters.sent) == (20, 5)
+
+
+@pytest.mark.parametrize("camera_hz", [50, 60, 90, 100, 120, 180, 200, 240, 360, 1000])
+def test_fifty_corrections_leave_per_second_whatever_the_cameras_rate(camera_hz):
+    bench = StationWithPackets()
+    bench.frames(10 * camera_hz, period_us=1e6 / camera_hz)
+    assert len(bench.sent) == pytest.approx(500, abs=2)
+    gaps_us = np.diff([now_us for now_us, _ in bench.sent])
+    assert gaps_us.max() <= 20_000 + 1e6 / camera_hz
+
+
+@pytest.mark.parametrize("camera_hz", [10, 25, 40, 45])
+def test_slower_cameras_lose_no_frame(camera_hz):
+    bench = StationWithPackets()
+    bench.frames(10 * camera_hz, period_us=1e6 / camera_hz)
+    assert len(bench.sent) == 10 * camera_hz
+
+
+@given(st.lists(st.integers(-2000, 2000), min_size=100, max_size=100))
+def test_jitter_of_a_camera_at_the_corrections_rate_loses_no_frame(jitter_us):
+    bench = StationWithPackets()
+    for number, late_us in enumerate(jitter_us):
+        frame = MocapFrame(20_000 * number + (late_us if number else 0), HOME.p_WG, UPRIGHT, True)
+        bench.station.on_frame(frame, frame.t_us + 38_000)
+    assert len(bench.sent) == 100
+
+
+def test_a_camera_clock_that_is_set_back_does_not_silence_the_corrections():
+    bench = StationWithPackets()
+    for t_us in (10_000_000, 10_020_000, 5_000_000, 5_020_000):
+        bench.station.on_frame(MocapFrame(t_us, HOME.p_WG, UPRIGHT, True), 20_000_000)
+    assert len(bench.sent) == 4
+
+
+def test_sent_age_is_that_on_arrival():
+    bench = StationWithPackets(latency_us=2000)
+    bench.frames(1)
+    assert crtp.decode_ext_pose(bench.sent[0][1][1:]).age_us == 40_000
+
+
+def test_untracked_frames_are_never_sent_and_the_slots_keep_their_phase():
+    bench = StationWithPackets()
+    bench.frames(20, valid=lambda number: number not in (4, 5, *range(8, 15)))
+    assert bench.numbers() == [0, 6, 15, 16]
+    assert bench.station.counters.invalid == 9
+
+
+def test_a_frame_without_a_pose_is_not_sent():
+    bench = StationWithPackets(corrections_hz=200.0)
+    bench.frames(3, p=lambda number: (nan, 0.0, 0.0) if number == 1 else (0.001 * number, 0.0, 1.15))
+    assert bench.numbers() == [0, 2]
+    assert bench.station.counters.invalid == 1
+
+
+def test_refused_frames_are_not_sent_and_the_next_good_one_takes_their_place():
+    """x grows by 1 mm per frame, 0.2 m/s; three frames are half a metre off. A track begins with the third frame."""
+    bench = StationWithPackets(tracker=Tracker(TrackerConfig(), 5000))
+    bench.frames(200, p=lambda number: (0.001 * number + 0.5 * (number in (99, 100, 101)), 0.0, 1.15))
+    assert bench.numbers() == [2, *range(4, 100, 4), 102, *range(104, 200, 4)]
+    assert bench.station.counters.invalid == 5
+    assert bench.station.notices() == ["motion capture: 3 poses refused, up to 0.50 m and 0 deg off"]
+
+
+def test_the_goal_of_the_moment_counts_not_that_of_the_exposure():
+    bench = StationWithPackets(corrections_hz=200.0, trajectory=Offsets(HOME, 40_000, x=Step(0.5)))
+    bench.frames(2, p=lambda number: HOME.p_WG)  # arrive at 38 and 43 ms
+    assert bench.numbers() == [0, -500]
+
+
+@given(st.binary(max_size=40))
+def test_any_packet_is_counted_and_none_is_raised(data):
+    bench = StationWithPackets()
+    bench.station.on_packet(0, data)
+    assert bench.station.counters.received == 1
+    assert bench.station.counters.malformed <= 1
+
+
+def test_unreadable_telemetry_is_counted_and_other_services_are_not():
+    bench = StationWithPackets()
+    bench.station.on_packet(0, b"\x5e\x63\0\0\0")
+    assert bench.station.counters.malformed == 1
+    bench.station.on_packet(0, b"\x0chello")  # console
+    assert bench.station.counters.malformed == 1
+
+
+@pytest.mark.parametrize("change", [{"corrections_hz": 0}, {"link_latency_us": -1}, {"correctionshz": 50}])
+def test_bad_configuration_is_refused(change):
+    with pytest.raises(ValidationError):
+        StationConfig(**change)
+
+
+def test_telemetry_is_asked_for_at_the_first_frame_and_after_half_a_second_without_it():
+    bench = StationWithPackets()
+    bench.frames(300)
+    assert [now_us for now_us, _ in bench.requests] == [38_000, 538_000, 1_038_000]
+    assert {data for _, data in bench.requests} == {b"\x2f\0telemetry\0stream\0\x08\x01"}
+    bench.requests.clear()
+    for now_us in range(1_540_000, 3_000_000, 400_000):
+        bench.station.on_packet(now_us, next(telemetry_packets(now_us // 1000)))
+        bench.station.on_frame(MocapFrame(now_us, HOME.p_WG, UPRIGHT, True), now_us + 399_000)
+    assert bench.requests == []
+
+
+def telemetry_packets(timestamp_ms, blocks=telemetry.BLOCKS):
+    for block in blocks:
+        shown = [(variable.scale or 1) * (0.5 + block.id) for variable in block.variables]
+        yield telemetry.encode_block(block, timestamp_ms, shown)
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = StationWithPackets(log=log)
+    bench.frames(1, p=lambda number: (0.25, 0.0, 1.15))
+    for timestamp_ms in (20, 40):
+        for data in telemetry_packets(timestamp_ms):
+            bench.station.on_packet(timestamp_ms * 1000 + 900, data)
+    log.close()
+    log.close()
+    first, second = rows(tmp_path / "telemetry.csv")
+    assert (first["board.t [ms]"], second["board.t [ms]"]) == ("20", "40")
+    assert float(first["ground.t [s]"]) == 0.0209
+    assert float(first["goal.z [m]"]) == 1.15
+    assert float(first["mocap.x [m]"]) == 0.25
+    for block in telemetry.BLOCKS:
+        for variable in block.variables:
+            expected = 0.5 + block.id if variable.type is Scalar.F32 else block.id
+            assert float(first[f"{variable.name} [{variable.unit}]"]) == expected
+
+
+def test_times_are_to_the_microsecond_on_a_computer_that_has_run_for_days(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = StationWithPackets(log=log)
+    now_us = 1_000_000_123_457
+    bench.station.on_frame(MocapFrame(now_us - 38_001, (0.0, 0.0, 1.15), UPRIGHT, True), now_us)
+    for data in telemetry_packets(20):
+        bench.station.on_packet(now_us, data)
+    log.close()
+    (row,) = rows(tmp_path / "telemetry.csv")
+    times_us = [round(float(row[title]) * 1e6) for title in ("ground.t [s]", "mocap.t [s]")]
+    assert times_us == [now_us, now_us - 38_001]
+
+
+def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = StationWithPackets(log=log)
+    for timestamp_ms, blocks in ((20, telemetry.BLOCKS), (40, telemetry.BLOCKS[1:])):
+        for data in telemetry_packets(timestamp_ms, blocks):
+            bench.station.on_packet(0, data)
+    log.close()
+    first, second = rows(tmp_path / "telemetry.csv")
+    assert float(first["stateEstimate.x [m]"]) == 0.5 + telemetry.BLOCKS[0].id
+    assert isnan(float(second["stateEstimate.x [m]"]))
+    assert float(second["stateEstimate.roll [rad]"]) == 0.5 + telemetry.BLOCKS[1].id
+    assert isnan(float(second["mocap.x [m]"]))
+
+
+def test_log_knows_velocity_and_quality_of_the_track_and_the_last_usable_pose(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = StationWithPackets(log=log, tracker=Tracker(TrackerConfig(), 5000))
+    packet = next(telemetry_packets(20, telemetry.BLOCKS))
+    bench.frames(100)
+    bench.station.on_packet(500_000, packet)
+    bench.station.on_frame(MocapFrame(500_000, (0.5, 0.0, 1.15), UPRIGHT, True), 538_000)
+    bench.station.on_packet(540_000, next(telemetry_packets(40, telemetry.BLOCKS)))
+    log.close()
+    good, refused = rows(tmp_path / "telemetry.csv")
+    assert (float(good["mocap.quality []"]), float(refused["mocap.quality []"])) == (
+        Quality.TRACKED,
+        Quality.REFUSED,
+    )
+    for row in (good, refused):
+        assert float(row["mocap.vx [m/s]"]) == pytest.approx(0.2, abs=1e-3)
+        assert float(row["mocap.r [rad/s]"]) == pytest.approx(0.0, abs=1e-6)
+        assert float(row["mocap.x [m]"]) == pytest.approx(0.099)
+
+
+def test_log_on_disk_is_never_much_more_than_a_second_old(tmp_path):
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    bench = StationWithPackets(log=log)
+    for timestamp_ms in range(0, 10_000, 500):  # few bytes: no buffer is ever full
+        for data in telemetry_packets(timestamp_ms):
+            bench.station.on_packet(timestamp_ms * 1000, data)
+    # not closed, as after a crash
+    assert int(rows(tmp_path / "telemetry.csv")[-1]["board.t [ms]"]) >= 8000
+    log.close()
+
+
+def test_hold_holds_and_offsets_begin_at_their_start():
+    assert Hold(HOME).at(0) == Hold(HOME).at(10**9) == HOME
+    trajectory = Offsets(HOME, 1_000_000, y=Square(0.05, -0.05, 0.1), z=Sine(0.2, 0.05), yaw=Step(1.5))
+    assert trajectory.at(999_999) == HOME
+    assert trajectory.at(1_000_000) == Goal((0.0, 0.05, 1.15), 1.5)
+    assert trajectory.at(5_999_999).p_WG[1] == 0.05
+    assert trajectory.at(6_000_000).p_WG[1] == -0.05
+    assert trajectory.at(6_000_000).p_WG[2] == pytest.approx(1.35)
+    assert trajectory.at(11_000_000).p_WG == pytest.approx((0.0, 0.05, 1.15))

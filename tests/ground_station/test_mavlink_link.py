@@ -1,0 +1,411 @@
+"""The ground station's MAVLink link without a line: what pymavlink's codec reads of it, and what it makes of pymavlink's."""
+
+import hashlib
+import io
+from math import pi
+
+import numpy as np
+import pymavlink.dialects.v20.common as dialect
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from firmware_py.geometry import from_euler_zyx
+from firmware_py.wire import WireError
+from firmware_py.wire.telemetry import BLOCKS
+from ground_station.config import StationConfig
+from ground_station.errors import LinkError
+from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
+from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
+from ground_station.mocap import MocapFrame
+from ground_station.station import GroundStation
+from ground_station.trajectory import Goal, Hold
+from hil.config import load_config
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.lockstep import MAVLINK, lockstep_flight
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+HOME = Goal((0.0, 0.0, 1.15), 0.0)
+KEY = hashlib.sha256(b"floaty").digest()
+POSE, TARGET, COMMAND, HEARTBEAT = (
+    dialect.MAVLINK_MSG_ID_ATT_POS_MOCAP,
+    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED,
+    dialect.MAVLINK_MSG_ID_COMMAND_LONG,
+    dialect.MAVLINK_MSG_ID_HEARTBEAT,
+)
+STREAMS = {
+    dialect.MAVLINK_MSG_ID_ATTITUDE,
+    dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    dialect.MAVLINK_MSG_ID_DEBUG_FLOAT_ARRAY,
+}
+
+
+class LinkWithCodec:
+    """A link whose frames are read by pymavlink, and a board that is pymavlink, too."""
+
+    def __init__(self, baud=921_600, pose_hz=50.0, key=b"", board=1):
+        self.codec = dialect.MAVLink(io.BytesIO(), srcSystem=board, srcComponent=1)
+        if key:
+            self.codec.signing.secret_key = key
+            self.codec.signing.sign_outgoing = True
+        self.sent = []  # (now_us, message)
+        self.bytes = 0
+        self.link = MavlinkLink(self._transmit, MavlinkLinkConfig(baud, pose_hz, key, latency_us=900))
+
+    def _transmit(self, now_us, data):
+        self.bytes += len(data)
+        self.sent += [(now_us, message) for message in self.codec.parse_buffer(data)]
+
+    def of(self, number):
+        return [(now_us, message) for now_us, message in self.sent if message.get_msgId() == number]
+
+    def hear(self, now_us, *messages):
+        return list(self.link.receive(now_us, b"".join(message.pack(self.codec) for message in messages)))
+
+    def pose(self, now_us, goal=HOME, p=(0.0, 0.0, 1.15), q=UPRIGHT):
+        self.link.send(now_us, MocapFrame(now_us - 40_000, p, q, True), goal)
+
+
+def heartbeat(state=2):
+    return dialect.MAVLink_heartbeat_message(0, 0, 1, state, 4, 3)
+
+
+# Uplink
+
+
+def test_pose_one_two_three_goes_up_in_ned_with_the_time_of_its_exposure():
+    bench = LinkWithCodec()
+    bench.pose(1_040_000, p=(1.0, 2.0, 3.0), q=from_euler_zyx(0.1, 0.2, 0.3))
+    ((_, message),) = bench.of(POSE)
+    assert message.time_usec == 1_000_000
+    assert (message.x, message.y, message.z) == (1.0, -2.0, -3.0)
+    R_NED = np.diag((1.0, -1.0, -1.0))
+    expected = R_NED @ Rotation.from_euler("ZYX", (0.3, 0.2, 0.1)).as_matrix() @ R_NED
+    assert Rotation.from_quat(message.q, scalar_first=True).as_matrix() == pytest.approx(expected, abs=1e-6)
+
+
+def test_goal_goes_up_before_the_first_pose_in_ned_and_turned():
+    bench = LinkWithCodec()
+    bench.pose(40_000, Goal((1.0, 2.0, 3.0), 0.5))
+    kinds = [message.get_msgId() for _, message in bench.sent]
+    assert kinds.index(TARGET) < kinds.index(POSE)
+    ((_, message),) = bench.of(TARGET)
+    assert (message.x, message.y, message.z, message.yaw) == (1.0, -2.0, -3.0, -0.5)
+    assert message.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
+    assert message.type_mask == 0b1001_1111_1000  # only position and yaw are meant
+    assert message.target_system == 0
+
+
+def test_a_standing_goal_is_repeated_every_half_second_and_a_new_one_goes_up_at_once():
+    bench = LinkWithCodec()
+    for now_us in range(0, 2_000_000, 20_000):
+        bench.pose(now_us, HOME if now_us < 1_100_000 else Goal((0.5, 0.0, 1.15), 0.0))
+    assert [now_us for now_us, _ in bench.of(TARGET)] == [0, 500_000, 1_000_000, 1_100_000, 1_600_000]
+    assert bench.of(TARGET)[3][1].x == 0.5
+
+
+def test_a_moving_goal_goes_up_with_every_pose_as_far_as_the_line_can_carry_it():
+    for baud, goals in ((115_200, 100), (57_600, 50)):
+        bench = LinkWithCodec(baud)
+        for k in range(100):
+            bench.pose(20_000 * k, Goal((0.001 * k, 0.0, 1.15), 0.0))
+        assert len(bench.of(POSE)) == 100
+        assert len(bench.of(TARGET)) == goals
+        assert bench.bytes / 2.0 <= 0.9 * baud / 10
+
+
+@pytest.mark.parametrize(
+    ("p", "q"), [((0.0, float("nan"), 0.0), UPRIGHT), ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0, 0.0))]
+)
+def test_a_pose_that_is_none_is_refused_and_nothing_is_sent(p, q):
+    bench = LinkWithCodec()
+    with pytest.raises(WireError):
+        bench.pose(0, p=p, q=q)
+    assert bench.sent == []
+
+
+def test_a_heartbeat_goes_up_every_second():
+    bench = LinkWithCodec()
+    for now_us in range(0, 5_000_000, 20_000):
+        bench.pose(now_us)
+    beats = bench.of(HEARTBEAT)
+    assert [now_us for now_us, _ in beats] == [0, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
+    assert {message.type for _, message in beats} == {dialect.MAV_TYPE_GCS}
+    assert beats[0][1].get_srcSystem() == 255
+
+
+# Telemetry
+
+
+def asked(bench):
+    wanted = [message for _, message in bench.of(COMMAND)]
+    assert {message.command for message in wanted} <= {dialect.MAV_CMD_SET_MESSAGE_INTERVAL}
+    return [(round(message.param1), round(message.param2)) for message in wanted]
+
+
+def telemetry(t_ms, p=(0.0, 0.0, 0.0), yaw=0.0):
+    data = [float(k) for k in range(1, 17)] + [0.0] * 42
+    return (
+        dialect.MAVLink_attitude_message(t_ms, 0.1, -0.2, -yaw, 1.0, -2.0, -3.0),
+        dialect.MAVLink_local_position_ned_message(t_ms, p[0], -p[1], -p[2], 1.0, -2.0, -3.0),
+        dialect.MAVLink_debug_float_array_message(1000 * t_ms, b"floaty", 0, data),
+    )
+
+
+@pytest.mark.parametrize(("baud", "hz"), [(921_600, 50), (115_200, 25), (57_600, 20)])
+def test_three_streams_are_asked_for_at_the_rate_of_the_budget(baud, hz):
+    bench = LinkWithCodec(baud)
+    bench.link.start_telemetry(0)
+    assert sorted(asked(bench)) == sorted((number, 1_000_000 // hz) for number in STREAMS)
+
+
+def test_only_a_stream_that_is_too_slow_is_asked_for_again():
+    bench = LinkWithCodec()
+    bench.hear(0, heartbeat())
+    bench.link.start_telemetry(0)
+    bench.sent.clear()
+    for t_ms in range(0, 1000, 20):
+        bench.pose(1000 * t_ms)
+        attitude, position, array = telemetry(t_ms)
+        bench.hear(1000 * t_ms, attitude, array, *[position] * (t_ms % 260 == 0))  # 4 Hz, as after a reboot
+    assert bench.of(COMMAND) == []
+    bench.pose(1_000_000)
+    assert asked(bench) == [(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 20_000)]
+    assert bench.of(COMMAND)[0][1].target_system == 1
+
+
+def test_telemetry_is_seen_from_a_goal_that_looks_left():
+    bench = LinkWithCodec()
+    bench.pose(0, Goal((0.0, 0.0, 1.0), pi / 2))  # world x is to its right and world y ahead
+    motion, attitude, flaps, health = BLOCKS
+    samples = {
+        sample.block: sample for sample in bench.hear(0, *telemetry(1234, (1.0, 2.0, 3.0), yaw=pi / 2 + 0.3))
+    }
+    assert {sample.timestamp_ms for sample in samples.values()} == {1234}
+    assert samples[motion].values == pytest.approx((2.0, -1.0, 2.0, 2.0, -1.0, 3.0), abs=1e-6)
+    assert samples[attitude].values == pytest.approx((0.1, 0.2, 0.3, 1.0, 2.0, 3.0), abs=1e-6)
+    assert samples[flaps].values + samples[health].values == tuple(range(1, 17))
+    assert bench.link.supervisor_state == 13
+
+
+@given(st.tuples(*[st.floats(-2, 2)] * 3), st.floats(-pi, pi), st.floats(-pi, pi))
+def test_position_and_yaw_are_scipys_in_the_goal_frame(p, goal_yaw, yaw):
+    bench = LinkWithCodec()
+    bench.pose(0, Goal((0.3, -0.2, 1.15), goal_yaw))
+    _, position, _ = telemetry(0, p)
+    attitude, _, _ = telemetry(0, yaw=yaw)
+    turned, moved = bench.hear(0, attitude, position)
+    R_GW = Rotation.from_euler("z", goal_yaw).inv()
+    assert moved.values[:3] == pytest.approx(R_GW.apply(np.subtract(p, (0.3, -0.2, 1.15))), abs=1e-5)
+    assert moved.values[3:] == pytest.approx(R_GW.apply((1.0, 2.0, 3.0)), abs=1e-5)
+    expected = R_GW * Rotation.from_euler("ZYX", (yaw, 0.2, 0.1))
+    assert (Rotation.from_euler("ZYX", turned.values[2::-1]).inv() * expected).magnitude() < 1e-5
+
+
+def test_the_station_logs_what_comes_in_pieces_of_any_size():
+    bench = LinkWithCodec()
+    station = GroundStation(bench.link, Hold(HOME), None, StationConfig())
+    station.on_frame(MocapFrame(0, HOME.p_WG, UPRIGHT, True), 40_000)
+    stream = b"".join(message.pack(bench.codec) for t_ms in (20, 40) for message in telemetry(t_ms))
+    for byte in stream:
+        station.on_packet(50_000, bytes((byte,)))
+    assert station.counters.samples == 8
+    assert station.counters.malformed == 0
+
+
+def test_others_are_not_listened_to():
+    bench = LinkWithCodec()
+    bench.pose(0)
+    bench.hear(0, heartbeat())
+    for system, component in ((2, 1), (1, 2), (255, 190)):
+        other = dialect.MAVLink(io.BytesIO(), srcSystem=system, srcComponent=component)
+        data = b"".join(message.pack(other) for message in (*telemetry(20), heartbeat(3)))
+        assert bench.link.receive(20_000, data) == []
+    assert bench.link.supervisor_state == 2
+    assert bench.link.board == 1
+
+
+def test_an_array_of_another_name_is_no_telemetry():
+    bench = LinkWithCodec()
+    bench.pose(0)
+    other = dialect.MAVLink_debug_float_array_message(0, b"other", 0, [0.0] * 58)
+    assert bench.hear(0, other, *telemetry(20))[0].timestamp_ms == 20
+
+
+def test_texts_and_refusals_are_collected():
+    bench = LinkWithCodec()
+    text = dialect.MAVLink_statustext_message(4, b"supervisor: failsafe, silence")
+    bench.hear(
+        0, text, dialect.MAVLink_command_ack_message(511, 0), dialect.MAVLink_command_ack_message(511, 4)
+    )
+    assert list(bench.link.texts) == [
+        "board: supervisor: failsafe, silence",
+        "the board refuses command 511: result 4",
+    ]
+    assert bench.link.answered
+
+
+# Time
+
+
+def test_the_board_is_told_the_time_that_it_asks_for():
+    bench = LinkWithCodec()
+    bench.hear(123_456, dialect.MAVLink_timesync_message(0, 777))
+    (_, answer), *_ = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)
+    assert (answer.tc1, answer.ts1) == (123_456_000, 777)
+
+
+def test_the_round_trip_is_that_of_the_own_request_only():
+    bench = LinkWithCodec()
+    bench.pose(1_000_000)
+    ((_, request),) = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)
+    assert (request.tc1, request.ts1) == (0, 1_000_000_000)
+    bench.hear(1_001_000, dialect.MAVLink_timesync_message(5, 999_000_000))
+    assert bench.link.statistics.round_trip_us is None
+    bench.hear(1_004_200, dialect.MAVLink_timesync_message(5, request.ts1))
+    assert bench.link.statistics.round_trip_us == 4200
+
+
+def test_the_latency_is_half_of_the_round_trip_and_assumed_before():
+    bench = LinkWithCodec()
+    assert str(bench.link.latency) == "serial (assumed)"
+    assert bench.link.latency.us == 900
+    bench.pose(1_000_000)
+    ((_, request),) = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)
+    bench.hear(1_004_200, dialect.MAVLink_timesync_message(5, request.ts1))
+    assert str(bench.link.latency) == "serial"
+    assert bench.link.latency.us == 2100
+
+
+def test_what_is_read_late_counts_from_its_arrival():
+    """The board's request is answered with the middle between arrival and answer, as NTP has it."""
+    bench = LinkWithCodec()
+    bench.pose(1_000_000)
+    request = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)[0][1]
+    messages = (
+        dialect.MAVLink_timesync_message(5, request.ts1),
+        dialect.MAVLink_timesync_message(0, 777),
+    )
+    bench.link.receive(1_004_200, b"".join(message.pack(bench.codec) for message in messages), 1_010_200)
+    assert bench.link.latency.us == 2100
+    answered_us, answer = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)[1]
+    assert (answered_us, answer.tc1, answer.ts1) == (1_010_200, 1_007_200_000, 777)
+
+
+# What goes wrong
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(
+        st.binary(max_size=60)
+        | st.sampled_from([message.pack(LinkWithCodec().codec) for message in telemetry(20)])
+    )
+)
+def test_whatever_comes_nothing_is_raised(pieces):
+    bench = LinkWithCodec()
+    bench.pose(0)
+    for k, piece in enumerate(pieces):
+        bench.link.receive(1000 * k, piece)
+
+
+def test_lost_and_broken_frames_are_counted():
+    bench = LinkWithCodec()
+    frames = []
+    for bench.codec.seq in range(10):
+        frames.append(heartbeat().pack(bench.codec))
+    broken = frames[5][:-1] + bytes((frames[5][-1] ^ 1,))
+    bench.link.receive(0, b"".join((*frames[:2], *frames[4:5], broken, *frames[6:])))
+    statistics = bench.link.statistics
+    assert (statistics.frames, statistics.lost, statistics.bad) == (7, 3, 1)
+
+
+def test_with_a_key_everything_is_signed_and_nothing_unsigned_is_believed():
+    bench, stranger = LinkWithCodec(key=KEY), LinkWithCodec()
+    bench.codec.signing.timestamp = 1
+    bench.pose(0)
+    assert bench.of(POSE)[0][1].get_signed()  # pymavlink has checked it
+    assert stranger.link.receive(0, heartbeat().pack(stranger.codec)) == []
+    assert bench.link.receive(0, heartbeat().pack(stranger.codec)) == []
+    assert (bench.link.board, bench.link.statistics.bad) == (None, 1)
+    bench.hear(0, heartbeat())
+    assert bench.link.board == 1
+
+
+# Budget
+
+
+def test_the_budget_of_the_uplink_is_what_the_link_sends():
+    for key in (b"", KEY):
+        bench = LinkWithCodec(key=key)
+        for now_us in range(0, 10_000_000, 20_000):
+            bench.pose(now_us, p=(0.1, 0.2, 1.3), q=from_euler_zyx(0.1, 0.2, 0.3))
+            if now_us % 500_000 == 0:
+                bench.hear(now_us, dialect.MAVLink_timesync_message(0, 10**15 + now_us))
+        assert bench.bytes / 10 == pytest.approx(bench.link.budget.up_load * 92_160, rel=0.01)
+
+
+@pytest.mark.parametrize("baud", [57_600, 921_600])
+def test_the_budget_of_the_downlink_is_what_the_board_sends(baud):
+    flight = lockstep_flight(
+        load_config("floaty", (f"serial.baud={baud}",)), EXPERIMENTS["hover"], 6.0, 1, None, link=MAVLINK
+    )
+    begun = []
+    flight.events.at(2_000_000, lambda now_us: begun.append(flight.robot.uart.down.sent_bytes))
+    assert flight.run().lost is None
+    sent = flight.robot.uart.down.sent_bytes - begun[0]
+    assert sent / 5.0 == pytest.approx(link_budget(baud, 50.0).down_load * baud / 10, rel=0.04)
+
+
+def test_at_57600_baud_the_loads_are_those_of_frames_counted_by_hand():
+    # Frame sizes as measured with pymavlink (reference/links.md): pose 48, goal 65, heartbeat 21, time 28, of which the
+    # last is zero for two years; below: attitude 40, position 40, array 96.
+    budget = link_budget(57_600, 50.0)
+    assert budget.up_load * 5760 == 50 * 48 + 2 * 65 + 21 + 3 * 27
+    assert budget.telemetry_hz == 20
+    signed = link_budget(57_600, 50.0, signed=True)
+    assert (signed.up_load - budget.up_load) * 5760 == pytest.approx(56 * 13)
+    assert budget.text == "57600 baud: uplink 2.6 kB/s, 46 %; telemetry 20 Hz, 4.1 kB/s, 71 %"
+    more = link_budget(115_200, 50.0)
+    assert more.down_load * 11_520 - budget.down_load * 5760 == pytest.approx((25 - 20) * (40 + 40 + 96))
+
+
+@given(st.integers(9600, 3_000_000), st.floats(1.0, 200.0), st.booleans())
+def test_what_the_budget_allows_fits_and_it_allows_no_less_than_fits(baud, pose_hz, signed):
+    try:
+        budget = link_budget(baud, pose_hz, signed)
+    except LinkError:
+        poses = pose_hz * (48 + 13 * signed) + 400  # [bytes/s] with goals, heartbeats and clocks
+        telemetry = (
+            TELEMETRY_HZ[-1] * (40 + 40 + 96 + 39 * signed) + 600 + 208 * signed
+        )  # with what comes unasked
+        assert poses > 0.09 * baud or telemetry > 0.08 * baud
+        return
+    assert budget.up_load <= 0.9
+    assert budget.down_load <= 0.8
+    faster = TELEMETRY_HZ[TELEMETRY_HZ.index(budget.telemetry_hz) - 1] if budget.telemetry_hz < 50 else None
+    if faster:
+        sample = (40 + 40 + 96 + 39 * signed) * 10 / baud
+        assert budget.down_load + (faster - budget.telemetry_hz) * sample > 0.8
+
+
+@pytest.mark.parametrize(
+    ("baud", "pose_hz", "message"),
+    [
+        (
+            9600,
+            50.0,
+            "9600 baud: 50 poses/s need 2.63 kB/s, 90 % of the line are 0.86: lower station.corrections_hz",
+        ),
+        (
+            9600,
+            5.0,
+            "9600 baud: 5 Hz of telemetry need 1.44 kB/s, 80 % of the line are 0.77: raise serial.baud",
+        ),
+    ],
+)
+def test_a_line_that_cannot_carry_a_flight_is_refused_in_one_line(baud, pose_hz, message):
+    with pytest.raises(LinkError) as refusal:
+        LinkWithCodec(baud, pose_hz)
+    assert str(refusal.value).startswith(message)

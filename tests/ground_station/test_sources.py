@@ -1,0 +1,302 @@
+"""Poses out of a NatNet stream: their age, what is no pose, and what goes wrong with the server."""
+
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from ground_station.clock import clock_us
+from ground_station.config import CaptureConfig
+from ground_station.errors import MocapError
+from ground_station.mocap import MocapFrame
+from ground_station.natnet_stream import MISTIMED_FRAMES, NatnetStream
+from ground_station.server_clock import ServerClock
+from ground_station.sources.address import find_source
+from ground_station.sources.alignment import Alignment
+from support import natnet_packets as packets
+from support.natnet_packets import VERSIONS
+
+V = (4, 1)
+TICKS_PER_US = packets.CLOCK_HZ // 1_000_000
+AHEAD_US = 7_000_000_000  # of the server's clock
+CAMERA_US = 8000  # exposure to transmission
+AS_STREAMED = Alignment(CaptureConfig(axes="z-up"))
+
+
+class ServedStream:
+    """A stream with one body, 7; packets take 300 us each way."""
+
+    def __init__(self) -> None:
+        self.stream = NatnetStream("floaty", AS_STREAMED)
+        self.now_us = 50_000_000
+        self.number = 0
+        self.ahead_us = AHEAD_US
+        self.stream.on_packet(packets.server_info(V), self.now_us)
+        self.stream.on_packet(packets.model_definition({"floaty": 7}, V), self.now_us)
+        self.stream.outgoing.clear()
+
+    def ticks(self, t_us: int) -> int:
+        return (t_us + self.ahead_us) * TICKS_PER_US
+
+    def echo(self) -> None:
+        self.stream.on_packet(packets.echo(self.now_us, self.ticks(self.now_us + 300)), self.now_us + 600)
+
+    def frame(self, number: int | None = None, **options: object) -> MocapFrame | None:
+        """Expose after 5 ms; the pose differs each time."""
+        self.now_us += 5000
+        self.number = self.number + 1 if number is None else number
+        sent_us = self.now_us + CAMERA_US
+        ticks = (self.ticks(self.now_us), self.ticks(sent_us - 1000), self.ticks(sent_us))
+        options = {"pose": ((float(self.now_us), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))} | options
+        data = packets.frame(self.number, V, ticks, **options)  # type: ignore[arg-type]
+        return self.stream.on_packet(data, sent_us + 300)
+
+    def pose(self, **options: object) -> MocapFrame:
+        frame = self.frame(**options)  # type: ignore[arg-type]
+        assert frame is not None
+        return frame
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_every_instant_of_the_way_is_by_the_station_s_clock(tracked: bool) -> None:
+    bench = ServedStream()
+    bench.echo()
+    pose = bench.pose(tracked=tracked)
+    assert pose.valid == tracked
+    instants = (pose.t_us, pose.received_us, pose.transmitted_us, pose.arrived_us)
+    way_us = (0, CAMERA_US - 1000, CAMERA_US, CAMERA_US + 300)
+    assert instants == pytest.approx([bench.now_us + t_us for t_us in way_us], abs=1)
+
+
+def test_no_stage_of_the_way_takes_less_than_no_time() -> None:
+    bench = ServedStream()  # without an echo the server's clock is thought to be 300 us behind
+    bench.now_us += 5000
+    early, late = bench.ticks(bench.now_us - 9000), bench.ticks(bench.now_us)
+    for ticks in ((late, early, late), (early, late, late + 90 * TICKS_PER_US), (early, late, early)):
+        bench.number += 1
+        pose = bench.stream.on_packet(packets.frame(bench.number, V, ticks), bench.now_us + 300)
+        assert pose is not None
+        way_us = (pose.t_us, pose.received_us, pose.transmitted_us, pose.arrived_us)
+        assert sorted(way_us) == list(way_us)
+
+
+def test_without_echoes_only_the_way_through_the_network_is_missing() -> None:
+    bench = ServedStream()
+    assert abs(bench.pose().t_us - (bench.now_us + 300)) <= 1
+
+
+def test_the_clock_follows_drift_and_shrugs_off_late_packets() -> None:
+    clock = ServerClock(1_000_000)
+    for second in range(600):
+        now_us = second * 1_000_000
+        server_us = now_us + second * 30  # 30 ppm fast
+        clock.answered(now_us - 300, server_us, now_us + 300)
+        clock.sent(server_us, now_us + 40_000)
+        assert abs(clock.to_station_us(server_us) - now_us) < 60
+
+
+def test_a_server_whose_clock_was_set_is_followed_again() -> None:
+    bench = ServedStream()
+    bench.echo()
+    assert bench.pose().valid
+    bench.ahead_us -= 5_000_000
+    assert not bench.pose().valid
+    bench.echo()
+    assert bench.pose().valid
+    bench.ahead_us -= 5_000_000
+    for _ in range(MISTIMED_FRAMES):
+        assert not bench.pose().valid
+    assert bench.pose().valid  # without an echo
+
+
+def test_lost_tracking_is_never_a_pose() -> None:
+    bench = ServedStream()
+    assert bench.pose().valid
+    assert not bench.pose(tracked=False).valid
+    assert not bench.pose(number_of_body=8).valid
+    assert not bench.pose(pose=((float("nan"), 0, 0), (0, 0, 0, 1))).valid
+    assert not bench.pose(pose=((0, 0, 0), (0, 0, 0, 0))).valid
+    frozen = [bench.pose(pose=packets.POSE).valid for _ in range(6)]
+    assert frozen == [True, True, True, False, False, False]
+    assert bench.pose().valid
+    assert bench.stream.counters.lost == 7
+
+
+def test_frames_that_come_twice_or_late_are_dropped_and_counted() -> None:
+    bench = ServedStream()
+    numbers = [10, 11, 11, 13, 12, 14]
+    assert [bench.frame(number) is not None for number in numbers] == [True, True, False, True, False, True]
+    assert bench.stream.counters.dropped == 2
+    assert bench.frame(2_000_000) is not None
+    assert bench.frame(1) is not None  # the server began anew
+
+
+@pytest.mark.parametrize(("name", "bodies", "message"), [
+    ("flouty", {"floaty": 7, "wand": 8}, "no body 'flouty'; there are: floaty, wand"),
+    ("", {"floaty": 7, "wand": 8}, "body=NAME is missing; there are: floaty, wand"),
+    ("floaty", {}, "no body 'floaty'; there are: none"),
+])  # fmt: skip
+def test_a_wrong_body_is_one_line_with_those_there_are(
+    name: str, bodies: dict[str, int], message: str
+) -> None:
+    stream = NatnetStream(name, AS_STREAMED)
+    stream.on_packet(packets.server_info(V), 0)
+    with pytest.raises(MocapError) as caught:
+        stream.on_packet(packets.model_definition(bodies, V), 0)
+    assert str(caught.value) == message
+
+
+def test_a_body_that_goes_away_in_flight_is_a_notice_and_comes_back_with_any_id() -> None:
+    bench = ServedStream()
+    bench.stream.on_packet(packets.model_definition({"wand": 7}, V), bench.now_us)
+    assert bench.stream.notices == ["motion capture: no body 'floaty'; there are: wand"]
+    assert not bench.pose().valid
+    bench.stream.on_packet(packets.model_definition({"floaty": 9}, V), bench.now_us)
+    assert bench.pose(number_of_body=9).valid
+
+
+def newer(bitstream: bytes | None, multicast: bool = False) -> NatnetStream:
+    """A stream whose server speaks 4.2; `bitstream` is its answer to the wish for another version."""
+    stream = NatnetStream("floaty", AS_STREAMED)
+    stream.on_packet(packets.server_info((4, 2), multicast), 0)
+    assert stream.outgoing == [packets.packet(2, b"Bitstream,4.1\0")]
+    stream.outgoing.clear()
+    if bitstream is not None:
+        stream.on_packet(packets.packet(3, bitstream), 0)
+    return stream
+
+
+@pytest.mark.parametrize("answer", [bytes(4), b"Bitstream,4.1\0", b"Bitstream,4.1.0\0"])
+def test_a_newer_server_is_asked_for_the_newest_version_that_can_be_read(answer: bytes) -> None:
+    stream = newer(answer)
+    assert [data[0] for data in stream.outgoing] == [4]
+    stream.on_packet(packets.model_definition({"floaty": 7}, V), 0)
+    frame = stream.on_packet(packets.frame(1, V, (1, 1, 1)), 0)
+    assert frame is not None
+    assert (frame.valid, frame.p_WB) == (True, packets.POSE[0])
+
+
+@pytest.mark.parametrize("answer", [b"\xff\xff\xff\xff", b"", b"no\0", b"Bitstream,4.2\0"])
+def test_a_newer_server_that_refuses_is_one_line(answer: bytes) -> None:
+    with pytest.raises(MocapError, match=r"^NatNet 4\.2 of Motive: 3\.0, 3\.1, 4\.0 or 4\.1 is needed\Z"):
+        newer(answer)
+    assert newer(None).missing() == "NatNet 4.2 of Motive: 3.0, 3.1, 4.0 or 4.1 is needed"
+
+
+def test_a_newer_server_with_multicast_and_an_older_one_are_refused_at_once() -> None:
+    for version, multicast in (((4, 2), True), ((2, 10), False)):
+        stream = NatnetStream("floaty", AS_STREAMED)
+        with pytest.raises(MocapError, match=f"NatNet {version[0]}"):
+            stream.on_packet(packets.server_info(version, multicast), 0)
+
+
+def test_changed_models_are_asked_for() -> None:
+    bench = ServedStream()
+    bench.frame(parameters=2)
+    assert [data[0] for data in bench.stream.outgoing] == [4]
+
+
+def test_a_stream_that_stops_is_told_once_and_called_until_it_is_back() -> None:
+    bench = ServedStream()
+    bench.frame()
+    calls = 0
+    for _ in range(30):
+        bench.now_us += 100_000
+        bench.stream.call(bench.now_us, packets_wait=False)
+        calls += sum(data[0] == 0 for data in bench.stream.outgoing)
+        bench.stream.outgoing.clear()
+    assert 4 <= calls <= 6
+    assert bench.pose().valid
+    assert bench.stream.notices == [
+        "motion capture: no frames; calling the server again", "motion capture: frames again after 3.0 s",
+    ]  # fmt: skip
+
+
+def test_who_did_not_listen_does_not_call_the_server_silent() -> None:
+    bench = ServedStream()
+    bench.frame()
+    bench.now_us += 3_000_000
+    bench.stream.call(bench.now_us, packets_wait=True)
+    assert 0 not in [data[0] for data in bench.stream.outgoing]
+    assert bench.pose().valid
+    assert bench.stream.notices == []
+
+
+@contextmanager
+def served(version: tuple[int, int], multicast: bool) -> Iterator[int]:
+    """A server with one body at 200 Hz; gives its command port."""
+    with socket.socket(type=socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        data_port = probe.getsockname()[1]
+    with socket.socket(type=socket.SOCK_DGRAM) as commands:
+        commands.bind(("127.0.0.1", 0))
+        commands.settimeout(0.005)
+        commands.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+        stop = threading.Event()
+        thread = threading.Thread(target=_serve, args=(commands, data_port, version, multicast, stop))
+        thread.start()
+        try:
+            yield commands.getsockname()[1]
+        finally:
+            stop.set()
+            thread.join()
+
+
+def _serve(
+    commands: socket.socket, port: int, version: tuple[int, int], multicast: bool, stop: threading.Event
+) -> None:
+    number, client = 0, None
+    while not stop.is_set():
+        number += 1
+        now = clock_us() * TICKS_PER_US
+        data = packets.frame(
+            number, version, (now - 80_000, now, now), pose=((number, 2, 3), packets.POSE[1])
+        )
+        if multicast:
+            commands.sendto(data, ("239.255.42.99", port))
+        elif client is not None:
+            commands.sendto(data, client)
+        try:
+            asked, client = commands.recvfrom(1000)
+        except TimeoutError:
+            continue
+        if asked[0] == 0:
+            commands.sendto(packets.server_info(version, multicast, port), client)
+        elif asked[0] == 4:
+            commands.sendto(packets.model_definition({"floaty": 7}, version), client)
+        elif asked[0] == 12:
+            (asked_us,) = struct.unpack("<Q", asked[4:])
+            commands.sendto(packets.echo(asked_us, clock_us() * TICKS_PER_US), client)
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
+def test_poses_come_over_real_sockets(version: tuple[int, int], multicast: bool) -> None:
+    with served(version, multicast) as port:
+        source = find_source(
+            f"optitrack:127.0.0.1:{port}{',multicast' if multicast else ''},body=floaty", CaptureConfig()
+        )
+        source.open()
+        frames = [source.receive(1.0) for _ in range(10)]
+        way = "multicast" if multicast else "unicast"
+        told = f"mocap Motive at 127.0.0.1, NatNet {version[0]}.{version[1]}, {way}, y-up"
+        assert source.notices() == [told]
+        source.close()
+    assert all(frame is not None and frame.valid and frame.p_WB[1:] == (-3.0, 2.0) for frame in frames)
+    assert frames[-1] is not None
+    assert 7000 <= clock_us() - frames[-1].t_us < 2_000_000
+
+
+@pytest.mark.realtime
+def test_a_server_that_is_not_there_or_not_so_is_one_line_within_four_seconds() -> None:
+    begin_s = time.monotonic()
+    with pytest.raises(MocapError, match=r"^127\.0\.0\.1:9: no NatNet server answers\Z"):
+        find_source("optitrack:127.0.0.1:9", CaptureConfig()).open()
+    assert time.monotonic() - begin_s < 4
+    with served(V, False) as port, pytest.raises(MocapError, match="does not stream by multicast"):
+        find_source(f"optitrack:127.0.0.1:{port},multicast", CaptureConfig()).open()

@@ -1,0 +1,163 @@
+"""The command line as a user meets it: exit codes, one-line errors, files where it says they are."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil.errors import LabError
+from hil.laboratory.recorder import load_log
+from support.command import floaty
+
+FLOATY = (sys.executable, "-m", "hil.commands")
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_fly_writes_everything_and_says_where(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert floaty(monkeypatch, "fly", "hover", "--duration", "3", "--seed", "5") == 0
+    folder = tmp_path / "runs" / "hover-5"
+    expected = {
+        "log.parquet", "events.jsonl", "telemetry.csv", "schedule.parquet", "result.json", "flight.rrd", "report.html",
+    }  # fmt: skip
+    assert {path.name for path in folder.iterdir()} == expected
+    shown = capsys.readouterr().out
+    assert "within_6cm_x" in shown
+    assert "runs/hover-5/report.html" in shown
+    assert json.loads((folder / "result.json").read_text())["passed"] is True
+
+
+def test_a_failed_limit_is_exit_code_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = floaty(monkeypatch, "fly", "hover", "--set", "tunnel.speed=7", "--out", "crash")
+    assert code == 1
+    assert "lost" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fly", "hovver"], "experiment 'hovver': unknown; did you mean hover?"),
+        (["fly", "hover", "--duration", "-1"], "--duration -1"),
+        (["fly", "hover", "--duration", "nan"], "--duration nan"),
+        (["fly", "hover", "--duration", "soon"], "'soon' is not a valid float"),
+        (["fly", "hover", "--seed", "-1"], "-1"),
+        (["fly", "hover", "--profile", "flaoty"], "did you mean floaty?"),
+        (["fly", "hover", "--set", "controller.gain_z=nan"], "controller.gain_z = nan"),
+        (["fly", "hover", "--set", "controler.gain_z=1"], "did you mean controller?"),
+        (["fly", "hover", "--out", "/proc/floaty/run"], "--out /proc/floaty/run: cannot be written"),
+        (["fly", "hover", "--seeds", "2", "--view"], "--seeds 2"),
+        (["fly", "hover", "--seeds", "2", "--perfetto"], "--seeds 2"),
+        (["fly", "hover", "--bogus"], "No such option"),
+        (["fly"], "Missing argument"),
+        (["report", "nowhere"], "nowhere"),
+        (["view", "nowhere"], "nowhere"),
+        (["flyy"], "No such command"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert floaty(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("floaty: ")
+    assert error.count("\n") == 1
+
+
+def test_list_names_experiments_and_profiles(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "list") == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("hover  ")
+    assert "profiles: as-flown, floaty (default)" in shown
+
+
+@pytest.mark.long
+def test_perfetto_writes_its_trace(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--perfetto", "--out", "run") == 0
+    assert "run/flight.perfetto-trace" in capsys.readouterr().out
+    assert Path("run/flight.perfetto-trace").stat().st_size > 10_000
+
+
+@pytest.mark.long
+def test_report_can_be_written_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--out", "run")
+    Path("run/report.html").unlink()
+    assert floaty(monkeypatch, "report", "run") == 0
+    assert Path("run/report.html").stat().st_size > 10_000
+
+
+def test_seeds_fly_in_other_processes_with_the_same_hash(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "fly", "hover", "--duration", "1", "--seed", "4", "--seeds", "2") == 0
+    assert "2 seeds: 2 hold all limits, 0 lost" in capsys.readouterr().out
+    assert floaty(monkeypatch, "fly", "hover", "--duration", "1", "--seed", "4", "--out", "here") == 0
+    elsewhere, here = (json.loads(Path(p, "result.json").read_text()) for p in ("runs/hover-4", "here"))
+    assert elsewhere["hash"] == here["hash"]
+
+
+def rows_on_disk() -> int:
+    try:
+        return int(load_log(Path("run")).num_rows)
+    except LabError:
+        return 0
+
+
+def start(*arguments: str) -> "subprocess.Popen[str]":
+    """Start the command and wait until a second of the flight is on disk."""
+    process = subprocess.Popen(
+        [*FLOATY, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert process.stdout is not None
+    while rows_on_disk() < 100:
+        assert process.poll() is None, process.stdout.read()
+    return process
+
+
+def test_ctrl_c_leaves_log_report_and_recording(tmp_path: Path) -> None:
+    process = start("fly", "hover", "--realtime", "--duration", "600", "--out", "run")
+    process.send_signal(signal.SIGINT)
+    shown, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, shown
+    assert "interrupted" in shown
+    assert load_log(tmp_path / "run").num_rows >= 100
+    assert {"report.html", "flight.rrd", "result.json"} <= set(os.listdir("run"))
+
+
+@pytest.mark.long
+def test_a_killed_flight_can_still_be_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    process = start("fly", "hover", "--realtime", "--duration", "600", "--out", "run")
+    process.kill()
+    process.communicate(timeout=60)
+    assert not Path("run/log.parquet").exists()
+    assert load_log(tmp_path / "run").num_rows >= 100
+    assert floaty(monkeypatch, "report", "run") == 0
+
+
+@pytest.mark.long
+def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.delitem(sys.modules, "hil.pictures.viewer", raising=False)
+    assert floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--out", "run") == 0
+    assert "view" in capsys.readouterr().err
+    assert not Path("run/flight.rrd").exists()
+    assert Path("run/report.html").exists()
+    monkeypatch.delitem(sys.modules, "hil.pictures.viewer", raising=False)
+    assert floaty(monkeypatch, "fly", "hover", "--view", "--out", "run2") == 2

@@ -1,0 +1,371 @@
+"""`floaty deploy check`: equal targets are called equal, a bit that differs is found where and when it differs."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
+from firmware_py.export.c99 import translate
+from firmware_py.export.plain import PlainRunner
+from firmware_py.extras import install_command
+from hil.deploy.check import Checked, check_flight, plan
+from hil.deploy.targets import TARGETS
+from hil.laboratory.faults import parse
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.run import Request
+from support.command import floaty
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder whose builds the tests share."""
+    return tmp_path_factory.mktemp("built")
+
+
+class Spoilt(PythonRunner):
+    """Python with one word that is wrong from one call on."""
+
+    def __init__(self, blocks: CoreBlocks, call: str, tick: int, spoil: Callable[[CoreBlocks], None]) -> None:
+        super().__init__(blocks)
+        self._spoilt = (call, tick, lambda: spoil(blocks))
+        self._tick = 0
+
+    def _done(self, name: str) -> None:
+        call, tick, spoil = self._spoilt
+        if (call, tick) == (name, self._tick):
+            spoil()
+
+    def estimate(self) -> None:
+        super().estimate()
+        self._tick += 1
+        self._done("estimate")
+
+    def control(self) -> None:
+        super().control()
+        self._done("control")
+
+
+def fly_beside(factory: RunnerFactory) -> Checked:
+    [request] = plan("hover", False, "floaty", (), 3, 0.5, ())
+    return check_flight(request, lambda stack: {"spoilt": factory}, lambda now_us, flight: None)
+
+
+def one_ulp(values: np.ndarray, index: tuple[int, ...]) -> None:
+    values[index] = np.nextafter(values[index], np.float32(np.inf))
+
+
+@pytest.mark.parametrize(
+    ("call", "tick", "spoil", "struct", "field", "bits"),
+    [
+        ("estimate", 37, lambda blocks: one_ulp(blocks.estimator.fields.P, (3, 4)), "Estimator", "P[3,4]", None),
+        ("control", 101, lambda blocks: one_ulp(blocks.control.fields.u, (2,)), "Control", "u[2]", None),
+        ("control", 0, lambda blocks: blocks.control.fields.count.__setitem__(1, 0), "Control", "count[1]", None),
+        ("estimate", 1, lambda blocks: blocks.estimator.fields.x.__setitem__(5, -0.0), "Estimator", "x[5]", 1),
+        ("estimate", 64, lambda blocks: setattr(blocks.estimator.fields, "fused", -1), "Estimator", "fused", None),
+        ("control", 9, lambda blocks: setattr(blocks.parameters.fields, "gain_z", 0.0), "Parameters", "gain_z", None),
+    ],
+)  # fmt: skip
+def test_the_first_difference_is_reported_with_its_tick_call_and_word(
+    call: str, tick: int, spoil: Callable[[CoreBlocks], None], struct: str, field: str, bits: int | None
+) -> None:
+    [target] = fly_beside(lambda blocks: Spoilt(blocks, call, tick, spoil)).targets
+    found = target.divergence
+    assert found is not None
+    assert (found.tick, found.call, found.where) == (tick, call, struct)
+    assert [one.field for one in found.differences] == [field]
+    if bits is not None:
+        assert found.differences[0].bits == bits
+
+
+def test_a_target_that_answers_otherwise_is_found() -> None:
+    class Late(PythonRunner):
+        def file_pose(self) -> int:
+            return super().file_pose() + 1
+
+    found = fly_beside(Late).targets[0].divergence
+    assert found is not None
+    assert (found.call, found.where) == ("file_pose", "answer")
+    assert found.differences[0].values == (0, 1)
+
+
+def test_a_target_that_has_differed_does_not_hide_the_others() -> None:
+    def factories(stack: ExitStack) -> dict[str, RunnerFactory]:
+        def spoil(blocks: CoreBlocks) -> None:
+            blocks.control.fields.count[0] += 1
+
+        def spoilt(blocks: CoreBlocks) -> CoreRunner:
+            return Spoilt(blocks, "control", 20, spoil)
+
+        return {"spoilt": spoilt, "python": PythonRunner}
+
+    [request] = plan("hover", False, "floaty", (), 3, 0.5, ())
+    checked = check_flight(request, factories, lambda now_us, flight: None)
+    assert [target.ticks for target in checked.targets] == [20, 150]
+    assert not checked.equal
+    assert checked.targets[1].divergence is None
+
+
+def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> None:
+    flights: list[Request] = plan(None, False, "floaty", (), 1, None, ())
+    assert [(one.experiment.name, bool(one.faults)) for one in flights] == [
+        ("hover", False), ("yaw-step", False), ("hover", True),
+    ]  # fmt: skip
+    assert sum(one.duration_s + one.config.flight.release_us * 1e-6 for one in flights) >= 100.0
+
+
+SOMETHING_OF_EACH = ("--duration", "0.8", "--fault", "mocap.latency@0.2:0.4=150", "--fault", "push.y@0.4=2")
+
+
+@pytest.mark.long
+def test_all_targets_are_equal_in_a_short_flight_with_faults(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+) -> None:
+    monkeypatch.chdir(built)
+    assert floaty(monkeypatch, "deploy", "check", "yaw-step", *SOMETHING_OF_EACH) == 0
+    shown = capsys.readouterr().out
+    assert [line.split()[0] for line in shown.splitlines() if line.endswith("equal")] == list(TARGETS)
+    assert "180 ticks, numba beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
+    assert re.search(r"flash \d+ B, RAM 4820 B, stack \d+ B\n", shown)
+    mean, worst = map(int, re.search(r"per tick: mean (\d+), worst (\d+)", shown).groups())
+    assert 10_000 < mean <= worst < 200_000
+
+
+@pytest.mark.long
+def test_ten_thousand_ticks_of_hover_yaw_step_and_faults_do_not_differ_in_a_bit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+) -> None:
+    monkeypatch.chdir(built)
+    assert floaty(monkeypatch, "deploy", "check") == 0
+    sums = re.search(r"^(\d+) ticks, .*: no bit differs$", capsys.readouterr().out, re.MULTILINE)
+    assert int(sums[1]) >= 10_000
+
+
+class Watch(PythonRunner):
+    """Python that notes the tick in which the counter of late poses first moves."""
+
+    first: ClassVar[list[int]] = []
+
+    def __init__(self, blocks: CoreBlocks) -> None:
+        super().__init__(blocks)
+        self._fields = blocks.estimator.fields
+
+    def file_pose(self) -> int:
+        answer = super().file_pose()
+        if self._fields.too_old == 1 and not self.first:
+            self.first.append(int(self._fields.tick))
+        return answer
+
+
+@pytest.mark.parametrize("target", ["c-O2", pytest.param("cortex-m4", marks=pytest.mark.long)])
+def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path, target: str
+) -> None:
+    monkeypatch.chdir(built)
+    text = translate().source
+    right, wrong = (
+        "estimator->too_old = estimator->too_old + 1;",
+        "estimator->too_old = estimator->too_old - 1;",
+    )
+    assert text.count(right) == 1
+    Path("changed.c").write_text(text.replace(right, wrong), encoding="utf-8")
+    options = ("--targets", target, "--source", "changed.c")
+    assert floaty(monkeypatch, "deploy", "check", "hover", *SOMETHING_OF_EACH, *options) == 1
+    shown = capsys.readouterr().out
+    [request] = plan("hover", False, "floaty", (), 1, 0.8, [parse(text) for text in SOMETHING_OF_EACH[3::2]])
+    Watch.first.clear()
+    flight = lockstep_flight(
+        request.config, request.experiment, request.duration_s, 1, None, faults=request.faults, runner=Watch
+    )
+    flight.run()
+    [tick] = Watch.first
+    assert tick > 100
+    assert f"tick {tick}, after file_pose: Estimator.too_old: 1 00000001 | -1 ffffffff (31 bits)" in shown
+    assert f"{target} DIFFERS" in shown
+
+
+def test_machine_code_that_leaves_its_memory_is_exit_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+) -> None:
+    monkeypatch.chdir(built)
+    text, right = translate().source, "const int32_t row = estimator->tick % FLOATY_HISTORY;"
+    assert text.count(right) == 1
+    wild = "const int32_t row = estimator->tick == 23 ? 0x8000000 : estimator->tick % FLOATY_HISTORY;"
+    Path("wild.c").write_text(text.replace(right, wild), encoding="utf-8")
+    options = ("--duration", "0.1", "--targets", "cortex-m4", "--source", "wild.c")
+    assert floaty(monkeypatch, "deploy", "check", "hover", *options) == 1
+    assert "tick 23, in estimate: " in capsys.readouterr().out
+
+
+def test_a_plain_python_that_has_ended_is_a_difference() -> None:
+    runners: list[PlainRunner] = []
+
+    def factory(blocks: CoreBlocks) -> CoreRunner:
+        runners.append(PlainRunner(blocks))
+        runners[0]._child.kill()
+        runners[0]._child.wait()
+        return runners[0]
+
+    found = fly_beside(factory).targets[0].divergence
+    assert found is not None
+    assert (found.tick, found.call) == (0, "reset")
+    runners[0].close()
+
+
+@pytest.mark.parametrize("package", ["unicorn", "elftools.elf.elffile"])
+def test_a_missing_package_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path, package: str
+) -> None:
+    monkeypatch.chdir(built)
+    monkeypatch.setitem(sys.modules, package, None)
+    assert floaty(monkeypatch, "deploy", "check", "hover", "--targets", "cortex-m4") == 2
+    error = capsys.readouterr().err
+    assert error.endswith(f"is missing: {install_command('deploy')}\n")
+    assert error.count("\n") == 1
+
+
+FIRMWARE = """
+#include "floaty_core.h"
+int main(void);
+__attribute__((section(".vectors"), used)) const void *vectors[] = {(void *)0x20020000, (void *)main};
+static FloatyParameters parameters;
+static FloatyInput data;
+static FloatyEstimator estimator;
+static FloatyControl control;
+int calls = 7;
+int main(void) {
+    floaty_core_reset(&parameters, &estimator);
+    for (;;) {
+        calls += floaty_core_file_pose(&parameters, &data, &estimator);
+        floaty_core_estimate(&parameters, &data, &estimator, &control);
+        floaty_core_control(&parameters, &data, &estimator, &control);
+    }
+}
+"""
+MAP = """
+ENTRY(main)
+SECTIONS {
+    . = 0x08004000;
+    .text : { KEEP(*(.vectors)) *(.text*) *(.rodata*) }
+    . = 0x20000000;
+    .data : { *(.data*) *(.bss*) *(COMMON) }
+    /DISCARD/ : { *(.ARM.exidx*) *(.ARM.attributes) *(.comment) }
+}
+"""
+# Those of the Crazyflie's firmware; they would let gcc fuse multiplications with additions.
+CRAZYFLIE_FLAGS = (
+    "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-std=gnu11", "-Os", "-g", "-Wall", "-Werror",
+    "-Wdouble-promotion", "-fno-math-errno", "-fno-strict-aliasing", "-ffunction-sections", "-fdata-sections",
+)  # fmt: skip
+
+
+@pytest.mark.skipif(shutil.which("arm-none-eabi-gcc") is None, reason="needs Debian's gcc-arm-none-eabi")
+@pytest.mark.parametrize(
+    ("right", "wrong", "code"), [("", "", 0), ("word * COUNT_1MS", "word + COUNT_1MS", 1)]
+)
+def test_the_core_inside_a_linked_firmware_is_checked(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    built: Path,
+    right: str,
+    wrong: str,
+    code: int,
+) -> None:
+    monkeypatch.chdir(built)
+    core = translate()
+    assert right in core.source
+    texts = {"main.c": FIRMWARE, "map.ld": MAP, "floaty_core.h": core.header}
+    texts["floaty_core.c"] = core.source.replace(right, wrong) if right else core.source
+    for name, text in texts.items():
+        Path(name).write_text(text, encoding="utf-8")
+    link = ("-nostartfiles", "-Wl,--gc-sections", "-T", "map.ld", "-o", "cf2.elf", "main.c", "floaty_core.c")
+    subprocess.run(["arm-none-eabi-gcc", *CRAZYFLIE_FLAGS, *link], check=True, timeout=60)
+    options = ("--duration", "0.5", "--targets", "cortex-m4", "--elf", "cf2.elf")
+    assert floaty(monkeypatch, "deploy", "check", "yaw-step", *options) == code
+    shown = capsys.readouterr().out
+    if code:
+        assert "tick 0, after control: Control.count[0]" in shown
+    else:
+        assert "150 ticks, numba beside cortex-m4: no bit differs" in shown
+
+
+def test_c_that_does_not_compile_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("broken.c").write_text("int x = ;\n", encoding="utf-8")
+    assert floaty(monkeypatch, "deploy", "check", "hover", "--targets", "c-O2", "--source", "broken.c") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("floaty: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["hovver"], "did you mean hover?"),
+        (["hover", "--all"], "hover and --all: one or the other"),
+        (["--fault", "push.y@1=2"], "for which EXPERIMENT?"),
+        (["hover", "--targets", "plain,c"], "'c' is none of plain, c-O0, c-O2, cortex-m4"),
+        (["hover", "--duration", "0"], "--duration"),
+        (["hover", "--profile", "flaoty"], "did you mean floaty?"),
+        (["hover", "--source", "nowhere.c"], "nowhere.c"),
+        (["hover", "--elf", "nowhere.elf"], "nowhere.elf: No such file"),
+        (["hover", "--source", "a.c", "--elf", "a.elf"], "one or the other"),
+        (["hover", "--elf", __file__], "not an ELF file"),
+        (["hover", "--elf", os.path.realpath(sys.executable)], "flash"),
+        (["hover", "--targets", "plain", "--elf", "cf2.elf"], "--elf cf2.elf: nothing to check it with"),
+    ],
+)
+def test_bad_input_of_check_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert floaty(monkeypatch, "deploy", "check", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("floaty: ")
+    assert error.count("\n") == 1
+
+
+def test_the_exported_app_holds_the_c_that_is_checked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "deploy", "export", "app", "--profile", "as-flown") == 0
+    shown = [Path(line) for line in capsys.readouterr().out.splitlines()]
+    assert {path for path in Path("app").rglob("*") if path.is_file()} == set(shown)
+    assert Path("app/src/floaty_core.c").read_text(encoding="utf-8") == translate().source
+    assert Path("app/Makefile") in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["app", "--profile", "flaoty"], "did you mean floaty?"),
+        (["app", "--set", "controller.gain_z=nan"], "controller.gain_z = nan"),
+        (["other"], "other: "),
+        ([], "Missing argument"),
+    ],
+)
+def test_bad_input_of_export_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    Path("other").mkdir()
+    Path("other/thesis.tex").write_text("mine", encoding="utf-8")
+    assert floaty(monkeypatch, "deploy", "export", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert [path.name for path in Path("other").iterdir()] == ["thesis.tex"]
+    assert not Path("app").exists()

@@ -1,0 +1,319 @@
+"""The dongle, the air and the board's radio chip on simulated time; the host's side of safelink is cflib's own code."""
+
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from cflib.crtp.radiodriver import _RadioDriverThread
+from cflib.drivers.crazyradio import _radio_ack
+
+from hil.devices.config import RadioConfig
+from hil.devices.dongle import VirtualDongle
+from hil.devices.nrf51 import RESET_DELAY_US, Nrf51, Power, RadioSettings
+from hil.devices.radio import Air, exchange_us
+from hil.events import EventQueue
+
+ADDRESS = bytes.fromhex("E7E7E7E7E7")
+CHIP = bytes.fromhex("0110A7F10AC0")
+NULL = b"\xff"
+RSSI_ACK_SIZE = 3
+
+
+class Stm:
+    """Records what reaches the STM32."""
+
+    battery_V = 3.75
+
+    def __init__(self) -> None:
+        self.packets: list[bytes] = []
+        self.starts: list[int] = []
+        self.stops: list[int] = []
+
+    def start(self, now_us: int) -> None:
+        self.starts.append(now_us)
+
+    def stop(self, now_us: int) -> None:
+        self.stops.append(now_us)
+
+    def catch_up(self, now_us: int) -> None:
+        pass
+
+    def greet(self, now_us: int) -> None:
+        pass
+
+    def received(self, now_us: int, data: bytes) -> None:
+        self.packets.append(data)
+
+
+class DongleWithBoards:
+    """One dongle, one or more boards."""
+
+    def __init__(self, boards: int = 1, seed: int = 1, **radio: float) -> None:
+        config = RadioConfig.model_validate(
+            {"uplink_loss": 0.0, "downlink_loss": 0.0, "usb_jitter_us": 0, **radio}
+        )
+        self.events = EventQueue()
+        self.stms = [Stm() for _ in range(boards)]
+        self.boards = [
+            Nrf51(
+                RadioSettings(80, 2_000_000, ADDRESS[:4] + bytes((0xE7 - n,))),
+                CHIP,
+                8,
+                self.events,
+                stm,
+                Air.of(config),
+            )
+            for n, stm in enumerate(self.stms)
+        ]
+        self.dongle = VirtualDongle(config, self.events, np.random.default_rng(seed), self.boards)
+        self.tune(80, 2, ADDRESS)
+
+    def tune(self, channel: int, rate: int, address: bytes) -> None:
+        self.dongle.control(0x01, channel, b"")
+        self.dongle.control(0x02, 0, address)
+        self.dongle.control(0x03, rate, b"")
+
+    def exchange(self, packet: bytes) -> bytes:
+        """What the host reads from the dongle."""
+        answers: list[bytes] = []
+        self.dongle.transmit(self.events.now_us, packet, lambda _, answer: answers.append(answer))
+        while not answers:
+            assert self.events.next_us is not None
+            self.events.run(self.events.next_us)
+        (answer,) = answers
+        return answer
+
+    def wait(self, duration_us: int) -> None:
+        self.events.run(self.events.now_us + duration_us)
+
+    # What cflib's driver thread calls
+    def send_packet(self, packet: bytes) -> _radio_ack:
+        answer = self.exchange(bytes(packet))
+        ack = _radio_ack()
+        ack.ack, ack.retry, ack.data = bool(answer[0] & 1), answer[0] >> 4, answer[1:]
+        return ack
+
+
+def test_a_packet_arrives_and_the_answer_is_the_signal_strength() -> None:
+    bench = DongleWithBoards()
+    answer = bench.exchange(b"\x10hello")
+    assert (answer[0], answer[1] & 0xF3, answer[2:]) == (1, 0xF3, bytes((1, 40)))
+    bench.wait(1000)
+    assert bench.stms[0].packets == [b"\x10hello"]
+
+
+def test_empty_packets_do_not_reach_the_processor() -> None:
+    bench = DongleWithBoards()
+    for header in (0xFF, 0xF3, 0xF7, 0xFB):
+        bench.exchange(bytes((header,)))
+    bench.wait(1000)
+    assert bench.stms[0].packets == []
+
+
+@pytest.mark.parametrize(("rate", "bits_per_second"), [(0, 250_000), (1, 1_000_000), (2, 2_000_000)])
+@pytest.mark.parametrize("size", [1, 4, 28, 31])
+def test_an_exchange_takes_its_time_on_the_air_and_on_usb(rate: int, bits_per_second: int, size: int) -> None:
+    bench = DongleWithBoards()
+    bench.boards[0].settings = RadioSettings(80, bits_per_second, ADDRESS)
+    bench.tune(80, rate, ADDRESS)
+    bench.exchange(bytes([0x10] * size))
+    assert bench.events.now_us == pytest.approx(
+        500 + exchange_us(size, RSSI_ACK_SIZE, bits_per_second), abs=2
+    )
+
+
+def test_the_hosts_jitter_delays_answers_and_stays_within_its_bound() -> None:
+    bench, waits = DongleWithBoards(usb_jitter_us=400), []
+    for _ in range(300):
+        start_us = bench.events.now_us
+        bench.exchange(NULL)
+        waits.append(bench.events.now_us - start_us)
+    least = 500 + exchange_us(1, RSSI_ACK_SIZE, 2_000_000)
+    assert least - 2 <= min(waits) < least + 30
+    assert least + 370 < max(waits) <= least + 400
+
+
+@pytest.mark.parametrize("setting", [(81, 2, ADDRESS), (80, 1, ADDRESS), (80, 2, b"\xe7\xe7\xe7\xe7\x00")])
+def test_nobody_answers_on_another_channel_rate_or_address(setting: tuple[int, int, bytes]) -> None:
+    bench = DongleWithBoards()
+    bench.tune(*setting)
+    assert bench.exchange(b"\x10hello") == b"\x00"
+    bench.wait(1000)
+    assert bench.stms[0].packets == []
+
+
+@pytest.mark.parametrize(
+    ("rate", "bits_per_second", "retry_us"), [(0, 250_000, 1500), (1, 1_000_000, 500), (2, 2_000_000, 500)]
+)
+@pytest.mark.parametrize("retries", [0, 3, 15])
+def test_giving_up_takes_as_long_as_the_tries(
+    rate: int, bits_per_second: int, retry_us: int, retries: int
+) -> None:
+    bench = DongleWithBoards()
+    bench.tune(81, rate, ADDRESS)
+    bench.dongle.control(0x06, retries, b"")
+    assert bench.exchange(b"\x10hello") == b"\x00"
+    try_us = 130 + (73 + 8 * 6) * 1e6 / bits_per_second + retry_us
+    assert bench.events.now_us == pytest.approx(500 + (retries + 1) * try_us, abs=retries + 1)
+
+
+def test_ten_boards_hear_only_what_is_for_them() -> None:
+    bench = DongleWithBoards(boards=10)
+    for n, board in enumerate(bench.boards):
+        bench.tune(80, 2, board.settings.address)
+        assert bench.exchange(bytes((0x10, n)))[0] & 1
+    bench.wait(1000)
+    assert [stm.packets for stm in bench.stms] == [[bytes((0x10, n))] for n in range(10)]
+
+
+def cflib_host(bench: DongleWithBoards) -> Iterator[bytes | None]:
+    """cflib's driver with safelink: takes packets by `send`, yields what it would hand to its client."""
+    driver = _RadioDriverThread(bench, None, None, None, None, None, None)
+    for _ in range(10):
+        if tuple(bench.send_packet(b"\xff\x05\x01").data) == (0xFF, 0x05, 0x01):
+            break
+    else:
+        raise AssertionError("no safelink")
+    driver._curr_up = driver._curr_down = 0
+    received: bytes | None = None
+    while True:
+        packet = yield received
+        out = bytearray(packet or NULL)
+        while not (ack := driver._send_packet_safe(bench, out)).ack:
+            pass
+        received = bytes(ack.data) if ack.data and ack.data[0] & 0xF3 != 0xF3 else None
+
+
+@pytest.mark.parametrize(
+    ("up", "down", "ber"),
+    [(0.0, 0.0, 0.0), (0.1, 0.1, 0.0), (0.5, 0.0, 0.0), (0.0, 0.5, 0.0), (0.3, 0.3, 1e-3)],
+)
+def test_safelink_brings_everything_once_and_in_order(up: float, down: float, ber: float) -> None:
+    bench = DongleWithBoards(
+        uplink_loss=up, downlink_loss=down, uplink_bit_error_rate=ber, downlink_bit_error_rate=ber
+    )
+    host = cflib_host(bench)
+    next(host)
+    sent_up = [struct.pack("<BH", 0x10, n) for n in range(300)]
+    sent_down = [struct.pack("<BH", 0x50, n) for n in range(300)]
+    waiting, received = list(sent_down), []
+    for packet in [*sent_up, *[None] * 320]:
+        while waiting and bench.boards[0].send(waiting[0]):
+            waiting.pop(0)
+        answer = host.send(packet)
+        if answer is not None:
+            received.append(bytes((answer[0] & 0xF3,)) + answer[1:])
+    bench.wait(1000)
+    assert received == sent_down
+    assert [bytes((packet[0] & 0xF3,)) + packet[1:] for packet in bench.stms[0].packets] == sent_up
+
+
+def test_losses_are_those_that_were_asked_for() -> None:
+    bench = DongleWithBoards(uplink_loss=0.3, downlink_loss=0.2)
+    bench.dongle.control(0x06, 0, b"")  # no retries
+    answered = sum(bench.exchange(b"\x10hello") != b"\x00" for _ in range(4000))
+    bench.wait(1000)
+    assert answered / 4000 == pytest.approx(0.7 * 0.8, abs=0.025)
+    assert len(bench.stms[0].packets) / 4000 == pytest.approx(0.7, abs=0.025)
+
+
+def test_bit_errors_cost_long_packets_more_than_short_ones() -> None:
+    def share(size: int) -> float:
+        bench = DongleWithBoards(uplink_bit_error_rate=2e-3, downlink_bit_error_rate=2e-3)
+        bench.dongle.control(0x06, 0, b"")
+        return sum(bench.exchange(bytes([0x10] * size)) != b"\x00" for _ in range(2000)) / 2000
+
+    for size in (1, 31):
+        bits = 2 * 73 + 8 * (size + RSSI_ACK_SIZE)
+        assert share(size) == pytest.approx((1 - 2e-3) ** bits, abs=0.035)
+
+
+@pytest.mark.parametrize("direction", ["uplink_loss", "downlink_loss"])
+def test_retries_are_counted_in_the_status_and_take_time(direction: str) -> None:
+    bench = DongleWithBoards(**{direction: 0.5})
+    seen = set()
+    for _ in range(200):
+        start_us = bench.events.now_us
+        answer = bench.exchange(b"\x10hello")
+        if answer != b"\x00":
+            retries = answer[0] >> 4
+            seen.add(retries)
+            expected_us = 500 + exchange_us(6, 3, 2_000_000) + retries * (130 + (73 + 48) // 2 + 500)
+            assert bench.events.now_us - start_us == pytest.approx(expected_us, abs=4)
+    assert seen == {0, 1, 2, 3}
+
+
+def test_the_ninth_packet_finds_the_queue_full() -> None:
+    bench = DongleWithBoards()
+    assert [bench.boards[0].send(b"\x50") for _ in range(9)] == [True] * 8 + [False]
+    bench.exchange(NULL)
+    assert bench.boards[0].send(b"\x50")
+
+
+def boot_address(answer: bytes) -> bytes:
+    """As cflib's cloader computes it."""
+    return bytes.fromhex("B1" + answer[3:7][::-1].hex())
+
+
+def into_bootloader(bench: DongleWithBoards) -> None:
+    bench.exchange(b"\xff\xfe\xff")
+    answer = bench.exchange(NULL)[1:]
+    assert answer == b"\xff\xfe\xff" + CHIP
+    bench.exchange(b"\xff\xfe\xf0\x00")
+    bench.wait(RESET_DELAY_US + 1000)
+    bench.tune(0, 2, boot_address(answer))
+
+
+def test_the_bootloader_is_at_the_address_that_cflib_computes_and_back() -> None:
+    bench = DongleWithBoards()
+    into_bootloader(bench)
+    assert bench.boards[0].power is Power.BOOTLOADER
+    assert len(bench.stms[0].stops) == 1
+    assert bench.exchange(b"\xff\xff\x10") == b"\x01"  # no contents: anything else breaks cflib's flashing
+    info = bench.exchange(NULL)
+    assert info[1:4] == b"\xff\xff\x10"
+    bench.exchange(b"\xff\xfe\xf0\x01")
+    bench.wait(RESET_DELAY_US + 1000)
+    assert bench.boards[0].power is Power.RUNNING
+    assert len(bench.stms[0].starts) == 1
+    assert bench.exchange(NULL) == b"\x00"  # not there any more
+    bench.tune(80, 2, ADDRESS)
+    assert bench.exchange(NULL)[0] & 1
+
+
+def test_the_bootloader_does_not_know_safelink() -> None:
+    bench = DongleWithBoards()
+    into_bootloader(bench)
+    assert all(bench.exchange(b"\xff\x05\x01") == b"\x01" for _ in range(10))
+
+
+def test_a_reset_needs_its_announcement() -> None:
+    bench = DongleWithBoards()
+    bench.exchange(b"\xff\xfe\xf0\x00")
+    bench.wait(RESET_DELAY_US + 1000)
+    assert bench.boards[0].power is Power.RUNNING
+
+
+def test_power_switch() -> None:
+    bench = DongleWithBoards()
+    board, stm = bench.boards[0], bench.stms[0]
+    bench.exchange(b"\xf3\xfe\x02")
+    assert (board.power, len(stm.stops), len(stm.starts)) == (Power.RADIO_ONLY, 1, 0)
+    assert bench.exchange(b"\x10lost")[0] & 1  # the radio chip still answers
+    bench.exchange(b"\xf3\xfe\x03")
+    assert (board.power, len(stm.stops), len(stm.starts)) == (Power.RUNNING, 1, 1)
+    bench.wait(1000)
+    assert stm.packets == []
+    bench.exchange(b"\xf3\xfe\x01")
+    assert (board.power, len(stm.stops)) == (Power.OFF, 2)
+    assert bench.exchange(NULL) == b"\x00"
+    board.press_button(bench.events.now_us)
+    assert (board.power, len(stm.starts)) == (Power.RUNNING, 2)
+    assert bench.exchange(NULL)[0] & 1
+
+
+def test_the_battery_voltage_is_answered() -> None:
+    bench = DongleWithBoards()
+    bench.exchange(b"\xf3\xfe\x04")
+    assert bench.exchange(NULL)[1:] == b"\xff\xfe\x04" + struct.pack("<f", 3.75)

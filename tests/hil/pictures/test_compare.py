@@ -1,0 +1,157 @@
+"""Comparing flights: the first difference is the first, and what differs besides is told."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hil.config import load_config
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.recorder import load_log
+from hil.laboratory.run import Request, fly, prepare
+from hil.pictures.compare import Run, compare, load_run
+from support.command import floaty
+
+
+def flown(folder: Path, seed: int, *overrides: str) -> Path:
+    prepare(folder)
+    fly(Request.of(EXPERIMENTS["hover"], "floaty", overrides, seed, 0.5), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    parent = tmp_path_factory.mktemp("compare")
+    return {
+        "one": flown(parent / "one", 1),
+        "again": flown(parent / "again", 1),
+        "two": flown(parent / "two", 2),
+        "strong": flown(parent / "strong", 1, "controller.gain_z=3.5"),
+    }
+
+
+def changed(run: Run, row: int, column: str, value: float) -> Run:
+    """The run with one cell changed."""
+    place = run.log.column_names.index(column)
+    field = run.log.schema.field(place)
+    values = run.log.column(place).to_numpy().copy()
+    values[row] = value
+    return Run(run.folder, run.log.set_column(place, field, pa.array(values, field.type)), run.result)
+
+
+def test_the_same_seed_is_identical(runs: dict[str, Path]) -> None:
+    comparison = compare(load_run(runs["one"]), load_run(runs["again"]))
+    assert comparison.identical
+    assert comparison.first is None
+    assert comparison.settings == ()
+    assert all(pair.difference == 0 for pair in comparison.metrics)
+
+
+def test_the_first_difference_is_the_first_by_row_then_by_column(runs: dict[str, Path]) -> None:
+    a, b = load_run(runs["one"]), load_run(runs["two"])
+    found = next(  # slow and plain: Python rows instead of numpy columns
+        (row, name, x[name], y[name])
+        for row, (x, y) in enumerate(zip(a.log.to_pylist(), b.log.to_pylist(), strict=True))
+        for name in a.log.column_names
+        if x[name] != y[name]
+    )
+    first = compare(a, b).first
+    assert first is not None
+    assert (first.row, first.column, *first.values) == found
+    assert first.t_us == a.log.column("t")[first.row].as_py()
+
+
+@settings(deadline=None, max_examples=40)
+@given(data=st.data())
+def test_any_changed_cell_is_found(runs: dict[str, Path], data: st.DataObject) -> None:
+    run = load_run(runs["one"])
+    column = data.draw(st.sampled_from([name for name in run.log.column_names if name.startswith("truth.")]))
+    row = data.draw(st.integers(0, run.log.num_rows - 1))
+    value = data.draw(st.sampled_from([math.nan, math.inf, -1e300, 5e-324]))
+    other = changed(run, row, column, value)
+    first = compare(run, other).first
+    assert first is not None
+    assert (first.row, first.column) == (row, column)
+    assert first.values[0] == run.log.column(column)[row].as_py()
+    assert np.array_equal(first.values[1], value, equal_nan=True)
+    assert compare(other, other).identical, "NaN equals NaN"
+
+
+def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) -> None:
+    run = load_run(runs["one"])
+    short = Run(run.folder, run.log.slice(0, 20), run.result)
+    for a, b, ended in ((run, short, 1), (short, run, 0)):
+        first = compare(a, b).first
+        assert first is not None
+        assert (first.row, first.t_us) == (20, run.log.column("t")[20].as_py())
+        assert first.values[ended] is None
+        assert "the log has ended" in str(first)
+
+
+def test_a_missing_column_is_told(runs: dict[str, Path]) -> None:
+    run = load_run(runs["one"])
+    less = Run(run.folder, run.log.drop_columns(["truth.x"]), run.result)
+    comparison = compare(run, less)
+    assert comparison.missing == ((), ("truth.x",))
+    assert comparison.first is None
+    assert not comparison.identical
+
+
+def test_what_was_set_otherwise_is_told_and_nothing_else(runs: dict[str, Path]) -> None:
+    comparison = compare(load_run(runs["one"]), load_run(runs["strong"]))
+    gain = load_config().controller.gain_z
+    assert ("controller.gain_z", str(gain), "3.5") in comparison.settings
+    assert {name for name, _, _ in comparison.settings} <= {"controller.gain_z", "overrides", "commit"}
+
+
+def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Path]) -> None:
+    a, b = (json.loads((runs[name] / "result.json").read_text())["metrics"] for name in ("one", "two"))
+    told = {pair.name: pair for pair in compare(load_run(runs["one"]), load_run(runs["two"])).metrics}
+    assert told["rms_x"].values == pytest.approx((100 * a["rms_x"], 100 * b["rms_x"]))
+    assert told["rms_x"].unit == "cm"
+    assert told["rms_x"].difference == pytest.approx(100 * (b["rms_x"] - a["rms_x"]))
+
+
+def test_the_command_tells_the_difference_by_its_exit_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], runs: dict[str, Path], tmp_path: Path
+) -> None:
+    assert floaty(monkeypatch, "compare", runs["one"], runs["again"], "--out", tmp_path) == 0
+    assert "identical" in capsys.readouterr().out
+    assert floaty(monkeypatch, "compare", runs["one"], runs["two"], "--out", tmp_path / "new") == 1
+    shown = capsys.readouterr().out
+    assert "first difference: row " in shown
+    assert "seed: 1 | 2" in shown
+    assert (tmp_path / "new" / "compare.png").read_bytes().startswith(b"\x89PNG")
+    page = (tmp_path / "new" / "compare.html").read_text(encoding="utf-8")
+    assert "first differ in row" in page
+    assert "data:image/png;base64," in page
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "no parquet", "no flight", "no json"])
+def test_a_bad_folder_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], runs: dict[str, Path], tmp_path: Path,
+    damage: str,
+) -> None:  # fmt: skip
+    bad = tmp_path / "bad"
+    if damage == "empty":
+        bad.mkdir()
+    elif damage != "missing":
+        shutil.copytree(runs["one"], bad)
+    if damage == "no parquet":
+        (bad / "log.parquet").write_bytes(b"PAR1 and then nothing")
+    elif damage == "no flight":
+        pq.write_table(load_log(bad).select(["t", "truth.x"]), bad / "log.parquet")
+    elif damage == "no json":
+        (bad / "result.json").write_text("{")
+    assert floaty(monkeypatch, "compare", runs["one"], bad, "--out", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("floaty: ")
+    assert "bad" in error
+    assert error.count("\n") == 1

@@ -1,0 +1,190 @@
+"""The report: one self-contained page that tells every metric, for every way in which a flight can end."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+import hil.pictures.report
+from ground_station.latency import STAGES
+from ground_station.telemetry_log import TELEMETRY
+from hil.config import load_config
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.laboratory import ages
+from hil.laboratory.metrics import METRICS
+from hil.laboratory.recorder import load_log
+from hil.laboratory.run import Request, fly, prepare, read_result
+from hil.laboratory.schedule import load_schedule
+from hil.pictures.figures import PICTURES, way
+from hil.pictures.report import metric_rows, write_report
+from support.html_page import Page
+
+
+def report(folder: Path) -> Page:
+    page = Page(write_report(folder).read_text(encoding="utf-8"))
+    drawn = [
+        picture for picture in hil.pictures.report.PICTURES if picture.needs in load_log(folder).column_names
+    ]
+    others = [table for table in (ages.told(folder), load_schedule(folder)) if table.num_rows]
+    assert len(page.pictures) == len(drawn) + len(others)
+    assert all(picture.startswith(b"\x89PNG\r\n\x1a\n") for picture in page.pictures)
+    assert page.links == []
+    assert page.scripts == 0
+    assert (folder / "report.html").stat().st_size < 3_000_000
+    return page
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report") / "run"
+    prepare(folder)
+    fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 2.0), folder)
+    return folder
+
+
+@pytest.fixture
+def folder(flown: Path, tmp_path: Path) -> Path:
+    """A copy that may be damaged."""
+    return Path(shutil.copytree(flown, tmp_path / "run"))
+
+
+@pytest.fixture
+def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For pages whose figures are another test's subject."""
+    monkeypatch.setattr(hil.pictures.report, "PICTURES", PICTURES[:1])
+
+
+def change_result(folder: Path, **changes: Any) -> None:
+    content = json.loads((folder / "result.json").read_text()) | changes
+    (folder / "result.json").write_text(json.dumps(content))
+
+
+def keep_rows(folder: Path, count: int) -> None:
+    pq.write_table(load_log(folder).slice(0, count), folder / "log.parquet")
+
+
+def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
+    result, rows = read_result(folder), report(folder).tables["metrics"][1:]
+    assert {row[0] for row in rows} == {
+        name for name, value in result["metrics"].items() if value is not None
+    }
+    assert {verdict["metric"] for verdict in result["verdicts"]} <= {row[0] for row in rows} <= set(METRICS)
+    told = {row[0]: row for row in rows}
+    for verdict in result["verdicts"]:
+        name, value, _, limit, holds, _ = told[verdict["metric"]]
+        scale = {"lost": 1, "attitude_max": math.degrees(1)}.get(name, 100)
+        assert float(value) == pytest.approx(verdict["value"] * scale, rel=1e-3)
+        assert float(limit[1:]) == pytest.approx(verdict["bound"] * scale, rel=1e-3)
+        assert limit[0] == ("≤" if METRICS[name].bound == "max" else "≥")
+        assert holds == ("holds" if verdict["holds"] else "fails")
+    assert {row[0] for row in rows if row[3]} == {verdict["metric"] for verdict in result["verdicts"]}
+    assert float(told["rms_x"][1]) == pytest.approx(100 * result["metrics"]["rms_x"], rel=1e-3)
+    assert told["rms_x"][2] == "cm"
+
+
+def test_the_way_of_the_poses_adds_up_to_their_age_and_survives_a_cut_file(folder: Path) -> None:
+    told = ages.told(folder)
+    stage = {name: told.column(name).to_numpy() for name in STAGES}
+    assert told.num_rows > 100
+    apart = stage["camera"] + stage["processing"] + stage["network"]
+    assert apart == pytest.approx(stage["mocap"], abs=1e-3)
+    drawn = way(told).axes[0].collections
+    top = max(path.vertices[:, 1].max() for area in drawn for path in area.get_paths())
+    assert top == pytest.approx((apart + stage["station"] + stage["link"]).max())
+    file = folder / TELEMETRY
+    file.write_bytes(file.read_bytes()[:-40])
+    assert ages.told(folder).num_rows in (told.num_rows, told.num_rows - 1)
+    for rest in (b"", b"board.t [ms],gr"):
+        file.write_bytes(rest)
+        assert ages.told(folder).num_rows == 0
+    report(folder)
+
+
+@pytest.mark.usefixtures("few_pictures")
+def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) -> None:
+    stages = read_result(folder)["ages"]
+    rows = report(folder).tables["ages"][1:]
+    assert [row[0] for row in rows] == [
+        "pose on board",
+        "camera",
+        "processing",
+        "network",
+        "station",
+        "radio",
+    ]
+    for row, stage in zip(rows, stages, strict=True):
+        assert [float(text) for text in row[1:]] == pytest.approx(
+            [1e-3 * stage["mean_us"], 1e-3 * stage["p99_us"]], abs=0.006
+        )
+
+
+@pytest.mark.usefixtures("few_pictures")
+def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
+    change_result(folder, overrides=["tunnel.turbulence=T1"], commit="0123456789ab")
+    result, page = read_result(folder), report(folder)
+    run = {row[0]: row[1] for row in page.tables["run"]}
+    assert run["seed"] == "1"
+    assert run["hash"] == result["hash"]
+    assert run["commit"] == "0123456789ab"
+    assert run["profile"] == "floaty --set tunnel.turbulence=T1"
+    for name, number in result["versions"].items():
+        assert f"{name} {number}" in run["versions"]
+    assert "released" in [row[2] for row in page.tables["events"]]
+
+
+@pytest.mark.usefixtures("few_pictures")
+def test_a_failed_limit_is_told_first(folder: Path) -> None:
+    change_result(
+        folder,
+        passed=False,
+        outcome="lost",
+        cause="fell",
+        verdicts=[{"metric": "max_z", "value": 0.5, "bound": 0.1, "holds": False}],
+    )
+    first = report(folder).tables["metrics"][1]
+    assert first[:1] + first[2:5] == ["max_z", "cm", "≤ 10", "fails"]
+    assert "lost: fell" in (folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rows", [1, *(pytest.param(rows, marks=pytest.mark.long) for rows in (0, 15))])
+def test_a_flight_that_never_began_has_a_report(folder: Path, rows: int) -> None:
+    keep_rows(folder, rows)
+    change_result(folder, metrics=dict.fromkeys(METRICS, None), verdicts=[], passed=False)
+    told = report(folder).tables["metrics"][1:]
+    assert told == []
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("few_pictures")
+def test_a_killed_flight_has_a_report(folder: Path) -> None:
+    (folder / "result.json").unlink()
+    (folder / "events.jsonl").unlink()
+    page = report(folder)
+    assert page.tables["events"][1:] == []
+    assert {"rms_x", "flown"} <= {row[0] for row in page.tables["metrics"][1:]}
+
+
+@pytest.mark.usefixtures("few_pictures")
+def test_texts_of_a_flight_cannot_become_markup(folder: Path) -> None:
+    text = "<script>alert(1)</script> & <b>"
+    (folder / "events.jsonl").write_text(json.dumps({"t_us": 5, "source": "<i>", "text": text}) + "\n")
+    change_result(folder, cause=text, profile=text, overrides=[text])
+    assert report(folder).tables["events"][1] == ["0.000", "<i>", text]
+
+
+def test_without_a_log_there_is_no_report(tmp_path: Path) -> None:
+    with pytest.raises(LabError, match="expected a run folder"):
+        write_report(tmp_path)
+
+
+def test_a_metric_without_a_value_is_a_dash_and_fails() -> None:
+    verdict = {"metric": "rms_x", "value": None, "bound": 0.1, "holds": False}
+    rows = {row.name: row for row in metric_rows({"metrics": {"rms_x": None}, "verdicts": [verdict]})}
+    assert (rows["rms_x"].value, rows["rms_x"].holds) == ("–", False)
+    assert "rms_y" not in rows  # neither a value nor a limit

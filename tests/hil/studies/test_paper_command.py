@@ -1,0 +1,227 @@
+"""`floaty paper`: every row is flown on both profiles, judged by the experiments' limits, and told in one report."""
+
+import dataclasses
+import json
+import math
+import os
+import signal
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.metrics import METRICS, Verdict
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.studies.catalogue import PROFILES
+from hil.studies.paper import Paper, Spread, Trials
+from hil.studies.paper_rows import OUTSIDE, ROWS, Claim, Row
+from support.command import floaty
+from support.html_page import Page
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seeds of the hover on both profiles."""
+    folder = tmp_path_factory.mktemp("paper") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        assert floaty(patch, "paper", "--only", "hov*", "--seeds", "2", "--out", str(folder)) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    folder = tmp_path_factory.mktemp("flight") / "run"
+    prepare(folder)
+    return fly(Request.of(EXPERIMENTS["hover"], duration_s=0.3), folder)
+
+
+def content(folder: Path) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads((folder / "result.json").read_text())
+    return told
+
+
+def test_every_experiment_is_a_row_or_known_not_to_be_the_papers() -> None:
+    assert set(EXPERIMENTS) == set(ROWS) | set(OUTSIDE)
+    assert not set(ROWS) & set(OUTSIDE)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_shows_metrics_that_exist_and_says_where_the_paper_claims_them(name: str) -> None:
+    assert set(ROWS[name].claims) <= set(METRICS)
+    assert ROWS[name].claim
+    assert ROWS[name].place
+
+
+@pytest.mark.long
+def test_every_flight_keeps_its_log_and_nothing_big_besides(flown: Path) -> None:
+    folders = {path.name for path in flown.iterdir() if path.is_dir()}
+    assert folders == {f"hover-{profile}-{seed}" for profile in PROFILES for seed in (1, 2)}
+    for name in folders:
+        assert {path.name for path in (flown / name).iterdir()} == {
+            "log.parquet",
+            "events.jsonl",
+            "result.json",
+        }
+
+
+@pytest.mark.long
+def test_the_table_is_the_mean_and_deviation_of_the_flights(flown: Path) -> None:
+    (row,) = content(flown)["rows"]
+    for profile in PROFILES:
+        flights = [
+            json.loads((flown / f"hover-{profile}-{seed}" / "result.json").read_text()) for seed in (1, 2)
+        ]
+        rms = [100 * flight["metrics"]["rms_y"] for flight in flights]
+        told = row["profiles"][profile]["metrics"]["rms_y"]
+        assert told["mean"] == pytest.approx(statistics.mean(rms))
+        assert told["deviation"] == pytest.approx(statistics.stdev(rms))
+        assert (told["low"], told["high"]) == pytest.approx((min(rms), max(rms)))
+        assert (told["unit"], told["count"]) == ("cm", 2)
+        assert [flight["hash"] for flight in row["profiles"][profile]["flights"]] == [
+            f["hash"] for f in flights
+        ]
+
+
+@pytest.mark.long
+def test_a_flight_of_the_paper_is_the_flight_that_fly_flies(
+    flown: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    floaty(
+        monkeypatch, "fly", "hover", "--profile", "as-flown", "--seed", "2", "--out", str(tmp_path / "run")
+    )
+    alone = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert content(flown)["rows"][0]["profiles"]["as-flown"]["flights"][1]["hash"] == alone["hash"]
+
+
+@pytest.mark.long
+def test_the_report_tells_the_papers_value_and_ours(flown: Path) -> None:
+    page = Page((flown / "report.html").read_text(encoding="utf-8"))
+    rows = {row[0]: row[1:] for row in page.tables["paper"]}
+    told = content(flown)["rows"][0]["profiles"]
+    cells = rows[METRICS["attitude_max"].meaning]
+    assert cells[0] == ROWS["hover"].claims["attitude_max"].text
+    for cell, profile in zip(cells[1:], PROFILES, strict=True):
+        assert float(cell.split()[0]) == pytest.approx(
+            told[profile]["metrics"]["attitude_max"]["mean"], rel=0.01
+        )
+        assert cell.endswith(" deg")
+    assert rows["limits held"][1:] == ["2 of 2", "2 of 2"]
+    assert len(page.pictures) >= 2 * len(PROFILES)
+    assert all(picture.startswith(b"\x89PNG") for picture in page.pictures)
+    assert page.scripts == 0
+    assert [link for link in page.links if not link.startswith("#")] == []
+
+
+def trials(result: Result, *passed: bool) -> Trials:
+    """Flights of which some failed a limit."""
+    flights = (
+        dataclasses.replace(result, verdicts=(Verdict("max_x", 0.0 if one else 1.0, 0.1, one),))
+        for one in passed
+    )
+    return Trials("floaty", tuple(flights))
+
+
+def test_every_seed_of_the_default_profile_must_hold(result: Result) -> None:
+    row = ROWS["hover"]
+    good, bad = trials(result, True, True), trials(result, True, False)
+    assert Paper((("hover", row, (good, bad)),), (), False).holds, "the other profile shows what it shows"
+    assert not Paper((("hover", row, (bad, good)),), (), False).holds
+    assert not Paper((("hover", row, (good, good)),), (), True).holds, "interrupted"
+    assert not Paper((("hover", row, (Trials("floaty", ()), good)),), (), False).holds, "nothing was flown"
+    assert bad.failed == ["max_x 1×"]
+
+
+def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -> None:
+    row = Row(
+        "t",
+        "c",
+        "p",
+        {"settle": Claim("< 0.5 s", 0.5), "peak_rate": Claim("> 80 deg/s", math.radians(80))},
+        "why",
+    )
+    slow, fast = (
+        dataclasses.replace(result, verdicts=(), metrics={"settle": settle, "peak_rate": rate})
+        for settle, rate in ((0.75, math.radians(70)), (0.45, math.radians(90)))
+    )
+    good, bad = Trials("floaty", (fast, fast)), Trials("as-flown", (slow, fast))  # the mean: 0.6 s, 80 deg/s
+    assert bad.holds
+    assert [good.missed(row, metric) for metric in row.claims] == ["", ""]
+    assert bad.missed(row, "settle") == "misses by 0.1 s"
+    assert Trials("floaty", (slow,)).missed(row, "peak_rate") == "misses by 10 deg/s"
+    assert [(profile, what) for _, profile, what in Paper((("x", row, (good, bad)),), (), False).misses] == [
+        ("as-flown", ["settle misses by 0.1 s"])
+    ]
+
+
+def test_the_representative_trial_has_the_median_error(result: Result) -> None:
+    flights = [
+        dataclasses.replace(result, metrics={**result.metrics, "rms_x": error})
+        for error in (0.5, 0.1, 0.3, 0.2, 0.4)
+    ]
+    ordered = Trials("floaty", tuple(flights)).representative_first()
+    assert [one.metrics["rms_x"] for one in ordered] == [0.3, 0.1, 0.2, 0.4, 0.5]
+
+
+def test_a_figure_that_no_flight_has_is_a_dash(result: Result) -> None:
+    assert str(Spread.of("held_up_to", [result])) == "–"
+    assert str(Spread.of("lost", [result])) == "0"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["paper", "--only", "fly-to-the-moon"], "--only fly-to-the-moon: no row matches; there are hover"),
+        (["paper", "--seeds", "0"], "--seeds"),
+        (["paper", "--only", "hover", "--out", "/proc/floaty"], "--out /proc/floaty: cannot be written"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert floaty(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("floaty: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.long
+def test_ctrl_c_keeps_what_was_flown_and_writes_the_report(tmp_path: Path) -> None:
+    seeds = 10 * (os.cpu_count() or 1)
+    command = [
+        sys.executable,
+        "-m",
+        "hil.commands",
+        "paper",
+        "--only",
+        "hover",
+        "--seeds",
+        f"{seeds}",
+        "--out",
+        "out",
+    ]
+    process = subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    while not (
+        tmp_path / "out" / "hover-floaty-1"
+    ).exists():  # in the air: it lands before the report is written
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.05)
+    process.send_signal(signal.SIGINT)
+    shown, _ = process.communicate(timeout=120)
+    assert process.returncode == 130, shown
+    told = content(tmp_path / "out")
+    assert told["interrupted"] is True
+    flights = told["rows"][0]["profiles"]["floaty"]["flights"]
+    assert 1 <= len(flights) < seeds
+    assert "interrupted" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

@@ -1,0 +1,200 @@
+"""The exported app on a board of memory: compiled for this machine with the stubs, and driven step by step."""
+
+import ctypes
+import os
+import struct
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+from firmware_py.core.structs import Estimator
+from firmware_py.export.crazyflie import write_app
+from firmware_py.export.native import compilers
+from hil.config import load_config
+from support.paths import STUBS
+
+TIMER_REGISTERS = "CR1 CR2 SMCR DIER SR EGR CCMR1 CCMR2 CCER CNT PSC ARR RCR CCR1 CCR2 CCR3 CCR4"
+PIN_REGISTERS = "MODER OTYPER OSPEEDR PUPDR IDR ODR BSRR LCKR"
+LOCALISATION = 6
+GENERIC = 1
+OUT_OF_TREE = 3  # StateEstimatorTypeOutOfTree
+
+
+class Supervisor(ctypes.Structure):
+    """FloatySupervisor."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in (
+            "last_pose_us", "battery_good_us", "watchdog_us", "episode_start_us", "bounded_us", "outside_until_us",
+        )),
+        *((name, ctypes.c_int32) for name in ("pose_timeout_us", "low_battery_mv", "battery_mv", "bounded")),
+        *((name, ctypes.c_uint8) for name in (
+            "state", "cause", "manual", "calibrated", "armed", "pose_seen", "stopped", "battery_empty", "watchdog_fed",
+        )),
+    )  # fmt: skip
+
+
+class Pose(ctypes.Structure):
+    """FloatyPose."""
+
+    _fields_ = (
+        ("arrival_us", ctypes.c_int64),
+        ("position", ctypes.c_float * 3),
+        ("quaternion", ctypes.c_float * 4),
+        ("age_us", ctypes.c_int32),
+    )
+
+
+class GyroZero(ctypes.Structure):
+    """FloatyGyroZero."""
+
+    _fields_ = (
+        ("squares", ctypes.c_int64 * 3),
+        ("sums", ctypes.c_int32 * 3),
+        ("samples", ctypes.c_int32),
+        ("windows_refused", ctypes.c_int32),
+        ("found", ctypes.c_bool),
+    )
+
+
+class Timer(ctypes.Structure):
+    """TIM_TypeDef, its registers in their order."""
+
+    _fields_ = tuple((name, ctypes.c_uint32) for name in TIMER_REGISTERS.split())
+
+
+class Pins(ctypes.Structure):
+    """GPIO_TypeDef."""
+
+    _fields_ = (
+        *((name, ctypes.c_uint32) for name in PIN_REGISTERS.split()),
+        ("AFR", ctypes.c_uint32 * 2),
+    )
+
+
+def build_app(folder: Path) -> Path:
+    """Export the app of the default profile and return it as a shared library."""
+    write_app(load_config(), "floaty", folder)
+    compiler = min(
+        compilers(), key=lambda one: one.name == "zig"
+    )  # the system's, if there is one: it is faster
+    sources = sorted((folder / "src").glob("*.c"))
+    library = folder / "app.so"
+    flags = (
+        "-std=gnu11",
+        "-O1",
+        "-Wall",
+        "-Werror",
+        "-Wdouble-promotion",
+        "-fno-math-errno",
+        "-shared",
+        "-fPIC",
+    )
+    zig = ("-fno-sanitize=all", "-Wl,--no-gc-sections") if compiler.name == "zig" else ()
+    caches = {name: str(folder / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
+    subprocess.run(
+        (
+            *compiler.command, *flags, *zig, "-I", str(STUBS), "-o", str(library),
+            *map(str, sources), str(STUBS / "board.c"), "-lm",
+        ),
+        check=True, env=os.environ | caches,
+    )  # fmt: skip
+    return library
+
+
+class App:
+    """A freshly booted app; each one is a library of its own, because the app's memory is static."""
+
+    def __init__(self, library: Path, copy: Path) -> None:
+        copy.write_bytes(library.read_bytes())
+        c = self.c = ctypes.CDLL(str(copy))
+        c.stub_log_name.restype = c.stub_param_name.restype = ctypes.c_char_p
+        c.stub_log_value.restype = c.stub_param_get.restype = ctypes.c_double
+        c.stub_param_set.argtypes = (ctypes.c_int, ctypes.c_double)
+        c.floaty_supervisor_mode.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32)
+        c.floaty_supervisor_feed_watchdog.argtypes = (ctypes.c_void_p, ctypes.c_int64)
+        c.floaty_supervisor_arm.argtypes = (ctypes.c_void_p, ctypes.c_bool)
+        c.floaty_supervisor_recover.argtypes = (ctypes.c_void_p, ctypes.c_int64)
+        c.floaty_supervisor_see_battery.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32)
+        c.floaty_supervisor_arm.restype = c.floaty_supervisor_recover.restype = ctypes.c_bool
+        c.floaty_pose_decode.argtypes = (ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int64, ctypes.c_void_p)
+        c.floaty_pose_decode.restype = c.floaty_gyro_zero_add.restype = ctypes.c_bool
+        c.estimatorOutOfTreeTest.restype = ctypes.c_bool
+        self.now = ctypes.c_uint64.in_dll(c, "stub_now_us")
+        self.gyro = (ctypes.c_int32 * 3).in_dll(c, "stub_gyro")
+        self.battery = ctypes.c_float.in_dll(c, "stub_battery")
+        self.locked = ctypes.c_int32.in_dll(c, "stub_locked")
+        self.gyro_known = ctypes.c_int32.in_dll(c, "stub_gyro_known")
+        self.estimator_type = ctypes.c_int32.in_dll(c, "stub_estimator")
+        self.supervisor = Supervisor.in_dll(c, "floaty_supervisor")
+        self.timers = [Timer.in_dll(c, name) for name in ("stub_tim3", "stub_tim5")]
+        self.pins = [Pins.in_dll(c, name) for name in ("stub_gpio_a", "stub_gpio_b")]
+        self._estimator = (ctypes.c_char * Estimator.dtype.itemsize).in_dll(c, "floaty_estimator")
+        self._console = (ctypes.c_char * 4096).in_dll(c, "stub_console")
+        self._state = ctypes.create_string_buffer(256)
+        self._control = ctypes.create_string_buffer(256)
+        self._nothing = ctypes.create_string_buffer(1024)
+        self.params = {name: i for i, name in _names(c.stub_param_name)}
+        self.logs = {name: i for i, name in _names(c.stub_log_name)}
+
+    def boot(self) -> None:
+        """Initialise as the stabilizer does, let the app's task start, and switch to the estimator that it wants."""
+        self.c.controllerOutOfTreeInit()
+        self.c.stub_run_app(0)
+        if self.estimator_type.value == OUT_OF_TREE:
+            self.c.estimatorOutOfTreeInit()
+
+    def step(self, step: int) -> None:
+        """Run one pass of the stabilizer."""
+        self.now.value = step * 1000
+        if self.estimator_type.value == OUT_OF_TREE:
+            self.c.estimatorOutOfTree(self._state, step)
+        self.c.controllerOutOfTree(self._control, self._nothing, self._nothing, self._state, step)
+
+    def radio(self, data: bytes, port: int = LOCALISATION, channel: int = GENERIC) -> None:
+        """Receive a packet."""
+        self.c.stub_radio(port, channel, data, len(data))
+
+    def app_channel(self, data: bytes) -> None:
+        """Receive a packet of the app channel."""
+        self.c.stub_app_packet(data, len(data))
+        self.c.stub_run_app(1)
+
+    def counts(self) -> list[int]:
+        """Return what the compare registers of M1..M4 hold."""
+        tim3, tim5 = self.timers
+        return [tim5.CCR3, tim3.CCR1, tim3.CCR2, tim5.CCR4]
+
+    def estimator(self) -> bytes:
+        """Return the estimator's memory."""
+        return self._estimator.raw
+
+    def state(self) -> dict[str, float]:
+        """Return what the firmware logs of the estimate, by the names of its log variables."""
+        parts = (("roll", "pitch", "yaw"), ("qx", "qy", "qz", "qw"), ("x", "y", "z"), ("vx", "vy", "vz"))
+        values = struct.unpack_from("<4x3f4f4x3f4x3f", self._state)
+        return dict(zip((f"stateEstimate.{name}" for part in parts for name in part), values, strict=True))
+
+    def console(self) -> str:
+        """Return what the app has printed."""
+        return self._console.value.decode()
+
+    def log(self, name: str) -> float:
+        """Return the value of a log variable."""
+        return float(self.c.stub_log_value(self.logs[name]))
+
+    def get(self, name: str) -> float:
+        """Return a parameter as a client reads it."""
+        return float(self.c.stub_param_get(self.params[name]))
+
+    def set(self, name: str, value: float) -> None:
+        """Write a parameter as a client does."""
+        self.c.stub_param_set(self.params[name], value)
+
+
+def _names(of: "ctypes._CFuncPtr") -> Iterator[tuple[int, str]]:  # type: ignore[name-defined]
+    i = 0
+    while (name := of(i)) is not None:
+        if name:
+            yield i, name.decode()
+        i += 1

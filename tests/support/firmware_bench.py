@@ -1,0 +1,77 @@
+"""The firmware as a whole on a board of plain numbers, in simulated time."""
+
+from collections.abc import Sequence
+
+from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
+from firmware_py.firmware import Firmware
+from firmware_py.wire import crtp, telemetry
+from hil.config import load_config
+from hil.events import EventQueue
+
+HOVER_COUNTS = [
+    21000 + int(sign * 0.436332 * 31290 + 32767 + shift) * 21000 // 65535  # the original's mapping, +-25 deg
+    for sign, shift in zip((1, -1, 1, -1), (-3600, -5000, -9000, 6200), strict=True)
+]
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+class FirmwareBench:
+    """A board without a world: still IMU, pins that remember, and the loop of the harness."""
+
+    def __init__(self) -> None:
+        self.events = EventQueue()
+        self.imu: ImuCounts = (3, -2, 1, 0, 0, 1365)
+        self.imu_alive = True
+        self.radio_open = True
+        self.writes: list[tuple[int, list[int]]] = []
+        self.sent: list[tuple[int, bytes]] = []
+        self.console: list[str] = []
+        self.now_us = 0
+        self.battery_mv = 3900
+        self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
+        self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
+        self.firmware = Firmware(load_config(), self)
+        self.events.at(1000, self._sample)
+
+    def read_imu(self) -> ImuCounts:
+        return self.imu
+
+    def read_battery_mv(self) -> int:
+        return self.battery_mv
+
+    def write_compare(self, counts: Sequence[int]) -> None:
+        self.writes.append((self.now_us, list(counts)))
+
+    def radio_send(self, data: bytes) -> bool:
+        if self.radio_open:
+            self.sent.append((self.now_us, data))
+        return self.radio_open
+
+    def debug_write(self, text: str) -> None:
+        self.console.append(text)
+
+    def _sample(self, now_us: int) -> None:
+        if self.imu_alive:
+            self.firmware.imu_ready()
+        self.events.at(now_us + 1000, self._sample)
+
+    def pose(
+        self, at_us: int, p: tuple[float, float, float] = (0.0, 0.0, 0.0), age_us: int | None = 40_000
+    ) -> None:
+        data = crtp.encode_ext_pose(p, LEVEL, age_us)
+        self.events.at(at_us, lambda now_us: self.firmware.radio_received(data))
+
+    def poses(self, start_us: int, end_us: int, p: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        for at_us in range(start_us, end_us, 20_000):
+            self.pose(at_us, p)
+
+    def stream(self, at_us: int) -> None:
+        data = telemetry.encode_stream_request(True)
+        self.events.at(at_us, lambda now_us: self.firmware.radio_received(data))
+
+    def run(self, end_us: int) -> None:
+        while self.now_us < end_us:
+            wakes = [end_us, self.events.next_us, self.firmware.next_wake_us]
+            self.now_us = min(wake for wake in wakes if wake is not None)
+            self.events.run(self.now_us)
+            self.firmware.run(self.now_us)

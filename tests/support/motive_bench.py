@@ -1,0 +1,101 @@
+"""A virtual Motive that sees one body move, without a plant; and what its clients should see."""
+
+import contextlib
+import importlib.util
+import select
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from ground_station.mocap import MocapFrame
+from hil.devices.markers import NO_POINTS, Sighting, marker_places
+from hil.servers.dongle_server import Readers
+from hil.servers.motive import Streaming, VirtualMotive
+from hil.world.config import PlantConfig
+
+FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
+PERIOD_S = 0.005
+LATENCY_US = 38_000
+PLACES = marker_places(PlantConfig())
+NO_POSE = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))  # Motive looks at the frame's
+
+
+def seen(number: int) -> MocapFrame:
+    """The pose of the body in a frame: all over the place."""
+    rng = np.random.default_rng(number)
+    q = rng.standard_normal(4)
+    q /= np.linalg.norm(q)
+    return MocapFrame(number, tuple(rng.uniform(-1, 1, 3).tolist()), tuple(q.tolist()), valid=True)
+
+
+def sighted(number: int, tracked: bool = True) -> Sighting:
+    """What is seen of the markers in a frame: anything, anywhere."""
+    rng = np.random.default_rng(number)
+    points, ghosts = rng.uniform(-1, 1, (8, 3)), rng.uniform(-1, 1, (number % 3, 3))
+    shown = rng.random(8) < 0.7
+    residuals = 0.01 * rng.random(8) * shown
+    return Sighting(points, shown, residuals, ghosts, 0.001 * number, NO_POSE if tracked else None)
+
+
+class MotiveBench:
+    """A Motive that sees one body move, without a plant."""
+
+    def __init__(
+        self, version: tuple[int, int] = (4, 1), multicast: bool = False, markers: bool = False
+    ) -> None:
+        self.readers: Readers = {}
+        places = PLACES if markers else NO_POINTS
+        self.motive = VirtualMotive(Streaming(0, version, multicast), {1: "floaty"}, self.readers, places)
+        self.number = 0
+        self.markers = markers
+
+    def expose(self, valid: bool = True) -> None:
+        self.number += 1
+        frame = seen(self.number)
+        shown = MocapFrame(7_000_000, frame.p_WB, frame.q_WB, valid)
+        sighting = sighted(self.number, valid) if self.markers else None
+        self.motive.take(1, shown, 7_000_000 + LATENCY_US, sighting)
+
+    def answer(self) -> None:
+        """Answer what clients have asked by now."""
+        while ready := select.select(self.readers, (), (), 0)[0]:
+            for reader in ready:
+                self.readers[reader](0)
+
+    def run(self, stopping: Callable[[], bool]) -> None:
+        """Expose at 200 Hz and answer."""
+        deadline = time.monotonic() + 10.0
+        while not stopping():
+            assert time.monotonic() < deadline, "10 s have gone by"
+            self.expose()
+            select.select(self.readers, (), (), PERIOD_S)
+            self.answer()
+
+
+def needs(client: str) -> pytest.MarkDecorator:
+    """Skip where a client is not installed."""
+    missing = importlib.util.find_spec(client) is None
+    return pytest.mark.skipif(missing, reason=f"{client} IS NOT TESTED: `make clients` installs it")
+
+
+@contextlib.contextmanager
+def moving(stands: Callable[[], bool] = lambda: False) -> Iterator[MotiveBench]:
+    """A Motive that streams in a thread, without the body while it `stands`."""
+    lab, stop = MotiveBench(), threading.Event()
+
+    def pump() -> None:
+        while not stop.wait(0.005):
+            lab.expose(valid=not stands())
+            lab.answer()
+
+    thread = threading.Thread(target=pump)
+    thread.start()
+    try:
+        yield lab
+    finally:
+        stop.set()
+        thread.join()
+        lab.motive.close()
