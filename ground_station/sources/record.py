@@ -29,8 +29,10 @@ class RecordingSource:
         self._file.write(",".join(COLUMNS) + "\n")
 
     def open(self) -> None:
-        """Connect again; raises `MocapError`."""
+        """Connect again, and go on with the file; raises `MocapError`, `OSError`."""
         self._source.open()
+        if self._file is None:
+            self._file = self._path.open("a", encoding="utf-8", newline="\n")
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
         """The next frame, None when none comes in time."""
@@ -54,9 +56,10 @@ class RecordingSource:
     def close(self) -> None:
         """Disconnect and close the file."""
         self._source.close()
-        if self._file is not None:
+        file, self._file = self._file, None
+        if file is not None:
             with suppress(OSError):
-                self._file.close()
+                file.close()
 
     def _write(self, file: TextIO, frame: MocapFrame, now_us: int) -> None:
         numbers = (repr(value) for value in (*frame.p_WB, *frame.q_WB))  # the shortest that reads back alike
