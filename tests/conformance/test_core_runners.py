@@ -1,0 +1,82 @@
+"""Laws of every `CoreRunner`: whatever executes the flight core gives the same bits and keeps nothing to itself."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from firmware_py.config import parameters_of
+from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Parameters
+from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
+from firmware_py.export.boards import BOARDS, runner_of
+from firmware_py.export.plain import PlainRunner
+from hil.config import load_config
+from support.core_streams import Recording, blocks_of, fill, record_wild, run_step
+from support.paths import ROOT
+
+PLAIN = "plain"
+RECORDING = 25  # ticks
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return record_wild(7, RECORDING)
+
+
+@pytest.fixture(scope="module", params=[*BOARDS, PLAIN])
+def runner(request: pytest.FixtureRequest) -> Iterator[RunnerFactory]:
+    """What makes a runner of each kind."""
+    if request.param != PLAIN:
+        yield runner_of(request.param, ROOT / "runs" / "build")
+        return
+    children: list[PlainRunner] = []
+
+    def plain(blocks: CoreBlocks) -> CoreRunner:
+        children.append(PlainRunner(blocks))
+        return children[-1]
+
+    yield plain
+    for child in children:
+        child.close()
+
+
+def core_at_start(recording: Recording, runner: RunnerFactory) -> CoreBlocks:
+    core = CoreBlocks(Parameters.allocate(), runner)
+    for block, content in zip(blocks_of(core), recording.start, strict=True):
+        fill(block, content)
+    return core
+
+
+def test_arbitrary_calls_give_the_bits_of_python(recording: Recording, runner: RunnerFactory) -> None:
+    core = core_at_start(recording, runner)
+    for number, (step, after) in enumerate(zip(recording.steps, recording.after, strict=True)):
+        assert run_step(core, step) == after, f"call {number}, {step.call}"
+
+
+def test_what_one_runner_begins_another_one_continues(recording: Recording, runner: RunnerFactory) -> None:
+    """All state lies in the blocks: runners that take turns with Python's compute what one alone does."""
+    core = core_at_start(recording, runner)
+    runners = (core.run, PythonRunner(core))
+    for number, (step, after) in enumerate(zip(recording.steps, recording.after, strict=True)):
+        core.run = runners[number % 3 % 2]
+        assert run_step(core, step) == after, f"call {number}, {step.call}"
+
+
+def test_no_call_writes_parameters_or_input(recording: Recording, runner: RunnerFactory) -> None:
+    core = core_at_start(recording, runner)
+    for step in recording.steps:
+        run_step(core, step)
+        assert (core.parameters.bytes(), core.data.bytes()) == (step.parameters, step.data), step.call
+
+
+def test_a_pose_is_on_time_too_old_or_none(runner: RunnerFactory) -> None:
+    core = CoreBlocks(parameters_of(load_config()), runner)
+    core.run.reset()
+    for _ in range(20):  # until a pose can belong to the past
+        core.run.estimate()
+    data = core.data.fields
+    data.pose_quaternion[:] = (1, 0, 0, 0)
+    found = []
+    for x, age_us in ((0.1, 40_000), (0.1, 10_000_000), (float("nan"), 40_000), (0.1, 40_000)):
+        data.pose_position[:], data.pose_age_us = (x, 0, 0), age_us
+        found.append(core.run.file_pose())
+    assert found == [POSE_ON_TIME, POSE_TOO_OLD, POSE_INVALID, POSE_ON_TIME]
