@@ -1,6 +1,7 @@
 """Who may import whom, and which files alone may touch clocks, threads, randomness and heavy libraries."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -338,3 +339,19 @@ def test_only_real_time_tests_look_at_the_wall_clock(path: Path) -> None:
 def test_a_planted_sleep_is_caught() -> None:
     assert watches_the_clock("def test_x():\n    for _ in range(3):\n        time.sleep(1)") == ["test_x"]
     assert watches_the_clock("@pytest.mark.realtime\ndef test_x():\n    time.sleep(1)") == []
+
+
+def borrows(source: str) -> list[str]:
+    """What a file of the tests imports from a test file; what is shared stands in `support`."""
+    return [name for _, name in imported(ast.parse(source)) if re.search(r"(^|\.)(test_|conftest\b)", name)]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("*.py")), ids=lambda path: path.name)
+def test_no_test_file_imports_from_another(path: Path) -> None:
+    assert borrows(path.read_text(encoding="utf-8")) == []
+
+
+def test_a_planted_loan_is_caught() -> None:
+    assert borrows("from test_firmware import Bench") == ["test_firmware.Bench"]
+    assert borrows("import tests.hil.world.test_plant as plant") == ["tests.hil.world.test_plant"]
+    assert borrows("from support.firmware_bench import FirmwareBench") == []
