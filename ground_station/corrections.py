@@ -17,10 +17,10 @@ class Correction:
 
     p_GB: tuple[float, float, float]  # [m]
     q_GB: tuple[float, float, float, float]  # w x y z
-    age_us: int  # since the exposure, when the correction leaves the ground station
+    age_us: int  # since the exposure, when the board has it
 
 
-def correct(frame: MocapFrame, goal: Goal, now_us: int) -> Correction:
-    """The correction of `frame` with respect to `goal`, made at `now_us`."""
+def correct(frame: MocapFrame, goal: Goal, arrival_us: int) -> Correction:
+    """The correction of `frame` with respect to `goal`, which the board has at `arrival_us`."""
     p_GB, q_GB = in_goal_frame(frame.p_WB, frame.q_WB, goal.p_WG, goal.yaw)
-    return Correction(p_GB, q_GB, age_us=now_us - frame.t_us)
+    return Correction(p_GB, q_GB, age_us=arrival_us - frame.t_us)

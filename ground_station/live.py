@@ -6,62 +6,20 @@ flaps at hover: the corrections stop first, and the link is closed when the boar
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
 from ground_station.frame_rate import FrameRate
+from ground_station.links.live_link import LiveLink
 from ground_station.mocap import MocapSource
-from ground_station.station import GroundStation, Link
+from ground_station.station import GroundStation
 
 POSE_TIMEOUT_US = 5_000_000
 RECONNECT_TIMEOUT_US = 30_000_000
 RECONNECT_PERIOD_US = 500_000
 STATUS_PERIOD_US = 5_000_000
 FAILSAFE_TIMEOUT_US = 2_000_000
-
-
-class LiveLink(Link, Protocol):
-    """A link to a board that is out there."""
-
-    @property
-    def uri(self) -> str:
-        """Where the board is."""
-        ...
-
-    @property
-    def supervisor_state(self) -> int | None:
-        """The state that the board told last, None before it did, and again from `mute` on."""
-        ...
-
-    def open(self, give_up: Callable[[], bool]) -> None:
-        """Connect and start telemetry; raises `LinkError`, also when told to give up."""
-        ...
-
-    def received(self) -> list[tuple[int, bytes]]:
-        """What came since the last call, with the instants of its arrival [us, `clock_us`]."""
-        ...
-
-    def notices(self) -> list[str]:
-        """Lines for the user since the last call."""
-        ...
-
-    def summary(self) -> str:
-        """One line on how the link does."""
-        ...
-
-    def check(self) -> None:
-        """Raise `LinkError` when the link is lost."""
-        ...
-
-    def mute(self) -> None:
-        """Send no more poses until `open`; the board notices the silence."""
-        ...
-
-    def close(self) -> None:
-        """Disconnect; `open` connects again."""
-        ...
 
 
 @dataclass(slots=True)

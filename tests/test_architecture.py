@@ -56,7 +56,10 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "time": ("hil/clock.py", "hil/laboratory/run.py", "ground_station/clock.py"),
     "datetime": (),
     "asyncio": (),
-    "threading": ("hil/pictures/window.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py"),
+    "threading": (
+        "hil/pictures/window.py",
+        "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
+    ),
     "multiprocessing": ("hil/studies/sweep.py",),
     "concurrent": ("hil/studies/sweep.py",),
     "unicorn": ("firmware_py/export/cortex_m4.py",),

@@ -22,10 +22,9 @@ class LoopbackLink:
         self._transmit(now_us, encode_stream_request(True))
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Hand the correction to the carrier, with the age that it will have on arrival."""
-        correction = correct(frame, goal, now_us)
-        age_us = correction.age_us + self.latency.us
-        self._transmit(now_us, encode_ext_pose(correction.p_GB, correction.q_GB, age_us))
+        """Hand the correction to the carrier."""
+        correction = correct(frame, goal, now_us + self.latency.us)
+        self._transmit(now_us, encode_ext_pose(correction.p_GB, correction.q_GB, correction.age_us))
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
         """The telemetry in a packet from the board, empty for a packet of another service."""

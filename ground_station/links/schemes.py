@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ground_station.errors import LinkError
-from ground_station.live import LiveLink
+from ground_station.links.live_link import LiveLink
 
 
 @dataclass(frozen=True, slots=True)

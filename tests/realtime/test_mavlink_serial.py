@@ -24,24 +24,18 @@ from serial.rfc2217 import PortManager
 
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
-from ground_station.links import mavlink_serial
+from ground_station.links import live_link
 from ground_station.links.mavlink import MavlinkLinkConfig
 from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
-from support.serving import Served, serve
+from support.serving import CAMERAS, Served, serve
 
 FLOATY = (sys.executable, "-m", "hil.commands")
 PATIENCE_S = 40.0
 KEY = hashlib.sha256(b"floaty").hexdigest()
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
 Talk = Callable[["Peer"], None]
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 # A URI
@@ -88,13 +82,14 @@ def test_what_cannot_work_is_one_line_and_exit_code_two(link: str, message: str)
 
 def refused(link: str, message: str, *arguments: str) -> None:
     begin_s = time.monotonic()
-    command = [*FLOATY, "station", "--link", link, "--mocap", f"virtual:{free_port()}", *arguments]
+    command = [*FLOATY, "station", "--link", link, "--mocap", CAMERAS, *arguments]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert time.monotonic() - begin_s < 10.0
     assert shown.returncode == 2
     assert message in shown.stderr
     assert shown.stderr.startswith("floaty: ")
-    assert (shown.stdout, shown.stderr.count("\n")) == ("", 1)
+    assert [line for line in shown.stdout.splitlines() if not line.startswith("mocap ")] == []
+    assert shown.stderr.count("\n") == 1
 
 
 class Peer:
@@ -199,7 +194,7 @@ def test_why_there_is_no_connection_is_said(
     message: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(mavlink_serial, "ANSWER_TIMEOUT_US", 1_000_000)
+    monkeypatch.setattr(live_link, "ANSWER_TIMEOUT_US", 1_000_000)
     with pytest.raises(LinkError, match=message):
         link_to(peers(talk, board_key), station_key).open(lambda: False)
 

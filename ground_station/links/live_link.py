@@ -1,0 +1,227 @@
+"""What all links to a board out there have in common; `crazyradio` and `mavlink_serial` are the back ends.
+
+The newest pose waits in a mailbox; one thread sends, so that nobody else waits for the line, and a pose that is too old by
+then stays here. Every wait has a limit, and everything that goes wrong is a `LinkError` of one line. A back end opens, sends
+and reads.
+"""
+
+import queue
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+from firmware_py.wire import WireError
+from firmware_py.wire.telemetry import Sample
+from ground_station.clock import clock_us
+from ground_station.errors import LinkError
+from ground_station.latency import LinkLatency
+from ground_station.mocap import MocapFrame
+from ground_station.trajectory import Goal
+
+ANSWER_TIMEOUT_US = 4_000_000  # without any answer while connecting
+CONNECT_TIMEOUT_US = 60_000_000  # in all; tables of contents are long and slow with losses
+SILENCE_TIMEOUT_US = 2_000_000  # connected: the slowest board is heard once per second
+MAX_AGE_US = 120_000  # of a pose on board, which could not use an older one
+POLL_S = 0.05  # between two looks at a board that connects
+CLOSE_TIMEOUT_S = 1.5
+PIECES = 2000  # that were read and wait for `received`
+
+Job = Callable[[], None]
+
+
+class Sender:
+    """A thread that does one job after the other."""
+
+    def __init__(self) -> None:
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()  # few; of poses there is one
+        self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
+        self._thread.start()
+
+    def put(self, job: Job) -> None:
+        """Let a job be done when those before it are."""
+        self._jobs.put(job)
+
+    def close(self) -> None:
+        """Let the thread end behind what waits; a job that hangs is left alone."""
+        self._jobs.put(None)
+        self._thread.join(CLOSE_TIMEOUT_S)
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job()
+
+
+class LiveLink(ABC):
+    """One board. `open` before use; it may be opened again after `close`.
+
+    The back end keeps `heard_us`, `latency` and `supervisor_state` up to date, and hands what it reads to `_hear`.
+    """
+
+    def __init__(self, uri: str, latency: LinkLatency) -> None:
+        self.uri = uri
+        self.latency = latency
+        self.supervisor_state: int | None = None  # the board's last, None before it, and again from `mute` on
+        self.sent = 0  # poses
+        self.late = (
+            0  # poses that a newer one replaced, or that were too old or unfit when they were to be sent
+        )
+        self.heard_us = 0  # when the board was last heard; 0: not yet
+        self._notices: list[str] = []
+        self._received: queue.Queue[tuple[int, bytes]] = queue.Queue(PIECES)
+        self._mailbox: tuple[MocapFrame, Goal] | None = None
+        self._muted = True
+        self._lock = threading.Lock()  # around mailbox, mute and counters
+        self._sender: Sender | None = None
+
+    # What a back end is
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Open the device; raises `LinkError`."""
+
+    @abstractmethod
+    def _connect(self) -> bool:
+        """Wait `POLL_S` for the board's next step towards a connection; whether that was the last one."""
+
+    @abstractmethod
+    def _why_no_connection(self, now_us: int, within: str) -> str:
+        """Return why the board has not connected `within` `ANSWER_TIMEOUT_US`; empty if it is still getting on."""
+
+    @abstractmethod
+    def _send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        """Send a pose that leaves at `now_us`, in the sender's thread; `WireError` for one that cannot be sent."""
+
+    @abstractmethod
+    def _failure(self) -> str:
+        """Return why the device does not work any more, empty while it does."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Close the device, if it is open."""
+
+    @abstractmethod
+    def start_telemetry(self, now_us: int) -> None:
+        """Ask the board for its telemetry."""
+
+    @abstractmethod
+    def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
+        """Return the telemetry in what arrived at `now_us`; `WireError` if it is malformed."""
+
+    @abstractmethod
+    def summary(self) -> str:
+        """Return one line on how the link does."""
+
+    # Connecting
+
+    def open(self, give_up: Callable[[], bool]) -> None:
+        """Connect and start telemetry; raises `LinkError`, also when told to give up."""
+        self.heard_us = 0
+        self._received = queue.Queue(PIECES)
+        self._sender = Sender()
+        try:
+            self._open()
+            start_us = clock_us()
+            while not self._connect():
+                if why := self._why_hopeless(start_us, give_up):
+                    raise LinkError(f"{self.uri}: {why}")
+        except LinkError:
+            self.close()
+            raise
+        with self._lock:
+            self._muted = False
+
+    def _why_hopeless(self, start_us: int, give_up: Callable[[], bool]) -> str:
+        """Return why to connect no longer, empty while there is hope."""
+        now_us = clock_us()
+        if give_up():
+            return "stopped while connecting"
+        if why := self._failure():
+            return why
+        if now_us - start_us > CONNECT_TIMEOUT_US:
+            return f"not connected after {seconds(CONNECT_TIMEOUT_US)}"
+        if now_us - start_us > ANSWER_TIMEOUT_US:
+            return self._why_no_connection(now_us, f"within {seconds(ANSWER_TIMEOUT_US)}")
+        return ""
+
+    def check(self) -> None:
+        """Raise `LinkError` when the link is lost."""
+        why = self._failure()
+        if not why and clock_us() - self.heard_us > SILENCE_TIMEOUT_US:
+            why = f"silent for {seconds(SILENCE_TIMEOUT_US)}"
+        if why:
+            raise LinkError(f"{self.uri}: lost: {why}")
+
+    def mute(self) -> None:
+        """Send no more poses until `open`; the board notices the silence and puts its flaps to hover."""
+        self.supervisor_state = None
+        with self._lock:
+            self._muted, self._mailbox = True, None
+
+    def close(self) -> None:
+        """Disconnect, within some seconds; `open` connects again."""
+        self.mute()
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.close()
+        self._close()
+
+    # Uplink
+
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        """Put pose and goal into the mailbox."""
+        with self._lock:
+            if self._muted:
+                return
+            replaces = self._mailbox is not None
+            self._mailbox = (frame, goal)
+            self.late += replaces
+        if not replaces:
+            self._do(self._send_newest)
+
+    def _send_newest(self) -> None:
+        """Send what lies in the mailbox, when its turn has come."""
+        with self._lock:
+            mail, self._mailbox = self._mailbox, None
+        if mail is None:
+            return
+        now_us = clock_us()
+        late = now_us + self.latency.us - mail[0].t_us > MAX_AGE_US
+        if not late:
+            try:
+                self._send(now_us, *mail)
+            except WireError:
+                late = True
+        with self._lock:
+            self.late += late
+            self.sent += not late
+
+    def _do(self, job: Job) -> None:
+        """Let the sender's thread do it."""
+        if (sender := self._sender) is not None:
+            sender.put(job)
+
+    # Downlink
+
+    def _hear(self, data: bytes) -> None:
+        """Keep what has just been read; the back end's reader calls this."""
+        with suppress(queue.Full):  # nobody looks any more
+            self._received.put_nowait((clock_us(), data))
+
+    def received(self) -> list[tuple[int, bytes]]:
+        """Return what came since the last call, with the instants of its arrival [us, `clock_us`]."""
+        pieces: list[tuple[int, bytes]] = []
+        with suppress(queue.Empty):
+            while True:
+                pieces.append(self._received.get_nowait())
+        return pieces
+
+    def notices(self) -> list[str]:
+        """Return lines for the user since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
+
+
+def seconds(duration_us: int) -> str:
+    """A limit as it is told to the user."""
+    return f"{duration_us * 1e-6:.0f} s"
