@@ -8,9 +8,9 @@ from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
-from ground_station.natnet import COMMAND_PORT, MessageId, packet
-from ground_station.natnet_stream import NatnetStream
 from ground_station.sources.alignment import Alignment
+from ground_station.sources.natnet import COMMAND_PORT, MessageId, packet
+from ground_station.sources.natnet_stream import NatnetStream
 
 CONNECT_TIMEOUT_US = 3_000_000
 PACKET_MAX = 65_536

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from firmware_py.geometry import Quaternion, Vector
 from ground_station.clock import clock_us
 from ground_station.mocap import MocapFrame
-from ground_station.natnet import (
+from ground_station.sources.natnet import (
     HEADER_SIZE,
     MULTICAST_GROUP,
     BodyDescription,
@@ -27,7 +27,7 @@ from ground_station.natnet import (
     ServerInfo,
     packet,
 )
-from ground_station.natnet_reader import Version
+from ground_station.sources.natnet_reader import Version
 from hil.clock import Readers
 from hil.devices.markers import DIAMETER, NO_POINTS, Points, Sighting
 from hil.errors import LabError

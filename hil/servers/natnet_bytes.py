@@ -1,4 +1,4 @@
-"""What Motive says on the network, as bytes: the other direction of `ground_station.natnet`, whose values it packs.
+"""What Motive says on the network, as bytes: the other direction of `ground_station.sources.natnet`, whose values it packs.
 
 Pure functions; sockets: `virtual_motive`. Layouts: reference/links.md section 2.
 """
@@ -6,7 +6,7 @@ Pure functions; sockets: `virtual_motive`. Layouts: reference/links.md section 2
 import struct
 from collections.abc import Sequence
 
-from ground_station.natnet import (
+from ground_station.sources.natnet import (
     TRACKED,
     BodyDescription,
     BodyPose,
@@ -17,7 +17,7 @@ from ground_station.natnet import (
     ServerInfo,
     packet,
 )
-from ground_station.natnet_reader import Version
+from ground_station.sources.natnet_reader import Version
 
 _SERVER_INFO = struct.Struct("<256s4B4BQHB4B")
 _COUNT = struct.Struct("<I")

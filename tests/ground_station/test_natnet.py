@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
-from ground_station.natnet import Echo, Frame, ModelDefinition, Other, ServerInfo, decode
-from ground_station.natnet_stream import NatnetStream
 from ground_station.sources.alignment import Alignment
+from ground_station.sources.natnet import Echo, Frame, ModelDefinition, Other, ServerInfo, decode
+from ground_station.sources.natnet_stream import NatnetStream
 from support import natnet_packets as packets
 from support.natnet_packets import VERSIONS
 

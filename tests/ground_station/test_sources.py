@@ -13,10 +13,10 @@ from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
-from ground_station.natnet_stream import MISTIMED_FRAMES, NatnetStream
-from ground_station.server_clock import ServerClock
 from ground_station.sources.address import find_source
 from ground_station.sources.alignment import Alignment
+from ground_station.sources.natnet_stream import MISTIMED_FRAMES, NatnetStream
+from ground_station.sources.server_clock import ServerClock
 from support import natnet_packets as packets
 from support.natnet_packets import VERSIONS
 

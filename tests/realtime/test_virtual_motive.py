@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ground_station.natnet import (
+from ground_station.sources.natnet import (
     BodyDescription,
     BodyPose,
     Echo,

@@ -7,8 +7,8 @@ import numpy as np
 
 from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapFrame
-from ground_station.natnet_stream import NatnetStream
 from ground_station.sources.alignment import Alignment
+from ground_station.sources.natnet_stream import NatnetStream
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight

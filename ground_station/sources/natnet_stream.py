@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame, is_pose
-from ground_station.natnet import (
+from ground_station.sources.alignment import Alignment
+from ground_station.sources.bodies import choose_body
+from ground_station.sources.natnet import (
     VERSIONS,
     BodyPose,
     Echo,
@@ -19,10 +21,8 @@ from ground_station.natnet import (
     decode,
     packet,
 )  # fmt: skip
-from ground_station.natnet_reader import Quaternion, Vector, Version
-from ground_station.server_clock import ServerClock
-from ground_station.sources.alignment import Alignment
-from ground_station.sources.bodies import choose_body
+from ground_station.sources.natnet_reader import Quaternion, Vector, Version
+from ground_station.sources.server_clock import ServerClock
 
 LATE_FRAMES = 100  # a number that lies further back is that of a server that began anew
 FROZEN_FRAMES = 3  # with the very same pose: the server repeats what it saw last

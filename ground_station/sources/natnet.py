@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from ground_station.errors import MocapError
-from ground_station.natnet_reader import Quaternion, Reader, Vector, Version
+from ground_station.sources.natnet_reader import Quaternion, Reader, Vector, Version
 
 COMMAND_PORT = 1510
 DATA_PORT = 1511
