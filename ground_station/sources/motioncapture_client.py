@@ -17,10 +17,10 @@ from ground_station.mocap import MocapFrame, is_pose
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.bodies import choose_body
 from ground_station.sources.capture_lines import Arrival, Body, decode_line
+from ground_station.sources.silence import Silence
 
 CONNECT_TIMEOUT_US = 5_500_000  # the process gives up after 5 s without a frame
 SETTLE_US = 1_000_000  # from the first frame on, in which all bodies should have been seen
-SILENCE_US = 500_000
 RESTART_US = 2_000_000  # starting one takes 0.2 s of a processor
 OLDEST_US = 1_000_000  # an arrival longer ago waited in the pipe
 LINE_MAX = 65_536
@@ -48,12 +48,11 @@ class MotioncaptureSource:
         self._buffer = b""
         self._lines: list[bytes] = []  # whole ones, the next last
         self._pose: Body | None = None
-        self._heard_us = 0  # the last frame
-        self._silent = False
         self._age_us = 0
         self._lost = 0  # frames without a pose
         self._malformed = 0
         self._notices: list[str] = []
+        self._silence = Silence(self._notices)
 
     def open(self) -> None:
         """Find the server and the body; raises `MocapError` within 6 s."""
@@ -83,7 +82,7 @@ class MotioncaptureSource:
             if arrival is not None:
                 names |= dict.fromkeys(arrival.bodies)
                 settled_us = min(settled_us, now_us + SETTLE_US)
-                self._heard_us = now_us
+                self._silence.on_frame(now_us)
         if settled_us == math.inf:
             raise MocapError(f"no frames of a {self._system} server")
         return choose_body(self._capture.body, list(names))
@@ -96,16 +95,16 @@ class MotioncaptureSource:
             if self._process is None and now_us >= self._restart_us:
                 self._start()
             arrival = self._next(max(0, deadline_us - now_us) * 1e-6)
-            if arrival is None and now_us - self._heard_us > SILENCE_US and not self._silent:
-                self._silent = True
-                self._notices.append("motion capture: no frames; calling the server again")
+            if arrival is None:
+                self._silence.lasts(now_us)
             frame = self._on_arrival(arrival, clock_us()) if isinstance(arrival, Arrival) else None
             if frame is not None or clock_us() >= deadline_us:
                 return frame
 
     def notices(self) -> list[str]:
         """Lines for the user since the last call."""
-        notices, self._notices = self._notices, []
+        notices = self._notices.copy()
+        self._notices.clear()
         return notices
 
     def summary(self) -> str:
@@ -127,12 +126,7 @@ class MotioncaptureSource:
         body = arrival.bodies.get(self._body)
         if (body is None and self._system == "vrpn") or now_us - arrival.t_us > OLDEST_US:
             return None  # VRPN tells each body's news apart
-        if self._silent:
-            self._silent = False
-            self._notices.append(
-                f"motion capture: frames again after {(now_us - self._heard_us) * 1e-6:.1f} s"
-            )
-        self._heard_us = now_us
+        self._silence.on_frame(now_us)
         arrived_us = min(arrival.t_us, now_us)
         t_us = arrived_us - self._capture.latency_us
         if body is None or not self._usable(body):

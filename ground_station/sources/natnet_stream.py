@@ -23,6 +23,7 @@ from ground_station.sources.natnet import (
 )  # fmt: skip
 from ground_station.sources.natnet_reader import Quaternion, Vector, Version
 from ground_station.sources.server_clock import ServerClock
+from ground_station.sources.silence import Silence
 
 LATE_FRAMES = 100  # a number that lies further back is that of a server that began anew
 FROZEN_FRAMES = 3  # with the very same pose: the server repeats what it saw last
@@ -30,7 +31,6 @@ MISTIMED_FRAMES = (
     1000  # one after the other: the server's clock was set. Those that waited in a socket are fewer
 )
 OLDEST_US = 1_000_000  # an exposure longer ago is of no use, or its time stamp is wrong
-SILENCE_US = 500_000  # without frames, after which the server is called again
 CALL_PERIOD_US = 500_000
 MODELS_CHANGED = 2  # bit of a frame's parameters
 BITSTREAM = (
@@ -69,8 +69,7 @@ class NatnetStream:
         self._pose: BodyPose | None = None
         self._repeated = 0
         self._mistimed = 0  # frames on end
-        self._heard_us: int | None = None  # the last frame
-        self._silent = False
+        self._silence = Silence(self.notices)
         self._call_us = 0
 
     def on_packet(self, data: bytes, now_us: int) -> MocapFrame | None:
@@ -106,10 +105,7 @@ class NatnetStream:
         if now_us < self._call_us:
             return
         self._call_us = now_us + CALL_PERIOD_US
-        silent = not packets_wait and self._heard_us is not None and now_us - self._heard_us > SILENCE_US
-        if silent and not self._silent:
-            self.notices.append("motion capture: no frames; calling the server again")
-        self._silent = silent
+        silent = not packets_wait and self._silence.lasts(now_us)
         if self.server is None or silent:
             self.outgoing.append(packet(MessageId.CONNECT, b"Ping\0"))
         elif self.models is None:
@@ -165,12 +161,7 @@ class NatnetStream:
             counters.dropped += 1
             return None
         self._number = frame.number
-        if self._silent and self._heard_us is not None:
-            self.notices.append(
-                f"motion capture: frames again after {(now_us - self._heard_us) * 1e-6:.1f} s"
-            )
-            self._silent = False
-        self._heard_us = now_us
+        self._silence.on_frame(now_us)
         if frame.parameters & MODELS_CHANGED:
             self.outgoing.append(packet(MessageId.REQUEST_MODELDEF, b"\0"))
         counters.frames += 1

@@ -79,7 +79,8 @@ class OptitrackSource:
 
     def notices(self) -> list[str]:
         """Lines for the user since the last call."""
-        notices, self._stream.notices = self._stream.notices, []
+        notices = self._stream.notices.copy()
+        self._stream.notices.clear()
         return notices
 
     def summary(self) -> str:

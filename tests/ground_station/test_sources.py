@@ -17,6 +17,7 @@ from ground_station.sources.address import find_source
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.natnet_stream import MISTIMED_FRAMES, NatnetStream
 from ground_station.sources.server_clock import ServerClock
+from ground_station.sources.silence import SILENCE_US, Silence
 from support import natnet_packets as packets
 from support.natnet_packets import VERSIONS
 
@@ -224,6 +225,21 @@ def test_who_did_not_listen_does_not_call_the_server_silent() -> None:
     assert 0 not in [data[0] for data in bench.stream.outgoing]
     assert bench.pose().valid
     assert bench.stream.notices == []
+
+
+def test_silence_begins_with_a_frame_and_each_one_is_told_twice() -> None:
+    notices: list[str] = []
+    silence = Silence(notices)
+    assert not silence.lasts(10 * SILENCE_US)  # nothing has come yet: that is for who connects to say
+    for begin_us in (20_000_000, 30_000_000):
+        silence.on_frame(begin_us)
+        asked = [silence.lasts(begin_us + wait_us) for wait_us in (SILENCE_US, SILENCE_US + 1, 2_000_000)]
+        assert asked == [False, True, True]
+    silence.on_frame(30_000_000 + 2_500_000)
+    assert notices == [
+        "motion capture: no frames; calling the server again", "motion capture: frames again after 10.0 s",
+        "motion capture: no frames; calling the server again", "motion capture: frames again after 2.5 s",
+    ]  # fmt: skip
 
 
 @contextmanager
