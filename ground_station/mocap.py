@@ -1,9 +1,9 @@
 """What a motion capture system says about the robot."""
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
+
+FAR = 1000.0  # [m] no tunnel is as large
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,15 +16,21 @@ class MocapFrame:
     t_us: int  # the exposure
     p_WB: tuple[float, float, float]  # [m]
     q_WB: tuple[float, float, float, float]  # w x y z
-    valid: bool  # False: the body was not tracked, the pose means nothing
+    valid: bool  # False: the body was not tracked, the pose means nothing; True is what the system says until `judged`
     received_us: int | None = None  # the motion capture computer has the images
     transmitted_us: int | None = None  # the pose leaves it
     arrived_us: int | None = None  # the ground station has it
 
 
-def is_pose(p: Sequence[float], q: Sequence[float]) -> bool:
-    """Whether numbers of a motion capture system are a place and a rotation."""
-    return abs(math.hypot(*q) - 1.0) < 0.01 and all(map(math.isfinite, p))  # the former is false for NaN
+def judged(frame: MocapFrame) -> MocapFrame:
+    """A frame as the station takes it, from whatever source: valid only if its numbers are a place and a rotation.
+
+    The comparisons are false for NaN and infinity, too.
+    """
+    x, y, z = frame.p_WB
+    a, b, c, d = frame.q_WB
+    is_pose = abs(x) + abs(y) + abs(z) < FAR and abs(a * a + b * b + c * c + d * d - 1.0) < 0.02
+    return frame if is_pose or not frame.valid else replace(frame, valid=False)
 
 
 class MocapSource(Protocol):

@@ -13,7 +13,7 @@ from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import Sample
 from ground_station.config import StationConfig
 from ground_station.latency import LatencyBudget, LinkLatency
-from ground_station.mocap import MocapFrame
+from ground_station.mocap import MocapFrame, judged
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import Track, Tracker
 from ground_station.trajectory import Goal, Trajectory
@@ -108,6 +108,7 @@ class GroundStation:
         if now_us >= self._ask_for_telemetry_us:
             self._link.start_telemetry(now_us)
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
+        frame = judged(frame)
         due = self._slots.due(frame.t_us)
         if self.tracker is not None:
             self._last_track = self.tracker.take(frame)

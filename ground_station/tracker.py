@@ -19,7 +19,6 @@ from ground_station.track_notices import TrackNotices
 POSES = 3  # that begin a track
 FIT_US = 50_000  # between them; one that comes later says nothing about the others
 WIDEN_US = 60_000  # refused poses widen the gate until then only, else they would open it to themselves
-FAR = 1000.0  # [m] no tunnel is as large
 UNKNOWN: Vector = (nan, nan, nan)
 
 
@@ -52,7 +51,7 @@ class TrackerCounters:
 
 
 class Tracker:
-    """`take` every frame; they come `period_us` apart."""
+    """`take` every frame, judged before; they come `period_us` apart."""
 
     def __init__(self, config: TrackerConfig, period_us: int) -> None:
         self.counters = TrackerCounters()
@@ -96,12 +95,12 @@ class Tracker:
         )
 
     def _take(self, frame: MocapFrame) -> Track:
-        t_us, usable = frame.t_us, _is_pose(frame)
+        t_us = frame.t_us
         if self._poses and abs(t_us - self._good_us) >= self._patience_us:
             self._lose()
         if not self._poses:
             self._t_us = t_us
-            if usable:
+            if frame.valid:
                 self._begin(frame)
             return _without(frame, Quality.NONE)
         elapsed_us = t_us - self._t_us
@@ -111,7 +110,7 @@ class Tracker:
         self._t_us = t_us
         steps = 1 if elapsed_us <= self._period_us else round(elapsed_us / self._period_us)
         self._filter.predict(steps, self._refused_in_a_row < self._widening)
-        if not usable:
+        if not frame.valid:
             return self._stand_in(frame, Quality.NONE)
         distance2, angle2, theta = self._filter.off(frame.p_WB, frame.q_WB)
         position2, rotation2 = self._filter.variances
@@ -171,13 +170,6 @@ class Tracker:
 def tracker_of(config: TrackerConfig, period_us: int) -> Tracker | None:
     """The tracker that a profile asks for."""
     return Tracker(config, period_us) if config.enabled else None
-
-
-def _is_pose(frame: MocapFrame) -> bool:
-    """Whether a frame holds one; the comparisons are false for NaN and infinity, too."""
-    x, y, z = frame.p_WB
-    a, b, c, d = frame.q_WB
-    return frame.valid and abs(x) + abs(y) + abs(z) < FAR and 0.81 <= a * a + b * b + c * c + d * d <= 1.21
 
 
 def _without(frame: MocapFrame, quality: Quality) -> Track:

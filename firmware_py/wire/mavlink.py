@@ -138,7 +138,11 @@ def turn_quaternion(q: Quaternion) -> Quaternion:
 
 
 def pose(t_us: int, p_WB: Vector, q_WB: Quaternion) -> Message:
-    """The pose of a motion capture frame taken at `t_us` of the sender's clock; the covariance is not stated."""
+    """The pose of a motion capture frame taken at `t_us` of the sender's clock; the covariance is not stated.
+
+    Raises `WireError` for a pose that the receiver would refuse.
+    """
+    check_pose(p_WB, q_WB)
     return dialect.MAVLink_att_pos_mocap_message(max(0, t_us), turn_quaternion(q_WB), *turn(p_WB))
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 from firmware_py.geometry import rotate, wrap_angle, yaw_quaternion
 from firmware_py.wire import WireError, mavlink
-from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
 from firmware_py.wire.telemetry import BLOCKS, Sample
 from ground_station.latency import LinkLatency
@@ -117,11 +116,11 @@ class MavlinkLink:
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         """Send the pose, after a goal that has changed; what can wait comes behind. `WireError` for an unfit pose."""
-        check_pose(frame.p_WB, frame.q_WB)
+        pose = mavlink.pose(frame.t_us, frame.p_WB, frame.q_WB)
         since_us = now_us - self._goal_us
         if self._goal is None or (goal != self._goal and since_us >= self.budget.goal_period_us):
             self._send_goal(now_us, frame, goal)
-        self._send(now_us, mavlink.pose(frame.t_us, frame.p_WB, frame.q_WB))
+        self._send(now_us, pose)
         self._poses += 1
         if goal == self._goal and now_us - self._goal_us >= REPEAT_GOAL_US:
             self._send_goal(now_us, frame, goal)

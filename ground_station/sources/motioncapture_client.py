@@ -13,7 +13,7 @@ import sys
 from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
-from ground_station.mocap import MocapFrame, is_pose
+from ground_station.mocap import MocapFrame
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.bodies import choose_body
 from ground_station.sources.capture_lines import Arrival, Body, decode_line
@@ -138,9 +138,9 @@ class MotioncaptureSource:
         return MocapFrame(t_us, p_WB, q_WB, valid=True, arrived_us=arrived_us)
 
     def _usable(self, body: Body) -> bool:
-        """Whether it is a rotation, and not the last pose again, which cameras never see."""
+        """Whether it is not the last pose again, which cameras never see."""
         last, self._pose = self._pose, body
-        return is_pose(body[:3], body[3:]) and body != last
+        return body != last
 
     def _start(self) -> None:
         self._process = subprocess.Popen(

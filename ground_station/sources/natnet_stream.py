@@ -6,7 +6,7 @@ A server that speaks a newer NatNet than can be read here is asked for the newes
 from dataclasses import dataclass
 
 from ground_station.errors import MocapError
-from ground_station.mocap import MocapFrame, is_pose
+from ground_station.mocap import MocapFrame
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.bodies import choose_body
 from ground_station.sources.natnet import (
@@ -193,11 +193,11 @@ class NatnetStream:
         return None
 
     def _usable(self, pose: BodyPose) -> bool:
-        """Whether it is tracked, a rotation, and not the last one over and over."""
+        """Whether it is tracked, and not the last one over and over."""
         last, self._pose = self._pose, pose
         same = last is not None and (last.p, last.q) == (pose.p, pose.q)
         self._repeated = self._repeated + 1 if same else 0
-        return pose.valid and is_pose(pose.p, pose.q) and self._repeated < FROZEN_FRAMES
+        return pose.valid and self._repeated < FROZEN_FRAMES
 
 
 def _unreadable(server: ServerInfo) -> MocapError:

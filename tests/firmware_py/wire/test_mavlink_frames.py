@@ -64,6 +64,11 @@ def any_message(kind: Any, rng: np.random.Generator) -> Any:
     return kind(*fields)
 
 
+def rotation(rng: np.random.Generator) -> tuple[float, ...]:
+    q = rng.normal(size=4)
+    return tuple(q / np.linalg.norm(q))
+
+
 def conversation(rng: np.random.Generator, count: int) -> list[Any]:
     """Messages of a flight: poses mostly."""
     others = (
@@ -75,7 +80,7 @@ def conversation(rng: np.random.Generator, count: int) -> list[Any]:
     return [
         others[i // 4 % 4]()
         if i % 4 == 3
-        else mavlink.pose(int(rng.integers(1 << 40)), tuple(rng.normal(size=3)), tuple(rng.normal(size=4)))
+        else mavlink.pose(int(rng.integers(1 << 40)), tuple(rng.normal(size=3)), rotation(rng))
         for i in range(count)
     ]
 
