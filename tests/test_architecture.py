@@ -253,6 +253,22 @@ def test_every_confined_file_exists() -> None:
     assert {file for file in files if not (ROOT / file).exists()} == set()
 
 
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+
+
+def test_every_file_that_the_architecture_names_exists() -> None:
+    named = set(re.findall(r"`([\w./]+(?:\.py|/\w*))`", ARCHITECTURE))
+    assert len(named) > 20
+    assert {name for name in named if not (ROOT / name).exists()} == set()
+
+
+def test_the_architecture_s_floors_are_those_that_are_enforced() -> None:
+    section = ARCHITECTURE.split("## The floors")[1].split("## ")[0]
+    rows = re.findall(r"^\| (\d) \| ([^|]+) \|", section, re.MULTILINE)
+    told = {int(floor): set(re.findall(r"`(\w+)`", rooms)) for floor, rooms in rows}
+    assert told == dict(enumerate(map(set, FLOORS)))
+
+
 def test_every_room_has_its_floor_and_no_more_than_sixteen_files() -> None:
     rooms = {
         path.relative_to(ROOT / "hil").parts[0].removesuffix(".py") for path in (ROOT / "hil").rglob("*.py")

@@ -63,7 +63,7 @@ def refused(shown: "subprocess.CompletedProcess[str]", begin_s: float, message: 
         (["--link", "carrier-pigeon://coop"], "expected radio://"),
         (["--link", URI, "--mocap", "vicon"], "--mocap vicon: expected optitrack:HOST"),
         (["--link", URI, "--trajectory", "loop"], "experiment 'loop': unknown"),
-        (["--link", URI, "--log", "/nowhere/log.csv"], "--log /nowhere/log.csv: No such file"),
+        (["--link", URI, "--log", "/nowhere/log.csv"], "--log /nowhere/log.csv: there is no folder /nowhere"),
     ],
 )
 def test_what_cannot_work_is_one_line_within_ten_seconds(arguments: list[str], message: str) -> None:

@@ -71,7 +71,13 @@ def test_while_the_board_connects_the_cameras_are_served() -> None:
         link = SlowLink()
         ground = GroundStation(link, Hold(Goal((0.0, 0.0, 1.15), 0.0)), None, StationConfig())
         LiveStation(
-            link, ground, source, FrameRate(5000, 50.0), said.append, lambda: time.monotonic() > end
+            link,
+            ground,
+            source,
+            FrameRate(5000, 50.0),
+            said.append,
+            lambda: time.monotonic() > end,
+            lambda now_us: None,
         ).run()
         source.close()
     assert 10 < link.sent < 20  # of 0.3 s, not of the 1.5 s before
