@@ -1,0 +1,163 @@
+"""What links to real boards have in common, on a back end that sends when the test lets it."""
+
+import threading
+
+import pytest
+
+from firmware_py.wire import WireError
+from ground_station.clock import clock_us
+from ground_station.errors import LinkError
+from ground_station.latency import LinkLatency
+from ground_station.links.live_link import MAX_AGE_US, PIECES, LiveLink
+from ground_station.mocap import MocapFrame
+from ground_station.trajectory import Goal
+
+HOME = Goal((0.0, 0.0, 1.15), 0.0)
+PATIENCE_S = 30.0
+UNFIT = 666
+
+
+class Board(LiveLink):
+    """Notes the numbers of the poses that it sends, each after a `gate`; connects in `steps`."""
+
+    def __init__(self, latency_us=0, steps=1):
+        super().__init__("board:1", LinkLatency("air", latency_us, measured=False))
+        self.numbers, self.opened, self.steps, self.failure = [], 0, steps, ""
+        self.sending, self.gate = threading.Event(), threading.Event()
+        self.gate.set()
+
+    def _open(self):
+        self.opened += 1
+
+    def _connect(self):
+        self.steps -= 1
+        self.heard_us = clock_us()
+        return self.steps == 0
+
+    def _why_no_connection(self, now_us, within):
+        return "never"
+
+    def _send(self, now_us, frame, goal):
+        self.sending.set()
+        assert self.gate.wait(PATIENCE_S)
+        if frame.p_WB[0] == UNFIT:
+            raise WireError("unfit")
+        self.numbers.append(frame.p_WB[0])
+
+    def _failure(self):
+        return self.failure
+
+    def _close(self):
+        self.opened -= 1
+
+    def start_telemetry(self, now_us): ...
+
+    def receive(self, now_us, data):
+        return ()
+
+    def summary(self):
+        return ""
+
+    def put(self, number, age_us=-3_600_000_000):
+        """A pose that stays fresh for an hour, however slow this machine is."""
+        now_us = clock_us()
+        self.send(now_us, MocapFrame(now_us - age_us, (number, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), True), HOME)
+
+
+def opened(**options):
+    board = Board(**options)
+    board.open(lambda: False)
+    return board
+
+
+def test_the_newest_pose_replaces_those_that_wait_for_the_line():
+    board = opened()
+    board.gate.clear()
+    board.put(1)
+    assert board.sending.wait(PATIENCE_S)
+    for number in (2, 3, 4, 5):
+        board.put(number)
+    board.gate.set()
+    wait_for(board, 5)
+    assert (board.numbers, board.sent, board.late) == ([1, 5], 2, 3)
+    board.close()
+
+
+def wait_for(board, count):
+    """Until the sender has done what lies before it."""
+    done = threading.Event()
+    board._do(done.set)
+    assert done.wait(PATIENCE_S)
+    assert board.sent + board.late == count
+
+
+@pytest.mark.parametrize(("latency_us", "age_us"), [(0, MAX_AGE_US + 1), (100_000, MAX_AGE_US - 99_999)])
+def test_a_pose_that_would_be_too_old_on_board_stays_here(latency_us, age_us):
+    board = opened(latency_us=latency_us)
+    board.put(1, age_us)
+    wait_for(board, 1)
+    board.put(2)
+    wait_for(board, 2)
+    assert (board.numbers, board.late) == ([2], 1)
+    board.close()
+
+
+def test_a_pose_that_the_wire_refuses_is_counted_and_the_next_one_goes_out():
+    board = opened()
+    board.put(UNFIT)
+    wait_for(board, 1)
+    board.put(2)
+    wait_for(board, 2)
+    assert (board.numbers, board.late) == ([2], 1)
+    board.close()
+
+
+def test_a_muted_link_sends_nothing_until_it_is_opened_again():
+    board = Board(steps=1)
+    board.put(1)
+    board.open(lambda: False)
+    board.put(2)
+    wait_for(board, 1)
+    board.mute()
+    board.put(3)
+    wait_for(board, 1)
+    board.close()
+    board.steps = 1
+    board.open(lambda: False)
+    board.put(4)
+    wait_for(board, 2)
+    assert board.numbers == [2, 4]
+    board.close()
+
+
+@pytest.mark.parametrize(
+    ("stops", "failure", "why"), [(True, "", "stopped while connecting"), (False, "no", "no")]
+)
+def test_who_cannot_or_may_not_connect_leaves_the_device_closed(stops, failure, why):
+    board = Board(steps=5)
+    board.failure = failure
+    with pytest.raises(LinkError, match=f"^board:1: {why}$"):
+        board.open(lambda: stops)
+    assert board.opened == 0
+
+
+def test_a_board_that_is_silent_for_two_seconds_is_lost():
+    board = opened()
+    board.heard_us = clock_us()
+    board.check()
+    board.heard_us = clock_us() - 2_000_001
+    with pytest.raises(LinkError, match=r"^board:1: lost: silent for 2 s$"):
+        board.check()
+    board.failure = "pulled out"
+    with pytest.raises(LinkError, match=r"^board:1: lost: pulled out$"):
+        board.check()
+    board.close()
+
+
+def test_what_nobody_fetches_is_bounded():
+    board = opened()
+    for _ in range(PIECES + 10):
+        board._hear(b"x")
+    assert len(board.received()) == PIECES
+    assert board.received() == []
+    board.close()
