@@ -147,7 +147,9 @@ def test_a_frame_without_a_pose_is_not_sent():
     ],
 )
 def test_what_is_no_pose_gets_no_further_than_the_station_s_border(tracked, p, q):
-    bench = Bench(corrections_hz=200.0, tracker=Tracker(TrackerConfig(), 5000) if tracked else None)
+    bench = StationWithPackets(
+        corrections_hz=200.0, tracker=Tracker(TrackerConfig(), 5000) if tracked else None
+    )
     for number in range(10):
         bench.station.on_frame(MocapFrame(5000 * number, p, q, True), 5000 * number + 38_000)
     assert (bench.sent, bench.station.counters.invalid) == ([], 10)
