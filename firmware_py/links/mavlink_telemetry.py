@@ -1,7 +1,8 @@
-"""What the streams carry: the running board's values as messages, absolute in W, with the tick as time stamp.
+"""What the streams carry: the running board's values as messages, with the tick as time stamp.
 
-The estimator's state is relative to the goal that the last pose was seen from; position, velocity and yaw are turned back
-here.
+Our own ground station takes the flight array: the telemetry blocks as the board knows them, relative to the goal that the
+last pose was seen from. For those of others the standard's messages are absolute in W: position, velocity and yaw are
+turned there here.
 """
 
 from collections.abc import Sequence
@@ -87,8 +88,8 @@ class FlightMessages:
         return (mavlink.local_position(tick, (p_WG[0] + x, p_WG[1] + y, p_WG[2] + z), v_W),)
 
     def _flight_array(self, tick: int) -> Messages:
-        flaps, health = (self._read_block(block) for block in telemetry.BLOCKS[2:])
-        return (mavlink.flight_array(tick * 1000, (*flaps, *health)),)
+        values = [value for block in telemetry.BLOCKS for value in block.si_of(self._read_block(block))]
+        return (mavlink.flight_array(tick * 1000, values),)
 
     def _servo_outputs(self, tick: int) -> Messages:
         return (mavlink.servo_outputs(tick * 1000, tuple(self._control.count.tolist())),)

@@ -9,6 +9,7 @@ What goes down saturates where an integer is too narrow and never raises; what c
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from math import isfinite, nan
 
 import pymavlink.dialects.v20.common as dialect
@@ -18,6 +19,7 @@ from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_pose
 from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.mavlink_services import u16, u32
+from firmware_py.wire.telemetry import BLOCKS, TIMESTAMP_MASK, Sample
 
 # isort: off
 from firmware_py.wire.mavlink_services import (  # offered here, too
@@ -57,7 +59,7 @@ MSG_STATUSTEXT = 253
 MSG_DEBUG_FLOAT_ARRAY = 350
 
 FLIGHT_ARRAY = "floaty"
-FLIGHT_ARRAY_SIZE = 16  # 4 flap angles, 4 counts, 4 u, supervisor state, age, poses, rejected
+FLIGHT_ARRAY_SIZE = sum(len(block.variables) for block in BLOCKS)
 COUNTS_PER_US = 21  # of the servo timer
 
 _U16_MAX = 0xFFFF
@@ -104,24 +106,6 @@ class Target:
 
     p_WG: Vector | None  # [m]
     yaw: float | None  # [rad] about z up
-
-
-@dataclass(frozen=True, slots=True)
-class AttitudeSample:
-    """The board's attitude."""
-
-    t_ms: int
-    attitude: Vector  # roll, pitch, yaw, zyx [rad]
-    rates_B: Vector  # p, q, r [rad/s]
-
-
-@dataclass(frozen=True, slots=True)
-class PositionSample:
-    """The board's position and velocity."""
-
-    t_ms: int
-    p_WB: Vector  # [m]
-    v_W: Vector  # [m/s]
 
 
 def turn(v: Vector) -> Vector:
@@ -238,7 +222,7 @@ def home_position(t_us: int, p_WG: Vector) -> Message:
 
 
 def flight_array(t_us: int, values: Sequence[float]) -> Message:
-    """The values of `telemetry.BLOCKS[2]` and `[3]` in their order."""
+    """The samples of `telemetry.BLOCKS` in their order, relative to the goal as the board knows them, in SI."""
     data = (*values, *(0.0,) * (58 - len(values)))
     return dialect.MAVLink_debug_float_array_message(max(0, t_us), FLIGHT_ARRAY.encode(), 0, data)
 
@@ -246,24 +230,12 @@ def flight_array(t_us: int, values: Sequence[float]) -> Message:
 # Downlink, at the station
 
 
-def read_attitude(message: Message) -> AttitudeSample:
-    """The contents of an ATTITUDE."""
-    angles = (message.roll, message.pitch, message.yaw)
-    rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
-    return AttitudeSample(message.time_boot_ms, turn(angles), turn(rates))
-
-
-def read_local_position(message: Message) -> PositionSample:
-    """The contents of a LOCAL_POSITION_NED."""
-    p, v = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
-    return PositionSample(message.time_boot_ms, turn(p), turn(v))
-
-
-def read_flight_array(message: Message) -> tuple[float, ...]:
-    """The 16 values of a `flight_array`; its time stamp is `message.time_usec`."""
+def read_flight_array(message: Message) -> tuple[Sample, ...]:
+    """The samples in a `flight_array`."""
     if message.name != FLIGHT_ARRAY:
         raise WireError(f"array {message.name!r}: not {FLIGHT_ARRAY!r}")
-    return tuple(message.data[:FLIGHT_ARRAY_SIZE])
+    values, timestamp_ms = iter(message.data), message.time_usec // 1000 & TIMESTAMP_MASK
+    return tuple(Sample(block, timestamp_ms, tuple(islice(values, len(block.variables)))) for block in BLOCKS)
 
 
 def _from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:

@@ -20,6 +20,7 @@ from firmware_py.wire.parameters import SetByName, encode_set_by_name
 from firmware_py.wire.scalars import Scalar
 
 PERIOD_MS = 20  # of the original ground station's log blocks
+TIMESTAMP_MASK = 0xFFFFFF  # of a sample: what a log data packet has room for
 
 
 STREAM = "telemetry.stream"  # uint8 parameter: 1 switches the stream on
@@ -89,7 +90,7 @@ class Sample:
     """The values of one block at one instant of the board's clock."""
 
     block: Block
-    timestamp_ms: int  # modulo 2^24
+    timestamp_ms: int  # in the bits of TIMESTAMP_MASK
     values: tuple[float, ...]  # in the order of block.variables
 
 

@@ -2,18 +2,17 @@
 
 The pose goes up as it was seen, absolute and with its own time stamp; the goal goes apart from it, when it has changed
 and every half second, and the board forms the error. For its true age the board needs the station's clock, so its
-TIMESYNC requests are answered. Telemetry comes down absolute as well, and is turned back into the goal frame with the
-goal that was sent last: while a goal changes, a sample may be told by its neighbour.
+TIMESYNC requests are answered. Telemetry comes down in one array, relative to the goal as the board knows it; what the
+board sends in the standard's messages is for ground stations of others.
 
-A stream of telemetry that comes at less than half of the rate it was asked for is asked for again: the request, or the
-board's memory of it, was lost.
+Telemetry that comes at less than half of the rate it was asked for is asked for again: the request, or the board's memory
+of it, was lost.
 """
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from firmware_py.geometry import rotate, wrap_angle, yaw_quaternion
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
 from firmware_py.wire.telemetry import BLOCKS, Sample
@@ -30,12 +29,8 @@ LOOK_PERIOD_US = 1_000_000
 REPEAT_GOAL_US = round(1e6 / STANDING_GOAL_HZ)
 TEXTS = 100  # that wait for somebody to read them
 SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # a command and its best result
-STREAMS = (mavlink.MSG_LOCAL_POSITION_NED, mavlink.MSG_ATTITUDE, mavlink.MSG_DEBUG_FLOAT_ARRAY)
-MOTION, ATTITUDE, FLAPS, HEALTH = BLOCKS
-SUPERVISOR_STATE = [variable.name for variable in FLAPS.variables + HEALTH.variables].index(
-    "supervisor.state"
-)
-TIMESTAMP_MASK = 0xFFFFFF  # of a sample
+HEALTH = 3  # the block with the supervisor's state
+SUPERVISOR_STATE = [variable.name for variable in BLOCKS[HEALTH].variables].index("supervisor.state")
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,15 +80,13 @@ class MavlinkLink:
         self._goal: Goal | None = None  # as last sent
         self._goal_us = 0
         self._asked = False
-        self._streamed: Counter[int] = Counter()  # messages by number since the last look
+        self._samples = 0  # of telemetry since the last look
         self._look_us = 0  # when to look after the link next
         self._time_request_ns = 0  # own clock in the last one
         self._read_us = 0  # when what is being understood was read
         self._handlers: dict[int, Callable[[int, Message], Sequence[Sample]]] = {
             mavlink.MSG_HEARTBEAT: self._on_heartbeat,
             mavlink.MSG_TIMESYNC: self._on_timesync,
-            mavlink.MSG_ATTITUDE: self._on_attitude,
-            mavlink.MSG_LOCAL_POSITION_NED: self._on_position,
             mavlink.MSG_DEBUG_FLOAT_ARRAY: self._on_flight_array,
             mavlink.MSG_COMMAND_ACK: self._on_command_ack,
             mavlink.MSG_STATUSTEXT: self._on_text,
@@ -109,9 +102,9 @@ class MavlinkLink:
     # Uplink
 
     def start_telemetry(self, now_us: int) -> None:
-        """Ask the board for all streams of telemetry."""
+        """Ask the board for telemetry."""
         self._asked = True
-        self._streamed.clear()
+        self._samples = 0
         self._look_after(now_us)
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
@@ -140,17 +133,16 @@ class MavlinkLink:
         self._carry(now_us, self._sender.encode(now_us, message))
 
     def _look_after(self, now_us: int) -> None:
-        """Ask for the time, say that we are here, and ask for the streams that are too slow."""
+        """Ask for the time, say that we are here, and ask for telemetry that is too slow."""
         self._look_us = now_us + LOOK_PERIOD_US
         self._time_request_ns = now_us * 1000
         self._send(now_us, mavlink.timesync(0, self._time_request_ns))
         self._send(now_us, mavlink.station_heartbeat())
-        rate_hz, board = self.budget.telemetry_hz, self._addressee
-        for number in STREAMS if self._asked else ():
-            if self._streamed[number] < rate_hz / 2:
-                wanted = (SET_MESSAGE_INTERVAL, number, 1_000_000 // rate_hz)
-                self._send(now_us, mavlink.command(board, BOARD_COMPONENT, *wanted))
-        self._streamed.clear()
+        rate_hz = self.budget.telemetry_hz
+        if self._asked and self._samples < rate_hz / 2:
+            wanted = (SET_MESSAGE_INTERVAL, mavlink.MSG_DEBUG_FLOAT_ARRAY, 1_000_000 // rate_hz)
+            self._send(now_us, mavlink.command(self._addressee, BOARD_COMPONENT, *wanted))
+        self._samples = 0
 
     # Downlink
 
@@ -166,7 +158,6 @@ class MavlinkLink:
             if handler is None or not self._is_of_board(message):
                 continue
             self.heard_us = now_us
-            self._streamed[message.get_msgId()] += 1
             samples += handler(now_us, message)
         if self._read_us >= self._look_us:
             self._look_after(self._read_us)
@@ -203,28 +194,11 @@ class MavlinkLink:
         self.texts.append(f"board: {message.text}")
         return ()
 
-    def _on_position(self, now_us: int, message: Message) -> Sequence[Sample]:
-        if self._goal is None:
-            return ()
-        position = mavlink.read_local_position(message)
-        (x, y, z), goal = position.p_WB, self._goal.p_WG
-        q_GW = yaw_quaternion(-self._goal.yaw)
-        p_GB = rotate(q_GW, (x - goal[0], y - goal[1], z - goal[2]))
-        return (Sample(MOTION, position.t_ms & TIMESTAMP_MASK, (*p_GB, *rotate(q_GW, position.v_W))),)
-
-    def _on_attitude(self, now_us: int, message: Message) -> Sequence[Sample]:
-        if self._goal is None:
-            return ()
-        sample = mavlink.read_attitude(message)
-        roll, pitch, yaw = sample.attitude
-        angles = (roll, pitch, wrap_angle(yaw - self._goal.yaw))
-        return (Sample(ATTITUDE, sample.t_ms & TIMESTAMP_MASK, (*angles, *sample.rates_B)),)
-
     def _on_flight_array(self, now_us: int, message: Message) -> Sequence[Sample]:
         try:
-            values = mavlink.read_flight_array(message)
+            samples = mavlink.read_flight_array(message)
         except WireError:
             return ()  # somebody's array of another name
-        t_ms, flaps = message.time_usec // 1000 & TIMESTAMP_MASK, len(FLAPS.variables)
-        self.supervisor_state = int(values[SUPERVISOR_STATE])
-        return Sample(FLAPS, t_ms, values[:flaps]), Sample(HEALTH, t_ms, values[flaps:])
+        self._samples += 1
+        self.supervisor_state = int(samples[HEALTH].values[SUPERVISOR_STATE])
+        return samples

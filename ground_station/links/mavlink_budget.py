@@ -13,7 +13,7 @@ from ground_station.errors import LinkError
 BYTE_BITS = 10  # start, 8 data, stop
 UP_LIMIT = 0.9  # of the line: poses that wait get old
 DOWN_LIMIT = 0.8  # of the line: the rest is for parameters, texts and answers
-TELEMETRY_HZ = (50, 25, 20, 10, 5)
+TELEMETRY_HZ = (50, 25, 20, 10, 4)
 STANDING_GOAL_HZ = 2.0  # how often a goal that stands is repeated
 HOUSEKEEPING_HZ = 1.0  # of the station: heartbeat, time request
 BOARD_TIME_HZ = 2.0  # time requests of the board
@@ -75,17 +75,15 @@ _POSE = (mavlink.pose(10**12, _U, _Q),)
 _GOAL = (mavlink.target(10**9, _U, 0.1),)
 _HOUSEKEEPING = (mavlink.station_heartbeat(),)
 _TIME = (mavlink.timesync(10**15, 10**15),)
-_SAMPLE = (
-    mavlink.attitude(10**9, *_U, *_U),
-    mavlink.local_position(10**9, _U, _U),
-    mavlink.flight_array(10**12, (0.5,) * mavlink.FLIGHT_ARRAY_SIZE),
-)
+_SAMPLE = (mavlink.flight_array(10**12, (0.5,) * mavlink.FLIGHT_ARRAY_SIZE),)
 # What the board sends unasked: rate [Hz] and message.
 _BOARD = (
     (1.0, mavlink.heartbeat(True, 2)),
     (1.0, mavlink.sys_status(3900, 0.1, 1, 0.1)),
     (1.0, mavlink.battery(3900)),
+    (4.0, mavlink.attitude(10**9, *_U, *_U)),
     (4.0, mavlink.attitude_quaternion(10**9, _Q, *_U)),
+    (4.0, mavlink.local_position(10**9, _U, _U)),
     (2.0, mavlink.servo_outputs(10**9, (31_500,) * 4)),
     (1.0, mavlink.estimator_status(10**12, True, 0.1, 0.1)),
     (3.0, mavlink.named_value(10**9, "ten_letter", 0.1)),

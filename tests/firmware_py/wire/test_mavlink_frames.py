@@ -424,8 +424,6 @@ def test_fuzzed_frames_never_raise_and_the_next_good_frame_is_received() -> None
         mavlink.MSG_ATT_POS_MOCAP: mavlink.read_pose,
         mavlink.MSG_VISION_POSITION_ESTIMATE: mavlink.read_pose,
         mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED: mavlink.read_target,
-        mavlink.MSG_ATTITUDE: mavlink.read_attitude,
-        mavlink.MSG_LOCAL_POSITION_NED: mavlink.read_local_position,
         mavlink.MSG_DEBUG_FLOAT_ARRAY: mavlink.read_flight_array,
         mavlink.MSG_PING: mavlink.ping_answer,
         mavlink.MSG_FILE_TRANSFER_PROTOCOL: mavlink.ftp_nak,

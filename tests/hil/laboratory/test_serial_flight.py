@@ -53,7 +53,7 @@ def test_the_budget_is_stated_before_take_off(tmp_path: Path) -> None:
     first = load_events(result.folder)[0]
     assert first["t_us"] == 0
     assert first["text"].startswith("57600 baud: uplink ")
-    assert "telemetry 20 Hz" in first["text"]
+    assert "telemetry 25 Hz" in first["text"]
 
 
 def test_a_line_that_cannot_carry_the_poses_is_refused_before_take_off(tmp_path: Path) -> None:
