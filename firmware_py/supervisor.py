@@ -66,9 +66,14 @@ class Supervisor:
         return self._stopped
 
     @property
+    def can_be_armed(self) -> bool:
+        """Whether a request to arm is obeyed: neither a stop nor the battery is in its way."""
+        return not self._stopped and not self._battery_empty
+
+    @property
     def can_fly(self) -> bool:
         """Whether poses are all that is needed."""
-        return self.calibrated and self.armed and not self._stopped and not self._battery_empty
+        return self.calibrated and self.armed and self.can_be_armed
 
     def mode(self, now_us: int) -> int:
         """Return the controller's mode at this instant and announce a change of state; called every 10 ms."""
@@ -95,8 +100,8 @@ class Supervisor:
         self._watchdog_us = now_us + WATCHDOG_US
 
     def arm(self, armed: bool) -> bool:
-        """Arm or disarm; False when the request to arm was refused, because a stop or the battery is in its way."""
-        if armed and (self._stopped or self._battery_empty):
+        """Arm or disarm; False when the request to arm was refused."""
+        if armed and not self.can_be_armed:
             return False
         self.armed = armed
         return True

@@ -125,7 +125,7 @@ def answer_link(packet: Packet) -> tuple[bytes, ...]:
 def supervisor_bits(supervisor: Supervisor) -> int:
     """Return the Crazyflie's bit field: can be armed, armed, arms itself, can fly, flies, tumbled, locked."""
     flags = (
-        not supervisor.armed and supervisor.calibrated and not supervisor.stopped,
+        not supervisor.armed and supervisor.calibrated and supervisor.can_be_armed,
         supervisor.armed,
         True,
         supervisor.can_fly,

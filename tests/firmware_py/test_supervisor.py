@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
+from firmware_py.links.platform import supervisor_bits
 from firmware_py.supervisor import Manual, Supervisor
 from firmware_py.wire import crtp
 from firmware_py.wire.supervisor import Cause, State
@@ -90,7 +91,7 @@ def ran_down(supervisor: Supervisor) -> None:
         supervisor.see_battery(now_us, 3000)
 
 
-@pytest.mark.parametrize(
+EVENTS = pytest.mark.parametrize(
     ("happen", "cause", "flown_by"),
     [
         (lambda supervisor: None, Cause.NONE, (MODE_FLY, MODE_MANUAL, MODE_HOVER)),
@@ -101,16 +102,61 @@ def ran_down(supervisor: Supervisor) -> None:
         (lambda supervisor: supervisor.arm(False), Cause.DISARMED, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
     ],
 )
+
+
+def in_flight(happen: Callable[[Supervisor], object]) -> Supervisor:
+    supervisor = Supervisor(load_config().supervisor, SimpleNamespace(bounded=0), lambda text: None)
+    supervisor.calibrated, supervisor.last_pose_us = True, 6_000_000
+    happen(supervisor)
+    return supervisor
+
+
+@EVENTS
 @pytest.mark.parametrize("manual", Manual)
 def test_angles_from_outside_move_the_flaps_unless_somebody_or_the_battery_stopped_the_robot(
     happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int], manual: Manual
 ) -> None:
-    supervisor = Supervisor(load_config().supervisor, SimpleNamespace(bounded=0), lambda text: None)
-    supervisor.calibrated, supervisor.last_pose_us = True, 6_000_000
+    supervisor = in_flight(happen)
     supervisor.manual = manual
-    happen(supervisor)
     assert supervisor.mode(6_000_000) == flown_by[manual]
     assert supervisor.cause is cause
+
+
+CAN_BE_ARMED, CAN_FLY = 1 << 0, 1 << 3
+
+
+@EVENTS
+def test_a_board_that_says_that_it_can_fly_flies_at_the_next_pose(
+    happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int]
+) -> None:
+    supervisor = in_flight(happen)
+    told = supervisor_bits(supervisor)
+    supervisor.last_pose_us = 9_000_000  # after any time out of bounds
+    supervisor.mode(9_000_000)
+    assert bool(told & CAN_FLY) == (supervisor.state is State.FLYING)
+
+
+@EVENTS
+def test_a_disarmed_board_that_says_that_it_can_be_armed_obeys(
+    happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int]
+) -> None:
+    supervisor = in_flight(happen)
+    assert not supervisor_bits(supervisor) & CAN_BE_ARMED or cause is Cause.DISARMED
+    supervisor.arm(False)
+    assert bool(supervisor_bits(supervisor) & CAN_BE_ARMED) == supervisor.arm(True)
+
+
+def test_silence_begins_when_the_last_pose_is_as_old_as_its_limit() -> None:
+    supervisor = in_flight(lambda supervisor: None)
+    end_us = 6_000_000 + supervisor.pose_timeout_us
+    assert (supervisor.mode(end_us - 1), supervisor.mode(end_us)) == (MODE_FLY, MODE_HOVER)
+
+
+def test_a_board_that_is_disarmed_while_it_calibrates_is_in_failsafe() -> None:
+    supervisor = in_flight(lambda supervisor: supervisor.arm(False))
+    supervisor.calibrated = False
+    supervisor.mode(6_000_000)
+    assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.DISARMED)
 
 
 @pytest.mark.parametrize(("port", "data"), [(LOC, b"\4"), (SUPERVISOR, b"\4")])
