@@ -375,10 +375,13 @@ def test_two_outliers_that_agree_are_a_jump_of_the_goal(p: tuple[float, ...], q:
     assert core.counters["refused"] == 1
 
 
-def test_outliers_that_contradict_each_other_are_never_accepted() -> None:
+@pytest.mark.parametrize("axis", range(6))
+def test_outliers_that_contradict_each_other_in_one_axis_alone_are_never_accepted(axis: int) -> None:
     core = settled()
     for k in range(10):
-        core.pose((0.5, 0, 0) if k % 2 else (-0.5, 0, 0))
+        off = np.array([0.5, 0.5, 0.5, 0.8, 0.8, 0.8])
+        off[axis] *= (-1) ** k
+        core.pose(off[:3], quaternion(*off[3:]))
         core.tick()
         core.tick()
     assert core.counters["refused"] == 10

@@ -83,6 +83,22 @@ def test_a_client_finds_the_crazyflie_protocol_version_12(client: Client) -> Non
     assert client.ask(LINK, 2, b"swallowed") == client.ask(LINK, 3, b"") == []
 
 
+@pytest.mark.parametrize(
+    ("channel", "data", "malformed", "unserved"),
+    [
+        (crtp.CHANNEL_GENERIC, b"\xee", 1, 0),
+        (crtp.CHANNEL_GENERIC, struct.pack("<B7f", crtp.EXT_POSE, *7 * [nan]), 1, 0),
+        (3, b"\0", 0, 1),
+    ],
+)
+def test_what_cannot_be_read_is_malformed_and_what_nobody_serves_unserved(
+    client: Client, channel: int, data: bytes, malformed: int, unserved: int
+) -> None:
+    client.send(LOC, channel, data)
+    client.run(client.now_us + 3000)
+    assert (client.firmware.link.malformed, client.firmware.link.unserved) == (malformed, unserved)
+
+
 def test_application_channel_echoes_and_counts_what_it_loses(client: Client) -> None:
     assert client.one(PLATFORM, 2, bytes(range(30))) == bytes(range(30))
     client.radio_open = False
@@ -342,6 +358,23 @@ def test_writing_a_parameter_changes_the_running_core(client: Client, params) ->
     assert client.write(params, "delayComp.activate", 0) == core.predict == 0
     client.run(client.now_us + 20_000)
     assert client.writes[-1][1] != HOVER_COUNTS
+
+
+def test_each_parameter_of_the_set_point_sets_its_own_element(client: Client, params) -> None:
+    for number, name in enumerate(("X", "Y", "Z", "Yaw"), 1):
+        client.write(params, f"setpoint.{name}", number / 8)
+    assert list(client.firmware._core.parameters.fields.target) == [1 / 8, 2 / 8, 3 / 8, 4 / 8]
+    client.write(params, "extCtrl.target_yaw", 0.0)
+    assert client.read(params, "setpoint.Yaw") == 0.0
+
+
+def test_the_sensors_and_decks_that_are_told_as_present_are_those_of_the_board(
+    client: Client, params
+) -> None:
+    present = {
+        name for name in params if name.startswith(("imu_sensors.", "deck.")) and client.read(params, name)
+    }
+    assert present == {"imu_sensors.BMI088", "deck.bcFloaty"}
 
 
 def test_the_authors_gains_by_their_own_names_are_the_profile_as_flown(client: Client, params) -> None:

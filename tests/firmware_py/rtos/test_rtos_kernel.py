@@ -417,6 +417,31 @@ def test_after_the_outermost_resume_all_the_highest_ready_task_runs_at_once(rais
     assert order == [*range(6, own - 1, -1), "goes on", *range(own - 1, 1, -1)]
 
 
+@given(st.permutations(["a", "b", "c", "d"]))
+def test_tasks_of_equal_priority_woken_while_the_scheduler_is_suspended_run_in_the_order_of_their_wakes(
+    woken,
+):
+    kernel = Kernel()
+    wakes = {name: kernel.create_binary_semaphore("wake") for name in woken}
+    order = []
+
+    def waiter(name):
+        yield from wakes[name].take()
+        order.append(name)
+
+    def suspender():
+        kernel.suspend_all()
+        yield from kernel.work(1_000)
+        yield from kernel.resume_all()
+
+    for name in sorted(woken):
+        kernel.create_task(name, 2, waiter, name)
+    kernel.create_task("suspender", 1, suspender)
+    kernel.start()
+    run_until(kernel, 3_000, [(100 + 100 * n, wakes[name].give_from_isr) for n, name in enumerate(woken)])
+    assert order == woken
+
+
 def test_timers_expire_at_their_ticks_and_obey_stop_reset_and_period():
     kernel = Kernel()
     expired = []
@@ -467,6 +492,7 @@ def test_a_mailbox_holds_the_newest_item_and_wakes_its_reader_when_the_writer_gi
     kernel.run(20)
     assert order == ["written", "new", "newest", "written again"]
     assert mailbox.peek() is None
+    assert mailbox.high_water == 1
 
 
 def test_a_plain_receive_lets_a_more_urgent_sender_go_on_when_the_receiver_gives_way():

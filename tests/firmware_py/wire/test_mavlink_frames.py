@@ -325,9 +325,10 @@ def test_a_cut_signature_costs_only_its_frame() -> None:
         assert feed_all(signed_receiver(), stream, 1000) == frames[:2] + frames[3:], f"{cut} bytes cut"
 
 
-def test_a_key_has_32_bytes() -> None:
-    with pytest.raises(WireError, match="31 bytes"):
-        Signing(bytes(31))
+@pytest.mark.parametrize("size", [0, 31, 33])
+def test_a_key_has_32_bytes(size: int) -> None:
+    with pytest.raises(WireError, match=f"{size} bytes"):
+        Signing(bytes(size))
 
 
 # Loss counters

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.wire import WireError, mavlink, telemetry
 from firmware_py.wire.mavlink_frames import FrameSender
+from firmware_py.wire.supervisor import State
 from support.crtp_client import PARAM, Client
 
 # NED seen from W and FRD seen from B: x stays, y and z turn over.
@@ -189,6 +190,7 @@ def test_heartbeat_tells_state_and_arming(state: int, status: str) -> None:
         assert message.system_status == getattr(dialect, f"MAV_STATE_{status}")
         assert bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED) == armed
         assert message.base_mode & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        assert bool(message.base_mode & dialect.MAV_MODE_FLAG_GUIDED_ENABLED) == (state == State.FLYING)
 
 
 def test_status_has_the_standards_units() -> None:
