@@ -119,6 +119,11 @@ def test_qualisys_has_one_port() -> None:
         find_source("qualisys:h:22223", CaptureConfig())
 
 
+@pytest.mark.parametrize("text", ["optitrack:h:1511", "vicon:h:802", "vrpn:h:3884", "qualisys:h"])
+def test_a_port_may_be_named_where_the_client_takes_one(text: str) -> None:
+    find_source(text, CaptureConfig()).close()
+
+
 def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
     def told(*periods_us: int, expected_us: int = 5000) -> list[str]:
         rate, t_us, lines = FrameRate(expected_us, 50.0), 7, []

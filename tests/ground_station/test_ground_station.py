@@ -219,14 +219,14 @@ def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
     bench = StationWithPackets(log=log)
     bench.frames(1, p=lambda number: (0.25, 0.0, 1.15))
-    for timestamp_ms in (20, 40):
+    for timestamp_ms in (0, 20):  # a board that has just booted, too
         for data in telemetry_packets(timestamp_ms):
             bench.station.on_packet(timestamp_ms * 1000 + 900, data)
     log.close()
     log.close()
     first, second = rows(tmp_path / "telemetry.csv")
-    assert (first["board.t [ms]"], second["board.t [ms]"]) == ("20", "40")
-    assert float(first["ground.t [s]"]) == 0.0209
+    assert (first["board.t [ms]"], second["board.t [ms]"]) == ("0", "20")
+    assert float(first["ground.t [s]"]) == 0.0009
     assert float(first["goal.z [m]"]) == 1.15
     assert float(first["mocap.x [m]"]) == 0.25
     for block in telemetry.BLOCKS:

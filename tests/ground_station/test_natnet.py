@@ -18,6 +18,7 @@ from ground_station.mocap import judged
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.natnet import Echo, Frame, ModelDefinition, Other, ServerInfo, decode
 from ground_station.sources.natnet_stream import NatnetStream
+from hil.servers.natnet_bytes import encode_frame
 from support import natnet_packets as packets
 from support.natnet_packets import VERSIONS
 
@@ -36,6 +37,13 @@ def test_a_frame_is_read_in_every_version(version: Version) -> None:
     assert (body.id, body.p, body.q, body.valid) == (7, (1.0, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5), True)
     assert frame.unlabelled == ((4.0, 5.0, 6.0),)
     assert [(marker.id, marker.p) for marker in frame.labelled] == [(0x70001, (1.0, 2.0, 3.0))]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_frame_of_the_virtual_server_says_what_was_put_into_it(version: Version) -> None:
+    frame = decode(packets.frame(41, version, TICKS, parameters=2), version)
+    assert isinstance(frame, Frame)
+    assert decode(encode_frame(frame, version), version) == frame
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -72,6 +80,8 @@ def test_the_server_and_its_echo_are_read() -> None:
     server = decode(packets.server_info((4, 1), True), (3, 0))
     group = "239.255.42.99"
     assert server == ServerInfo("Motive", (3, 1, 0, 0), (4, 1, 0, 0), packets.CLOCK_HZ, 1511, True, group)
+    reused = packets.server_info((4, 1), True).replace(b"Motive\0\0", b"Motive\0x")
+    assert decode(reused, (3, 0)) == server  # whatever stands behind the end of the name
     assert decode(packets.echo(5, 6), (3, 0)) == Echo(5, 6)
     assert decode(packets.packet(100, b""), (3, 0)) == Other(100)
 

@@ -1,6 +1,7 @@
 """Frames of motion capture on disk: recorded without loss, played at their pace, and files that are none."""
 
 import contextlib
+import tempfile
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -64,12 +65,52 @@ def test_a_record_that_was_cut_short_ends_with_its_last_whole_frame(tmp_path: Pa
     assert [frame for _, frame in read_frames(path)] == FRAMES_SEEN[:-1]
 
 
+def test_a_record_on_disk_is_never_much_more_than_a_second_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "frames.csv"
+    recording = RecordingSource(Played(FRAMES_SEEN), path)
+    for number in range(len(FRAMES_SEEN)):  # few bytes: no buffer is ever full
+        monkeypatch.setattr("ground_station.sources.record.clock_us", lambda now_us=number * 500_000: now_us)
+        recording.receive(0.0)
+        # not closed, as after a crash
+        written_us = [arrival_us for arrival_us, _ in read_frames(path)]
+        assert written_us[-1] >= number * 500_000 - 1_000_000
+    recording.close()
+
+
 def test_a_full_disk_ends_the_record_but_not_the_flight() -> None:
     recording = RecordingSource(Played(FRAMES_SEEN), Path("/dev/full"))
     assert [recording.receive(0.0) for _ in FRAMES_SEEN] == FRAMES_SEEN
     recording.close()
     told = "/dev/full: No space left on device; frames are not recorded any more"
     assert recording.notices() == ["played", told]
+
+
+@given(st.floats(0.001, 0.1))
+def test_a_replay_hands_on_each_frame_when_it_is_due_by_its_own_clock(timeout_s: float) -> None:
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        now_us = [7_000_000]
+
+        def wait(duration_s: float) -> None:
+            now_us[0] += max(1, round(duration_s * 1e6))
+
+        patch.setattr("ground_station.sources.replay.clock_us", lambda: now_us[0])
+        patch.setattr("ground_station.sources.replay.wait", wait)
+        path = Path(folder) / "frames.csv"
+        record(path, []).close()
+        rows = [f"{100_000 + 20_000 * n},{93_000 + 20_000 * n},1,2,3,1,0,0,0,1\n" for n in range(10)]
+        path.write_text(path.read_text() + "".join(rows))
+        source = ReplaySource(path)
+        source.open()
+        arrivals = []
+        while not source.over:
+            if (frame := source.receive(timeout_s)) is not None:
+                arrivals.append((now_us[0] - 7_000_000, frame.t_us - 7_000_000))
+    assert [t_us for _, t_us in arrivals] == [20_000 * n - 7_000 for n in range(10)]
+    assert [arrival_us for arrival_us, _ in arrivals] == pytest.approx(
+        [20_000 * n for n in range(10)], abs=20
+    )
 
 
 @pytest.mark.realtime

@@ -73,6 +73,27 @@ def test_every_instant_of_the_way_is_by_the_station_s_clock(tracked: bool) -> No
     assert instants == pytest.approx([bench.now_us + t_us for t_us in way_us], abs=1)
 
 
+@pytest.mark.parametrize("asked_us", [-1_000_001, 600])
+def test_an_echo_that_is_too_late_or_from_the_future_does_not_set_the_clock(asked_us: int) -> None:
+    bench = Bench()
+    bench.echo()
+    asked_us += bench.now_us
+    bench.stream.on_packet(packets.echo(asked_us, bench.ticks(asked_us) + 40_000), bench.now_us)
+    bench.echo()
+    assert bench.pose().t_us == pytest.approx(bench.now_us, abs=1)
+
+
+def test_no_frame_counts_before_the_server_has_named_its_bodies() -> None:
+    bench = Bench()
+    bench.stream = NatnetStream("floaty", AS_STREAMED)
+    assert bench.frame() is None
+    bench.stream.on_packet(packets.server_info(V), bench.now_us)
+    assert bench.frame() is None
+    assert bench.stream.counters.frames == 0
+    bench.stream.on_packet(packets.model_definition({"floaty": 7}, V), bench.now_us)
+    assert bench.frame() is not None
+
+
 def test_no_stage_of_the_way_takes_less_than_no_time() -> None:
     bench = ServedStream()  # without an echo the server's clock is thought to be 300 us behind
     bench.now_us += 5000

@@ -169,6 +169,17 @@ def test_variances_are_those_of_the_plain_filter_before_the_pose() -> None:
             one.update(seen.p_WB, (0.0, 0.0, 0.0))
 
 
+def test_the_attitude_is_of_unit_length_from_the_first_pose_on_and_however_long_the_robot_turns() -> None:
+    one = PoseFilter(0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration)
+    one.begin((0.0, 0.0, 0.0), (0.95, 0.0, 0.0, 0.0))
+    for number in range(1, 1000):
+        assert np.linalg.norm(one.pose[1]) == pytest.approx(1.0, abs=1e-12)
+        q = Rotation.from_euler("z", 0.02 * number).as_quat(scalar_first=True)
+        one.predict(1, widen=True)
+        _, _, theta = one.off((0.0, 0.0, 0.0), tuple(q))
+        one.update((0.0, 0.0, 0.0), theta)
+
+
 # The gate
 
 
