@@ -288,6 +288,24 @@ def test_the_bootloader_does_not_know_safelink() -> None:
     assert all(bench.exchange(b"\xff\x05\x01") == b"\x01" for _ in range(10))
 
 
+def test_without_safelink_a_packet_that_comes_twice_is_passed_on_twice() -> None:
+    bench = Bench()
+    for on, passed_on in ((1, 1), (0, 3)):
+        assert bench.exchange(bytes((0xFF, 0x05, on))) == bytes((1, 0xFF, 0x05, on))
+        for _ in range(2):
+            bench.exchange(b"\x14hello")  # the counter that safelink expects first
+        bench.wait(1000)
+        assert len(bench.stms[0].packets) == passed_on
+
+
+def test_a_command_that_names_none_does_nothing() -> None:
+    bench = Bench()
+    assert bench.exchange(b"\xff\xfe")[0] == 1
+    bench.wait(RESET_DELAY_US + 1000)
+    assert bench.boards[0].power is Power.RUNNING
+    assert bench.stms[0].stops == []
+
+
 def test_a_reset_needs_its_announcement() -> None:
     bench = DongleWithBoards()
     bench.exchange(b"\xff\xfe\xf0\x00")

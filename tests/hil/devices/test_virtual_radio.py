@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ground_station.config import StationConfig
 from hil.devices.config import RadioConfig
-from hil.devices.radio import VirtualRadio, air_us, exchange_us
+from hil.devices.radio import VirtualRadio, air_us, exchange_us, syslink_us
 from hil.events import EventQueue
 
 QUIET = {"uplink_loss": 0.0, "downlink_loss": 0.0, "usb_jitter_us": 0}
@@ -97,6 +97,18 @@ def test_answer_of_the_poll_under_way_carries_what_is_ready_in_time():
     late.radio.downlink(100, bytes(TELEMETRY))
     late.events.run(10_000)
     assert late.on_ground[0][0] == bench.on_ground[0][0] + 500 + exchange_us(1, 3, 2_000_000)
+
+
+def test_on_a_busy_link_no_answer_carries_what_the_radio_has_not_taken_in_yet():
+    bench = Bench(**QUIET)
+    bench.pose_every(500, 1000)
+    bench.telemetry_every(1777, 250)
+    bench.events.run(600_000)
+    latencies = [
+        arrived_us - 1777 * n for (arrived_us, _), n in zip(bench.on_ground, range(250), strict=True)
+    ]
+    shortest_us = syslink_us(bytes(TELEMETRY)) + 130 + air_us(TELEMETRY, 2_000_000) + 250
+    assert shortest_us <= min(latencies) < shortest_us + 20
 
 
 def test_lone_packets_meet_the_polls_at_every_phase():

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -28,6 +29,9 @@ from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.run import Request, Result, fly, prepare, read_result
 from hil.pictures.report import write_report
+from hil.world.config import PlantConfig, ServoConfig
+from hil.world.plant import Plant
+from hil.world.tunnel import TunnelConfig
 
 HOVER = EXPERIMENTS["hover"]
 Settings = tuple[str, ...]
@@ -372,6 +376,21 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
     assert wind == pytest.approx([0.2, 1.2, 3.2, 3.2, 2.2, 0.2])
     assert pace == pytest.approx([0.8, 0.4, 0.0, 0.4, 0.8, 0.8])
     assert flight.robot.plant.tunnel.side_wind == (0.1, 0.2, 0.3)
+
+
+@pytest.mark.parametrize(("kind", "axis"), [("wind.side_x", 0), ("wind.side_y", 1)])
+@given(wind=st.floats(-20.0, 20.0), more=st.floats(-30.0, 30.0))
+def test_side_wind_blows_either_way_up_to_20_metres_per_second(
+    kind: str, axis: int, wind: float, more: float
+) -> None:
+    plant = Plant(PlantConfig(), TunnelConfig(), ServoConfig(), np.random.default_rng(1))
+    before = [1.0, -2.0, 3.0]
+    before[axis] = wind
+    plant.tunnel.set_side_wind(*before)
+    (knob,) = KINDS[kind].knobs
+    knob.turn(SimpleNamespace(plant=plant), knob.blend(wind, more))  # type: ignore[arg-type]
+    before[axis] = min(max(wind + more, -20.0), 20.0)
+    assert plant.tunnel.side_wind == tuple(before)
 
 
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])

@@ -1,4 +1,4 @@
-"""The errors that metrics are made of are those that the board flies on."""
+"""The errors that metrics are made of are those that the board flies on; metrics count from the release to the end."""
 
 from math import pi
 
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.geometry import from_euler_zyx, in_goal_frame, to_euler_zyx
-from hil.laboratory.metrics import attitude_error, position_error
+from hil.laboratory.metrics import METRICS, attitude_error, measure, position_error
 
 length, angle, tilt = st.floats(-3.0, 3.0), st.floats(-pi, pi), st.floats(-1.2, 1.2)
 place = st.tuples(length, length, length)
@@ -27,3 +27,56 @@ def test_errors_are_the_pose_in_the_goal_frame(flight) -> None:
     off = attitude_error(table) - np.array([to_euler_zyx(q_GB) for _, q_GB in poses])
     off[:, 2] = np.remainder(off[:, 2] + pi, 2 * pi) - pi  # half a turn is the same either way
     assert off == pytest.approx(np.zeros_like(off), abs=1e-9)
+
+
+def test_metrics_count_from_the_release_to_the_end() -> None:
+    """Held for 4 s, then free for 10 s, 2 s of them in failsafe; on the serial line, with a tracker."""
+    free = [*4 * [0], *11 * [1]]
+    log: dict[str, object] = {
+        "t": [1_000_000 * second for second in range(15)],
+        "flight.free": free,
+        "truth.x": [*4 * [5.0], *10 * [0.05], 0.3],
+        "truth.y": [0.01] * 15,
+        "supervisor.state": [*4 * [3], 3, 3, *9 * [2]],
+        "serial.up_busy": [9 * 10**5 * second for second in range(4)]
+        + [3_600_000 + 10**5 * n for n in range(11)],
+        "serial.down_busy": [10**6 * second // 2 for second in range(15)],
+        "serial.overrun": [0, *14 * [7]],
+        "estimator.refused": [*10 * [0], *5 * [2]],
+        "estimator.too_old": [1] * 15,
+        "estimator.invalid": range(15),
+        "tracker.refused": range(0, 30, 2),
+        "estimator.pose_age_us": [*4 * [0], *11 * [40_000]],
+    }
+    still = dict.fromkeys(("truth.z", "truth.qx", "truth.qy", "truth.qz"), [0.0] * 15) | {
+        "truth.qw": [1.0] * 15
+    }
+    goal = {f"goal.{name}": [0.0] * 15 for name in ("x", "y", "z", "yaw")}
+    values = measure(pa.table(log | still | goal), lost=False)
+    told = {name: value for name, value in values.items() if not np.isnan(value)}
+    assert told == pytest.approx(
+        {
+            "lost": 0.0,
+            "flown": 10.0,
+            "rms_x": np.sqrt((10 * 0.05**2 + 0.3**2) / 11),
+            "rms_y": 0.01,
+            "rms_z": 0.0,
+            "max_x": 0.3,
+            "max_y": 0.01,
+            "max_z": 0.0,
+            "within_6cm_x": 10 / 11,
+            "within_6cm_y": 1.0,
+            "within_6cm_z": 1.0,
+            "in_box": 10 / 11,
+            "attitude_max": 0.0,
+            "y_over_x": 0.01 / np.sqrt((10 * 0.05**2 + 0.3**2) / 11),
+            "age_mean": 0.04,
+            "failsafe": 10.0 * 2 / 11,
+            "line_up": 0.1,
+            "line_down": 0.5,
+            "line_overrun": 7.0,
+            "poses_refused": 2 + 1 + 14,
+            "frames_refused": 28.0,
+        }
+    )
+    assert told.keys() <= METRICS.keys()

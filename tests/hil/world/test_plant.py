@@ -119,6 +119,19 @@ def test_flap_forces_at_hover_are_those_of_the_specification_and_mirror_images()
     assert plant.plate_forces_W[0] == pytest.approx([0, 0, 0.159 * 0.34 * 9.81], abs=3e-3)
 
 
+@given(wind=st.tuples(*3 * [st.floats(-15.0, 15.0)]), angles=st.tuples(*4 * [st.floats(-1.5, 1.5)]))
+def test_plates_in_the_opposite_flow_feel_the_opposite_force_and_torque(
+    wind: tuple[float, ...], angles: tuple[float, ...]
+) -> None:
+    felt = []
+    for sign in (1.0, -1.0):
+        plant = make(TunnelConfig(turbulence="none", fan_factor=0.0), variant="plate")
+        plant.tunnel.set_side_wind(*(sign * component for component in wind))
+        plant.place(HOME, LEVEL, flaps=angles)
+        felt.append(sign * plant.wrench_B)
+    assert felt[1] == pytest.approx(felt[0], abs=1e-12)
+
+
 def test_plate_forces_turn_with_the_body() -> None:
     plant = make(TunnelConfig(turbulence="none", profile_radius=5.0, height_slope=0.0))
     level = plant.plate_forces_W.copy()
@@ -273,6 +286,16 @@ def test_short_tether_ends_a_flight() -> None:
     plant.place((0, 0, 0.9), LEVEL)
     plant.advance(1000)
     assert (plant.lost or "").startswith("tether taut, 0.25 m below")
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [{"fan_factor": 0.8}, {"side_wind": (1.0, -2.0, 0.5)}, {"turbulence": "T1"}, {"hover_height": 0.9}],
+)
+def test_the_dynamics_at_hover_are_the_designs_however_the_tunnel_is_set(setting: dict[str, object]) -> None:
+    plant = make(TunnelConfig.model_validate({"turbulence": "none"} | setting))
+    plant.advance(20_000)
+    assert plant.linearise() == make().linearise()
 
 
 def test_factors_are_true_over_design() -> None:
