@@ -1,0 +1,189 @@
+"""Plants the mistakes of `planted_mistakes.toml` one at a time in a copy of the working tree, and says which tests see them.
+
+    python tools/planted_mistakes.py [--only PATTERN] [--jobs N]
+
+A row of the table is a text that occurs once in its file, the text of a tired developer in its place, and the tests that
+should fail then (those of its file unless it names its own). `hangs = true` says that the mistake makes a loop endless:
+only then does a run without an end count as caught. Exit code 0: at least 95 % are caught, 1: fewer, 2: the table or the
+tests are not in order, and nothing was planted.
+"""
+
+import argparse
+import os
+import queue
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+SHARE_CAUGHT = 0.95
+LIMIT_S = 300  # generous: what is caught must not depend on what else the machine does
+PASSED, FAILED, NOT_COLLECTED = 0, 1, 2  # exit codes of pytest; an import that fails is seen, too
+ENVIRONMENT = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}  # two mistakes within a second share a time stamp
+
+
+class TableError(Exception):
+    """A row that cannot be planted, or tests that fail without it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """One row of the table."""
+
+    path: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+    hangs: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.path}: {' '.join(self.old.split())} -> {' '.join(self.new.split())}"
+
+
+def read(table: Path) -> list[Mistake]:
+    """Return the rows of a table."""
+    return [
+        Mistake(
+            file["path"],
+            row["old"],
+            row["new"],
+            tuple(row.get("tests", file["tests"]).split()),
+            row.get("hangs", False),
+        )
+        for file in tomllib.loads(table.read_text(encoding="utf-8"))["file"]
+        for row in file["mistakes"]
+    ]
+
+
+def planted(mistake: Mistake, root: Path) -> str:
+    """Return the source of the file with the mistake in it; raises `TableError`."""
+    path = root / mistake.path
+    if not path.is_file():
+        raise TableError(f"{mistake.path}: no such file")
+    source = path.read_text(encoding="utf-8")
+    if (count := source.count(mistake.old)) != 1:
+        raise TableError(f"{mistake.path}: {mistake.old!r} occurs {count} times, not once")
+    wrong = source.replace(mistake.old, mistake.new)
+    try:
+        compile(wrong, mistake.path, "exec")
+    except SyntaxError as error:
+        raise TableError(f"{mistake.path}: {mistake.new!r} is no Python: {error.msg}") from error
+    for test in mistake.tests:
+        if not (root / test.partition("::")[0]).is_file():
+            raise TableError(f"{mistake.path}: no such tests: {test}")
+    return wrong
+
+
+def copy_of(root: Path, folder: Path) -> Path:
+    """Copy what git knows or would add into a folder."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=root, check=True, capture_output=True, text=True).stdout
+    for name in listed.split("\0"):
+        if (root / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(root / name, folder / name)
+    return folder
+
+
+def run_tests(copy: Path, tests: Sequence[str], limit_s: float | None = None) -> int:
+    """Run tests in a copy until one fails and return pytest's exit code; raises `subprocess.TimeoutExpired`."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
+    return subprocess.run(
+        command, cwd=copy, env=ENVIRONMENT, capture_output=True, timeout=limit_s, check=False
+    ).returncode
+
+
+def check_clean(copy: Path, mistakes: Sequence[Mistake]) -> None:
+    """Raise `TableError` unless a copy imports its own files and passes all tests of the table; compiles what they need."""
+    for package in sorted({Path(mistake.path).parts[0].removesuffix(".py") for mistake in mistakes}):
+        code = f"import {package}; print({package}.__file__)"
+        ran = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=copy,
+            env=ENVIRONMENT,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert Path(ran.stdout.strip()).is_relative_to(copy), f"{package} comes from {ran.stdout.strip()}"
+    tests = sorted({test for mistake in mistakes for test in mistake.tests})
+    if code := run_tests(copy, tests):
+        raise TableError(f"without any mistake pytest ends with {code}: {' '.join(tests)}")
+
+
+def fate(mistake: Mistake, wrong: str, copy: Path) -> tuple[bool, str]:
+    """Plant a mistake in a copy, run its tests and take it out again; return whether it was caught, and a word on it."""
+    path = copy / mistake.path
+    right = path.read_bytes()
+    path.write_text(wrong, encoding="utf-8")
+    try:
+        code = run_tests(copy, mistake.tests, LIMIT_S)
+    except subprocess.TimeoutExpired:
+        return mistake.hangs, "hangs" if mistake.hangs else f"no end in {LIMIT_S} s"
+    finally:
+        path.write_bytes(right)
+    return (True, "caught") if code in (FAILED, NOT_COLLECTED) else (False, "SURVIVED")
+
+
+def plant_all(mistakes: Sequence[Mistake], root: Path, jobs: int) -> list[Mistake]:
+    """Plant the mistakes and print what becomes of each; return the survivors. Raises `TableError` before the first."""
+    wrong = [planted(mistake, root) for mistake in mistakes]
+    with tempfile.TemporaryDirectory(prefix="planted-") as folder, ThreadPoolExecutor(jobs) as pool:
+        clean = copy_of(root, Path(folder).resolve() / "0")
+        print(f"{len(mistakes)} mistakes; first the tests without any ...", flush=True)
+        check_clean(clean, mistakes)
+        copies: queue.SimpleQueue[Path] = queue.SimpleQueue()
+        copies.put(clean)
+        for number in range(1, jobs):
+            copies.put(shutil.copytree(clean, clean.with_name(str(number))))
+
+        def plant(mistake: Mistake, source: str) -> tuple[bool, str, float]:
+            copy, start_s = copies.get(), time.monotonic()
+            try:
+                return *fate(mistake, source, copy), time.monotonic() - start_s
+            finally:
+                copies.put(copy)
+
+        runs = {pool.submit(plant, *both): both[0] for both in zip(mistakes, wrong, strict=True)}
+        survivors = []
+        for number, run in enumerate(as_completed(runs), 1):
+            caught, word, duration_s = run.result()
+            if not caught:
+                survivors.append(runs[run])
+            print(f"{number:3}/{len(runs)} {word:8} {duration_s:4.0f} s  {runs[run]}", flush=True)
+    return survivors
+
+
+def main(arguments: Sequence[str], root: Path = ROOT, table: Path | None = None) -> int:
+    """Do what the command line asks and return the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", metavar="PATTERN", default="", help="rows whose `path: old -> new` matches")
+    parser.add_argument("--jobs", metavar="N", type=int, default=1, help="copies at work at a time")
+    options = parser.parse_args(arguments)
+    try:
+        rows = read(table or root / "tools" / "planted_mistakes.toml")
+        mistakes = [mistake for mistake in rows if re.search(options.only, str(mistake))]
+        if not mistakes:
+            raise TableError(f"--only {options.only}: none of {len(rows)} rows")
+        survivors = plant_all(mistakes, root, options.jobs)
+    except TableError as error:
+        print(error, file=sys.stderr)
+        return 2
+    share = 1.0 - len(survivors) / len(mistakes)
+    print(f"{len(mistakes) - len(survivors)} of {len(mistakes)} caught, {100 * share:.1f} %", end="")
+    print("; survived:" if survivors else "", *survivors, sep="\n  " if survivors else "\n", end="\n")
+    return 0 if share >= SHARE_CAUGHT else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
