@@ -75,7 +75,7 @@ def test_every_instant_of_the_way_is_by_the_station_s_clock(tracked: bool) -> No
 
 @pytest.mark.parametrize("asked_us", [-1_000_001, 600])
 def test_an_echo_that_is_too_late_or_from_the_future_does_not_set_the_clock(asked_us: int) -> None:
-    bench = Bench()
+    bench = ServedStream()
     bench.echo()
     asked_us += bench.now_us
     bench.stream.on_packet(packets.echo(asked_us, bench.ticks(asked_us) + 40_000), bench.now_us)
@@ -84,7 +84,7 @@ def test_an_echo_that_is_too_late_or_from_the_future_does_not_set_the_clock(aske
 
 
 def test_no_frame_counts_before_the_server_has_named_its_bodies() -> None:
-    bench = Bench()
+    bench = ServedStream()
     bench.stream = NatnetStream("floaty", AS_STREAMED)
     assert bench.frame() is None
     bench.stream.on_packet(packets.server_info(V), bench.now_us)

@@ -289,7 +289,7 @@ def test_the_bootloader_does_not_know_safelink() -> None:
 
 
 def test_without_safelink_a_packet_that_comes_twice_is_passed_on_twice() -> None:
-    bench = Bench()
+    bench = DongleWithBoards()
     for on, passed_on in ((1, 1), (0, 3)):
         assert bench.exchange(bytes((0xFF, 0x05, on))) == bytes((1, 0xFF, 0x05, on))
         for _ in range(2):
@@ -299,7 +299,7 @@ def test_without_safelink_a_packet_that_comes_twice_is_passed_on_twice() -> None
 
 
 def test_a_command_that_names_none_does_nothing() -> None:
-    bench = Bench()
+    bench = DongleWithBoards()
     assert bench.exchange(b"\xff\xfe")[0] == 1
     bench.wait(RESET_DELAY_US + 1000)
     assert bench.boards[0].power is Power.RUNNING

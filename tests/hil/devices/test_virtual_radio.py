@@ -100,7 +100,7 @@ def test_answer_of_the_poll_under_way_carries_what_is_ready_in_time():
 
 
 def test_on_a_busy_link_no_answer_carries_what_the_radio_has_not_taken_in_yet():
-    bench = Bench(**QUIET)
+    bench = RadioWithEnds(**QUIET)
     bench.pose_every(500, 1000)
     bench.telemetry_every(1777, 250)
     bench.events.run(600_000)

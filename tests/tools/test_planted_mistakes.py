@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from support.paths import ROOT
 
 spec = importlib.util.spec_from_file_location("planted_mistakes", ROOT / "tools" / "planted_mistakes.py")
 planted_mistakes = importlib.util.module_from_spec(spec)
