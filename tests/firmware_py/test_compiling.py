@@ -36,6 +36,7 @@ def half(x):
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "kept", [pytest.param("beside the sources", marks=pytest.mark.long), "NUMBA_CACHE_DIR"]
 )

@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
@@ -72,6 +73,7 @@ def flown(plain: bool) -> list[str]:
     ).stdout.splitlines()
 
 
+@pytest.mark.long
 def test_plain_python_gives_the_bits_of_the_compiled_core_in_every_tick() -> None:
     compiled, plain = flown(plain=False), flown(plain=True)
     assert len(compiled) == TICKS + 1

@@ -124,6 +124,7 @@ def in_a_process(library: Path, seed: int) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
 
+@pytest.mark.long
 @gcc_only
 def test_arbitrary_bits_meet_no_undefined_behaviour_and_an_unclamped_conversion_is_one() -> None:
     flags = ("-fsanitize=undefined,float-cast-overflow,bounds-strict", "-fsanitize-undefined-trap-on-error")

@@ -114,6 +114,7 @@ def test_every_message_of_the_dialect_has_pymavlinks_bytes_and_fields(number: in
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "kind"), DIALECT, ids=[kind.msgname for _, kind in DIALECT])
 def test_trailing_zeros_are_cut_and_come_back(number: int, kind: Any) -> None:
     zero = [b"" if type == "char" else [0] * length if length else 0 for type, length in fields_of(kind)]

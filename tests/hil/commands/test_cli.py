@@ -101,6 +101,7 @@ def test_report_can_be_written_again(monkeypatch: pytest.MonkeyPatch) -> None:
     assert Path("run/report.html").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_seeds_fly_in_other_processes_with_the_same_hash(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -197,6 +197,7 @@ def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
     assert f"{target} DIFFERS" in shown
 
 
+@pytest.mark.long
 def test_machine_code_that_leaves_its_memory_is_exit_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
 ) -> None:

@@ -147,7 +147,7 @@ def test_no_flap_angle_carries_the_plant_at_eight_metres_per_second() -> None:
 # The flights
 
 
-QUICK = ("yaw-step", "y-square", "side-wind-3", "airspeed-10")
+QUICK = ("yaw-step", "side-wind-3")
 FLIGHTS = [pytest.param(name, marks=() if name in QUICK else pytest.mark.long) for name in PAPER]
 
 
@@ -199,6 +199,7 @@ def test_pushes_come_one_after_the_other_and_are_counted_until_the_robot_is_lost
     assert math.isnan(lost.metrics["back_in_box"])
 
 
+@pytest.mark.long
 def test_a_flight_too_short_to_measure_fails_its_limits(tmp_path: Path) -> None:
     for name in ("yaw-step", "yaw-sine-0.02", "y-square", "pushes", "side-wind-1"):
         result = flown(tmp_path / name, name, duration_s=0.5)

@@ -319,7 +319,20 @@ def rows_between(table: pa.Table, begin_s: float, end_s: float) -> pa.Table:
     return table.filter((times >= begin_s) & (times < end_s))
 
 
-@pytest.mark.parametrize("sign", SIGNS, ids=lambda sign: sign.fault)
+# One of each layer; the others are in the long tier.
+QUICK_SIGNS = (
+    "mocap.dropout", "marker.hidden", "radio.cut", "serial.cut", "imu.bias.p", "servo.trim.1", "wind.fan=0.97",
+    "push.y=-1", "cpu.load",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "sign",
+    [
+        pytest.param(sign, id=sign.fault, marks=() if sign.fault in QUICK_SIGNS else pytest.mark.long)
+        for sign in SIGNS
+    ],
+)
 def test_a_fault_acts_from_its_begin_to_its_end(sign: Sign) -> None:
     name, _, size = sign.fault.partition("=")
     link = KINDS[name].link or RADIO
@@ -570,6 +583,7 @@ def test_report_and_recording_show_the_faults(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.long
 def test_a_flight_without_faults_has_no_table_of_them(tmp_path: Path) -> None:
     folder = go(tmp_path / "run", duration_s=0.3).folder
     assert 'id="faults"' not in write_report(folder).read_text(encoding="utf-8")

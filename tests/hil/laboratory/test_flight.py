@@ -58,6 +58,7 @@ def test_without_the_predictor_the_authors_gains_lose_the_robot(tmp_path: Path, 
     assert result.cause is not None
 
 
+@pytest.mark.long
 def test_log_events_and_report_know_what_the_tracker_refused(tmp_path: Path) -> None:
     outlier = parse("mocap.outlier@1:0.05=0.5")
     prepare(tmp_path / "run")

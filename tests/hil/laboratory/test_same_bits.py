@@ -66,6 +66,7 @@ def usual() -> list[str]:
     return found
 
 
+@pytest.mark.long
 def test_oldest_blas_and_no_vector_instructions_make_the_same_flights(usual: list[str]) -> None:
     assert hashes(SETTINGS["prescott"] | SETTINGS["numpy"] | SETTINGS["libm"]) == usual
 

@@ -34,7 +34,9 @@ def explain(result: Result) -> str:
     return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
 
 
-@pytest.mark.parametrize("baud", [57_600, 115_200, 460_800, 921_600])
+@pytest.mark.parametrize(
+    "baud", [57_600, *(pytest.param(baud, marks=pytest.mark.long) for baud in (115_200, 460_800, 921_600))]
+)
 def test_hover_holds_its_limits_at_every_baud_rate(tmp_path: Path, baud: int) -> None:
     result = fly_over_mavlink(tmp_path / "run", f"serial.baud={baud}", seed=3)
     assert result.passed, explain(result)

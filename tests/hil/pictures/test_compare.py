@@ -119,6 +119,7 @@ def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Pat
     assert told["rms_x"].difference == pytest.approx(100 * (b["rms_x"] - a["rms_x"]))
 
 
+@pytest.mark.long
 def test_the_command_tells_the_difference_by_its_exit_code(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], runs: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -87,6 +87,7 @@ def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
     assert told["rms_x"][2] == "cm"
 
 
+@pytest.mark.long
 def test_the_way_of_the_poses_adds_up_to_their_age_and_survives_a_cut_file(folder: Path) -> None:
     told = ages.told(folder)
     stage = {name: told.column(name).to_numpy() for name in STAGES}
@@ -105,6 +106,7 @@ def test_the_way_of_the_poses_adds_up_to_their_age_and_survives_a_cut_file(folde
     report(folder)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) -> None:
     stages = read_result(folder)["ages"]
@@ -123,6 +125,7 @@ def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) ->
         )
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
     change_result(folder, overrides=["tunnel.turbulence=T1"], commit="0123456789ab")

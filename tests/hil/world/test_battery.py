@@ -140,6 +140,7 @@ def test_the_estimate_of_a_short_hover_is_the_endurance(tmp_path: Path) -> None:
     assert short.metrics["power"] == pytest.approx(whole.metrics["power"], rel=0.05)
 
 
+@pytest.mark.long
 def test_a_hover_draws_what_the_paper_says(tmp_path: Path) -> None:
     result = flown(tmp_path / "run", "power", duration_s=15.0)
     assert result.passed
