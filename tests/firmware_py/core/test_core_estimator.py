@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.core import entry
 from firmware_py.core.structs import (
+    HISTORY,
     POSE_INVALID,
     POSE_ON_TIME,
     Parameters,
@@ -615,13 +616,14 @@ def test_reset_forgets_everything_but_the_counters() -> None:
     used, fresh = feed(Core(), 99, (0.1, 0.2, 0.3), quaternion(yaw=1.0)), Core()
     for age_us in (0, 10_000, 20_000, 30_000):
         used.pose((0.1, 0.2, 0.3), LEVEL, age_us)
-    used.tick(counts((1, 2, 3)), command=(0.1, 0.2, 0.3, 0.4))
+    for _ in range(HISTORY):
+        used.tick(counts((1, 2, 3)), command=(0.1, 0.2, 0.3, 0.4))
     entry.reset(used.parameters.arg, used.estimator.arg)
     for tick in range(50):
         for core in (used, fresh):
             if tick > 10:
                 core.pose((0, 0.1, 0))
-            core.tick()
+            core.tick(samples=10 if tick > 5 else 0)  # at first the last rates are all that is known
         assert (used.x == fresh.x).all()
         assert (used.P == fresh.P).all()
         assert (used.now == fresh.now).all()

@@ -283,13 +283,14 @@ def test_streams_go_on_after_the_processor_was_taken_from_them(client: Client) -
     thief = client.firmware.add_thief()
     for number in (30, 31, 32):
         client.command(511, number, 1000)
-    thief.share = 0.8  # now and then their messages take longer than their interval
-    client.run(client.now_us + 200_000)
-    thief.share = 0.0
-    client.run(client.now_us + 10_000)
-    client.messages.clear()
-    client.run(client.now_us + 100_000)
-    assert len(client.of("ATTITUDE")) == 100
+    for share in (0.7, 0.75, 0.8, 0.85):  # now and then their messages take longer than their interval
+        thief.share = share
+        client.run(client.now_us + 300_000)
+        thief.share = 0.0
+        client.run(client.now_us + 20_000)
+        client.messages.clear()
+        client.run(client.now_us + 100_000)
+        assert len(client.of("ATTITUDE")) == 100
 
 
 def test_a_message_that_is_never_sent_has_interval_zero(client: Client) -> None:

@@ -27,6 +27,87 @@ def run_until(kernel, end_us, interrupts=()):
 INSTANTS_US = st.lists(st.integers(0, 20_000), max_size=30)
 
 
+@given(st.lists(st.integers(2, 6), min_size=2, max_size=6))
+def test_a_mutex_goes_to_the_most_urgent_of_those_that_wait_and_among_equals_to_the_first(priorities):
+    kernel = Kernel()
+    mutex = kernel.create_mutex("mutex")
+    takers = []
+
+    def holder():
+        yield from mutex.take()
+        yield from kernel.delay(20)
+        yield from mutex.give()
+
+    def waiter(number):
+        yield from kernel.delay(1 + number)
+        yield from mutex.take()
+        takers.append(number)
+        yield from mutex.give()
+
+    kernel.create_task("holder", 1, holder)
+    for number, priority in enumerate(priorities):
+        kernel.create_task(f"waiter {number}", priority, waiter, number)
+    kernel.start()
+    kernel.run(40_000)
+    assert takers == sorted(range(len(priorities)), key=lambda number: -priorities[number])
+
+
+def test_who_holds_several_mutexes_keeps_a_lent_priority_until_it_has_given_them_all():
+    kernel = Kernel()
+    mutexes = [kernel.create_mutex(name) for name in "abc"]
+    order = []
+
+    def low():
+        for mutex in mutexes:
+            yield from mutex.take()
+        yield from kernel.work(3_000)
+        for mutex in reversed(mutexes):
+            yield from mutex.give()
+            order.append(f"low gave {mutex.name}")
+            yield from kernel.work(100)
+
+    def medium():
+        yield from kernel.delay(2)
+        order.append("medium")
+
+    def high():
+        yield from kernel.delay(1)
+        yield from mutexes[1].take()
+        order.append("high")
+
+    for priority, body in enumerate((low, medium, high), 1):
+        kernel.create_task(body.__name__, priority, body)
+    kernel.start()
+    kernel.run(10_000)
+    assert order == ["low gave c", "low gave b", "high", "medium", "low gave a"]
+
+
+@pytest.mark.parametrize(("waiting", "left"), [((5,), 1), ((5, 4), 4), ((5, 3, 4), 4), ((5, 5, 3), 5)])
+def test_when_a_waiter_gives_up_the_holder_has_the_priority_of_the_most_urgent_that_still_waits(
+    waiting, left
+):
+    kernel = Kernel()
+    mutex = kernel.create_mutex("mutex")
+
+    def holder():
+        yield from mutex.take()
+        yield from kernel.work(20_000)
+        yield from mutex.give()
+
+    def waiter(number):
+        yield from kernel.delay(1 + sorted(waiting).index(waiting[number]))  # the less urgent before
+        yield from mutex.take(5 if number == 0 else FOREVER)
+
+    task = kernel.create_task("holder", 1, holder)
+    for number, priority in enumerate(waiting):
+        kernel.create_task(f"waiter {number}", priority, waiter, number)
+    kernel.start()
+    kernel.run(5_000)
+    assert task.priority == 5
+    kernel.run(10_000)
+    assert task.priority == left
+
+
 @given(
     starts=st.tuples(st.integers(0, 3_000), st.integers(0, 3_000), st.integers(0, 3_000)),
     critical_us=st.integers(1, 4_000),

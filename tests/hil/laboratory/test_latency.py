@@ -14,7 +14,16 @@ from hypothesis import strategies as st
 from firmware_py.signals import COUNTERS
 from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig
-from ground_station.latency import SENT_POSES, LatencyBudget, LinkLatency, budget_line, budget_of, row_of
+from ground_station.latency import (
+    SENT_POSES,
+    STAGES,
+    LatencyBudget,
+    LinkLatency,
+    budget_line,
+    budget_of,
+    row_of,
+    stages_told,
+)
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
 from hil.config import load_config
@@ -62,6 +71,12 @@ def test_the_line_says_what_is_assumed_and_nothing_that_was_not_told() -> None:
     assert str(budget) == (
         "pose 40.6 ms old on board (99 %: 40.6): camera 20.0 + processing 18.0 + network 0.3 + station 0.2 + serial 2.1"
     )
+
+
+@pytest.mark.parametrize("untold", [(), *STAGES[:3], STAGES[:2], STAGES[:3]])
+def test_where_a_stage_of_the_cameras_was_not_told_they_are_one_stage(untold: tuple[str, ...] | str) -> None:
+    columns = {stage: [1.0, math.nan if stage in untold else 2.0] for stage in STAGES}
+    assert stages_told(columns) == ((*STAGES[:3], *STAGES[4:]) if untold == () else STAGES[3:])
 
 
 def test_the_budget_forgets_what_is_long_ago() -> None:
