@@ -99,7 +99,7 @@ def test_a_flight_is_recorded_and_its_record_flown_again(tmp_path: Path) -> None
             f'base = "floaty"\n[capture]\nsystem = "optitrack"\nport = {port}\nbody = "floaty"\n'
         )
         shown = station(
-            "--link", link, "--profile", str(profile), "--duration", "5", "--record", str(frames), "--log",
+            "--link", link, "--profile", str(profile), "--duration", "8", "--record", str(frames), "--log",
             str(tmp_path / "telemetry.csv"),
         )  # fmt: skip
         assert shown.returncode == 0, shown.stdout + shown.stderr

@@ -11,9 +11,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
-CAMERAS = f"replay:{Path(__file__).parent / 'vectors/hover_frame.csv'}"  # of a station that gets no further than its link
+from support.paths import VECTORS
+
+CAMERAS = f"replay:{VECTORS / 'hover_frame.csv'}"  # one frame, for those who need no more
+
 START_TIMEOUT_S = 60.0
 STANDSTILL = re.compile(r"time stood still for (\d+) ms")
 SERVED: list["Served"] = []  # those of this test session
