@@ -85,8 +85,8 @@ def assert_markers(out: bytes) -> None:
 
 @needs("natnet")
 def test_markers_can_be_taken_off() -> None:
-    with serve("--udp", "0", "--natnet-port", "0", "--set", "markers.enabled=false", what="lab") as lab:
-        port = lab.line("motive ")[0].split(":")[2]
+    with serve("--udp", "0", "--set", "markers.enabled=false", motive=True) as lab:
+        port = lab.motive.split(":")[2]
         script = str(SUPPORT / "natnet_clients.py")
         command = [sys.executable, script, "natnet-markers", port, "unicast", "1"]
         out = subprocess.run(command, capture_output=True, timeout=START_S).stdout
@@ -109,7 +109,7 @@ def test_mavproxy_flies_the_robot_from_what_motive_says(tmp_path: Path) -> None:
     """Its optitrack module knows no ports but 1510 and 1511."""
     if any(map(is_taken, (1510, 1511))):
         pytest.skip("MAVProxy's optitrack IS NOT TESTED: another program has UDP port 1510 or 1511")
-    with serve("--mavlink", "pty", motive=True) as lab:
+    with serve("--mavlink", "pty", "--natnet-port", "1510", motive=True) as lab:
         proxy = MavProxy(lab.line("mavlink ")[0], tmp_path)
         proxy.sees("Detected vehicle 1:1")
         for line in ("module load optitrack", "optitrack set multicast False", "optitrack set msg_intvl_ms 18",

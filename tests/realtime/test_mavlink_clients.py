@@ -104,7 +104,7 @@ def test_mavsdk_reads_telemetry_and_tunes(url: str) -> None:
     assert seen["attitude_deg"] == pytest.approx([0, 0, 0], abs=5)  # held at home
     assert seen["quaternion"] == pytest.approx([1, 0, 0, 0], abs=0.05)
     assert len(seen["position"]) == 3
-    assert seen["battery_V"] == pytest.approx(3.9, abs=0.1)
+    assert 3.9 < seen["battery_V"] < 4.2  # charged, under load
     assert len(seen["floats"]) > 30
     assert seen["others"] == 0
     assert seen["before"] == seen["floats"][GAIN] != 2.5

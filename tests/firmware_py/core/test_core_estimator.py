@@ -530,6 +530,16 @@ def test_gyro_counts_become_body_rates(omega: tuple[float, ...]) -> None:
     assert core.now[9:12] == pytest.approx(omega, abs=1e-3)
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_rates_beyond_their_bound_are_held_there_in_every_axis(axis: int, sign: int) -> None:
+    core = Core(bound_rate=2.0)
+    omega = np.zeros(3)
+    omega[axis] = 3.0 * sign
+    core.tick(counts(omega))
+    assert core.now[9 + axis] == 2.0 * sign
+
+
 def test_silent_gyro_leaves_the_last_rates() -> None:
     core = settled()
     core.tick(counts((0.5, -0.4, 0.3)))
