@@ -2,6 +2,7 @@
 # and long ones as well, `make check` compares the C and the machine code with the Python that flies; all set up .venv by themselves.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
+unexport PYTHONDONTWRITEBYTECODE  # the tests start many programs: each would compile all sources anew
 
 .PHONY: fly test test-all check bench clients clean
 
