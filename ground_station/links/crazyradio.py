@@ -5,9 +5,11 @@ Telemetry comes through log blocks that are created on connecting. Of the links 
 
 import logging
 import re
+import shutil
 import struct
 import tempfile
 import threading
+import weakref
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
@@ -57,7 +59,8 @@ class CrazyradioLink(LiveLink):
         self._round_trips_us: deque[int] = deque(maxlen=ECHOES)
         self._echo_us = 0  # when to ask for the next one
         self._sent_us = 0  # the last correction
-        self._cache: tempfile.TemporaryDirectory[str] | None = None  # of the TOC, for connecting again
+        self._cache = tempfile.mkdtemp(prefix="floaty-toc-")  # of the TOC, for connecting again
+        weakref.finalize(self, shutil.rmtree, self._cache, ignore_errors=True)
         self._crazyflie: Crazyflie | None = None
         self._connected = threading.Event()
         self._lost = ""  # what cflib says of it
@@ -73,8 +76,7 @@ class CrazyradioLink(LiveLink):
             cflib.crtp.init_drivers()
         self._connected = connected = threading.Event()
         self._lost, self._blocks = "", {}
-        self._cache = self._cache or tempfile.TemporaryDirectory(prefix="floaty-toc-")
-        crazyflie = self._crazyflie = Crazyflie(rw_cache=self._cache.name)
+        crazyflie = self._crazyflie = Crazyflie(rw_cache=self._cache)
         crazyflie.packet_received.add_callback(self._on_any_packet)
         crazyflie.connected.add_callback(lambda uri: connected.set())
         lost = partial(self._on_lost, crazyflie)
