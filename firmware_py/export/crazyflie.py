@@ -169,7 +169,7 @@ def _toc(template: str, parameters: tuple[AppParameter, ...]) -> str:
     """Return the table of parameters in C."""
     variables = [f"static {C_TYPES[p.kind]} {p.variable} = {_value(p)};" for p in parameters]
     table = [
-        f"  {{&{p.variable}, &{p.target}, {_number(p.scale)}, {_number(p.low)}, {_number(p.high)}, "
+        f'  {{"{p.name}", &{p.variable}, &{p.target}, {_number(p.scale)}, {_number(p.low)}, {_number(p.high)}, '
         f"{_number(p.initial)}, KIND_{p.kind}, KIND_{p.target_kind}}},"
         for p in parameters
     ]

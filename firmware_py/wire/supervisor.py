@@ -21,3 +21,4 @@ class Cause(IntEnum):
     EMERGENCY_STOP = 3
     LOW_BATTERY = 4
     DISARMED = 5
+    NO_CONTROL = 6  # of a real board: no controller step came, or another controller runs

@@ -5,9 +5,13 @@
 typedef long BaseType_t;
 typedef unsigned long UBaseType_t;
 typedef uint32_t TickType_t;
+typedef uint32_t StackType_t;
 #define pdFALSE ((BaseType_t)0)
 #define pdTRUE ((BaseType_t)1)
 #define M2T(X) ((unsigned int)(X))
 typedef struct {
   void *opaque[20];
 } StaticQueue_t;
+typedef struct {
+  uint32_t opaque[24];
+} StaticTask_t;

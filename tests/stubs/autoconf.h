@@ -1,6 +1,9 @@
 /* Written by Kconfig in a real build. */
 #pragma once
 #define CONFIG_APP_ENABLE 1
+#define CONFIG_APP_PRIORITY 2
+#define CONFIG_APP_STACKSIZE 300
 #define CONFIG_CONTROLLER_OOT 1
 #define CONFIG_ESTIMATOR_KALMAN_ENABLE 1
 #define CONFIG_ESTIMATOR_OOT 1
+#define CONFIG_SENSORS_BMI088_BMP3XX 1

@@ -12,40 +12,66 @@
 #include "FreeRTOS.h"
 #include "app.h"
 #include "app_channel.h"
+#include "cfassert.h"
 #include "crtp.h"
+#include "crtp_supervisor.h"
 #include "debug.h"
 #include "estimator.h"
 #include "log.h"
 #include "param.h"
+#include "param_task.h"
+#include "platform.h"
 #include "pm.h"
 #include "queue.h"
 #include "stm32fxxx.h"
 #include "supervisor.h"
+#include "system.h"
 #include "task.h"
 #include "usec_time.h"
+#include "watchdog.h"
 
 uint64_t stub_now_us;
+uint64_t stub_usec_reset_us; /* when usec.reset was written */
+TickType_t stub_first_tick;
 int32_t stub_gyro[3];
 float stub_battery = 3.9f;
-int32_t stub_locked;
+int32_t stub_locked, stub_stop_requested, stub_watchdog_fed;
 int32_t stub_gyro_known = 1;
-int32_t stub_estimator = StateEstimatorTypeComplementary; /* what the stabilizer starts with */
+int32_t stub_sensors = SensorImplementation_bmi088_bmp3xx;
+int32_t stub_estimator = StateEstimatorTypeAutoSelect; /* what the stabilizer starts with */
+int32_t stub_connected = 1;
+int32_t stub_after_watchdog, stub_after_assert, stub_self_test_passed;
 char stub_console[4096];
 
-uint64_t usecTimestamp(void) { return stub_now_us; }
-TickType_t xTaskGetTickCount(void) { return (TickType_t)(stub_now_us / 1000); }
+uint64_t usecTimestamp(void) { return stub_now_us - stub_usec_reset_us; }
+TickType_t xTaskGetTickCount(void) { return stub_first_tick + (TickType_t)(stub_now_us / 1000); }
 float pmGetBatteryVoltage(void) { return stub_battery; }
 bool supervisorIsLocked() { return stub_locked != 0; }
+void crtpSupervisorSetEmergencyStop(void) { stub_stop_requested = 1; }
+void crtpSupervisorNotifyEmergencyStopWatchdog(void) { stub_watchdog_fed += 1; }
+bool crtpSupervisorIsEmergencyStopRequested(void) { return stub_stop_requested != 0; }
+bool crtpIsConnected(void) { return stub_connected != 0; }
+SensorImplementation_t platformConfigGetSensorImplementation() { return (SensorImplementation_t)stub_sensors; }
+bool paramTest(void) { return true; }
+void systemWaitStart(void) {}
+
+/* What made the board start again is told once, in words on the console, as the firmware does. */
+static bool normal(int32_t *abnormal, const char *warning) {
+  const bool was_normal = *abnormal == 0;
+  if (!was_normal) {
+    eprintf(consolePutchar, "%s", warning);
+  }
+  *abnormal = 0;
+  return was_normal;
+}
+bool watchdogNormalStartTest(void) { return normal(&stub_after_watchdog, "SYS: after watchdog\n"); }
+bool cfAssertNormalStartTest(void) { return normal(&stub_after_assert, "SYS: after assert\n"); }
 StateEstimatorType stateEstimatorGetType(void) { return (StateEstimatorType)stub_estimator; }
 paramVarId_t paramGetVarId(const char *group, const char *name) {
-  const bool known = strcmp(group, "stabilizer") == 0 && strcmp(name, "estimator") == 0;
+  const bool known = strcmp(group, "system") == 0 && strcmp(name, "selftestPassed") == 0;
   return (paramVarId_t){known ? 1 : 0xffff, 0};
 }
-void paramSetInt(paramVarId_t varid, int valuei) {
-  if (varid.id == 1) {
-    stub_estimator = valuei;
-  }
-}
+int paramGetInt(paramVarId_t varid) { return varid.id == 1 ? stub_self_test_passed : -1; }
 bool estimatorDequeue(measurement_t *measurement) { (void)measurement; return false; }
 
 int consolePutchar(int c) { return c; }
@@ -155,13 +181,14 @@ BaseType_t xQueueReceive(QueueHandle_t q, void *const item, TickType_t ticks) {
   return pdTRUE;
 }
 
-/* Radio, and the app's task, which runs until it has looked `looks` times */
+/* Radio, and the app's task, which runs from its begin until it has looked `looks` times */
 
 static CrtpCallback callbacks[16];
 static uint8_t app_packet[APPCHANNEL_MTU];
 static size_t app_length;
 static int app_looks;
 static jmp_buf app_leave;
+static TaskFunction_t app_task;
 
 void crtpRegisterPortCB(int port, CrtpCallback cb) { callbacks[port] = cb; }
 
@@ -177,11 +204,31 @@ void stub_radio(int port, int channel, const uint8_t *data, int length) {
   }
 }
 
-size_t appchannelReceiveDataPacket(void *buffer, size_t max_length, int timeout_ms) {
-  (void)timeout_ms;
+static void look(void) {
   if (app_looks-- == 0) {
     longjmp(app_leave, 1);
   }
+}
+
+TaskHandle_t xTaskCreateStatic(TaskFunction_t function, const char *name, uint32_t depth, void *parameters,
+                               UBaseType_t priority, StackType_t *stack, StaticTask_t *task) {
+  (void)name;
+  (void)depth;
+  (void)parameters;
+  (void)priority;
+  (void)stack;
+  app_task = function;
+  return (TaskHandle_t)task;
+}
+
+void vTaskDelay(TickType_t ticks) {
+  (void)ticks;
+  look();
+}
+
+size_t appchannelReceiveDataPacket(void *buffer, size_t max_length, int timeout_ms) {
+  (void)timeout_ms;
+  look();
   const size_t length = app_length < max_length ? app_length : max_length;
   memcpy(buffer, app_packet, length);
   app_length = 0;
@@ -196,7 +243,7 @@ void stub_app_packet(const uint8_t *data, int length) {
 void stub_run_app(int looks) {
   app_looks = looks;
   if (setjmp(app_leave) == 0) {
-    appMain();
+    app_task(NULL);
   }
 }
 
@@ -266,7 +313,8 @@ double stub_param_get(int i) {
     default: return (double)NAN;
   }
 }
-void stub_param_set(int i, double value) {
+/* A value from the EEPROM is written without a call of the parameter's callback. */
+void stub_param_load(int i, double value) {
   const struct param_s *entry = &__start_param_table[i];
   switch (entry->type & 15) {
     case PARAM_UINT8: *(uint8_t *)entry->address = (uint8_t)value; break;
@@ -274,7 +322,10 @@ void stub_param_set(int i, double value) {
     case PARAM_INT16: *(int16_t *)entry->address = (int16_t)value; break;
     case PARAM_FLOAT: *(float *)entry->address = (float)value; break;
   }
-  if (entry->callback) {
-    entry->callback();
+}
+void stub_param_set(int i, double value) {
+  stub_param_load(i, value);
+  if (__start_param_table[i].callback) {
+    __start_param_table[i].callback();
   }
 }

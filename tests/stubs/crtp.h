@@ -17,3 +17,4 @@ typedef struct {
 } __attribute__((packed)) CRTPPacket;
 typedef void (*CrtpCallback)(CRTPPacket *);
 void crtpRegisterPortCB(int, CrtpCallback);
+bool crtpIsConnected(void);

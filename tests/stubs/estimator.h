@@ -5,7 +5,7 @@ typedef struct {
   uint32_t opaque[12];
 } measurement_t;
 typedef enum {
-  StateEstimatorTypeComplementary = 1,
+  StateEstimatorTypeAutoSelect = 0,
   StateEstimatorTypeOutOfTree = 3, /* after Kalman, which is built by default */
 } StateEstimatorType;
 StateEstimatorType stateEstimatorGetType(void);

@@ -14,16 +14,22 @@
 #include "app.h"
 #include "app_channel.h"
 #include "autoconf.h"
+#include "cfassert.h"
 #include "controller.h"
 #include "crtp.h"
+#include "crtp_supervisor.h"
 #include "debug.h"
 #include "estimator.h"
 #include "log.h"
 #include "param.h"
+#include "param_task.h"
+#include "platform.h"
 #include "pm.h"
 #include "stm32fxxx.h"
 #include "supervisor.h"
+#include "system.h"
 #include "usec_time.h"
+#include "watchdog.h"
 
 #define SAME(A, B) __builtin_types_compatible_p(A, B)
 #define VALUE(EXPRESSION, EXPECTED) _Static_assert((EXPRESSION) == (EXPECTED), #EXPRESSION);
@@ -39,6 +45,9 @@ VALUE(pdTRUE, 1)
 TYPE(M2T(20), unsigned)
 VALUE(M2T(20), 20)
 SIZE(StaticQueue_t, 80)
+_Static_assert(SAME(StackType_t, uint32_t), "stack");
+SIZE(StaticTask_t, 96)
+_Static_assert(SAME(TaskHandle_t, struct tskTaskControlBlock *) && SAME(TaskFunction_t, void (*)(void *)), "task");
 _Static_assert(SAME(QueueHandle_t, struct QueueDefinition *), "queue");
 VALUE(queueSEND_TO_BACK, 0)
 FUNCTION(xQueueGenericCreateStatic, QueueHandle_t, UBaseType_t, UBaseType_t, uint8_t *, StaticQueue_t *, uint8_t)
@@ -47,9 +56,21 @@ FUNCTION(xQueueReceive, BaseType_t, QueueHandle_t, void *, TickType_t)
 TYPE(xQueueCreateStatic(1, 1, NULL, NULL), QueueHandle_t)
 TYPE(xQueueSend(NULL, NULL, 0), BaseType_t)
 FUNCTION(xTaskGetTickCount, TickType_t, void)
+FUNCTION(vTaskDelay, void, TickType_t)
+FUNCTION(xTaskCreateStatic, TaskHandle_t, TaskFunction_t, const char *, uint32_t, void *, UBaseType_t, StackType_t *,
+         StaticTask_t *)
 
-/* app.h, app_channel.h, crtp.h, debug.h, pm.h, supervisor.h, usec_time.h */
-FUNCTION(appMain, void, void)
+/* app.h, app_channel.h, crtp.h, debug.h, pm.h, system.h and others of one or two names */
+FUNCTION(appInit, void, void)
+FUNCTION(systemWaitStart, void, void)
+FUNCTION(cfAssertNormalStartTest, bool, void)
+FUNCTION(watchdogNormalStartTest, bool, void)
+FUNCTION(crtpSupervisorSetEmergencyStop, void, void)
+FUNCTION(crtpSupervisorNotifyEmergencyStopWatchdog, void, void)
+FUNCTION(crtpSupervisorIsEmergencyStopRequested, bool, void)
+VALUE(SensorImplementation_bmi088_bmp3xx, 0)
+VALUE(SensorImplementation_mpu9250_lps25h, 1)
+FUNCTION(platformConfigGetSensorImplementation, SensorImplementation_t, void)
 VALUE(APPCHANNEL_MTU, 30)
 FUNCTION(appchannelReceiveDataPacket, size_t, void *, size_t, int)
 VALUE(CRTP_MAX_DATA_SIZE, 30)
@@ -61,6 +82,7 @@ FIELD(CRTPPacket, data, uint8_t[CRTP_MAX_DATA_SIZE], 2)
 static const CRTPPacket port_6_channel_1 __attribute__((unused)) = {.port = 6, .reserved = 0, .channel = 1};
 _Static_assert(SAME(CrtpCallback, void (*)(CRTPPacket *)), "CRTP");
 FUNCTION(crtpRegisterPortCB, void, int, CrtpCallback)
+FUNCTION(crtpIsConnected, bool, void)
 FUNCTION(consolePutchar, int, int)
 FUNCTION(eprintf, int, int (*)(int), const char *, ...)
 TYPE(DEBUG_PRINT("%s %d\n", "", 0), int)
@@ -70,6 +92,9 @@ FUNCTION(usecTimestamp, uint64_t, void)
 
 /* autoconf.h, estimator.h, controller.h, stabilizer_types.h */
 VALUE(CONFIG_APP_ENABLE, 1)
+VALUE(CONFIG_APP_PRIORITY, 2)
+VALUE(CONFIG_APP_STACKSIZE, 300)
+VALUE(CONFIG_SENSORS_BMI088_BMP3XX, 1)
 VALUE(CONFIG_CONTROLLER_OOT, 1)
 VALUE(CONFIG_ESTIMATOR_KALMAN_ENABLE, 1)
 VALUE(CONFIG_ESTIMATOR_OOT, 1)
@@ -94,7 +119,7 @@ FIELD(state_t, velocity.z, float, 60)
 FIELD(state_t, acc.x, float, 68)
 SIZE(control_t, 20)
 SIZE(measurement_t, 48)
-VALUE(StateEstimatorTypeComplementary, 1)
+VALUE(StateEstimatorTypeAutoSelect, 0)
 VALUE(StateEstimatorTypeOutOfTree, 3)
 FUNCTION(stateEstimatorGetType, StateEstimatorType, void)
 FUNCTION(estimatorDequeue, bool, measurement_t *)
@@ -125,7 +150,8 @@ SIZE(paramVarId_t, 4)
 FIELD(paramVarId_t, id, uint16_t, 0)
 FIELD(paramVarId_t, index, uint16_t, 2)
 FUNCTION(paramGetVarId, paramVarId_t, const char *, const char *)
-FUNCTION(paramSetInt, void, paramVarId_t, int)
+FUNCTION(paramGetInt, int, paramVarId_t)
+FUNCTION(paramTest, bool, void)
 SIZE(struct param_s, 20)
 FIELD(struct param_s, type, uint8_t, 0)
 FIELD(struct param_s, extended_type, uint8_t, 1)

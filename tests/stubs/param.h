@@ -7,7 +7,7 @@ typedef struct {
   uint16_t index;
 } __attribute__((packed)) paramVarId_t;
 paramVarId_t paramGetVarId(const char *, const char *);
-void paramSetInt(paramVarId_t, int);
+int paramGetInt(paramVarId_t);
 struct param_s {
   uint8_t type;
   uint8_t extended_type;

@@ -4,7 +4,7 @@ import ctypes
 import os
 import struct
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from firmware_py.core.structs import Estimator
@@ -25,11 +25,11 @@ class Supervisor(ctypes.Structure):
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in (
-            "last_pose_us", "battery_good_us", "watchdog_us", "episode_start_us", "bounded_us", "outside_until_us",
+            "last_pose_us", "battery_good_us", "episode_start_us", "bounded_us", "outside_until_us",
         )),
         *((name, ctypes.c_int32) for name in ("pose_timeout_us", "low_battery_mv", "battery_mv", "bounded")),
         *((name, ctypes.c_uint8) for name in (
-            "state", "cause", "manual", "calibrated", "armed", "pose_seen", "stopped", "battery_empty", "watchdog_fed",
+            "state", "cause", "manual", "calibrated", "armed", "pose_seen", "stopped", "battery_empty",
         )),
     )  # fmt: skip
 
@@ -110,22 +110,31 @@ class App:
         c = self.c = ctypes.CDLL(str(copy))
         c.stub_log_name.restype = c.stub_param_name.restype = ctypes.c_char_p
         c.stub_log_value.restype = c.stub_param_get.restype = ctypes.c_double
-        c.stub_param_set.argtypes = (ctypes.c_int, ctypes.c_double)
+        c.stub_param_set.argtypes = c.stub_param_load.argtypes = (ctypes.c_int, ctypes.c_double)
         c.floaty_supervisor_mode.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32)
-        c.floaty_supervisor_feed_watchdog.argtypes = (ctypes.c_void_p, ctypes.c_int64)
         c.floaty_supervisor_arm.argtypes = (ctypes.c_void_p, ctypes.c_bool)
         c.floaty_supervisor_recover.argtypes = (ctypes.c_void_p, ctypes.c_int64)
         c.floaty_supervisor_see_battery.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32)
         c.floaty_supervisor_arm.restype = c.floaty_supervisor_recover.restype = ctypes.c_bool
         c.floaty_pose_decode.argtypes = (ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int64, ctypes.c_void_p)
         c.floaty_pose_decode.restype = c.floaty_gyro_zero_add.restype = ctypes.c_bool
-        c.estimatorOutOfTreeTest.restype = ctypes.c_bool
+        for test in (c.estimatorOutOfTreeTest, c.watchdogNormalStartTest, c.cfAssertNormalStartTest):
+            test.restype = ctypes.c_bool
         self.now = ctypes.c_uint64.in_dll(c, "stub_now_us")
         self.gyro = (ctypes.c_int32 * 3).in_dll(c, "stub_gyro")
         self.battery = ctypes.c_float.in_dll(c, "stub_battery")
+        self.usec_reset = ctypes.c_uint64.in_dll(c, "stub_usec_reset_us")
+        self.first_tick = ctypes.c_uint32.in_dll(c, "stub_first_tick")
         self.locked = ctypes.c_int32.in_dll(c, "stub_locked")
+        self.stop_requested = ctypes.c_int32.in_dll(c, "stub_stop_requested")
+        self.watchdog_fed = ctypes.c_int32.in_dll(c, "stub_watchdog_fed")
         self.gyro_known = ctypes.c_int32.in_dll(c, "stub_gyro_known")
+        self.sensors = ctypes.c_int32.in_dll(c, "stub_sensors")
         self.estimator_type = ctypes.c_int32.in_dll(c, "stub_estimator")
+        self.connected = ctypes.c_int32.in_dll(c, "stub_connected")
+        self.after_watchdog = ctypes.c_int32.in_dll(c, "stub_after_watchdog")
+        self.after_assert = ctypes.c_int32.in_dll(c, "stub_after_assert")
+        self.self_test_passed = ctypes.c_int32.in_dll(c, "stub_self_test_passed")
         self.supervisor = Supervisor.in_dll(c, "floaty_supervisor")
         self.timers = [Timer.in_dll(c, name) for name in ("stub_tim3", "stub_tim5")]
         self.pins = [Pins.in_dll(c, name) for name in ("stub_gpio_a", "stub_gpio_b")]
@@ -137,19 +146,27 @@ class App:
         self.params = {name: i for i, name in _names(c.stub_param_name)}
         self.logs = {name: i for i, name in _names(c.stub_log_name)}
 
-    def boot(self) -> None:
-        """Initialise as the stabilizer does, let the app's task start, and switch to the estimator that it wants."""
-        self.c.controllerOutOfTreeInit()
-        self.c.stub_run_app(0)
-        if self.estimator_type.value == OUT_OF_TREE:
-            self.c.estimatorOutOfTreeInit()
+    def boot(self, stored: Mapping[str, float] | None = None) -> None:
+        """Start as the firmware's system task does, with parameters `stored` in the EEPROM, up to the stabilizer's loop."""
+        c = self.c
+        c.appInit()
+        for name, value in (stored or {}).items():
+            c.stub_param_load(self.params[name], value)
+        c.estimatorOutOfTreeInit()
+        self.estimator_type.value = OUT_OF_TREE
+        c.controllerOutOfTreeInit()
+        tests = (c.estimatorOutOfTreeTest, c.watchdogNormalStartTest, c.cfAssertNormalStartTest)
+        self.self_test_passed.value = min(test() for test in tests)  # each of them is asked
+        c.stub_run_app(0)
 
-    def step(self, step: int) -> None:
-        """Run one pass of the stabilizer."""
+    def step(self, step: int, *, controlled: bool = True) -> None:
+        """Run one pass of the stabilizer, which waits for the self-test; another controller may be selected."""
         self.now.value = step * 1000
-        if self.estimator_type.value == OUT_OF_TREE:
-            self.c.estimatorOutOfTree(self._state, step)
-        self.c.controllerOutOfTree(self._control, self._nothing, self._nothing, self._state, step)
+        if not self.self_test_passed.value:
+            return
+        self.c.estimatorOutOfTree(self._state, step)
+        if controlled:
+            self.c.controllerOutOfTree(self._control, self._nothing, self._nothing, self._state, step)
 
     def radio(self, data: bytes, port: int = LOCALISATION, channel: int = GENERIC) -> None:
         """Receive a packet."""

@@ -28,7 +28,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.firmware import Firmware
 from firmware_py.wire import WireError, crtp, telemetry
 from hil.config import load_config
-from support.crazyflie_app import STUBS, App, GyroZero, Pose, Supervisor, build_app
+from support.crazyflie_app import LOCALISATION, STUBS, App, GyroZero, Pose, Supervisor, build_app
 
 ARM = "arm-none-eabi-gcc"
 ARM_FLAGS = (  # of the Crazyflie firmware
@@ -131,11 +131,13 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
             data = data[:2] + bytes(29)
         just_before_control = step in (600, 3800)  # the first one, and the one that ends the silence
         events[step + (0 if just_before_control else int(rng.integers(0, 20)))].append(pose(data))
-    header = bytes((crtp.header(6, 1),))
-    events[5207] = [pose(header + b"\x03")]  # emergency stop
-    events[5603] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
-    events[6009] += [pose(header + b"\x04")]  # emergency stop watchdog, not fed again
-    events[7301] = [lambda app, lab: (app.set("floaty.stop", 0), lab.parameters["stabilizer.stop"].set(0))]  # type: ignore[list-item]
+    for step, stop in ((5207, 1), (5603, 0), (7301, 0)):  # the last one leaves the empty battery
+        events[step].append(
+            lambda app, lab, stop=stop: (
+                app.set("floaty.stop", stop),
+                lab.parameters["stabilizer.stop"].set(stop),
+            )
+        )  # type: ignore[list-item]
     for name, value in (
         ("extCtrl.x_P", 3.5),
         ("extCtrl.y_P", 99.0),
@@ -212,14 +214,27 @@ def test_servos_hang_on_the_originals_pins_at_400_hz(app: App) -> None:
     assert a.MODER == 0b10100000  # no other pin
 
 
+STANDING = crtp.encode_ext_pose((0.01, -0.02, 0.05), (1.0, 0.0, 0.0, 0.0), 40_000)[1:]
+SUPERVISOR = 9
+
+
 def flying(app: App, until: int = 1200) -> None:
     app.boot()
-    data = crtp.encode_ext_pose((0.01, -0.02, 0.05), (1.0, 0.0, 0.0, 0.0), 40_000)[1:]
     for step in range(1, until):
         if step % 20 == 1:
-            app.radio(data)
+            app.radio(STANDING)
         app.step(step)
     assert app.supervisor.state == reference.State.FLYING
+
+
+def hover_of(app: App) -> list[int]:
+    """The servo counts of the hover angles."""
+    before = app.counts()
+    app.c.floaty_hover()
+    hover = app.counts()
+    tim3, tim5 = app.timers
+    tim5.CCR3, tim3.CCR1, tim3.CCR2, tim5.CCR4 = before
+    return hover
 
 
 def test_a_loop_that_stands_still_puts_the_servos_to_hover(app: App) -> None:
@@ -258,16 +273,186 @@ def test_poses_come_through_the_app_channel_too(app: App) -> None:
     assert app.log("locSrv.age") == pytest.approx(270)  # 20 ms, and 7 to the next step
 
 
-def test_a_gyro_without_raw_counts_leaves_the_flaps_at_hover(app: App) -> None:
-    app.gyro_known.value = 0
+@pytest.mark.parametrize("lacking", ["gyro_known", "sensors"])
+def test_a_board_without_a_bmi088_says_so_and_leaves_the_flaps_at_hover(app: App, lacking: str) -> None:
+    getattr(app, lacking).value = 1 - getattr(app, lacking).value
     app.boot()
-    assert not app.c.estimatorOutOfTreeTest()
+    assert "no raw counts of a BMI088: flaps stay at hover" in app.console()
     hover = app.counts()
     for step in range(1, 700):
         app.step(step)
-    assert app.supervisor.state == reference.State.CALIBRATING
     assert app.counts() == hover
-    assert "no raw gyro counts" in app.console()
+
+
+def fly_on(app: App, first: int, steps: int, **step: bool) -> set[tuple[int, ...]]:
+    """Go on with poses at 50 Hz; return the servo counts that were seen."""
+    seen = set()
+    for i in range(first, first + steps):
+        if i % 20 == 1:
+            app.radio(STANDING)
+        app.step(i, **step)
+        seen.add(tuple(app.counts()))
+    return seen
+
+
+def test_a_client_that_writes_the_estimators_parameter_does_not_disturb_the_flight(app: App) -> None:
+    flying(app)
+    hover, fused = hover_of(app), app.log("kalman.fused")
+    app.c.estimatorOutOfTreeInit()  # what a write of 1 or 2 leads to: the build forces this estimator
+    assert tuple(hover) not in fly_on(app, 1200, 200)
+    assert app.log("kalman.fused") == fused + 10
+    assert np.frombuffer(app.estimator(), Estimator.dtype)[0]["started"] == 1
+    app.estimator_type.value = 2
+    app.c.estimatorOutOfTreeInit()  # a switch that is one starts afresh
+    app.step(1400)
+    assert np.frombuffer(app.estimator(), Estimator.dtype)[0]["started"] == 0
+
+
+@pytest.mark.parametrize("reset_us", [1_190_000, 1_195_000])
+def test_a_microsecond_clock_set_to_zero_neither_ends_a_flight_nor_its_failsafe(
+    app: App, reset_us: int
+) -> None:
+    flying(app)
+    app.usec_reset.value = reset_us
+    for step in range(1200, 1680):
+        app.step(step)
+    assert app.supervisor.state == reference.State.FLYING
+    for step in range(1680, 1710):
+        app.step(step)
+    assert (app.supervisor.state, app.supervisor.cause) == (
+        reference.State.FAILSAFE, reference.Cause.SILENCE,
+    )  # fmt: skip
+    assert app.counts() == hover_of(app)
+
+
+def test_a_pose_from_before_the_clock_was_set_counts_as_if_it_came_with_the_step(app: App) -> None:
+    flying(app, until=1201)
+    app.radio(STANDING)
+    app.usec_reset.value = app.now.value
+    app.step(1201)
+    for step in range(1202, 1210):
+        app.step(step)
+    assert app.log("locSrv.age") == pytest.approx(480)  # 40 ms, and 8 to the estimator's step
+
+
+def test_the_failsafe_outlives_the_wrap_of_the_tick_count(app: App) -> None:
+    app.first_tick.value = 2**32 - 1300
+    flying(app)
+    for step in range(1200, 1710):
+        app.step(step)
+    assert app.supervisor.cause == reference.Cause.SILENCE
+
+
+@pytest.mark.parametrize("reason", ["watchdog", "assert"])
+def test_after_a_watchdog_or_assert_reset_floaty_says_so_and_flies_on(app: App, reason: str) -> None:
+    getattr(app, f"after_{reason}").value = 1
+    flying(app)
+    assert f"SYS: after {reason}\n" in app.console()
+    assert "restarted by watchdog or assert" in app.console()
+
+
+def test_a_normal_start_says_nothing_of_a_restart(app: App) -> None:
+    flying(app)
+    assert "restarted" not in app.console()
+
+
+def test_a_self_test_that_does_not_pass_is_told_once(app: App) -> None:
+    app.c.appInit()
+    app.c.stub_run_app(48)
+    assert app.console() == ""
+    app.c.stub_run_app(200)
+    assert app.console() == "FLOATY: self-test not passed: flaps stay at hover until a reboot\n"
+
+
+def test_servos_pulse_from_the_first_hook_and_take_the_trims_of_the_eeprom(app: App) -> None:
+    app.c.appInit()
+    profile = app.counts()
+    assert all(21_000 <= count <= 42_000 for count in profile)
+    assert all(timer.CR1 & 1 for timer in app.timers)
+    for name in ("m1", "m3"):
+        app.c.stub_param_load(app.params[f"motorShifts.{name}"], app.get(f"motorShifts.{name}") + 1000)
+    app.c.estimatorOutOfTreeInit()
+    moved = [after - before for after, before in zip(app.counts(), profile, strict=True)]
+    assert moved == [pytest.approx(1000 * 21_000 / 65_535, abs=1), 0] * 2
+
+
+def test_parameters_from_the_eeprom_are_named_on_the_console(app: App) -> None:
+    app.boot(
+        {
+            "extCtrl.x_P": 3.25,
+            "motorShifts.m2": -123,
+            "extCtrl.y_P": 99.0,
+            "extCtrl.z_P": app.get("extCtrl.z_P"),
+        }
+    )
+    assert (
+        "FLOATY: 2 parameters from the EEPROM, not from profile floaty: extCtrl.x_P motorShifts.m2\n"
+        in app.console()
+    )  # 99 is out of its limits, and z_P as in the profile
+
+
+def test_a_profile_that_nothing_overrides_is_not_mentioned(app: App) -> None:
+    app.boot()
+    assert "EEPROM" not in app.console()
+
+
+def test_while_another_controller_runs_the_state_is_no_flight(app: App) -> None:
+    flying(app)
+    fly_on(app, 1200, 60, controlled=False)
+    app.c.stub_run_app(1)
+    assert app.counts() == hover_of(app)
+    assert (app.supervisor.state, app.supervisor.cause) == (
+        reference.State.FAILSAFE, reference.Cause.NO_CONTROL,
+    )  # fmt: skip
+    assert app.console().endswith("supervisor: failsafe, no control\n")
+    fly_on(app, 1260, 20)
+    app.c.stub_run_app(1)
+    assert app.console().endswith("supervisor: flying\n")
+
+
+def test_manual_angles_last_as_long_as_a_client_is_there(app: App) -> None:
+    app.boot()
+    hover = hover_of(app)
+    app.set("extCtrl.manual", reference.Manual.ANGLES)
+    for connected in (1, 0, 1):
+        app.connected.value = connected
+        for step in range(1, 21):
+            app.step(step)
+        assert (app.counts() == hover) == (not connected)
+
+
+@pytest.mark.parametrize("port", [LOCALISATION, SUPERVISOR])
+def test_a_stop_by_either_port_lasts_until_a_reboot(app: App, port: int) -> None:
+    flying(app)
+    if port == LOCALISATION:
+        app.radio(b"\x03")
+    else:
+        app.stop_requested.value = 1  # the firmware's own service of that port
+    fly_on(app, 1200, 20)
+    assert app.supervisor.cause == reference.Cause.EMERGENCY_STOP
+    app.set("floaty.stop", 0)
+    fly_on(app, 1220, 20)
+    assert app.supervisor.cause == reference.Cause.EMERGENCY_STOP
+    assert app.counts() == hover_of(app)
+    assert app.stop_requested.value == 1  # the firmware locks itself
+
+
+def test_the_watchdog_of_the_stop_is_the_firmwares(app: App) -> None:
+    app.boot()
+    app.radio(b"\x04")
+    assert app.watchdog_fed.value == 1
+
+
+def test_a_full_pose_queue_keeps_the_newest_poses(app: App) -> None:
+    app.boot()
+    for step in range(1, 100):
+        app.step(step)
+    for i in range(20):
+        app.radio(crtp.encode_ext_pose((0.01 * i, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)[1:])
+    for step in range(100, 140):
+        app.step(step)
+    assert app.log("floaty.overflows") == 12
+    assert app.state()["stateEstimate.x"] == pytest.approx(0.19, abs=0.01)
 
 
 RENAMED = {
@@ -339,7 +524,6 @@ OPERATIONS = st.one_of(
     st.tuples(st.just("pose"), st.integers(0, 300_000), st.just(0)),
     st.tuples(st.just("calibrated"), st.just(0), st.just(0)),
     st.tuples(st.just("stop"), st.just(0), st.just(0)),
-    st.tuples(st.just("feed"), st.integers(0, 300_000), st.just(0)),
     st.tuples(st.just("arm"), st.just(0), st.integers(0, 1)),
     st.tuples(st.just("recover"), st.integers(0, 10_000), st.just(0)),
     st.tuples(st.just("battery"), st.integers(0, 3_000_000), st.integers(3000, 3400)),
@@ -383,9 +567,6 @@ def test_supervisor_decides_as_the_laboratorys(
         elif name == "stop":
             python.emergency_stop()
             here.stopped = 1
-        elif name == "feed":
-            python.feed_watchdog(now)
-            c.floaty_supervisor_feed_watchdog(this, now)
         elif name == "arm":
             assert c.floaty_supervisor_arm(this, bool(value)) == python.arm(bool(value))
         elif name == "recover":
@@ -524,7 +705,7 @@ def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) ->
     ).stdout
     stack = {
         name: deepest_stack(arm_build)[name]
-        for name in ("estimatorOutOfTree", "controllerOutOfTree", "appMain")
+        for name in ("estimatorOutOfTree", "controllerOutOfTree", "app_task", "appInit")
     }
     print(f"flash {text + data} B, RAM {data + bss} B, stack {stack} B")
     assert text + data < 20_000

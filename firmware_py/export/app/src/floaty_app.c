@@ -8,8 +8,10 @@
  * there is a new one in each step; neither the firmware's low-pass nor its bias is in between, so that the core computes
  * what it computes in the laboratory, bit for bit, from the same counts, poses and instants.
  *
- * Poses: packets of port 6 come here instead of to the firmware's own localisation service, because that does not look
- * at the age behind an external pose. The same bytes are taken from the app channel.
+ * Time: what is decided by time counts ticks, which nobody can set. How long a pose waited is measured in microseconds,
+ * by a clock that the parameter usec.reset sets to zero.
+ *
+ * What receives poses and requests, and talks on the console, is floaty_task.c.
  */
 #define DEBUG_MODULE "FLOATY"
 
@@ -22,20 +24,18 @@
 #include "queue.h"
 #include "task.h"
 
-#include "app.h"
-#include "app_channel.h"
 #include "controller.h"
 #include "crtp.h"
+#include "crtp_supervisor.h"
 #include "debug.h"
 #include "estimator.h"
 #include "log.h"
-#include "param.h"
+#include "platform.h"
 #include "pm.h"
 #include "supervisor.h"
 #include "usec_time.h"
 
 #include "floaty_gyro_zero.h"
-#include "floaty_poses.h"
 #include "floaty_servos.h"
 #include "floaty_settings.h"
 
@@ -45,12 +45,9 @@
 #define STEP_US 1000
 #define BATTERY_STEPS 100
 #define POSE_QUEUE 8
-#define CHANNEL_GENERIC 1
-#define EMERGENCY_STOP 3
-#define EMERGENCY_STOP_WATCHDOG 4
-#define STALE_MS 50 /* without a controller step: servos to hover */
-#define LOOK_MS 20  /* how often the app's task looks at that */
 #define POSE_ON_TIME 0
+#define MODE_HOVER 0
+#define MODE_MANUAL 2
 #define DEGREES 57.2957795f /* per radian */
 
 FloatyParameters floaty_parameters;
@@ -63,6 +60,7 @@ FloatyRequests floaty_requests;
 
 static FloatyGyroZero gyro_zero;
 static logVarId_t gyro_raw[3];
+static bool gyro_found;
 static volatile TickType_t controlled_tick;
 
 /* In ordinary memory: the macros of static_mem.h would put it into CCM, which is full. */
@@ -70,47 +68,44 @@ static StaticQueue_t pose_queue_buffer;
 static uint8_t pose_queue_storage[POSE_QUEUE * sizeof(FloatyPose)];
 static QueueHandle_t pose_queue;
 
-static int64_t now_us(void) {
-  return (int64_t)usecTimestamp();
-}
-
-static void start(void) {
-  if (pose_queue) {
-    return;
-  }
+void floaty_begin(void) {
   pose_queue = xQueueCreateStatic(POSE_QUEUE, sizeof(FloatyPose), pose_queue_storage, &pose_queue_buffer);
   floaty_core_init(&floaty_parameters);
   floaty_core_reset(&floaty_parameters, &floaty_estimator);
-  gyro_raw[0] = logGetVarId("gyro", "xRaw");
-  gyro_raw[1] = logGetVarId("gyro", "yRaw");
-  gyro_raw[2] = logGetVarId("gyro", "zRaw");
   floaty_supervisor_init(&floaty_supervisor, FLOATY_POSE_TIMEOUT_US, FLOATY_LOW_BATTERY_MV);
   floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control); /* mode 0: hover */
   floaty_servos_init(floaty_control.count);
 }
 
-/* Poses, in the tasks that receive them */
+void floaty_hover(void) {
+  static const FloatyInput input; /* mode 0 */
+  FloatyControl control;
+  memset(&control, 0, sizeof control);
+  floaty_core_control(&floaty_parameters, &input, &floaty_estimator, &control);
+  floaty_servos_write(control.count);
+}
 
-static void receive_pose(const uint8_t *data, uint32_t length) {
-  FloatyPose pose;
-  if (!floaty_pose_decode(data, length, now_us(), &pose)) {
-    floaty_observed.malformed += 1;
-  } else if (xQueueSend(pose_queue, &pose, 0) != pdTRUE) {
-    floaty_observed.overflows += 1;
+uint32_t floaty_controlled_tick(void) {
+  return controlled_tick;
+}
+
+void floaty_queue_pose(const FloatyPose *pose) {
+  FloatyPose oldest;
+  while (xQueueSend(pose_queue, pose, 0) != pdTRUE) {
+    if (xQueueReceive(pose_queue, &oldest, 0) == pdTRUE) {
+      floaty_observed.overflows += 1;
+    }
   }
 }
 
-static void receive_localisation(CRTPPacket *packet) {
-  if (packet->channel != CHANNEL_GENERIC || packet->size < 1) {
-    return; /* a position without attitude is no pose */
-  }
-  if (packet->data[0] == EMERGENCY_STOP) {
-    floaty_requests.stop = true;
-  } else if (packet->data[0] == EMERGENCY_STOP_WATCHDOG) {
-    floaty_requests.feed_watchdog = true;
-  } else {
-    receive_pose(packet->data, packet->size);
-  }
+/* Only the stabilizer task asks. The sum of differences does not run back when the tick count passes 2^32. */
+static int64_t loop_us(void) {
+  static TickType_t last;
+  static int64_t us;
+  const TickType_t tick = xTaskGetTickCount();
+  us += (int64_t)(TickType_t)(tick - last) * STEP_US;
+  last = tick;
+  return us;
 }
 
 /* The estimator, in the stabilizer task */
@@ -122,6 +117,9 @@ static bool asked(volatile bool *request) {
 }
 
 static void file_pose(const FloatyPose *pose, stabilizerStep_t step) {
+  /* Negative only when usec.reset has been written since the pose came: then as if it came now. */
+  const int64_t since_us = (int64_t)usecTimestamp() - pose->arrival_us;
+  const int64_t waited_us = since_us > 0 ? since_us : 0;
   for (int i = 0; i < 3; i++) {
     floaty_input.pose_position[i] = pose->position[i];
   }
@@ -131,10 +129,10 @@ static void file_pose(const FloatyPose *pose, stabilizerStep_t step) {
   floaty_input.pose_age_us = FLOATY_AGE_UNKNOWN;
   if (pose->age_us != FLOATY_AGE_UNKNOWN) {
     const int32_t steps_to_go = (int32_t)((ESTIMATOR_PHASE + STEPS - step % STEPS) % STEPS);
-    floaty_input.pose_age_us = (int32_t)(now_us() - pose->arrival_us) + pose->age_us + steps_to_go * STEP_US;
+    floaty_input.pose_age_us = (int32_t)waited_us + pose->age_us + steps_to_go * STEP_US;
   }
   if (floaty_core_file_pose(&floaty_parameters, &floaty_input, &floaty_estimator) == POSE_ON_TIME) {
-    floaty_supervisor.last_pose_us = pose->arrival_us;
+    floaty_supervisor.last_pose_us = loop_us() - waited_us;
     floaty_supervisor.pose_seen = true;
   }
 }
@@ -198,17 +196,37 @@ static void observe(void) {
   floaty_observed.poses = (uint16_t)(e->fused + e->jumps + rejected);
 }
 
-void estimatorOutOfTreeInit(void) {
-  start();
-  floaty_requests.reset = true;
+static bool find_gyro(void) {
+  gyro_raw[0] = logGetVarId("gyro", "xRaw");
+  gyro_raw[1] = logGetVarId("gyro", "yRaw");
+  gyro_raw[2] = logGetVarId("gyro", "zRaw");
+  /* The variables are there with another sensor on board, too, and then stay at zero. */
+  return platformConfigGetSensorImplementation() == SensorImplementation_bmi088_bmp3xx && logVarIdIsValid(gyro_raw[0]) &&
+         logVarIdIsValid(gyro_raw[1]) && logVarIdIsValid(gyro_raw[2]);
 }
 
+/* The firmware calls this at start, when the EEPROM has been read, and whenever a client writes stabilizer.estimator,
+ * although the build forces this estimator: then it flies on. */
+void estimatorOutOfTreeInit(void) {
+  if (stateEstimatorGetType() == StateEstimatorTypeOutOfTree) {
+    return;
+  }
+  gyro_found = find_gyro();
+  floaty_requests.reset = true;
+  floaty_toc_apply();
+  floaty_hover(); /* with the trims of the EEPROM */
+}
+
+/* When this fails the firmware starts neither the stabilizer nor the app: the console has to hear of it here. */
 bool estimatorOutOfTreeTest(void) {
-  return logVarIdIsValid(gyro_raw[0]) && logVarIdIsValid(gyro_raw[1]) && logVarIdIsValid(gyro_raw[2]);
+  if (!gyro_found) {
+    DEBUG_PRINT("no raw counts of a BMI088: flaps stay at hover\n");
+  }
+  return gyro_found;
 }
 
 void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
-  if (!estimatorOutOfTreeTest()) {
+  if (!gyro_found) {
     return; /* without a gyro Floaty stays calibrating, flaps at hover */
   }
   if (asked(&floaty_requests.reset)) {
@@ -237,17 +255,13 @@ static void serve_requests(int64_t now) {
   if (asked(&floaty_requests.disarm)) {
     floaty_supervisor_arm(&floaty_supervisor, false);
   }
-  if (asked(&floaty_requests.feed_watchdog)) {
-    floaty_supervisor_feed_watchdog(&floaty_supervisor, now);
-  }
-  if (asked(&floaty_requests.stop) || supervisorIsLocked()) { /* or the firmware's own emergency stop */
+  /* The firmware's own stop, by ports 6 and 9, their watchdogs or stabilizer.stop, holds until a reboot. */
+  if (asked(&floaty_requests.stop) || crtpSupervisorIsEmergencyStopRequested() || supervisorIsLocked()) {
     floaty_supervisor.stopped = true;
   }
 }
 
-void controllerOutOfTreeInit(void) {
-  start();
-}
+void controllerOutOfTreeInit(void) {}
 
 bool controllerOutOfTreeTest(void) {
   return true;
@@ -255,7 +269,7 @@ bool controllerOutOfTreeTest(void) {
 
 void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const sensorData_t *sensors,
                          const state_t *state, const stabilizerStep_t stabilizerStep) {
-  const int64_t now = now_us();
+  const int64_t now = loop_us();
   (void)setpoint;
   (void)sensors;
   (void)state;
@@ -263,69 +277,14 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
   serve_requests(now);
   if (stabilizerStep % STEPS == CONTROL_PHASE) {
     floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
+    if (floaty_input.mode == MODE_MANUAL && !crtpIsConnected()) {
+      floaty_input.mode = MODE_HOVER; /* nobody is there who could take the angles back */
+    }
     floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control);
     floaty_servos_write(floaty_control.count);
     controlled_tick = xTaskGetTickCount();
   }
   if (stabilizerStep % BATTERY_STEPS == 0) {
     floaty_supervisor_see_battery(&floaty_supervisor, now, (int32_t)(1000.0f * pmGetBatteryVoltage()));
-  }
-}
-
-/* The app's own task: poses from the app channel, the console, and a loop that stands still */
-
-static void hover(void) {
-  static const FloatyInput input; /* mode 0 */
-  FloatyControl control;
-  memset(&control, 0, sizeof control);
-  floaty_core_control(&floaty_parameters, &input, &floaty_estimator, &control);
-  floaty_servos_write(control.count);
-}
-
-static void announce(void) {
-  static const char *const STATES[] = {"calibrating", "waiting", "flying", "failsafe"};
-  static const char *const CAUSES[] = {"",           ", silence",     ", out of bounds", ", emergency stop",
-                                       ", low battery", ", disarmed"};
-  static uint8_t state = FLOATY_CALIBRATING, cause = FLOATY_NONE;
-  const uint8_t new_state = floaty_supervisor.state, new_cause = floaty_supervisor.cause;
-  if (new_state != state || new_cause != cause) {
-    state = new_state;
-    cause = new_cause;
-    DEBUG_PRINT("supervisor: %s%s\n", STATES[state], CAUSES[cause]);
-  }
-}
-
-/* The firmware takes an out-of-tree controller by itself, but an out-of-tree estimator only when told to. */
-static void select_estimator(void) {
-  if (!estimatorOutOfTreeTest()) {
-    DEBUG_PRINT("no raw gyro counts: is this a BMI088?\n");
-  }
-  if (stateEstimatorGetType() != StateEstimatorTypeOutOfTree) {
-    paramSetInt(paramGetVarId("stabilizer", "estimator"), StateEstimatorTypeOutOfTree);
-  }
-}
-
-void appMain(void) {
-  uint8_t data[APPCHANNEL_MTU];
-  bool stale = false;
-
-  floaty_toc_apply();
-  select_estimator();
-  crtpRegisterPortCB(CRTP_PORT_LOCALIZATION, receive_localisation);
-  DEBUG_PRINT("core %s, profile %s %s\n", FLOATY_CORE_VERSION, FLOATY_PROFILE_NAME, floaty_profile_hash);
-  while (true) {
-    const size_t length = appchannelReceiveDataPacket(data, sizeof data, LOOK_MS);
-    if (length > 0) {
-      receive_pose(data, (uint32_t)length);
-    }
-    const TickType_t controlled = controlled_tick; /* 0: not yet, and the servos are at hover since the start */
-    if (controlled == 0 || xTaskGetTickCount() - controlled < M2T(STALE_MS)) {
-      stale = false;
-    } else if (!stale) {
-      stale = true;
-      floaty_observed.stale_hovers += 1;
-      hover();
-    }
-    announce();
   }
 }

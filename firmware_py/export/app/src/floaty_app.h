@@ -1,10 +1,11 @@
-/* What the files of the app share: the memory of the flight core and what is logged of it. */
+/* What the files of the app share: the memory of the flight core, what is logged of it, and who asks whom for what. */
 #pragma once
 
 #include <stdbool.h>
 #include <stdint.h>
 
 #include "floaty_core.h"
+#include "floaty_poses.h"
 #include "floaty_supervisor.h"
 
 /* What an observer sees and the core does not hold in this form. */
@@ -14,8 +15,8 @@ typedef struct {
   uint16_t poses;    /* received, modulo 65536 */
   uint16_t rejected; /* of these, refused */
   uint32_t malformed;     /* packets on the pose channels that no one could read */
-  uint32_t overflows;     /* poses that found the queue full */
-  uint32_t stale_hovers;  /* times the loop stood still and the servos were put to hover */
+  uint32_t overflows;     /* poses that a newer one drove out of the full queue */
+  uint32_t stale_hovers;  /* times no controller step came and the servos were put to hover */
 } FloatyObserved;
 
 extern FloatyParameters floaty_parameters;
@@ -29,7 +30,6 @@ extern FloatyObserved floaty_observed;
 typedef struct {
   volatile bool stop;          /* emergency stop */
   volatile bool recover;       /* leave it */
-  volatile bool feed_watchdog; /* of the emergency stop */
   volatile bool arm;
   volatile bool disarm;
   volatile bool reset; /* start the estimator afresh */
@@ -37,5 +37,20 @@ typedef struct {
 
 extern FloatyRequests floaty_requests;
 
-/* Brings parameters that were read from the memory at start into force (floaty_toc.c). */
+/* floaty_app.c: sets the core up and lets the servos pulse, at hover. The first call of all. */
+void floaty_begin(void);
+
+/* floaty_app.c: hands a pose to the stabilizer task; when the queue is full the oldest one goes. */
+void floaty_queue_pose(const FloatyPose *pose);
+
+/* floaty_app.c: puts the servos to hover whatever the stabilizer task does. */
+void floaty_hover(void);
+
+/* floaty_app.c: the tick of the last controller step; 0: none yet. */
+uint32_t floaty_controlled_tick(void);
+
+/* floaty_toc.c: brings parameters that were read from the EEPROM into force. */
 void floaty_toc_apply(void);
+
+/* floaty_toc.c: says on the console which parameters are not as in the profile. */
+void floaty_toc_report(void);

@@ -3,7 +3,6 @@
 
 #include <string.h>
 
-#define WATCHDOG_US 1000000
 #define BATTERY_LOW_US 5000000
 #define EPISODE_GAP_US 50000 /* two bounded steps closer than this belong to one episode */
 #define EPISODE_LIMIT_US 200000
@@ -59,9 +58,6 @@ static FloatyCause cause_of_failsafe(const FloatySupervisor *self, int64_t now_u
 
 int32_t floaty_supervisor_mode(FloatySupervisor *self, int64_t now_us, int32_t bounded) {
   watch_bounds(self, now_us, bounded);
-  if (self->watchdog_fed && now_us >= self->watchdog_us) {
-    self->stopped = true;
-  }
   self->cause = cause_of_failsafe(self, now_us);
   if (self->cause != FLOATY_NONE) {
     self->state = FLOATY_FAILSAFE;
@@ -79,11 +75,6 @@ int32_t floaty_supervisor_mode(FloatySupervisor *self, int64_t now_us, int32_t b
   return self->state == FLOATY_FLYING ? MODE_FLY : MODE_HOVER;
 }
 
-void floaty_supervisor_feed_watchdog(FloatySupervisor *self, int64_t now_us) {
-  self->watchdog_us = now_us + WATCHDOG_US;
-  self->watchdog_fed = true;
-}
-
 bool floaty_supervisor_arm(FloatySupervisor *self, bool armed) {
   if (armed && (self->stopped || self->battery_empty)) {
     return false;
@@ -94,7 +85,6 @@ bool floaty_supervisor_arm(FloatySupervisor *self, bool armed) {
 
 bool floaty_supervisor_recover(FloatySupervisor *self, int64_t now_us) {
   self->stopped = false;
-  self->watchdog_fed = false;
   if (self->battery_mv >= self->low_battery_mv) {
     self->battery_empty = false;
     self->battery_good_us = now_us;
@@ -109,4 +99,9 @@ void floaty_supervisor_see_battery(FloatySupervisor *self, int64_t now_us, int32
   } else if (now_us - self->battery_good_us >= BATTERY_LOW_US) {
     self->battery_empty = true;
   }
+}
+
+void floaty_supervisor_lose_control(FloatySupervisor *self) {
+  self->state = FLOATY_FAILSAFE;
+  self->cause = FLOATY_NO_CONTROL;
 }

@@ -1,6 +1,7 @@
-/* Decides, before every controller step, whether the loop may be closed; the same machine as firmware_py/supervisor.py.
+/* Decides, before every controller step, whether the loop may be closed; the same machine as firmware_py/supervisor.py,
+ * but for the watchdog of the emergency stop, which is the firmware's.
  *
- * Pure: no firmware API. Time is int64 microseconds and arrives as an argument.
+ * Pure: no firmware API. Time is int64 microseconds and arrives as an argument; it never runs back.
  */
 #pragma once
 
@@ -21,6 +22,7 @@ typedef enum {
   FLOATY_EMERGENCY_STOP = 3,
   FLOATY_LOW_BATTERY = 4,
   FLOATY_DISARMED = 5,
+  FLOATY_NO_CONTROL = 6, /* no controller step comes: the loop stands still, or another controller runs */
 } FloatyCause;
 
 typedef enum {
@@ -32,7 +34,6 @@ typedef enum {
 typedef struct {
   int64_t last_pose_us; /* meaningless until `pose_seen` */
   int64_t battery_good_us;
-  int64_t watchdog_us; /* instant at which the emergency stop watchdog bites; meaningless until `watchdog_fed` */
   int64_t episode_start_us;
   int64_t bounded_us;
   int64_t outside_until_us;
@@ -48,7 +49,6 @@ typedef struct {
   bool pose_seen;
   bool stopped;
   bool battery_empty;
-  bool watchdog_fed;
 } FloatySupervisor;
 
 /* Starts calibrating and armed. */
@@ -56,9 +56,6 @@ void floaty_supervisor_init(FloatySupervisor *self, int32_t pose_timeout_us, int
 
 /* Returns the core's mode: 0 hover, 1 fly, 2 manual. `bounded` counts how often the estimator was held at a bound. */
 int32_t floaty_supervisor_mode(FloatySupervisor *self, int64_t now_us, int32_t bounded);
-
-/* Starts the emergency stop watchdog, or keeps it from biting for another second. */
-void floaty_supervisor_feed_watchdog(FloatySupervisor *self, int64_t now_us);
 
 /* Arms or disarms; false when the request to arm was refused. */
 bool floaty_supervisor_arm(FloatySupervisor *self, bool armed);
@@ -68,3 +65,6 @@ bool floaty_supervisor_recover(FloatySupervisor *self, int64_t now_us);
 
 /* Takes in the supply voltage. */
 void floaty_supervisor_see_battery(FloatySupervisor *self, int64_t now_us, int32_t battery_mv);
+
+/* Says that nobody asks for the mode any more; the next call of floaty_supervisor_mode says otherwise. */
+void floaty_supervisor_lose_control(FloatySupervisor *self);

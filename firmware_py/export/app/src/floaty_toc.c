@@ -4,14 +4,20 @@
  * other is put back. Names that the firmware has already are left to it; Floaty's own are then in the group `floaty` or
  * `FloatyKalm`. Their angles are radians.
  */
+#define DEBUG_MODULE "FLOATY"
+
 #include "floaty_app.h"
 
+#include "debug.h"
 #include "log.h"
 #include "param.h"
+
+#include "floaty_settings.h"
 
 typedef enum { KIND_F32, KIND_I32, KIND_U16, KIND_I16, KIND_U8 } Kind;
 
 typedef struct {
+  const char *name;
   void *seen;     /* what the client reads and writes */
   void *target;   /* what it stands for: target = scale * seen */
   float scale;
@@ -70,6 +76,23 @@ void floaty_toc_apply(void) {
     put(p->seen, p->seen_kind, get(p->target, p->target_kind) / p->scale);
     in_force[i] = get(p->seen, p->seen_kind);
   }
+}
+
+void floaty_toc_report(void) {
+  int different = 0;
+  for (unsigned i = 0; i < COUNT; i++) {
+    different += in_force[i] != PARAMETERS[i].initial;
+  }
+  if (different == 0) {
+    return;
+  }
+  DEBUG_PRINT("%d parameters from the EEPROM, not from profile %s:", different, FLOATY_PROFILE_NAME);
+  for (unsigned i = 0; i < COUNT; i++) {
+    if (in_force[i] != PARAMETERS[i].initial) {
+      eprintf(consolePutchar, " %s", PARAMETERS[i].name);
+    }
+  }
+  eprintf(consolePutchar, "\n");
 }
 
 static uint8_t stop_wanted, armed_wanted = 1, reset_wanted;

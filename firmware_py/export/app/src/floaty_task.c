@@ -1,0 +1,134 @@
+/* The app beside the stabilizer task: the start, poses and requests that arrive, the console, a loop that stands still.
+ *
+ * appInit is the firmware's weak hook for a task of its own. It comes some 0.1 s after a reset, before decks, sensors and
+ * self-test: the servos have pulses from there on, and what made the board start again is taken from the self-test.
+ *
+ * Poses: packets of port 6 come here instead of to the firmware's own localisation service, because that does not look
+ * at the age behind an external pose. The same bytes are taken from the app channel.
+ */
+#define DEBUG_MODULE "FLOATY"
+
+#include "floaty_app.h"
+
+#include "FreeRTOS.h"
+#include "task.h"
+
+#include "app.h"
+#include "app_channel.h"
+#include "autoconf.h"
+#include "cfassert.h"
+#include "crtp.h"
+#include "crtp_supervisor.h"
+#include "debug.h"
+#include "param.h"
+#include "param_task.h"
+#include "system.h"
+#include "usec_time.h"
+#include "watchdog.h"
+
+#include "floaty_settings.h"
+
+#define CHANNEL_GENERIC 1
+#define EMERGENCY_STOP 3
+#define EMERGENCY_STOP_WATCHDOG 4
+#define STALE_MS 50 /* without a controller step: servos to hover */
+#define LOOK_MS 20  /* how often the task looks at that */
+#define SELF_TEST_MS 100
+#define SELF_TEST_LOOKS 50 /* 5 s; the self-test ends 1.2 s after a reset, later with decks */
+
+static bool restarted; /* by the watchdog or a failed assert */
+static StackType_t stack[CONFIG_APP_STACKSIZE]; /* not in CCM, as the firmware's macros would have it: CCM is full */
+static StaticTask_t task;
+
+static void receive_pose(const uint8_t *data, uint32_t length) {
+  FloatyPose pose;
+  if (floaty_pose_decode(data, length, (int64_t)usecTimestamp(), &pose)) {
+    floaty_queue_pose(&pose);
+  } else {
+    floaty_observed.malformed += 1;
+  }
+}
+
+static void receive_localisation(CRTPPacket *packet) {
+  if (packet->channel != CHANNEL_GENERIC || packet->size < 1) {
+    return; /* a position without attitude is no pose */
+  }
+  if (packet->data[0] == EMERGENCY_STOP) {
+    crtpSupervisorSetEmergencyStop(); /* as port 9 */
+  } else if (packet->data[0] == EMERGENCY_STOP_WATCHDOG) {
+    crtpSupervisorNotifyEmergencyStopWatchdog();
+  } else {
+    receive_pose(packet->data, packet->size);
+  }
+}
+
+static void announce_state(void) {
+  static const char *const STATES[] = {"calibrating", "waiting", "flying", "failsafe"};
+  static const char *const CAUSES[] = {"",           ", silence",  ", out of bounds", ", emergency stop",
+                                       ", low battery", ", disarmed", ", no control"};
+  static uint8_t state = FLOATY_CALIBRATING, cause = FLOATY_NONE;
+  const uint8_t new_state = floaty_supervisor.state, new_cause = floaty_supervisor.cause;
+  if (new_state != state || new_cause != cause) {
+    state = new_state;
+    cause = new_cause;
+    DEBUG_PRINT("supervisor: %s%s\n", STATES[state], CAUSES[cause]);
+  }
+}
+
+/* A loop that stands still, or a controller that is not Floaty's. */
+static void watch_control(void) {
+  static bool stale;
+  const TickType_t controlled = floaty_controlled_tick(); /* 0: not yet, and the servos are at hover since the start */
+  if (controlled == 0 || xTaskGetTickCount() - controlled < M2T(STALE_MS)) {
+    stale = false;
+  } else if (!stale) {
+    stale = true;
+    floaty_observed.stale_hovers += 1;
+    floaty_supervisor_lose_control(&floaty_supervisor);
+    floaty_hover();
+  }
+}
+
+static void wait_for_self_test(void) {
+  while (!paramTest()) { /* the table of parameters is not there yet */
+    vTaskDelay(M2T(2));
+  }
+  const paramVarId_t passed = paramGetVarId("system", "selftestPassed");
+  for (int looks = 1; paramGetInt(passed) != 1; looks++) {
+    if (looks == SELF_TEST_LOOKS) {
+      DEBUG_PRINT("self-test not passed: flaps stay at hover until a reboot\n");
+    }
+    vTaskDelay(M2T(SELF_TEST_MS));
+  }
+  systemWaitStart();
+}
+
+static void app_task(void *unused) {
+  uint8_t data[APPCHANNEL_MTU];
+  (void)unused;
+
+  wait_for_self_test();
+  crtpRegisterPortCB(CRTP_PORT_LOCALIZATION, receive_localisation);
+  DEBUG_PRINT("core %s, profile %s %s\n", FLOATY_CORE_VERSION, FLOATY_PROFILE_NAME, floaty_profile_hash);
+  floaty_toc_report();
+  if (restarted) {
+    DEBUG_PRINT("restarted by watchdog or assert, see above: flies on when the gyro has been still\n");
+  }
+  while (true) {
+    const size_t length = appchannelReceiveDataPacket(data, sizeof data, LOOK_MS);
+    if (length > 0) {
+      receive_pose(data, (uint32_t)length);
+    }
+    watch_control();
+    announce_state();
+  }
+}
+
+void appInit(void) {
+  floaty_begin();
+  /* Each prints its warning and forgets: the self-test asks again, would fail, and Floaty would never fly. */
+  const bool after_watchdog = !watchdogNormalStartTest();
+  const bool after_assert = !cfAssertNormalStartTest();
+  restarted = after_watchdog || after_assert;
+  xTaskCreateStatic(app_task, "APP", CONFIG_APP_STACKSIZE, NULL, CONFIG_APP_PRIORITY, stack, &task);
+}
