@@ -108,6 +108,7 @@ def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
         field("delayComp.horizon", "horizon", PredictorConfig, "U8", "I32"),
         field("FloatyKalm.maxPos", "bound_position", EstimatorConfig),
         field("FloatyKalm.maxVel", "bound_velocity", EstimatorConfig),
+        AppParameter("extPose.absolute", "U8", "floaty_absolute", "U8", 0, 0, 1),
         supervision("supervisor.poseTimeout", "pose_timeout_us", 1000),
         supervision("supervisor.lowBattery", "low_battery_mv", 1),
     )  # fmt: skip

@@ -18,6 +18,7 @@
 #include "debug.h"
 #include "estimator.h"
 #include "log.h"
+#include "motors.h"
 #include "param.h"
 #include "param_task.h"
 #include "platform.h"
@@ -41,6 +42,7 @@ int32_t stub_sensors = SensorImplementation_bmi088_bmp3xx;
 int32_t stub_estimator = StateEstimatorTypeAutoSelect; /* what the stabilizer starts with */
 int32_t stub_connected = 1;
 int32_t stub_after_watchdog, stub_after_assert, stub_self_test_passed;
+int32_t stub_ratios[4];
 char stub_console[4096];
 
 uint64_t usecTimestamp(void) { return stub_now_us - stub_usec_reset_us; }
@@ -51,6 +53,7 @@ void crtpSupervisorSetEmergencyStop(void) { stub_stop_requested = 1; }
 void crtpSupervisorNotifyEmergencyStopWatchdog(void) { stub_watchdog_fed += 1; }
 bool crtpSupervisorIsEmergencyStopRequested(void) { return stub_stop_requested != 0; }
 bool crtpIsConnected(void) { return stub_connected != 0; }
+void motorsSetRatio(uint32_t id, uint16_t ratio) { stub_ratios[id] = ratio; }
 SensorImplementation_t platformConfigGetSensorImplementation() { return (SensorImplementation_t)stub_sensors; }
 bool paramTest(void) { return true; }
 void systemWaitStart(void) {}

@@ -21,6 +21,7 @@
 #include "debug.h"
 #include "estimator.h"
 #include "log.h"
+#include "motors.h"
 #include "param.h"
 #include "param_task.h"
 #include "platform.h"
@@ -68,6 +69,8 @@ FUNCTION(watchdogNormalStartTest, bool, void)
 FUNCTION(crtpSupervisorSetEmergencyStop, void, void)
 FUNCTION(crtpSupervisorNotifyEmergencyStopWatchdog, void, void)
 FUNCTION(crtpSupervisorIsEmergencyStopRequested, bool, void)
+VALUE(MOTOR_M4, 3)
+FUNCTION(motorsSetRatio, void, uint32_t, uint16_t)
 VALUE(SensorImplementation_bmi088_bmp3xx, 0)
 VALUE(SensorImplementation_mpu9250_lps25h, 1)
 FUNCTION(platformConfigGetSensorImplementation, SensorImplementation_t, void)
@@ -117,7 +120,31 @@ FIELD(state_t, velocity.x, float, 52)
 FIELD(state_t, velocity.y, float, 56)
 FIELD(state_t, velocity.z, float, 60)
 FIELD(state_t, acc.x, float, 68)
+_Static_assert(SAME(__typeof__(((state_t *)0)->attitude), attitude_t), "attitude");
 SIZE(control_t, 20)
+SIZE(setpoint_t, 128)
+FIELD(setpoint_t, timestamp, uint32_t, 0)
+FIELD(setpoint_t, attitude, attitude_t, 4)
+FIELD(setpoint_t, attitudeRate, attitude_t, 20)
+FIELD(setpoint_t, attitudeQuaternion, quaternion_t, 36)
+FIELD(setpoint_t, thrust, float, 52)
+FIELD(setpoint_t, position, point_t, 56)
+FIELD(setpoint_t, velocity.x, float, 76)
+FIELD(setpoint_t, acceleration.x, float, 92)
+FIELD(setpoint_t, jerk.x, float, 108)
+FIELD(setpoint_t, velocity_body, bool, 120)
+FIELD(setpoint_t, mode, setpoint_mode_t, 121)
+SIZE(setpoint_mode_t, 7)
+FIELD(setpoint_mode_t, x, stab_mode_t, 0)
+FIELD(setpoint_mode_t, y, stab_mode_t, 1)
+FIELD(setpoint_mode_t, z, stab_mode_t, 2)
+FIELD(setpoint_mode_t, roll, stab_mode_t, 3)
+FIELD(setpoint_mode_t, pitch, stab_mode_t, 4)
+FIELD(setpoint_mode_t, yaw, stab_mode_t, 5)
+FIELD(setpoint_mode_t, quat, stab_mode_t, 6)
+VALUE(modeDisable, 0)
+VALUE(modeAbs, 1)
+VALUE(modeVelocity, 2)
 SIZE(measurement_t, 48)
 VALUE(StateEstimatorTypeAutoSelect, 0)
 VALUE(StateEstimatorTypeOutOfTree, 3)

@@ -57,6 +57,23 @@ class GyroZero(ctypes.Structure):
     )
 
 
+class Setpoint(ctypes.Structure):
+    """setpoint_t; modes 0 disable, 1 absolute, 2 velocity."""
+
+    _fields_ = (
+        ("timestamp", ctypes.c_uint32),
+        ("attitude_time", ctypes.c_uint32),
+        *((name, ctypes.c_float) for name in ("roll", "pitch", "yaw")),
+        ("attitudeRate", ctypes.c_float * 4),
+        *((name, ctypes.c_float) for name in ("qx", "qy", "qz", "qw", "thrust")),
+        ("position_time", ctypes.c_uint32),
+        *((name, ctypes.c_float) for name in ("x", "y", "z")),
+        ("derivatives", ctypes.c_float * 12),
+        ("velocity_body", ctypes.c_bool),
+        *((f"{name}_mode", ctypes.c_uint8) for name in ("x", "y", "z", "roll", "pitch", "yaw", "quat")),
+    )
+
+
 class Timer(ctypes.Structure):
     """TIM_TypeDef, its registers in their order."""
 
@@ -82,6 +99,7 @@ def build_app(folder: Path) -> Path:
     library = folder / "app.so"
     flags = (
         "-std=gnu11",
+        "-fshort-enums",
         "-O1",
         "-Wall",
         "-Werror",
@@ -135,6 +153,7 @@ class App:
         self.after_watchdog = ctypes.c_int32.in_dll(c, "stub_after_watchdog")
         self.after_assert = ctypes.c_int32.in_dll(c, "stub_after_assert")
         self.self_test_passed = ctypes.c_int32.in_dll(c, "stub_self_test_passed")
+        self.ratios = (ctypes.c_int32 * 4).in_dll(c, "stub_ratios")
         self.supervisor = Supervisor.in_dll(c, "floaty_supervisor")
         self.timers = [Timer.in_dll(c, name) for name in ("stub_tim3", "stub_tim5")]
         self.pins = [Pins.in_dll(c, name) for name in ("stub_gpio_a", "stub_gpio_b")]
@@ -143,6 +162,7 @@ class App:
         self._state = ctypes.create_string_buffer(256)
         self._control = ctypes.create_string_buffer(256)
         self._nothing = ctypes.create_string_buffer(1024)
+        self.setpoint = Setpoint()  # of the stock commander
         self.params = {name: i for i, name in _names(c.stub_param_name)}
         self.logs = {name: i for i, name in _names(c.stub_log_name)}
 
@@ -166,7 +186,9 @@ class App:
             return
         self.c.estimatorOutOfTree(self._state, step)
         if controlled:
-            self.c.controllerOutOfTree(self._control, self._nothing, self._nothing, self._state, step)
+            self.c.controllerOutOfTree(
+                self._control, ctypes.byref(self.setpoint), self._nothing, self._state, step
+            )
 
     def radio(self, data: bytes, port: int = LOCALISATION, channel: int = GENERIC) -> None:
         """Receive a packet."""

@@ -26,9 +26,16 @@ from firmware_py.drivers.imu import GyroZero as PythonGyroZero
 from firmware_py.export.crazyflie import write_app
 from firmware_py.export.errors import ExportError
 from firmware_py.firmware import Firmware
+from firmware_py.geometry import (
+    Quaternion,
+    Vector,
+    from_euler_zyx,
+    in_goal_frame,
+    yaw_quaternion,
+)
 from firmware_py.wire import WireError, crtp, telemetry
 from hil.config import load_config
-from support.crazyflie_app import LOCALISATION, STUBS, App, GyroZero, Pose, Supervisor, build_app
+from support.crazyflie_app import LOCALISATION, STUBS, App, GyroZero, Pose, Setpoint, Supervisor, build_app
 
 ARM = "arm-none-eabi-gcc"
 ARM_FLAGS = (  # of the Crazyflie firmware
@@ -361,7 +368,7 @@ def test_a_self_test_that_does_not_pass_is_told_once(app: App) -> None:
     app.c.stub_run_app(48)
     assert app.console() == ""
     app.c.stub_run_app(200)
-    assert app.console() == "FLOATY: self-test not passed: flaps stay at hover until a reboot\n"
+    assert app.console() == "FLOATY: self-test has not passed: flaps stay at hover, see above\n"
 
 
 def test_servos_pulse_from_the_first_hook_and_take_the_trims_of_the_eeprom(app: App) -> None:
@@ -455,6 +462,187 @@ def test_a_full_pose_queue_keeps_the_newest_poses(app: App) -> None:
     assert app.state()["stateEstimate.x"] == pytest.approx(0.19, abs=0.01)
 
 
+# Absolute poses: the stock commander says where to fly
+
+
+def commanded(app: App, **fields: float) -> None:
+    """Let the stock commander command this."""
+    app.setpoint = Setpoint(**fields)
+
+
+def position(x: float, y: float, z: float, yaw_deg: float = 0.0) -> dict[str, float]:
+    """A set-point of the high-level commander."""
+    return {"x": x, "y": y, "z": z, "yaw": yaw_deg, "x_mode": 1, "y_mode": 1, "z_mode": 1, "yaw_mode": 1}
+
+
+def absolute(app: App, first: int, steps: int, p_WB: Vector, q_WB: Quaternion) -> None:
+    data = crtp.encode_ext_pose(p_WB, q_WB, 0)[1:]
+    for step in range(first, first + steps):
+        if step % 20 == 1:
+            app.radio(data)
+        app.step(step)
+
+
+def estimate(app: App) -> list[float]:
+    """Position, velocity, attitude in G."""
+    return np.frombuffer(app.estimator(), Estimator.dtype)[0]["now"][:9].tolist()  # type: ignore[no-any-return]
+
+
+P_WB, Q_WB = (1.0, 2.0, 3.0), from_euler_zyx(0.1, -0.2, 1.3)
+
+
+@pytest.mark.parametrize("how", ["attitude", "quaternion"])
+def test_absolute_poses_and_a_set_point_fly_as_corrections_to_there(
+    app: App, library: Path, tmp_path: Path, how: str
+) -> None:
+    rng = np.random.default_rng(5)
+    twin = App(library, tmp_path / "twin.so")
+    app.boot({"extPose.absolute": 1})
+    twin.boot()
+    p, yaw = np.array(P_WB), 1.3
+    for step in range(1, 2000):
+        if step % 10 == 1:  # the high-level commander's rate
+            goal = (1.0 + 0.1 * math.sin(0.002 * step), 2.0, 3.05)
+            goal_yaw = 1.3 + 2.0 * math.sin(0.001 * step)  # through half a turn
+            commanded(app, **position(*goal, math.degrees(goal_yaw)))
+            if how == "quaternion":  # a full-state set-point
+                app.setpoint.yaw_mode, app.setpoint.quat_mode, app.setpoint.yaw = 0, 1, 0.0
+                s = app.setpoint
+                s.qw, s.qx, s.qy, s.qz = yaw_quaternion(goal_yaw)
+        if step % 20 == 5:
+            p += rng.normal(0, 0.002, 3)
+            p_WB = (p[0].item(), p[1].item(), p[2].item())
+            yaw += rng.normal(0, 0.01)
+            q_WB = from_euler_zyx(0.1, -0.05, yaw)
+            app.radio(crtp.encode_ext_pose(p_WB, q_WB, 40_000)[1:])
+            twin.radio(crtp.encode_ext_pose(*in_goal_frame(p_WB, q_WB, goal, goal_yaw), 40_000)[1:])
+        for board in (app, twin):
+            board.step(step)
+        assert estimate(app) == pytest.approx(estimate(twin), abs=1e-4), step
+    assert app.supervisor.state == reference.State.FLYING
+    assert max(map(abs, estimate(app))) > 0.1
+
+
+def test_the_firmwares_commander_is_told_the_state_in_the_world(app: App) -> None:
+    app.boot({"extPose.absolute": 1})
+    commanded(app, **position(0.9, 1.95, 2.97, 170.0))
+    q_WB = from_euler_zyx(0.02, -0.01, 3.2)
+    absolute(app, 1, 1000, P_WB, q_WB)
+    state = app.state()
+    assert [state[f"stateEstimate.{name}"] for name in "xyz"] == pytest.approx(P_WB, abs=0.01)
+    told = np.array([state[f"stateEstimate.q{name}"] for name in "wxyz"])
+    assert abs(told @ np.array(q_WB)) == pytest.approx(1.0, abs=1e-3)
+    assert state["stateEstimate.yaw"] == pytest.approx(math.degrees(3.2 - 2 * math.pi), abs=2.0)
+
+
+def test_velocities_are_told_in_the_world(app: App) -> None:
+    app.boot({"extPose.absolute": 1})
+    commanded(app, **position(0.0, 0.0, 1.0, 90.0))
+    for step in range(1, 1000):
+        if step % 20 == 1:
+            p_WB = (-0.5 + 0.3e-3 * step, 0.0, 1.0)
+            app.radio(crtp.encode_ext_pose(p_WB, yaw_quaternion(math.pi / 2), 0)[1:])
+        app.step(step)
+    state = app.state()
+    assert state["stateEstimate.vx"] == pytest.approx(0.3, abs=0.05)
+    assert abs(state["stateEstimate.vy"]) < 0.05
+
+
+def test_until_something_is_commanded_floaty_holds_where_it_is(app: App) -> None:
+    app.boot({"extPose.absolute": 1})
+    absolute(app, 1, 1000, P_WB, yaw_quaternion(1.3))
+    assert max(map(abs, estimate(app))) < 1e-3
+    assert app.supervisor.state == reference.State.FLYING
+
+
+def test_a_yaw_that_is_no_number_leaves_the_goals_yaw(app: App) -> None:
+    app.boot({"extPose.absolute": 1})
+    commanded(app, **position(1.0, 2.0, 2.9, 40.0))
+    absolute(app, 1, 300, P_WB, yaw_quaternion(1.0))
+    before = estimate(app)
+    commanded(app, **position(1.0, 2.0, 2.9, math.nan))
+    absolute(app, 300, 300, P_WB, yaw_quaternion(1.0))
+    assert estimate(app)[8] == pytest.approx(before[8], abs=0.02)
+    assert app.log("kalman.invalid") == 0
+
+
+def test_a_commander_that_stops_leaves_the_goal_where_it_was(app: App) -> None:
+    app.boot({"extPose.absolute": 1})
+    commanded(app, **position(1.0, 2.0, 2.9, 0.0))
+    absolute(app, 1, 600, P_WB, Q_WB)
+    commanded(app)
+    absolute(app, 600, 400, P_WB, Q_WB)
+    assert estimate(app)[2] == pytest.approx(0.1, abs=5e-3)
+    assert "not followed" not in app.console()
+
+
+def test_corrections_forget_the_goal_of_absolute_poses(app: App) -> None:
+    app.boot({"extPose.absolute": 1})
+    commanded(app, **position(1.0, 2.0, 2.9, 0.0))
+    absolute(app, 1, 600, P_WB, Q_WB)
+    app.set("extPose.absolute", 0)
+    commanded(app)
+    fly_on(app, 600, 400)
+    assert app.state()["stateEstimate.z"] == pytest.approx(0.05, abs=5e-3)
+    app.set("extPose.absolute", 1)
+    absolute(app, 1000, 400, P_WB, Q_WB)
+    assert estimate(app)[2] == pytest.approx(0.0, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"roll_mode": 1, "pitch_mode": 1, "yaw_mode": 2, "thrust": 30000.0},  # port 3
+        {"x_mode": 2, "y_mode": 2, "z_mode": 1, "yaw_mode": 2, "z": 1.0},  # hover
+        {"x_mode": 1, "y_mode": 1, "z_mode": 1, "x": math.nan},
+    ],
+)
+def test_a_set_point_without_a_position_is_refused_in_one_line(app: App, other: dict[str, float]) -> None:
+    app.boot({"extPose.absolute": 1})
+    commanded(app, **position(1.0, 2.0, 2.9, 0.0))
+    absolute(app, 1, 600, P_WB, Q_WB)
+    for first in (600, 620, 640):
+        commanded(app, **other)
+        absolute(app, first, 20, P_WB, Q_WB)
+        app.c.stub_run_app(1)
+    assert app.console().count("set-point not followed: only positions are\n") == 1
+    assert estimate(app)[2] == pytest.approx(0.1, abs=5e-3)
+    commanded(app)
+    absolute(app, 660, 20, P_WB, Q_WB)
+    app.c.stub_run_app(1)
+    commanded(app, **other)
+    absolute(app, 680, 20, P_WB, Q_WB)
+    app.c.stub_run_app(1)
+    assert app.console().count("set-point not followed: only positions are\n") == 2
+
+
+def test_with_corrections_a_commanded_position_is_refused_in_one_line(app: App) -> None:
+    flying(app)
+    before = app.state()
+    commanded(app, **position(1.0, 2.0, 3.0))
+    for first in (1200, 1300):
+        fly_on(app, first, 100)
+        app.c.stub_run_app(1)
+    assert app.console().count("set-point not followed: poses are corrections, see extPose.absolute\n") == 1
+    assert app.state() == pytest.approx(before, abs=1e-2)
+
+
+def test_the_firmware_sees_a_flight_only_while_its_commander_leads_one(app: App) -> None:
+    flying(app)
+    assert list(app.ratios) == [0, 0, 0, 0]
+    app.set("extPose.absolute", 1)
+    absolute(app, 1200, 100, P_WB, Q_WB)
+    assert app.supervisor.state == reference.State.FLYING
+    assert list(app.ratios) == [0, 0, 0, 1]  # of 65535: the motors' PWM has 255 steps
+    app.ratios[3] = 0  # the firmware's own, after each step of the controller
+    for step in range(1300, 1900):
+        app.step(step)
+    app.ratios[3] = 0
+    app.step(1900)
+    assert app.supervisor.cause == reference.Cause.SILENCE
+    assert list(app.ratios) == [0, 0, 0, 0]
+
+
 RENAMED = {
     "floaty.stop": "stabilizer.stop", "floaty.armed": None, "floaty.reset": "FloatyKalm.resetKalman",
     "FloatyKalm.maxPos": "kalman.maxPos", "FloatyKalm.maxVel": "kalman.maxVel",
@@ -467,7 +655,7 @@ def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App
     for name, index in app.params.items():
         twin = laboratory.parameters.get(RENAMED.get(name, name) or "")
         if twin is None:
-            assert name == "floaty.armed"
+            assert name in ("floaty.armed", "extPose.absolute")
             continue
         assert app.c.stub_param_type(index) == twin.scalar.parameter_number, name
         assert app.get(name) == twin.read(), name

@@ -30,6 +30,7 @@
 #include "debug.h"
 #include "estimator.h"
 #include "log.h"
+#include "motors.h"
 #include "platform.h"
 #include "pm.h"
 #include "supervisor.h"
@@ -49,6 +50,7 @@
 #define MODE_HOVER 0
 #define MODE_MANUAL 2
 #define DEGREES 57.2957795f /* per radian */
+#define TURN 6.28318531f
 
 FloatyParameters floaty_parameters;
 FloatyInput floaty_input;
@@ -57,10 +59,13 @@ FloatyControl floaty_control;
 FloatySupervisor floaty_supervisor;
 FloatyObserved floaty_observed;
 FloatyRequests floaty_requests;
+uint8_t floaty_absolute;
 
 static FloatyGyroZero gyro_zero;
 static logVarId_t gyro_raw[3];
 static bool gyro_found;
+static FloatyGoal goal;  /* of absolute poses */
+static FloatyGoal frame; /* that the estimate is in: the last pose's goal; W itself for corrections */
 static volatile TickType_t controlled_tick;
 
 /* In ordinary memory: the macros of static_mem.h would put it into CCM, which is full. */
@@ -116,10 +121,17 @@ static bool asked(volatile bool *request) {
   return was;
 }
 
-static void file_pose(const FloatyPose *pose, stabilizerStep_t step) {
+static void file_pose(FloatyPose *pose, stabilizerStep_t step) {
   /* Negative only when usec.reset has been written since the pose came: then as if it came now. */
   const int64_t since_us = (int64_t)usecTimestamp() - pose->arrival_us;
   const int64_t waited_us = since_us > 0 ? since_us : 0;
+  if (floaty_absolute) {
+    floaty_goal_see(&goal, pose);
+    frame = goal;
+  } else {
+    memset(&goal, 0, sizeof goal); /* not known */
+    memset(&frame, 0, sizeof frame);
+  }
   for (int i = 0; i < 3; i++) {
     floaty_input.pose_position[i] = pose->position[i];
   }
@@ -161,24 +173,28 @@ static void take_measurements(stabilizerStep_t step) {
   }
 }
 
-/* For the firmware's log variables, which are in degrees and whose pitch is positive with the nose up. */
+/* For the firmware's commander and its log variables: in W when poses are, in degrees, pitch positive with the nose up. */
 static void tell_state(state_t *state, stabilizerStep_t step) {
   const float *now = floaty_estimator.now;
+  const float yaw = remainderf(now[8] + frame.yaw, TURN);
   const float cr = cosf(0.5f * now[6]), sr = sinf(0.5f * now[6]);
   const float cp = cosf(0.5f * now[7]), sp = sinf(0.5f * now[7]);
-  const float cy = cosf(0.5f * now[8]), sy = sinf(0.5f * now[8]);
+  const float cy = cosf(0.5f * yaw), sy = sinf(0.5f * yaw);
+  float p[3], v[3];
+  floaty_goal_turn(&frame, now, p);
+  floaty_goal_turn(&frame, now + FLOATY_VELOCITY, v);
   state->position.timestamp = step;
-  state->position.x = now[0];
-  state->position.y = now[1];
-  state->position.z = now[2];
+  state->position.x = frame.position[0] + p[0];
+  state->position.y = frame.position[1] + p[1];
+  state->position.z = frame.position[2] + p[2];
   state->velocity.timestamp = step;
-  state->velocity.x = now[3];
-  state->velocity.y = now[4];
-  state->velocity.z = now[5];
+  state->velocity.x = v[0];
+  state->velocity.y = v[1];
+  state->velocity.z = v[2];
   state->attitude.timestamp = step;
   state->attitude.roll = DEGREES * now[6];
   state->attitude.pitch = -DEGREES * now[7];
-  state->attitude.yaw = DEGREES * now[8];
+  state->attitude.yaw = DEGREES * yaw;
   state->attitudeQuaternion.w = cr * cp * cy + sr * sp * sy;
   state->attitudeQuaternion.x = sr * cp * cy - cr * sp * sy;
   state->attitudeQuaternion.y = cr * sp * cy + sr * cp * sy;
@@ -232,6 +248,11 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (asked(&floaty_requests.reset)) {
     floaty_core_reset(&floaty_parameters, &floaty_estimator);
   }
+  if (floaty_absolute && floaty_supervisor.state == FLOATY_FLYING) {
+    /* Less than one step of the motors' PWM: no pulse. But the firmware's supervisor, which looks at this next, sees
+     * that the robot flies; else it would disarm and stop its commander 30 s after arming. */
+    motorsSetRatio(MOTOR_M4, 1);
+  }
   take_measurements(stabilizerStep);
   if (stabilizerStep % STEPS != ESTIMATOR_PHASE) {
     return;
@@ -270,11 +291,14 @@ bool controllerOutOfTreeTest(void) {
 void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const sensorData_t *sensors,
                          const state_t *state, const stabilizerStep_t stabilizerStep) {
   const int64_t now = loop_us();
-  (void)setpoint;
   (void)sensors;
   (void)state;
   memset(control, 0, sizeof *control); /* no motors */
   serve_requests(now);
+  floaty_observed.setpoint = floaty_setpoint_kind(setpoint);
+  if (floaty_observed.setpoint == FLOATY_SETPOINT_POSITION) {
+    floaty_goal_move(&goal, setpoint);
+  }
   if (stabilizerStep % STEPS == CONTROL_PHASE) {
     floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
     if (floaty_input.mode == MODE_MANUAL && !crtpIsConnected()) {

@@ -5,6 +5,7 @@
 #include <stdint.h>
 
 #include "floaty_core.h"
+#include "floaty_goal.h"
 #include "floaty_poses.h"
 #include "floaty_supervisor.h"
 
@@ -17,6 +18,7 @@ typedef struct {
   uint32_t malformed;     /* packets on the pose channels that no one could read */
   uint32_t overflows;     /* poses that a newer one drove out of the full queue */
   uint32_t stale_hovers;  /* times no controller step came and the servos were put to hover */
+  uint8_t setpoint;       /* FloatySetpoint: what the stock commander commands */
 } FloatyObserved;
 
 extern FloatyParameters floaty_parameters;
@@ -25,6 +27,7 @@ extern FloatyEstimator floaty_estimator;
 extern FloatyControl floaty_control;
 extern FloatySupervisor floaty_supervisor;
 extern FloatyObserved floaty_observed;
+extern uint8_t floaty_absolute; /* 1: poses are in W, the commander says where to fly; 0: they are corrections, in G */
 
 /* What other tasks ask of the stabilizer task, which alone touches the supervisor's instants and the estimator. */
 typedef struct {

@@ -34,10 +34,10 @@
 #define STALE_MS 50 /* without a controller step: servos to hover */
 #define LOOK_MS 20  /* how often the task looks at that */
 #define SELF_TEST_MS 100
-#define SELF_TEST_LOOKS 50 /* 5 s; the self-test ends 1.2 s after a reset, later with decks */
+#define SELF_TEST_LOOKS 50 /* 5 s; the self-test ends 2.4 s after a reset, later with decks */
 
 static bool restarted; /* by the watchdog or a failed assert */
-static StackType_t stack[CONFIG_APP_STACKSIZE]; /* not in CCM, as the firmware's macros would have it: CCM is full */
+static StackType_t stack[CONFIG_APP_STACKSIZE]; /* in ordinary memory: CCM is full */
 static StaticTask_t task;
 
 static void receive_pose(const uint8_t *data, uint32_t length) {
@@ -75,6 +75,17 @@ static void announce_state(void) {
   }
 }
 
+static void announce_setpoint(void) {
+  static bool refused;
+  const uint8_t setpoint = floaty_observed.setpoint;
+  const bool refuse = setpoint == FLOATY_SETPOINT_OTHER || (setpoint == FLOATY_SETPOINT_POSITION && !floaty_absolute);
+  if (refuse && !refused) {
+    DEBUG_PRINT("set-point not followed: %s\n",
+                floaty_absolute ? "only positions are" : "poses are corrections, see extPose.absolute");
+  }
+  refused = refuse;
+}
+
 /* A loop that stands still, or a controller that is not Floaty's. */
 static void watch_control(void) {
   static bool stale;
@@ -96,7 +107,7 @@ static void wait_for_self_test(void) {
   const paramVarId_t passed = paramGetVarId("system", "selftestPassed");
   for (int looks = 1; paramGetInt(passed) != 1; looks++) {
     if (looks == SELF_TEST_LOOKS) {
-      DEBUG_PRINT("self-test not passed: flaps stay at hover until a reboot\n");
+      DEBUG_PRINT("self-test has not passed: flaps stay at hover, see above\n");
     }
     vTaskDelay(M2T(SELF_TEST_MS));
   }
@@ -121,6 +132,7 @@ static void app_task(void *unused) {
     }
     watch_control();
     announce_state();
+    announce_setpoint();
   }
 }
 
