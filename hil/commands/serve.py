@@ -21,7 +21,7 @@ from hil.commands.options import (
 from hil.errors import LabError
 
 if TYPE_CHECKING:
-    pass
+    from hil.servers.motive import Up
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
@@ -61,6 +61,10 @@ BOARDS_MAX = 10
     "--natnet-port", type=click.IntRange(0, 65534), default=MOTIVE_PORT, show_default=True, metavar="PORT",
     help="Motive's command port; frames go to the next one. 0: any.",
 )  # fmt: skip
+@click.option(
+    "--up", type=click.Choice(["y", "z"]), default="y", show_default=True,
+    help="Which of the axes that Motive streams points up.",
+)  # fmt: skip
 @click.option("--multicast", is_flag=True, help="Motive sends frames to its group instead of to each client.")
 @fault_option
 @seed_option
@@ -77,6 +81,7 @@ def serve(
     motive: bool,
     natnet: str,
     natnet_port: int,
+    up: Up,
     multicast: bool,
     fault_texts: tuple[str, ...],
     seed: int,
@@ -86,8 +91,8 @@ def serve(
     """Serve robots in virtual tunnels, in real time, until Ctrl-C.
 
     Without --udp, --radio or --mavlink the first board is on UDP. A robot is held until it flies: corrections come from
-    clients or, with --station, from within. Motive calls the bodies floaty, floaty2, ...; its y axis points up. It tracks
-    them by eight markers each, which --set markers.enabled=false takes off: poses have noise of their own then.
+    clients or, with --station, from within. Motive calls the bodies floaty, floaty2, .... It tracks them
+    by eight markers each, which --set markers.enabled=false takes off: poses have noise of their own then.
 
     While it runs, a line like push.y=2 or mocap.dropout:0.5 lets that fault act at once; help shows what else can be typed.
     """
@@ -124,8 +129,9 @@ def serve(
         if ends:
             say(f"mavlink {' '.join(server.ends.serve_mavlink(ends))}")
         if motive:
-            port = server.ends.serve_motive(Streaming(natnet_port, NATNET[natnet], multicast)).port
-            say(f"motive optitrack:127.0.0.1:{port}{',multicast' if multicast else ''}")
+            port = server.ends.serve_motive(Streaming(natnet_port, NATNET[natnet], multicast, up)).port
+            options = (",multicast" if multicast else "") + (",z-up" if up == "z" else "")
+            say(f"motive optitrack:127.0.0.1:{port}{options}")
         if station:
             for robot in server.ends.robots:
                 robot.fly()

@@ -3,13 +3,15 @@
 It answers connect, model definitions, echo, keep-alive and the bitstream request on its command port, and sends every
 frame either to the multicast group or to each client: to the data port of its computer and, once it keeps alive, to
 where it speaks from, because clients differ in where they listen. Nothing here blocks: the board server calls it.
-What it cannot read is counted. Its clock counts from its own start, as that of another computer would; its axes are y up.
+What it cannot read is counted. Its clock counts from its own start, as that of another computer would.
 """
 
 import socket
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Literal
 
 from firmware_py.geometry import Quaternion, Vector
 from ground_station.clock import clock_us
@@ -54,6 +56,11 @@ _ACCEPTED, _REFUSED = (
 )
 
 Address = tuple[str, int]
+Up = Literal["y", "z"]
+_TURNS: dict[Up, Callable[[float, float, float], Vector]] = {  # from W to the axes with this one up
+    "y": lambda x, y, z: (x, z, -y),
+    "z": lambda x, y, z: (x, y, z),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +70,7 @@ class Streaming:
     port: int  # of commands, 0: any; frames go to the next one, which clients are told
     version: Version
     multicast: bool  # to the group, else to each client
+    up: Up = "y"  # the axis; z: those of the world
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,19 +81,11 @@ class _Client:
     keeps_alive: bool  # then it takes frames where it speaks from; others would take them for answers
 
 
-def with_y_up(p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
-    """A pose in axes with y up, for world and body alike: x_M = x, y_M = z, z_M = -y."""
+def in_axes(up: Up, p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]:
+    """A pose as Motive streams it, in its axes for world and body alike."""
     w, a, b, c = q_WB
-    return _turned(*p_WB), (w, *_turned(a, b, c))
-
-
-def _turned(x: float, y: float, z: float) -> Vector:
-    return (x, z, -y)
-
-
-def _all_turned(points: Points) -> list[Vector]:
-    """Points (N, 3) in axes with y up."""
-    return [_turned(x, y, z) for x, y, z in points.tolist()]
+    turn = _TURNS[up]
+    return turn(*p_WB), (w, *turn(a, b, c))
 
 
 class VirtualMotive:
@@ -97,9 +97,10 @@ class VirtualMotive:
         self.malformed = 0
         self._version = settings.version
         self._multicast = settings.multicast
+        self._up = settings.up
         described = tuple(
             MarkerDescription(place, _PASSIVE, f"Marker{number}")
-            for number, place in enumerate(_all_turned(markers), 1)
+            for number, place in enumerate(self._all_turned(markers), 1)
         )
         self._models = ModelDefinition(
             tuple(
@@ -134,12 +135,12 @@ class VirtualMotive:
 
     def take(self, body: int, frame: MocapFrame, now_us: int, sighting: Sighting | None = None) -> None:
         """Take what was seen of a body, of another clock, on which it is `now_us`; the last body completes a frame."""
-        p, q = with_y_up(frame.p_WB, frame.q_WB)
+        p, q = in_axes(self._up, frame.p_WB, frame.q_WB)
         error = 0.0 if sighting is None else sighting.error
         self._seen.append(BodyPose(body, p, q, error, frame.valid))
         if sighting is not None:
-            self._unlabelled += _all_turned(sighting.unlabelled)
-            self._labelled += _labelled(body, sighting) if frame.valid else ()
+            self._unlabelled += self._all_turned(sighting.unlabelled)
+            self._labelled += self._labels(body, sighting) if frame.valid else ()
         if len(self._seen) < len(self._models.bodies):
             return
         bodies, labelled, unlabelled = tuple(self._seen), tuple(self._labelled), tuple(self._unlabelled)
@@ -247,11 +248,16 @@ class VirtualMotive:
                 return _ACCEPTED
         return _REFUSED
 
+    def _all_turned(self, points: Points) -> list[Vector]:
+        """Points (N, 3) of W or B in Motive's axes."""
+        turn = _TURNS[self._up]
+        return [turn(x, y, z) for x, y, z in points.tolist()]
 
-def _labelled(body: int, sighting: Sighting) -> list[LabelledMarker]:
-    """All the markers of a body that is tracked: those that nobody sees stand where the body has them."""
-    rows = zip(_all_turned(sighting.points), sighting.seen.tolist(), sighting.residuals.tolist(), strict=True)
-    return [
-        LabelledMarker(body << 16 | number, p, DIAMETER, _SEEN if seen else _UNSEEN, residual)
-        for number, (p, seen, residual) in enumerate(rows, 1)
-    ]
+    def _labels(self, body: int, sighting: Sighting) -> list[LabelledMarker]:
+        """All the markers of a body that is tracked: those that nobody sees stand where the body has them."""
+        points, seen = self._all_turned(sighting.points), sighting.seen.tolist()
+        rows = zip(points, seen, sighting.residuals.tolist(), strict=True)
+        return [
+            LabelledMarker(body << 16 | number, p, DIAMETER, _SEEN if seen else _UNSEEN, residual)
+            for number, (p, seen, residual) in enumerate(rows, 1)
+        ]

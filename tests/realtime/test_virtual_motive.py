@@ -15,6 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from ground_station.config import Axes, CaptureConfig
+from ground_station.sources.alignment import Alignment
 from ground_station.sources.natnet import (
     BodyDescription,
     BodyPose,
@@ -28,8 +30,9 @@ from ground_station.sources.natnet import (
     decode,
     packet,
 )
+from ground_station.sources.natnet_stream import NatnetStream
 from hil.errors import LabError
-from hil.servers.motive import MAX_CLIENTS, Streaming, VirtualMotive, with_y_up
+from hil.servers.motive import MAX_CLIENTS, Streaming, Up, VirtualMotive, in_axes
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
 from support.motive_bench import (
     FROM_MOTIVE,
@@ -86,10 +89,14 @@ def test_the_server_info_arrives_as_it_was_sent() -> None:
 def test_motives_axes_have_y_up() -> None:
     """Against rotation matrices of scipy: nose x, left y, up z become nose x, up y, right z."""
     q = Rotation.from_euler("zyx", [0.3, -0.5, 0.9])
-    p_M, (w, x, y, z) = with_y_up((1.0, 2.0, 3.0), tuple(q.as_quat()[[3, 0, 1, 2]]))
+    p_M, (w, x, y, z) = in_axes("y", (1.0, 2.0, 3.0), tuple(q.as_quat()[[3, 0, 1, 2]]))
     assert p_M == (1.0, 3.0, -2.0)
     expected = FROM_MOTIVE.T @ q.as_matrix() @ FROM_MOTIVE
     assert Rotation.from_quat([x, y, z, w]).as_matrix() == pytest.approx(expected)
+
+
+def test_with_z_up_motives_axes_are_those_of_the_world() -> None:
+    assert in_axes("z", (1.0, 2.0, 3.0), (0.5, 0.1, 0.7, 0.5)) == ((1.0, 2.0, 3.0), (0.5, 0.1, 0.7, 0.5))
 
 
 @pytest.fixture
@@ -153,6 +160,44 @@ def test_every_form_of_connect_is_answered_and_frames_follow(
     frame = decode(client.hear(), (4, 1))
     assert frame.number == 2
     assert frame.bodies[0].p == pytest.approx(FROM_MOTIVE.T @ seen(2).p_WB, abs=1e-6)
+
+
+@pytest.mark.parametrize(("up", "axes"), [("y", None), ("y", "y-up"), ("z", "z-up")])
+def test_the_station_sees_the_world_whichever_axis_of_motive_points_up(up: Up, axes: Axes | None) -> None:
+    lab = MotiveBench(up=up)
+    client = Client(lab)
+    stream = NatnetStream("floaty", Alignment(CaptureConfig(axes=axes)))
+    for request in (MessageId.CONNECT, MessageId.REQUEST_MODELDEF, MessageId.KEEPALIVE):
+        client.say(request)
+        if request != MessageId.KEEPALIVE:
+            stream.on_packet(client.hear(), 0)
+    for number in (1, 2, 3):
+        lab.expose()
+        found = stream.on_packet(client.hear(), 1_000_000)
+        assert found is not None
+        assert found.p_WB == pytest.approx(seen(number).p_WB, abs=1e-6)
+        turned = Rotation.from_quat(found.q_WB, scalar_first=True).inv()
+        assert (turned * Rotation.from_quat(seen(number).q_WB, scalar_first=True)).magnitude() < 1e-6
+    client.close()
+    lab.motive.close()
+
+
+def test_with_z_up_markers_and_model_are_in_the_world_s_axes() -> None:
+    lab = MotiveBench(markers=True, up="z")
+    client = Client(lab)
+    client.connect()
+    client.say(MessageId.REQUEST_MODELDEF)
+    (body,) = decode(client.hear(), (4, 1)).bodies
+    assert np.array([marker.p for marker in body.markers]) == pytest.approx(PLACES, abs=1e-6)
+    lab.expose()
+    frame = decode(client.hear(), (4, 1))
+    assert np.array([marker.p for marker in frame.labelled]) == pytest.approx(sighted(1).points, abs=1e-6)
+    lab.expose()
+    frame = decode(client.hear(), (4, 1))
+    assert np.array(frame.unlabelled) == pytest.approx(sighted(2).ghosts, abs=1e-6)
+    assert len(frame.unlabelled) == 2
+    client.close()
+    lab.motive.close()
 
 
 def test_a_frame_is_stamped_with_its_exposure(lab: MotiveBench, client: Client) -> None:

@@ -13,7 +13,7 @@ import pytest
 from ground_station.mocap import MocapFrame
 from hil.devices.markers import NO_POINTS, Sighting, marker_places
 from hil.servers.dongle_server import Readers
-from hil.servers.motive import Streaming, VirtualMotive
+from hil.servers.motive import Streaming, Up, VirtualMotive
 from hil.world.config import PlantConfig
 
 FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
@@ -44,11 +44,15 @@ class MotiveBench:
     """A Motive that sees one body move, without a plant."""
 
     def __init__(
-        self, version: tuple[int, int] = (4, 1), multicast: bool = False, markers: bool = False
+        self,
+        version: tuple[int, int] = (4, 1),
+        multicast: bool = False,
+        markers: bool = False,
+        up: Up = "y",
     ) -> None:
         self.readers: Readers = {}
         places = PLACES if markers else NO_POINTS
-        self.motive = VirtualMotive(Streaming(0, version, multicast), {1: "floaty"}, self.readers, places)
+        self.motive = VirtualMotive(Streaming(0, version, multicast, up), {1: "floaty"}, self.readers, places)
         self.number = 0
         self.markers = markers
 
