@@ -21,6 +21,9 @@ from hil.servers.dongle_server import HOST
 Received = Callable[[int, bytes], object]  # (now_us, data)
 
 READ_SIZE = 4096
+WHOLE_SIZE = (
+    1 << 18
+)  # more than a client's socket holds back on the loopback interface in one turn of the server
 UDP_PORT = 14550  # where ground stations listen
 TCP_PORT = 5760  # where vehicles listen
 PTYS = "/dev/pts/"
@@ -164,39 +167,37 @@ class UdpEnd:
 
 
 class TcpEnd:
-    """Listens for one client at a time; another one waits until the first has left."""
+    """Listens for any number of clients: all hear the board, and it hears them all."""
 
     def __init__(self, host: str, port: int, readers: Readers, received: Received) -> None:
         self._listener = socket.create_server((host, port))
         self.master = f"tcp:{host}:{self._listener.getsockname()[1]}"
         self._readers = readers
         self._received = received
-        self._client: socket.socket | None = None
+        self._clients: list[socket.socket] = []
         readers[self._listener] = self._accept
 
     def _accept(self, now_us: int) -> None:
         client, _ = self._listener.accept()
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._client = client
-        self._readers[client] = self._read
-        del self._readers[self._listener]
+        self._clients.append(client)
+        self._readers[client] = partial(self._read, client)
 
     def send(self, data: bytes) -> None:
-        """Pass bytes on; what a slow client does not take is lost."""
-        if self._client is None:
-            return
-        try:
-            self._client.send(data)
-        except BlockingIOError:
-            pass
-        except OSError:
-            self._leave()
+        """Pass bytes on; what a slow client does not take is lost for it."""
+        for client in self._clients.copy():
+            try:
+                client.send(data)
+            except BlockingIOError:
+                pass
+            except OSError:
+                self._leave(client)
 
-    def _read(self, now_us: int) -> None:
-        assert self._client is not None
+    def _read(self, client: socket.socket, now_us: int) -> None:
+        """Take all that a client has sent, so that no frame of another's comes into the middle of one of its own."""
         try:
-            data = self._client.recv(READ_SIZE)
+            data = client.recv(WHOLE_SIZE)
         except BlockingIOError:
             return
         except OSError:
@@ -204,19 +205,16 @@ class TcpEnd:
         if data:
             self._received(now_us, data)
         else:
-            self._leave()
+            self._leave(client)
 
-    def _leave(self) -> None:
-        """Wait for the next client."""
-        assert self._client is not None
-        del self._readers[self._client]
-        self._client.close()
-        self._client = None
-        self._readers[self._listener] = self._accept
+    def _leave(self, client: socket.socket) -> None:
+        del self._readers[client]
+        self._clients.remove(client)
+        client.close()
 
     def close(self) -> None:
-        """Stop listening; the client notices."""
-        if self._client is not None:
-            self._leave()
+        """Stop listening; the clients notice."""
+        for client in self._clients.copy():
+            self._leave(client)
         del self._readers[self._listener]
         self._listener.close()

@@ -104,6 +104,15 @@ def test_a_message_comes_as_often_as_it_was_asked_for(client: Client) -> None:
     assert client.command(set_interval, number, 0) == dialect.MAV_RESULT_ACCEPTED
 
 
+def test_two_tcp_clients_hear_the_board_and_each_gets_its_answers(served: Served) -> None:
+    first, second = (Client(masters(served)[0]) for _ in range(2))
+    for client in (first, second):
+        assert client.command(dialect.MAV_CMD_NAV_LAND) == dialect.MAV_RESULT_UNSUPPORTED
+    for client in (first, second):
+        client.wait("HEARTBEAT")
+        client.close()
+
+
 def test_the_baud_rate_limits_what_comes_through() -> None:
     with serve("--mavlink", "tcp:0", "--baud", "9600") as served:
         client = Client(masters(served)[0])

@@ -1,29 +1,59 @@
 """The ends of a served serial line: bytes pass both ways, nobody who comes, leaves or sleeps holds the server up."""
 
 import os
-import socket
 
 import pytest
 import serial
 
 from hil.errors import LabError
 from hil.servers.serial_server import Address, parse_addresses
-from support.line_clients import OpenEnd
+from support.line_clients import OpenEnd, TcpClient
 
 
-def test_a_second_tcp_client_waits_for_the_first_to_leave():
+def test_several_tcp_clients_all_hear_the_board_and_are_heard():
     bench = OpenEnd(Address("tcp").open)
-    where = bench.end._listener.getsockname()
-    with socket.create_connection(where) as first, socket.create_connection(where) as second:
-        first.sendall(b"1")
-        second.sendall(b"2")
-        bench.serve_until(lambda: bench.received == b"1")
-        bench.end.send(b"for the first")
-        assert first.recv(100) == b"for the first"
-        first.close()
-        bench.serve_until(lambda: bench.received == b"12")
-        bench.end.send(b"for the second")
-        assert second.recv(100) == b"for the second"
+    first, second, third = (TcpClient(bench) for _ in range(3))
+    for number, client in enumerate((first, second, third)):
+        client.write(b"%d" % number)
+        bench.serve_until(lambda number=number: bench.received.endswith(b"%d" % number))
+    bench.end.send(b"for all")
+    assert [client.exactly(7) for client in (first, second, third)] == [b"for all"] * 3
+    second.close()
+    bench.serve_until(lambda: len(bench.readers) == 3)  # the listener and two clients
+    bench.end.send(b"for two")
+    assert [client.exactly(7) for client in (first, third)] == [b"for two"] * 2
+    bench.close()
+    assert first.exactly(1) == b""
+    first.close()
+    third.close()
+
+
+def test_a_tcp_client_that_does_not_read_takes_nothing_from_another():
+    bench = OpenEnd(Address("tcp").open)
+    asleep, awake = TcpClient(bench), TcpClient(bench)
+    sent = b""
+    for number in range(20_000):
+        data = number.to_bytes(4, "big") * 70
+        bench.end.send(data)
+        sent += data
+        if number % 100 == 99:
+            assert awake.exactly(len(sent)) == sent
+            sent = b""
+    asleep.close()
+    awake.close()
+    bench.close()
+
+
+def test_what_one_tcp_client_sent_at_once_is_not_torn_by_another():
+    bench = OpenEnd(Address("tcp").open)
+    first, second = TcpClient(bench), TcpClient(bench)
+    long, short = bytes(range(256)) * 64, b"between"
+    first.write(long)
+    second.write(short)
+    bench.serve_until(lambda: len(bench.received) == len(long) + len(short))
+    assert bytes(bench.received) in (long + short, short + long)
+    first.close()
+    second.close()
     bench.close()
 
 

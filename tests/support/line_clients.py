@@ -57,12 +57,16 @@ class PtyClient:
 class TcpClient:
     def __init__(self, open_end: OpenEnd) -> None:
         host, port = open_end.end.master.split(":")[1:]
+        before = set(open_end.readers)
         self._socket = socket.create_connection((host, int(port)), PATIENCE_S)
         self.write, self.close = self._socket.sendall, self._socket.close
-        open_end.serve_until(lambda: open_end.end._client is not None)
+        open_end.serve_until(lambda: open_end.readers.keys() - before)
 
     def exactly(self, size: int) -> bytes:
-        return self._socket.recv(size, socket.MSG_WAITALL)
+        data = b""
+        while len(data) < size and (more := self._socket.recv(size - len(data))):
+            data += more
+        return data
 
 
 class _Datagrams:
