@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-FAR = 1000.0  # [m] no tunnel is as large
+from firmware_py.wire.crtp import FAR
 
 
 @dataclass(frozen=True, slots=True)

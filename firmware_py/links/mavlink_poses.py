@@ -11,13 +11,12 @@ from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.links.timesync import RemoteClock
 from firmware_py.measurements import POSE, Measurement, PoseMeasurement
 from firmware_py.rtos import Queue
-from firmware_py.wire import WireError, mavlink
+from firmware_py.wire import mavlink
 from firmware_py.wire.crtp import PoseMessage
 from firmware_py.wire.mavlink_frames import Message
 
 OLDEST_US = 500_000  # an age beyond is no age: poses that old are of no use to anybody
 EARLIEST_US = -5_000  # the clocks' offset is not known better than this
-FAR = 1000.0  # [m] farther from the origin is no tunnel
 SYNC_PERIOD = 487  # ticks; prime, so that the poses' and the telemetry's frames are not always in the way
 FIRST_SYNC_PERIOD = 97
 FIRST_SYNCS = 5
@@ -42,8 +41,8 @@ class PoseService:
         self._localisation = localisation
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
-        stack.handle(mavlink.MSG_ATT_POS_MOCAP, self._take_pose)
-        stack.handle(mavlink.MSG_VISION_POSITION_ESTIMATE, self._take_pose)
+        for number in mavlink.POSES:
+            stack.handle(number, self._take_pose)
         stack.handle(mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED, self._take_target)
         stack.handle(mavlink.MSG_HEARTBEAT, self._see_heartbeat)
         stack.handle(mavlink.MSG_TIMESYNC, self._take_timesync)
@@ -51,7 +50,6 @@ class PoseService:
 
     def _take_pose(self, message: Message) -> None:
         pose = mavlink.read_pose(message)
-        _near(pose.p_WB)
         self._meet(message)
         now_us = self._stack.kernel.now_us
         self.last_goal = self.goal
@@ -72,7 +70,7 @@ class PoseService:
         target = mavlink.read_target(message)
         p_WG, yaw = self.goal
         if target.p_WG is not None:
-            p_WG = _near(target.p_WG)
+            p_WG = target.p_WG
         if target.yaw is not None:
             yaw = target.yaw
         self.goal = (p_WG, yaw)
@@ -106,10 +104,3 @@ class PoseService:
             if self._partner is not None:
                 self._clock.request(kernel.now_us)
                 yield from self._stack.offer(mavlink.timesync(0, kernel.now_us * 1000))
-
-
-def _near(p_W: Vector) -> Vector:
-    """Return a position that is not out of the world; raise `WireError` otherwise."""
-    if not all(abs(coordinate) <= FAR for coordinate in p_W):
-        raise WireError(f"position {p_W} m: more than {FAR:g} m away")
-    return p_W

@@ -29,6 +29,7 @@ PORT_LINK = 15
 
 MAX_LOG_VALUES = 26  # 30 less the block's id and the time stamp
 
+FAR = 1000.0  # [m] no tunnel is as large
 AGE_UNIT_US = 500
 AGE_MAX_CODE = 254  # and everything older: 127 ms
 AGE_UNKNOWN_CODE = 255
@@ -38,7 +39,6 @@ _POSE = struct.Struct("<B7f")
 _POSE_WITH_AGE = struct.Struct("<BB7fB")
 _LOG_HEAD = struct.Struct("<BBHB")
 _MIN_NORM2, _MAX_NORM2 = 0.9**2, 1.1**2
-_FLOAT32_MAX = (2 - 2**-23) * 2.0**127
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +133,14 @@ def _age_code(age_us: int | None) -> int:
 
 
 def check_pose(p_GB: tuple[float, float, float], q_GB: tuple[float, float, float, float]) -> None:
-    """Raise `WireError` for a pose that both ends refuse. The comparisons are false for NaN, too."""
+    """Raise `WireError` for a pose that both ends refuse, of the body or, over the radio, of its error."""
     w, x, y, z = q_GB
     if not _MIN_NORM2 <= w * w + x * x + y * y + z * z <= _MAX_NORM2:
         raise WireError(f"quaternion {q_GB}: its length must be 0.9..1.1")
-    if not all(abs(coordinate) <= _FLOAT32_MAX for coordinate in p_GB):
-        raise WireError(f"position {p_GB} m: must be finite in float32")
+    check_place(p_GB)
+
+
+def check_place(p: tuple[float, float, float]) -> None:
+    """Raise `WireError` for a position that is none. The comparisons are false for NaN, too."""
+    if not all(abs(coordinate) <= FAR for coordinate in p):
+        raise WireError(f"position {p} m: each coordinate must be within {FAR:g} m")

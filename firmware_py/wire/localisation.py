@@ -5,10 +5,10 @@ quaternion is "smallest three": the largest component is left out, the others ta
 """
 
 import struct
-from math import isfinite, sqrt
+from math import sqrt
 
 from firmware_py.wire import WireError
-from firmware_py.wire.crtp import PoseMessage, check_pose
+from firmware_py.wire.crtp import PoseMessage, check_place, check_pose
 
 CHANNEL_POSITION = 0
 CHANNEL_PACKED = 2
@@ -30,8 +30,7 @@ def decode_position(data: bytes) -> Vector:
     if len(data) < _POSITION.size:
         raise WireError(f"a position of {len(data)} bytes: {_POSITION.size} are needed")
     x, y, z = _POSITION.unpack_from(data)
-    if not isfinite(x + y + z):
-        raise WireError(f"position {x}, {y}, {z} m: must be finite")
+    check_place((x, y, z))
     return x, y, z
 
 

@@ -10,29 +10,32 @@ What goes down saturates where an integer is too narrow and never raises; what c
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
-from math import isfinite, nan
+from math import degrees, isfinite, isnan, nan
 
 import pymavlink.dialects.v20.common as dialect
 
 from firmware_py.elementary import cos, sin
 from firmware_py.wire import WireError
-from firmware_py.wire.crtp import check_pose
+from firmware_py.wire.crtp import check_place, check_pose
 from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.mavlink_services import u16, u32
 from firmware_py.wire.telemetry import BLOCKS, TIMESTAMP_MASK, Sample
 
 # isort: off
 from firmware_py.wire.mavlink_services import (  # offered here, too
-    autopilot_version as autopilot_version, command as command, command_ack as command_ack, ftp_nak as ftp_nak,
-    heartbeat as heartbeat, mavlink_name as mavlink_name, message_interval as message_interval,
-    named_value as named_value, parameter as parameter, ping_answer as ping_answer,
-    station_heartbeat as station_heartbeat, status_text as status_text, timesync as timesync,
+    autopilot_version as autopilot_version, command as command, command_ack as command_ack,
+    extended_state as extended_state, ftp_nak as ftp_nak, heartbeat as heartbeat, mavlink_name as mavlink_name,
+    message_interval as message_interval, named_value as named_value, no_log_data as no_log_data, no_logs as no_logs,
+    no_mission as no_mission, parameter as parameter, parameter_error as parameter_error, ping_answer as ping_answer,
+    refused_mission as refused_mission, station_heartbeat as station_heartbeat, status_text as status_text,
+    timesync as timesync,
 )  # fmt: skip
 # isort: on
 
 MSG_HEARTBEAT = 0
 MSG_SYS_STATUS = 1
 MSG_PING = 4
+MSG_SET_MODE = 11
 MSG_PARAM_REQUEST_READ = 20
 MSG_PARAM_REQUEST_LIST = 21
 MSG_PARAM_VALUE = 22
@@ -40,23 +43,51 @@ MSG_PARAM_SET = 23
 MSG_ATTITUDE = 30
 MSG_ATTITUDE_QUATERNION = 31
 MSG_LOCAL_POSITION_NED = 32
+MSG_GLOBAL_POSITION_INT = 33
 MSG_SERVO_OUTPUT_RAW = 36
+MSG_MISSION_REQUEST_LIST = 43
 MSG_REQUEST_DATA_STREAM = 66
 MSG_COMMAND_INT = 75
 MSG_COMMAND_LONG = 76
 MSG_COMMAND_ACK = 77
 MSG_SET_POSITION_TARGET_LOCAL_NED = 84
+MSG_GLOBAL_VISION_POSITION_ESTIMATE = 101
 MSG_VISION_POSITION_ESTIMATE = 102
+MSG_VICON_POSITION_ESTIMATE = 104
+MSG_HIGHRES_IMU = 105
 MSG_FILE_TRANSFER_PROTOCOL = 110
 MSG_TIMESYNC = 111
+MSG_LOG_REQUEST_LIST = 117
+MSG_LOG_REQUEST_DATA = 119
 MSG_ATT_POS_MOCAP = 138
 MSG_BATTERY_STATUS = 147
 MSG_AUTOPILOT_VERSION = 148
 MSG_ESTIMATOR_STATUS = 230
 MSG_HOME_POSITION = 242
+MSG_EXTENDED_SYS_STATE = 245
 MSG_NAMED_VALUE_FLOAT = 251
 MSG_STATUSTEXT = 253
+MSG_ODOMETRY = 331
 MSG_DEBUG_FLOAT_ARRAY = 350
+
+POSES = (
+    MSG_ATT_POS_MOCAP,
+    MSG_VISION_POSITION_ESTIMATE,
+    MSG_GLOBAL_VISION_POSITION_ESTIMATE,
+    MSG_VICON_POSITION_ESTIMATE,
+    MSG_ODOMETRY,
+)
+MISSION_MESSAGES = (
+    37,
+    38,
+    39,
+    40,
+    41,
+    44,
+    45,
+    51,
+    73,
+)  # what is asked or told of missions, but for the list and its end
 
 FLIGHT_ARRAY = "floaty"
 FLIGHT_ARRAY_SIZE = sum(len(block.variables) for block in BLOCKS)
@@ -68,6 +99,25 @@ _IGNORE_POSITION = 0x007  # bits of POSITION_TARGET_TYPEMASK
 _IGNORE_REST = 0x038 | 0x1C0 | 0x800  # velocity, acceleration, yaw rate
 _IS_FORCE = 0x200
 _IGNORE_YAW = 0x400
+_MOCAP_NED = 14  # reserved today, but it is what MAVSDK sends
+_WORLD_FRAMES = (
+    dialect.MAV_FRAME_LOCAL_NED,
+    _MOCAP_NED,
+    dialect.MAV_FRAME_LOCAL_FRD,
+)  # x of W is north, or forward
+_BODY_FRAME = dialect.MAV_FRAME_BODY_FRD
+_DIAGONAL = (
+    (0, 0.1),
+    (6, 0.1),
+    (11, 0.1),
+    (15, 0.2),
+    (18, 0.2),
+    (20, 0.2),
+)  # of a covariance: index, deviation [m, rad]
+_UNKNOWN = (nan, *(0.0,) * 20)  # covariance
+_FAILED = -1  # quality of odometry
+_STANDARD_GRAVITY = 9.80665  # [m/s^2 per g]
+_GYRO_AND_ACCELEROMETER = 0x3F  # fields of HIGHRES_IMU
 _SENSORS = (
     dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
     | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
@@ -131,14 +181,46 @@ def pose(t_us: int, p_WB: Vector, q_WB: Quaternion) -> Message:
 
 
 def read_pose(message: Message) -> Pose:
-    """The pose in an ATT_POS_MOCAP or a VISION_POSITION_ESTIMATE."""
-    if message.get_msgId() == MSG_ATT_POS_MOCAP:
-        t_us, q = message.time_usec, tuple(message.q)
+    """The pose in one of `POSES`; `WireError` also for one in other frames, or that its sender does not rely on."""
+    number = message.get_msgId()
+    if number == MSG_ODOMETRY:
+        _check_odometry(message)
+        t_us, q, covariance = message.time_usec, tuple(message.q), message.pose_covariance
+    elif number == MSG_ATT_POS_MOCAP:
+        t_us, q, covariance = message.time_usec, tuple(message.q), message.covariance
     else:
-        t_us, q = message.usec, _from_euler(message.roll, message.pitch, message.yaw)
+        q = _from_euler(message.roll, message.pitch, message.yaw)
+        t_us, covariance = message.usec, message.covariance
+    _check_covariance(covariance)
     p_WB, q_WB = turn((message.x, message.y, message.z)), turn_quaternion(q)
     check_pose(p_WB, q_WB)
     return Pose(t_us, p_WB, q_WB)
+
+
+def _check_odometry(message: Message) -> None:
+    frames = message.frame_id, message.child_frame_id
+    if frames[0] not in _WORLD_FRAMES or frames[1] != _BODY_FRAME:
+        raise WireError(
+            f"odometry in frames {frames}: {_WORLD_FRAMES}, which are NED, with {_BODY_FRAME}, BODY_FRD, are served"
+        )
+    if message.quality == _FAILED:
+        raise WireError("odometry of quality -1: its sender says that it has failed")
+    if message.estimator_type == dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT:
+        raise WireError(
+            "odometry of an autopilot: that is an estimate, of ours or another's, and no measurement"
+        )
+
+
+def _check_covariance(covariance: Sequence[float]) -> None:
+    """Raise `WireError` for a pose that is said to be worse than any that the estimator may take for exact.
+
+    NaN first, or zeros, which MAVLink 2 leaves away: nothing is said.
+    """
+    if isnan(covariance[0]):
+        return
+    if not all(0 <= covariance[index] <= limit * limit for index, limit in _DIAGONAL):
+        stated = [covariance[index] for index, _ in _DIAGONAL]
+        raise WireError(f"pose with variances {stated}: at most (0.1 m)^2 and (0.2 rad)^2 are of use")
 
 
 def target(t_ms: int, p_WG: Vector | None, yaw: float | None, system: int = 1, component: int = 1) -> Message:
@@ -164,8 +246,10 @@ def read_target(message: Message) -> Target:
     yaw = None if mask & _IGNORE_YAW else -message.yaw
     if p_WG is None and yaw is None:
         raise WireError(f"target with mask {mask:#x}: neither position nor yaw")
-    if not isfinite(sum(p_WG or ()) + (yaw or 0.0)):
-        raise WireError(f"target {p_WG} m, yaw {yaw} rad: must be finite")
+    if p_WG is not None:
+        check_place(p_WG)
+    if yaw is not None and not isfinite(yaw):
+        raise WireError(f"target with yaw {yaw} rad: must be finite")
     return Target(p_WG, yaw)
 
 
@@ -221,6 +305,37 @@ def home_position(t_us: int, p_WG: Vector) -> Message:
     )
 
 
+def global_position(t_ms: int, p_WB: Vector, v_W: Vector, yaw: float, home_z: float) -> Message:
+    """Height, velocity and heading; latitude and longitude stay 0, because nobody knows them."""
+    vx, vy, vz = (_i16(100 * speed) for speed in turn(v_W))
+    heading = round(100 * degrees(-yaw)) % 36_000
+    return dialect.MAVLink_global_position_int_message(
+        u32(t_ms), 0, 0, round(1000 * p_WB[2]), round(1000 * (p_WB[2] - home_z)), vx, vy, vz, heading
+    )
+
+
+def odometry(t_us: int, p_WB: Vector, q_WB: Quaternion, v_B: Vector, rates: Vector) -> Message:
+    """Pose in the world, velocity [m/s] and rates [rad/s] in the body; the covariances are not stated."""
+    return dialect.MAVLink_odometry_message(
+        max(0, t_us), _FRAME_LOCAL_NED, _BODY_FRAME, *turn(p_WB), turn_quaternion(q_WB), *turn(v_B), *turn(rates),
+        _UNKNOWN, _UNKNOWN, 0, dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, 0,
+    )  # fmt: skip
+
+
+def imu(t_us: int, rates: Vector, acceleration: Vector) -> Message:
+    """What the gyro [rad/s, B] and the accelerometer [g, B] measure; there are no other sensors."""
+    force = turn(
+        (
+            acceleration[0] * _STANDARD_GRAVITY,
+            acceleration[1] * _STANDARD_GRAVITY,
+            acceleration[2] * _STANDARD_GRAVITY,
+        )
+    )
+    return dialect.MAVLink_highres_imu_message(
+        max(0, t_us), *force, *turn(rates), 0, 0, 0, 0, 0, 0, 0, _GYRO_AND_ACCELEROMETER
+    )
+
+
 def flight_array(t_us: int, values: Sequence[float]) -> Message:
     """The samples of `telemetry.BLOCKS` in their order, relative to the goal as the board knows them, in SI."""
     data = (*values, *(0.0,) * (58 - len(values)))
@@ -250,3 +365,8 @@ def _from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
     )
+
+
+def _i16(value: float) -> int:
+    """The nearest number that 16 bits with a sign can hold."""
+    return round(max(-0x8000, min(0x7FFF, value)))

@@ -43,6 +43,12 @@ _STATUS_OF_STATE = (
     dialect.MAV_STATE_ACTIVE,
     dialect.MAV_STATE_CRITICAL,
 )
+_LANDED_OF_STATE = (
+    dialect.MAV_LANDED_STATE_ON_GROUND,
+    dialect.MAV_LANDED_STATE_ON_GROUND,
+    dialect.MAV_LANDED_STATE_IN_AIR,
+    dialect.MAV_LANDED_STATE_UNDEFINED,
+)
 _STATE_FLYING = 2
 _MODE_FLYING = dialect.MAV_MODE_FLAG_STABILIZE_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
 
@@ -89,7 +95,7 @@ def ping_answer(request: Message) -> Message:
 
 
 def heartbeat(armed: bool, state: int) -> Message:
-    """The board is here; `state` is the supervisor's, 0..3, and also the custom mode."""
+    """The board is here; `armed`: the flaps are under control. `state` is the supervisor's, 0..3, and the custom mode."""
     mode = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if armed:
         mode |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
@@ -140,6 +146,47 @@ def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) 
 def message_interval(number: int, interval_us: int) -> Message:
     """How often a message is sent; -1: not at all, 0: there is no such message."""
     return dialect.MAVLink_message_interval_message(u16(number), max(-1, min(_I32_MAX, interval_us)))
+
+
+def parameter_error(request: Message, name: str, index: int, error: int) -> Message:
+    """Why a request about a parameter comes to nothing: MAV_PARAM_ERROR 1 does not exist, 2 value out of range."""
+    return dialect.MAVLink_param_error_message(
+        request.get_srcSystem(), request.get_srcComponent(), _text(name, NAME_SIZE), index, error
+    )
+
+
+def no_mission(request: Message) -> Message:
+    """The answer to MISSION_REQUEST_LIST, for every type of mission."""
+    return dialect.MAVLink_mission_count_message(
+        request.get_srcSystem(), request.get_srcComponent(), 0, request.mission_type
+    )
+
+
+def refused_mission(request: Message) -> Message:
+    """The answer to whatever else is asked or told of missions."""
+    return dialect.MAVLink_mission_ack_message(
+        request.get_srcSystem(),
+        request.get_srcComponent(),
+        dialect.MAV_MISSION_UNSUPPORTED,
+        getattr(request, "mission_type", dialect.MAV_MISSION_TYPE_MISSION),
+    )
+
+
+def no_logs() -> Message:
+    """The answer to LOG_REQUEST_LIST."""
+    return dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0)
+
+
+def no_log_data(request: Message) -> Message:
+    """The answer to LOG_REQUEST_DATA: the log ends there."""
+    return dialect.MAVLink_log_data_message(request.id, request.ofs, 0, (0,) * 90)
+
+
+def extended_state(state: int) -> Message:
+    """Whether the robot is in the air, as far as the supervisor's state says: in failsafe nobody on board knows."""
+    return dialect.MAVLink_extended_sys_state_message(
+        dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED_OF_STATE[state]
+    )
 
 
 def ftp_nak(request: Message) -> Message:

@@ -93,9 +93,11 @@ def test_both_ends_refuse_a_pose_that_is_none(p, q):
         crtp.decode_ext_pose(struct.pack("<B7fB", 8, *p, *q[1:], q[0], 0))
 
 
-def test_position_beyond_float32_cannot_be_sent():
-    with pytest.raises(WireError, match="float32"):
-        crtp.encode_ext_pose((1e39, 0, 0), Q, 0)
+def test_a_position_outside_of_any_tunnel_is_none():
+    assert crtp.decode_ext_pose(crtp.encode_ext_pose((0, -1000.0, 0), Q, 0)[1:]).p_GB == (0, -1000.0, 0)
+    for x in (1000.5, -1001.0, 1e39):
+        with pytest.raises(WireError, match="within 1000 m"):
+            crtp.encode_ext_pose((x, 0, 0), Q, 0)
 
 
 @given(st.binary(max_size=40))

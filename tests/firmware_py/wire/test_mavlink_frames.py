@@ -423,8 +423,10 @@ def test_fuzzed_frames_never_raise_and_the_next_good_frame_is_received() -> None
     signed = golden(peer(KEY), conversation(rng, 200))
     numbers = [number for number, _ in DIALECT]
     readers = {
-        mavlink.MSG_ATT_POS_MOCAP: mavlink.read_pose,
-        mavlink.MSG_VISION_POSITION_ESTIMATE: mavlink.read_pose,
+        **dict.fromkeys(mavlink.POSES, mavlink.read_pose),
+        **dict.fromkeys(mavlink.MISSION_MESSAGES, mavlink.refused_mission),
+        mavlink.MSG_MISSION_REQUEST_LIST: mavlink.no_mission,
+        mavlink.MSG_LOG_REQUEST_DATA: mavlink.no_log_data,
         mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED: mavlink.read_target,
         mavlink.MSG_DEBUG_FLOAT_ARRAY: mavlink.read_flight_array,
         mavlink.MSG_PING: mavlink.ping_answer,

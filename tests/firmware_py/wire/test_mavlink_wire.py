@@ -53,11 +53,104 @@ def test_pose_is_the_standards_and_comes_back() -> None:
     assert (pose.t_us, pose.p_WB, pose.q_WB) == (1_234_567, near(V), near(Q_WB))
 
 
-def test_visual_pose_is_read() -> None:
+@pytest.mark.parametrize("kind", ["vision", "global_vision", "vicon"])
+def test_a_pose_in_angles_is_read(kind: str) -> None:
     yaw, pitch, roll = R_NED_FRD.as_euler("ZYX")
-    message = over_the_wire(dialect.MAVLink_vision_position_estimate_message(99, *(D @ V), roll, pitch, yaw))
-    pose = mavlink.read_pose(message)
+    create = getattr(dialect, f"MAVLink_{kind}_position_estimate_message")
+    pose = mavlink.read_pose(over_the_wire(create(99, *(D @ V), roll, pitch, yaw)))
     assert (pose.t_us, pose.p_WB, pose.q_WB) == (99, near(V), near(Q_WB))
+
+
+NED, FRD_WORLD, BODY_FRD = (
+    dialect.MAV_FRAME_LOCAL_NED,
+    dialect.MAV_FRAME_LOCAL_FRD,
+    dialect.MAV_FRAME_BODY_FRD,
+)
+NOT_STATED = (nan, *(0.0,) * 20)
+SENSED = dialect.MAV_ESTIMATOR_TYPE_MOCAP
+
+
+def odometry(
+    world: int = NED,
+    body: int = BODY_FRD,
+    covariance: Any = NOT_STATED,
+    estimator: int = SENSED,
+    quality: int = 0,
+) -> Any:
+    q = R_NED_FRD.as_quat(scalar_first=True)
+    return over_the_wire(
+        dialect.MAVLink_odometry_message(
+            99, world, body, *(D @ V), q, 0, 0, 0, 0, 0, 0, covariance, NOT_STATED, 0, estimator, quality
+        )
+    )
+
+
+@pytest.mark.parametrize("world", [NED, 14, FRD_WORLD])  # 14: MOCAP_NED, as MAVSDK still calls it
+@pytest.mark.parametrize("quality", [0, 1, 100])
+def test_odometry_is_a_pose(world: int, quality: int) -> None:
+    pose = mavlink.read_pose(odometry(world, quality=quality))
+    assert (pose.t_us, pose.p_WB, pose.q_WB) == (99, near(V), near(Q_WB))
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"world": dialect.MAV_FRAME_BODY_FRD}, "frames"),
+        ({"world": dialect.MAV_FRAME_LOCAL_ENU}, "frames"),
+        ({"world": dialect.MAV_FRAME_LOCAL_FLU}, "frames"),
+        ({"world": dialect.MAV_FRAME_GLOBAL}, "frames"),
+        ({"body": dialect.MAV_FRAME_LOCAL_FRD}, "frames"),
+        ({"body": dialect.MAV_FRAME_LOCAL_NED}, "frames"),
+        ({"quality": -1}, "failed"),
+        ({"estimator": dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT}, "autopilot"),
+    ],
+)
+def test_odometry_that_is_no_pose_of_ours_is_refused(options: dict[str, int], why: str) -> None:
+    with pytest.raises(WireError, match=why):
+        mavlink.read_pose(odometry(**options))
+
+
+def triangle(position: float, attitude: float) -> list[float]:
+    """The upper right of a diagonal covariance, of standard deviations."""
+    diagonal = np.diag([position**2] * 3 + [attitude**2] * 3)
+    return diagonal[np.triu_indices(6)].tolist()  # type: ignore[no-any-return]
+
+
+def with_covariance(covariance: Any) -> list[Any]:
+    """A message of each kind."""
+    angles = [
+        over_the_wire(getattr(dialect, f"MAVLink_{kind}_message")(99, *V, 0, 0, 0, covariance))
+        for kind in ("vision_position_estimate", "global_vision_position_estimate", "vicon_position_estimate")
+    ]
+    mocap = over_the_wire(dialect.MAVLink_att_pos_mocap_message(99, (1, 0, 0, 0), *V, covariance))
+    return [*angles, mocap, odometry(covariance=covariance)]
+
+
+@pytest.mark.parametrize(
+    "covariance", [[0.0] * 21, NOT_STATED, [nan] * 21, triangle(0.002, 0.01), triangle(0.1, 0.2)]
+)
+def test_a_pose_whose_covariance_is_small_or_not_stated_counts(covariance: Any) -> None:
+    for message in with_covariance(covariance):
+        assert mavlink.read_pose(message).t_us == 99
+
+
+def spoilt(index: int, value: float) -> list[float]:
+    covariance = triangle(0.01, 0.01)
+    covariance[index] = value
+    return covariance
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [
+        spoilt(0, 0.011), spoilt(6, 0.011), spoilt(11, 0.011), spoilt(15, 0.041), spoilt(18, 0.041), spoilt(20, 0.041),
+        spoilt(0, -1e-6), spoilt(11, nan), spoilt(20, inf),
+    ],
+)  # fmt: skip
+def test_a_pose_that_its_sender_does_not_rely_on_is_refused(covariance: list[float]) -> None:
+    for message in with_covariance(covariance):
+        with pytest.raises(WireError, match="variances"):
+            mavlink.read_pose(message)
 
 
 @pytest.mark.parametrize(
@@ -113,13 +206,14 @@ FORCE, NO_YAW = 512, 1024
         (dialect.MAV_FRAME_LOCAL_NED, FORCE, 1.0),
         (dialect.MAV_FRAME_LOCAL_NED, 0, nan),
         (dialect.MAV_FRAME_LOCAL_NED, 0, inf),
+        (dialect.MAV_FRAME_LOCAL_NED, 0, 1001.0),
     ],
 )
 def test_target_that_cannot_be_served_is_refused(frame: int, mask: int, x: float) -> None:
     message = dialect.MAVLink_set_position_target_local_ned_message(
         0, 1, 1, frame, mask, x, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0
     )
-    with pytest.raises(WireError, match="target"):
+    with pytest.raises(WireError, match=r"target|position \("):
         mavlink.read_target(over_the_wire(message))
 
 
