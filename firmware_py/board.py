@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Protocol
 
+from firmware_py.wire.mavlink_numbers import Result
+
 ImuCounts = tuple[int, int, int, int, int, int]  # gyro x y z, accelerometer x y z, int16, sensor frame
 
 EEPROM_SIZE = 8192
@@ -46,4 +48,12 @@ class Board(Protocol):
 
     def debug_write(self, text: str) -> None:
         """Write a line to the debug console."""
+        ...
+
+    def reset(self) -> None:
+        """Reset the processor, as its own instruction does; EEPROM and deck memory keep what they have."""
+        ...
+
+    def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
+        """Let a part of the robot fail, by MAVLink's numbers; hardware that cannot do that says UNSUPPORTED."""
         ...

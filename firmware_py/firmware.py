@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory, costs_of
-from firmware_py.drivers.imu import GyroZero
+from firmware_py.drivers.imu import GyroZero, acceleration, rates
+from firmware_py.geometry import Vector
 from firmware_py.links.console import Console
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.links.localisation import LocalisationService
@@ -142,18 +143,24 @@ class Firmware:
         read: ReadBlock,
     ) -> None:
         """Create what MAVLink clients find."""
+        from firmware_py.links.mavlink_absent import answer_for_what_is_not_there
         from firmware_py.links.mavlink_commands import CommandService
+        from firmware_py.links.mavlink_on_request import RequestedMessages
         from firmware_py.links.mavlink_parameters import MavlinkParameters
         from firmware_py.links.mavlink_poses import PoseService
         from firmware_py.links.mavlink_streams import StreamService
         from firmware_py.links.mavlink_telemetry import FlightMessages
+        from firmware_py.links.mavlink_world import World
 
         core, supervisor = self._core, self._supervisor
         poses = PoseService(stack, self.measurements, running.localisation, config.home)
-        messages = FlightMessages(stack, supervisor, poses, core.estimator.fields, core.control.fields, read)
-        streams = StreamService(stack, messages.streams(config.rates))
+        world = World(core.estimator.fields, poses)
+        messages = FlightMessages(stack, supervisor, world, core.control.fields, read)
+        requested = RequestedMessages(supervisor, world, self._measured, config.home)
+        streams = StreamService(stack, (*messages.streams(config.rates), *requested.streams()))
         MavlinkParameters(stack, self.parameters)
-        CommandService(stack, supervisor, streams, self.parameters, storage, config.home)
+        CommandService(stack, self._board, supervisor, streams, self.parameters, storage)
+        answer_for_what_is_not_there(stack)
         self._console.listeners.append(stack.say)
 
     @property
@@ -197,6 +204,11 @@ class Firmware:
         thief = Thief()
         self.kernel.create_task("THIEF", PRIORITY, thief_task, self.kernel, thief)
         return thief
+
+    def _measured(self) -> tuple[Vector, Vector]:
+        """Return what the IMU measures now: rates [rad/s, B] and acceleration [g, B]."""
+        counts = self._board.read_imu()
+        return rates(counts, self._core.data.fields.gyro_bias.tolist()), acceleration(counts)
 
     def _zero_found(self) -> None:
         bias = self._zero.bias

@@ -46,6 +46,7 @@ class Supervisor:
         self.cause = Cause.NONE
         self.calibrated = False
         self.armed = True
+        self.controlling = False  # whether the flaps obey controller or manual angles, as `mode` said last
         self.manual = Manual.OFF
         self.last_pose_us: int | None = None
         self.pose_timeout_us = config.pose_timeout_us
@@ -85,11 +86,17 @@ class Supervisor:
             self.state, self.cause = state, cause
             reason = "" if cause is Cause.NONE else f", {cause.name.lower().replace('_', ' ')}"
             self._announce(f"supervisor: {state.name.lower()}{reason}")
-        if cause > Cause.OUT_OF_BOUNDS or self.manual is Manual.HOVER:
+        mode = self._mode()
+        self.controlling = mode != MODE_HOVER
+        return mode
+
+    def _mode(self) -> int:
+        """Return the mode that follows from state, cause and who moves the flaps."""
+        if self.cause > Cause.OUT_OF_BOUNDS or self.manual is Manual.HOVER:
             return MODE_HOVER
         if self.manual is Manual.ANGLES:
             return MODE_MANUAL
-        return MODE_FLY if state is State.FLYING else MODE_HOVER
+        return MODE_FLY if self.state is State.FLYING else MODE_HOVER
 
     def emergency_stop(self) -> None:
         """Stop until `recover`."""

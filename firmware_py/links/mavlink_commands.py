@@ -7,20 +7,21 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 from math import isfinite
 
-from firmware_py.geometry import Vector
-from firmware_py.links.mavlink_stack import MavlinkStack
+from firmware_py.board import Board
+from firmware_py.links.mavlink_stack import WARNING, MavlinkStack, Task
 from firmware_py.links.mavlink_streams import StreamService
 from firmware_py.links.parameters import Parameter
 from firmware_py.links.storage import ParameterStorage
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.mavlink_numbers import Result
 
-VERSION = (26, 11, 0)
-REVISION = bytes.fromhex("0f10a717")  # the parameters firmware.revision0
-SERIAL_NUMBER = 0x00F10A71  # the parameter cpu.id0
 FORCE = 21196  # MAVLink's magic number for disarming in flight
 STORE = 1  # PREFLIGHT_STORAGE: write all
+REBOOT = 1  # PREFLIGHT_REBOOT_SHUTDOWN
+REBOOT_IN_FLIGHT = 20190226  # REBOOT_SHUTDOWN_CONDITIONS_FORCE
+REBOOT_TICKS = 200  # before the reset: what was said leaves, 1 kB even at 57600 baud
 
 
 class Command(IntEnum):
@@ -28,22 +29,14 @@ class Command(IntEnum):
 
     DO_FLIGHTTERMINATION = 185
     PREFLIGHT_STORAGE = 245
+    PREFLIGHT_REBOOT_SHUTDOWN = 246
     COMPONENT_ARM_DISARM = 400
     GET_HOME_POSITION = 410
+    INJECT_FAILURE = 420
     GET_MESSAGE_INTERVAL = 510
     SET_MESSAGE_INTERVAL = 511
     REQUEST_MESSAGE = 512
     REQUEST_AUTOPILOT_CAPABILITIES = 520
-
-
-class Result(IntEnum):
-    """MAV_RESULT."""
-
-    ACCEPTED = 0
-    TEMPORARILY_REJECTED = 1
-    DENIED = 2
-    UNSUPPORTED = 3
-    FAILED = 4
 
 
 Outcome = tuple[Result, Sequence[Message]]  # and what is sent after the acknowledgement
@@ -57,23 +50,26 @@ class CommandService:
     def __init__(
         self,
         stack: MavlinkStack,
+        board: Board,
         supervisor: Supervisor,
         streams: StreamService,
         parameters: Sequence[Parameter],
         storage: ParameterStorage,
-        home: Vector,
     ) -> None:
         self._stack = stack
+        self._board = board
         self._supervisor = supervisor
         self._streams = streams
         self._parameters = parameters
         self._storage = storage
-        self._home = home
+        self._rebooting = False
         self._commands: dict[int, Callable[[Message], Outcome]] = {
             Command.DO_FLIGHTTERMINATION: self._terminate,
             Command.PREFLIGHT_STORAGE: self._store,
+            Command.PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
             Command.COMPONENT_ARM_DISARM: self._arm,
             Command.GET_HOME_POSITION: lambda command: self._once(mavlink.MSG_HOME_POSITION),
+            Command.INJECT_FAILURE: self._fail,
             Command.GET_MESSAGE_INTERVAL: self._tell_interval,
             Command.SET_MESSAGE_INTERVAL: self._set_interval,
             Command.REQUEST_MESSAGE: lambda command: self._once(_whole(command.param1)),
@@ -104,7 +100,35 @@ class CommandService:
             return DENIED
         if command.param1 == 0 and command.param2 == FORCE:
             self._supervisor.emergency_stop()
-        return DONE if self._supervisor.arm(command.param1 == 1) else (Result.TEMPORARILY_REJECTED, ())
+        if self._supervisor.arm(command.param1 == 1):
+            return DONE
+        obstacle = "emergency stop; reboot first" if self._supervisor.stopped else "battery low"
+        return self._not_now(f"not armed: {obstacle}")
+
+    def _not_now(self, why: str) -> Outcome:
+        return Result.TEMPORARILY_REJECTED, (mavlink.status_text(WARNING, why),)
+
+    def _reboot(self, command: Message) -> Outcome:
+        if command.param1 != REBOOT:
+            return DENIED
+        if self._supervisor.controlling and _sixth(command) != REBOOT_IN_FLIGHT:
+            return self._not_now("not rebooted: the flaps are under control")
+        if not self._rebooting:
+            self._rebooting = True
+            self._stack.kernel.create_task("MAV-BOOT", 1, self._reboot_task)
+        return DONE
+
+    def _reboot_task(self) -> Task:
+        while True:
+            yield from self._stack.kernel.delay(REBOOT_TICKS)
+            self._board.reset()
+
+    def _fail(self, command: Message) -> Outcome:
+        """Let the world do it; hardware that flies has no way to."""
+        unit, failing, instance = (
+            _whole(value) for value in (command.param1, command.param2, command.param3)
+        )
+        return self._board.inject_failure(unit, failing, instance), ()
 
     def _terminate(self, command: Message) -> Outcome:
         if command.param1 != 1:
@@ -130,14 +154,14 @@ class CommandService:
 
     def _once(self, number: int) -> Outcome:
         """Send a message once."""
-        messages: Sequence[Message]
-        if number == mavlink.MSG_AUTOPILOT_VERSION:
-            messages = (mavlink.autopilot_version(VERSION, REVISION, SERIAL_NUMBER),)
-        elif number == mavlink.MSG_HOME_POSITION:
-            messages = (mavlink.home_position(self._stack.kernel.now_us, self._home),)
-        else:
-            messages = self._streams.make(number)
+        messages = self._streams.make(number)
         return (Result.ACCEPTED, messages) if messages else DENIED
+
+
+def _sixth(command: Message) -> float:
+    """A command's sixth parameter, which COMMAND_INT calls y."""
+    value: float = command.param6 if command.get_msgId() == mavlink.MSG_COMMAND_LONG else command.y
+    return value
 
 
 def _whole(value: float) -> int:

@@ -1,7 +1,8 @@
 """The parameter protocol: list, read by index or by name, set. Only what can be written is in the list.
 
 Every value travels as REAL32, the one encoding that all ground stations agree on. Whatever becomes of a request to set,
-the answer carries the value that is in force. The list is sent one by one, each when the line has taken the one before; a
+the answer carries the value that is in force. What cannot be done is answered with PARAM_ERROR, each time, and for people
+with a text, once. The list is sent one by one, each when the line has taken the one before; a
 request for the list while it is on its way starts it anew.
 """
 
@@ -19,6 +20,8 @@ from firmware_py.wire.parameters import OK
 HASH_NAME = "_HASH_CHECK"
 HASH_BITS = 24  # which a REAL32 carries exactly
 NO_INDEX = 0xFFFF
+NO_NUMBER = -1  # the same in messages where it has a sign
+DOES_NOT_EXIST, OUT_OF_RANGE = 1, 2  # MAV_PARAM_ERROR
 REAL32 = 9  # MAV_PARAM_TYPE
 
 
@@ -57,25 +60,29 @@ class MavlinkParameters:
             if message.param_id == HASH_NAME:
                 self._stack.reply(self._hash())
                 return
-            number = self._find(message.param_id)
+            number = self._find(message)
         elif number >= len(self._parameters):
+            self._stack.reply(mavlink.parameter_error(message, message.param_id, number, DOES_NOT_EXIST))
             raise WireError(f"parameter {number}: there are {len(self._parameters)}")
         self._stack.reply(self._value(number))
 
     def _set(self, message: Message) -> None:
         name, value = message.param_id, message.param_value
-        number = self._find(name)
+        number = self._find(message)
         parameter = self._parameters[number]
         whole = parameter.scalar.is_float or (isfinite(value) and value == int(value))
         done = message.param_type == REAL32 and whole and parameter.set(value) == OK
         self._stack.reply(self._value(number))
         if not done:
+            self._stack.reply(mavlink.parameter_error(message, name, NO_NUMBER, OUT_OF_RANGE))
             limits = f"{parameter.minimum:g}..{parameter.maximum:g}"
             self._refuse(f"{name} = {value:g}: refused, {limits}")
 
-    def _find(self, name: str) -> int:
+    def _find(self, request: Message) -> int:
+        name = request.param_id
         number = self._numbers.get(name)
         if number is None:
+            self._stack.reply(mavlink.parameter_error(request, name, NO_NUMBER, DOES_NOT_EXIST))
             self._refuse(f"no parameter {name}")
         return number
 

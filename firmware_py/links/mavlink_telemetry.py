@@ -1,19 +1,17 @@
 """What the streams carry: the running board's values as messages, with the tick as time stamp.
 
 Our own ground station takes the flight array: the telemetry blocks as the board knows them, relative to the goal that the
-last pose was seen from. For those of others the standard's messages are absolute in W: position, velocity and yaw are
-turned there here.
+last pose was seen from. For those of others the standard's messages are absolute in W.
 """
 
 from collections.abc import Sequence
 from math import sqrt
 
 from firmware_py.config import StreamRates
-from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY, Control, Estimator
-from firmware_py.geometry import from_euler_zyx, rotate, wrap_angle, yaw_quaternion
-from firmware_py.links.mavlink_poses import PoseService
+from firmware_py.core.structs import POSITION, Control
 from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
+from firmware_py.links.mavlink_world import World
 from firmware_py.links.stream import ReadBlock
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink, telemetry
@@ -30,15 +28,13 @@ class FlightMessages:
         self,
         stack: MavlinkStack,
         supervisor: Supervisor,
-        poses: PoseService,
-        estimator: Estimator,
+        world: World,
         control: Control,
         read_block: ReadBlock,
     ) -> None:
         self._stack = stack
         self._supervisor = supervisor
-        self._poses = poses
-        self._estimator = estimator
+        self._world = world
         self._control = control
         self._read_block = read_block
         self._load_since = (0, 0)  # instant and processor time of the last SYS_STATUS [us]
@@ -62,30 +58,16 @@ class FlightMessages:
         )
 
     def _heartbeat(self, tick: int) -> Messages:
-        return (mavlink.heartbeat(self._supervisor.armed, self._supervisor.state),)
-
-    def _angles(self) -> tuple[float, float, float]:
-        """Roll, pitch, yaw of B in W."""
-        roll, pitch, yaw = self._estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
-        return roll, pitch, wrap_angle(yaw + self._poses.last_goal[1])
-
-    def _rates(self) -> tuple[float, float, float]:
-        p, q, r = self._estimator.now[RATE : RATE + 3].tolist()
-        return p, q, r
+        return (mavlink.heartbeat(self._supervisor.controlling, self._supervisor.state),)
 
     def _attitude(self, tick: int) -> Messages:
-        return (mavlink.attitude(tick, *self._angles(), *self._rates()),)
+        return (mavlink.attitude(tick, *self._world.angles(), *self._world.rates()),)
 
     def _attitude_quaternion(self, tick: int) -> Messages:
-        return (mavlink.attitude_quaternion(tick, from_euler_zyx(*self._angles()), *self._rates()),)
+        return (mavlink.attitude_quaternion(tick, self._world.q_WB(), *self._world.rates()),)
 
     def _local_position(self, tick: int) -> Messages:
-        p_WG, yaw = self._poses.last_goal
-        q_WG = yaw_quaternion(yaw)
-        now = self._estimator.now
-        x, y, z = rotate(q_WG, tuple(now[POSITION : POSITION + 3].tolist()))
-        v_W = rotate(q_WG, tuple(now[VELOCITY : VELOCITY + 3].tolist()))
-        return (mavlink.local_position(tick, (p_WG[0] + x, p_WG[1] + y, p_WG[2] + z), v_W),)
+        return (mavlink.local_position(tick, *self._world.motion()),)
 
     def _flight_array(self, tick: int) -> Messages:
         values = [value for block in telemetry.BLOCKS for value in block.si_of(self._read_block(block))]
@@ -97,7 +79,7 @@ class FlightMessages:
     def _estimator_status(self, tick: int) -> Messages:
         last_us, timeout_us = self._supervisor.last_pose_us, self._supervisor.pose_timeout_us
         healthy = last_us is not None and self._stack.kernel.now_us - last_us < timeout_us
-        x, y, z = self._estimator.P.diagonal()[POSITION : POSITION + 3].tolist()
+        x, y, z = self._world.estimator.P.diagonal()[POSITION : POSITION + 3].tolist()
         return (mavlink.estimator_status(tick * 1000, healthy, sqrt(max(0.0, x, y)), sqrt(max(0.0, z))),)
 
     def _sys_status(self, tick: int) -> Messages:
@@ -118,12 +100,12 @@ class FlightMessages:
         return (mavlink.battery(self._supervisor.battery_mv),)
 
     def _named_values(self, tick: int) -> Messages:
-        age_us = self._poses.age_us
+        age_us = self._world.poses.age_us
         return tuple(
             mavlink.named_value(tick, name, value)
             for name, value in (
                 ("age_ms", UNKNOWN_AGE if age_us is None else age_us * 1e-3),
-                ("refused", int(self._estimator.refused)),
+                ("refused", int(self._world.estimator.refused)),
                 ("up_lost", self._stack.counters.lost),
                 ("tx_dropped", self._stack.dropped),
                 ("overruns", self._stack.overruns),

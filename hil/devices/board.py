@@ -5,9 +5,12 @@ from typing import Protocol
 
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.rtos import Kernel
+from firmware_py.wire.mavlink_numbers import Result
 from hil.events import EventQueue
 
 STILL: ImuCounts = (0, 0, 0, 0, 0, 0)
+
+InjectFailure = Callable[[int, int, int, int], Result]  # (now_us, unit, failing, instance)
 
 
 class Uart(Protocol):
@@ -31,7 +34,7 @@ class VirtualBoard:
     """Implements `firmware_py.board.Board`; `servo`, `radio`, `console` and `uart` are where the pins lead to.
 
     Those are told the instant by the clock of the hardware. `run_on` tells whose time it is, and which hardware pins may set
-    going.
+    going. `on_reset` and `on_failure` may be set later: by default a reset comes to nothing, and no part can be let fail.
     """
 
     def __init__(
@@ -41,6 +44,8 @@ class VirtualBoard:
         console: Callable[[int, str], None],
         uart: Uart | None = None,
     ) -> None:
+        self.on_reset: Callable[[int], None] = lambda now_us: None
+        self.on_failure: InjectFailure = lambda now_us, unit, failing, instance: Result.UNSUPPORTED
         self.imu: ImuCounts = STILL
         self.battery_mv = 3900
         self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
@@ -109,3 +114,14 @@ class VirtualBoard:
     def debug_write(self, text: str) -> None:
         """Hand a line to the console."""
         self._console(self.now_us, text)
+
+    def reset(self) -> None:
+        """Let whoever boots the processor do so before its tasks go on."""
+        self.on_reset(self.now_us)
+        self._let_hardware_go_first()
+
+    def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
+        """Ask the world."""
+        result = self.on_failure(self.now_us, unit, failing, instance)
+        self._let_hardware_go_first()
+        return result

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.firmware import Firmware
 from firmware_py.wire import crtp, telemetry
+from firmware_py.wire.mavlink_numbers import Result
 from hil.config import load_config
 from hil.events import EventQueue
 
@@ -26,6 +27,7 @@ class FirmwareBench:
         self.writes: list[tuple[int, list[int]]] = []
         self.sent: list[tuple[int, bytes]] = []
         self.console: list[str] = []
+        self.resets_us: list[int] = []
         self.now_us = 0
         self.battery_mv = 3900
         self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
@@ -49,6 +51,12 @@ class FirmwareBench:
 
     def debug_write(self, text: str) -> None:
         self.console.append(text)
+
+    def reset(self) -> None:
+        self.resets_us.append(self.now_us)
+
+    def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
+        return Result.UNSUPPORTED  # as hardware that flies
 
     def _sample(self, now_us: int) -> None:
         if self.imu_alive:

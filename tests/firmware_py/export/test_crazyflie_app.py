@@ -34,6 +34,7 @@ from firmware_py.geometry import (
     yaw_quaternion,
 )
 from firmware_py.wire import WireError, crtp, telemetry
+from firmware_py.wire.mavlink_numbers import Result
 from hil.config import load_config
 from support.crazyflie_app import LOCALISATION, STUBS, App, GyroZero, Pose, Setpoint, Supervisor, build_app
 
@@ -101,6 +102,12 @@ class Laboratory:
 
     def debug_write(self, text: str) -> None:
         pass
+
+    def reset(self) -> None:
+        pass
+
+    def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
+        return Result.UNSUPPORTED
 
     def advance(self, now_us: int) -> None:
         while (wake_us := self.firmware.next_wake_us) is not None and wake_us <= now_us:

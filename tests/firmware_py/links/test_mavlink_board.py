@@ -79,12 +79,26 @@ def test_what_a_goal_masks_out_stays_as_it_was(client: Client) -> None:
     assert last_pose(client)[0] == pytest.approx((-0.5, 0.0, 0.0), abs=1e-6)
 
 
-def test_a_visual_pose_is_a_pose(client: Client) -> None:
-    client.send("vision_position_estimate", 0, 0.1, -0.2, -1.45, 0.3, -0.2, -0.5)
+@pytest.mark.parametrize("kind", ["vision", "global_vision", "vicon"])
+def test_a_pose_in_angles_is_a_pose(client: Client, kind: str) -> None:
+    client.send(f"{kind}_position_estimate", 0, 0.1, -0.2, -1.45, 0.3, -0.2, -0.5)
     client.run(client.now_us + 2000)
     p_GB, R_GB, _ = last_pose(client)
     assert p_GB == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
     assert R_GB.as_euler("ZYX") == pytest.approx((0.5, 0.2, 0.3), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "expected"),
+    [(dialect.MAV_ESTIMATOR_TYPE_MOCAP, State.FLYING), (dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, State.WAITING)],
+)
+def test_odometry_closes_the_loop_unless_it_is_an_autopilots(estimator: int, expected: State) -> None:
+    client, unknown = Client(), [math.nan] + [0.0] * 20
+    fields = (1, 12, 0, 0, -1.15, LEVEL, 0, 0, 0, 0, 0, 0, unknown, unknown, 0, estimator)
+    for at_us in range(GYRO_ZERO_US, 1_000_000, 20_000):
+        client.events.at(at_us, lambda now_us: client.send("odometry", now_us, *fields))
+    client.run(1_000_000)
+    assert client.firmware.signals.supervisor.state is expected
 
 
 @pytest.mark.parametrize(
@@ -487,12 +501,28 @@ def test_a_value_that_is_not_allowed_is_refused_and_the_one_in_force_is_echoed(
     assert client.stack.refused == 2
 
 
-def test_an_unknown_parameter_is_not_answered(client: Client) -> None:
-    assert [a.get_type() for a in client.ask("param_set", 1, 1, b"NONE", 1.0, 9)] == ["STATUSTEXT"]
-    assert client.ask("param_request_read", 1, 1, b"NONE", -1) == []  # said that before
-    assert client.ask("param_request_read", 1, 1, b"", 1000) == []
-    assert client.ask("param_request_read", 1, 1, b"\xff\xfe", -1)[0].get_type() == "STATUSTEXT"
-    assert client.stack.refused == 4
+def test_what_cannot_be_done_with_a_parameter_is_answered_with_the_reason_each_time(client: Client) -> None:
+    def error(name: str, *fields: Any) -> tuple[Any, ...]:
+        (found,) = [a for a in client.ask(name, 1, 1, *fields) if a.get_type() == "PARAM_ERROR"]
+        assert (found.target_system, found.target_component) == (255, 190)
+        return found.param_id, found.param_index, found.error
+
+    missing, out_of_range = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST, dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
+    for _ in range(2):
+        assert error("param_set", b"NONE", 1.0, 9) == ("NONE", -1, missing)
+        assert error("param_request_read", b"NONE", -1) == ("NONE", -1, missing)
+        assert error("param_request_read", b"", 1000) == ("", 1000, missing)
+        assert error("param_set", b"EXT_Z_P", 1e9, 9) == ("EXT_Z_P", -1, out_of_range)
+    assert client.stack.refused == 8
+
+
+def test_an_unknown_parameter_is_told_to_people_once(client: Client) -> None:
+    assert [a.get_type() for a in client.ask("param_set", 1, 1, b"NONE", 1.0, 9)] == [
+        "PARAM_ERROR",
+        "STATUSTEXT",
+    ]
+    assert [a.get_type() for a in client.ask("param_request_read", 1, 1, b"NONE", -1)] == ["PARAM_ERROR"]
+    assert client.ask("param_request_read", 1, 1, b"\xff\xfe", -1)[-1].get_type() == "STATUSTEXT"
 
 
 def test_the_hash_changes_with_any_value_and_back(client: Client) -> None:
@@ -548,14 +578,14 @@ def test_a_list_comes_through_on_a_line_full_of_telemetry(client: Client) -> Non
 
 @pytest.mark.parametrize("kind", ["command_long", "command_int"])
 def test_every_command_is_acknowledged_to_its_sender(client: Client, kind: str) -> None:
-    for number in (400, 185, 245, 410, 510, 511, 512, 520, 1, 0, 65535):
+    for number in (400, 185, 245, 246, 410, 420, 510, 511, 512, 520, 1, 0, 65535):
         fields = (number, 0) if kind == "command_long" else (0, number, 0, 0)
         answers = client.ask(
             kind, 1, 1, *fields, *(math.nan,) * 4, *((0, 0, 0) if kind == "command_int" else (0.0,) * 3)
         )
         (ack,) = [answer for answer in answers if answer.get_type() == "COMMAND_ACK"]
         assert (ack.command, ack.target_system, ack.target_component) == (number, 255, 190)
-        assert (ack.result == UNSUPPORTED) == (number in (1, 0, 65535))
+        assert (ack.result == UNSUPPORTED) == (number in (420, 1, 0, 65535))
 
 
 @pytest.mark.parametrize("target", [(2, 1), (1, 2), (7, 0)])
@@ -587,10 +617,82 @@ def test_a_forced_stop_is_latched(client: Client, params: tuple[float, ...]) -> 
     assert client.command(*params)[0].result == 0  # type: ignore[arg-type]
     client.run(client.now_us + 20_000)
     assert client.firmware.signals.supervisor.cause is Cause.EMERGENCY_STOP
-    assert client.command(400, 1)[0].result == TEMPORARILY_REJECTED
+    ack, why = client.command(400, 1)
+    assert (ack.result, why.text) == (TEMPORARILY_REJECTED, "not armed: emergency stop; reboot first")
+    assert why.severity == dialect.MAV_SEVERITY_WARNING
 
 
-@pytest.mark.parametrize("params", [(400, 2), (400, math.nan), (185, 0), (185, 2), (245, 0), (245, 2)])
+def test_with_an_empty_battery_arming_is_refused_with_that_reason(client: Client) -> None:
+    client.battery_mv = 3000
+    client.run(6_020_000)
+    ack, why = client.command(400, 1)
+    assert (ack.result, why.text) == (TEMPORARILY_REJECTED, "not armed: battery low")
+
+
+@pytest.mark.parametrize("kind", ["command_long", "command_int"])
+def test_a_board_on_the_ground_is_reset_once_what_it_said_has_left(client: Client, kind: str) -> None:
+    fields = (246, 0, 1, 0, 0, 0, 0, 0, 0) if kind == "command_long" else (0, 246, 0, 0, 1, 0, 0, 0, 0, 0, 0)
+    for _ in range(2):  # the second because the first acknowledgement was lost
+        assert [answer.result for answer in client.ask(kind, 1, 1, *fields)] == [0]
+    asked_us = client.now_us
+    client.run(asked_us + 300_000)
+    (reset_us,) = client.resets_us
+    assert 190_000 < reset_us - asked_us < 200_000
+
+
+@pytest.mark.parametrize("kind", ["command_long", "command_int"])
+def test_in_flight_only_a_forced_reset_is_obeyed(kind: str) -> None:
+    client = Client()
+    client.poses(GYRO_ZERO_US, 2_000_000)
+    client.run(1_000_000)
+
+    def reboot(condition: int) -> list[Any]:
+        params = (1, 0, 0, 0, 0, condition, 0)
+        fields = (246, 0, *params) if kind == "command_long" else (0, 246, 0, 0, *params)
+        return [a for a in client.ask(kind, 1, 1, *fields) if a.get_type() in ("COMMAND_ACK", "STATUSTEXT")]
+
+    ack, why = reboot(0)
+    assert (ack.result, why.text) == (TEMPORARILY_REJECTED, "not rebooted: the flaps are under control")
+    client.run(1_400_000)
+    assert client.resets_us == []
+    (ack,) = reboot(20190226)
+    assert ack.result == 0
+    client.run(1_700_000)
+    assert len(client.resets_us) == 1
+
+
+def test_hardware_that_flies_lets_no_part_of_it_fail(client: Client) -> None:
+    assert [answer.result for answer in client.command(420, 0, 2)] == [UNSUPPORTED]
+
+
+def test_the_heartbeat_says_armed_only_while_the_flaps_are_under_control() -> None:
+    client = Client()
+    client.command(511, 0, 50_000)
+
+    def armed_at(end_us: int) -> bool:
+        client.run(end_us)
+        return bool(client.of("HEARTBEAT")[-1].base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    supervisor = client.firmware.signals.supervisor
+    assert supervisor.armed
+    assert not armed_at(300_000)  # calibrating
+    assert not armed_at(700_000)  # waiting for poses
+    client.poses(700_000, 1_400_000)
+    assert armed_at(1_300_000)
+    assert not armed_at(2_100_000)  # silence
+    client.one("param_set", 1, 1, b"EXT_MANUAL", 1.0, 9)
+    assert armed_at(2_300_000)  # angles from outside
+    client.one("param_set", 1, 1, b"EXT_MANUAL", 2.0, 9)
+    assert not armed_at(2_500_000)  # at hover
+    client.one("param_set", 1, 1, b"EXT_MANUAL", 1.0, 9)
+    client.command(185, 1)
+    assert not armed_at(2_700_000)
+
+
+@pytest.mark.parametrize(
+    "params",
+    [(400, 2), (400, math.nan), (185, 0), (185, 2), (245, 0), (245, 2), (246, 0), (246, 2), (246, math.nan)],
+)
 def test_a_parameter_that_cannot_be_is_denied(client: Client, params: tuple[float, ...]) -> None:
     assert client.command(*params)[0].result == DENIED  # type: ignore[arg-type]
     assert client.firmware.signals.supervisor.armed

@@ -1,0 +1,38 @@
+"""Where the robot is in the world: the estimator knows its error from the goal that the last pose was seen from."""
+
+from dataclasses import dataclass
+
+from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY, Estimator
+from firmware_py.geometry import Quaternion, Vector, from_euler_zyx, rotate, wrap_angle, yaw_quaternion
+from firmware_py.links.mavlink_poses import PoseService
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """Reads the running board; every call tells what is true now."""
+
+    estimator: Estimator
+    poses: PoseService
+
+    def angles(self) -> Vector:
+        """Roll, pitch, yaw of B in W."""
+        roll, pitch, yaw = self.estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
+        return roll, pitch, wrap_angle(yaw + self.poses.last_goal[1])
+
+    def q_WB(self) -> Quaternion:
+        """The attitude."""
+        return from_euler_zyx(*self.angles())
+
+    def rates(self) -> Vector:
+        """Body rates p, q, r [rad/s]."""
+        p, q, r = self.estimator.now[RATE : RATE + 3].tolist()
+        return p, q, r
+
+    def motion(self) -> tuple[Vector, Vector]:
+        """p_WB [m] and v_W [m/s]."""
+        p_WG, yaw = self.poses.last_goal
+        q_WG = yaw_quaternion(yaw)
+        now = self.estimator.now
+        x, y, z = rotate(q_WG, tuple(now[POSITION : POSITION + 3].tolist()))
+        v_W = rotate(q_WG, tuple(now[VELOCITY : VELOCITY + 3].tolist()))
+        return (p_WG[0] + x, p_WG[1] + y, p_WG[2] + z), v_W
