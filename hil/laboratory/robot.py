@@ -57,7 +57,7 @@ class Robot:
     """Built at rest in its holder at home, with the firmware running; `watch` sets IMU and cameras going.
 
     `air` (of its radio) and `uart` are what faults of its lines turn, None for a line that it has not. `firmware` is that
-    of the present boot.
+    of the present boot; `restart` is what a reset of its processor comes to, and may be replaced.
     """
 
     def __init__(
@@ -91,6 +91,8 @@ class Robot:
         self._seen_by: list[See] = []
         self.booted_us = 0
         self.board = VirtualBoard(self.plant.set_counts, self._send, self._console, self.uart)
+        self.board.on_reset = self._reset
+        self.restart: Callable[[int], None] = self.boot
         self.board.battery_mv = self.battery.millivolts
 
     def boot(self, now_us: int) -> None:
@@ -196,6 +198,14 @@ class Robot:
         self.events.at(arrival_us, deliver)
 
     # Pins
+
+    def _reset(self, now_us: int) -> None:
+        def restart(now_us: int) -> None:
+            if self.powered:
+                self.say("board", "reset")
+                self.restart(now_us)
+
+        self.events.at(now_us, restart)
 
     def _send(self, now_us: int, data: bytes) -> bool:
         return self.send_packet(now_us, data)

@@ -64,6 +64,7 @@ class ServedRobot:
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
         self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, events, self, robot.air)
         robot.send_packet = self._send
+        robot.restart = self.start
         robot.board.eeprom[:CONFIG_SIZE] = self._factory_config()
         self.start(0)
 

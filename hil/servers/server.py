@@ -12,6 +12,7 @@ from hil.devices.dongle import VirtualDongle
 from hil.devices.markers import NO_POINTS, marker_places
 from hil.devices.nrf51 import Power
 from hil.errors import LabError
+from hil.laboratory.failures import Failures
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
@@ -128,6 +129,7 @@ class Server:
         self.ends.robots.append(served)
         switchboard = Switchboard(robot)
         self.switchboards.append(switchboard)
+        robot.board.on_failure = Failures(robot, switchboard).inject
         planned = False
 
         def let_go(now_us: int) -> None:

@@ -15,6 +15,8 @@ from support.mavproxy_program import PATIENCE_S, MavProxy, mavproxy_here
 from support.paths import SUPPORT
 from support.serving import Served, free_port, serve
 
+PROGRAM_S = 60.0  # for a program to do all that it shall
+
 mavsdk_here = pytest.mark.skipif(
     importlib.util.find_spec("mavsdk") is None,
     reason="MAVSDK IS NOT TESTED: `make clients` (pip install mavsdk) installs it",
@@ -97,7 +99,7 @@ def url(request: pytest.FixtureRequest) -> Iterator[str]:
 def test_mavsdk_reads_telemetry_and_tunes(url: str) -> None:
     script = SUPPORT / "mavsdk_client.py"
     command = [sys.executable, str(script), url, GAIN, "2.5"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=PROGRAM_S, check=False)
     assert ended.returncode == 0, ended.stderr + ended.stdout
     seen = json.loads(ended.stdout.splitlines()[-1])
     assert seen["system"] == 1
@@ -105,7 +107,34 @@ def test_mavsdk_reads_telemetry_and_tunes(url: str) -> None:
     assert seen["quaternion"] == pytest.approx([1, 0, 0, 0], abs=0.05)
     assert len(seen["position"]) == 3
     assert 3.9 < seen["battery_V"] < 4.2  # charged, under load
+    assert seen["odometry"] == pytest.approx(seen["position"], abs=0.5)  # of an estimator without poses
+    assert seen["imu"] == pytest.approx([0, 0, -9.8], abs=3)  # in the flow
+    assert seen["home"] == pytest.approx([0, 0, -1.15])
+    assert abs(seen["height"]) < 1.0
+    assert min(seen["heading_deg"], 360 - seen["heading_deg"]) < 5
+    assert (seen["in_air"], seen["landed_state"], seen["armed"]) == (False, "ON_GROUND", False)
     assert len(seen["floats"]) > 30
     assert seen["others"] == 0
     assert seen["before"] == seen["floats"][GAIN] != 2.5
     assert seen["after"] == 2.5
+
+
+@mavsdk_here
+def test_mavsdk_lets_units_fail_stops_and_reboots() -> None:
+    with serve("--mavlink", address("udp"), "--station") as served:
+        served.wait_for("released", PATIENCE_S)
+        _, host, port = served.line("mavlink ")[0].split(":")
+        command = [sys.executable, str(SUPPORT / "mavsdk_pilot.py"), f"udpin://{host}:{port}"]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=PROGRAM_S, check=False)
+    assert ended.returncode == 0, ended.stderr + ended.stdout
+    seen = json.loads(ended.stdout.splitlines()[-1])
+    assert (seen["in_air"], seen["landed_state"]) == (True, "IN_AIR")
+    assert seen["without poses"] == "disarmed"
+    assert seen["with poses"] == "armed"
+    assert seen["gps"] == "UNSUPPORTED"
+    assert seen["clear mission"] == "UNSUPPORTED"
+    assert seen["logs"] == "NO_LOGFILES"
+    assert seen["unknown parameter"] == "DOES_NOT_EXIST"
+    assert seen["parameter out of range"] == "VALUE_OUT_OF_RANGE"
+    assert seen["arm after the stop"] == "COMMAND_DENIED"
+    assert "not armed: emergency stop; reboot first" in seen["texts"]

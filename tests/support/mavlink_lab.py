@@ -1,0 +1,77 @@
+"""A served robot with a MAVLink line whose far end is pymavlink's own codec, without a wall clock."""
+
+from collections.abc import Callable
+from typing import Any
+
+from hil.clock import FreeRunning, Readers
+from hil.config import load_config
+from hil.laboratory.robot import Robot
+from hil.servers.server import Server
+from support.mavlink_client import STATION, codec
+
+
+class MavlinkLab:
+    """`messages` is what the client has heard, with the instant; `flying` has a ground station, on a wire of its own."""
+
+    master = "here"
+
+    def __init__(self, *settings: str, flying: bool = False) -> None:
+        self.said: list[str] = []
+        self.messages: list[tuple[int, Any]] = []
+        self._codec, self._parser = codec(*STATION), codec(0, 0)
+        self.server = Server(load_config("floaty", settings), 1, 1, self.said.append, mavlink=True)
+        self.server.lab.clock = FreeRunning()
+        (served,) = self.server.ends.robots
+        self.robot: Robot = served.robot
+        served.serve_mavlink(self, {})  # type: ignore[arg-type]
+        if flying:
+            served.fly()
+        self.run(0.1)
+
+    @property
+    def now_us(self) -> int:
+        return self.server.lab.now_us
+
+    @property
+    def faults(self) -> dict[str, float]:
+        """The faults in force, and their sizes."""
+        active = self.server.switchboards[0].active
+        assert len({fault.kind for fault in active}) == len(active)
+        return {fault.kind: fault.size for fault in active}
+
+    # The end of the line
+
+    def open(self, readers: Readers, received: Callable[[int, bytes], object]) -> "MavlinkLab":
+        self._uplink = received
+        return self
+
+    def send(self, data: bytes) -> None:
+        for message in self._parser.parse_buffer(bytearray(data)) or ():
+            self.messages.append((self.server.lab.events.now_us, message))
+
+    # The client
+
+    def run(self, duration_s: float) -> None:
+        lab = self.server.lab
+        lab.end_us = lab.now_us + round(duration_s * 1e6)
+        lab.run()
+
+    def command(self, number: int, *params: float) -> Any:
+        """Send a COMMAND_LONG; returns what comes of it, None when no acknowledgement comes."""
+        self.messages.clear()
+        values = (*params, *(0.0,) * (7 - len(params)))
+        self._uplink(self.now_us, self._codec.command_long_encode(1, 1, number, 0, *values).pack(self._codec))
+        self.run(0.05)
+        return next((message.result for message in self.of("COMMAND_ACK")), None)
+
+    def of(self, kind: str) -> list[Any]:
+        return [message for _, message in self.messages if message.get_type() == kind]
+
+    def texts(self) -> list[str]:
+        return [message.text for message in self.of("STATUSTEXT")]
+
+    def armed(self) -> bool:
+        """What the next heartbeat says."""
+        self.messages.clear()
+        self.run(1.05)
+        return bool(self.of("HEARTBEAT")[-1].base_mode & 128)
