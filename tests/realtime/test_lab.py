@@ -26,6 +26,20 @@ HOVER = 0.1  # off home at most [m]; the paper hovers within centimetres
 AGE_MS = 5.0  # off the cameras' latency at most: the loopback interface and a busy machine
 
 
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_whichever_axis_points_up_the_printed_address_shows_the_robot_in_its_holder(up: str) -> None:
+    with serve("--udp", "0", "--up", up, motive=True) as lab:
+        assert lab.motive.endswith(",z-up") == (up == "z")
+        receiver = find_source(lab.motive, CaptureConfig())
+        receiver.open()
+        frame, deadline = None, time.monotonic() + START_S
+        while (frame is None or not frame.valid) and time.monotonic() < deadline:
+            frame = receiver.receive(0.1)
+        receiver.close()
+    assert frame is not None
+    assert frame.p_WB == pytest.approx((0.0, 0.0, 1.15), abs=0.05)
+
+
 @needs("natnet")
 def test_the_cameras_pose_is_what_a_client_gets() -> None:
     """Against what our own client makes of the same stream; the noise makes each frame one of a kind.

@@ -21,11 +21,11 @@ class MavlinkLab:
         self._codec, self._parser = codec(*STATION), codec(0, 0)
         self.server = Server(load_config("floaty", settings), 1, 1, self.said.append, mavlink=True)
         self.server.lab.clock = FreeRunning()
-        (served,) = self.server.ends.robots
-        self.robot: Robot = served.robot
-        served.serve_mavlink(self, {})  # type: ignore[arg-type]
+        (self.served,) = self.server.ends.robots
+        self.robot: Robot = self.served.robot
+        self.served.serve_mavlink(self, {})  # type: ignore[arg-type]
         if flying:
-            served.fly()
+            self.served.fly()
         self.run(0.1)
 
     @property

@@ -12,7 +12,7 @@ from cflib.crtp.crtpstack import CRTPPacket
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_py.wire import WireError, crtp, telemetry
+from firmware_py.wire import WireError, crtp, localisation, telemetry
 from firmware_py.wire.scalars import Scalar
 from ground_station.links.crazyradio import CrazyradioLink
 
@@ -98,6 +98,13 @@ def test_a_position_outside_of_any_tunnel_is_none():
     for x in (1000.5, -1001.0, 1e39):
         with pytest.raises(WireError, match="within 1000 m"):
             crtp.encode_ext_pose((x, 0, 0), Q, 0)
+
+
+@pytest.mark.parametrize("z", [nan, inf, 1000.5, -3e38])
+def test_a_position_without_attitude_is_judged_alike(z):
+    assert localisation.decode_position(struct.pack("<3f", 1, 2, 1000)) == (1, 2, 1000)
+    with pytest.raises(WireError, match="within 1000 m"):
+        localisation.decode_position(struct.pack("<3f", 1, 2, z))
 
 
 @given(st.binary(max_size=40))
