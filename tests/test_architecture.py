@@ -66,7 +66,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "elftools": ("firmware_py/export/arm_image.py",),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
     "subprocess": (
-        "hil/laboratory/run.py", "hil/pictures/window.py", "hil/servers/linked.py",
+        "hil/laboratory/result.py", "hil/pictures/window.py", "hil/servers/linked.py",
         "ground_station/sources/motioncapture_client.py",
         "firmware_py/export/native.py", "firmware_py/export/arm_image.py", "firmware_py/export/plain.py",
     ),

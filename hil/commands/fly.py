@@ -138,10 +138,8 @@ def _fly_one(request: Request, folder: Path, realtime: bool, watch: bool, perfet
         console.print(
             f"the live viewer was too slow for {missed} of the flight's seconds; the recording has them all"
         )
-    if result.stood_still_us:
-        console.print(
-            f"this machine was too slow: time stood still for {result.stood_still_us / 1000:.0f} ms"
-        )
+    if result.stood_still_ms:
+        console.print(f"this machine was too slow: time stood still for {result.stood_still_ms:.0f} ms")
     if result.outcome == "interrupted":
         return INTERRUPTED
     return 0 if result.passed else 1

@@ -10,7 +10,7 @@ from rich.console import Console
 from hil.commands.options import console
 
 if TYPE_CHECKING:
-    from hil.laboratory.run import Result
+    from hil.laboratory.result import Result
 
 SEED_COLUMNS = (
     ("rms x y z [cm]", ("rms_x", "rms_y", "rms_z"), 100.0, 2),
@@ -27,14 +27,14 @@ def print_seeds(rows: list[Result]) -> None:
 
     if not rows:
         return
-    table = Table(title=f"{rows[0].request.experiment.name}, profile {rows[0].request.profile}")
+    table = Table(title=f"{rows[0].experiment}, profile {rows[0].profile}")
     for heading in ("seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict"):
         table.add_column(heading, justify="right")
     for result in rows:
         failed = ", ".join(verdict.metric for verdict in result.verdicts if not verdict.holds)
         verdict = "ok" if result.passed else result.cause or f"fails: {failed}"
         table.add_row(
-            str(result.request.seed),
+            str(result.seed),
             *(
                 " ".join(f"{result.metrics[name] * scale:.{digits}f}" for name in names)
                 for _, names, scale, digits in SEED_COLUMNS
@@ -66,8 +66,7 @@ def print_result(result: Result) -> None:
     from ground_station.latency import budget_line
     from hil.laboratory.metrics import METRICS
 
-    request = result.request
-    table = Table(title=f"{request.experiment.name}, seed {request.seed}, profile {request.profile}")
+    table = Table(title=f"{result.experiment}, seed {result.seed}, profile {result.profile}")
     table.add_column("metric")
     for heading in ("value", "limit", "verdict"):
         table.add_column(heading, justify="right")
@@ -90,7 +89,7 @@ def print_result(result: Result) -> None:
         console.print(budget_line(result.ages), soft_wrap=True)
     if result.usage is not None:
         for name, load in result.usage.entries.items():
-            console.print(f"  {request.board} {name:9} {load}", soft_wrap=True)
+            console.print(f"  {result.board} {name:9} {load}", soft_wrap=True)
     for name in ("report.html", "flight.rrd", "flight.perfetto-trace", "log.parquet"):
         if (result.folder / name).is_file():
             hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from pydantic import BeforeValidator
 
 from firmware_py.geometry import euler_zyx_of
 from firmware_py.wire.supervisor import State
@@ -97,12 +98,15 @@ METRICS: Mapping[str, Metric] = {
 }
 
 
+Figure = Annotated[float, BeforeValidator(lambda value: np.nan if value is None else value)]  # null in a file
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """One limit, judged."""
 
     metric: str
-    value: float
+    value: Figure
     bound: float
     holds: bool
 

@@ -137,10 +137,13 @@ def finish_log(
 def load_log(folder: Path) -> pa.Table:
     """Return the log of a run folder; a run whose process died is read up to its last complete second.
 
-    Raises `LabError` when the folder holds no log.
+    Raises `LabError` when the folder holds no log that can be read.
     """
     if (folder / PARQUET).is_file():
-        return pa.parquet.read_table(folder / PARQUET)
+        try:
+            return pa.parquet.read_table(folder / PARQUET)
+        except (pa.ArrowInvalid, OSError) as error:
+            raise LabError(f"{folder / PARQUET}: not a flight log ({error})") from None
     if (folder / STREAM).is_file():
         return _read_stream(folder / STREAM)
     raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")

@@ -16,12 +16,12 @@ import pyarrow as pa
 from hil.errors import LabError
 from hil.laboratory.metrics import METRICS, SHOWN
 from hil.laboratory.recorder import load_log
-from hil.laboratory.run import read_result
+from hil.laboratory.result import Result, read_result
 from hil.pictures.overlays import pair
 from hil.pictures.pages import data_uri, write_page
 
 PICTURE, PAGE = "compare.png", "compare.html"
-ORIGIN = (
+SETTINGS = (
     "experiment",
     "profile",
     "seed",
@@ -37,9 +37,8 @@ ORIGIN = (
 class Run:
     """A run folder's log and result."""
 
-    folder: Path
     log: pa.Table
-    result: Mapping[str, Any]
+    result: Result
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +88,7 @@ class Comparison:
 
 def load_run(folder: Path) -> Run:
     """Return what a run folder holds. Raises `LabError` when it cannot be read."""
-    try:
-        run = Run(folder, load_log(folder), read_result(folder))
-    except (ValueError, KeyError, OSError) as error:  # pyarrow's and json's errors are ValueErrors
-        raise LabError(f"{folder}: not a readable run ({error})") from None
+    run = Run(load_log(folder), read_result(folder))
     if "flight.free" not in run.log.column_names:
         raise LabError(f"{folder}: its log is not that of a flight")
     return run
@@ -115,7 +111,7 @@ def compare(a: Run, b: Run) -> Comparison:
 
 def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Path:
     """Write `compare.png` and `compare.html` into a folder; returns the page. Raises `LabError`."""
-    png = pair((a.log, b.log), (str(a.folder), str(b.folder)))
+    png = pair((a.log, b.log), (str(a.result.folder), str(b.result.folder)))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / PICTURE).write_bytes(png)
@@ -143,22 +139,20 @@ def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Differenc
     return Difference(rows, next(t for t in times if t is not None), "t", (times[0], times[1]))
 
 
-def _metric_pairs(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[MetricPair]:
+def _metric_pairs(a: Result, b: Result) -> list[MetricPair]:
     pairs = []
     for name, metric in METRICS.items():
-        values = [result["metrics"].get(name) for result in (a, b)]
-        if values == [None, None]:
-            continue
         scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
-        first, second = (math.nan if value is None else value * scale for value in values)
-        pairs.append(MetricPair(name, unit, (first, second)))
+        first, second = (result.metrics.get(name, math.nan) * scale for result in (a, b))
+        if not (math.isnan(first) and math.isnan(second)):
+            pairs.append(MetricPair(name, unit, (first, second)))
     return pairs
 
 
 def _differing_settings(a: Run, b: Run) -> list[tuple[str, str, str]]:
     trees = [
-        {name: run.result.get(name) for name in ORIGIN}
-        | {f"versions.{name}": number for name, number in run.result.get("versions", {}).items()}
+        {name: getattr(run.result, name) for name in SETTINGS}
+        | {f"versions.{name}": number for name, number in run.result.versions.items()}
         | _flat(json.loads((run.log.schema.metadata or {}).get(b"config", b"{}")))
         for run in (a, b)
     ]

@@ -5,10 +5,9 @@ From `result.json`, `log.parquet` and `events.jsonl`; a flight that was lost, in
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 
@@ -18,7 +17,7 @@ from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Span, spans_of
 from hil.laboratory.metrics import METRICS, SHOWN
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import read_result
+from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.figures import PICTURES, SCHEDULE, WAY
 from hil.pictures.gallery import pictures_of
@@ -64,7 +63,7 @@ class Shown:
 def write_report(folder: Path) -> Path:
     """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log."""
     log, result = load_log(folder), read_result(folder)
-    own = pictures_of(result["experiment"])
+    own = pictures_of(result.experiment)
     shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
     shown += [
         _show(picture, table)
@@ -86,20 +85,20 @@ def write_report(folder: Path) -> Path:
     )
 
 
-def metric_rows(result: Mapping[str, Any]) -> list[Row]:
-    """Return one row per metric of a `result.json` that has a value or a limit, those with a limit first."""
-    verdicts = {verdict["metric"]: verdict for verdict in result["verdicts"]}
+def metric_rows(result: Result) -> list[Row]:
+    """Return one row per metric that has a value or a limit, those with a limit first."""
+    verdicts = {verdict.metric: verdict for verdict in result.verdicts}
     rows = []
     for name, metric in METRICS.items():
-        value = result["metrics"].get(name)
+        value = result.metrics.get(name, math.nan)
         scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
         verdict = verdicts.get(name)
-        if value is None and verdict is None:
+        if math.isnan(value) and verdict is None:
             continue
         sign = "≤" if metric.bound == "max" else "≥"
-        limit = "" if verdict is None else f"{sign} {verdict['bound'] * scale:.4g}"
-        text = "–" if value is None else f"{value * scale:.4g}"
-        rows.append(Row(name, metric.meaning, text, unit, limit, verdict and verdict["holds"]))
+        limit = "" if verdict is None else f"{sign} {verdict.bound * scale:.4g}"
+        text = "–" if math.isnan(value) else f"{value * scale:.4g}"
+        rows.append(Row(name, metric.meaning, text, unit, limit, None if verdict is None else verdict.holds))
     return sorted(rows, key=lambda row: row.holds is None)
 
 

@@ -17,7 +17,8 @@ from rich.console import Console
 from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.metrics import METRICS, SHOWN
-from hil.laboratory.run import Request, Result
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper_rows import ROWS, Row
 from hil.studies.study import Study
@@ -154,7 +155,8 @@ def fly_paper(
         for number, (_, _, request) in enumerate(planned):
             jobs.setdefault(_key(request), Job(request, out / f"study-{study_name}-{number}", ()))
     results, interrupted = fly_all(list(jobs.values()), notices)
-    flown = {_key(result.request): result for result in results}
+    landed = {result.folder: result for result in results}
+    flown = {key: landed[job.folder] for key, job in jobs.items() if job.folder in landed}
 
     def of(name: str, profile: str) -> Trials:
         return Trials(profile, tuple(flown[key] for key in trials[name, profile] if key in flown))

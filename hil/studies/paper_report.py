@@ -16,7 +16,7 @@ import numpy as np
 from hil.config import load_config
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
-from hil.laboratory.run import RESULT, commit, versions
+from hil.laboratory.result import RESULT, commit, versions
 from hil.pictures.figures import PICTURES
 from hil.pictures.gallery import pictures_of
 from hil.pictures.pages import data_uri, write_page
@@ -89,7 +89,7 @@ def _figures(both: Sequence[Trials]) -> list[Figure]:
         if not ordered:
             continue
         logs = [load_log(result.folder) for result in ordered]
-        own = pictures_of(ordered[0].request.experiment.name)
+        own = pictures_of(ordered[0].experiment)
         figures += [
             Figure(
                 trials.profile, one.title, one.caption, data_uri(one.png(*(logs if own else logs[:1])))
@@ -130,7 +130,7 @@ def _trials(row: Row, trials: Trials) -> dict[str, Any]:
         },
         "flights": [
             {
-                "seed": result.request.seed,
+                "seed": result.seed,
                 "outcome": result.outcome,
                 "cause": result.cause,
                 "passed": result.passed,

@@ -9,7 +9,8 @@ import numpy as np
 
 from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
-from hil.laboratory.run import Request, Result
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request
 from hil.studies.study import Expected, Study, Variant
 
 OUTCOMES = ("holds", "degrades", "failsafe", "lost", "error")  # from good to bad

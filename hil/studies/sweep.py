@@ -11,7 +11,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
 
 
 @dataclass(frozen=True, slots=True)

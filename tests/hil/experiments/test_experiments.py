@@ -22,7 +22,8 @@ from hil.experiments.pushes import FAULTS, PUSHES
 from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.gallery import pictures_of
 from hil.pictures.picture import Picture
 from hil.world.body import SIGNS

@@ -11,7 +11,8 @@ from hil.experiments import EXPERIMENTS
 from hil.experiments.take_off import CONTROLLER_ON, FANS_OFF, LANDING_FROM, STANDING_Z
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
 from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 

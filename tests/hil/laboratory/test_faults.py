@@ -27,7 +27,8 @@ from hil.laboratory.faults import Fault, check, parse, spans_of
 from hil.laboratory.lockstep import MAVLINK, RADIO, lockstep_flight
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, Result, fly, prepare, read_result
+from hil.laboratory.result import Result, read_result
+from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.report import write_report
 from hil.world.config import PlantConfig, ServoConfig
 from hil.world.plant import Plant
@@ -447,17 +448,14 @@ def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> No
     for span in spans_of(log.schema.metadata):
         expected += (column(log, "t") >= span.begin_us) & (column(log, "t") < span.end_us)
     assert column(log, "fault.active").tolist() == expected.tolist()
-    assert [str(span.fault) for span in spans_of(log.schema.metadata)] == result_faults(result)
+    assert [str(span.fault) for span in spans_of(log.schema.metadata)] == list(
+        read_result(result.folder).faults
+    )
     texts = [event["text"] for event in load_events(result.folder) if "fault" in event["text"]]
     assert texts[:3] == [
         "fault imu.noise@0.2:1=2 begins", "fault push.x@0.5=0.1 begins", "fault push.x@0.5=0.1 ends"
     ]  # fmt: skip
     assert len(texts) == 6
-
-
-def result_faults(result: Result) -> list[str]:
-    faults: list[str] = read_result(result.folder)["faults"]
-    return faults
 
 
 def test_without_faults_the_log_has_no_column_of_them(tmp_path: Path) -> None:

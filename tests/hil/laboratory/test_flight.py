@@ -15,7 +15,8 @@ from hil.laboratory.faults import parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import METRICS, column, judge
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, Result, fly, prepare, read_result
+from hil.laboratory.result import Result, read_result
+from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.report import write_report
 
 HOVER = EXPERIMENTS["hover"]
@@ -146,7 +147,7 @@ def test_ctrl_c_keeps_what_was_flown(tmp_path: Path) -> None:
     assert result.outcome == "interrupted"
     assert not result.passed
     assert load_log(result.folder).num_rows == pytest.approx(200, abs=30)
-    assert read_result(result.folder)["outcome"] == "interrupted"
+    assert read_result(result.folder).outcome == "interrupted"
 
 
 def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -> None:
@@ -192,9 +193,12 @@ def test_pose_is_about_forty_milliseconds_old(tmp_path: Path) -> None:
 def test_a_killed_run_is_readable_up_to_its_last_second(tmp_path: Path) -> None:
     result = hover(tmp_path / "run", duration_s=0.5)
     (result.folder / "result.json").unlink()
-    content = read_result(result.folder)
-    assert content["outcome"] == "error"
-    assert content["seed"] == 1
+    killed = read_result(result.folder)
+    assert killed.outcome == "error"
+    assert not killed.passed
+    assert (killed.experiment, killed.seed, killed.duration_s, killed.faults) == ("hover", 1, 0.5, ())
+    assert killed.versions == result.versions
+    assert killed.metrics["rms_x"] == result.metrics["rms_x"]
 
 
 def test_a_folder_with_other_things_in_it_is_left_alone(tmp_path: Path) -> None:

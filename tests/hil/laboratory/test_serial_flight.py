@@ -13,7 +13,8 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import MAVLINK
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.figures import PICTURES
 
 FLOATY = (sys.executable, "-m", "hil.commands")

@@ -43,7 +43,7 @@ def changed(run: Run, row: int, column: str, value: float) -> Run:
     field = run.log.schema.field(place)
     values = run.log.column(place).to_numpy().copy()
     values[row] = value
-    return Run(run.folder, run.log.set_column(place, field, pa.array(values, field.type)), run.result)
+    return Run(run.log.set_column(place, field, pa.array(values, field.type)), run.result)
 
 
 def test_the_same_seed_is_identical(runs: dict[str, Path]) -> None:
@@ -86,7 +86,7 @@ def test_any_changed_cell_is_found(runs: dict[str, Path], data: st.DataObject) -
 
 def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) -> None:
     run = load_run(runs["one"])
-    short = Run(run.folder, run.log.slice(0, 20), run.result)
+    short = Run(run.log.slice(0, 20), run.result)
     for a, b, ended in ((run, short, 1), (short, run, 0)):
         first = compare(a, b).first
         assert first is not None
@@ -97,7 +97,7 @@ def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) ->
 
 def test_a_missing_column_is_told(runs: dict[str, Path]) -> None:
     run = load_run(runs["one"])
-    less = Run(run.folder, run.log.drop_columns(["truth.x"]), run.result)
+    less = Run(run.log.drop_columns(["truth.x"]), run.result)
     comparison = compare(run, less)
     assert comparison.missing == ((), ("truth.x",))
     assert comparison.first is None

@@ -18,7 +18,8 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory import ages
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
-from hil.laboratory.run import Request, fly, prepare, read_result
+from hil.laboratory.result import read_result
+from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.figures import PICTURES, way
 from hil.pictures.report import metric_rows, write_report
@@ -71,19 +72,19 @@ def keep_rows(folder: Path, count: int) -> None:
 def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
     result, rows = read_result(folder), report(folder).tables["metrics"][1:]
     assert {row[0] for row in rows} == {
-        name for name, value in result["metrics"].items() if value is not None
+        name for name, value in result.metrics.items() if not math.isnan(value)
     }
-    assert {verdict["metric"] for verdict in result["verdicts"]} <= {row[0] for row in rows} <= set(METRICS)
+    assert {verdict.metric for verdict in result.verdicts} <= {row[0] for row in rows} <= set(METRICS)
     told = {row[0]: row for row in rows}
-    for verdict in result["verdicts"]:
-        name, value, _, limit, holds, _ = told[verdict["metric"]]
+    for verdict in result.verdicts:
+        name, value, _, limit, holds, _ = told[verdict.metric]
         scale = {"lost": 1, "attitude_max": math.degrees(1)}.get(name, 100)
-        assert float(value) == pytest.approx(verdict["value"] * scale, rel=1e-3)
-        assert float(limit[1:]) == pytest.approx(verdict["bound"] * scale, rel=1e-3)
+        assert float(value) == pytest.approx(verdict.value * scale, rel=1e-3)
+        assert float(limit[1:]) == pytest.approx(verdict.bound * scale, rel=1e-3)
         assert limit[0] == ("≤" if METRICS[name].bound == "max" else "≥")
-        assert holds == ("holds" if verdict["holds"] else "fails")
-    assert {row[0] for row in rows if row[3]} == {verdict["metric"] for verdict in result["verdicts"]}
-    assert float(told["rms_x"][1]) == pytest.approx(100 * result["metrics"]["rms_x"], rel=1e-3)
+        assert holds == ("holds" if verdict.holds else "fails")
+    assert {row[0] for row in rows if row[3]} == {verdict.metric for verdict in result.verdicts}
+    assert float(told["rms_x"][1]) == pytest.approx(100 * result.metrics["rms_x"], rel=1e-3)
     assert told["rms_x"][2] == "cm"
 
 
@@ -109,7 +110,7 @@ def test_the_way_of_the_poses_adds_up_to_their_age_and_survives_a_cut_file(folde
 @pytest.mark.long
 @pytest.mark.usefixtures("few_pictures")
 def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) -> None:
-    stages = read_result(folder)["ages"]
+    stages = read_result(folder).ages
     rows = report(folder).tables["ages"][1:]
     assert [row[0] for row in rows] == [
         "pose on board",
@@ -121,7 +122,7 @@ def test_the_report_tells_where_the_age_of_the_poses_comes_from(folder: Path) ->
     ]
     for row, stage in zip(rows, stages, strict=True):
         assert [float(text) for text in row[1:]] == pytest.approx(
-            [1e-3 * stage["mean_us"], 1e-3 * stage["p99_us"]], abs=0.006
+            [1e-3 * stage.mean_us, 1e-3 * stage.p99_us], abs=0.006
         )
 
 
@@ -132,10 +133,10 @@ def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
     result, page = read_result(folder), report(folder)
     run = {row[0]: row[1] for row in page.tables["run"]}
     assert run["seed"] == "1"
-    assert run["hash"] == result["hash"]
+    assert run["hash"] == result.hash
     assert run["commit"] == "0123456789ab"
     assert run["profile"] == "floaty --set tunnel.turbulence=T1"
-    for name, number in result["versions"].items():
+    for name, number in result.versions.items():
         assert f"{name} {number}" in run["versions"]
     assert "released" in [row[2] for row in page.tables["events"]]
 
@@ -186,8 +187,9 @@ def test_without_a_log_there_is_no_report(tmp_path: Path) -> None:
         write_report(tmp_path)
 
 
-def test_a_metric_without_a_value_is_a_dash_and_fails() -> None:
+def test_a_metric_without_a_value_is_a_dash_and_fails(folder: Path) -> None:
     verdict = {"metric": "rms_x", "value": None, "bound": 0.1, "holds": False}
-    rows = {row.name: row for row in metric_rows({"metrics": {"rms_x": None}, "verdicts": [verdict]})}
+    change_result(folder, metrics={"rms_x": None}, verdicts=[verdict])
+    rows = {row.name: row for row in metric_rows(read_result(folder))}
     assert (rows["rms_x"].value, rows["rms_x"].holds) == ("–", False)
     assert "rms_y" not in rows  # neither a value nor a limit

@@ -15,7 +15,8 @@ import pytest
 
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS, Verdict
-from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_rows import OUTSIDE, ROWS, Claim, Row

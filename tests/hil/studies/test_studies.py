@@ -11,7 +11,8 @@ from hil.commands.app import main
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
-from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
 from hil.studies.catalogue import STUDIES
 from hil.studies.study import Change, Expected, Study, Variant
 from hil.studies.study_figures import picture

@@ -13,7 +13,8 @@ from hil.experiments.specific_power import VEHICLES
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
 from hil.world.battery import Battery, endurance, open_circuit_voltage
 from hil.world.config import BatteryConfig
 

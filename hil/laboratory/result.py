@@ -1,0 +1,155 @@
+"""What is known of a run: where it comes from and how it went; `result.json`, written once and read back as the same type.
+
+A number that a flight does not have is NaN here and null in the file. Of a run whose process was killed, which left no
+`result.json`, the log tells the origin and the metrics.
+"""
+
+import json
+import math
+import platform
+import subprocess
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, computed_field
+
+from firmware_py.export.cortex_m4 import Usage
+from firmware_py.rtos import TaskReport
+from ground_station.latency import Stage
+from hil.errors import LabError
+from hil.laboratory.metrics import Figure, Verdict, measure
+from hil.laboratory.recorder import load_log
+
+RESULT = "result.json"
+
+Outcome = Literal["completed", "lost", "interrupted", "error"]
+AsText = BeforeValidator(
+    lambda value: json.loads(value) if isinstance(value, str) else value
+)  # in a log's schema
+
+
+@dataclass(frozen=True, slots=True)
+class QueueReport:
+    """How full a queue became."""
+
+    name: str
+    length: int
+    high_water: int
+    dropped: int
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What was flown, by which program; it stands in the log's schema, too."""
+
+    experiment: str
+    profile: str
+    overrides: Annotated[tuple[str, ...], AsText]
+    seed: int
+    duration_s: float
+    link: str
+    board: str
+    faults: Annotated[tuple[str, ...], AsText]  # the experiment's own and those on top
+    versions: Annotated[Mapping[str, str], AsText]  # of what computed the flight
+    commit: str
+
+    def metadata(self) -> dict[str, str]:
+        """Return it as a log's schema holds it."""
+        values = {field.name: getattr(self, field.name) for field in fields(Origin)}
+        return {
+            name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Result(Origin):
+    """How a run went."""
+
+    outcome: Outcome
+    cause: str | None
+    metrics: Mapping[str, Figure]
+    verdicts: tuple[Verdict, ...]
+    tasks: tuple[TaskReport, ...]
+    queues: tuple[QueueReport, ...]
+    usage: Usage | None  # of the board, where it was measured
+    ages: tuple[Stage, ...]  # where the age of the poses came from
+    hash: str  # empty: the process was killed
+    real_time_factor: Figure
+    stood_still_ms: Figure  # simulated time, while the machine was too slow for a paced flight
+    folder: Annotated[Path, Field(exclude=True)] = Path()  # where it lies
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def passed(self) -> bool:
+        """Whether the flight came to an end of its own, which may be a crash, and every limit holds."""
+        return self.outcome in ("completed", "lost") and all(verdict.holds for verdict in self.verdicts)
+
+
+_ORIGIN, _RESULT = TypeAdapter(Origin), TypeAdapter(Result)
+
+
+def write_result(result: Result) -> None:
+    """Write `result.json`."""
+    (result.folder / RESULT).write_bytes(_RESULT.dump_json(result, indent=2) + b"\n")
+
+
+def read_result(folder: Path) -> Result:
+    """Return the result of a run folder. Raises `LabError` when the folder holds no run of this version."""
+    path = folder / RESULT
+    if not path.is_file():
+        return _of_killed(folder)
+    try:
+        return replace(_RESULT.validate_json(path.read_bytes()), folder=folder)
+    except ValidationError as error:
+        raise LabError(f"{path}: {_first_of(error)}") from None
+
+
+def _of_killed(folder: Path) -> Result:
+    log = load_log(folder)
+    metadata = {key.decode(): value.decode() for key, value in (log.schema.metadata or {}).items()}
+    try:
+        origin = _ORIGIN.validate_python(metadata)
+    except ValidationError as error:
+        raise LabError(f"{folder}: the log's schema: {_first_of(error)}") from None
+    return Result(
+        **asdict(origin), outcome="error", cause="the process ended before the flight did",
+        metrics=measure(log, lost=False), verdicts=(), tasks=(), queues=(), usage=None, ages=(), hash="",
+        real_time_factor=math.nan, stood_still_ms=math.nan, folder=folder,
+    )  # fmt: skip
+
+
+def _first_of(error: ValidationError) -> str:
+    """Return what is wrong first: which value, and what is expected."""
+    detail = error.errors()[0]
+    name, message = ".".join(map(str, detail["loc"])), detail["msg"]
+    if detail["type"] == "missing":
+        return f"{name} is missing: it was written by another version; fly again"
+    value = f"{name} = {detail['input']!r}: " if name else ""
+    return f"{value}{message[0].lower()}{message[1:]}"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computes a flight."""
+    found = {"python": platform.python_version()}
+    for name in ("floaty-hil", "numpy", "numba", "pyarrow"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def commit() -> str:
+    """Return the git commit of the sources, with `+` when they were changed; empty outside a clone."""
+    source = Path(__file__).parent
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"],
+            cwd=source, capture_output=True, text=True, timeout=10, check=True,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return described.stdout.strip()

@@ -1,0 +1,133 @@
+"""A run's result: written once, read back as the same type, and whatever is not one is one clear line."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from firmware_py.export.cortex_m4 import Load, Usage
+from firmware_py.rtos import TaskReport
+from ground_station.latency import Stage
+from hil.errors import LabError
+from hil.laboratory.metrics import Verdict
+from hil.laboratory.recorder import Channel, Quantity, Recorder
+from hil.laboratory.result import RESULT, Origin, QueueReport, Result, read_result, write_result
+from support.command import floaty
+
+KEYS = """
+    experiment profile overrides seed duration_s link board faults outcome cause metrics verdicts passed tasks queues usage
+    ages hash versions commit real_time_factor stood_still_ms
+""".split()  # noqa: SIM905  of result.json, which programs of users read
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Result:
+    return Result(
+        "hover", "floaty", ("predictor.enabled=false",), 7, 2.5, "radio", "cortex-m4", ("push.y@1:0.3=2",),
+        {"python": "3.11.2"}, "0123456789ab+",
+        outcome="lost", cause="fell", metrics={"rms_x": 0.01, "settle": math.nan, "rise": math.inf},
+        verdicts=(Verdict("rms_x", 0.01, 0.02, True), Verdict("settle", math.nan, 0.5, False)),
+        tasks=(TaskReport("KALMAN", 2, 50, 100, 900, 30, (1,) * 12, None, 0),), queues=(QueueReport("log", 5, 2, 0),),
+        usage=Usage(7530, 4820, 256, {"estimate": Load(3, 100, 120, 50, 60)}), ages=(Stage("pose", 40.5, 41.0),),
+        hash="ab" * 32, real_time_factor=12.34, stood_still_ms=0.0, folder=tmp_path,
+    )  # fmt: skip
+
+
+def change(folder: Path, **values: Any) -> None:
+    content = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+    (folder / RESULT).write_text(json.dumps(content | values), encoding="utf-8")
+
+
+def drop(folder: Path, key: str) -> None:
+    content = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+    del content[key]
+    (folder / RESULT).write_text(json.dumps(content), encoding="utf-8")
+
+
+def test_a_result_is_read_back_as_it_was_written(result: Result) -> None:
+    write_result(result)
+    read = read_result(result.folder)
+    metrics = {"rms_x": 0.01, "settle": math.nan, "rise": math.nan}
+    assert repr(read) == repr(
+        replace(result, metrics=metrics)
+    )  # a NaN does not equal a NaN, but is written alike
+
+
+def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_number(result: Result) -> None:
+    write_result(result)
+    content = json.loads((result.folder / RESULT).read_text(encoding="utf-8"))
+    assert set(content) == set(KEYS)
+    assert content["metrics"] == {"rms_x": 0.01, "settle": None, "rise": None}
+    assert content["verdicts"][1] == {"metric": "settle", "value": None, "bound": 0.5, "holds": False}
+    assert content["usage"]["entries"]["estimate"]["worst_cycles"] == 60
+
+
+@pytest.mark.parametrize(
+    ("outcome", "holds", "passed"),
+    [("completed", True, True), ("lost", True, True), ("completed", False, False), ("lost", False, False),
+     ("interrupted", True, False), ("error", True, False)],
+)  # fmt: skip
+def test_a_run_passes_that_ends_by_itself_and_holds_every_limit(
+    result: Result, outcome: Any, holds: bool, passed: bool
+) -> None:
+    verdicts = (Verdict("rms_x", 0.0, 1.0, True), Verdict("rms_y", 0.0, 1.0, holds))
+    write_result(replace(result, outcome=outcome, verdicts=verdicts))
+    assert json.loads((result.folder / RESULT).read_text(encoding="utf-8"))["passed"] is passed
+    assert read_result(result.folder).passed is passed
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (lambda folder: (folder / RESULT).write_bytes(b"{"), "invalid JSON"),
+        (lambda folder: (folder / RESULT).write_bytes(b'{"hash": "\xff"}'), "invalid JSON"),
+        (lambda folder: (folder / RESULT).write_text("[]"), "should be an object"),
+        (lambda folder: drop(folder, "ages"), "ages is missing: it was written by another version"),
+        (lambda folder: change(folder, seed="x"), "seed = 'x': input should be a valid integer"),
+        (lambda folder: change(folder, outcome="won"), "outcome = 'won': input should be 'completed', 'lost'"),
+        (lambda folder: change(folder, metrics={"rms_x": "big"}), "metrics.rms_x = 'big': input should be a"),
+        (lambda folder: change(folder, verdicts=[{"metric": "rms_x"}]), "verdicts.0.value is missing"),
+    ],
+)  # fmt: skip
+def test_what_is_no_result_is_one_line_that_names_file_and_value(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], result: Result,
+    damage: Callable[[Path], None], told: str,
+) -> None:  # fmt: skip
+    write_result(result)
+    killed(result.folder, result.metadata())
+    damage(result.folder)
+    assert floaty(monkeypatch, "report", result.folder) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"floaty: {result.folder / RESULT}: ")
+    assert told in error
+    assert error.count("\n") == 1
+
+
+def killed(folder: Path, metadata: dict[str, str]) -> None:
+    """Leave a log of no rows."""
+    Recorder(folder, (Channel("f8", lambda: 0.0, (Quantity(("flight.free",), ""),)),), metadata).close()
+
+
+def test_the_origin_of_a_killed_run_is_read_from_its_log(result: Result) -> None:
+    killed(result.folder, result.metadata())
+    read = read_result(result.folder)
+    assert Origin(*(getattr(read, name) for name in Origin.__slots__)) == Origin(
+        *(getattr(result, name) for name in Origin.__slots__)
+    )
+    assert (read.outcome, read.passed, read.hash, read.folder) == ("error", False, "", result.folder)
+    assert math.isnan(read.real_time_factor)
+
+
+def test_a_log_whose_schema_does_not_tell_where_it_comes_from_is_refused(result: Result) -> None:
+    origin = result.metadata()
+    for metadata, told in (
+        ({name: text for name, text in origin.items() if name != "seed"}, "seed is missing"),
+        (origin | {"overrides": "["}, "overrides = '['"),
+    ):
+        killed(result.folder, metadata)
+        with pytest.raises(LabError, match=f"{result.folder}.*{told}".replace("[", r"\[")):
+            read_result(result.folder)
