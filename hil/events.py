@@ -7,7 +7,7 @@ which they were planned.
 from collections.abc import Callable
 from heapq import heappop, heappush, heapreplace
 
-Callback = Callable[[int], None]  # receives the planned instant [us]
+Callback = Callable[[int], object]  # receives the planned instant [us]
 
 
 class EventQueue:

@@ -1,18 +1,16 @@
 """A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, boards that may hear it.
 
-It repeats a packet until it is acknowledged, up to the host's setting; each try and each answer can be lost on its
-own. Times on the air, turn-rounds, retry delays and USB transfers are those of `virtual_radio`; here the host is real
-software, so every exchange happens, empty polls included. Radios that send at the same time do not disturb each other.
+Here the host is real software, so every exchange happens, empty polls included. What happens to one on the air is
+`hil.devices.shockburst`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from hil.devices.config import RadioConfig
 from hil.devices.nrf51 import Nrf51, RadioSettings
-from hil.devices.radio import MAX_PACKET, RETRIES, TURN_ROUND_US, air_us
+from hil.devices.shockburst import MAX_PACKET, RETRIES, Air, Exchange, Transmitter
 from hil.events import EventQueue
 
 Answer = Callable[[int, bytes], None]  # (now_us, what the host reads from the dongle)
@@ -21,27 +19,7 @@ SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_RETRIES, SET_ACKS = 0x01, 0x02, 0x03, 0x
 RATES = (250_000, 1_000_000, 2_000_000)  # by number of the vendor request
 ACKNOWLEDGED = 0x01  # status byte; retries are in its upper half
 NOT_ACKNOWLEDGED = b"\x00"
-
-
-@dataclass(slots=True)
-class DongleCounters:
-    """Exchanges of one dongle."""
-
-    exchanges: int = 0
-    retried: int = 0
-    unanswered: int = 0
-
-
-@dataclass(slots=True)
-class _Exchange:
-    """A packet on its way; `tries` counts those that were begun."""
-
-    packet: bytes
-    board: Nrf51
-    answer: Answer
-    again_us: int
-    tries_left: int
-    tries: int = 0
+NOWHERE = Air(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # to a board that is not there
 
 
 class VirtualDongle:
@@ -50,10 +28,8 @@ class VirtualDongle:
     def __init__(
         self, config: RadioConfig, events: EventQueue, rng: np.random.Generator, boards: Sequence[Nrf51]
     ) -> None:
-        self.counters = DongleCounters()
-        self._config = config
-        self._events = events
         self._rng = rng
+        self._transmitter = Transmitter(config, events, rng.random)
         self._boards = boards
         self._settings = RadioSettings(2, 2_000_000, b"\xe7" * 5)
         self._retries = RETRIES
@@ -76,54 +52,26 @@ class VirtualDongle:
     def transmit(self, now_us: int, packet: bytes, answer: Answer) -> None:
         """Send a packet of 1..32 bytes; `answer` is called once, unless acknowledgements are switched off."""
         packet = packet[:MAX_PACKET]
-        self.counters.exchanges += 1
-        rate = self._settings.bits_per_second
-        heard_us = self._config.usb_us + TURN_ROUND_US + air_us(len(packet), rate)
-        again_us = TURN_ROUND_US + air_us(len(packet), rate) + (1500 if rate == RATES[0] else 500)
-        board = next((board for board in self._boards if board.hears(self._settings)), None)
-        if board is None or not packet:
-            self._give_up(now_us + 2 * self._config.usb_us + (self._retries + 1) * again_us, answer)
-            return
-        exchange = _Exchange(packet, board, answer, again_us, self._retries + 1)
-        self._try(now_us + heard_us + self._jitter_us(board.air.uplink_jitter_us), exchange)
+        settings, acks = self._settings, self._acks
+        payload: bytes | None = None  # of the last answer
+        board = next((board for board in self._boards if packet and board.hears(settings)), None)
+        air = NOWHERE if board is None else board.air
 
-    def _try(self, heard_us: int, exchange: _Exchange) -> None:
-        """Repeat the packet until the board hears it."""
-        loss = exchange.board.air.lost_up(len(exchange.packet))
-        while exchange.tries_left:
-            exchange.tries_left -= 1
-            exchange.tries += 1
-            if not self._happens(loss):
-                self._events.at(heard_us, lambda now_us: self._heard(now_us, exchange))
-                return
-            heard_us += exchange.again_us
-        self._give_up(heard_us + self._config.usb_us, exchange.answer)
+        def hear(now_us: int) -> int | None:
+            nonlocal payload
+            payload = None
+            if board is None or not board.hears(settings):  # switched off meanwhile
+                return None
+            payload = board.hear(now_us, packet)
+            return len(payload) if acks else None
 
-    def _heard(self, now_us: int, exchange: _Exchange) -> None:
-        """The board answers; the dongle hears that, or tries again."""
-        if not exchange.board.hears(self._settings):  # switched off meanwhile
-            self._give_up(now_us + exchange.tries_left * exchange.again_us, exchange.answer)
-            return
-        payload = exchange.board.hear(now_us, exchange.packet)
-        if not self._acks:
-            return
-        if self._happens(exchange.board.air.lost_down(len(payload))):
-            self._try(now_us + exchange.again_us, exchange)
-            return
-        retries = exchange.tries - 1
-        self.counters.retried += retries
-        jitter_us = self._jitter_us(self._config.usb_jitter_us + exchange.board.air.downlink_jitter_us)
-        back_us = TURN_ROUND_US + air_us(len(payload), self._settings.bits_per_second) + self._config.usb_us
-        status = bytes((ACKNOWLEDGED | retries << 4,))
-        self._events.at(now_us + back_us + jitter_us, lambda t_us: exchange.answer(t_us, status + payload))
+        def ended(repetitions: int | None, now_us: int) -> None:
+            if repetitions is not None and payload is not None:
+                answer(now_us, bytes((ACKNOWLEDGED | repetitions << 4,)) + payload)
+            elif acks:
+                answer(now_us, NOT_ACKNOWLEDGED)
 
-    def _give_up(self, at_us: int, answer: Answer) -> None:
-        self.counters.unanswered += 1
-        if self._acks:
-            self._events.at(at_us, lambda now_us: answer(now_us, NOT_ACKNOWLEDGED))
-
-    def _jitter_us(self, limit_us: float) -> int:
-        return int(self._rng.random() * limit_us) if limit_us else 0
-
-    def _happens(self, chance: float) -> bool:
-        return chance > 0.0 and self._rng.random() < chance
+        jitter_us = int(self._rng.random() * air.uplink_jitter_us) if air.uplink_jitter_us else 0
+        retries = self._retries if acks else 0
+        exchange = Exchange(len(packet), settings.bits_per_second, air, retries, hear, ended)
+        self._transmitter.send(now_us + jitter_us, exchange)

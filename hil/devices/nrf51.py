@@ -1,20 +1,19 @@
-"""The board's radio chip, which is also the master of its power: Enhanced ShockBurst with safelink, power switch, reset.
+"""The board's radio chip, which is also the master of its power: safelink on the wire, power switch, reset.
 
-Every packet heard is acknowledged with the head of a queue of 8. Safelink adds one bit per direction: a packet that
-repeats the last bit is not passed on again, and an answer is repeated until the host's bit says that it arrived.
+Every packet heard is acknowledged with the head of a queue of 8. Safelink's counters stand in the headers' two spare bits:
+a packet that repeats the last one is not passed on again, and an answer is repeated until the host's says that it arrived.
 With nothing else to say the firmware acknowledges with its signal strength, the bootloader with nothing at all.
 Facts: Bitcraze's nRF51 firmware and bootloader, reference/crazyflie-clients-and-protocol.md 3.3 and 3.5.
 """
 
 import struct
-from collections import deque
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
 from typing import Protocol
 
 from hil.devices.bootloader import HEADER, NRF51, Bootloader
-from hil.devices.radio import Air, syslink_us
+from hil.devices.shockburst import Air, BoardEnd, Waiting, syslink_us
 from hil.events import EventQueue
 
 NULL, NULL_MASK = 0xF3, 0xF3  # an empty packet's header; the other bits are safelink's
@@ -98,11 +97,9 @@ class Nrf51:
 
     def _forget(self) -> None:
         """Lose what was in memory."""
-        self._queue: deque[bytes] = deque()
+        self._end = BoardEnd(self._capacity)
         self._service = b""
         self._answer = b""  # sent last, to be repeated
-        self._safelink = False
-        self._up = self._down = 1
         self._reset_armed = False
 
     def hears(self, settings: RadioSettings) -> bool:
@@ -112,53 +109,49 @@ class Nrf51:
         booting = self.power is Power.BOOTLOADER
         return settings == (self._bootloader_settings if booting else self.settings)
 
-    def send(self, data: bytes) -> bool:
+    def send(self, now_us: int, data: bytes) -> bool:
         """Take a packet of the STM32 for the ground; False when the queue is full."""
-        if len(self._queue) >= self._capacity:
-            return False
-        self._queue.append(data)
-        return True
+        return self._end.put(Waiting(now_us + syslink_us(data), now_us, data))
+
+    def _reply(self, now_us: int, data: bytes) -> None:
+        """Put a packet of its own into the queue."""
+        self._end.put(Waiting(now_us, now_us, data))
 
     def hear(self, now_us: int, data: bytes) -> bytes:
         """Take a packet from the air and return the acknowledgement's payload."""
-        self.heard_us = now_us
+        self.heard_us, end = now_us, self._end
         if self.power is Power.BOOTLOADER:
-            answer = self._next_answer()
+            answer = self._next_answer(now_us)
             self._bootload(now_us, data)
             return answer
         kind = data[1] if len(data) > 1 and data[0] & NULL_MASK == NULL else None
         if kind == NRF51:
-            answer = self._next_answer()
+            answer = self._next_answer(now_us)
             self._command(now_us, data)
             return answer
         if kind == SAFELINK and len(data) == 3:
-            self._safelink, self._service = bool(data[2]), data
-            answer = self._next_answer()
-            self._up = self._down = 1
+            self._service = data
+            answer = self._next_answer(now_us)
+            end.switch(bool(data[2]))
             self._processor.greet(now_us)
             return answer
-        if not self._safelink or data[0] >> 3 & 1 != self._up:
-            self._up ^= 1
-            if len(data) > 1 or data[0] & NULL_MASK != NULL:
-                self._events.at(now_us + syslink_us(data), partial(self._pass_on, data))
-        if not self._safelink or data[0] >> 2 & 1 != self._down:
-            self._down ^= 1
-            return self._next_answer()
-        return self._answer
+        if end.takes(data[0] >> 3 & 1) and (len(data) > 1 or data[0] & NULL_MASK != NULL):
+            self._events.at(now_us + syslink_us(data), partial(self._pass_on, data))
+        return self._next_answer(now_us) if end.answered(data[0] >> 2 & 1) else self._answer
 
-    def _next_answer(self) -> bytes:
+    def _next_answer(self, now_us: int) -> bytes:
         """Return what comes after the answer that has arrived."""
+        end = self._end
+        end.confirm()
         if self._service:
             self._answer, self._service = self._service, b""
-        elif self._queue:
-            packet = self._queue.popleft()
-            self._answer = (
-                bytes((packet[0] & NULL_MASK | self._down << 2,)) + packet[1:] if self._safelink else packet
-            )
+        elif packet := end.answer(now_us):
+            counted = bytes((packet[0] & NULL_MASK | end.down << 2,)) + packet[1:]
+            self._answer = counted if end.safelink else packet
         elif self.power is Power.BOOTLOADER:
             self._answer = b""
         else:
-            self._answer = bytes((NULL | self._down << 2, SIGNAL_STRENGTH, SIGNAL_DBM))
+            self._answer = bytes((NULL | end.down << 2, SIGNAL_STRENGTH, SIGNAL_DBM))
         return self._answer
 
     def _pass_on(self, data: bytes, now_us: int) -> None:
@@ -172,7 +165,7 @@ class Nrf51:
         command = data[2] if len(data) > 2 else None
         if command == RESET_INIT:
             self._reset_armed = True
-            self.send(bytes((HEADER, NRF51, RESET_INIT)) + self._chip)
+            self._reply(now_us, bytes((HEADER, NRF51, RESET_INIT)) + self._chip)
         elif command == RESET and len(data) == 4 and self._reset_armed:
             self._reset_later(now_us, data)
         elif command == ALL_OFF:
@@ -184,16 +177,17 @@ class Nrf51:
         elif command == SYSTEM_ON and self.power is Power.RADIO_ONLY:
             self._start(now_us)
         elif command == BATTERY:
-            self.send(bytes((HEADER, NRF51, BATTERY)) + struct.pack("<f", self._processor.battery_V))
+            volts = struct.pack("<f", self._processor.battery_V)
+            self._reply(now_us, bytes((HEADER, NRF51, BATTERY)) + volts)
 
     def _bootload(self, now_us: int, data: bytes) -> None:
         """Execute a packet in the bootloader."""
         if data[:3] == bytes((HEADER, NRF51, RESET_INIT)):
-            self.send(data[:3] + self._chip)
+            self._reply(now_us, data[:3] + self._chip)
         elif data[:3] == bytes((HEADER, NRF51, RESET)):
             self._reset_later(now_us, data)
         elif (reply := self.bootloader.answer(data)) is not None:
-            self.send(reply)
+            self._reply(now_us, reply)
 
     def _reset_later(self, now_us: int, data: bytes) -> None:
         """Reset, into the bootloader if the command's argument is 0."""

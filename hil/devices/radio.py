@@ -1,64 +1,45 @@
-"""The Crazyradio between ground station and board: a polling dongle, Enhanced ShockBurst, safelink.
+"""The Crazyradio between ground station and board in lockstep: a modelled host, which polls without pause.
 
-The dongle asks without pause. One exchange carries at most one packet each way: the host hands a packet (or
-an empty poll) to the dongle over USB, the dongle sends it, the board answers with an acknowledgement that
-carries the head of its queue, and that goes back to the host. What is lost is repeated with the same contents
-by the dongle (3 times), then by the host; safelink's counters make that exactly once and in order.
+One exchange carries at most one packet each way: the host hands a packet (or an empty poll) to the dongle over USB, and
+the board's answer goes back to it. What the dongle repeats in vain the host repeats with the same contents; safelink's
+counters make that exactly once and in order. What happens on the air is `hil.devices.shockburst`.
 
 Exchanges that carry something are events. The empty polls in between are not: when something is ready, the
 poll that it meets is computed (the first of the pause) or drawn (any later one: the host's jitter has made
-its phase uniform). Figures: Crazyradio, nRF24L01+ and cflib, reference/crazyflie-clients-and-protocol.md part
-3. Connecting and disconnecting are not modelled: the host repeats for ever.
+its phase uniform). Connecting and disconnecting are not modelled: the host repeats for ever.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
 
 from firmware_py.elementary import power
 from hil.devices.config import RadioConfig
+from hil.devices.shockburst import (
+    MAX_PACKET,
+    RETRIES,
+    TURN_ROUND_US,
+    Air,
+    BoardEnd,
+    Exchange,
+    Transmitter,
+    Waiting,
+    again_us,
+    air_us,
+    exchange_us,
+    syslink_us,
+)
 from hil.events import EventQueue
 
 Receiver = Callable[[int, bytes], object]  # (now_us, packet)
 
-MAX_PACKET = 32  # bytes, of the nRF24
-RETRIES = 3  # by the dongle (ARC), as cflib sets it
-TURN_ROUND_US = 130  # nRF24: settling before each transmission
-FRAME_BITS = 73  # preamble 8, address 40, control field 9, CRC 16
 POLL_BYTES = 1  # an empty poll is one header byte
 EMPTY_ACK_BYTES = 3  # with nothing else to say the nRF51 reports its signal strength
-SYSLINK_FRAME_BYTES = 6  # start 2, type, length, checksum 2
-SYSLINK_BYTE_US = 10  # the line between nRF51 and STM32: 1 Mbaud, 10 bits per byte
-
-
-@dataclass(slots=True)
-class Air:
-    """What the air does to packets of one board, whoever talks to it; faults change it in flight."""
-
-    uplink_loss: float  # per try, 0..1
-    downlink_loss: float
-    uplink_bit_error_rate: float  # 0..1
-    downlink_bit_error_rate: float
-    uplink_jitter_us: float
-    downlink_jitter_us: float
-
-    @classmethod
-    def of(cls, config: RadioConfig) -> Air:
-        """Return what the profile says."""
-        return cls(*(getattr(config, field.name) for field in fields(cls)))
-
-    def lost_up(self, size: int) -> float:
-        """The chance that a packet of `size` bytes to the board is lost."""
-        return packet_loss(self.uplink_loss, self.uplink_bit_error_rate, size)
-
-    def lost_down(self, size: int) -> float:
-        """The chance that an answer of `size` bytes is lost."""
-        return packet_loss(self.downlink_loss, self.downlink_bit_error_rate, size)
 
 
 @dataclass(slots=True)
@@ -80,41 +61,6 @@ class DirectionCounters:
             self.latency_max_us = latency_us
 
 
-@dataclass(slots=True)
-class AirCounters:
-    """Exchanges that were simulated: those that carried something, and empty ones repeated before them."""
-
-    exchanges: int = 0
-    retried: int = 0  # repetitions by the dongle
-    unanswered: int = 0  # exchanges in which all tries were lost
-
-
-def air_us(size: int, bits_per_second: int) -> int:
-    """Time on the air of a packet with `size` bytes of payload."""
-    return (FRAME_BITS + 8 * size) * 1_000_000 // bits_per_second
-
-
-def exchange_us(up_size: int, down_size: int, bits_per_second: int) -> int:
-    """A packet and its answer, with both turn-rounds, without USB."""
-    return 2 * TURN_ROUND_US + air_us(up_size, bits_per_second) + air_us(down_size, bits_per_second)
-
-
-def packet_loss(loss: float, bit_error_rate: float, size: int) -> float:
-    """The chance that a packet with `size` bytes of payload is lost as a whole or by a wrong bit."""
-    if not bit_error_rate:
-        return loss
-    return 1.0 - (1.0 - loss) * power(1.0 - bit_error_rate, FRAME_BITS + 8 * size)
-
-
-@dataclass(slots=True)
-class _Waiting:
-    """A packet in a queue; queues are first in, first out."""
-
-    ready_us: int  # not before this instant
-    sent_us: int
-    data: bytes
-
-
 class VirtualRadio:
     """Carries packets of 1..32 bytes both ways through `medium`; `connect` it before use."""
 
@@ -124,29 +70,20 @@ class VirtualRadio:
         self.medium = medium or Air.of(config)
         self.up = DirectionCounters()
         self.down = DirectionCounters()
-        self.air = AirCounters()
 
         self._config = config
         self._events = events
         self._rng = rng
         self._uniforms: list[float] = []
-        # Tables over the size of a packet: time on the air; from the begin of an exchange until the board has
-        # heard it; from one try to the next (the dongle's ARD counts from the end of its packet).
-        retry_delay_us = 1500 if config.bits_per_second == 250_000 else 500
-        self._air_us = [air_us(size, config.bits_per_second) for size in range(MAX_PACKET + 1)]
-        self._heard_after_us = [config.usb_us + TURN_ROUND_US + on_air_us for on_air_us in self._air_us]
-        self._again_us = [TURN_ROUND_US + on_air_us + retry_delay_us for on_air_us in self._air_us]
-
-        self._up_queue: deque[_Waiting] = deque()
-        self._down_queue: deque[_Waiting] = deque()
+        self._transmitter = Transmitter(config, events, self._uniform)
+        self.air = self._transmitter.counters  # of the exchanges that are simulated
+        self._board = BoardEnd(config.downlink_queue, safelink=True)
+        self._up_queue: deque[Waiting] = deque()
         self._busy = False  # an exchange is planned or under way
         self._idle_since_us = 0
-        # Of the exchange under way; kept until it is answered.
-        self._uploading: _Waiting | None = None
-        self._heard = False  # the board has it already
-        self._downloading = False  # the answer carries the head of the board's queue
-        self._tries_left = 0
-        self._given_up_us = 0
+        self._counter = 0  # safelink's, of the packets to the board
+        self._uploading: Waiting | None = None  # kept until it is answered
+        self._answer_size: int | None = None  # of the exchange under way, once the board has heard it
 
     def connect(self, on_board: Receiver, on_ground: Receiver) -> None:
         """Name the receivers of the uplink and of the downlink."""
@@ -162,7 +99,7 @@ class VirtualRadio:
             queue.popleft()
             counters.dropped += 1
         delay_us = int(self._uniform() * self.medium.uplink_jitter_us) if self.medium.uplink_jitter_us else 0
-        queue.append(_Waiting(now_us + delay_us, now_us, data))
+        queue.append(Waiting(now_us + delay_us, now_us, data))
         counters.queue_high_water = max(counters.queue_high_water, len(queue))
         if delay_us:
             self._events.at(now_us + delay_us, self._wake_for_uplink)
@@ -171,17 +108,16 @@ class VirtualRadio:
     def downlink(self, now_us: int, data: bytes) -> bool:
         """Take a packet for the ground; False when the nRF51's queue is full and the sender has to wait."""
         _check_size(data)
-        queue, counters = self._down_queue, self.down
-        if len(queue) >= self._config.downlink_queue:
+        counters, ready_us = self.down, now_us + syslink_us(data)
+        if not self._board.put(Waiting(ready_us, now_us, data)):
             counters.dropped += 1
             return False
         counters.sent += 1
-        ready_us = now_us + syslink_us(data)
-        queue.append(_Waiting(ready_us, now_us, data))
-        counters.queue_high_water = max(counters.queue_high_water, len(queue))
+        counters.queue_high_water = max(counters.queue_high_water, len(self._board.queue))
         if not self._busy:
             start_us, end_us, answered = self._poll_at(ready_us)
-            if ready_us <= start_us + self._heard_after_us[POLL_BYTES]:  # in time for this poll's answer
+            poll_us = self._config.usb_us + TURN_ROUND_US + air_us(POLL_BYTES, self._config.bits_per_second)
+            if ready_us <= start_us + poll_us:  # in time for this poll's answer
                 self._plan(start_us, True, now_us)
             else:
                 self._plan(end_us, answered, now_us)
@@ -219,7 +155,9 @@ class VirtualRadio:
             heard = 1.0 - self.medium.lost_up(POLL_BYTES)
             lost = 1.0 - heard * (1.0 - self.medium.lost_down(EMPTY_ACK_BYTES))
             if lost:
-                lengths, weights, total = _polls_met(lost, length_us, host_us, self._again_us[POLL_BYTES])
+                lengths, weights, total = _polls_met(
+                    lost, length_us, host_us, again_us(POLL_BYTES, config.bits_per_second)
+                )
                 rest, kind = self._uniform() * total, 0
                 while kind <= RETRIES and rest >= weights[kind]:
                     rest -= weights[kind]
@@ -228,53 +166,36 @@ class VirtualRadio:
             since_us = t_us - int(self._uniform() * length_us)
         return since_us, since_us + length_us, answered
 
-    # One exchange: up to 1 + RETRIES tries, each a packet and its answer. Either can be lost.
+    # One exchange
 
     def _exchange(self, start_us: int) -> None:
-        """Try until the board hears the packet."""
-        self.air.exchanges += 1
-        size = self._up_size()
-        again_us, loss = self._again_us[size], self.medium.lost_up(size)
-        self._given_up_us = start_us + 2 * self._config.usb_us + (RETRIES + 1) * again_us + self._usb_jitter()
-        for failed in range(RETRIES + 1):
-            if not self._happens(loss):
-                self._tries_left = RETRIES - failed
-                self._events.at(start_us + self._heard_after_us[size] + failed * again_us, self._hear)
-                return
-        self._give_up()
+        """Hand packet or poll to the dongle."""
+        self._answer_size = None
+        exchange = Exchange(
+            POLL_BYTES if self._uploading is None else len(self._uploading.data),
+            self._config.bits_per_second, self.medium, RETRIES, self._hear, self._ended,
+        )  # fmt: skip
+        self._transmitter.send(start_us, exchange)
 
-    def _hear(self, now_us: int) -> None:
-        """The board hears the packet, passes it on once, and answers; try on until the dongle hears that."""
-        if self._uploading is not None and not self._heard:
-            self._heard = True
-            deliver = partial(self._deliver_up, self._uploading)
-            self._events.at(now_us + syslink_us(self._uploading.data), deliver)
-        if self._down_queue and self._down_queue[0].ready_us <= now_us:
-            self._downloading = True
-        size = self._up_size()
-        ack_size = len(self._down_queue[0].data) if self._downloading else EMPTY_ACK_BYTES
-        loss, ack_loss = self.medium.lost_up(size), self.medium.lost_down(ack_size)
-        for failed in range(self._tries_left + 1):
-            heard = failed == 0 or not self._happens(loss)
-            if heard and not self._happens(ack_loss):
-                self.air.retried += RETRIES - self._tries_left + failed
-                answer_us = TURN_ROUND_US + self._air_us[ack_size]
-                back_us = answer_us + self._config.usb_us + self._usb_jitter()
-                self._events.at(now_us + failed * self._again_us[size] + back_us, self._answered)
-                return
-        self._give_up()
+    def _hear(self, now_us: int) -> int:
+        """The board hears the packet, passes it on if it is new, and answers; every later try gets the same answer."""
+        if self._answer_size is None:
+            if self._board.takes(self._counter) and self._uploading is not None:
+                deliver = partial(self._deliver_up, self._uploading)
+                self._events.at(now_us + syslink_us(self._uploading.data), deliver)
+            answer = self._board.answer(now_us)
+            self._answer_size = EMPTY_ACK_BYTES if answer is None else len(answer)
+        return self._answer_size
 
-    def _give_up(self) -> None:
-        """All tries were lost: the host repeats the exchange with the same contents."""
-        self.air.retried += RETRIES
-        self.air.unanswered += 1
-        self._events.at(self._given_up_us, self._exchange)
-
-    def _answered(self, now_us: int) -> None:
-        """The answer is at the host: the exchange is complete in both directions."""
-        received = self._down_queue.popleft() if self._downloading else None
-        self._uploading, self._heard, self._downloading = None, False, False
-        if self._down_queue or (self._up_queue and self._up_queue[0].ready_us <= now_us):
+    def _ended(self, repetitions: int | None, now_us: int) -> None:
+        """The answer is at the host, and the exchange complete in both directions; or the host repeats it."""
+        if repetitions is None:
+            self._exchange(now_us)
+            return
+        self._counter ^= 1
+        self._uploading = None
+        received = self._board.confirm()  # the next poll would say it, which may not be simulated
+        if self._board.queue or (self._up_queue and self._up_queue[0].ready_us <= now_us):
             self._begin(now_us)
         else:
             self._busy = False
@@ -283,21 +204,9 @@ class VirtualRadio:
             self.down.count_delivery(now_us - received.sent_us)
             self._on_ground(now_us, received.data)
 
-    def _deliver_up(self, packet: _Waiting, now_us: int) -> None:
+    def _deliver_up(self, packet: Waiting, now_us: int) -> None:
         self.up.count_delivery(now_us - packet.sent_us)
         self._on_board(now_us, packet.data)
-
-    # Times and chances.
-
-    def _up_size(self) -> int:
-        return POLL_BYTES if self._uploading is None else len(self._uploading.data)
-
-    def _usb_jitter(self) -> int:
-        jitter_us = self._config.usb_jitter_us + self.medium.downlink_jitter_us
-        return int(self._uniform() * jitter_us) if jitter_us else 0
-
-    def _happens(self, chance: float) -> bool:
-        return chance > 0.0 and self._uniform() < chance
 
     def _uniform(self) -> float:
         """The next number of 0..1, drawn in blocks: one call of numpy costs as much as fifty numbers."""
@@ -320,11 +229,6 @@ def _polls_met(
         power(lost, RETRIES + 1) * lengths[-1],
     )
     return lengths, weights, sum(weights)
-
-
-def syslink_us(data: bytes) -> int:
-    """Between nRF51 and STM32."""
-    return (len(data) + SYSLINK_FRAME_BYTES) * SYSLINK_BYTE_US
 
 
 def _check_size(data: bytes) -> None:

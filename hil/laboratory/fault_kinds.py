@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from hil.devices.radio import Air
     from hil.devices.rigid_body import VirtualMarkers
+    from hil.devices.shockburst import Air
     from hil.devices.uart import VirtualSerial
     from hil.laboratory.robot import Robot
 

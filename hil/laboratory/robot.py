@@ -20,8 +20,8 @@ from hil.devices.board import VirtualBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import VirtualImu
 from hil.devices.markers import Sighting
-from hil.devices.radio import Air
 from hil.devices.rigid_body import make_markers
+from hil.devices.shockburst import Air
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue

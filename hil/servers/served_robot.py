@@ -171,7 +171,7 @@ class ServedRobot:
         """Send a packet of the firmware to who talked to it: the UDP session if there is one, else the radio."""
         if self.udp is not None and self.udp.has_session(now_us):
             return self.udp_radio.downlink(now_us, data)
-        return self.nrf51.send(data)
+        return self.nrf51.send(now_us, data)
 
     def _to_udp(self, now_us: int, data: bytes) -> None:
         if self.udp is not None:

@@ -11,7 +11,7 @@ from cflib.drivers.crazyradio import _radio_ack
 from hil.devices.config import RadioConfig
 from hil.devices.dongle import VirtualDongle
 from hil.devices.nrf51 import RESET_DELAY_US, Nrf51, Power, RadioSettings
-from hil.devices.radio import Air, exchange_us
+from hil.devices.shockburst import Air, air_us, exchange_us, syslink_us
 from hil.events import EventQueue
 
 ADDRESS = bytes.fromhex("E7E7E7E7E7")
@@ -147,11 +147,15 @@ def test_nobody_answers_on_another_channel_rate_or_address(setting: tuple[int, i
     ("rate", "bits_per_second", "retry_us"), [(0, 250_000, 1500), (1, 1_000_000, 500), (2, 2_000_000, 500)]
 )
 @pytest.mark.parametrize("retries", [0, 3, 15])
+@pytest.mark.parametrize(
+    ("channel", "lost"), [(81, {}), (80, {"uplink_loss": 1.0}), (80, {"downlink_loss": 1.0})]
+)
 def test_giving_up_takes_as_long_as_the_tries(
-    rate: int, bits_per_second: int, retry_us: int, retries: int
+    rate: int, bits_per_second: int, retry_us: int, retries: int, channel: int, lost: dict[str, float]
 ) -> None:
-    bench = DongleWithBoards()
-    bench.tune(81, rate, ADDRESS)
+    bench = DongleWithBoards(**lost)
+    bench.boards[0].settings = RadioSettings(80, bits_per_second, ADDRESS)
+    bench.tune(channel, rate, ADDRESS)
     bench.dongle.control(0x06, retries, b"")
     assert bench.exchange(b"\x10hello") == b"\x00"
     try_us = 130 + (73 + 8 * 6) * 1e6 / bits_per_second + retry_us
@@ -199,7 +203,7 @@ def test_safelink_brings_everything_once_and_in_order(up: float, down: float, be
     sent_down = [struct.pack("<BH", 0x50, n) for n in range(300)]
     waiting, received = list(sent_down), []
     for packet in [*sent_up, *[None] * 320]:
-        while waiting and bench.boards[0].send(waiting[0]):
+        while waiting and bench.boards[0].send(bench.events.now_us, waiting[0]):
             waiting.pop(0)
         answer = host.send(packet)
         if answer is not None:
@@ -216,6 +220,16 @@ def test_losses_are_those_that_were_asked_for() -> None:
     bench.wait(1000)
     assert answered / 4000 == pytest.approx(0.7 * 0.8, abs=0.025)
     assert len(bench.stms[0].packets) / 4000 == pytest.approx(0.7, abs=0.025)
+
+
+def test_without_acknowledgements_a_packet_is_sent_once_and_nobody_answers() -> None:
+    bench, answers = DongleWithBoards(uplink_loss=0.5), []
+    bench.dongle.control(0x10, 0, b"")
+    for _ in range(2000):
+        bench.dongle.transmit(bench.events.now_us, b"\x10hello", lambda _, answer: answers.append(answer))
+        bench.wait(5000)
+    assert len(bench.stms[0].packets) / 2000 == pytest.approx(0.5, abs=0.04)
+    assert answers == []
 
 
 def test_bit_errors_cost_long_packets_more_than_short_ones() -> None:
@@ -244,11 +258,24 @@ def test_retries_are_counted_in_the_status_and_take_time(direction: str) -> None
     assert seen == {0, 1, 2, 3}
 
 
-def test_the_ninth_packet_finds_the_queue_full() -> None:
+def test_the_ninth_packet_finds_the_queue_full_until_the_first_has_arrived() -> None:
     bench = DongleWithBoards()
-    assert [bench.boards[0].send(b"\x50") for _ in range(9)] == [True] * 8 + [False]
+    board, events = bench.boards[0], bench.events
+    assert [board.send(0, b"\x50") for _ in range(9)] == [True] * 8 + [False]
+    assert bench.exchange(NULL) == b"\x01\x50"
+    assert not board.send(events.now_us, b"\x50")
     bench.exchange(NULL)
-    assert bench.boards[0].send(b"\x50")
+    assert board.send(events.now_us, b"\x50")
+
+
+@pytest.mark.parametrize(("size", "carried"), [(31, True), (32, False)])
+def test_an_answer_carries_only_what_the_radio_chip_has_by_then(size: int, carried: bool) -> None:
+    bench, packet = DongleWithBoards(usb_us=200), bytes([0x50] * size)
+    assert bench.boards[0].send(0, packet)
+    heard_us = 200 + 130 + air_us(1, 2_000_000)
+    assert (syslink_us(packet) <= heard_us) is carried
+    assert (bench.exchange(NULL)[1:] == packet) is carried
+    assert (bench.exchange(NULL)[1:] == packet) is not carried
 
 
 def boot_address(answer: bytes) -> bytes:
@@ -286,6 +313,17 @@ def test_the_bootloader_does_not_know_safelink() -> None:
     bench = DongleWithBoards()
     into_bootloader(bench)
     assert all(bench.exchange(b"\xff\x05\x01") == b"\x01" for _ in range(10))
+
+
+@pytest.mark.parametrize(("safelink", "passed_on"), [(0, 4), (1, 1)])
+def test_every_try_that_the_board_hears_is_passed_on_unless_safelink_knows_it(
+    safelink: int, passed_on: int
+) -> None:
+    bench = DongleWithBoards(downlink_loss=1.0)
+    bench.exchange(bytes((0xFF, 0x05, safelink)))
+    assert bench.exchange(b"\x14hello") == b"\x00"
+    bench.wait(1000)
+    assert bench.stms[0].packets == [b"\x14hello"] * passed_on
 
 
 def test_without_safelink_a_packet_that_comes_twice_is_passed_on_twice() -> None:
