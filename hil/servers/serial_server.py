@@ -40,7 +40,7 @@ class Endpoint(Protocol):
         ...
 
     def close(self) -> None:
-        """Give everything back."""
+        """Give everything back; to close it again changes nothing."""
         ...
 
 
@@ -95,6 +95,7 @@ class PtyEnd:
         self._readers = readers
         self._received = received
         self._link = link
+        self._closed = False
         if link is not None and link.is_symlink() and os.readlink(link).startswith(PTYS):
             link.unlink()  # left behind by a server that was killed
         self._master, self._slave = os.openpty()  # the slave stays open, so that clients may come and go
@@ -127,6 +128,9 @@ class PtyEnd:
 
     def close(self) -> None:
         """Remove the pty and the link to it."""
+        if self._closed:  # its descriptors and its link may be those of another end by now
+            return
+        self._closed = True
         if self._link is not None:
             with suppress(OSError):
                 self._link.unlink()
@@ -162,7 +166,7 @@ class UdpEnd:
 
     def close(self) -> None:
         """Close the socket."""
-        del self._readers[self._socket]
+        self._readers.pop(self._socket, None)
         self._socket.close()
 
 
@@ -216,5 +220,5 @@ class TcpEnd:
         """Stop listening; the clients notice."""
         for client in self._clients.copy():
             self._leave(client)
-        del self._readers[self._listener]
+        self._readers.pop(self._listener, None)
         self._listener.close()

@@ -76,3 +76,15 @@ def test_a_closed_end_gives_its_address_back_and_everything_it_reads_from(
         open_end.close()
         assert open_end.readers == {}
         client.close()
+
+
+def test_an_end_that_is_closed_twice_harms_nobody(again: Callable[[], Pair]) -> None:
+    closed, _ = again()
+    closed.close()
+    open_end, connect = again()  # with the same address, and the descriptors that have become free
+    closed.close()
+    client = connect(open_end)
+    client.write(b"here")
+    open_end.serve_until(lambda: open_end.received == b"here")
+    client.close()
+    open_end.close()
