@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from support.line_clients import ENDS, Client, OpenEnd
+from support.line_clients import ENDS, LineClient, OpenEnd
 from support.serving import free_port
 
-Pair = tuple[OpenEnd, Callable[[OpenEnd], Client]]
+Pair = tuple[OpenEnd, Callable[[OpenEnd], LineClient]]
 PACKETS = [bytes(range(start, start + 16)) for start in range(0, 256, 16)]
 
 

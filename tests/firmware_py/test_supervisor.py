@@ -13,16 +13,16 @@ from firmware_py.supervisor import Manual, Supervisor
 from firmware_py.wire import crtp
 from firmware_py.wire.supervisor import Cause, State
 from hil.config import load_config
-from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, Client
+from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, CrtpClient
 from support.firmware_bench import HOVER_COUNTS, LEVEL
 
 OFF_CENTRE = (0.0, 0.04, 0.02)
 
 
 @pytest.fixture
-def flying() -> Client:
+def flying() -> CrtpClient:
     """A board that flies at 1 s and gets poses until 20 s."""
-    client = Client()
+    client = CrtpClient()
     client.poses(605_000, 20_000_000, OFF_CENTRE)
     client.run(1_000_000)
     assert state(client) == (State.FLYING, Cause.NONE)
@@ -31,31 +31,31 @@ def flying() -> Client:
     return client
 
 
-def state(client: Client) -> tuple[State, Cause]:
+def state(client: CrtpClient) -> tuple[State, Cause]:
     supervisor = client.firmware.signals.supervisor
     return supervisor.state, supervisor.cause
 
 
-def after(client: Client, wait_us: int) -> tuple[State, Cause]:
+def after(client: CrtpClient, wait_us: int) -> tuple[State, Cause]:
     client.run(client.now_us + wait_us)
     return state(client)
 
 
-def stop(client: Client) -> None:
+def stop(client: CrtpClient) -> None:
     client.send(LOC, 1, b"\3")
 
 
-def stop_on_the_supervisors_port(client: Client) -> None:
+def stop_on_the_supervisors_port(client: CrtpClient) -> None:
     client.send(SUPERVISOR, 1, b"\3")
 
 
-def stop_by_parameter(client: Client) -> None:
+def stop_by_parameter(client: CrtpClient) -> None:
     client.send(PARAM, 3, b"\0stabilizer\0stop\0\x08\1")
 
 
 @pytest.mark.parametrize("stop", [stop, stop_on_the_supervisors_port, stop_by_parameter])
 def test_emergency_stop_acts_within_eleven_milliseconds_and_ends_only_by_recovery(
-    flying: Client, stop
+    flying: CrtpClient, stop
 ) -> None:
     stop(flying)
     assert after(flying, 11_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
@@ -67,7 +67,7 @@ def test_emergency_stop_acts_within_eleven_milliseconds_and_ends_only_by_recover
     assert after(flying, 11_000) == (State.FLYING, Cause.NONE)
 
 
-def test_emergency_stop_beats_flaps_from_outside(flying: Client) -> None:
+def test_emergency_stop_beats_flaps_from_outside(flying: CrtpClient) -> None:
     flying.send(PARAM, 3, b"\0extCtrl\0manual\0\x08\1")
     flying.run(flying.now_us + 20_000)
     assert flying.writes[-1][1] != HOVER_COUNTS
@@ -173,7 +173,7 @@ def test_watchdog_bites_one_second_after_its_last_meal_and_not_before_the_first(
     assert after(flying, 3_000_000)[0] is State.FLYING  # recovery ends the watchdog, too
 
 
-def test_disarmed_board_does_not_fly_until_it_is_armed(flying: Client) -> None:
+def test_disarmed_board_does_not_fly_until_it_is_armed(flying: CrtpClient) -> None:
     flying.one(SUPERVISOR, 1, b"\1\0")
     assert after(flying, 11_000) == (State.FAILSAFE, Cause.DISARMED)
     assert flying.writes[-1][1] == HOVER_COUNTS
@@ -181,7 +181,7 @@ def test_disarmed_board_does_not_fly_until_it_is_armed(flying: Client) -> None:
     assert after(flying, 11_000)[0] is State.FLYING
 
 
-def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage(flying: Client) -> None:
+def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage(flying: CrtpClient) -> None:
     flying.battery_mv = 3100
     flying.run(flying.now_us + 4_000_000)
     flying.battery_mv = 3300  # a sag
@@ -198,13 +198,13 @@ def test_low_battery_needs_five_seconds_and_ends_by_recovery_with_a_good_voltage
     assert after(flying, 1_000_000)[0] is State.FLYING
 
 
-def test_recovery_is_refused_while_the_battery_is_low(flying: Client) -> None:
+def test_recovery_is_refused_while_the_battery_is_low(flying: CrtpClient) -> None:
     flying.battery_mv = 3100
     assert after(flying, 5_300_000)[1] is Cause.LOW_BATTERY
     assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\0\0"
 
 
-def test_silence_is_a_parameter(flying: Client) -> None:
+def test_silence_is_a_parameter(flying: CrtpClient) -> None:
     flying.send(PARAM, 3, b"\0supervisor\0poseTimeout\0\x09" + struct.pack("<H", 100))
     flying.events = type(flying.events)()  # no more poses
     flying.events.at(flying.now_us // 1000 * 1000 + 1000, flying._sample)
@@ -213,7 +213,7 @@ def test_silence_is_a_parameter(flying: Client) -> None:
     assert flying.console == ["supervisor: failsafe, silence"]
 
 
-def test_one_outlier_pose_changes_neither_the_state_nor_the_estimate(flying: Client) -> None:
+def test_one_outlier_pose_changes_neither_the_state_nor_the_estimate(flying: CrtpClient) -> None:
     counters = flying.firmware.signals.counters
     resets = counters[6]
     flying.run(flying.now_us + 18_000)  # of two poses that were true in one tick the later counts
@@ -229,7 +229,7 @@ def test_one_outlier_pose_changes_neither_the_state_nor_the_estimate(flying: Cli
 
 
 def test_an_estimator_at_its_bounds_is_a_failsafe_that_ends_half_a_second_after_it_is_back(
-    flying: Client,
+    flying: CrtpClient,
 ) -> None:
     flying.send(PARAM, 3, b"\0kalman\0maxPos\0\x06" + struct.pack("<f", 0.03))  # the robot is at y = 0.04
     begin_us = flying.now_us
@@ -247,7 +247,7 @@ def test_an_estimator_at_its_bounds_is_a_failsafe_that_ends_half_a_second_after_
     assert flying.console == ["supervisor: failsafe, out of bounds", "supervisor: flying"]
 
 
-def test_state_and_cause_are_log_variables(flying: Client) -> None:
+def test_state_and_cause_are_log_variables(flying: CrtpClient) -> None:
     table = flying.toc(LOG)
     assert flying.log(table, "supervisor.state", "supervisor.cause", "sys.canfly", "sys.isFlying") == [
         2,
@@ -261,7 +261,7 @@ def test_state_and_cause_are_log_variables(flying: Client) -> None:
     assert flying.log(table, *names) == [3, 3, 0, 0, 0b1000110]
 
 
-def test_flaps_never_rest_whatever_the_supervisor_says(flying: Client) -> None:
+def test_flaps_never_rest_whatever_the_supervisor_says(flying: CrtpClient) -> None:
     stop(flying)
     flying.run(flying.now_us + 500_000)
     times = [t for t, _ in flying.writes]

@@ -17,7 +17,7 @@ from cflib.utils.power_switch import PowerSwitch
 from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapSource
 from ground_station.sources.address import find_source
-from support.mavlink_socket import GAIN, Client
+from support.mavlink_socket import GAIN, MavlinkSocket
 from support.plugged_dongle import plug
 from support.serving import Served, free_port, serve
 
@@ -33,13 +33,13 @@ def served() -> Iterator[Served]:
 
 
 @pytest.fixture
-def client(served: Served) -> Iterator[Client]:
-    client = Client(masters(served)[0])
+def client(served: Served) -> Iterator[MavlinkSocket]:
+    client = MavlinkSocket(masters(served)[0])
     yield client
     client.close()
 
 
-def test_a_heartbeat_comes_every_second_from_an_autopilot(client: Client) -> None:
+def test_a_heartbeat_comes_every_second_from_an_autopilot(client: MavlinkSocket) -> None:
     client.wait("HEARTBEAT")
     start = time.monotonic()
     beat = client.wait("HEARTBEAT")
@@ -52,7 +52,7 @@ def test_a_heartbeat_comes_every_second_from_an_autopilot(client: Client) -> Non
 @pytest.mark.parametrize("end", ["pty", "udp", "tcp"])
 def test_every_end_carries_the_whole_parameter_table(end: str) -> None:
     with serve("--mavlink", f"udp:{free_port()}" if end == "udp" else end + ":0" * (end == "tcp")) as served:
-        client = Client(masters(served)[0])
+        client = MavlinkSocket(masters(served)[0])
         client.wait("HEARTBEAT")  # then the board's port is known
         found = client.parameters()
         client.close()
@@ -63,7 +63,7 @@ def test_every_end_carries_the_whole_parameter_table(end: str) -> None:
     assert all(math.isfinite(message.param_value) for message in found.values())
 
 
-def test_parameters_are_read_by_name_and_by_index(client: Client) -> None:
+def test_parameters_are_read_by_name_and_by_index(client: MavlinkSocket) -> None:
     listed = client.parameters()[GAIN]
     client.codec.param_request_read_send(1, 1, GAIN.encode(), -1)
     by_name = client.wait("PARAM_VALUE")
@@ -74,7 +74,7 @@ def test_parameters_are_read_by_name_and_by_index(client: Client) -> None:
         assert message.param_value == listed.param_value
 
 
-def test_a_parameter_is_set_within_its_range_and_kept_otherwise(client: Client) -> None:
+def test_a_parameter_is_set_within_its_range_and_kept_otherwise(client: MavlinkSocket) -> None:
     before = client.parameters()[GAIN].param_value
     assert client.set(GAIN, 2.5) == 2.5
     assert client.set(GAIN, 99) == 2.5
@@ -83,7 +83,7 @@ def test_a_parameter_is_set_within_its_range_and_kept_otherwise(client: Client) 
     assert client.set(GAIN, before) == before
 
 
-def test_commands_are_acknowledged_to_their_sender(client: Client) -> None:
+def test_commands_are_acknowledged_to_their_sender(client: MavlinkSocket) -> None:
     request = dialect.MAV_CMD_REQUEST_MESSAGE
     assert client.command(request, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == dialect.MAV_RESULT_ACCEPTED
     client.codec.command_long_send(1, 1, request, 0, dialect.MAVLINK_MSG_ID_HOME_POSITION, *[math.nan] * 6)
@@ -94,7 +94,7 @@ def test_commands_are_acknowledged_to_their_sender(client: Client) -> None:
     assert any(message.get_type() == "AUTOPILOT_VERSION" for message in client.received)
 
 
-def test_a_message_comes_as_often_as_it_was_asked_for(client: Client) -> None:
+def test_a_message_comes_as_often_as_it_was_asked_for(client: MavlinkSocket) -> None:
     number, set_interval = dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAV_CMD_SET_MESSAGE_INTERVAL
     assert client.command(set_interval, number, 20_000) == dialect.MAV_RESULT_ACCEPTED
     stamps = [message.time_boot_ms for message in client.collect(2.0) if message.get_type() == "ATTITUDE"]
@@ -115,7 +115,7 @@ def test_two_tcp_clients_hear_the_board_and_each_gets_its_answers(served: Served
 
 def test_the_baud_rate_limits_what_comes_through() -> None:
     with serve("--mavlink", "tcp:0", "--baud", "9600") as served:
-        client = Client(masters(served)[0])
+        client = MavlinkSocket(masters(served)[0])
         client.wait("HEARTBEAT")
         for message in (dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED):
             client.codec.command_long_send(
@@ -131,7 +131,7 @@ def test_the_baud_rate_limits_what_comes_through() -> None:
 
 def test_wrong_bits_spoil_frames_and_nothing_else() -> None:
     with serve("--mavlink", "tcp:0", "--set", "serial.downlink_bit_error_rate=1e-3") as served:
-        client = Client(masters(served)[0])
+        client = MavlinkSocket(masters(served)[0])
         client.wait("HEARTBEAT", timeout_s=20)
         client.codec.command_long_send(
             1,
@@ -153,7 +153,7 @@ def test_several_boards_have_ends_and_system_ids_of_their_own(tmp_path: Path) ->
         assert not any(line.startswith("udp") for line in served.lines)
         assert masters(served) == [str(tmp_path / "line"), str(tmp_path / "line-2")]
         for number, master in enumerate(masters(served), 1):
-            client = Client(master)
+            client = MavlinkSocket(master)
             assert client.wait("HEARTBEAT").get_srcSystem() == number
             client.close()
         assert served.interrupt() == 0
@@ -163,7 +163,7 @@ def test_several_boards_have_ends_and_system_ids_of_their_own(tmp_path: Path) ->
 class Pilot:
     """Sends a served board's true poses as ATT_POS_MOCAP, every fourth of 200 per second, until stopped."""
 
-    def __init__(self, client: Client, poses: MocapSource) -> None:
+    def __init__(self, client: MavlinkSocket, poses: MocapSource) -> None:
         self._client, self._poses = client, poses
         self._stopping = False
         self._thread = threading.Thread(target=self._run)
@@ -191,7 +191,7 @@ def test_poses_fly_the_board_and_a_pulled_pty_ends_in_failsafe_until_it_is_plugg
     with serve("--mavlink", "pty", motive=True) as served:
         poses = find_source(served.motive, CaptureConfig())
         poses.open()
-        client = Client(masters(served)[0])
+        client = MavlinkSocket(masters(served)[0])
         with Pilot(client, poses):
             served.wait_for("board 1: released", 15)
             with pytest.raises(AssertionError, match="no line"):  # it flies free
@@ -200,7 +200,7 @@ def test_poses_fly_the_board_and_a_pulled_pty_ends_in_failsafe_until_it_is_plugg
         served.wait_for("supervisor: failsafe, silence", 5)
         served.wait_for("it is put back", 15)
         served.forget()
-        client = Client(masters(served)[0])
+        client = MavlinkSocket(masters(served)[0])
         with Pilot(client, poses):
             served.wait_for("supervisor: flying", 5)
             served.wait_for("board 1: released", 5)
@@ -211,7 +211,7 @@ def test_poses_fly_the_board_and_a_pulled_pty_ends_in_failsafe_until_it_is_plugg
 def test_a_reboot_by_radio_keeps_the_end_and_forgets_what_came_while_the_board_was_off() -> None:
     with serve("--mavlink", "tcp:0", "--radio", "--radio-port", "0") as served:
         plug(served)
-        client = Client(masters(served)[0])
+        client = MavlinkSocket(masters(served)[0])
         before_ms = client.wait("ATTITUDE", lambda message: message.time_boot_ms > 1000).time_boot_ms
         switch = PowerSwitch(served.radio_uris[0])
         switch.stm_power_down()

@@ -24,7 +24,7 @@ from cflib.utils.encoding import compress_quaternion
 from cflib.utils.power_switch import PowerSwitch
 
 from hil.servers.dongle_plugin import Backend
-from support.cflib_client import Client
+from support.cflib_client import CflibClient
 from support.plugged_dongle import plug
 from support.serving import Served, serve
 
@@ -65,7 +65,7 @@ def test_scanning_finds_the_board(served: Served) -> None:
 
 
 def test_a_client_does_what_clients_do(uri: str, cache: Path) -> None:
-    client = Client(uri, cache).ready()
+    client = CflibClient(uri, cache).ready()
     cf = client.cf
     assert cf.platform.get_protocol_version() == 12
 
@@ -92,7 +92,7 @@ def test_a_client_does_what_clients_do(uri: str, cache: Path) -> None:
 
 @pytest.mark.parametrize("packed", [False, True], ids=["extpose", "packed"])
 def test_poses_are_flown_and_their_end_is_announced(uri: str, cache: Path, packed: bool) -> None:
-    client = Client(uri, cache).ready()
+    client = CflibClient(uri, cache).ready()
     goal, stop = (0.01, -0.02, 0.03), threading.Event()
 
     def send() -> None:
@@ -128,7 +128,7 @@ def app_echo(cf: Crazyflie, data: bytes, callback: Callable[[bytes], None]) -> N
 
 def test_a_stored_parameter_survives_a_reboot_by_radio(served: Served, cache: Path) -> None:
     uri = served.radio_uris[0]
-    client = Client(uri, cache).ready()
+    client = CflibClient(uri, cache).ready()
     client.set("extCtrl.vz_P", 0.75)
     client.set("extCtrl.yaw_P", 0.75)
     assert client.answer(client.cf.param.persistent_store, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
@@ -137,7 +137,7 @@ def test_a_stored_parameter_survives_a_reboot_by_radio(served: Served, cache: Pa
     switch.stm_power_down()
     switch.stm_power_up()
     switch.close()
-    again = Client(uri, cache).ready()
+    again = CflibClient(uri, cache).ready()
     assert again.cf.param.get_value("extCtrl.vz_P") == "0.75"
     assert float(again.cf.param.get_value("extCtrl.yaw_P")) != 0.75
     assert again.answer(again.cf.param.persistent_clear, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
@@ -158,7 +158,7 @@ def test_flashing_is_byte_identical_and_the_board_comes_back(
         assert b"".join(tool._cload.read_flash(target, start + n) for n in range(3))[: len(image)] == image
     assert tool.reset_to_firmware()
     tool.close()
-    Client(served.radio_uris[0], cache).ready().close()
+    CflibClient(served.radio_uris[0], cache).ready().close()
 
 
 def test_a_board_that_is_off_or_left_in_its_bootloader_gets_its_button_pressed(
@@ -173,7 +173,7 @@ def test_a_board_that_is_off_or_left_in_its_bootloader_gets_its_button_pressed(
         served.wait_for("board 1: power button pressed", PATIENCE_S)
         served.wait_for("gyro zero", PATIENCE_S)
     switch.close()
-    Client(served.radio_uris[0], cache).ready().close()
+    CflibClient(served.radio_uris[0], cache).ready().close()
 
 
 def probe_for_ever(prober: socket.socket) -> None:
@@ -199,7 +199,7 @@ def test_the_board_can_be_switched_off_and_on_by_radio(served: Served, cache: Pa
         prober.send(b"\xff")
         assert prober.recv(64) == b"\xff"
     switch.close()
-    Client(served.radio_uris[0], cache).ready().close()
+    CflibClient(served.radio_uris[0], cache).ready().close()
 
 
 def test_a_udp_port_that_was_taken_meanwhile_is_waited_for(served: Served) -> None:
@@ -290,8 +290,8 @@ def test_without_a_server_there_is_no_dongle() -> None:
 def test_ten_boards_on_one_dongle(cache: Path) -> None:
     with serve("--radio", "--radio-port", "0", "--boards", "10") as served:
         plug(served)
-        Client(served.radio_uris[0], cache).ready().close()  # fills the cache
-        clients = [Client(uri, cache) for uri in served.radio_uris]
+        CflibClient(served.radio_uris[0], cache).ready().close()  # fills the cache
+        clients = [CflibClient(uri, cache) for uri in served.radio_uris]
         assert len(clients) == 10
         for client in clients:
             client.ready()

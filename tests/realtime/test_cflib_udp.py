@@ -18,7 +18,7 @@ from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
 from cflib.utils.encoding import compress_quaternion
 
 from firmware_py.wire.supervisor import State
-from support.cflib_client import Client
+from support.cflib_client import CflibClient
 from support.udp_pump import UdpBoard
 
 PATIENCE_S = 20.0
@@ -33,7 +33,7 @@ def board() -> Iterator[UdpBoard]:
     board.close()
 
 
-class Session(Client):
+class Session(CflibClient):
     """A connection of cflib's over UDP."""
 
     patience_s = PATIENCE_S

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from support.mavlink_socket import GAIN, Client
+from support.mavlink_socket import GAIN, MavlinkSocket
 from support.mavproxy_program import PATIENCE_S, MavProxy, mavproxy_here
 from support.paths import SUPPORT
 from support.serving import Served, free_port, serve
@@ -61,7 +61,7 @@ def test_mavproxy_watches_tunes_and_commands(proxied: tuple[Served, MavProxy], t
     saved = dict(line.split() for line in (tmp_path / "mav.parm").read_text().splitlines())
     assert set(saved) == set(values)
     proxy.kill()
-    again = Client(served.line("mavlink ")[0])  # the board does not care that it has gone
+    again = MavlinkSocket(served.line("mavlink ")[0])  # the board does not care that it has gone
     again.wait("HEARTBEAT")
     again.close()
 

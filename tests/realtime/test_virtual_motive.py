@@ -106,7 +106,7 @@ def lab() -> Iterator[MotiveBench]:
     lab.motive.close()
 
 
-class Client:
+class NatNetSocket:
     """A bare socket that speaks NatNet."""
 
     def __init__(self, lab: MotiveBench) -> None:
@@ -140,15 +140,15 @@ class Client:
 
 
 @pytest.fixture
-def client(lab: MotiveBench) -> Iterator[Client]:
-    client = Client(lab)
+def client(lab: MotiveBench) -> Iterator[NatNetSocket]:
+    client = NatNetSocket(lab)
     yield client
     client.close()
 
 
 @pytest.mark.parametrize("payload", [b"", b"Ping\0", bytes(271)], ids=["empty", "Ping", "with the sender"])
 def test_every_form_of_connect_is_answered_and_frames_follow(
-    lab: MotiveBench, client: Client, payload: bytes
+    lab: MotiveBench, client: NatNetSocket, payload: bytes
 ) -> None:
     client.say(MessageId.CONNECT, payload)
     info = decode(client.hear(), (4, 1))
@@ -165,7 +165,7 @@ def test_every_form_of_connect_is_answered_and_frames_follow(
 @pytest.mark.parametrize(("up", "axes"), [("y", None), ("y", "y-up"), ("z", "z-up")])
 def test_the_station_sees_the_world_whichever_axis_of_motive_points_up(up: Up, axes: Axes | None) -> None:
     lab = MotiveBench(up=up)
-    client = Client(lab)
+    client = NatNetSocket(lab)
     stream = NatnetStream("floaty", Alignment(CaptureConfig(axes=axes)))
     for request in (MessageId.CONNECT, MessageId.REQUEST_MODELDEF, MessageId.KEEPALIVE):
         client.say(request)
@@ -184,7 +184,7 @@ def test_the_station_sees_the_world_whichever_axis_of_motive_points_up(up: Up, a
 
 def test_with_z_up_markers_and_model_are_in_the_world_s_axes() -> None:
     lab = MotiveBench(markers=True, up="z")
-    client = Client(lab)
+    client = NatNetSocket(lab)
     client.connect()
     client.say(MessageId.REQUEST_MODELDEF)
     (body,) = decode(client.hear(), (4, 1)).bodies
@@ -200,7 +200,7 @@ def test_with_z_up_markers_and_model_are_in_the_world_s_axes() -> None:
     lab.motive.close()
 
 
-def test_a_frame_is_stamped_with_its_exposure(lab: MotiveBench, client: Client) -> None:
+def test_a_frame_is_stamped_with_its_exposure(lab: MotiveBench, client: NatNetSocket) -> None:
     hz = client.connect().clock_hz
     lab.run(lambda: lab.number >= 20)  # Motive is older than its cameras' latency then
     frames = [decode(client.hear(), (4, 1)) for _ in range(20)]
@@ -213,7 +213,7 @@ def test_a_frame_is_stamped_with_its_exposure(lab: MotiveBench, client: Client) 
     assert frames[-1].transmitted <= echo.server < frames[-1].transmitted + hz
 
 
-def test_a_body_that_is_not_tracked_is_marked(lab: MotiveBench, client: Client) -> None:
+def test_a_body_that_is_not_tracked_is_marked(lab: MotiveBench, client: NatNetSocket) -> None:
     client.connect()
     lab.expose(valid=False)
     assert not decode(client.hear(), (4, 1)).bodies[0].valid
@@ -221,7 +221,7 @@ def test_a_body_that_is_not_tracked_is_marked(lab: MotiveBench, client: Client) 
 
 def test_markers_of_a_body_that_is_not_tracked_have_no_label() -> None:
     lab = MotiveBench(markers=True)
-    client = Client(lab)
+    client = NatNetSocket(lab)
     client.connect()
     lab.expose(valid=False)
     frame = decode(client.hear(), (4, 1))
@@ -238,7 +238,7 @@ def test_markers_of_all_bodies_share_a_frame_and_are_told_apart() -> None:
     lab.motive.close()
     names = {1: "floaty", 2: "floaty2"}
     lab.motive = VirtualMotive(Streaming(0, (3, 1), False), names, lab.readers, PLACES)
-    client = Client(lab)
+    client = NatNetSocket(lab)
     client.connect()
     for _ in range(2):  # nothing is left of the frame before
         lab.motive.take(1, seen(1), 0, sighted(1))
@@ -258,7 +258,7 @@ def test_bodies_of_one_exposure_share_a_frame() -> None:
     lab = MotiveBench()
     lab.motive.close()
     lab.motive = VirtualMotive(Streaming(0, (3, 1), False), {1: "floaty", 2: "floaty2"}, lab.readers)
-    client = Client(lab)
+    client = NatNetSocket(lab)
     client.connect()
     lab.motive.take(1, seen(1), 0)
     assert client.hears_nothing()
@@ -271,7 +271,7 @@ def test_bodies_of_one_exposure_share_a_frame() -> None:
     lab.motive.close()
 
 
-def test_the_bitstream_is_changed_for_the_client_that_asks(lab: MotiveBench, client: Client) -> None:
+def test_the_bitstream_is_changed_for_the_client_that_asks(lab: MotiveBench, client: NatNetSocket) -> None:
     client.connect()
     client.say(MessageId.REQUEST, b"Bitstream\0")
     assert client.hear() == packet(MessageId.RESPONSE, b"Bitstream,4.1.0\0")
@@ -285,7 +285,7 @@ def test_the_bitstream_is_changed_for_the_client_that_asks(lab: MotiveBench, cli
     assert client.hear() == packet(MessageId.UNRECOGNIZED)
 
 
-def test_frames_end_with_the_disconnect(lab: MotiveBench, client: Client) -> None:
+def test_frames_end_with_the_disconnect(lab: MotiveBench, client: NatNetSocket) -> None:
     client.connect()
     client.say(MessageId.DISCONNECT)
     lab.expose()
@@ -293,7 +293,7 @@ def test_frames_end_with_the_disconnect(lab: MotiveBench, client: Client) -> Non
 
 
 def test_one_client_too_many_displaces_the_most_silent_one(lab: MotiveBench) -> None:
-    clients = [Client(lab) for _ in range(MAX_CLIENTS + 1)]
+    clients = [NatNetSocket(lab) for _ in range(MAX_CLIENTS + 1)]
     for client in clients[:-1]:
         client.connect()
     clients[0].say(MessageId.KEEPALIVE)
@@ -304,7 +304,7 @@ def test_one_client_too_many_displaces_the_most_silent_one(lab: MotiveBench) -> 
         client.close()
 
 
-def test_what_cannot_be_read_is_counted_and_not_answered(lab: MotiveBench, client: Client) -> None:
+def test_what_cannot_be_read_is_counted_and_not_answered(lab: MotiveBench, client: NatNetSocket) -> None:
     broken = [b"", b"\0", packet(MessageId.FRAME), packet(MessageId.ECHO_REQUEST, b"short")]
     for data in (*broken, packet(MessageId.REQUEST, b"Bitstream")[:-1], b"\xff" * 2048):
         client.send(data)
@@ -312,7 +312,7 @@ def test_what_cannot_be_read_is_counted_and_not_answered(lab: MotiveBench, clien
     assert client.hears_nothing()
 
 
-def test_no_bytes_stop_the_server(lab: MotiveBench, client: Client) -> None:
+def test_no_bytes_stop_the_server(lab: MotiveBench, client: NatNetSocket) -> None:
     @settings(max_examples=300, deadline=None)
     @given(st.sampled_from([*MessageId, 3000]), st.binary(max_size=40), st.integers(-3, 3))
     def fuzz(message: int, payload: bytes, wrong: int) -> None:

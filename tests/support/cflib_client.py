@@ -9,7 +9,7 @@ from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig
 
 
-class Client:
+class CflibClient:
     """A program with cflib: connected, in the end disconnected. No wait is longer than `patience_s`."""
 
     patience_s = 30.0

@@ -12,7 +12,7 @@ from support.firmware_bench import FirmwareBench
 PARAM, MEM, LOG, LOC, SUPERVISOR, PLATFORM, LINK = 2, 4, 5, 6, 9, 13, 15
 
 
-class Client(FirmwareBench):
+class CrtpClient(FirmwareBench):
     """A bench with a radio partner; `reboot` keeps only what survives a power cycle."""
 
     def __init__(self) -> None:

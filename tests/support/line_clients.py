@@ -38,7 +38,7 @@ class OpenEnd:
         assert self.readers == {}
 
 
-class Client(Protocol):
+class LineClient(Protocol):
     """A program at the end."""
 
     def write(self, data: bytes) -> object: ...
@@ -105,7 +105,7 @@ class UdpClient(_Datagrams):
         self.peer = self._socket.recvfrom(100)[1]
 
 
-class CrtpClient(_Datagrams):
+class CrtpUdpClient(_Datagrams):
     """A program with a Crazyflie's UDP link, which talks first."""
 
     def __init__(self, open_end: OpenEnd) -> None:
@@ -117,9 +117,12 @@ class CrtpClient(_Datagrams):
         del open_end.received[before:]
 
 
-ENDS: dict[str, tuple[Callable[[Any], OpenEnd], Callable[[OpenEnd], Client]]] = {
+ENDS: dict[str, tuple[Callable[[Any], OpenEnd], Callable[[OpenEnd], LineClient]]] = {
     "pty": (lambda path: OpenEnd(Address("pty", path=path).open), PtyClient),
     "udp": (lambda port: OpenEnd(Address("udp", port=port).open), UdpClient),
     "tcp": (lambda port: OpenEnd(Address("tcp", port=port).open), TcpClient),
-    "crtp": (lambda port: OpenEnd(lambda readers, received: UdpServer(port, readers, received)), CrtpClient),
+    "crtp": (
+        lambda port: OpenEnd(lambda readers, received: UdpServer(port, readers, received)),
+        CrtpUdpClient,
+    ),
 }

@@ -20,7 +20,7 @@ Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 HOME: Pose = ((0.0, 0.0, 1.15), LEVEL)  # W, z up
 
 
-class Client(FirmwareBench):
+class MavlinkClient(FirmwareBench):
     """`messages` is what pymavlink found in the board's bytes, with the instant at which they left."""
 
     def __init__(self, *overrides: str, station: tuple[int, int] = STATION) -> None:

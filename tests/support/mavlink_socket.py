@@ -14,7 +14,7 @@ PATIENCE_S = 10.0
 GAIN = "EXT_Z_P"  # extCtrl.z_P, the parameter that tests tune
 
 
-class Client:
+class MavlinkSocket:
     """A ground station (system 255, component 190) on an end as `floaty serve --mavlink` prints it."""
 
     def __init__(self, master: str) -> None:

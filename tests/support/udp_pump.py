@@ -5,12 +5,12 @@ import socket
 import threading
 import time
 
-from support.crtp_client import Client
+from support.crtp_client import CrtpClient
 
 STEP_S = 0.001
 
 
-class UdpBoard(Client):
+class UdpBoard(CrtpClient):
     """Runs in a thread of its own from creation to `close`; the newest client has the board."""
 
     def __init__(self) -> None:

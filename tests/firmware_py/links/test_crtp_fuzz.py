@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from firmware_py.wire import WireError, crtp, localisation, memories, parameters
 from firmware_py.wire.supervisor import State
-from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, Client
+from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, CrtpClient
 from support.firmware_bench import LEVEL
 
 BATCH = 4  # packets per millisecond: more than the delivery queue's tasks are ever given by a radio
@@ -61,7 +61,7 @@ def mutant(rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize("packets", [4_000, pytest.param(200_000, marks=pytest.mark.long)])
 def test_the_board_survives_random_and_mutated_packets(packets: int) -> None:
     rng = np.random.default_rng(4)
-    client = Client()
+    client = CrtpClient()
     client.imu_alive = False
     link = client.firmware.link
     offered = 0
@@ -77,7 +77,7 @@ def test_the_board_survives_random_and_mutated_packets(packets: int) -> None:
         assert queue.high_water <= queue.length, queue.name
     assert link.malformed > packets // 20
     assert link.unserved > 0
-    fresh = Client()
+    fresh = CrtpClient()
     for port in (LOG, PARAM):
         assert client.one(port, 0, b"\3") == fresh.one(port, 0, b"\3")
     assert np.isfinite(client.firmware.signals.estimate).all()
@@ -93,15 +93,15 @@ def test_the_board_survives_random_and_mutated_packets(packets: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def board() -> Client:
-    client = Client()
+def board() -> CrtpClient:
+    client = CrtpClient()
     client.imu_alive = False
     return client
 
 
 @given(st.lists(st.binary(max_size=40), max_size=5))
 @settings(max_examples=300, deadline=None)
-def test_any_bytes_leave_the_board_alive(board: Client, burst: list[bytes]) -> None:
+def test_any_bytes_leave_the_board_alive(board: CrtpClient, burst: list[bytes]) -> None:
     for data in burst:
         board.firmware.radio_received(data)
     board.run(board.now_us + 2000)

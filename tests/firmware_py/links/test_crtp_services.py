@@ -28,7 +28,7 @@ from firmware_py.wire.localisation import unpack_quaternion
 from firmware_py.wire.scalars import LOG_SCALARS, Scalar
 from firmware_py.wire.toc import Toc
 from hil.config import load_config
-from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, Client
+from support.crtp_client import LINK, LOC, LOG, MEM, PARAM, PLATFORM, SUPERVISOR, CrtpClient
 from support.firmware_bench import HOVER_COUNTS
 from support.paths import VECTORS
 
@@ -53,18 +53,18 @@ IDLE_TASKS = (
 
 
 @pytest.fixture
-def client() -> Client:
-    return Client()
+def client() -> CrtpClient:
+    return CrtpClient()
 
 
 @pytest.fixture(scope="module")
 def params() -> dict[str, tuple[int, int]]:
-    return Client().toc(PARAM)
+    return CrtpClient().toc(PARAM)
 
 
 @pytest.fixture(scope="module")
 def logs() -> dict[str, tuple[int, int]]:
-    return Client().toc(LOG)
+    return CrtpClient().toc(LOG)
 
 
 # Link and platform
@@ -73,10 +73,10 @@ def logs() -> dict[str, tuple[int, int]]:
 @given(st.binary(max_size=30))
 @settings(max_examples=20, deadline=None)
 def test_echo_is_exact(data: bytes) -> None:
-    assert Client().one(LINK, 0, data) == data
+    assert CrtpClient().one(LINK, 0, data) == data
 
 
-def test_a_client_finds_the_crazyflie_protocol_version_12(client: Client) -> None:
+def test_a_client_finds_the_crazyflie_protocol_version_12(client: CrtpClient) -> None:
     assert client.one(LINK, 1, b"\0") == b"Bitcraze Crazyflie".ljust(30, b"\0")
     assert client.one(PLATFORM, 1, b"\0") == b"\0\x0c\0\0\0"
     assert client.one(PLATFORM, 1, b"\2") == b"\2C21F\0"
@@ -92,14 +92,14 @@ def test_a_client_finds_the_crazyflie_protocol_version_12(client: Client) -> Non
     ],
 )
 def test_what_cannot_be_read_is_malformed_and_what_nobody_serves_unserved(
-    client: Client, channel: int, data: bytes, malformed: int, unserved: int
+    client: CrtpClient, channel: int, data: bytes, malformed: int, unserved: int
 ) -> None:
     client.send(LOC, channel, data)
     client.run(client.now_us + 3000)
     assert (client.firmware.link.malformed, client.firmware.link.unserved) == (malformed, unserved)
 
 
-def test_application_channel_echoes_and_counts_what_it_loses(client: Client) -> None:
+def test_application_channel_echoes_and_counts_what_it_loses(client: CrtpClient) -> None:
     assert client.one(PLATFORM, 2, bytes(range(30))) == bytes(range(30))
     client.radio_open = False
     for number in range(200):  # 120 wait for the radio, 10 for the application
@@ -113,7 +113,7 @@ def test_application_channel_echoes_and_counts_what_it_loses(client: Client) -> 
     assert client.log(client.toc(LOG), "app.overflows") == [200 - len(echoed)]
 
 
-def test_setpoints_and_notify_stop_are_accepted_without_effect(client: Client) -> None:
+def test_setpoints_and_notify_stop_are_accepted_without_effect(client: CrtpClient) -> None:
     before = client.writes[-1][1]
     for port, channel, data in ((3, 0, bytes(14)), (7, 1, b"\0" * 5), (7, 0, b"\0")):
         assert client.ask(port, channel, data) == []
@@ -126,7 +126,7 @@ def test_setpoints_and_notify_stop_are_accepted_without_effect(client: Client) -
 
 
 @pytest.mark.parametrize(("port", "element"), [(LOG, LogTocElement), (PARAM, ParamTocElement)])
-def test_cflib_reads_every_entry_of_the_table(client: Client, port: int, element: type) -> None:
+def test_cflib_reads_every_entry_of_the_table(client: CrtpClient, port: int, element: type) -> None:
     count = struct.unpack_from("<H", client.one(port, 0, b"\3"), 1)[0]
     names = []
     for number in range(count):
@@ -138,7 +138,7 @@ def test_cflib_reads_every_entry_of_the_table(client: Client, port: int, element
     assert client.one(port, 0, struct.pack("<BH", 2, count)) == b"\2"
 
 
-def test_the_two_tables_have_different_checksums(client: Client) -> None:
+def test_the_two_tables_have_different_checksums(client: CrtpClient) -> None:
     log, param = (struct.unpack_from("<I", client.one(port, 0, b"\3"), 3)[0] for port in (LOG, PARAM))
     assert log != param
     assert Toc.of(LOG, [(1, "a.b")]).crc != Toc.of(PARAM, [(1, "a.b")]).crc  # even of equal tables
@@ -181,7 +181,7 @@ def test_parameter_that_clients_look_for_is_there(params, name: str) -> None:
 # Log
 
 
-def test_the_stream_is_byte_for_byte_what_the_same_log_blocks_give(client: Client, logs) -> None:
+def test_the_stream_is_byte_for_byte_what_the_same_log_blocks_give(client: CrtpClient, logs) -> None:
     client.poses(605_000, 1_500_000, (0.01, 0.02, -0.03))
     client.stream(900_000)
     client.run(1_000_000)
@@ -207,7 +207,7 @@ def test_the_stream_is_byte_for_byte_what_the_same_log_blocks_give(client: Clien
 
 
 def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_firmware_shows_them(
-    client: Client,
+    client: CrtpClient,
 ) -> None:
     qx, qy, qz, qw = (
         Rotation.from_euler("ZYX", (15, 10, 5), degrees=True).as_quat().tolist()
@@ -224,7 +224,7 @@ def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_f
         assert angles == pytest.approx([roll, -pitch, yaw], rel=1e-5)
 
 
-def test_stream_is_a_parameter_that_can_be_switched_off_and_on(client: Client, params) -> None:
+def test_stream_is_a_parameter_that_can_be_switched_off_and_on(client: CrtpClient, params) -> None:
     for value, count in ((1, 25), (0, 0), (1, 25)):
         assert client.write(params, telemetry.STREAM, value) == value
         client.run(client.now_us // 20_000 * 20_000 + 30_000)
@@ -233,7 +233,7 @@ def test_stream_is_a_parameter_that_can_be_switched_off_and_on(client: Client, p
         assert len(client.packets(LOG, 2)) == count * len(telemetry.BLOCKS)
 
 
-def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: Client, logs) -> None:
+def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: CrtpClient, logs) -> None:
     client.poses(605_000, 2_000_000, (0.01, 0.02, -0.03))
     client.run(1_000_000)
     names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "pm.vbat")
@@ -254,7 +254,7 @@ def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: Client, logs
     assert client.packets(LOG, 2) == []
 
 
-def test_newer_start_counts_in_milliseconds_and_period_zero_sends_once(client: Client, logs) -> None:
+def test_newer_start_counts_in_milliseconds_and_period_zero_sends_once(client: CrtpClient, logs) -> None:
     assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
     assert client.one(LOG, 1, struct.pack("<BBH", 8, 1, 4)) == bytes((8, 1, 0))
     client.sent.clear()
@@ -266,7 +266,7 @@ def test_newer_start_counts_in_milliseconds_and_period_zero_sends_once(client: C
     assert len(client.packets(LOG, 2)) <= 1
 
 
-def test_refused_log_requests_have_the_crazyflies_errors_and_change_nothing(client: Client, logs) -> None:
+def test_refused_log_requests_have_the_crazyflies_errors_and_change_nothing(client: CrtpClient, logs) -> None:
     number, kind = logs["stateEstimate.x"]
     item, count = (kind, number), len(logs)
     assert client.create(1, item) == 0
@@ -287,14 +287,14 @@ def test_refused_log_requests_have_the_crazyflies_errors_and_change_nothing(clie
     assert client.create(17, item) == 0
 
 
-def test_at_most_128_variables_are_in_blocks(client: Client, logs) -> None:
+def test_at_most_128_variables_are_in_blocks(client: CrtpClient, logs) -> None:
     number = logs["supervisor.state"][0]
     for block in range(16):
         assert client.create(block, *[(1, number)] * 8) == 0
     assert client.one(LOG, 1, bytes((7, 3)) + struct.pack("<BH", 1, number)) == bytes((7, 3, errno.ENOMEM))
 
 
-def test_a_full_request_of_cflibs_ends_in_the_middle_of_an_item(client: Client, logs) -> None:
+def test_a_full_request_of_cflibs_ends_in_the_middle_of_an_item(client: CrtpClient, logs) -> None:
     number, kind = logs["stateEstimate.x"]
     data = bytes((6, 1)) + struct.pack("<BH", 1, logs["supervisor.state"][0]) * 9 + bytes((kind,))
     assert len(data) == 30
@@ -302,7 +302,7 @@ def test_a_full_request_of_cflibs_ends_in_the_middle_of_an_item(client: Client, 
     assert client.one(LOG, 1, bytes((7, 1)) + struct.pack("<BH", kind, number)) == bytes((7, 1, 0))
 
 
-def test_a_block_that_the_processor_kept_waiting_returns_to_its_grid(client: Client, logs) -> None:
+def test_a_block_that_the_processor_kept_waiting_returns_to_its_grid(client: CrtpClient, logs) -> None:
     thief = client.firmware.add_thief()
     assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
     client.one(LOG, 1, bytes((3, 1, 2)))
@@ -334,7 +334,7 @@ def test_floats_are_rounded_as_numpy_does(value: float) -> None:
     assert Scalar.U8.pack(inf) == Scalar.U8.pack(nan) == b"\0"
 
 
-def test_a_variable_can_be_fetched_as_every_type(client: Client, logs) -> None:
+def test_a_variable_can_be_fetched_as_every_type(client: CrtpClient, logs) -> None:
     number = logs["pm.vbatMV"][0]
     for kind, scalar in LOG_SCALARS.items():
         assert client.create(kind, (kind, number)) == 0
@@ -349,7 +349,7 @@ def test_a_variable_can_be_fetched_as_every_type(client: Client, logs) -> None:
 # Parameters
 
 
-def test_writing_a_parameter_changes_the_running_core(client: Client, params) -> None:
+def test_writing_a_parameter_changes_the_running_core(client: CrtpClient, params) -> None:
     core = client.firmware._core.parameters.fields
     assert client.write(params, "RandConsts.flapHoverAng", 0.3) == pytest.approx(0.3)
     assert core.hover_angle == np.float32(0.3)
@@ -360,7 +360,7 @@ def test_writing_a_parameter_changes_the_running_core(client: Client, params) ->
     assert client.writes[-1][1] != HOVER_COUNTS
 
 
-def test_each_parameter_of_the_set_point_sets_its_own_element(client: Client, params) -> None:
+def test_each_parameter_of_the_set_point_sets_its_own_element(client: CrtpClient, params) -> None:
     for number, name in enumerate(("X", "Y", "Z", "Yaw"), 1):
         client.write(params, f"setpoint.{name}", number / 8)
     assert list(client.firmware._core.parameters.fields.target) == [1 / 8, 2 / 8, 3 / 8, 4 / 8]
@@ -369,7 +369,7 @@ def test_each_parameter_of_the_set_point_sets_its_own_element(client: Client, pa
 
 
 def test_the_sensors_and_decks_that_are_told_as_present_are_those_of_the_board(
-    client: Client, params
+    client: CrtpClient, params
 ) -> None:
     present = {
         name for name in params if name.startswith(("imu_sensors.", "deck.")) and client.read(params, name)
@@ -377,7 +377,7 @@ def test_the_sensors_and_decks_that_are_told_as_present_are_those_of_the_board(
     assert present == {"imu_sensors.BMI088", "deck.bcFloaty"}
 
 
-def test_the_authors_gains_by_their_own_names_are_the_profile_as_flown(client: Client, params) -> None:
+def test_the_authors_gains_by_their_own_names_are_the_profile_as_flown(client: CrtpClient, params) -> None:
     head = {
         "x": 3.5, "y": 3.5, "z": 3.0, "vx": 0.8, "vy": 0.8, "vz": 0.6, "roll": -0.2, "pitch": -0.15, "yaw": 0.4,
         "roll_rate": -0.18, "pitch_rate": -0.03, "yaw_rate": 0.07,
@@ -392,7 +392,7 @@ def test_the_authors_gains_by_their_own_names_are_the_profile_as_flown(client: C
 
 
 def test_every_parameter_refuses_what_is_no_number_or_outside_and_says_what_is_in_force(
-    client: Client, params
+    client: CrtpClient, params
 ) -> None:
     refused = 0
     for name, (number, kind) in params.items():
@@ -412,11 +412,11 @@ def test_every_parameter_refuses_what_is_no_number_or_outside_and_says_what_is_i
 
 
 @pytest.mark.parametrize("channel", [1, 2])
-def test_unknown_parameter_is_enoent(client: Client, channel: int) -> None:
+def test_unknown_parameter_is_enoent(client: CrtpClient, channel: int) -> None:
     assert client.one(PARAM, channel, b"\xff\xff") == bytes((0xFF, 0xFF, errno.ENOENT))
 
 
-def test_set_by_name_acts_answers_and_tells_the_new_value(client: Client, params) -> None:
+def test_set_by_name_acts_answers_and_tells_the_new_value(client: CrtpClient, params) -> None:
     number = params["extCtrl.z_P"][0]
     request = b"\0extCtrl\0z_P\0\x06" + struct.pack("<f", 2.5)
     reply, update = client.ask(PARAM, 3, request)
@@ -432,7 +432,7 @@ def test_set_by_name_acts_answers_and_tells_the_new_value(client: Client, params
     assert client.read(params, "extCtrl.z_P") == 2.5
 
 
-def test_stored_parameter_survives_a_reboot_and_cleared_one_does_not(client: Client, params) -> None:
+def test_stored_parameter_survives_a_reboot_and_cleared_one_does_not(client: CrtpClient, params) -> None:
     number, kind = params["extCtrl.z_P"]
     ident = struct.pack("<H", number)
     assert kind & 0x10
@@ -456,7 +456,7 @@ def test_stored_parameter_survives_a_reboot_and_cleared_one_does_not(client: Cli
     assert client.read(params, "extCtrl.z_P") == 3.0
 
 
-def test_only_persistent_parameters_can_be_stored(client: Client, params) -> None:
+def test_only_persistent_parameters_can_be_stored(client: CrtpClient, params) -> None:
     number, kind = params["stabilizer.stop"]
     ident = struct.pack("<H", number)
     assert not kind & 0x10
@@ -490,7 +490,7 @@ def test_a_store_that_somebody_else_filled_with_strange_names_can_be_written() -
     assert len(storage.load()) == 2
 
 
-def test_a_full_store_refuses_and_keeps_what_it_has(client: Client) -> None:
+def test_a_full_store_refuses_and_keeps_what_it_has(client: CrtpClient) -> None:
     storage = ParameterStorage(bytearray(b"\xff" * 1124))
     stored = 0
     while storage.store(f"g.{stored:02}", b"1234"):
@@ -504,7 +504,7 @@ def test_a_full_store_refuses_and_keeps_what_it_has(client: Client) -> None:
 class Handler:
     """What cflib's memory elements read and write through."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: CrtpClient) -> None:
         self.client = client
 
     def read(self, element, address: int, length: int) -> None:
@@ -524,7 +524,7 @@ class Handler:
         element.write_done(element, address)
 
 
-def test_three_memories_announce_themselves(client: Client) -> None:
+def test_three_memories_announce_themselves(client: CrtpClient) -> None:
     assert client.one(MEM, 0, b"\1") == b"\1\3"
     kinds = [struct.unpack_from("<BBBI", client.one(MEM, 0, bytes((2, number)))) for number in range(3)]
     assert kinds == [(2, 0, 0x00, 8192), (2, 1, 0x01, 112), (2, 2, 0x15, 0x1000)]
@@ -532,7 +532,7 @@ def test_three_memories_announce_themselves(client: Client) -> None:
     assert client.one(MEM, 0, b"\2\3") == b"\2\3"
 
 
-def test_cflib_reads_and_writes_the_configuration_block(client: Client) -> None:
+def test_cflib_reads_and_writes_the_configuration_block(client: CrtpClient) -> None:
     element, done = I2CElement(0, 0, 8192, Handler(client)), []
     element.update(done.append)
     assert element.valid
@@ -547,7 +547,7 @@ def test_cflib_reads_and_writes_the_configuration_block(client: Client) -> None:
     assert again.elements["radio_address"] == 0xE7E7E7E701
 
 
-def test_cflib_reads_the_decks_one_wire_memory_and_rewrites_it(client: Client) -> None:
+def test_cflib_reads_the_decks_one_wire_memory_and_rewrites_it(client: CrtpClient) -> None:
     element, done = OWElement(1, 1, 112, bytes(8), Handler(client)), []
     element.update(done.append)
     assert element.valid
@@ -560,7 +560,7 @@ def test_cflib_reads_the_decks_one_wire_memory_and_rewrites_it(client: Client) -
     assert again.elements == {"Board name": "bcFloaty", "Board revision": "B7"}
 
 
-def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: Client, logs, params) -> None:
+def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: CrtpClient, logs, params) -> None:
     assert client.one(MEM, 1, struct.pack("<BIB", 2, 0x1FA, 10))[6:] == bytes(
         (0xFA, 0xFB, 0xFC, 0xFD, 0xFE, 0xFF, 0, 1, 2, 3)
     )
@@ -575,7 +575,9 @@ def test_memory_tester_gives_the_address_and_counts_wrong_bytes(client: Client, 
 @pytest.mark.parametrize(
     ("number", "address", "length"), [(0, 8192, 1), (0, 8190, 3), (1, 100, 13), (9, 0, 1), (0, 2**32 - 1, 2)]
 )
-def test_memory_access_outside_is_an_error(client: Client, number: int, address: int, length: int) -> None:
+def test_memory_access_outside_is_an_error(
+    client: CrtpClient, number: int, address: int, length: int
+) -> None:
     head = struct.pack("<BI", number, address)
     assert client.one(MEM, 1, head + bytes((length,))) == head + bytes((errno.EIO,))
     before = bytes(client.eeprom)
@@ -596,7 +598,7 @@ def test_packed_quaternion_is_cflibs(xyzw: tuple[float, ...]) -> None:
     assert abs(np.dot((x, y, z, w), q)) > 1 - 2e-5
 
 
-def test_packed_pose_with_our_address_is_flown_and_others_are_not(client: Client, logs) -> None:
+def test_packed_pose_with_our_address_is_flown_and_others_are_not(client: CrtpClient, logs) -> None:
     client.run(610_000)
     upright = compress_quaternion((0, 0, 0, 1))
     theirs = struct.pack("<BhhhI", 0x01, 900, 900, 900, upright)
@@ -610,7 +612,7 @@ def test_packed_pose_with_our_address_is_flown_and_others_are_not(client: Client
     )
 
 
-def test_position_without_attitude_is_logged_and_not_flown(client: Client, logs) -> None:
+def test_position_without_attitude_is_logged_and_not_flown(client: CrtpClient, logs) -> None:
     client.run(610_000)
     client.send(LOC, 0, struct.pack("<3f", 1, 2, 3))
     client.run(620_000)
@@ -626,7 +628,7 @@ def test_position_without_attitude_is_logged_and_not_flown(client: Client, logs)
 # Flaps from outside
 
 
-def test_manual_angles_move_the_flaps_and_zero_gives_them_back(client: Client, params) -> None:
+def test_manual_angles_move_the_flaps_and_zero_gives_them_back(client: CrtpClient, params) -> None:
     for flap, angle in enumerate((0.1, -0.2, 0.3, -0.4), 1):
         client.write(params, f"extCtrl.m{flap}", angle)
     client.run(client.now_us + 20_000)
@@ -643,7 +645,7 @@ def test_manual_angles_move_the_flaps_and_zero_gives_them_back(client: Client, p
     assert client.writes[-1][1] == HOVER_COUNTS
 
 
-def test_power_set_words_reach_the_timers_as_in_the_original(client: Client, params) -> None:
+def test_power_set_words_reach_the_timers_as_in_the_original(client: CrtpClient, params) -> None:
     vector = json.loads((VECTORS / "servo_word_to_count.json").read_text())
     count_of = dict(zip(vector["words"], vector["counts"], strict=True))
     client.write(params, "motorPowerSet.enable", 1)
@@ -664,7 +666,7 @@ def test_console_pieces_are_whole_characters_of_at_most_thirty_bytes(text: str) 
     assert "".join(part.decode() for part in parts) == text.encode("utf-8", "replace").decode()
 
 
-def test_console_tells_on_the_radio_what_it_tells_on_the_debug_pins(client: Client) -> None:
+def test_console_tells_on_the_radio_what_it_tells_on_the_debug_pins(client: CrtpClient) -> None:
     client.run(700_000)
     text = b"".join(client.packets(0, 0)).decode()
     assert text.splitlines() == client.console
@@ -674,7 +676,7 @@ def test_console_tells_on_the_radio_what_it_tells_on_the_debug_pins(client: Clie
 # What it costs
 
 
-def test_idle_services_do_not_run(client: Client) -> None:
+def test_idle_services_do_not_run(client: CrtpClient) -> None:
     client.run(1_000_000)
     before = {report.name: report.activations for report in client.firmware.statistics.reports()}
     client.run(2_000_000)
@@ -696,7 +698,7 @@ def test_idle_services_do_not_run(client: Client) -> None:
     assert after["PWRMGNT"] - before["PWRMGNT"] == 10
 
 
-def test_a_burst_of_requests_is_cut_to_the_queues_and_counted(client: Client) -> None:
+def test_a_burst_of_requests_is_cut_to_the_queues_and_counted(client: CrtpClient) -> None:
     for number in range(100):
         client.send(PARAM, 1, struct.pack("<H", number % 10))
     client.run(client.now_us + 50_000)
@@ -705,7 +707,7 @@ def test_a_burst_of_requests_is_cut_to_the_queues_and_counted(client: Client) ->
     assert client.firmware.link.dropped == 100 - answered
 
 
-def test_poses_come_in_while_nothing_goes_out(client: Client) -> None:
+def test_poses_come_in_while_nothing_goes_out(client: CrtpClient) -> None:
     client.poses(605_000, 2_000_000)
     client.radio_open = False
     for at_us in range(610_000, 1_990_000, 5000):
@@ -716,7 +718,7 @@ def test_poses_come_in_while_nothing_goes_out(client: Client) -> None:
     assert client.firmware.link.dropped > 100
 
 
-def test_supervisor_port_answers_state_and_commands(client: Client) -> None:
+def test_supervisor_port_answers_state_and_commands(client: CrtpClient) -> None:
     client.run(610_000)
     assert client.one(SUPERVISOR, 0, b"\x0c") == b"\x8c" + (0b1110).to_bytes(2, "little")
     assert client.one(SUPERVISOR, 1, b"\1\0") == b"\x81\1\0"

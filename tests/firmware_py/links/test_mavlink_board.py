@@ -18,27 +18,27 @@ from hil.devices.config import SerialConfig
 from hil.devices.uart import VirtualSerial
 from hil.events import EventQueue
 from support.firmware_bench import LEVEL, FirmwareBench
-from support.mavlink_client import GYRO_ZERO_US, Client, codec, count
+from support.mavlink_client import GYRO_ZERO_US, MavlinkClient, codec, count
 
 DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
 IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
 
 
 @pytest.fixture
-def client() -> Client:
-    made = Client()
+def client() -> MavlinkClient:
+    made = MavlinkClient()
     made.run(20_000)
     return made
 
 
 def target(
-    client: Client, p_NED: tuple[float, float, float], yaw_NED: float, mask: int = IGNORE_REST
+    client: MavlinkClient, p_NED: tuple[float, float, float], yaw_NED: float, mask: int = IGNORE_REST
 ) -> None:
     client.send("set_position_target_local_ned", 0, 1, 1, 1, mask, *p_NED, 0, 0, 0, 0, 0, 0, yaw_NED, 0)
     client.run(client.now_us + 2000)
 
 
-def last_pose(client: Client) -> tuple[Any, Any, int | None]:
+def last_pose(client: MavlinkClient) -> tuple[Any, Any, int | None]:
     """Position, quaternion and age of the last pose as the log variables show them."""
     values = {variable.name: variable.read for variable in client.firmware.variables}
     p = [values[f"locSrv.{axis}"]() for axis in "xyz"]
@@ -49,7 +49,7 @@ def last_pose(client: Client) -> tuple[Any, Any, int | None]:
 # Poses and goals
 
 
-def test_the_correction_is_the_pose_as_seen_from_the_goal(client: Client) -> None:
+def test_the_correction_is_the_pose_as_seen_from_the_goal(client: MavlinkClient) -> None:
     target(client, (1.0, -2.0, -3.0), -0.5)  # that is (1, 2, 3) with z up, 0.5 rad to the left
     R_WB = Rotation.from_euler("ZYX", (0.8, 0.2, 0.1))
     x, y, z, w = R_WB.as_quat()
@@ -61,13 +61,13 @@ def test_the_correction_is_the_pose_as_seen_from_the_goal(client: Client) -> Non
     assert (R_GB.inv() * (R_GW * R_WB)).magnitude() < 1e-6
 
 
-def test_without_a_goal_the_board_flies_to_its_home(client: Client) -> None:
+def test_without_a_goal_the_board_flies_to_its_home(client: MavlinkClient) -> None:
     client.pose(((0.1, 0.2, 1.45), LEVEL))
     client.run(client.now_us + 2000)
     assert last_pose(client)[0] == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
 
 
-def test_what_a_goal_masks_out_stays_as_it_was(client: Client) -> None:
+def test_what_a_goal_masks_out_stays_as_it_was(client: MavlinkClient) -> None:
     target(client, (1.0, -2.0, -3.0), -math.pi / 2)
     target(client, (0.0, 0.0, 0.0), math.pi / 2, IGNORE_REST | IGNORE_POSITION)
     client.pose(((2.0, 2.0, 3.0), LEVEL))
@@ -80,7 +80,7 @@ def test_what_a_goal_masks_out_stays_as_it_was(client: Client) -> None:
 
 
 @pytest.mark.parametrize("kind", ["vision", "global_vision", "vicon"])
-def test_a_pose_in_angles_is_a_pose(client: Client, kind: str) -> None:
+def test_a_pose_in_angles_is_a_pose(client: MavlinkClient, kind: str) -> None:
     client.send(f"{kind}_position_estimate", 0, 0.1, -0.2, -1.45, 0.3, -0.2, -0.5)
     client.run(client.now_us + 2000)
     p_GB, R_GB, _ = last_pose(client)
@@ -93,7 +93,7 @@ def test_a_pose_in_angles_is_a_pose(client: Client, kind: str) -> None:
     [(dialect.MAV_ESTIMATOR_TYPE_MOCAP, State.FLYING), (dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT, State.WAITING)],
 )
 def test_odometry_closes_the_loop_unless_it_is_an_autopilots(estimator: int, expected: State) -> None:
-    client, unknown = Client(), [math.nan] + [0.0] * 20
+    client, unknown = MavlinkClient(), [math.nan] + [0.0] * 20
     fields = (1, 12, 0, 0, -1.15, LEVEL, 0, 0, 0, 0, 0, 0, unknown, unknown, 0, estimator)
     for at_us in range(GYRO_ZERO_US, 1_000_000, 20_000):
         client.events.at(at_us, lambda now_us: client.send("odometry", now_us, *fields))
@@ -112,7 +112,7 @@ def test_odometry_closes_the_loop_unless_it_is_an_autopilots(estimator: int, exp
     ],
 )
 def test_an_impossible_goal_changes_nothing(
-    client: Client, p_NED: tuple[float, float, float], yaw: float, mask: int, frame: int
+    client: MavlinkClient, p_NED: tuple[float, float, float], yaw: float, mask: int, frame: int
 ) -> None:
     client.send("set_position_target_local_ned", 0, 1, 1, frame, mask, *p_NED, 0, 0, 0, 0, 0, 0, yaw, 0)
     client.pose(((0.1, 0.2, 1.45), LEVEL))
@@ -130,7 +130,7 @@ def test_an_impossible_goal_changes_nothing(
         (0, (1.0, 0.0, 0.0, 0.0), 3e38, 0.0, 0.0),
     ],
 )
-def test_an_impossible_pose_is_refused(client: Client, fields: tuple[Any, ...]) -> None:
+def test_an_impossible_pose_is_refused(client: MavlinkClient, fields: tuple[Any, ...]) -> None:
     client.run(GYRO_ZERO_US)
     client.send("att_pos_mocap", *fields)
     client.run(client.now_us + 20_000)
@@ -139,7 +139,7 @@ def test_an_impossible_pose_is_refused(client: Client, fields: tuple[Any, ...]) 
 
 
 def test_poses_close_the_loop_and_silence_opens_it() -> None:
-    client = Client()
+    client = MavlinkClient()
     client.poses(GYRO_ZERO_US, 1_000_000)
     client.run(1_000_000)
     assert client.firmware.signals.supervisor.state is State.FLYING
@@ -158,7 +158,7 @@ def test_poses_close_the_loop_and_silence_opens_it() -> None:
 
 @pytest.mark.parametrize("ahead_us", [0, 1_700_000_000_000_000, -90_000])
 def test_the_age_of_a_pose_is_true_whatever_the_stations_clock_shows(ahead_us: int) -> None:
-    client = Client()
+    client = MavlinkClient()
     client.clock_ahead_us = ahead_us
     client.poses(200_000, 4_500_000, lag_us=35_000)
     client.run(4_500_000)
@@ -171,7 +171,7 @@ def test_the_age_of_a_pose_is_true_whatever_the_stations_clock_shows(ahead_us: i
 
 
 def test_the_clock_is_asked_ten_times_a_second_until_five_answers_came_then_twice() -> None:
-    client = Client()
+    client = MavlinkClient()
     client.clock_ahead_us = 0
     client.send("heartbeat", 6, 8, 0, 0, 4, 3)
     client.run(3_000_000)
@@ -221,7 +221,7 @@ def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us
 
 @pytest.mark.parametrize("lag_us", [600_000, -20_000])
 def test_an_age_that_cannot_be_is_no_age(lag_us: int) -> None:
-    client = Client()
+    client = MavlinkClient()
     client.clock_ahead_us = 5_000_000
     client.poses(GYRO_ZERO_US, 2_000_000, lag_us=lag_us)
     client.run(2_100_000)
@@ -230,7 +230,7 @@ def test_an_age_that_cannot_be_is_no_age(lag_us: int) -> None:
 
 
 def test_only_the_clock_of_who_sends_poses_counts() -> None:
-    client = Client()
+    client = MavlinkClient()
     client.clock_ahead_us = 5_000_000
     client.poses(100_000, 1_500_000, lag_us=30_000)
     other = codec(7, 7)
@@ -251,7 +251,7 @@ def test_only_the_clock_of_who_sends_poses_counts() -> None:
 
 
 def test_after_boot_every_stream_keeps_its_rate() -> None:
-    client = Client()
+    client = MavlinkClient()
     client.run(5_100_000)
     counts = count(message for _, message in client.messages)
     counts.pop("STATUSTEXT")
@@ -263,7 +263,7 @@ def test_after_boot_every_stream_keeps_its_rate() -> None:
     assert client.of("HEARTBEAT")[0].get_srcComponent() == 1
 
 
-def test_an_interval_is_set_told_switched_off_and_returned_to_its_default(client: Client) -> None:
+def test_an_interval_is_set_told_switched_off_and_returned_to_its_default(client: MavlinkClient) -> None:
     def interval() -> int:
         ack, answer = [a for a in client.command(510, 30) if a.get_type() != "ATTITUDE"]
         assert (ack.command, ack.result) == (510, 0)
@@ -289,11 +289,11 @@ def test_an_interval_is_set_told_switched_off_and_returned_to_its_default(client
 @pytest.mark.parametrize(
     "params", [(30, math.nan), (30, -2), (30, 0.5), (math.nan, 1000), (1e30, 1000), (2, 1000)]
 )
-def test_an_interval_that_cannot_be_is_denied(client: Client, params: tuple[float, float]) -> None:
+def test_an_interval_that_cannot_be_is_denied(client: MavlinkClient, params: tuple[float, float]) -> None:
     assert client.command(511, *params)[0].result == DENIED
 
 
-def test_streams_go_on_after_the_processor_was_taken_from_them(client: Client) -> None:
+def test_streams_go_on_after_the_processor_was_taken_from_them(client: MavlinkClient) -> None:
     thief = client.firmware.add_thief()
     for number in (30, 31, 32):
         client.command(511, number, 1000)
@@ -307,11 +307,11 @@ def test_streams_go_on_after_the_processor_was_taken_from_them(client: Client) -
         assert len(client.of("ATTITUDE")) == 100
 
 
-def test_a_message_that_is_never_sent_has_interval_zero(client: Client) -> None:
+def test_a_message_that_is_never_sent_has_interval_zero(client: MavlinkClient) -> None:
     assert client.command(510, 2)[1].interval_us == 0
 
 
-def test_messages_of_one_period_carry_one_time_stamp(client: Client) -> None:
+def test_messages_of_one_period_carry_one_time_stamp(client: MavlinkClient) -> None:
     for number in (30, 32, 350):
         client.command(511, number, 20_000)
     thief = client.firmware.add_thief()
@@ -326,7 +326,7 @@ def test_messages_of_one_period_carry_one_time_stamp(client: Client) -> None:
 
 
 def test_position_and_attitude_are_those_in_the_world() -> None:
-    client = Client()
+    client = MavlinkClient()
     target(client, (1.0, -2.0, -3.0), -0.5)
     R_WB = Rotation.from_euler("ZYX", (0.6, 0.05, -0.04))
     x, y, z, w = R_WB.as_quat()
@@ -346,7 +346,7 @@ def test_position_and_attitude_are_those_in_the_world() -> None:
 
 @pytest.mark.parametrize("goal_yaw", [-0.5, 2.0])
 def test_the_reported_velocity_is_the_derivative_of_the_reported_position(goal_yaw: float) -> None:
-    client = Client()
+    client = MavlinkClient()
     client.command(511, 32, 20_000)
     client.command(400, 0)  # disarmed: no flap moves the model elsewhere than the poses go
     target(client, (0.1, -0.2, -1.15), goal_yaw)
@@ -366,7 +366,7 @@ def test_the_reported_velocity_is_the_derivative_of_the_reported_position(goal_y
 
 
 def test_a_new_goal_does_not_move_the_robot() -> None:
-    client = Client()
+    client = MavlinkClient()
     client.poses(100_000, 1_000_000)
     client.run(1_000_000)
     target(client, (1.0, 1.0, -2.0), 1.0)
@@ -376,7 +376,7 @@ def test_a_new_goal_does_not_move_the_robot() -> None:
 
 
 def test_the_flight_array_holds_the_telemetry_blocks() -> None:
-    client = Client()
+    client = MavlinkClient()
     client.command(511, 350, 20_000)
     client.poses(GYRO_ZERO_US, 1_000_000, (0.02, -0.03, 1.2))
     client.run(1_000_000)
@@ -391,20 +391,20 @@ def test_the_flight_array_holds_the_telemetry_blocks() -> None:
     assert values[26] == pytest.approx(now["locSrv.poses"], abs=2)
 
 
-def test_counters_in_the_flight_array_wrap_as_those_of_the_log_do(client: Client) -> None:
+def test_counters_in_the_flight_array_wrap_as_those_of_the_log_do(client: MavlinkClient) -> None:
     client.firmware.signals.counters[0] = (1 << 16) + 7  # poses that were fused
     (array,) = client.command(512, 350)[1:]
     assert array.data[26] == 7
 
 
-def test_a_message_can_be_asked_for_once(client: Client) -> None:
+def test_a_message_can_be_asked_for_once(client: MavlinkClient) -> None:
     ack, answer = client.command(512, 32)
     assert (ack.get_type(), ack.result) == ("COMMAND_ACK", 0)
     assert answer.get_type() == "LOCAL_POSITION_NED"
     assert client.command(512, 2)[0].result == DENIED
 
 
-def test_the_older_request_sets_groups_of_streams(client: Client) -> None:
+def test_the_older_request_sets_groups_of_streams(client: MavlinkClient) -> None:
     client.send("request_data_stream", 1, 1, dialect.MAV_DATA_STREAM_EXTRA1, 10, 1)
     client.send("request_data_stream", 1, 1, dialect.MAV_DATA_STREAM_POSITION, 5, 0)
     client.run(client.now_us + 2000)
@@ -415,7 +415,9 @@ def test_the_older_request_sets_groups_of_streams(client: Client) -> None:
     assert "LOCAL_POSITION_NED" not in counts
 
 
-def test_when_the_line_is_full_replies_wait_and_what_nobody_asked_for_is_dropped(client: Client) -> None:
+def test_when_the_line_is_full_replies_wait_and_what_nobody_asked_for_is_dropped(
+    client: MavlinkClient,
+) -> None:
     client.uart_room = 0
     client.command(511, 30, 1000)
     client.run(client.now_us + 1_000_000)
@@ -432,7 +434,7 @@ def test_when_the_line_is_full_replies_wait_and_what_nobody_asked_for_is_dropped
     assert all((b - a) % 256 == 1 for a, b in pairwise(sequence))
 
 
-def test_what_waits_for_room_on_the_line_leaves_within_a_tick_of_it(client: Client) -> None:
+def test_what_waits_for_room_on_the_line_leaves_within_a_tick_of_it(client: MavlinkClient) -> None:
     for wait_us in range(1_000_000, 1_020_000, 2_000):
         client.uart_room = 0
         client.run(client.now_us + wait_us)
@@ -445,12 +447,12 @@ def test_what_waits_for_room_on_the_line_leaves_within_a_tick_of_it(client: Clie
 # Parameters
 
 
-def parameter_list(client: Client) -> dict[str, Any]:
+def parameter_list(client: MavlinkClient) -> dict[str, Any]:
     answers = client.ask("param_request_list", 1, 1, wait_us=200_000)
     return {answer.param_id: answer for answer in answers if answer.get_type() == "PARAM_VALUE"}
 
 
-def test_the_list_is_complete_and_every_value_is_real32(client: Client) -> None:
+def test_the_list_is_complete_and_every_value_is_real32(client: MavlinkClient) -> None:
     table = parameter_list(client)
     writable = [parameter for parameter in client.firmware.parameters if parameter.write is not None]
     assert len(table) == len(writable) > 40
@@ -461,7 +463,7 @@ def test_the_list_is_complete_and_every_value_is_real32(client: Client) -> None:
         assert answer.param_value == pytest.approx(float(parameter.read()), rel=1e-6)
 
 
-def test_a_parameter_is_read_by_index_and_by_name(client: Client) -> None:
+def test_a_parameter_is_read_by_index_and_by_name(client: MavlinkClient) -> None:
     table = parameter_list(client)
     for name, listed in list(table.items())[::7]:
         by_name = client.one("param_request_read", 1, 1, name.encode(), -1)
@@ -469,7 +471,7 @@ def test_a_parameter_is_read_by_index_and_by_name(client: Client) -> None:
         assert by_name.to_dict() == by_index.to_dict() == listed.to_dict()
 
 
-def test_a_parameter_that_was_set_is_in_force_and_echoed_each_time(client: Client) -> None:
+def test_a_parameter_that_was_set_is_in_force_and_echoed_each_time(client: MavlinkClient) -> None:
     for _ in range(2):
         answer = client.one("param_set", 1, 1, b"EXT_Z_P", 2.5, dialect.MAV_PARAM_TYPE_REAL32)
         assert (answer.param_id, answer.param_value) == ("EXT_Z_P", 2.5)
@@ -491,7 +493,7 @@ def test_a_parameter_that_was_set_is_in_force_and_echoed_each_time(client: Clien
     ],
 )
 def test_a_value_that_is_not_allowed_is_refused_and_the_one_in_force_is_echoed(
-    client: Client, name: bytes, value: float, kind: int
+    client: MavlinkClient, name: bytes, value: float, kind: int
 ) -> None:
     before = client.one("param_request_read", 1, 1, name, -1).param_value
     answers = client.ask("param_set", 1, 1, name, value, kind)
@@ -501,7 +503,9 @@ def test_a_value_that_is_not_allowed_is_refused_and_the_one_in_force_is_echoed(
     assert client.stack.refused == 2
 
 
-def test_what_cannot_be_done_with_a_parameter_is_answered_with_the_reason_each_time(client: Client) -> None:
+def test_what_cannot_be_done_with_a_parameter_is_answered_with_the_reason_each_time(
+    client: MavlinkClient,
+) -> None:
     def error(name: str, *fields: Any) -> tuple[Any, ...]:
         (found,) = [a for a in client.ask(name, 1, 1, *fields) if a.get_type() == "PARAM_ERROR"]
         assert (found.target_system, found.target_component) == (255, 190)
@@ -516,7 +520,7 @@ def test_what_cannot_be_done_with_a_parameter_is_answered_with_the_reason_each_t
     assert client.stack.refused == 8
 
 
-def test_an_unknown_parameter_is_told_to_people_once(client: Client) -> None:
+def test_an_unknown_parameter_is_told_to_people_once(client: MavlinkClient) -> None:
     assert [a.get_type() for a in client.ask("param_set", 1, 1, b"NONE", 1.0, 9)] == [
         "PARAM_ERROR",
         "STATUSTEXT",
@@ -525,7 +529,7 @@ def test_an_unknown_parameter_is_told_to_people_once(client: Client) -> None:
     assert client.ask("param_request_read", 1, 1, b"\xff\xfe", -1)[-1].get_type() == "STATUSTEXT"
 
 
-def test_the_hash_changes_with_any_value_and_back(client: Client) -> None:
+def test_the_hash_changes_with_any_value_and_back(client: MavlinkClient) -> None:
     def digest() -> float:
         answer = client.one("param_request_read", 1, 1, b"_HASH_CHECK", -1)
         assert answer.param_index == 0xFFFF
@@ -538,7 +542,7 @@ def test_the_hash_changes_with_any_value_and_back(client: Client) -> None:
     assert digest() == first != second
 
 
-def slow_line(client: Client) -> None:
+def slow_line(client: MavlinkClient) -> None:
     """From now on 57600 baud, with a buffer of 120 bytes."""
 
     def fill(now_us: int) -> None:
@@ -549,7 +553,7 @@ def slow_line(client: Client) -> None:
     fill(client.now_us)
 
 
-def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client: Client) -> None:
+def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client: MavlinkClient) -> None:
     slow_line(client)
     client.send("param_request_list", 1, 1)
     client.run(client.now_us + 100_000)
@@ -563,7 +567,7 @@ def test_a_list_takes_what_the_line_has_left_and_starts_again_when_asked(client:
     assert client.stack.dropped == 0
 
 
-def test_a_list_comes_through_on_a_line_full_of_telemetry(client: Client) -> None:
+def test_a_list_comes_through_on_a_line_full_of_telemetry(client: MavlinkClient) -> None:
     slow_line(client)
     client.command(511, 30, 5000)  # 8 kB/s
     client.send("param_request_list", 1, 1)
@@ -577,7 +581,7 @@ def test_a_list_comes_through_on_a_line_full_of_telemetry(client: Client) -> Non
 
 
 @pytest.mark.parametrize("kind", ["command_long", "command_int"])
-def test_every_command_is_acknowledged_to_its_sender(client: Client, kind: str) -> None:
+def test_every_command_is_acknowledged_to_its_sender(client: MavlinkClient, kind: str) -> None:
     for number in (400, 185, 245, 246, 410, 420, 510, 511, 512, 520, 1, 0, 65535):
         fields = (number, 0) if kind == "command_long" else (0, number, 0, 0)
         answers = client.ask(
@@ -589,19 +593,19 @@ def test_every_command_is_acknowledged_to_its_sender(client: Client, kind: str) 
 
 
 @pytest.mark.parametrize("target", [(2, 1), (1, 2), (7, 0)])
-def test_a_command_for_somebody_else_is_ignored(client: Client, target: tuple[int, int]) -> None:
+def test_a_command_for_somebody_else_is_ignored(client: MavlinkClient, target: tuple[int, int]) -> None:
     assert client.command(400, 0, target=target) == []
     assert client.stack.unserved == 1
     assert client.firmware.signals.supervisor.armed
 
 
 @pytest.mark.parametrize("target", [(0, 0), (1, 0), (0, 1)])
-def test_a_command_for_all_is_obeyed(client: Client, target: tuple[int, int]) -> None:
+def test_a_command_for_all_is_obeyed(client: MavlinkClient, target: tuple[int, int]) -> None:
     assert client.command(400, 0, target=target)[0].result == 0
     assert not client.firmware.signals.supervisor.armed
 
 
-def test_arming_and_disarming_twice_is_acknowledged_twice(client: Client) -> None:
+def test_arming_and_disarming_twice_is_acknowledged_twice(client: MavlinkClient) -> None:
     for _ in range(2):
         assert client.command(400, 0)[0].result == 0
     assert not client.firmware.signals.supervisor.armed
@@ -613,7 +617,7 @@ def test_arming_and_disarming_twice_is_acknowledged_twice(client: Client) -> Non
 
 
 @pytest.mark.parametrize("params", [(185, 1), (400, 0, 21196)])
-def test_a_forced_stop_is_latched(client: Client, params: tuple[float, ...]) -> None:
+def test_a_forced_stop_is_latched(client: MavlinkClient, params: tuple[float, ...]) -> None:
     assert client.command(*params)[0].result == 0  # type: ignore[arg-type]
     client.run(client.now_us + 20_000)
     assert client.firmware.signals.supervisor.cause is Cause.EMERGENCY_STOP
@@ -622,7 +626,7 @@ def test_a_forced_stop_is_latched(client: Client, params: tuple[float, ...]) -> 
     assert why.severity == dialect.MAV_SEVERITY_WARNING
 
 
-def test_with_an_empty_battery_arming_is_refused_with_that_reason(client: Client) -> None:
+def test_with_an_empty_battery_arming_is_refused_with_that_reason(client: MavlinkClient) -> None:
     client.battery_mv = 3000
     client.run(6_020_000)
     ack, why = client.command(400, 1)
@@ -630,7 +634,7 @@ def test_with_an_empty_battery_arming_is_refused_with_that_reason(client: Client
 
 
 @pytest.mark.parametrize("kind", ["command_long", "command_int"])
-def test_a_board_on_the_ground_is_reset_once_what_it_said_has_left(client: Client, kind: str) -> None:
+def test_a_board_on_the_ground_is_reset_once_what_it_said_has_left(client: MavlinkClient, kind: str) -> None:
     fields = (246, 0, 1, 0, 0, 0, 0, 0, 0) if kind == "command_long" else (0, 246, 0, 0, 1, 0, 0, 0, 0, 0, 0)
     for _ in range(2):  # the second because the first acknowledgement was lost
         assert [answer.result for answer in client.ask(kind, 1, 1, *fields)] == [0]
@@ -642,7 +646,7 @@ def test_a_board_on_the_ground_is_reset_once_what_it_said_has_left(client: Clien
 
 @pytest.mark.parametrize("kind", ["command_long", "command_int"])
 def test_in_flight_only_a_forced_reset_is_obeyed(kind: str) -> None:
-    client = Client()
+    client = MavlinkClient()
     client.poses(GYRO_ZERO_US, 2_000_000)
     client.run(1_000_000)
 
@@ -661,12 +665,12 @@ def test_in_flight_only_a_forced_reset_is_obeyed(kind: str) -> None:
     assert len(client.resets_us) == 1
 
 
-def test_hardware_that_flies_lets_no_part_of_it_fail(client: Client) -> None:
+def test_hardware_that_flies_lets_no_part_of_it_fail(client: MavlinkClient) -> None:
     assert [answer.result for answer in client.command(420, 0, 2)] == [UNSUPPORTED]
 
 
 def test_the_heartbeat_says_armed_only_while_the_flaps_are_under_control() -> None:
-    client = Client()
+    client = MavlinkClient()
     client.command(511, 0, 50_000)
 
     def armed_at(end_us: int) -> bool:
@@ -693,12 +697,12 @@ def test_the_heartbeat_says_armed_only_while_the_flaps_are_under_control() -> No
     "params",
     [(400, 2), (400, math.nan), (185, 0), (185, 2), (245, 0), (245, 2), (246, 0), (246, 2), (246, math.nan)],
 )
-def test_a_parameter_that_cannot_be_is_denied(client: Client, params: tuple[float, ...]) -> None:
+def test_a_parameter_that_cannot_be_is_denied(client: MavlinkClient, params: tuple[float, ...]) -> None:
     assert client.command(*params)[0].result == DENIED  # type: ignore[arg-type]
     assert client.firmware.signals.supervisor.armed
 
 
-def test_stored_parameters_are_in_force_after_the_next_boot(client: Client) -> None:
+def test_stored_parameters_are_in_force_after_the_next_boot(client: MavlinkClient) -> None:
     client.one("param_set", 1, 1, b"EXT_Z_P", 2.5, 9)
     assert client.command(245, 1)[0].result == 0
     after = Firmware(load_config(), client)
@@ -706,7 +710,7 @@ def test_stored_parameters_are_in_force_after_the_next_boot(client: Client) -> N
 
 
 @pytest.mark.parametrize("params", [(410,), (512, 242)])
-def test_home_is_where_the_configuration_says(client: Client, params: tuple[float, ...]) -> None:
+def test_home_is_where_the_configuration_says(client: MavlinkClient, params: tuple[float, ...]) -> None:
     answers = {answer.get_type(): answer for answer in client.command(*params)}  # type: ignore[arg-type]
     home = answers["HOME_POSITION"]
     assert (home.x, home.y, home.z) == pytest.approx((0.0, 0.0, -1.15))
@@ -714,7 +718,7 @@ def test_home_is_where_the_configuration_says(client: Client, params: tuple[floa
 
 
 @pytest.mark.parametrize("params", [(520, 1), (512, 148)])
-def test_the_version_is_told(client: Client, params: tuple[float, ...]) -> None:
+def test_the_version_is_told(client: MavlinkClient, params: tuple[float, ...]) -> None:
     answers = {answer.get_type(): answer for answer in client.command(*params)}  # type: ignore[arg-type]
     version = answers["AUTOPILOT_VERSION"]
     assert version.flight_sw_version.to_bytes(4, "big")[:2] == bytes((26, 11))
@@ -724,7 +728,7 @@ def test_the_version_is_told(client: Client, params: tuple[float, ...]) -> None:
 # The rest
 
 
-def test_ping_timesync_and_file_transfer_are_answered(client: Client) -> None:
+def test_ping_timesync_and_file_transfer_are_answered(client: MavlinkClient) -> None:
     ping = client.one("ping", 1234, 5, 0, 0)
     assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (1234, 5, 255, 190)
     assert client.ask("ping", 1234, 5, 1, 1) == []  # an answer
@@ -736,7 +740,7 @@ def test_ping_timesync_and_file_transfer_are_answered(client: Client) -> None:
     assert (nak.target_system, nak.target_component) == (255, 190)
 
 
-def test_the_boards_own_frames_are_ignored_when_they_come_back(client: Client) -> None:
+def test_the_boards_own_frames_are_ignored_when_they_come_back(client: MavlinkClient) -> None:
     echo = codec(1, 1)
     client.messages.clear()
     client.receive(echo.command_long_encode(0, 0, 400, 0, 0, 0, 0, 0, 0, 0, 0).pack(echo))
@@ -745,7 +749,7 @@ def test_the_boards_own_frames_are_ignored_when_they_come_back(client: Client) -
     assert client.firmware.signals.supervisor.armed
 
 
-def test_half_a_frame_does_not_hold_back_the_last_command(client: Client) -> None:
+def test_half_a_frame_does_not_hold_back_the_last_command(client: MavlinkClient) -> None:
     client.receive(
         bytes.fromhex("fd fc 00 00 00 ff be 5e 01 00")
     )  # so a DEBUG_FLOAT_ARRAY of 264 bytes begins
@@ -757,7 +761,7 @@ def test_half_a_frame_does_not_hold_back_the_last_command(client: Client) -> Non
 KEY = bytes(range(32))
 
 
-def signed(client: Client) -> None:
+def signed(client: MavlinkClient) -> None:
     """Give the station and what reads for it the key."""
     for made in (client.codec, client.parser):
         made.signing.secret_key = KEY
@@ -766,7 +770,7 @@ def signed(client: Client) -> None:
 
 
 def test_with_a_key_nothing_unsigned_is_accepted_and_everything_sent_is_signed() -> None:
-    client = Client(f'mavlink.signing_key="{KEY.hex()}"')
+    client = MavlinkClient(f'mavlink.signing_key="{KEY.hex()}"')
     client.parser.signing.secret_key = KEY
     client.run(20_000)
     assert client.command(400, 0) == []
@@ -783,7 +787,7 @@ def test_with_a_key_nothing_unsigned_is_accepted_and_everything_sent_is_signed()
 
 
 def test_the_trace_names_no_interrupt_that_the_hardware_did_not_raise() -> None:
-    client = Client()
+    client = MavlinkClient()
     raised: list[None] = []
     traced: list[tuple[int, str, str, int, int]] = []
     for name in ("imu_ready", "uart_ready", "radio_received"):
@@ -801,7 +805,7 @@ def test_the_trace_names_no_interrupt_that_the_hardware_did_not_raise() -> None:
     assert len(interrupts) == len(raised)
 
 
-def test_counters_are_log_variables(client: Client) -> None:
+def test_counters_are_log_variables(client: MavlinkClient) -> None:
     client.receive(b"\xfd\x01\x00\x00\x00\x01\x01\x00\x00\x00\x00\x12\x34" + bytes(300))
     client.ask("ping", 1, 1, 0, 0)
     client.uart_overruns = 3
@@ -820,7 +824,7 @@ def test_without_mavlink_there_is_no_task_and_no_variable_of_it() -> None:
     firmware.uart_ready()  # an interrupt that nobody waits for
 
 
-def test_a_message_that_fits_no_frame_is_dropped_and_the_next_one_sent(client: Client) -> None:
+def test_a_message_that_fits_no_frame_is_dropped_and_the_next_one_sent(client: MavlinkClient) -> None:
     dropped = client.stack.dropped
     client.messages.clear()
 

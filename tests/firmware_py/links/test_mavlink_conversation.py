@@ -5,7 +5,7 @@ from typing import Any
 import pymavlink.dialects.v20.common as dialect
 import pytest
 
-from support.mavlink_client import STATION, STREAMS, Client
+from support.mavlink_client import STATION, STREAMS, MavlinkClient
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 MISSION, FENCE, RALLY = 0, 1, 2
@@ -14,18 +14,18 @@ REQUEST_MESSAGE, SET_MESSAGE_INTERVAL = 512, 511
 
 
 @pytest.fixture
-def client() -> Client:
-    made = Client()
+def client() -> MavlinkClient:
+    made = MavlinkClient()
     made.run(20_000)
     return made
 
 
-def answers(client: Client, kind: str, name: str, *fields: Any, wait_us: int = 3000) -> list[Any]:
+def answers(client: MavlinkClient, kind: str, name: str, *fields: Any, wait_us: int = 3000) -> list[Any]:
     """The answers of one kind to a message of ours."""
     return [message for message in client.ask(name, *fields, wait_us=wait_us) if message.get_type() == kind]
 
 
-def test_a_connection_as_qgroundcontrol_makes_it_meets_no_silence(client: Client) -> None:
+def test_a_connection_as_qgroundcontrol_makes_it_meets_no_silence(client: MavlinkClient) -> None:
     """In the order of its InitialConnectStateMachine; every request gets what it waits for, or a refusal."""
     client.send(
         "heartbeat", dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE
@@ -73,7 +73,7 @@ def test_a_connection_as_qgroundcontrol_makes_it_meets_no_silence(client: Client
 
 
 @pytest.mark.parametrize("kind", [MISSION, FENCE, RALLY])
-def test_whatever_else_is_asked_or_told_of_missions_is_unsupported(client: Client, kind: int) -> None:
+def test_whatever_else_is_asked_or_told_of_missions_is_unsupported(client: MavlinkClient, kind: int) -> None:
     item = (1, 1, 0, 3, 16, 0, 1, 0, 0, 0, 0, 0, 0, 0, kind)
     requests: dict[str, tuple[Any, ...]] = {
         "mission_count": (1, 1, 3, kind),
@@ -93,18 +93,18 @@ def test_whatever_else_is_asked_or_told_of_missions_is_unsupported(client: Clien
     assert ack.type == dialect.MAV_MISSION_UNSUPPORTED
 
 
-def test_missions_and_logs_of_somebody_else_are_left_to_him(client: Client) -> None:
+def test_missions_and_logs_of_somebody_else_are_left_to_him(client: MavlinkClient) -> None:
     assert client.ask("mission_request_list", 2, 1, 0) == []
     assert client.ask("log_request_list", 2, 1, 0, 0xFFFF) == []
     assert client.ask("set_mode", 2, 1, 4) == []
 
 
-def test_a_log_that_is_not_there_ends_at_once(client: Client) -> None:
+def test_a_log_that_is_not_there_ends_at_once(client: MavlinkClient) -> None:
     (data,) = answers(client, "LOG_DATA", "log_request_data", 1, 1, 7, 1000, 90)
     assert (data.id, data.ofs, data.count) == (7, 1000, 0)
 
 
-def test_a_mode_cannot_be_chosen_and_the_answer_says_so(client: Client) -> None:
+def test_a_mode_cannot_be_chosen_and_the_answer_says_so(client: MavlinkClient) -> None:
     (ack,) = answers(client, "COMMAND_ACK", "set_mode", 1, 1, 4)
     assert (ack.command, ack.result) == (176, UNSUPPORTED)
     assert (ack.target_system, ack.target_component) == STATION

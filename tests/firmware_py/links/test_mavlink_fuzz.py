@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_py.wire.supervisor import State
-from support.mavlink_client import STATION, Client, codec
+from support.mavlink_client import STATION, MavlinkClient, codec
 
 BATCH = 4  # messages per millisecond: twice what 921600 baud can carry
 COMMANDS = (185, 245, 400, 410, 510, 511, 512, 519, 520)
@@ -72,7 +72,7 @@ def spoilt(rng: np.random.Generator, frame: bytes) -> bytes:
     return bytes(data)
 
 
-def recover(client: Client) -> None:
+def recover(client: MavlinkClient) -> None:
     """Undo what the fuzz did to the supervisor and its parameters, as a ground station would."""
     for name, value in (
         (b"STAB_STOP", 1.0),
@@ -87,7 +87,7 @@ def recover(client: Client) -> None:
 @pytest.mark.parametrize("messages", [1_500, pytest.param(100_000, marks=pytest.mark.long)])
 def test_the_board_survives_messages_of_every_kind_with_any_contents(messages: int) -> None:
     rng = np.random.default_rng(5)
-    client = Client()
+    client = MavlinkClient()
     client.run(700_000)  # the gyro's zero is known
     client.imu_alive = False
     sender, sent = codec(*STATION), 0
@@ -113,7 +113,7 @@ def test_the_board_survives_messages_of_every_kind_with_any_contents(messages: i
     client.send("request_data_stream", 1, 1, 0, 1, 0)
     client.command(511, 350, -1)
     client.run(client.now_us + 200_000)
-    fresh = Client()
+    fresh = MavlinkClient()
     for asked in (client, fresh):
         asked.ask("param_request_list", 1, 1, wait_us=200_000)
     names = [[answer.param_id for answer in asked.of("PARAM_VALUE")] for asked in (client, fresh)]
@@ -127,15 +127,15 @@ def test_the_board_survives_messages_of_every_kind_with_any_contents(messages: i
 
 
 @pytest.fixture(scope="module")
-def board() -> Client:
-    client = Client()
+def board() -> MavlinkClient:
+    client = MavlinkClient()
     client.imu_alive = False
     return client
 
 
 @given(st.lists(st.binary(max_size=300), max_size=4), st.booleans())
 @settings(max_examples=300, deadline=None)
-def test_any_bytes_leave_the_board_alive(board: Client, bursts: list[bytes], magic: bool) -> None:
+def test_any_bytes_leave_the_board_alive(board: MavlinkClient, bursts: list[bytes], magic: bool) -> None:
     for data in bursts:
         board.receive(b"\xfd" + data if magic else data)
         board.run(board.now_us + 1000)
@@ -145,7 +145,7 @@ def test_any_bytes_leave_the_board_alive(board: Client, bursts: list[bytes], mag
 
 def test_a_board_with_a_key_learns_nothing_from_a_hundred_thousand_unsigned_bytes() -> None:
     rng = np.random.default_rng(6)
-    client = Client(f'mavlink.signing_key="{bytes(32).hex()}"')
+    client = MavlinkClient(f'mavlink.signing_key="{bytes(32).hex()}"')
     sender = codec(*STATION)
     for _ in range(1000):
         client.receive(message(rng).pack(sender) + rng.bytes(50))

@@ -8,7 +8,7 @@ import pymavlink.dialects.v20.common as dialect
 import pytest
 from scipy.spatial.transform import Rotation
 
-from support.mavlink_client import GYRO_ZERO_US, Client
+from support.mavlink_client import GYRO_ZERO_US, MavlinkClient
 
 ON_REQUEST = {33: "GLOBAL_POSITION_INT", 105: "HIGHRES_IMU", 148: "AUTOPILOT_VERSION", 242: "HOME_POSITION",
               245: "EXTENDED_SYS_STATE", 331: "ODOMETRY"}  # fmt: skip
@@ -18,9 +18,9 @@ START, V_W = np.array((-0.3, -0.2, 1.25)), np.array((0.3, 0.2, -0.1))
 
 
 @pytest.fixture(scope="module")
-def moving() -> Client:
+def moving() -> MavlinkClient:
     """A board that was carried through the tunnel, turned, with a goal that has a yaw."""
-    client = Client()
+    client = MavlinkClient()
     client.command(400, 0)  # disarmed: no flap moves the model elsewhere than the poses go
     client.send(
         "set_position_target_local_ned", 0, 1, 1, 1, 0x9F8, 0.1, -0.2, -1.15, 0, 0, 0, 0, 0, 0, -0.4, 0
@@ -33,14 +33,14 @@ def moving() -> Client:
     return client
 
 
-def once(client: Client, number: int) -> Any:
+def once(client: MavlinkClient, number: int) -> Any:
     ack, *answers = client.command(512, number)
     assert ack.result == 0
     (answer,) = [answer for answer in answers if answer.get_type() == dialect.mavlink_map[number].msgname]
     return answer
 
 
-def velocity(client: Client) -> tuple[float, float, float]:
+def velocity(client: MavlinkClient) -> tuple[float, float, float]:
     """In NED [m/s]."""
     found = once(client, 32)
     return found.vx, found.vy, found.vz
@@ -48,7 +48,7 @@ def velocity(client: Client) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("number", ON_REQUEST)
 def test_nobody_gets_it_unasked_and_who_asks_gets_it_at_his_rate(number: int) -> None:
-    client = Client()
+    client = MavlinkClient()
     client.run(1_500_000)
     assert client.of(ON_REQUEST[number]) == []
     assert client.command(511, number, 50_000)[0].result == 0
@@ -61,7 +61,7 @@ def test_nobody_gets_it_unasked_and_who_asks_gets_it_at_his_rate(number: int) ->
     assert client.of(ON_REQUEST[number]) == []
 
 
-def test_odometry_is_pose_and_motion_of_the_body_in_the_standards_axes(moving: Client) -> None:
+def test_odometry_is_pose_and_motion_of_the_body_in_the_standards_axes(moving: MavlinkClient) -> None:
     found = once(moving, 331)
     assert (found.frame_id, found.child_frame_id) == (dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_FRD)
     t_s = found.time_usec * 1e-6
@@ -80,7 +80,7 @@ def test_odometry_is_pose_and_motion_of_the_body_in_the_standards_axes(moving: C
     assert found.estimator_type == dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT
 
 
-def test_height_velocity_and_heading_have_the_standards_units(moving: Client) -> None:
+def test_height_velocity_and_heading_have_the_standards_units(moving: MavlinkClient) -> None:
     found = once(moving, 33)
     z = (START + V_W * (found.time_boot_ms * 1e-3))[2]
     assert (found.lat, found.lon) == (0, 0)
@@ -91,7 +91,7 @@ def test_height_velocity_and_heading_have_the_standards_units(moving: Client) ->
 
 
 def test_the_imu_measures_in_si_in_the_bodys_axes() -> None:
-    client = Client()
+    client = MavlinkClient()
     client.run(GYRO_ZERO_US)  # three counts of rest are zero from now on
     client.imu = (3 + 1000, -2 + 2000, 1 - 3000, 100, 200, 1365)
     found = once(client, 105)
@@ -105,13 +105,13 @@ def test_the_imu_measures_in_si_in_the_bodys_axes() -> None:
     assert 0 <= client.now_us - found.time_usec <= 3000
 
 
-def test_home_is_told_as_often_as_wanted(moving: Client) -> None:
+def test_home_is_told_as_often_as_wanted(moving: MavlinkClient) -> None:
     home = once(moving, 242)
     assert (home.x, home.y, home.z) == pytest.approx((0.0, 0.0, -1.15))
 
 
 def test_the_board_says_whether_it_is_in_the_air_as_far_as_it_knows() -> None:
-    client = Client()
+    client = MavlinkClient()
 
     def landed(end_us: int) -> int:
         client.run(end_us)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.wire import WireError, mavlink, telemetry
 from firmware_py.wire.mavlink_frames import FrameSender
 from firmware_py.wire.supervisor import State
-from support.crtp_client import PARAM, Client
+from support.crtp_client import PARAM, CrtpClient
 
 # NED seen from W and FRD seen from B: x stays, y and z turn over.
 D = np.diag([1.0, -1.0, -1.0])
@@ -397,7 +397,7 @@ def test_nothing_that_goes_down_raises(n: int, m: int, a: float, b: float, text:
 
 
 def test_parameter_names_are_unique_and_fit() -> None:
-    ours = list(Client().toc(PARAM))
+    ours = list(CrtpClient().toc(PARAM))
     names = [mavlink.mavlink_name(name) for name in ours]
     assert len(set(names)) == len(ours) > 60
     for name in names:
