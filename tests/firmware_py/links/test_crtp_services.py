@@ -377,6 +377,13 @@ def test_the_sensors_and_decks_that_are_told_as_present_are_those_of_the_board(
     assert present == {"imu_sensors.BMI088", "deck.bcFloaty"}
 
 
+def test_of_absent_decks_the_table_names_those_alone_that_cfclient_reads_without_asking(params) -> None:
+    read = "bcDWM1000 bcFlow bcFlow2 bcLighthouse4 bcLoco bcZRanger bcZRanger2".split()  # noqa: SIM905
+    assert {name for name in params if name.startswith("deck.")} == {
+        f"deck.{name}" for name in ["bcFloaty", *read]
+    }
+
+
 def test_the_authors_gains_by_their_own_names_are_the_profile_as_flown(client: CrtpClient, params) -> None:
     head = {
         "x": 3.5, "y": 3.5, "z": 3.0, "vx": 0.8, "vy": 0.8, "vz": 0.6, "roll": -0.2, "pitch": -0.15, "yaw": 0.4,
