@@ -101,7 +101,7 @@ def estimator_task(
                 y += counts[1]
                 z += counts[2]
             elif measurement[0] == POSE:
-                file_pose(kernel, measurement[1], supervisor, core)
+                hand_pose_to_core(kernel, measurement[1], supervisor, core)
         if kernel.tick_count >= step_tick:
             step_tick = next_step(kernel.tick_count, ESTIMATOR_PHASE)
             data.gyro_sum[:] = x, y, z
@@ -125,7 +125,9 @@ def next_step(tick: int, phase: int) -> int:
     return tick + 1 + (phase - tick - 1) % TICKS_PER_STEP
 
 
-def file_pose(kernel: Kernel, measurement: PoseMeasurement, supervisor: Supervisor, core: CoreBlocks) -> None:
+def hand_pose_to_core(
+    kernel: Kernel, measurement: PoseMeasurement, supervisor: Supervisor, core: CoreBlocks
+) -> None:
     """Hand a pose to the core with the age that it will have at the estimator's next step."""
     data = core.data.fields
     message = measurement.message

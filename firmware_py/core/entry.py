@@ -5,7 +5,7 @@ from firmware_py.core.structs import Control, Estimator, Input, Parameters
 from firmware_py.core.subset import Memory, i32, kernel
 
 _reset = predictor.reset
-_file_pose = predictor.file_pose
+_pose_into_history = predictor.pose_into_history
 _estimate = predictor.estimate
 _control_flaps = controller.control_flaps
 _drive_servos = servo.drive_servos
@@ -20,7 +20,7 @@ def reset(parameters: Memory[Parameters], estimator: Memory[Estimator]) -> None:
 @kernel
 def file_pose(parameters: Memory[Parameters], data: Memory[Input], estimator: Memory[Estimator]) -> i32:
     """File the pose in the input under the instant at which it was true."""
-    return _file_pose(parameters[0], data[0], estimator[0])
+    return _pose_into_history(parameters[0], data[0], estimator[0])
 
 
 @kernel

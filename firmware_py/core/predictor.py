@@ -82,7 +82,7 @@ def valid_pose(data: Input) -> bool:
 
 
 @kernel
-def file_pose(parameters: Parameters, data: Input, estimator: Estimator) -> i32:
+def pose_into_history(parameters: Parameters, data: Input, estimator: Estimator) -> i32:
     """File a pose under the coming tick minus its age; returns POSE_ON_TIME, POSE_TOO_OLD or POSE_INVALID.
 
     Call it before `estimate` of the tick that `pose_age_us` refers to.

@@ -121,7 +121,7 @@ static bool asked(volatile bool *request) {
   return was;
 }
 
-static void file_pose(FloatyPose *pose, stabilizerStep_t step) {
+static void hand_pose_to_core(FloatyPose *pose, stabilizerStep_t step) {
   /* Negative only when usec.reset has been written since the pose came: then as if it came now. */
   const int64_t since_us = (int64_t)usecTimestamp() - pose->arrival_us;
   const int64_t waited_us = since_us > 0 ? since_us : 0;
@@ -169,7 +169,7 @@ static void take_measurements(stabilizerStep_t step) {
     return; /* poses wait until the controller has run, as they do in the laboratory: it may see them in 1 to 11 ms */
   }
   while (xQueueReceive(pose_queue, &pose, 0) == pdTRUE) {
-    file_pose(&pose, step);
+    hand_pose_to_core(&pose, step);
   }
 }
 
