@@ -51,13 +51,6 @@ class TrackerConfig(BaseModel):
         description="standard deviations that position or rotation may be off [1]: 7 mm or 3 deg from frame to frame; "
         "5.2 at most in all experiments",
     )
-    bridge_us: int = Field(
-        0,
-        ge=0,
-        le=200_000,
-        description="predicted poses go out this long after the last good one [us], for boards that do not predict; ours "
-        "does, with its gyro: 0.3 s without cameras make the hover's rms of y 3.2 mm with 0, 3.8 with 20 ms, 5.2 with 50",
-    )
     reacquire_us: int = Field(
         400_000,
         ge=50_000,

@@ -1,4 +1,4 @@
-"""The tracker between motion capture and link: refuses wrong poses, bridges short gaps, knows the velocity.
+"""The tracker between motion capture and link: refuses wrong poses, knows the velocity.
 
 Good frames pass unchanged: smoothing would be a delay that the board's filter does not know. A pose is refused when it is
 further from the prediction than noise and pushes explain. Nothing good for `reacquire_us`: the track is lost, and begins
@@ -27,8 +27,7 @@ class Quality(IntEnum):
 
     NONE = 0  # there is no track, or nothing was seen
     REFUSED = 1  # it fits neither the track nor the time
-    BRIDGED = 2  # missing or refused, the prediction stands in for it
-    TRACKED = 3  # good
+    TRACKED = 3  # good; records of earlier versions have 2 for a predicted pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,6 @@ class TrackerCounters:
     """What happened to frames."""
 
     refused: int = 0
-    bridged: int = 0
     restarts: int = 0  # tracks begun but the first
 
 
@@ -89,10 +87,7 @@ class Tracker:
     def summary(self) -> str:
         """A few words on how it does."""
         counters = self.counters
-        return (
-            f"{self.quality.name.lower()} ({counters.refused} refused, {counters.bridged} bridged, "
-            f"{counters.restarts} restarts)"
-        )
+        return f"{self.quality.name.lower()} ({counters.refused} refused, {counters.restarts} restarts)"
 
     def _take(self, frame: MocapFrame) -> Track:
         t_us = frame.t_us
@@ -111,7 +106,7 @@ class Tracker:
         steps = 1 if elapsed_us <= self._period_us else round(elapsed_us / self._period_us)
         self._filter.predict(steps, self._refused_in_a_row < self._widening)
         if not frame.valid:
-            return self._stand_in(frame, Quality.NONE)
+            return self._without_pose(frame, Quality.NONE)
         distance2, angle2, theta = self._filter.off(frame.p_WB, frame.q_WB)
         position2, rotation2 = self._filter.variances
         if distance2 > self._gate2 * position2 or angle2 > self._gate2 * rotation2:
@@ -121,7 +116,7 @@ class Tracker:
             self.counters.refused += 1
             self._refused_in_a_row += 1
             self._notices.refused(t_us, sqrt(distance2), 2.0 * atan2(sqrt(angle2), 2.0))
-            return self._stand_in(frame, Quality.REFUSED)
+            return self._without_pose(frame, Quality.REFUSED)
         v_WB, w_B = self._filter.update(frame.p_WB, theta)
         self._good_us = t_us
         self._refused_in_a_row = 0
@@ -155,16 +150,12 @@ class Tracker:
         self._poses = 0
         self._tracking, self._patience_us = False, FIT_US
 
-    def _stand_in(self, frame: MocapFrame, quality: Quality) -> Track:
-        """The prediction in the place of a pose that is missing or wrong, while it is good enough."""
+    def _without_pose(self, frame: MocapFrame, quality: Quality) -> Track:
+        """A pose is missing or wrong: the prediction tells the velocity, and no pose goes out."""
         v_WB, w_B = self._filter.leave_out()
         if not self._tracking:
             return _without(frame, quality)
-        if frame.t_us - self._good_us > self._config.bridge_us:
-            return Track(replace(frame, valid=False), v_WB, w_B, quality)
-        self.counters.bridged += 1
-        p_WB, q_WB = self._filter.pose
-        return Track(replace(frame, p_WB=p_WB, q_WB=q_WB, valid=True), v_WB, w_B, Quality.BRIDGED)
+        return Track(replace(frame, valid=False), v_WB, w_B, quality)
 
 
 def tracker_of(config: TrackerConfig, period_us: int) -> Tracker | None:

@@ -54,8 +54,8 @@ def tracker_channel(tracker: Tracker) -> Channel:
     counters = tracker.counters
     return Channel(
         "int32",
-        lambda: (tracker.quality, counters.refused, counters.bridged, counters.restarts),
-        (quantity("tracker", "quality refused bridged restarts"),),
+        lambda: (tracker.quality, counters.refused, counters.restarts),
+        (quantity("tracker", "quality refused restarts"),),
     )
 
 
