@@ -105,7 +105,7 @@ def test_a_message_comes_as_often_as_it_was_asked_for(client: MavlinkSocket) -> 
 
 
 def test_two_tcp_clients_hear_the_board_and_each_gets_its_answers(served: Served) -> None:
-    first, second = (Client(masters(served)[0]) for _ in range(2))
+    first, second = (MavlinkSocket(masters(served)[0]) for _ in range(2))
     for client in (first, second):
         assert client.command(dialect.MAV_CMD_NAV_LAND) == dialect.MAV_RESULT_UNSUPPORTED
     for client in (first, second):
