@@ -612,6 +612,9 @@ def test_broken_state_starts_afresh_from_the_next_pose(place: tuple[str, object]
     assert core.now[[0, 1, 2, 8]] == pytest.approx([*p, 2.0], abs=1e-3)
     assert core.fields.resets == 1
     assert core.fields.refused == core.fields.jumps == 0
+    getattr(core.fields, name)[index] = bad
+    core.tick()
+    assert core.fields.resets == 2
 
 
 def test_broken_state_does_not_reach_the_controller_while_the_filter_waits() -> None:
