@@ -5,9 +5,9 @@ each, for example `Offsets(home, start_us, yaw=Sine(pi / 2, 0.15))`. Signals cou
 trajectory, so that a flight can be repeated.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import tau
+from math import isfinite, tau
 from typing import Protocol
 
 from firmware_py.elementary import sin
@@ -121,3 +121,40 @@ class Offsets:
             (x + self.x(elapsed_us), y + self.y(elapsed_us), z + self.z(elapsed_us)),
             self.home.yaw + self.yaw(elapsed_us),
         )
+
+
+Way = Callable[
+    [float], Sequence[float]
+]  # time since the start [s] to x, y, z [m] from home, W, and maybe yaw [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """`home` until `start_us`, then `home` and what a function of time returns. `at` raises `ValueError` for no goal."""
+
+    home: Goal
+    start_us: int
+    way: Way
+
+    def at(self, t_us: int) -> Goal:
+        if t_us < self.start_us:
+            return self.home
+        offset = self.way((t_us - self.start_us) * 1e-6)
+        try:
+            dx, dy, dz, turn = (*map(float, offset), 0.0)[:4] if len(offset) in (3, 4) else ()
+        except (TypeError, ValueError):
+            raise ValueError(f"{offset!r}: expected x, y, z [m] or x, y, z [m], yaw [rad]") from None
+        if not isfinite(dx + dy + dz + turn):
+            raise ValueError(f"{offset!r}: expected finite numbers")
+        x, y, z = self.home.p_WG
+        return Goal((x + dx, y + dy, z + dz), self.home.yaw + turn)
+
+
+@dataclass(frozen=True, slots=True)
+class Along:
+    """A trajectory of a function of time: what an experiment that moves the goal has for its trajectory."""
+
+    way: Way
+
+    def __call__(self, home: Goal, start_us: int) -> Trajectory:
+        return Path(home, start_us, self.way)

@@ -1,5 +1,32 @@
 """The exceptions of the laboratory; the command line turns them into one line and exit code 2."""
 
+import traceback
+from pathlib import Path
+
+OURS = [Path(__file__).parent.parent / package for package in ("hil", "ground_station", "firmware_py")]
+PYTHON = Path(traceback.__file__).parent
+
 
 class LabError(Exception):
     """Something the user asked for cannot be done; the text says what, the value, and what is allowed."""
+
+
+def blame(error: BaseException) -> str:
+    """Return an error of code that is not ours as one line: file, line, and what it says."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, SyntaxError):
+        return f"{Path(error.filename or '?').name}:{error.lineno}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    theirs = [frame for frame in frames if not _is_known(Path(frame.filename))]
+    if not theirs:
+        return text
+    where = [frame for frame in theirs if frame.filename == theirs[0].filename][-1]
+    kind = "" if isinstance(error, LabError) else f"{type(error).__name__}: "
+    return f"{Path(where.filename).name}:{where.lineno}: {kind}{text}"
+
+
+def _is_known(file: Path) -> bool:
+    """Whether a file is ours or Python's own."""
+    if file.name.startswith("<") or any(file.is_relative_to(folder) for folder in OURS):
+        return True
+    return file.is_relative_to(PYTHON) and "site-packages" not in file.parts

@@ -21,11 +21,11 @@ from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError
 
 if TYPE_CHECKING:
+    from hil.laboratory.experiment import Experiment
     from hil.laboratory.flight import Flight
     from hil.laboratory.run import Request
     from hil.pictures.viewer import LiveViewer
 
-DURATION_MAX_S = 86_400.0
 SEEDS_MAX = 10_000
 
 
@@ -77,9 +77,6 @@ def fly(
     from hil.experiments import find_experiment
 
     chosen = find_experiment(experiment)
-    flown_s = chosen.duration_s if duration is None else duration
-    if not 0.0 < flown_s <= DURATION_MAX_S:
-        raise LabError(f"--duration {flown_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}")
     if seeds > 1 and (realtime or watch or perfetto):
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
     if perfetto:
@@ -89,7 +86,7 @@ def fly(
 
     faults = [parse(text) for text in fault_texts]
     requests = [
-        Request.of(chosen, profile, overrides, seed + index, flown_s, link, faults, board)
+        Request.of(chosen, profile, overrides, seed + index, duration, link, faults, board)
         for index in range(seeds)
     ]
     announce_compilation()
@@ -127,7 +124,7 @@ def _fly_one(request: Request, folder: Path, realtime: bool, watch: bool, perfet
         make = None if request.in_lockstep else linked_flight
         result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto, make)
         progress.update(bar, description="writing recording and report", total=None, now="")
-        _write_pictures(folder)
+        _write_pictures(folder, request.experiment)
         if perfetto:
             from hil.pictures.perfetto import write_perfetto
 
@@ -152,7 +149,7 @@ def _live_viewer(folder: Path) -> LiveViewer:
     return LiveViewer(folder)
 
 
-def _write_pictures(folder: Path) -> None:
+def _write_pictures(folder: Path, experiment: Experiment) -> None:
     """Write recording and report; what cannot be written is said, for the log is there and can be shown later."""
     try:
         from hil.pictures.viewer import write_run_rrd
@@ -162,7 +159,7 @@ def _write_pictures(folder: Path) -> None:
         notices.print(f"floaty: no recording: {error}", soft_wrap=True)
     from hil.pictures.report import write_report
 
-    write_report(folder)
+    write_report(folder, experiment)
 
 
 def _fly_many(requests: list[Request], parent: Path) -> int:

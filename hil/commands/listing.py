@@ -1,26 +1,45 @@
 """`floaty list`: what can be flown."""
 
 import math
+from pathlib import Path
 
 import click
 from rich.console import Console
 
 from hil.commands.options import console
+from hil.errors import LabError
 
 
 @click.command("list")
+@click.argument("file", metavar="[FILE.py]", required=False, type=click.Path(path_type=Path))
 @click.option("--faults", is_flag=True, help="List the kinds of faults for `floaty fly --fault`.")
-def list_experiments(faults: bool) -> None:
-    """List the experiments, the robustness studies and the profiles, or the kinds of faults."""
-    if faults:
-        return _list_faults()
+def list_experiments(file: Path | None, faults: bool) -> None:
+    """List the experiments, the robustness studies and the profiles, or the kinds of faults.
+
+    Experiments of installed packages are among them, with their package; FILE.py: those of a file, and its faults.
+    """
     from hil.config import DEFAULT_PROFILE, profile_names
     from hil.experiments import EXPERIMENTS
+    from hil.experiments.own import entries, in_package, in_whole_file, package_of
     from hil.studies.catalogue import STUDIES
+
+    own = in_whole_file(file) if file else {}
+    if faults:
+        return _list_faults()
+    if file:
+        for name, experiment in own.items():
+            console.print(f"{file}:{name}  {experiment.summary}", soft_wrap=True, markup=False)
+        return None
 
     width = max(map(len, EXPERIMENTS))
     for experiment in EXPERIMENTS.values():
         console.print(f"{experiment.name:{width}}  {experiment.summary}", soft_wrap=True)
+    for entry in entries().values():
+        try:
+            text = in_package(entry).summary
+        except LabError as error:
+            text = str(error)
+        console.print(f"{entry.name:{width}}  {text} ({package_of(entry)})", soft_wrap=True, markup=False)
     bench = "forces and torques on the mounted robot over flap angles; not a flight: `floaty drag-model`"
     console.print(f"{'drag-model':{width}}  {bench}", soft_wrap=True)
     console.print("\nrobustness, for `floaty study`:")

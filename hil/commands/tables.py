@@ -74,7 +74,7 @@ def print_result(result: Result) -> None:
     for name, value in result.metrics.items():
         if math.isnan(value) and name not in verdicts:
             continue
-        metric = METRICS[name]
+        metric = result.own_metrics.get(name) or METRICS[name]
         limit = mark = ""
         if name in verdicts:
             limit = f"{'<=' if metric.bound == 'max' else '>='} {metric.show(verdicts[name].bound)}"

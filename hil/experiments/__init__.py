@@ -6,13 +6,14 @@ from hil.errors import LabError
 from hil.experiments.airspeed import AIRSPEEDS
 from hil.experiments.hover import HOVER
 from hil.experiments.overload import OVERLOAD
+from hil.experiments.own import entries, in_file, in_package
 from hil.experiments.position import HEIGHT_SINE, Y_SQUARE
 from hil.experiments.power import ENDURANCE, POWER
 from hil.experiments.pushes import PUSHED
 from hil.experiments.take_off import TAKE_OFF_LANDING
 from hil.experiments.wind import OCCLUSION, SIDE_WINDS
 from hil.experiments.yaw import YAW_SINES, YAW_STEP, YAW_STEP_0
-from hil.laboratory.experiment import Experiment
+from hil.laboratory.experiment import Experiment, Source
 
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment
@@ -34,13 +35,32 @@ EXPERIMENTS: dict[str, Experiment] = {
     )
 }
 
-__all__ = ["EXPERIMENTS", "Experiment", "find_experiment"]
+__all__ = ["EXPERIMENTS", "Experiment", "find_again", "find_experiment"]
 
 
 def find_experiment(name: str) -> Experiment:
-    """Return an experiment by name; an unknown one raises `LabError` with the nearest."""
+    """Return an experiment: by its name, one that ships or that an installed package has, or FILE.py:NAME.
+
+    Raises `LabError` for one that is not there, with the nearest name.
+    """
     if name in EXPERIMENTS:
         return EXPERIMENTS[name]
-    near = difflib.get_close_matches(name, EXPERIMENTS, 1)
-    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(EXPERIMENTS)}"
-    raise LabError(f"experiment {name!r}: unknown; {hint}")
+    if ".py" in name:
+        return in_file(name)
+    installed = entries()
+    if name in installed:
+        return in_package(installed[name])
+    near = difflib.get_close_matches(name, [*EXPERIMENTS, *installed], 1)
+    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join([*EXPERIMENTS, *installed])}"
+    raise LabError(f"experiment {name!r}: unknown; {hint}; one of your own is FILE.py:NAME")
+
+
+def find_again(name: str, source: Source | None) -> Experiment | None:
+    """Return the experiment that a run has flown; None when it is not known here, or not any more what it was."""
+    if source is None:
+        return EXPERIMENTS.get(name)
+    try:
+        found = find_experiment(source.reference)
+    except LabError:
+        return None
+    return found if found.source == source else None

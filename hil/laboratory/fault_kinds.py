@@ -7,9 +7,12 @@ is then what it was before the first of them, blended with the size of each.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
+
+from hil.errors import LabError
 
 if TYPE_CHECKING:
     from hil.devices.rigid_body import VirtualMarkers
@@ -17,7 +20,7 @@ if TYPE_CHECKING:
     from hil.devices.uart import VirtualSerial
     from hil.laboratory.robot import Robot
 
-Outcome = Literal["holds", "degrades", "failsafe", "lost"]
+Outcome = Literal["holds", "degrades", "failsafe", "lost", ""]
 OCCLUSION_RADIUS = 0.3  # [m] around the axis: the robot is inside the shadow wherever it is in its box
 PUSH_S = 0.1  # physics.md section 8, and the sizes of pushes and shadow
 MARKERS_ON = "markers.enabled=true"
@@ -47,6 +50,7 @@ class Kind:
         degrades  a limit fails, the robot flies on
         failsafe  the supervisor opens the loop, the robot flies on
         lost      the flight ends there
+        (empty)   not stated: a kind of one's own
     """
 
     meaning: str
@@ -55,7 +59,7 @@ class Kind:
     low: float
     high: float
     knobs: tuple[Knob, ...]
-    outcome: Outcome
+    outcome: Outcome = ""
     scale: float = 1.0  # from the unit to SI
     duration_s: float = math.inf  # default; inf: to the end of the flight
     link: str = ""  # the only one on which it acts
@@ -87,8 +91,8 @@ def either(value: float, size: float) -> float:
     return 1.0 - (1.0 - value) * (1.0 - size)
 
 
-def _knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
-    """Return the knob that is a plain attribute."""
+def knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
+    """Return the knob that is a plain attribute of a part of the robot, by that part and the attribute's name."""
     return Knob(
         lambda robot: float(getattr(owner(robot), name)),
         lambda robot, value: setattr(owner(robot), name, value),
@@ -107,11 +111,11 @@ def _of_robot(robot: Robot) -> VirtualMarkers:
 
 
 def _markers(name: str, blend: Blend) -> tuple[Knob, ...]:
-    return (_knob(_of_robot, name, blend),)
+    return (knob(_of_robot, name, blend),)
 
 
 def _mocap(name: str, blend: Blend) -> Knob:
-    return _knob(lambda robot: robot.mocap, name, blend)
+    return knob(lambda robot: robot.mocap, name, blend)
 
 
 def _air(robot: Robot) -> Air:
@@ -120,7 +124,7 @@ def _air(robot: Robot) -> Air:
 
 
 def _radio(name: str, blend: Blend = either) -> Knob:
-    return _knob(_air, name, blend)
+    return knob(_air, name, blend)
 
 
 def _bias(axis: int) -> Knob:
@@ -168,7 +172,7 @@ def _push(part: int) -> Knob:
 
 UPLINK_LOSS, DOWNLINK_LOSS = _radio("uplink_loss"), _radio("downlink_loss")
 RADIO_BITS = (_radio("uplink_bit_error_rate"), _radio("downlink_bit_error_rate"))
-SERIAL_BITS = (_knob(_uart, "uplink_bit_error_rate", either), _knob(_uart, "downlink_bit_error_rate", either))
+SERIAL_BITS = (knob(_uart, "uplink_bit_error_rate", either), knob(_uart, "downlink_bit_error_rate", either))
 CABLE = Knob(
     lambda robot: float(_uart(robot).connected),
     lambda robot, value: setattr(_uart(robot), "connected", value > 0.5),
@@ -198,14 +202,14 @@ GUSTS = Knob(
     lambda robot, value: robot.plant.tunnel.set_gust_scale(min(value, 5.0)),
     times,
 )
-LOAD = _knob(lambda robot: robot.thief, "share", lambda value, size: min(value + size, 1.0))
-SAG = _knob(lambda robot: robot.battery, "sag_V", add)
+LOAD = knob(lambda robot: robot.thief, "share", lambda value, size: min(value + size, 1.0))
+SAG = knob(lambda robot: robot.battery, "sag_V", add)
 PACES = tuple(_pace(servo) for servo in range(4))
 
 DEG = math.radians(1.0)
 MS = 1e3  # us: times stay whole microseconds
 
-KINDS: Mapping[str, Kind] = {
+KINDS: dict[str, Kind] = {
     "mocap.dropout": Kind(
         "share of the frames in which the body is not tracked", "", 1.0, 0.0, 1.0,
         (_mocap("dropout", either),), "holds", duration_s=GLIMPSE_S,
@@ -323,3 +327,20 @@ KINDS: Mapping[str, Kind] = {
     ),
     "battery.sag": Kind("the supply is this much lower", "V", 1.0, 0.0, 4.0, (SAG,), "failsafe"),
 }  # fmt: skip
+
+SHIPPED = frozenset(KINDS)
+
+
+def declare(name: str, kind: Kind) -> Kind:
+    """Make a kind of fault of one's own known by a name, from now on. Raises `LabError` for a name that is not free."""
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        raise LabError(f"fault kind {name!r}: a name has letters, digits, dots, hyphens and underscores")
+    if name in SHIPPED:
+        raise LabError(f"fault kind {name}: the laboratory has one of that name")
+    if not (kind.knobs and kind.low <= kind.size <= kind.high):
+        raise LabError(
+            f"fault kind {name}: size {kind.size:g} in {kind.low:g}..{kind.high:g}, {len(kind.knobs)} knobs: expected the "
+            "size within its bounds, and a knob"
+        )
+    KINDS[name] = kind
+    return kind

@@ -103,9 +103,10 @@ def spans(faults: Iterable[Fault], release_us: int) -> list[Span]:
 
 
 def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
-    """Return when the faults of a flight act, from the metadata of its log."""
+    """Return when the faults of a flight act, from the metadata of its log; those of kinds unknown here are left out."""
     known = metadata or {}
-    faults = [parse(text) for text in json.loads(known.get(b"faults", b"[]"))]
+    texts = json.loads(known.get(b"faults", b"[]"))
+    faults = [parse(text) for text in texts if text.partition("@")[0] in KINDS]
     if not faults:
         return []
     planned_us = json.loads(known[b"config"])["flight"]["release_us"]

@@ -72,7 +72,7 @@ class Programme(Protocol):
     """What a flight needs of an experiment."""
 
     @property
-    def name(self) -> str:
+    def reference(self) -> str:
         """What `floaty station --trajectory` calls it."""
         ...
 

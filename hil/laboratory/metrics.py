@@ -1,5 +1,6 @@
 """From a flight log to figures and verdicts: computed from the truth, after the release, never from the estimate."""
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -26,9 +27,8 @@ class Metric:
     meaning: str
 
     def show(self, value: float) -> str:
-        """Return a value as people read it: lengths in cm, angles in deg, shares in percent."""
-        scale, unit = SHOWN.get(self.unit, (1.0, self.unit))
-        return f"{value * scale:.4g} {unit}".strip()
+        """Return a value as people read it."""
+        return show(value, self.unit)
 
 
 SHOWN = {
@@ -37,6 +37,13 @@ SHOWN = {
     "rad/s": (180.0 / np.pi, "deg/s"),
     "share": (100.0, "%"),
 }
+
+
+def show(value: float, unit: str) -> str:
+    """Return a value as people read it: lengths in cm, angles in deg, shares in percent."""
+    scale, shown = SHOWN.get(unit, (1.0, unit))
+    return f"{value * scale:.4g} {shown}".strip()
+
 
 METRICS: Mapping[str, Metric] = {
     "lost": Metric("", "max", "1 when the flight ended as a crash"),
@@ -109,11 +116,13 @@ class Verdict:
     value: Figure
     bound: float
     holds: bool
+    unit: str
+    sense: Literal["max", "min"]  # of the bound
 
     def __str__(self) -> str:
-        metric = METRICS[self.metric]
-        relation = "<=" if metric.bound == "max" else ">="
-        return f"{self.metric} = {metric.show(self.value)} (limit {relation} {metric.show(self.bound)})"
+        relation = "<=" if self.sense == "max" else ">="
+        value, bound = show(self.value, self.unit), show(self.bound, self.unit)
+        return f"{self.metric} = {value} (limit {relation} {bound})"
 
 
 def column(table: pa.Table, *names: str) -> NDArray[np.float64]:
@@ -177,13 +186,24 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
     return values
 
 
-def judge(values: Mapping[str, float], limits: Mapping[str, float]) -> list[Verdict]:
-    """Return the verdict on each limit; a metric that is not a number fails. Unknown metrics raise `LabError`."""
+def judge(
+    values: Mapping[str, float], limits: Mapping[str, float], own: Mapping[str, Metric]
+) -> list[Verdict]:
+    """Return the verdict on each limit; a metric that is not a number fails. Raises `LabError` like `check_limits`."""
+    check_limits(limits, own)
     verdicts = []
     for name, bound in limits.items():
-        if name not in METRICS:
-            raise LabError(f"limit on {name!r}: no such metric, there are {', '.join(METRICS)}")
-        value = values[name]
-        holds = value <= bound if METRICS[name].bound == "max" else value >= bound
-        verdicts.append(Verdict(name, value, bound, bool(holds)))
+        metric, value = own.get(name) or METRICS[name], values[name]
+        holds = value <= bound if metric.bound == "max" else value >= bound
+        verdicts.append(Verdict(name, value, bound, bool(holds), metric.unit, metric.bound))
     return verdicts
+
+
+def check_limits(limits: Mapping[str, float], own: Mapping[str, Metric]) -> None:
+    """Raise `LabError` for a limit on something that neither METRICS nor an experiment's own metrics have."""
+    known = [*own, *METRICS]
+    for name in limits:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+            raise LabError(f"limit on {name!r}: no such metric; {hint}")

@@ -9,10 +9,10 @@ import math
 import platform
 import subprocess
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, computed_field
 
@@ -20,7 +20,8 @@ from firmware_py.export.cortex_m4 import Usage
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
 from hil.errors import LabError
-from hil.laboratory.metrics import Figure, Verdict, measure
+from hil.laboratory.experiment import Source
+from hil.laboratory.metrics import Figure, Metric, Verdict, measure
 from hil.laboratory.recorder import load_log
 
 RESULT = "result.json"
@@ -55,10 +56,15 @@ class Origin:
     faults: Annotated[tuple[str, ...], AsText]  # the experiment's own and those on top
     versions: Annotated[Mapping[str, str], AsText]  # of what computed the flight
     commit: str
+    source: Annotated[Source | None, AsText]  # of an experiment that does not ship
+
+    def fields(self) -> dict[str, Any]:
+        """Return them by name, also of a `Result`."""
+        return {field.name: getattr(self, field.name) for field in fields(Origin)}
 
     def metadata(self) -> dict[str, str]:
         """Return it as a log's schema holds it."""
-        values = {field.name: getattr(self, field.name) for field in fields(Origin)}
+        values = _ORIGIN.dump_python(self, mode="json")
         return {
             name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()
         }
@@ -71,6 +77,7 @@ class Result(Origin):
     outcome: Outcome
     cause: str | None
     metrics: Mapping[str, Figure]
+    own_metrics: Mapping[str, Metric]  # what the experiment's own ones are
     verdicts: tuple[Verdict, ...]
     tasks: tuple[TaskReport, ...]
     queues: tuple[QueueReport, ...]
@@ -115,8 +122,8 @@ def _of_killed(folder: Path) -> Result:
     except ValidationError as error:
         raise LabError(f"{folder}: the log's schema: {_first_of(error)}") from None
     return Result(
-        **asdict(origin), outcome="error", cause="the process ended before the flight did",
-        metrics=measure(log, lost=False), verdicts=(), tasks=(), queues=(), usage=None, ages=(), hash="",
+        **origin.fields(), outcome="error", cause="the process ended before the flight did",
+        metrics=measure(log, lost=False), own_metrics={}, verdicts=(), tasks=(), queues=(), usage=None, ages=(), hash="",
         real_time_factor=math.nan, stood_still_ms=math.nan, folder=folder,
     )  # fmt: skip
 

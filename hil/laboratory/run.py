@@ -6,10 +6,11 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -28,12 +29,13 @@ from hil.laboratory.experiment import Experiment
 from hil.laboratory.faults import Fault, check
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import LOCKSTEP, lockstep_flight
-from hil.laboratory.metrics import METRICS, free_flight, judge, measure
+from hil.laboratory.metrics import check_limits, free_flight, judge, measure
 from hil.laboratory.recorder import Recorder, load_log
 from hil.laboratory.result import RESULT, Origin, Outcome, QueueReport, Result, commit, versions, write_result
 
 LOADED_US = 250_000  # every part of the core has been called by then
 BUILD = Path("runs/build")
+DURATION_MAX_S = 86_400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,13 @@ class Request:
             raise LabError(f"--board {self.board}: expected {', '.join(BOARDS[:-1])} or {BOARDS[-1]}")
         if self.board != PYTHON and not self.in_lockstep:
             raise LabError(f"--board {self.board}: --link {self.link}: only python flies over a link")
+        if not 0.0 < self.duration_s <= DURATION_MAX_S:
+            raise LabError(
+                f"--duration {self.duration_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}"
+            )
         check(self.faults, self.duration_s, self.link, self.config.markers.enabled)
+        check_limits(self.limits, self.experiment.metrics)
+        self.experiment.check_goals(self.config.flight.home, self.duration_s)
 
     @classmethod
     def of(
@@ -80,12 +88,17 @@ class Request:
         """Whether station and board share one time line."""
         return self.link in LOCKSTEP
 
+    @property
+    def limits(self) -> Mapping[str, float]:
+        """What the flight is held to: the profile's limits for the experiment, or the experiment's own."""
+        return self.config.limits.get(self.experiment.name, self.experiment.limits)
+
     def origin(self) -> Origin:
         """Return what log and result say of where they come from."""
         faults = tuple(map(str, (*self.experiment.faults, *self.faults)))
         return Origin(
             self.experiment.name, self.profile, self.overrides, self.seed, self.duration_s, self.link, self.board,
-            faults, versions(), commit(),
+            faults, versions(), commit(), self.experiment.source,
         )  # fmt: skip
 
 
@@ -107,8 +120,6 @@ def fly(
 
     An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
-    limits = request.config.limits.get(request.experiment.name, request.experiment.limits)
-    judge(dict.fromkeys(METRICS, 0.0), limits)  # refuse unknown metrics before the flight
     flight = (flight_of or lockstep)(request, folder / TELEMETRY, clock, trace_all)
     origin = request.origin()
     metadata = {**origin.metadata(), "config": request.config.model_dump_json()}
@@ -140,16 +151,18 @@ def fly(
         flight.close()
         flight.write_schedule(folder)
     log = load_log(folder)
-    metrics = measure(log, outcome == "lost")
+    experiment = request.experiment
+    metrics = measure(log, outcome == "lost") | dict.fromkeys(experiment.metrics, math.nan)
     if (free := free_flight(log)).num_rows > 1:
-        metrics.update(request.experiment.measure(free))
+        metrics.update(experiment.measured(free))
     firmware = flight.robot.firmware
     result = Result(
-        **asdict(origin),
+        **origin.fields(),
         outcome=outcome,
         cause=cause,
         metrics=metrics,
-        verdicts=tuple(judge(metrics, limits)),
+        own_metrics=experiment.metrics,
+        verdicts=tuple(judge(metrics, request.limits, experiment.metrics)),
         tasks=tuple(firmware.statistics.reports()),
         queues=tuple(
             QueueReport(queue.name, queue.length, queue.high_water, queue.dropped)

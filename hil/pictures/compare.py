@@ -141,7 +141,7 @@ def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Differenc
 
 def _metric_pairs(a: Result, b: Result) -> list[MetricPair]:
     pairs = []
-    for name, metric in METRICS.items():
+    for name, metric in {**METRICS, **a.own_metrics, **b.own_metrics}.items():
         scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
         first, second = (result.metrics.get(name, math.nan) * scale for result in (a, b))
         if not (math.isnan(first) and math.isnan(second)):

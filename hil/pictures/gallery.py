@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from hil.experiments import EXPERIMENTS
+from functools import partial
+from typing import TYPE_CHECKING
+
+from hil.errors import LabError, blame
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.metrics import free_flight
 from hil.pictures import trials
 from hil.pictures.overload import OVERLOAD
 from hil.pictures.picture import Picture
 from hil.pictures.power import COMPARISON, DISCHARGE
 from hil.pictures.take_off import TAKE_OFF_LANDING
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.figure import Figure
 
 GALLERY: dict[str, Picture] = {
     "yaw-step": trials.YAW_STEP,
@@ -24,7 +33,28 @@ GALLERY: dict[str, Picture] = {
 }
 
 
-def pictures_of(experiment: str) -> tuple[Picture, ...]:
-    """Return the pictures of an experiment's own, none for one that is not known here."""
-    known = EXPERIMENTS.get(experiment)
-    return tuple(GALLERY[name] for name in known.pictures) if known else ()
+def pictures_of(experiment: Experiment) -> tuple[Picture, ...]:
+    """Return the pictures of an experiment's own. Raises `LabError` for a name that is none."""
+    if unknown := [name for name in experiment.pictures if name not in GALLERY]:
+        raise LabError(
+            f"experiment {experiment.name}: picture {unknown[0]!r}: there are {', '.join(GALLERY)}"
+        )
+    shared = tuple(GALLERY[name] for name in experiment.pictures)
+    if experiment.draw is None:
+        return shared
+    title = experiment.name.replace("-", " ").capitalize()
+    return (*shared, Picture(title, experiment.summary, partial(_draw, experiment)))
+
+
+def _draw(experiment: Experiment, log: pa.Table) -> Figure:
+    """Let an experiment draw. Raises `LabError` for what it does wrong."""
+    assert experiment.draw is not None
+    try:
+        figure: Figure = experiment.draw(free_flight(log))
+    except Exception as error:
+        raise LabError(f"experiment {experiment.name}: draw: {blame(error)}") from error
+    if not hasattr(figure, "savefig"):
+        raise LabError(
+            f"experiment {experiment.name}: draw returned {figure!r}: expected a matplotlib Figure"
+        )
+    return figure

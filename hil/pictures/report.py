@@ -12,7 +12,9 @@ from pathlib import Path
 import pyarrow as pa
 
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
+from hil.experiments import find_again
 from hil.laboratory.ages import told
+from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Span, spans_of
 from hil.laboratory.metrics import METRICS, SHOWN
@@ -60,10 +62,14 @@ class Shown:
     source: str
 
 
-def write_report(folder: Path) -> Path:
-    """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log."""
+def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
+    """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log.
+
+    `experiment` is what was flown; without it, it is looked for where the run says.
+    """
     log, result = load_log(folder), read_result(folder)
-    own = pictures_of(result.experiment)
+    experiment = experiment or find_again(result.experiment, result.source)
+    own = pictures_of(experiment) if experiment else ()
     shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
     shown += [
         _show(picture, table)
@@ -75,6 +81,7 @@ def write_report(folder: Path) -> Path:
         folder / REPORT,
         TEMPLATE,
         result=result,
+        found=experiment is not None,
         rows=metric_rows(result),
         faults=fault_rows(spans_of(log.schema.metadata)),
         events=load_events(folder),
@@ -89,7 +96,7 @@ def metric_rows(result: Result) -> list[Row]:
     """Return one row per metric that has a value or a limit, those with a limit first."""
     verdicts = {verdict.metric: verdict for verdict in result.verdicts}
     rows = []
-    for name, metric in METRICS.items():
+    for name, metric in {**METRICS, **result.own_metrics}.items():
         value = result.metrics.get(name, math.nan)
         scale, unit = SHOWN.get(metric.unit, (1.0, metric.unit))
         verdict = verdicts.get(name)

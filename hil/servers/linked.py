@@ -17,6 +17,7 @@ from pathlib import Path
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock, Paced
 from hil.errors import LabError
+from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.ages import STATION_CLOCK
 from hil.laboratory.channels import radio_channel
 from hil.laboratory.flight import Flight
@@ -72,7 +73,7 @@ class StationProcess:
         self._command = [
             sys.executable, "-m", "hil.commands", "station", "--link", station_uri,
             "--mocap", f"optitrack:127.0.0.1:{motive.port},body={name_of(1)},y-up",
-            "--trajectory", flight.experiment.name, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
+            "--trajectory", flight.experiment.reference, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
             *arguments, *ALIGNED,
         ]  # fmt: skip
         self._output = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - closed with the line
@@ -189,7 +190,21 @@ class StationProcess:
 
 
 def linked_flight(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
-    """Return a flight over a real link, always paced; it is released when its board flies."""
+    """Return a flight over a real link, always paced; it is released when its board flies.
+
+    Raises `LabError` for an experiment whose trajectory the station's process cannot find.
+    """
+    experiment = request.experiment
+    found = (
+        EXPERIMENTS.get(experiment.name)
+        if experiment.source is None
+        else find_experiment(experiment.reference)
+    )
+    if found is None or found.trajectory != experiment.trajectory:
+        raise LabError(
+            f"--link {request.link}: experiment {experiment.name}: its trajectory must stand in a file or a package, where "
+            "the ground station's process finds it"
+        )
     flight = Flight(
         request.config, request.experiment, request.duration_s, request.seed, Paced(), radio=True,
         mavlink=request.link.startswith(SERIAL), faults=request.faults, trace_all=trace_all,

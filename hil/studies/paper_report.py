@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hil.config import load_config
+from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import RESULT, commit, versions
@@ -89,7 +90,7 @@ def _figures(both: Sequence[Trials]) -> list[Figure]:
         if not ordered:
             continue
         logs = [load_log(result.folder) for result in ordered]
-        own = pictures_of(ordered[0].experiment)
+        own = pictures_of(EXPERIMENTS[ordered[0].experiment])
         figures += [
             Figure(
                 trials.profile, one.title, one.caption, data_uri(one.png(*(logs if own else logs[:1])))

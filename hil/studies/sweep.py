@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from hil.experiments.own import load_file, loaded_files
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
 
@@ -36,7 +37,7 @@ def fly_all(jobs: Sequence[Job], notices: Console) -> tuple[list[Result], bool]:
         TimeRemainingColumn(),
     )
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), context, _leave_interrupts_to_the_parent)
+    pool = ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), context, _begin, (loaded_files(),))
     futures = [pool.submit(_fly, job) for job in jobs]
     interrupted = False
     try:
@@ -65,5 +66,8 @@ def _fly(job: Job) -> Result:
     return result
 
 
-def _leave_interrupts_to_the_parent() -> None:
+def _begin(files: tuple[Path, ...]) -> None:
+    """Load what jobs refer to, and leave interrupts to the parent."""
+    for file in files:
+        load_file(file)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -157,7 +157,7 @@ def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str) -> None
     result = flown(tmp_path / "run", name, seed=7)
     assert result.passed, explain(result)
     assert result.verdicts
-    written = pictures_of(name)[0].png(load_log(result.folder))
+    written = pictures_of(EXPERIMENTS[name])[0].png(load_log(result.folder))
     assert written.startswith(PNG)
     assert len(written) > 10_000
 
@@ -206,7 +206,7 @@ def test_a_flight_too_short_to_measure_fails_its_limits(tmp_path: Path) -> None:
         result = flown(tmp_path / name, name, duration_s=0.5)
         assert result.outcome == "completed"
         assert not result.passed, name
-        for picture in pictures_of(name):
+        for picture in pictures_of(EXPERIMENTS[name]):
             assert picture.png(load_log(result.folder)).startswith(PNG)
 
 
@@ -237,7 +237,7 @@ def test_listing_experiments_draws_nothing() -> None:
 @pytest.mark.long
 def test_trials_are_drawn_behind_the_first_flight(tmp_path: Path) -> None:
     logs = [load_log(flown(tmp_path / str(seed), "yaw-step", seed=seed).folder) for seed in (1, 2, 3)]
-    picture: Picture = pictures_of("yaw-step")[0]
+    picture: Picture = pictures_of(EXPERIMENTS["yaw-step"])[0]
     figure = picture.draw(*logs)
     lines = figure.axes[0].get_lines()
     assert len(lines) == 4  # two trials, the flight, its target

@@ -215,8 +215,8 @@ def test_an_unknown_experiment_names_the_nearest() -> None:
 
 def test_judge_fails_what_is_not_a_number_and_refuses_unknown_metrics() -> None:
     values = dict.fromkeys(METRICS, float("nan"))
-    assert not judge(values, {"rms_x": 1.0})[0].holds
-    assert judge({**values, "rms_x": 0.5}, {"rms_x": 0.5})[0].holds
-    assert not judge({**values, "in_box": 0.98}, {"in_box": 0.99})[0].holds
-    with pytest.raises(LabError, match="no such metric"):
-        judge(values, {"rms_q": 1.0})
+    assert not judge(values, {"rms_x": 1.0}, {})[0].holds
+    assert judge({**values, "rms_x": 0.5}, {"rms_x": 0.5}, {})[0].holds
+    assert not judge({**values, "in_box": 0.98}, {"in_box": 0.99}, {})[0].holds
+    with pytest.raises(LabError, match="no such metric; did you mean rms_"):
+        judge(values, {"rms_q": 1.0}, {})

@@ -77,7 +77,9 @@ class NatnetFlight:
         outcome = self.flight.run()
         recorder.close()
         values = measure(load_log(folder), outcome.lost is not None)
-        return [str(verdict) for verdict in judge(values, EXPERIMENTS["hover"].limits) if not verdict.holds]
+        return [
+            str(verdict) for verdict in judge(values, EXPERIMENTS["hover"].limits, {}) if not verdict.holds
+        ]
 
 
 def test_hover_holds_its_limits_among_packets_out_of_order_twice_or_broken(tmp_path: Path) -> None:

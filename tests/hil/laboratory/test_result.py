@@ -13,14 +13,16 @@ from firmware_py.export.cortex_m4 import Load, Usage
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
 from hil.errors import LabError
-from hil.laboratory.metrics import Verdict
+from hil.laboratory.experiment import Source
+from hil.laboratory.metrics import Metric, Verdict
 from hil.laboratory.recorder import Channel, Quantity, Recorder
 from hil.laboratory.result import RESULT, Origin, QueueReport, Result, read_result, write_result
 from support.command import floaty
 
 KEYS = """
-    experiment profile overrides seed duration_s link board faults outcome cause metrics verdicts passed tasks queues usage
-    ages hash versions commit real_time_factor stood_still_ms
+    experiment profile overrides seed duration_s link board faults source outcome cause metrics
+    own_metrics verdicts passed tasks queues usage ages hash versions commit real_time_factor
+    stood_still_ms
 """.split()  # noqa: SIM905  of result.json, which programs of users read
 
 
@@ -28,9 +30,10 @@ KEYS = """
 def result(tmp_path: Path) -> Result:
     return Result(
         "hover", "floaty", ("predictor.enabled=false",), 7, 2.5, "radio", "cortex-m4", ("push.y@1:0.3=2",),
-        {"python": "3.11.2"}, "0123456789ab+",
-        outcome="lost", cause="fell", metrics={"rms_x": 0.01, "settle": math.nan, "rise": math.inf},
-        verdicts=(Verdict("rms_x", 0.01, 0.02, True), Verdict("settle", math.nan, 0.5, False)),
+        {"python": "3.11.2"}, "0123456789ab+", Source("/home/anna/eights.py:wide", "5e" * 32, "eights 1.0"),
+        outcome="lost", cause="fell", metrics={"rms_x": 0.01, "settle": math.nan, "rise": math.inf, "lap": 9.5},
+        own_metrics={"lap": Metric("s", "max", "time of a lap")},
+        verdicts=(Verdict("rms_x", 0.01, 0.02, True, "m", "max"), Verdict("settle", math.nan, 0.5, False, "s", "max")),
         tasks=(TaskReport("KALMAN", 2, 50, 100, 900, 30, (1,) * 12, None, 0),), queues=(QueueReport("log", 5, 2, 0),),
         usage=Usage(7530, 4820, 256, {"estimate": Load(3, 100, 120, 50, 60)}), ages=(Stage("pose", 40.5, 41.0),),
         hash="ab" * 32, real_time_factor=12.34, stood_still_ms=0.0, folder=tmp_path,
@@ -51,7 +54,7 @@ def drop(folder: Path, key: str) -> None:
 def test_a_result_is_read_back_as_it_was_written(result: Result) -> None:
     write_result(result)
     read = read_result(result.folder)
-    metrics = {"rms_x": 0.01, "settle": math.nan, "rise": math.nan}
+    metrics = {"rms_x": 0.01, "settle": math.nan, "rise": math.nan, "lap": 9.5}
     assert repr(read) == repr(
         replace(result, metrics=metrics)
     )  # a NaN does not equal a NaN, but is written alike
@@ -61,8 +64,10 @@ def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_n
     write_result(result)
     content = json.loads((result.folder / RESULT).read_text(encoding="utf-8"))
     assert set(content) == set(KEYS)
-    assert content["metrics"] == {"rms_x": 0.01, "settle": None, "rise": None}
-    assert content["verdicts"][1] == {"metric": "settle", "value": None, "bound": 0.5, "holds": False}
+    assert content["metrics"] == {"rms_x": 0.01, "settle": None, "rise": None, "lap": 9.5}
+    assert content["verdicts"][1] == {
+        "metric": "settle", "value": None, "bound": 0.5, "holds": False, "unit": "s", "sense": "max",
+    }  # fmt: skip
     assert content["usage"]["entries"]["estimate"]["worst_cycles"] == 60
 
 
@@ -74,7 +79,7 @@ def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_n
 def test_a_run_passes_that_ends_by_itself_and_holds_every_limit(
     result: Result, outcome: Any, holds: bool, passed: bool
 ) -> None:
-    verdicts = (Verdict("rms_x", 0.0, 1.0, True), Verdict("rms_y", 0.0, 1.0, holds))
+    verdicts = (Verdict("rms_x", 0.0, 1.0, True, "m", "max"), Verdict("rms_y", 0.0, 1.0, holds, "m", "max"))
     write_result(replace(result, outcome=outcome, verdicts=verdicts))
     assert json.loads((result.folder / RESULT).read_text(encoding="utf-8"))["passed"] is passed
     assert read_result(result.folder).passed is passed

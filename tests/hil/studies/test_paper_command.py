@@ -120,7 +120,7 @@ def test_the_report_tells_the_papers_value_and_ours(flown: Path) -> None:
 def trials(result: Result, *passed: bool) -> Trials:
     """Flights of which some failed a limit."""
     flights = (
-        dataclasses.replace(result, verdicts=(Verdict("max_x", 0.0 if one else 1.0, 0.1, one),))
+        dataclasses.replace(result, verdicts=(Verdict("max_x", 0.0 if one else 1.0, 0.1, one, "m", "max"),))
         for one in passed
     )
     return Trials("floaty", tuple(flights))

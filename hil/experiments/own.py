@@ -1,0 +1,105 @@
+"""Experiments of one's own: in a Python file, as FILE.py:NAME, or in an installed package, as an entry point.
+
+A file is executed once for every content that it has. What stands beside it can be imported. Every error in it is one
+line that names file and line.
+"""
+
+import difflib
+import hashlib
+import importlib.util
+import sys
+from dataclasses import replace
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+
+from hil.errors import LabError, blame
+from hil.laboratory.experiment import Experiment, Source
+
+GROUP = "floaty.experiments"
+_LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of what was executed
+
+
+def in_file(reference: str) -> Experiment:
+    """Return the experiment of FILE.py:NAME, or the only one of FILE.py. Raises `LabError` where there is none."""
+    text, _, name = reference.rpartition(":") if ".py:" in reference else (reference, "", "")
+    found = in_whole_file(Path(text))
+    if not name and len(found) == 1:
+        return next(iter(found.values()))
+    if name in found:
+        return found[name]
+    near = difflib.get_close_matches(name, found, 1)
+    there = f"did you mean {near[0]}?" if near else f"there {_are(list(found))}"
+    raise LabError(
+        f"experiment {reference}: {f'no experiment {name!r} in it' if name else 'which one?'}; {there}"
+    )
+
+
+def in_whole_file(path: Path) -> dict[str, Experiment]:
+    """Return the experiments of a file by the names of their variables. Raises `LabError` when it cannot be executed."""
+    module, digest = load_file(path)
+    place = path.resolve()
+    return {
+        name: replace(value, source=Source(f"{place}:{name}", digest))
+        for name, value in vars(module).items()
+        if isinstance(value, Experiment)
+    }
+
+
+def load_file(path: Path) -> tuple[ModuleType, str]:
+    """Return the module of a file, and the file's SHA-256. Raises `LabError` when it cannot be executed."""
+    place = path.resolve()
+    try:
+        content = place.read_bytes()
+    except OSError as error:
+        raise LabError(f"experiment {path}: {error.strerror or error}") from None
+    digest = hashlib.sha256(content).hexdigest()
+    known, module = _LOADED.get(place, ("", None))
+    if module is not None and known == digest:
+        return module, digest
+    name = f"floaty_own_{place.stem}_{hashlib.sha256(str(place).encode()).hexdigest()[:12]}"
+    module = ModuleType(name)
+    module.__file__ = str(place)
+    if str(place.parent) not in sys.path:
+        sys.path.append(str(place.parent))
+    sys.modules[name] = module  # what is pickled refers to it
+    try:
+        exec(compile(content, place, "exec"), vars(module))
+    except Exception as error:
+        raise LabError(f"experiment {path}: {blame(error)}") from error
+    _LOADED[place] = digest, module
+    return module, digest
+
+
+def loaded_files() -> tuple[Path, ...]:
+    """Return the files that have been executed: another process must do the same, before it is sent what is in them."""
+    return tuple(_LOADED)
+
+
+def entries() -> dict[str, EntryPoint]:
+    """Return the experiments of installed packages, not loaded."""
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def package_of(entry: EntryPoint) -> str:
+    """Return the package of an entry point, and its version."""
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.module
+
+
+def in_package(entry: EntryPoint) -> Experiment:
+    """Return the experiment of an entry point. Raises `LabError` when it cannot be loaded or is none."""
+    what = f"experiment {entry.name} of {package_of(entry)}"
+    try:
+        found = entry.load()
+    except Exception as error:
+        raise LabError(f"{what}: {blame(error)}") from error
+    if not isinstance(found, Experiment):
+        raise LabError(f"{what}: {entry.value} is {found!r}: expected an Experiment")
+    spec = importlib.util.find_spec(entry.module)
+    origin = spec.origin if spec else None
+    digest = hashlib.sha256(Path(origin).read_bytes()).hexdigest() if origin else ""
+    return replace(found, source=Source(entry.name, digest, package_of(entry)))
+
+
+def _are(names: list[str]) -> str:
+    return f"are {', '.join(names)}" if len(names) > 1 else f"is {names[0]}" if names else "is none"
