@@ -129,7 +129,7 @@ Way = Callable[
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class Course:
     """`home` until `start_us`, then `home` and what a function of time returns. `at` raises `ValueError` for no goal."""
 
     home: Goal
@@ -157,4 +157,4 @@ class Along:
     way: Way
 
     def __call__(self, home: Goal, start_us: int) -> Trajectory:
-        return Path(home, start_us, self.way)
+        return Course(home, start_us, self.way)

@@ -1,1 +1,55 @@
-"""The world around the board and the bench that joins them: plant, tunnel, sensors, links, harness, experiments."""
+"""The world around the board and the bench that joins them: plant, tunnel, sensors, links, harness, experiments.
+
+What a program of one's own needs of it is in `hil.api`, and can be imported from here: `from hil import fly`. It is loaded
+when it is first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hil.api import (
+        Along,
+        Experiment,
+        Fault,
+        Goal,
+        Kind,
+        Knob,
+        LabError,
+        Metric,
+        Request,
+        Run,
+        column,
+        declare,
+        fault,
+        fly,
+        knob,
+        load_run,
+        position_error,
+    )
+
+__all__ = [
+    "Along",
+    "Experiment",
+    "Fault",
+    "Goal",
+    "Kind",
+    "Knob",
+    "LabError",
+    "Metric",
+    "Request",
+    "Run",
+    "column",
+    "declare",
+    "fault",
+    "fly",
+    "knob",
+    "load_run",
+    "position_error",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module("hil.api"), name)

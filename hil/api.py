@@ -1,0 +1,264 @@
+"""The laboratory for programs of one's own: fly, look at what was flown, say what shall be flown.
+
+`docs/python-api.md` has an example of each. Lengths are in m, angles in rad, forces in N, times in s, but a log's own clock,
+`t`, which counts microseconds; frames are W (world, z up) and B (body, x forward, y left, z up).
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+import pyarrow as pa
+
+from firmware_py.export.boards import PYTHON
+from ground_station.trajectory import Along, Goal, Trajectory
+from hil.config import DEFAULT_PROFILE
+from hil.errors import LabError
+from hil.experiments import find_again, find_experiment
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.fault_kinds import Kind, Knob, declare, knob
+from hil.laboratory.faults import Fault
+from hil.laboratory.faults import parse as fault
+from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import RADIO
+from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.result import Outcome, Result, read_result
+from hil.laboratory.run import MakeFlight, Request, prepare
+from hil.laboratory.run import fly as fly_into
+
+__all__ = [
+    "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Options", "Request", "Run",
+    "column", "command_of", "declare", "fault", "fly", "knob", "load_run", "position_error", "request_of",
+]  # fmt: skip
+
+Progress = Callable[[float], None]  # (share of the flight, 0..1)
+
+
+class Options(TypedDict, total=False):
+    """How to fly, everything optional."""
+
+    profile: str  # one that ships, or a path that ends in .toml; default: floaty
+    overrides: Sequence[str]  # "section.key=value", as for `--set`
+    seed: int  # of everything random; default: 1
+    duration_s: float  # of free flight; default: the experiment's
+    link: str  # radio and mavlink: in lockstep; a URI: in real time; default: radio
+    faults: Sequence[Fault | str]  # on top of the experiment's own
+    board: str  # what executes the flight core: python, c or cortex-m4; default: python
+    trajectory: Callable[[Goal, int], Trajectory]  # instead of the experiment's, like Along(way)
+
+
+def request_of(experiment: Experiment | str, **options: Unpack[Options]) -> Request:
+    """Return what can be flown: an experiment, or the name of one or FILE.py:NAME. Raises `LabError` for bad input."""
+    chosen = find_experiment(experiment) if isinstance(experiment, str) else experiment
+    if "trajectory" in options:
+        chosen = replace(chosen, trajectory=options["trajectory"])
+    return Request.of(
+        chosen,
+        options.get("profile", DEFAULT_PROFILE),
+        options.get("overrides", ()),
+        options.get("seed", 1),
+        options.get("duration_s"),
+        options.get("link", RADIO),
+        [fault(one) if isinstance(one, str) else one for one in options.get("faults", ())],
+        options.get("board", PYTHON),
+    )
+
+
+def fly(
+    flown: Request | Experiment | str,
+    folder: Path | str | None = None,
+    progress: bool | Progress = False,
+    report: bool = False,
+    **options: Unpack[Options],
+) -> Run:
+    """Fly once, into a run folder, by default `runs/EXPERIMENT-SEED`; what was in it is replaced.
+
+    `flown` is an experiment, the name of one, FILE.py:NAME, or a `Request`, which takes no options. `progress` shows the
+    time in flight on standard error, or is called with the share of the flight that is over. `report` writes `report.html`.
+
+    A crash or a failed limit is a result, not an error. Raises `LabError` for bad input.
+    """
+    if isinstance(flown, Request):
+        if options:
+            raise LabError(f"fly: a Request has its options already: {', '.join(options)}")
+        request = flown
+    else:
+        request = request_of(flown, **options)
+    folder = (
+        Path(folder) if folder is not None else Path("runs") / f"{request.experiment.name}-{request.seed}"
+    )
+    prepare(folder)
+    show = _shown(request) if progress is True else progress or None
+
+    def on_progress(now_us: int, flight: Flight) -> None:
+        if show is not None:
+            show(min(now_us / flight.end_us, 1.0))  # almost nothing while the release is not planned
+
+    result = fly_into(request, folder, progress=on_progress, flight_of=_maker_of(request))
+    if show is not None:
+        show(1.0)
+    run = Run(result, request.experiment)
+    if report:
+        run.write_report()
+    return run
+
+
+def _maker_of(request: Request) -> MakeFlight | None:
+    if request.in_lockstep:
+        return None
+    from hil.servers.linked import linked_flight
+
+    return linked_flight
+
+
+def load_run(folder: Path | str) -> Run:
+    """Return a run that was flown before. Raises `LabError` when the folder holds none."""
+    result = read_result(Path(folder))
+    return Run(result, find_again(result.experiment, result.source))
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A flight and its folder. `experiment` is None when it is not known here any more."""
+
+    result: Result
+    experiment: Experiment | None
+
+    @property
+    def folder(self) -> Path:
+        """Where log, result and pictures lie."""
+        return self.result.folder
+
+    @property
+    def passed(self) -> bool:
+        """Whether the flight came to an end of its own and held every limit."""
+        return self.result.passed
+
+    @property
+    def outcome(self) -> Outcome:
+        """completed, lost, interrupted or error."""
+        return self.result.outcome
+
+    @property
+    def cause(self) -> str | None:
+        """Why the flight was lost or went wrong."""
+        return self.result.cause
+
+    @property
+    def metrics(self) -> Mapping[str, float]:
+        """Figures of the flight after the release, in the unit of `unit_of`; NaN where it has none."""
+        return self.result.metrics
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Every limit with the value and whether it holds."""
+        return self.result.verdicts
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of everything recorded; the same for the same flight in lockstep."""
+        return self.result.hash
+
+    @cached_property
+    def log(self) -> pa.Table:
+        """One row per 10 ms; `t` [us], all other columns with `unit` and `frame` in the metadata of their fields."""
+        return load_log(self.folder)
+
+    @property
+    def free(self) -> pa.Table:
+        """The rows after the release."""
+        return free_flight(self.log)
+
+    def to_pandas(self) -> Any:
+        """Return the log as a `pandas.DataFrame`, by time since the release [s]. Raises `LabError` without pandas."""
+        try:
+            frame = self.log.to_pandas()
+        except ImportError as error:
+            raise LabError(f"to_pandas: {error}: pip install pandas") from None
+        release_us = column(self.free, "t")[:1]
+        frame.index = (frame["t"] - (release_us[0] if len(release_us) else 0)) * 1e-6
+        return frame.rename_axis("s")
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """The unit of every column of the log, empty for a pure number."""
+        return {
+            name: self.log.schema.field(name).metadata[b"unit"].decode() for name in self.log.column_names
+        }
+
+    def unit_of(self, metric: str) -> str:
+        """Return the unit of a metric, empty for a pure number."""
+        return (self.result.own_metrics.get(metric) or METRICS[metric]).unit
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """What board, station and laboratory said: `t_us`, `source`, `text`."""
+        return load_events(self.folder)
+
+    @property
+    def paths(self) -> Mapping[str, Path]:
+        """The files of the run by their names: log.parquet, events.jsonl, telemetry.csv, result.json, …"""
+        return {path.name: path for path in sorted(self.folder.iterdir())}
+
+    def write_report(self) -> Path:
+        """Write `report.html` with all figures, and return its path."""
+        from hil.pictures.report import write_report  # loads matplotlib
+
+        return write_report(self.folder, self.experiment)
+
+    def __repr__(self) -> str:
+        failed = "; ".join(str(verdict) for verdict in self.verdicts if not verdict.holds)
+        how = self.cause or failed or ("all limits hold" if self.verdicts else "no limits")
+        return f"<{self.result.experiment}, seed {self.result.seed}: {self.outcome}, {how}; {self.folder}>"
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        rows = "".join(
+            f"<tr><td>{escape(verdict.metric)}</td><td>{escape(str(verdict))}</td>"
+            f"<td>{'holds' if verdict.holds else '<b>fails</b>'}</td></tr>"
+            for verdict in self.verdicts
+        )
+        report = self.paths.get("report.html")
+        link = f'<p><a href="{escape(str(report))}">{escape(str(report))}</a></p>' if report else ""
+        return f"<p>{escape(repr(self)[1:-1])}</p><table>{rows}</table>{link}"
+
+
+def command_of(request: Request) -> str | None:
+    """Return the command that flies a request again, bit for bit; None for an experiment that no command can name."""
+    experiment = request.experiment
+    settings, others = (
+        request.overrides[: len(experiment.settings)],
+        request.overrides[len(experiment.settings) :],
+    )
+    if find_again(experiment.name, experiment.source) != experiment or settings != experiment.settings:
+        return None
+    words = ["floaty", "fly", experiment.reference, "--seed", str(request.seed)]
+    words += ["--duration", repr(request.duration_s)] if request.duration_s != experiment.duration_s else []
+    words += ["--profile", request.profile] if request.profile != DEFAULT_PROFILE else []
+    words += _options("--set", others)
+    words += _options("--fault", map(str, request.faults))
+    words += ["--link", request.link] if request.link != RADIO else []
+    words += ["--board", request.board] if request.board != PYTHON else []
+    return shlex.join(words)
+
+
+def _options(name: str, values: Iterable[str]) -> list[str]:
+    return [word for value in values for word in (name, value)]
+
+
+def _shown(request: Request) -> Progress:
+    """Return what shows the progress in one line of standard error, which a notebook shows as well."""
+
+    def show(share: float) -> None:
+        text = f"\r{request.experiment.name}, seed {request.seed}: {share:4.0%} of {request.duration_s:g} s"
+        print(text, end="\n" if share >= 1.0 else "", file=sys.stderr, flush=True)
+
+    return show

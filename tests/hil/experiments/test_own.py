@@ -1,0 +1,317 @@
+"""Experiments of one's own: found in files and packages, flown like those that ship, refused in one line."""
+
+import json
+import math
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ground_station.trajectory import Along, Goal
+from hil import fly
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS, find_again, find_experiment
+from hil.experiments.own import in_file, load_file
+from hil.laboratory.experiment import Experiment, Source
+from hil.laboratory.fault_kinds import KINDS, Kind, declare
+from hil.laboratory.faults import parse
+from hil.laboratory.recorder import load_log
+from hil.laboratory.result import read_result
+from hil.laboratory.run import Request
+from hil.pictures.report import write_report
+from hil.servers.linked import linked_flight
+from support.command import floaty
+
+HEAD = "from hil import Along, Experiment, Fault, Kind, Metric, declare\n"
+PLAIN = 'Experiment("mine", "a summary", 0.3, {"lost": 0.0}%s)'
+HOME = Goal((0.0, 0.0, 1.15), 0.5)
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def write(text: str, path: str = "mine.py") -> None:
+    Path(path).write_text(HEAD + text, encoding="utf-8")
+
+
+# Trajectories
+
+
+def test_a_function_of_time_moves_the_goal_from_home_after_the_release() -> None:
+    course = Along(lambda t: (t, 2.0 * t, -4.0 * t))(Goal((0.0, 0.0, 1.25), 0.5), 1_000_000)
+    assert course.at(999_999) == Goal((0.0, 0.0, 1.25), 0.5)
+    assert course.at(1_250_000) == Goal((0.25, 0.5, 0.25), 0.5)
+    turning = Along(lambda t: np.array([0.0, 0.0, 0.0, t]))(HOME, 0)
+    assert turning.at(250_000) == Goal(HOME.p_WG, 0.75)
+
+
+@pytest.mark.parametrize(
+    ("way", "told"),
+    [
+        (lambda t: (0.0, 0.0), r"(0.0, 0.0): expected x, y, z [m] or x, y, z [m], yaw [rad]"),
+        (lambda t: (0.0,) * 5, "expected x, y, z [m]"),
+        (lambda t: 0.1, "0.1: expected x, y, z [m]"),
+        (lambda t: None, "None: expected x, y, z [m]"),
+        (lambda t: ("a", 0.0, 0.0), "expected x, y, z [m]"),
+        (lambda t: (0.0, math.nan, 0.0), "(0.0, nan, 0.0): expected finite numbers"),
+        (
+            lambda t: (0.0, 0.0, 0.0, math.inf if t > 0.1 else 0.0),
+            "at 0.12 s: (0.0, 0.0, 0.0, inf): expected fin",
+        ),
+        (lambda t: (0.0, 1.0 / (round(t, 6) - 0.2), 0.0), "at 0.2 s: test_own.py:"),
+    ],
+)
+def test_a_trajectory_without_a_goal_at_some_instant_is_refused_before_the_flight(
+    way: Callable[[float], tuple[float, ...]], told: str
+) -> None:
+    with pytest.raises(LabError) as error:
+        Request.of(Experiment("mine", "", 0.3, {}, Along(way)))
+    assert told in str(error.value)
+    assert str(error.value).startswith("experiment mine: trajectory at ")
+    assert "\n" not in str(error.value)
+
+
+def test_a_limit_that_no_metric_has_is_refused_before_the_flight() -> None:
+    with pytest.raises(LabError, match="limit on 'rms_q': no such metric; did you mean rms_"):
+        Request.of(Experiment("mine", "", 0.3, {"rms_q": 1.0}))
+
+
+# Files
+
+
+def test_an_experiment_of_a_file_is_flown_and_its_run_names_the_file_and_its_hash() -> None:
+    write(
+        "def measure(flight): return {'rows': flight.num_rows}\n"
+        "wide = "
+        + PLAIN
+        % ", Along(lambda t: (0.0, t, 0.0)), measure=measure, metrics={'rows': Metric('', 'min', 'how many')}"
+        + "\n"
+    )
+    result = fly("mine.py:wide").result
+    assert result.source == in_file("mine.py:wide").source
+    assert result.source is not None
+    assert result.source.reference == str(Path("mine.py:wide").absolute())
+    assert result.metrics["rows"] == 30.0
+    log = load_log(Path("runs/mine-1"))
+    assert json.loads(log.schema.metadata[b"source"])["sha256"] == result.source.sha256
+    assert log.column("goal.y")[-1].as_py() == pytest.approx(0.3, abs=0.02)
+    assert find_again(result.experiment, result.source) is not None
+    write("wide = " + PLAIN.replace("0.3", "0.4") % "")
+    assert find_again(result.experiment, result.source) is None
+
+
+@pytest.mark.long
+def test_experiments_of_a_file_fly_in_other_processes_with_the_same_hash(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    Path("neighbour.py").write_text("REACH = 0.05\n")
+    write(
+        "from neighbour import REACH\ndef way(t): return 0.0, REACH * t, 0.0\nwide = "
+        + PLAIN % ", Along(way)"
+    )
+    assert floaty(monkeypatch, "fly", "mine.py:wide", "--seeds", "2") == 0
+    assert floaty(monkeypatch, "fly", "mine.py:wide", "--seed", "2", "--out", "here") == 0
+    assert read_result(Path("here")).hash == read_result(Path("runs/mine-2")).hash
+
+
+def test_a_file_is_executed_once_for_every_content() -> None:
+    write("wide = " + PLAIN % "")
+    assert load_file(Path("mine.py"))[0] is load_file(Path("../", Path.cwd().name, "mine.py"))[0]
+    first = in_file("mine.py:wide")
+    write("wide = " + PLAIN.replace("0.3", "0.5") % "")
+    assert (first.duration_s, in_file("mine.py:wide").duration_s) == (0.3, 0.5)
+
+
+def test_the_only_experiment_of_a_file_needs_no_name() -> None:
+    write("wide = " + PLAIN % "")
+    assert in_file("mine.py").reference == str(Path("mine.py:wide").absolute())
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "told"),
+    [
+        ("wide = " + PLAIN % "", ":wied", "no experiment 'wied' in it; did you mean wide?"),
+        ("wide = " + PLAIN % "", ":experiment", "no experiment 'experiment' in it; there is wide"),
+        ("a = " + PLAIN % "" + "\nb = a", "", "which one?; there are a, b"),
+        ("", ":wide", "no experiment 'wide' in it; there is none"),
+        ("wide = (", ":wide", "mine.py:2: '(' was never closed"),
+        ("\nimport nowhere", ":wide", "mine.py:3: ModuleNotFoundError: No module named 'nowhere'"),
+        ("def f(): return 1 / 0\nf()", ":wide", "mine.py:2: ZeroDivisionError: division by zero"),
+        ("wide = " + PLAIN % ", faults=(Fault('pusch.y', 1, 1, 1),)", ":wide", "mine.py:2: fault 'pusch.y': unknown kind"),
+        ("wide = " + PLAIN % ", faults=(Fault('push.y', 1, 1, 99),)", ":wide", "mine.py:2: fault push.y: size 99: expected"),
+        ("wide = Experiment('a/b', '', 1.0, {})", ":wide", "mine.py:2: experiment 'a/b': a name has letters"),
+        ("wide = Experiment('a', '', 0.0, {})", ":wide", "mine.py:2: experiment a: duration_s = 0.0: expected seconds"),
+        ("wide = " + PLAIN % ", metrics={'rms_x': Metric('m', 'max', '')}", ":wide", "metric rms_x: every flight has one"),
+        ("wide = Experiment('a', '', 1.0, {'rms_q': 1})", ":wide", "limit on 'rms_q': no such metric; did you mean rms_"),
+        ("wide = Experiment('a', '', 1.0, {'spede': 1}, metrics={'speed': Metric('', 'max', '')})", ":wide", "mean speed?"),
+        ("wide = " + PLAIN % ", settings=('tunnel.sped=8',)", ":wide", "did you mean speed?"),
+        ("wide = " + PLAIN % ", Along(lambda t: (0.0, 0.0))", ":wide", "trajectory at 0 s: (0.0, 0.0): expected x, y, z"),
+        ("wide = " + PLAIN % ", Along(lambda t: wied)", ":wide", "mine.py:2: NameError: name 'wied' is not defined"),
+        ("wide = " + PLAIN % ", pictures=('yaw',)", ":wide", "picture 'yaw': there are yaw-step"),
+        ("wide = " + PLAIN % ", measure=lambda flight: {'tempo': 1}", ":wide", "measure returned 'tempo', which `metrics`"),
+        ("wide = " + PLAIN % ", measure=lambda flight: 1", ":wide", "experiment mine: measure: 'int' object"),
+        ("wide = " + PLAIN % ", measure=lambda flight: {}[0]", ":wide", "experiment mine: measure: mine.py:2: KeyError: 0"),
+        ("wide = " + PLAIN % ", draw=lambda flight: 1 / 0", ":wide", "experiment mine: draw: mine.py:2: ZeroDivisionError"),
+        ("wide = " + PLAIN % ", draw=lambda flight: 1", ":wide", "experiment mine: draw returned 1: expected a matplotlib"),
+        ("declare('push.y', Kind('', '', 1.0, 0.0, 2.0, ()))", ":wide", "fault kind push.y: the laboratory has one"),
+        ("declare('a@b', Kind('', '', 1.0, 0.0, 2.0, ()))", ":wide", "mine.py:2: fault kind 'a@b': a name has letters"),
+        ("declare('a.b', Kind('', '', 3.0, 0.0, 2.0, ()))", ":wide", "mine.py:2: fault kind a.b: size 3 in 0..2"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_a_file_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], text: str, name: str, told: str
+) -> None:
+    write(text)
+    assert floaty(monkeypatch, "fly", f"mine.py{name}") == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.startswith("floaty: ")
+    assert error.count("\n") == 1
+
+
+def test_a_file_that_is_not_there_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "fly", "nowhere.py:wide") == 2
+    assert capsys.readouterr().err == "floaty: experiment nowhere.py: No such file or directory\n"
+
+
+def test_the_experiments_of_a_file_are_listed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write("wide = " + PLAIN % "")
+    assert floaty(monkeypatch, "list", "mine.py") == 0
+    assert capsys.readouterr().out == "mine.py:wide  a summary\n"
+
+
+# Kinds of faults
+
+
+@pytest.mark.long
+def test_an_own_kind_of_fault_acts_is_listed_and_shown(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(KINDS, "wind.both", KINDS["push.y"])  # is replaced, and ends with the test
+    write(
+        "from hil.laboratory.fault_kinds import KINDS\n"
+        "knobs = (*KINDS['wind.side_x'].knobs, *KINDS['wind.side_y'].knobs)\n"
+        "declare('wind.both', Kind('both', 'm/s', 0.2, -5.0, 5.0, knobs))\n"
+        "wide = " + PLAIN % ", faults=(Fault('wind.both', 0.1, 0.1, 0.3),)"
+    )
+    assert floaty(monkeypatch, "fly", "mine.py:wide", "--fault", "wind.both@0.1=0.2") == 0
+    assert read_result(Path("runs/mine-1")).faults == ("wind.both@0.1:0.1=0.3", "wind.both@0.1=0.2")
+    assert "wind.both" in Path("runs/mine-1/report.html").read_text(encoding="utf-8")
+    capsys.readouterr()
+    assert floaty(monkeypatch, "list", "mine.py", "--faults") == 0
+    assert re.search(
+        r"^wind\.both +0\.2 m/s +-5\.\.5 +to the end +both", capsys.readouterr().out, re.MULTILINE
+    )
+    monkeypatch.delitem(KINDS, "wind.both")
+    Path("mine.py").unlink()
+    write_report(Path("runs/mine-1"))
+    assert (
+        "it is gone or has changed since, so its own picture and its own kinds of faults are missing here"
+        in Path("runs/mine-1/report.html").read_text("utf-8")
+    )
+
+
+def test_an_own_kind_may_be_declared_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, "push.mine", KINDS["push.y"])
+    declare("push.mine", Kind("", "", 1.0, 0.0, 2.0, KINDS["push.y"].knobs))
+    declare("push.mine", Kind("", "", 1.0, 0.0, 5.0, KINDS["push.y"].knobs))
+    assert parse("push.mine@1=4").size == 4.0
+
+
+# Packages
+
+
+def install(text: str, entry: str = "wide-eight = eights.flights:wide", folder: str = "site") -> None:
+    """Put a package `eights` with experiments where Python finds it."""
+    package = Path(folder, "eights")
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "flights.py").write_text(HEAD + text, encoding="utf-8")
+    info = Path(folder, "eights-1.2.dist-info")
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: eights\nVersion: 1.2\n")
+    (info / "entry_points.txt").write_text(f"[floaty.experiments]\n{entry}\n")
+
+
+@pytest.fixture
+def site(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path("site").absolute()))
+    for name in ("eights", "eights.flights"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+
+
+@pytest.mark.usefixtures("site")
+def test_an_installed_experiment_is_listed_with_its_package_and_flown_by_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install("wide = " + PLAIN % "")
+    assert floaty(monkeypatch, "list") == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wide-eight")]
+    assert line.split(maxsplit=1)[1] == "a summary (eights 1.2)"
+    result = fly("wide-eight").result
+    assert result.source is not None
+    assert (result.source.reference, result.source.package) == ("wide-eight", "eights 1.2")
+    assert len(result.source.sha256) == 64
+    assert find_again(result.experiment, result.source) == find_experiment("wide-eight")
+    with pytest.raises(LabError, match="did you mean wide-eight"):
+        find_experiment("wide-eigth")
+
+
+@pytest.mark.usefixtures("site")
+@pytest.mark.parametrize(
+    ("text", "entry", "told"),
+    [
+        ("1 / 0", "wide-eight = eights.flights:wide", "flights.py:2: ZeroDivisionError: division by zero"),
+        ("", "wide-eight = eights.flights:wide", "module 'eights.flights' has no attribute 'wide'"),
+        ("wide = 1", "wide-eight = eights.flights:wide", "eights.flights:wide is 1: expected an Experiment"),
+        ("", "wide-eight = eights.nowhere:wide", "No module named 'eights.nowhere'"),
+    ],
+)
+def test_a_broken_package_is_one_line_and_leaves_the_list_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], text: str, entry: str, told: str
+) -> None:
+    install(text, entry)
+    assert floaty(monkeypatch, "fly", "wide-eight") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("floaty: experiment wide-eight of eights 1.2: ")
+    assert told in error
+    assert error.count("\n") == 1
+    assert floaty(monkeypatch, "list") == 0
+    shown = capsys.readouterr().out
+    assert told in shown
+    assert "hover  " in shown
+
+
+@pytest.mark.usefixtures("site")
+def test_an_experiment_that_ships_goes_before_an_installed_one() -> None:
+    install("wide = " + PLAIN % "", "hover = eights.flights:wide")
+    assert find_experiment("hover") is EXPERIMENTS["hover"]
+
+
+# Over links
+
+
+@pytest.mark.parametrize(
+    "experiment",
+    [
+        Experiment("mine", "", 1.0, {}),
+        Experiment("hover", "", 1.0, {}, Along(lambda t: (0.0, 0.0, 0.0))),
+        Experiment("wide", "", 1.0, {}, Along(lambda t: (0.0, 0.0, 0.0)), source=Source("mine.py:wide", "")),
+    ],
+)
+def test_a_station_in_its_own_process_is_not_asked_for_a_trajectory_that_it_cannot_find(
+    experiment: Experiment, tmp_path: Path
+) -> None:
+    write("wide = " + PLAIN % "")
+    request = Request.of(experiment, link="udp://127.0.0.1:19850")
+    with pytest.raises(LabError, match="its trajectory must stand in a file or a package"):
+        linked_flight(request, tmp_path / "telemetry.csv", None, False)

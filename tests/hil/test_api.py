@@ -1,0 +1,188 @@
+"""The laboratory from Python: what docs/python-api.md shows, and what else a program may rely on."""
+
+import json
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import hil
+from hil import Along, Experiment, LabError, Metric, Request, fly, load_run
+from hil.api import command_of, request_of
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.fault_kinds import KINDS
+from support.command import floaty
+from support.examples import run_examples
+
+PAGE = Path(hil.__file__).parent.parent / "docs" / "python-api.md"
+SHORT = 0.3  # [s]
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(
+        KINDS, "mocap.slow", KINDS["push.y"]
+    )  # a page's own kind, which it replaces, ends with the test
+
+
+@pytest.mark.long
+def test_the_examples_of_the_page_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = run_examples(PAGE, monkeypatch)
+    assert set(names["late"]) == {0, 60}
+    assert Path("runs/figure-eight-1/report.html").stat().st_size > 10_000
+    late = json.loads(Path("later/result.json").read_text())
+    assert late["faults"] == ["mocap.slow@0.5:3=0.02", "mocap.slow@2:1=0.05"]
+    assert late["metrics"]["age_mean"] > 0.06
+
+
+def test_importing_the_package_loads_nothing_else() -> None:
+    check = "import hil, sys; sys.exit(any(name in sys.modules for name in ('numpy', 'pydantic', 'hil.api')))"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
+
+
+def test_flying_loads_no_drawing_and_no_link() -> None:
+    check = "import hil, sys; hil.fly; sys.exit(any(name in sys.modules for name in ('matplotlib', 'cflib', 'rerun')))"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
+
+
+def test_every_name_of_the_package_is_there_and_no_other() -> None:
+    assert all(hasattr(hil, name) for name in hil.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'flyy'"):
+        _ = hil.flyy  # type: ignore[attr-defined]
+
+
+def test_a_run_is_read_again_as_it_was_flown() -> None:
+    run = fly("hover", duration_s=SHORT, faults=["push.y@0.1=1"])
+    again = load_run(run.folder)
+    assert repr(again.result) == repr(run.result)
+    assert again.experiment is EXPERIMENTS["hover"]
+    assert again.log.equals(run.log)
+    assert [event["text"] for event in run.events if "begins" in event["text"]] == [
+        "fault push.y@0.1=1 begins"
+    ]
+    assert set(run.paths) >= {"log.parquet", "result.json", "events.jsonl", "telemetry.csv"}
+
+
+def test_the_table_counts_seconds_from_the_release() -> None:
+    run = fly("hover", duration_s=SHORT)
+    frame = run.to_pandas()
+    assert frame.index.name == "s"
+    at_release = frame["flight.free"].to_numpy().argmax()
+    assert frame.index[at_release] == pytest.approx(0.0, abs=0.011)
+    assert frame.index[-1] == pytest.approx(SHORT, abs=0.011)
+    assert (run.units["t"], run.units["truth.z"], run.unit_of("rms_x")) == ("us", "m", "m")
+
+
+def test_the_progress_of_a_flight_rises_to_one(capsys: pytest.CaptureFixture[str]) -> None:
+    shares: list[float] = []
+    fly("hover", duration_s=1.0, progress=shares.append)
+    assert shares == sorted(shares)
+    assert len(shares) > 4
+    assert shares[-1] == 1.0
+    fly("hover", duration_s=SHORT, progress=True)
+    assert capsys.readouterr().err.endswith("hover, seed 1: 100% of 0.3 s\n")
+
+
+def test_what_a_run_shows_names_the_failed_limit_and_the_folder() -> None:
+    run = fly(replace(EXPERIMENTS["hover"], limits={"rms_x": 1e-9, "lost": 0.0}), duration_s=SHORT)
+    assert "rms_x = " in repr(run)
+    assert "(limit <= 1e-07 cm); runs/hover-1>" in repr(run)
+    assert "<b>fails</b>" in run._repr_html_()
+    assert "report.html" not in run._repr_html_()
+    run.paths["result.json"].with_name("report.html").touch()
+    assert 'href="runs/hover-1/report.html"' in run._repr_html_()
+
+
+def test_a_request_is_flown_as_it_is() -> None:
+    request = Request.of(EXPERIMENTS["hover"], seed=3, duration_s=SHORT)
+    assert fly(request).hash == fly("hover", seed=3, duration_s=SHORT, folder="other").hash
+    with pytest.raises(LabError, match="a Request has its options already: seed"):
+        fly(request, seed=4)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"seed": 1, "faults": ["push.w@1"]}, "unknown kind 'push.w'"),
+        ({"duration_s": -1.0}, "--duration -1: expected seconds"),
+        ({"duration_s": math.nan}, "--duration nan"),
+        ({"board": "arm"}, "--board arm: expected"),
+        ({"profile": "flaoty"}, "did you mean floaty"),
+        ({"overrides": ["tunnel.sped=7"]}, "did you mean speed"),
+    ],
+)
+def test_bad_options_are_one_line(options: dict[str, object], told: str) -> None:
+    with pytest.raises(LabError, match=told) as error:
+        fly("hover", **options)  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, marks=pytest.mark.long),
+        pytest.param(
+            {"seed": 9, "overrides": ["servo.trim[1]=-4000", "imu.gyro_noise=0.01"]}, marks=pytest.mark.long
+        ),
+        pytest.param(
+            {"faults": ["push.y@0.1=1", "mocap.dropout@0.1:0.1"], "profile": "as-flown", "link": "mavlink"},
+            marks=pytest.mark.long,
+        ),
+    ],
+)
+def test_the_command_of_a_request_flies_it_again_bit_for_bit(
+    monkeypatch: pytest.MonkeyPatch, options: dict[str, object]
+) -> None:
+    request = request_of("yaw-step", duration_s=SHORT, **options)  # type: ignore[arg-type]
+    flown = fly(request, "one")
+    command = command_of(request)
+    assert command is not None
+    floaty(monkeypatch, *shell_words(command)[1:], "--out", "two")
+    assert load_run("two").hash == flown.hash
+
+
+def test_the_command_of_a_request_says_all_that_is_not_the_usual() -> None:
+    usual = command_of(request_of("yaw-step"))
+    assert usual == "floaty fly yaw-step --seed 1"
+    command = command_of(
+        request_of(
+            "yaw-step", seed=2, duration_s=0.1, profile="as-flown", link="mavlink", overrides=["servo.trim=[1, 2, 3, 4]"],
+            faults=["push.y@0=1", "push.z@0:0.05=2"],
+        )
+    )  # fmt: skip
+    assert command == (
+        "floaty fly yaw-step --seed 2 --duration 0.1 --profile as-flown --set 'servo.trim=[1, 2, 3, 4]' "
+        "--fault push.y@0=1 --fault push.z@0:0.05=2 --link mavlink"
+    )
+    assert command_of(request_of("hover", board="c")) == "floaty fly hover --seed 1 --board c"
+
+
+def shell_words(command: str) -> list[str]:
+    """Return the words that a shell makes of a command."""
+    shown = subprocess.run(
+        ["sh", "-c", f"printf '%s\\n' {command}"], capture_output=True, text=True, check=True
+    )
+    return shown.stdout.splitlines()
+
+
+def test_an_experiment_that_stands_nowhere_has_no_command() -> None:
+    hover = EXPERIMENTS["hover"]
+    assert command_of(Request.of(replace(hover, duration_s=5.0))) is None
+    assert command_of(Request.of(Experiment("mine", "", 1.0, {}))) is None
+    assert command_of(request_of("hover", trajectory=Along(lambda t: (0.0, 0.0, 0.0)))) is None
+
+
+def test_an_own_metric_has_its_unit_and_a_value_also_where_it_was_not_measured() -> None:
+    tilt = Metric("rad", "max", "tilt")
+    mine = Experiment("mine", "", SHORT, {"tilt": 1.0}, metrics={"tilt": tilt})
+    run = fly(mine)
+    assert math.isnan(run.metrics["tilt"])
+    assert not run.passed
+    assert run.unit_of("tilt") == "rad"
+    assert load_run(run.folder).unit_of("tilt") == "rad"
+    assert load_run(run.folder).experiment is None
