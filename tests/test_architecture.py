@@ -42,7 +42,7 @@ FLOORS = (
     ("pictures",),
     ("servers",),
     ("api",),
-    ("studies", "deploy"),
+    ("studies", "deploy", "testing"),
     ("commands",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -88,6 +88,8 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "filterpy": (),
     "motioncapture": ("ground_station/sources/motioncapture_process.py",),
     "scipy": (),
+    "pytest": ("hil/testing/",),
+    "hypothesis": ("hil/testing/strategies.py",),
     "perfetto": ("hil/pictures/perfetto.py",),
     "matplotlib": ("hil/pictures/", "hil/studies/"),
     "pyarrow": ("hil/api.py", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/"),

@@ -1,0 +1,22 @@
+"""Tests of one's own logic with pytest: the fixture `floaty`, a board without a world, and faults and ways for Hypothesis.
+
+`docs/testing.md` shows all of it. pytest finds the plugin by itself; `faults` and `trajectories` need Hypothesis and are
+loaded when they are first used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hil.testing.flights import Flights
+    from hil.testing.strategies import Waypoints, faults, trajectories
+
+__all__ = ["Flights", "Waypoints", "faults", "trajectories"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(
+        import_module("hil.testing.flights" if name == "Flights" else "hil.testing.strategies"), name
+    )

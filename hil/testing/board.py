@@ -1,0 +1,190 @@
+"""A board without a world: the firmware alone, fed by hand, in simulated time, which passes only in `run` and `expect`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from firmware_py.board import ImuCounts
+from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.firmware import Firmware
+from firmware_py.rtos import TaskReport
+from hil.config import LabConfig
+from hil.devices.board import VirtualBoard
+from hil.devices.imu import ACCEL_COUNTS, COS, COUNTS, GYRO_COUNTS, SIN
+from hil.errors import LabError
+from hil.events import EventQueue
+from hil.world.motion import GRAVITY
+
+IMU_PERIOD_US = 1_000
+Vector = tuple[float, float, float]
+
+
+class UnmetExpectation(AssertionError):  # noqa: N818 - pytest shows the name
+    """The board did not say in time what it should have said."""
+
+
+class SerialPins:
+    """A serial line without a line: what is received is there at once, what is sent is kept."""
+
+    overruns = 0
+
+    def __init__(self, sent: list[tuple[int, bytes]]) -> None:
+        self._received = bytearray()
+        self._sent = sent
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from outside."""
+        self._received += data
+
+    def read(self) -> bytes:
+        """Return what has been received since the last time."""
+        data = bytes(self._received)
+        self._received.clear()
+        return data
+
+    def write(self, now_us: int, data: bytes) -> bool:
+        """Keep what the firmware sends."""
+        self._sent.append((now_us, data))
+        return True
+
+
+class BareBoard:
+    """A booted board. It stands still and level until `feed_imu` says otherwise.
+
+    `sent` holds what it sent, each with its instant [us]; `console` what it said; `counts` the servo timers' compare
+    counts. With `serial` it speaks MAVLink over its UART: `receive` and `sent` are the bytes there.
+    """
+
+    def __init__(self, config: LabConfig, runner: RunnerFactory = PythonRunner, serial: bool = False) -> None:
+        self.counts: tuple[int, ...] = ()
+        self.console: list[str] = []
+        self.sent: list[tuple[int, bytes]] = []
+        self.now_us = 0
+        self.imu_running = True  # False: no more interrupts of the IMU
+        self._heard = 0  # lines of the console that an `expect` has matched or passed
+        self._repeats = 0  # the present generation of repeated packets
+        self._events = EventQueue()
+        self._serial = SerialPins(self.sent) if serial else None
+        self._board = VirtualBoard(self._set_counts, self._send, self._say, self._serial)
+        self._board.boot(0)
+        self.feed_imu()
+        self.firmware = Firmware(config, self._board, mavlink=serial, runner=runner)
+        self._board.run_on(self.firmware.kernel, self._events)
+        self._events.every(IMU_PERIOD_US, IMU_PERIOD_US, self._sample)
+
+    def feed_imu(
+        self,
+        omega_B: Vector = (0.0, 0.0, 0.0),
+        f_B: Vector = (0.0, 0.0, GRAVITY),
+        counts: ImuCounts | None = None,
+    ) -> None:
+        """Let the IMU measure this from now on: rates [rad/s] and specific force [m/s2], both in B, or counts."""
+        (p, q, r), (fx, fy, fz) = omega_B, f_B
+        rates = (COS * p + SIN * q, COS * q - SIN * p, r)
+        forces = (COS * fx + SIN * fy, COS * fy - SIN * fx, fz)
+        self._board.imu = counts or (
+            _count(rates[0], GYRO_COUNTS), _count(rates[1], GYRO_COUNTS), _count(rates[2], GYRO_COUNTS),
+            _count(forces[0], ACCEL_COUNTS), _count(forces[1], ACCEL_COUNTS), _count(forces[2], ACCEL_COUNTS),
+        )  # fmt: skip
+
+    def receive(self, packet: bytes, every_ms: float = 0.0) -> None:
+        """Let a packet arrive now, and again every `every_ms` until `hush`: CRTP from the radio, MAVLink from the UART."""
+        if not every_ms:
+            self._arrive(packet)
+            return
+        generation, period_us = self._repeats, round(every_ms * 1e3)
+
+        def again(now_us: int) -> None:
+            if generation == self._repeats:
+                self._arrive(packet)
+                self._events.at(now_us + period_us, again)
+
+        again(self.now_us)
+
+    def hush(self) -> None:
+        """Let nothing more arrive of what was repeated."""
+        self._repeats += 1
+
+    def run(self, ms: float) -> None:
+        """Let time pass."""
+        self._run_until(self.now_us + round(ms * 1e3))
+
+    def expect(self, text: str, within_ms: float) -> str:
+        """Let time pass until the board says a line with `text` in it, and return the line.
+
+        Lines up to the one that was expected last do not count. Raises `UnmetExpectation`.
+        """
+        __tracebackhide__ = True
+        begin_us, first = self.now_us, self._heard
+        end_us = begin_us + round(within_ms * 1e3)
+        while True:
+            while self._heard < len(self.console):
+                line = self.console[self._heard]
+                self._heard += 1
+                if text in line:
+                    return line
+            if self.now_us >= end_us:
+                said = "".join(f"\n  {line}" for line in self.console[first:]) or " nothing"
+                raise UnmetExpectation(
+                    f"{text!r} was not said within {within_ms:g} ms from {begin_us / 1000:g} ms on; the board said:{said}"
+                )
+            self._run_until(min(self.now_us + IMU_PERIOD_US, end_us))
+
+    def read(self, name: str) -> float:
+        """Return a log variable, like `stateEstimate.z`. Raises `LabError` for one that is not there."""
+        for variable in self.firmware.variables:
+            if variable.name == name:
+                return variable.read()
+        raise LabError(f"log variable {name!r}: there is none; cfclient lists them all")
+
+    @property
+    def tasks(self) -> Mapping[str, TaskReport]:
+        """How the tasks kept up, by name: run time, response, missed deadlines."""
+        return {report.name: report for report in self.firmware.statistics.reports()}
+
+    @property
+    def battery_mv(self) -> int:
+        """The supply voltage [mV]; may be set."""
+        return self._board.battery_mv
+
+    @battery_mv.setter
+    def battery_mv(self, value: int) -> None:
+        self._board.battery_mv = value
+
+    def _run_until(self, end_us: int) -> None:
+        """Go from one instant at which anything happens to the next: hardware first, then the firmware."""
+        events, firmware = self._events, self.firmware
+        while self.now_us < end_us:
+            wakes = (end_us, events.next_us, firmware.next_wake_us)
+            self.now_us = min(wake for wake in wakes if wake is not None)
+            if self.now_us > firmware.kernel.now_us:
+                firmware.kernel.advance(self.now_us)
+            events.run(self.now_us)
+            firmware.run(self.now_us)
+        firmware.check_watchdog()
+
+    def _sample(self, now_us: int) -> None:
+        if self.imu_running:
+            self.firmware.imu_ready()
+
+    def _arrive(self, packet: bytes) -> None:
+        if self._serial is None:
+            self.firmware.radio_received(packet)
+        else:
+            self._serial.receive(packet)
+            self.firmware.uart_ready()
+
+    def _set_counts(self, now_us: int, counts: Sequence[int]) -> None:
+        self.counts = tuple(counts)
+
+    def _send(self, now_us: int, data: bytes) -> bool:
+        if self._serial is None:
+            self.sent.append((now_us, data))
+        return True
+
+    def _say(self, now_us: int, text: str) -> None:
+        self.console.append(text)
+
+
+def _count(value: float, per_unit: float) -> int:
+    return int(min(max(round(value * per_unit), -COUNTS), COUNTS - 1.0))

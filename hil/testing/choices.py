@@ -1,0 +1,129 @@
+"""On what a test flies: seeds, boards and profiles of its mark or of the command line; and whether they can be had."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from typing import Any
+
+from firmware_py.export.boards import BOARDS, PYTHON, runner_of
+from firmware_py.export.errors import ExportError
+from hil.config import DEFAULT_PROFILE
+from hil.errors import LabError
+from hil.laboratory.lockstep import LOCKSTEP, RADIO
+from hil.laboratory.run import BUILD
+
+PACKAGES = {"mavlink": "pymavlink", "radio": "cflib"}  # capabilities that a package gives
+LOCKSTEP_ONLY = "lockstep"
+CAPABILITIES = (*BOARDS, *PACKAGES, LOCKSTEP_ONLY)
+WORDS = ("seeds", "boards", "profiles", "needs")
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What one test flies on."""
+
+    seed: int = 1
+    board: str = PYTHON
+    profile: str = DEFAULT_PROFILE
+    link: str = RADIO
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the command line says; empty: nothing."""
+
+    seeds: int = 0
+    boards: tuple[str, ...] = ()
+    profiles: tuple[str, ...] = ()
+    link: str = RADIO
+    usual_profile: str = DEFAULT_PROFILE
+
+
+@dataclass(frozen=True, slots=True)
+class Marked:
+    """What `@pytest.mark.floaty` says of a test. Raises `LabError` for what it cannot say."""
+
+    seeds: tuple[int, ...] = ()
+    boards: tuple[str, ...] = ()
+    profiles: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, words: Mapping[str, Any]) -> Marked:
+        """Check the mark's words: `seeds` is a number, which counts from 1 on, or the seeds themselves."""
+        for word in words:
+            if word not in WORDS:
+                near = difflib.get_close_matches(word, WORDS, 1)
+                raise LabError(
+                    f"{word}: {f'did you mean {near[0]}?' if near else 'expected ' + ', '.join(WORDS)}"
+                )
+        seeds = words.get("seeds", ())
+        if isinstance(seeds, int):
+            if seeds < 1:
+                raise LabError(f"seeds = {seeds}: expected 1 or more, or a list of seeds")
+            seeds = range(1, seeds + 1)
+        needs = words.get("needs", ())
+        marked = cls(
+            tuple(seeds), tuple(words.get("boards", ())), tuple(words.get("profiles", ())),
+            (needs,) if isinstance(needs, str) else tuple(needs),
+        )  # fmt: skip
+        _check("boards", marked.boards, BOARDS)
+        _check("needs", marked.needs, CAPABILITIES)
+        return marked
+
+
+def choices_of(marked: Marked, wanted: Wanted) -> list[Choice]:
+    """Return what a test flies on: the command line goes before the mark, and a board that it needs is its board."""
+    needed = tuple(board for board in marked.needs if board in BOARDS)
+    seeds = tuple(range(1, wanted.seeds + 1)) or marked.seeds or (1,)
+    boards = wanted.boards or marked.boards or needed or (PYTHON,)
+    profiles = wanted.profiles or marked.profiles or (wanted.usual_profile,)
+    return [
+        Choice(seed, board, profile, wanted.link) for profile, board, seed in product(profiles, boards, seeds)
+    ]
+
+
+def name_of(choice: Choice, choices: Sequence[Choice]) -> str:
+    """Return what tells a choice from the others in a test's name."""
+    parts = {
+        choice.profile: len({one.profile for one in choices}),
+        choice.board: len({one.board for one in choices}),
+        f"seed{choice.seed}": len({one.seed for one in choices}),
+    }
+    return "-".join(part for part, many in parts.items() if many > 1)
+
+
+def why_not(choice: Choice, needs: Iterable[str]) -> str:
+    """Return why a test cannot fly on its choice here, empty when it can."""
+    in_lockstep = choice.link in LOCKSTEP
+    if not in_lockstep and choice.board != PYTHON:
+        return f"board {choice.board}: --floaty-link {choice.link}: only python flies over a link"
+    for need in needs:
+        if need in BOARDS and need != choice.board:
+            return f"needs {need}: this flies on {choice.board}"
+        if need == LOCKSTEP_ONLY and not in_lockstep:
+            return f"needs lockstep: this flies over {choice.link}"
+        if need in PACKAGES and importlib.util.find_spec(PACKAGES[need]) is None:
+            return f"needs {need}: {PACKAGES[need]} is not installed"
+    return why_no_board(choice.board)
+
+
+@cache
+def why_no_board(board: str) -> str:
+    """Return why a board cannot be had on this machine, empty when it can."""
+    try:
+        runner_of(board, BUILD)
+    except ExportError as error:
+        return f"board {board} cannot be had here: {error}"
+    return ""
+
+
+def _check(word: str, values: tuple[str, ...], allowed: Sequence[str]) -> None:
+    for value in values:
+        if value not in allowed:
+            raise LabError(f"{word} = {value!r}: expected {', '.join(allowed)}")

@@ -1,0 +1,199 @@
+"""What a test has in its hands as `floaty`: flights into folders of the test's own, and boards without a world."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Unpack
+
+import pytest
+
+from firmware_py.export.boards import runner_of
+from hil.api import Options, Run, command_of, fly, request_of
+from hil.config import load_config
+from hil.errors import LabError
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.lockstep import MAVLINK, RADIO
+from hil.laboratory.run import BUILD, Request
+from hil.testing.board import BareBoard
+from hil.testing.choices import Choice, why_no_board
+
+SHOWN = 3  # flights of a test; of more, the last
+PICTURE = "flight.png"
+NAME_MAX = 80
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """A flight of a test."""
+
+    number: int
+    request: Request
+    run: Run
+
+
+@dataclass(slots=True)
+class Item:
+    """One test: what it flies on, where, and what it has flown."""
+
+    name: str  # pytest's
+    folder: Path
+    choice: Choice
+    flown: list[Flown] = field(default_factory=list)
+    failed: bool = False
+
+
+class Flights:
+    """The fixture `floaty`. `seed`, `profile` and `target`, the board, are those on which the test flies."""
+
+    def __init__(self, home: Path, folder: Path) -> None:
+        self.home = home  # pytest's root folder: paths of profiles and experiments begin there
+        self._folder = folder  # of all tests' runs
+        self._item: Item | None = None
+
+    def begin(self, name: str, choice: Choice) -> Item:
+        """Fly for a test from now on."""
+        self._item = Item(name, self._folder / folder_of(name), choice)
+        shutil.rmtree(self._item.folder, ignore_errors=True)
+        return self._item
+
+    @property
+    def choice(self) -> Choice:
+        """On what the present test flies."""
+        assert self._item is not None
+        return self._item.choice
+
+    @property
+    def seed(self) -> int:
+        """Of everything random."""
+        return self.choice.seed
+
+    @property
+    def profile(self) -> str:
+        """The profile."""
+        return self.choice.profile
+
+    @property
+    def target(self) -> str:
+        """What executes the flight core: python, c or cortex-m4."""
+        return self.choice.board
+
+    def fly(self, experiment: Experiment | str = "hover", **options: Unpack[Options]) -> Run:
+        """Fly once; what an option does not say is as the test's mark and the command line have it.
+
+        Options are those of `hil.fly`. A failed limit is no error: the test asks `passed`, `metrics`, `verdicts`. Skips the
+        test when a board cannot be had here. Raises `LabError` for bad input.
+        """
+        item, choice = self._item, self.choice
+        assert item is not None
+        options.setdefault("seed", choice.seed)
+        options.setdefault("board", choice.board)
+        options.setdefault("link", choice.link)
+        options["profile"] = self._placed(options.get("profile", choice.profile))
+        self._need(options["board"])
+        if isinstance(experiment, str):
+            experiment = self._placed(experiment)
+        request = request_of(experiment, **options)
+        number = len(item.flown) + 1
+        run = fly(request, item.folder / str(number))
+        item.flown.append(Flown(number, request, run))
+        return run
+
+    def board(
+        self, link: str = RADIO, profile: str | None = None, overrides: tuple[str, ...] = ()
+    ) -> BareBoard:
+        """Boot a board without a world. With `link="mavlink"` it speaks MAVLink over its UART.
+
+        Skips the test when the board cannot be had here. Raises `LabError` for bad input.
+        """
+        if link not in (RADIO, MAVLINK):
+            raise LabError(f"board: link {link!r}: expected {RADIO} or {MAVLINK}")
+        self._need(self.choice.board)
+        config = load_config(self._placed(profile or self.choice.profile), overrides)
+        return BareBoard(config, runner_of(self.choice.board, BUILD), link == MAVLINK)
+
+    def _need(self, board: str) -> None:
+        if reason := why_no_board(board):
+            pytest.skip(f"floaty: {reason}")
+
+    def _placed(self, name: str) -> str:
+        """Return a path from the root folder on as it is found from everywhere; another name as it is."""
+        path, end, variable = name.partition(".py:") if ".py:" in name else (name, "", "")
+        placed = self.home / (path + end.rstrip(":"))
+        is_path = placed.suffix in (".py", ".toml") and placed.is_file()
+        return f"{self.home / path}{end}{variable}" if is_path else name
+
+
+def folder_of(name: str) -> str:
+    """Return a test's name as that of a folder, which no other test has."""
+    plain = re.sub(r"[^\w.-]+", "-", name).strip("-")
+    if len(plain) <= NAME_MAX and plain == name:
+        return plain
+    return f"{plain[-NAME_MAX:].lstrip('-.')}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+def shown_of(item: Item) -> list[Flown]:
+    """Return the flights that a failure shows: all of a few, of many the last, the smallest that Hypothesis found."""
+    return item.flown if len(item.flown) <= SHOWN else item.flown[-1:]
+
+
+def told(item: Item, kept: bool, options: str) -> str:
+    """Return what a failure shows of a test's flights; `options` are those of pytest that choose what it flies on."""
+    texts = []
+    for one in shown_of(item):
+        request, result = one.request, one.run.result
+        how = f"{result.outcome}: {result.cause}" if result.cause else result.outcome
+        lines = [
+            f"{request.experiment.name}, seed {request.seed}, board {request.board}, profile {request.profile}, "
+            f"{request.link}: {how}"
+        ]
+        lines += [f"  limit    {verdict}" for verdict in result.verdicts if not verdict.holds]
+        lines += [f"  fault    {fault}" for fault in result.faults]
+        lines += [f"  folder   {one.run.folder}"] if kept else []
+        lines += [f"  picture  {one.run.folder / PICTURE}"] if (one.run.folder / PICTURE).is_file() else []
+        if result.stood_still_ms:
+            lines += [f"  machine  was too slow: time stood still for {result.stood_still_ms:.0f} ms"]
+        again = command_of(request) or f"pytest {options}'{item.name}'"
+        texts.append("\n".join([*lines, f"  again    {again}"]))
+    more = len(item.flown) - len(texts)
+    return "\n".join([*texts, f"({more} flights before that are not shown)"] if more else texts)
+
+
+def properties_of(item: Item) -> list[tuple[str, str]]:
+    """Return what a JUnit file says of a test's flights: hash, command, and every metric that has a value, in its unit."""
+    found = []
+    shown = shown_of(item)
+    for one in shown:
+        prefix = "floaty." if len(shown) == 1 else f"floaty.{one.number}."
+        values = {"hash": one.run.hash, "outcome": one.run.outcome, "folder": str(one.run.folder)}
+        values["again"] = command_of(one.request) or ""
+        values |= {
+            name: f"{value:.9g} {one.run.unit_of(name)}".rstrip()
+            for name, value in one.run.metrics.items()
+            if math.isfinite(value)
+        }
+        found += [(prefix + name, value) for name, value in values.items()]
+    return found
+
+
+def draw(item: Item) -> None:
+    """Draw one picture into the folder of every flight that a failure shows."""
+    from hil.pictures.drawing import png
+    from hil.pictures.figures import errors
+
+    for one in shown_of(item):
+        if one.run.log.num_rows > 1:
+            (one.run.folder / PICTURE).write_bytes(png(errors, one.run.log))
+
+
+def trim(item: Item, keep: bool) -> None:
+    """Forget the flights of a test that is over, and remove those that a failure would not show."""
+    shown = {one.number for one in shown_of(item)}
+    for one in item.flown:
+        if not keep and one.number not in shown:
+            shutil.rmtree(one.run.folder, ignore_errors=True)
+    item.flown.clear()

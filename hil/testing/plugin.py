@@ -1,0 +1,208 @@
+"""The pytest plugin: options, the mark `floaty`, the fixture `floaty`, and what a failed flight shows.
+
+The fixture lives as long as the session, because Hypothesis calls a test many times with one fixture; which test flies is
+told before each one. Nothing of the laboratory is loaded before a test asks for it.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections.abc import Generator
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from hil.testing.choices import Choice, Marked, Wanted
+    from hil.testing.flights import Flights, Item
+
+CHOICE = "floaty_choice"  # the parameter of a test that flies on several
+KEEP = ("failed", "all", "none")
+FOLDER = "runs/pytest"  # in pytest's root folder
+FLIGHTS = pytest.StashKey["Flights"]()
+ITEM = pytest.StashKey["Item"]()
+ALL = pytest.StashKey[list["Item"]]()  # of this process
+MARK = (
+    "floaty(seeds=20, boards=[...], profiles=[...], needs=...): what the fixture `floaty` flies on. seeds: how many, or "
+    "which; boards: of python, c, cortex-m4; needs: boards, mavlink, radio or lockstep, without which the test is skipped."
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options."""
+    group = parser.getgroup("floaty", "flights in the Floaty virtual laboratory")
+    group.addoption(
+        "--floaty-board", action="append", default=[], metavar="BOARD[,BOARD]",
+        help="what executes the flight core: python, c, cortex-m4; goes before the marks",
+    )  # fmt: skip
+    group.addoption(
+        "--floaty-profile", action="append", default=[], metavar="NAME|FILE[,…]",
+        help="profiles to fly on; goes before the marks",
+    )  # fmt: skip
+    group.addoption(
+        "--floaty-seeds", type=int, default=0, metavar="N", help="fly seeds 1 to N; goes before the marks"
+    )
+    group.addoption(
+        "--floaty-keep", choices=KEEP, default="failed",
+        help="whose run folders are kept, in runs/pytest/ [failed]",
+    )  # fmt: skip
+    group.addoption(
+        "--floaty-link", default="radio", metavar="LINK",
+        help="radio or mavlink: in lockstep [radio]; radio://…, udp://… or mavlink:pty: over a real link, in real time",
+    )  # fmt: skip
+    parser.addini(
+        "floaty_profile", "the profile on which tests fly that say no other, a name or a path", default=""
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the mark known, and refuse what cannot be."""
+    config.addinivalue_line("markers", MARK)
+    config.stash[ALL] = []
+    if config.getoption("floaty_seeds") < 0:
+        raise pytest.UsageError(f"--floaty-seeds {config.getoption('floaty_seeds')}: expected 1 or more")
+    if ":" in config.getoption("floaty_link") and getattr(config.option, "numprocesses", None):
+        raise pytest.UsageError(
+            f"--floaty-link {config.getoption('floaty_link')}: flights in real time fly one at a time; leave -n away"
+        )
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Repeat a test for every seed, board and profile."""
+    if "floaty" not in metafunc.fixturenames:
+        return
+    from hil.testing.choices import choices_of, name_of
+
+    choices = choices_of(_marked(metafunc.definition), _wanted(metafunc.config))
+    if len(choices) > 1:
+        metafunc.fixturenames.append(CHOICE)
+        metafunc.parametrize(CHOICE, choices, ids=[name_of(choice, choices) for choice in choices])
+
+
+@pytest.fixture(scope="session")
+def floaty(pytestconfig: pytest.Config) -> Flights:
+    """Fly experiments and boot boards: `floaty.fly("hover", faults=["push.y@3=2"])`, `floaty.board()`."""
+    return _flights(pytestconfig)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tell who flies from now on; skip what cannot be flown here."""
+    if "floaty" not in getattr(item, "fixturenames", ()):
+        return
+    from hil.testing.choices import choices_of, why_not
+
+    marked = _marked(item)
+    callspec = getattr(item, "callspec", None)
+    parameters = callspec.params if callspec else {}
+    choice: Choice = parameters.get(CHOICE) or choices_of(marked, _wanted(item.config))[0]
+    if reason := why_not(choice, marked.needs):
+        pytest.skip(f"floaty: {reason}")
+    item.stash[ITEM] = _flights(item.config).begin(item.nodeid, choice)
+    item.config.stash[ALL].append(item.stash[ITEM])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show a failed test's flights, and write down those of every test."""
+    flown = item.stash.get(ITEM, None)
+    if flown is None or not flown.flown:
+        return (yield)
+    from hil.testing.flights import draw, properties_of, told, trim
+
+    if call.when == "call":
+        item.user_properties.extend(properties_of(flown))
+    report = yield
+    keep = item.config.getoption("floaty_keep")
+    if report.failed:
+        if keep != "none" and not flown.failed:
+            draw(flown)
+        flown.failed = True
+        report.sections.append(("floaty flights", told(flown, keep != "none", _options(item.config))))
+    if call.when == "teardown":
+        trim(flown, keep == "all")
+    return report
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Remove the run folders that nobody wants; until now a fixture of a longer life may have looked at them."""
+    keep = session.config.getoption("floaty_keep")
+    for flown in session.config.stash[ALL]:
+        if not (keep == "all" or (keep == "failed" and flown.failed)):
+            shutil.rmtree(flown.folder, ignore_errors=True)
+    with suppress(OSError):  # one that holds something stays
+        (session.config.rootpath / FOLDER).rmdir()
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say what was not flown, also without -rs."""
+    reasons: dict[str, int] = {}
+    for report in terminalreporter.stats.get("skipped", []):
+        text = str(report.longrepr[2]) if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        if "floaty: " in text:
+            reason = text.partition("floaty: ")[2]
+            reasons[reason] = reasons.get(reason, 0) + 1
+    for reason, count in reasons.items():
+        terminalreporter.write_line(f"floaty: {count} not flown: {reason}", yellow=True)
+
+
+def _flights(config: pytest.Config) -> Flights:
+    from hil.testing.flights import Flights
+
+    return config.stash.setdefault(FLIGHTS, Flights(config.rootpath, config.rootpath / FOLDER))
+
+
+def _marked(item: pytest.Item) -> Marked:
+    """Return what the nearest mark says."""
+    from hil.errors import LabError
+    from hil.testing.choices import Marked
+
+    mark = item.get_closest_marker("floaty")
+    if mark is None:
+        return Marked()
+    if mark.args:
+        pytest.fail(
+            f"@pytest.mark.floaty{mark.args}: expected seeds=, boards=, profiles=, needs=", pytrace=False
+        )
+    try:
+        return Marked.of(mark.kwargs)
+    except LabError as error:
+        wrong = str(error)
+    pytest.fail(f"{item.name}: @pytest.mark.floaty: {wrong}", pytrace=False)
+
+
+def _wanted(config: pytest.Config) -> Wanted:
+    """Return what the command line and pytest's configuration say."""
+    from firmware_py.export.boards import BOARDS
+    from hil.config import DEFAULT_PROFILE
+    from hil.testing.choices import Wanted
+
+    boards = _split(config.getoption("floaty_board"))
+    for board in boards:
+        if board not in BOARDS:
+            raise pytest.UsageError(f"--floaty-board {board}: expected {', '.join(BOARDS)}")
+    return Wanted(
+        config.getoption("floaty_seeds"), boards, _split(config.getoption("floaty_profile")),
+        config.getoption("floaty_link"), config.getini("floaty_profile") or DEFAULT_PROFILE,
+    )  # fmt: skip
+
+
+def _split(values: list[str]) -> tuple[str, ...]:
+    return tuple(part.strip() for value in values for part in value.split(",") if part.strip())
+
+
+def _options(config: pytest.Config) -> str:
+    """Return the options that choose what a test flies on, as they were given."""
+    words = [
+        f"--floaty-{name}={value}"
+        for name in ("board", "profile")
+        for value in config.getoption(f"floaty_{name}")
+    ]
+    words += (
+        [f"--floaty-seeds={config.getoption('floaty_seeds')}"] if config.getoption("floaty_seeds") else []
+    )
+    return "".join(f"{shlex.quote(word)} " for word in words)

@@ -1,0 +1,407 @@
+"""The pytest plugin, seen by `pytester`: what is flown, what a failure shows, what is kept, what is skipped."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+import hil
+from firmware_py.export.errors import ExportError
+from hil.api import load_run
+from hil.errors import LabError
+from hil.testing import choices
+from hil.testing.choices import Choice, Marked, Wanted, choices_of, why_not
+from hil.testing.flights import folder_of
+from support.command import floaty
+from support.examples import FILE, blocks
+
+PAGE = Path(hil.__file__).parent.parent / "docs" / "testing.md"
+FLY = "def test_it(floaty):\n    assert floaty.fly(duration_s=0.3).passed\n"
+# A flight that fails its limits, by a profile whose limit nothing holds.
+FAIL = """
+def test_it(floaty):
+    flight = floaty.fly(duration_s=0.3, seed=3, faults=["push.y@0.1=0.2"], profile="strict.toml")
+    assert flight.passed
+"""
+STRICT = 'base = "floaty"\n[limits.hover]\nrms_x = 1e-9\n'
+
+
+@pytest.fixture(autouse=True)
+def fresh() -> Iterator[None]:
+    choices.why_no_board.cache_clear()
+    yield
+    choices.why_no_board.cache_clear()
+
+
+@pytest.fixture
+def strict(pytester: pytest.Pytester) -> pytest.Pytester:
+    (pytester.path / "strict.toml").write_text(STRICT)
+    pytester.makepyfile(FAIL)
+    return pytester
+
+
+def kept(pytester: pytest.Pytester) -> list[str]:
+    """Return the run folders that a session has left."""
+    folder = pytester.path / "runs" / "pytest"
+    return sorted(path.parent.relative_to(folder).as_posix() for path in folder.rglob("result.json"))
+
+
+# Failures
+
+
+def test_a_failure_shows_limit_value_folder_picture_and_the_command_that_flies_it_again(
+    strict: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = strict.runpytest_inprocess()
+    result.assert_outcomes(failed=1)
+    shown = result.stdout.str().partition("floaty flights")[2]
+    value = re.search(r"limit +rms_x = (\S+) cm \(limit <= 1e-07 cm\)", shown)
+    assert value is not None
+    assert "hover, seed 3, board python, profile " in shown
+    assert "fault    push.y@0.1=0.2" in shown
+    (folder,) = re.findall(r"folder +(\S+)", shown)
+    (picture,) = re.findall(r"picture +(\S+)", shown)
+    (again,) = re.findall(r"again +floaty (.+)", shown)
+    assert Path(picture).read_bytes().startswith(b"\x89PNG")
+    run = load_run(folder)
+    assert float(value[1]) == pytest.approx(100 * run.metrics["rms_x"], rel=1e-3)
+    monkeypatch.chdir(strict.mkdir("elsewhere"))
+    assert floaty(monkeypatch, *again.split(), "--out", "again") == 1
+    assert load_run("again").hash == run.hash
+
+
+def test_a_flight_that_no_command_names_is_flown_again_by_its_test(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+        import pytest
+        from hil import Experiment
+
+        @pytest.mark.floaty(seeds=[4])
+        def test_it(floaty):
+            assert floaty.fly(Experiment("mine", "", 0.3, {"rms_x": 1e-9})).passed
+        """)
+    result = pytester.runpytest_inprocess("--floaty-seeds=2")
+    result.assert_outcomes(failed=2)
+    (module,) = [path.name for path in pytester.path.glob("test_*.py")]
+    result.stdout.fnmatch_lines([f"*again*pytest --floaty-seeds=2 '{module}::test_it[[]seed2[]]'"])
+
+
+def test_of_many_flights_the_last_is_shown(strict: pytest.Pytester) -> None:
+    strict.makepyfile("""
+        def test_it(floaty):
+            for seed in range(1, 6):
+                flight = floaty.fly(duration_s=0.1, seed=seed)
+            assert flight.metrics["flown"] > 1.0
+        """)
+    result = strict.runpytest_inprocess()
+    shown = result.stdout.str().partition("floaty flights")[2]
+    assert re.findall(r"hover, seed (\d)", shown) == ["5"]
+    assert "(4 flights before that are not shown)" in shown
+    assert [path.rpartition("/")[2] for path in kept(strict)] == ["5"]
+
+
+@pytest.mark.long
+def test_hypothesis_shrinks_a_failing_flight_without_a_word_about_fixtures(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+        from hypothesis import given, settings
+        from hil.testing import faults
+
+        @given(push=faults("push.y", start_s=(0.0, 0.0)))
+        @settings(max_examples=10, deadline=None, derandomize=True, database=None)
+        def test_it(floaty, push):
+            floaty.fly(duration_s=0.1, faults=[push])
+            assert push.size < 2.31
+        """)
+    result = pytester.runpytest_inprocess()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*Fault(kind='push.y', start_s=0.0, duration_s=0.1, size=2.4)*"])
+    shown = result.stdout.str().partition("floaty flights")[2]
+    assert re.findall(r"again +floaty fly hover .*--fault (\S+)", shown) == ["push.y@0=2.4"]
+
+
+# What is kept
+
+
+@pytest.mark.parametrize(("keep", "numbers"), [("failed", ["2"]), ("all", ["1", "2"]), ("none", [])])
+def test_run_folders_are_kept_as_asked(pytester: pytest.Pytester, keep: str, numbers: list[str]) -> None:
+    pytester.makepyfile("""
+        def test_1(floaty):
+            assert floaty.fly(duration_s=0.1).outcome == "completed"
+
+        def test_2(floaty):
+            assert floaty.fly(duration_s=0.1).outcome == "lost"
+        """)
+    result = pytester.runpytest_inprocess(f"--floaty-keep={keep}")
+    result.assert_outcomes(passed=1, failed=1)
+    assert re.findall(r"test_(\d)-\w+/1", " ".join(kept(pytester))) == numbers
+    assert ("folder  " in result.stdout.str()) == (keep != "none")
+    assert (pytester.path / "runs" / "pytest").is_dir() == bool(numbers)
+
+
+def test_what_a_fixture_of_the_module_has_flown_can_be_looked_at_by_every_test(
+    pytester: pytest.Pytester,
+) -> None:
+    pytester.makepyfile("""
+        import pytest
+
+        @pytest.fixture(scope="module")
+        def flight(floaty):
+            return floaty.fly(duration_s=0.1)
+
+        def test_1(flight):
+            assert flight.outcome == "completed"
+
+        def test_2(flight):
+            assert flight.log.num_rows > 100
+        """)
+    pytester.runpytest_inprocess().assert_outcomes(passed=2)
+    assert kept(pytester) == []
+
+
+def test_no_two_tests_share_a_folder() -> None:
+    names = ["a.py::test[x/y]", "a.py::test[x-y]", "a.py::test[x y]", "a.py-test-x-y", "a" * 300, "a" * 301]
+    folders = [folder_of(name) for name in names]
+    assert len(set(folders)) == len(names)
+    assert all(re.fullmatch(r"[\w.-]{1,100}", folder) for folder in folders)
+
+
+# What is flown
+
+
+def test_a_mark_repeats_a_test_for_every_seed_board_and_profile(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+        import pytest
+
+        seen = []
+
+        @pytest.mark.floaty(seeds=2, boards=["python", "c"], profiles=["floaty", "as-flown"])
+        def test_it(floaty):
+            seen.append((floaty.profile, floaty.target, floaty.seed))
+
+        def test_all():
+            assert sorted(seen) == [
+                (p, b, s) for p in ("as-flown", "floaty") for b in ("c", "python") for s in (1, 2)
+            ]
+        """)
+    result = pytester.runpytest_inprocess("-v")
+    result.assert_outcomes(passed=9)
+    result.stdout.fnmatch_lines(["*::test_it[[]as-flown-c-seed2[]] PASSED*"])
+
+
+def test_flights_take_what_the_mark_says_and_options_go_before_it(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+        import pytest
+
+        @pytest.mark.floaty(seeds=[7], boards=["c"], profiles=["as-flown"])
+        def test_it(floaty):
+            flown = floaty.fly(duration_s=0.1).result
+            assert (flown.seed, flown.board, flown.profile) == (7, "c", "as-flown")
+            other = floaty.fly(duration_s=0.1, seed=9, board="python", profile="floaty").result
+            assert (other.seed, other.board, other.profile) == (9, "python", "floaty")
+        """)
+    pytester.runpytest_inprocess().assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize(
+    ("marked", "wanted", "found"),
+    [
+        ({}, Wanted(), [Choice()]),
+        ({"seeds": 2}, Wanted(), [Choice(1), Choice(2)]),
+        ({"seeds": [5, 3]}, Wanted(), [Choice(5), Choice(3)]),
+        ({"seeds": 20, "boards": ["c"]}, Wanted(1, ("python", "c")), [Choice(1), Choice(1, "c")]),
+        ({"needs": "cortex-m4"}, Wanted(), [Choice(1, "cortex-m4")]),
+        ({"needs": ["lockstep"]}, Wanted(link="udp://x:1"), [Choice(link="udp://x:1")]),
+        ({}, Wanted(usual_profile="as-flown"), [Choice(profile="as-flown")]),
+        ({"profiles": ["floaty"]}, Wanted(usual_profile="as-flown"), [Choice()]),
+        ({"profiles": ["floaty"]}, Wanted(profiles=("as-flown",)), [Choice(profile="as-flown")]),
+    ],
+)
+def test_the_command_line_goes_before_the_mark_and_the_mark_before_the_usual(
+    marked: dict[str, object], wanted: Wanted, found: list[Choice]
+) -> None:
+    assert choices_of(Marked.of(marked), wanted) == found
+
+
+def test_paths_begin_at_the_root_folder_and_the_ini_file_names_the_usual_profile(
+    pytester: pytest.Pytester,
+) -> None:
+    pytester.makeini("[pytest]\nfloaty_profile = strict.toml\n")
+    (pytester.path / "strict.toml").write_text(STRICT)
+    (pytester.path / "flights.py").write_text(
+        "from hil import Experiment\nmine = Experiment('mine', '', 0.1, {'lost': 0.0})\n"
+    )
+    pytester.makepyfile("""
+        def test_it(floaty, monkeypatch, tmp_path):
+            monkeypatch.chdir(tmp_path)
+            assert [verdict.metric for verdict in floaty.fly(duration_s=0.1).verdicts] == ["rms_x"]
+            assert floaty.fly("flights.py:mine").passed
+            assert floaty.board().firmware is not None
+        """)
+    pytester.runpytest_inprocess().assert_outcomes(passed=1)
+
+
+# What cannot be had
+
+
+def test_a_board_that_cannot_be_had_is_skipped_and_the_summary_says_so(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def runner_of(board: str, folder: Path) -> None:
+        if board != "python":
+            raise ExportError("no C compiler on this machine")
+
+    monkeypatch.setattr(choices, "runner_of", runner_of)
+    pytester.makepyfile("""
+        import pytest
+
+        @pytest.mark.floaty(boards=["python", "c", "cortex-m4"])
+        def test_it(floaty):
+            assert floaty.target == "python"
+
+        def test_in_the_middle(floaty):
+            floaty.fly(board="c")
+        """)
+    result = pytester.runpytest_inprocess()
+    result.assert_outcomes(passed=1, skipped=3)
+    result.stdout.fnmatch_lines(
+        [
+            "floaty: 2 not flown: board c cannot be had here: no C compiler on this machine",
+            "floaty: 1 not flown: board cortex-m4 cannot be had here: no C compiler on this machine",
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("choice", "needs", "told"),
+    [
+        (Choice(), (), ""),
+        (Choice(), ("lockstep", "mavlink", "radio"), ""),
+        (Choice(), ("cortex-m4",), "needs cortex-m4: this flies on python"),
+        (Choice(link="udp://127.0.0.1:1"), ("lockstep",), "needs lockstep: this flies over udp://127.0.0.1:1"),
+        (Choice(board="c", link="udp://127.0.0.1:1"), (), "board c: --floaty-link udp://127.0.0.1:1: only python flies"),
+    ],
+)  # fmt: skip
+def test_what_a_test_needs_decides_whether_it_is_flown(
+    choice: Choice, needs: tuple[str, ...], told: str
+) -> None:
+    reason = why_not(choice, needs)
+    assert reason.startswith(told)
+    assert bool(reason) == bool(told)
+
+
+def test_a_package_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(choices.PACKAGES, "mavlink", "pymavlink_is_not_here")
+    assert why_not(Choice(), ("mavlink",)) == "needs mavlink: pymavlink_is_not_here is not installed"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ({"sedes": 2}, "sedes: did you mean seeds?"),
+        ({"colour": 2}, "colour: expected seeds, boards, profiles, needs"),
+        ({"seeds": 0}, "seeds = 0: expected 1 or more"),
+        ({"boards": ["arm"]}, "boards = 'arm': expected python, c, cortex-m4"),
+        ({"needs": "wings"}, "needs = 'wings': expected python, c, cortex-m4, mavlink, radio, lockstep"),
+    ],
+)
+def test_a_mark_that_cannot_be_is_one_line(words: dict[str, object], told: str) -> None:
+    with pytest.raises(LabError) as error:
+        Marked.of(words)
+    assert str(error.value).startswith(told)
+
+
+def test_a_wrong_mark_fails_the_collection_in_one_line(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("import pytest\n\n@pytest.mark.floaty(sedes=2)\n" + FLY)
+    result = pytester.runpytest_inprocess()
+    result.assert_outcomes(errors=1)
+    assert "test_it: @pytest.mark.floaty: sedes: did you mean seeds?" in result.stdout.str()
+    assert "Traceback" not in result.stdout.str()
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--floaty-board=arm"], "--floaty-board arm: expected python, c, cortex-m4"),
+        (["--floaty-seeds=-1"], "--floaty-seeds -1: expected 1 or more"),
+        (["--floaty-keep=some"], "invalid choice: 'some'"),
+        (["--floaty-link=udp://127.0.0.1:1", "-n2"], "flights in real time fly one at a time; leave -n away"),
+    ],
+)
+def test_an_option_that_cannot_be_is_refused_before_any_test(
+    pytester: pytest.Pytester, options: list[str], told: str
+) -> None:
+    pytester.makepyfile(FLY)
+    result = pytester.runpytest_inprocess(*options)
+    assert result.ret in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.INTERRUPTED)
+    assert told in result.stdout.str() + result.stderr.str()
+
+
+# Records
+
+
+def test_the_junit_file_has_hash_command_and_metrics(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(FLY)
+    pytester.runpytest_inprocess("--junitxml=junit.xml", "--floaty-keep=all")
+    properties = {
+        element.attrib["name"]: element.attrib["value"]
+        for element in ElementTree.parse(pytester.path / "junit.xml").iter("property")
+    }
+    (folder,) = kept(pytester)
+    flown = json.loads((pytester.path / "runs" / "pytest" / folder / "result.json").read_text())
+    assert properties["floaty.hash"] == flown["hash"]
+    assert properties["floaty.again"] == "floaty fly hover --seed 1 --duration 0.3"
+    value, unit = properties["floaty.rms_x"].split()
+    assert (float(value), unit) == (pytest.approx(flown["metrics"]["rms_x"]), "m")
+    assert "floaty.settle" not in properties
+
+
+@pytest.mark.long
+def test_under_xdist_every_test_flies_into_folders_of_its_own_and_the_hashes_are_the_same(
+    pytester: pytest.Pytester,
+) -> None:
+    pytester.makepyfile("""
+        import pytest
+
+        @pytest.mark.floaty(seeds=4)
+        def test_it(floaty):
+            assert floaty.fly(duration_s=0.3).metrics["flown"] > 1.0
+        """)
+    hashes = []
+    for workers in ("-n3", "-n0"):
+        result = pytester.runpytest_subprocess(workers, "--junitxml=junit.xml")
+        result.assert_outcomes(failed=4)
+        assert len(kept(pytester)) == 4
+        cases = ElementTree.parse(pytester.path / "junit.xml").iter("property")
+        hashes.append(sorted(one.attrib["value"] for one in cases if one.attrib["name"] == "floaty.hash"))
+    assert hashes[0] == hashes[1]
+    assert len(set(hashes[0])) == 4
+
+
+def test_the_plugin_loads_nothing_of_the_laboratory_before_a_test_asks() -> None:
+    late = ("numpy", "hil.api", "hypothesis")
+    check = f"import hil.testing.plugin, sys; sys.exit(any(name in sys.modules for name in {late}))"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
+
+
+# The page
+
+
+@pytest.mark.long
+def test_the_examples_of_the_page_work(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    names: dict[str, object] = {}
+    for language, text in blocks(PAGE):
+        assert language == "python"
+        if named := FILE.match(text):
+            path = pytester.path / named[1]
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        else:
+            exec(compile(text, PAGE, "exec"), names)
+    assert 3.0 < names["smallest"].size < 6.0  # type: ignore[attr-defined]
+    pytester.runpytest_inprocess("tests").assert_outcomes(passed=13)

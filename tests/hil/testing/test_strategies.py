@@ -1,0 +1,86 @@
+"""Faults and trajectories for Hypothesis: what they draw is allowed, and the smallest is what an engineer calls small."""
+
+import pickle
+
+import pytest
+from hypothesis import find, given, settings
+from hypothesis import strategies as st
+
+from ground_station.trajectory import Along, Goal
+from hil.errors import LabError
+from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.faults import Fault, parse
+from hil.testing import Waypoints, faults, trajectories
+
+QUICK = settings(database=None, derandomize=True)
+HOME = Goal((0.0, 0.0, 1.15), 0.0)
+
+
+@given(fault=faults(start_s=(0.0, 2.0), duration_s=(0.1, 1.0)))
+@settings(max_examples=200)
+def test_every_fault_is_possible_and_reads_back_from_its_text(fault: Fault) -> None:
+    assert not KINDS[fault.kind].needs
+    assert 0.0 <= fault.start_s <= 2.0
+    assert 0.1 <= fault.duration_s <= 1.0
+    assert parse(str(fault)) == fault
+
+
+@given(fault=faults("push.y", size=(-1.0, 0.5)))
+def test_sizes_stay_within_what_is_asked(fault: Fault) -> None:
+    assert -1.0 <= fault.size <= 0.5
+    assert (fault.start_s, fault.duration_s) == (1.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [("push.y", 0.0), ("wind.fan", 1.0), ("imu.noise", 1.0), ("imu.saturation", 2000.0), ("mocap.latency", 0.0),
+     ("mocap.swap", 0.001), ("servo.slow.1", 1.0)],
+)  # fmt: skip
+def test_the_smallest_fault_is_none_at_all(kind: str, size: float) -> None:
+    smallest = find(faults(kind), lambda fault: True, settings=QUICK)
+    assert smallest.size == pytest.approx(size, rel=0.02)
+
+
+@pytest.mark.parametrize(("bound", "smallest"), [(2.31, 2.4), (-2.31, -2.4)])
+def test_a_failure_shrinks_to_the_first_size_beyond_the_bound(bound: float, smallest: float) -> None:
+    def fails(fault: Fault) -> bool:
+        return fault.size * bound > bound * bound
+
+    found = find(faults("push.y", start_s=(0.5, 3.0)), fails, settings=QUICK)
+    assert (found.size, found.start_s) == (smallest, 0.5)
+
+
+@given(way=trajectories(reach_m=0.05, turn_rad=0.2, every_s=0.5, most=3), t_s=st.floats(0.0, 10.0))
+def test_every_goal_is_within_reach_of_home_where_the_way_begins(way: Along, t_s: float) -> None:
+    path = way(HOME, 0)
+    goal = path.at(round(t_s * 1e6))
+    assert all(abs(now - then) <= 0.05 + 1e-9 for now, then in zip(goal.p_WG, HOME.p_WG, strict=True))
+    assert abs(goal.yaw) <= 0.2
+    assert path.at(499_999) == HOME
+    assert goal == pickle.loads(pickle.dumps(way))(HOME, 0).at(round(t_s * 1e6))
+
+
+def test_a_way_holds_every_goal_as_long_as_it_says_and_the_last_to_the_end() -> None:
+    way = Waypoints(0.5, ((0.01, 0.0, 0.0, 0.0), (0.02, 0.0, 0.0, 0.0)))
+    assert [way(t)[0] for t in (0.0, 0.49, 0.5, 0.99, 1.0, 9.0)] == [0.0, 0.0, 0.01, 0.01, 0.02, 0.02]
+
+
+def test_a_failing_way_shrinks_to_one_goal_on_one_axis() -> None:
+    def fails(way: Along) -> bool:
+        return any(abs(goal[1]) > 0.025 for goal in way.way.goals)  # type: ignore[attr-defined]
+
+    found = find(trajectories(), fails, settings=QUICK)
+    assert found == Along(Waypoints(1.0, ((0.0, 0.03, 0.0, 0.0),)))
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: faults("push.w"), "unknown kind 'push.w'"),
+        (lambda: faults("push.y", start_s=(2.0, 1.0)), "2..1 s: expected from..to"),
+        (lambda: faults("push.y", size=(30.0, 40.0)), "size 30..40: expected some of -20..20"),
+    ],
+)
+def test_what_no_flight_can_have_is_one_line(make: object, told: str) -> None:
+    with pytest.raises(LabError, match=told.replace(".", r"\.")):
+        make()  # type: ignore[operator]
