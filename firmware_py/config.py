@@ -179,6 +179,21 @@ class MavlinkConfig(Section):
     rates: StreamRates
 
 
+class LogicConfig(BaseModel):
+    """Modules of the user's own in the core, and values of their parameters (docs/own-logic.md)."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+    __pydantic_extra__: dict[str, float] = Field(init=False)
+
+    controller: str = Field("", description="file with the control law; empty: the core's")
+    estimator: str = Field("", description="file with the estimator; empty: the core's")
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters' values that differ from the modules' own."""
+        return dict(self.__pydantic_extra__)
+
+
 class FirmwareConfig(Section):
     """Everything that is flashed."""
 
@@ -191,6 +206,7 @@ class FirmwareConfig(Section):
     supervisor: SupervisorConfig
     cpu: CpuConfig
     mavlink: MavlinkConfig
+    logic: LogicConfig = Field(default_factory=LogicConfig)  # of which the profile states what there is
 
 
 def parameters_of(config: FirmwareConfig) -> Block[Parameters]:

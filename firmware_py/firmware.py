@@ -20,6 +20,7 @@ from firmware_py.links.parameters import ParameterService
 from firmware_py.links.platform import PlatformService
 from firmware_py.links.storage import ParameterStorage
 from firmware_py.links.stream import ReadBlock, TelemetryStream
+from firmware_py.logic.loading import load_logic
 from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.parameters import parameters
@@ -67,7 +68,7 @@ class Firmware:
     ) -> None:
         self.kernel = Kernel(preemption=True)
         self._board = board
-        core = CoreBlocks(parameters_of(config), runner)
+        core = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
         core.run.reset()
         core.run.control()
         board.write_compare(core.control.fields.count.tolist())  # hover from the first PWM period on

@@ -5,6 +5,7 @@ Names are the Crazyflie's and the original Floaty's. Limits are those of the con
 """
 
 from collections.abc import Iterator
+from functools import partial
 from math import pi, sqrt
 
 import numpy as np
@@ -23,8 +24,9 @@ from firmware_py.core.structs import Parameters
 from firmware_py.core.subset import F32s
 from firmware_py.links.parameters import Parameter
 from firmware_py.links.stream import TelemetryStream
+from firmware_py.logic.plugs import GROUP
 from firmware_py.supervisor import Manual
-from firmware_py.variables import F32, I16, U8, U16, U32, Running
+from firmware_py.variables import F32, I16, SCALARS, U8, U16, U32, Running
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import STREAM
 
@@ -66,6 +68,7 @@ def parameters(running: Running, stream: TelemetryStream) -> tuple[Parameter, ..
         _field("delayComp.horizon", "10 ms", core, "horizon", PredictorConfig, U8),
         *_kalman(running),
         *_supervision(running, stream),
+        *_own_logic(running),
         *_test_subjects(running),
         *_identity(),
     )  # fmt: skip
@@ -202,6 +205,17 @@ def _supervision(running: Running, stream: TelemetryStream) -> Iterator[Paramete
     )  # fmt: skip
     yield _attribute("supervisor.lowBattery", U16, "mV", supervisor, "low_battery_mv", low_mv, high_mv, True)
     yield Parameter(STREAM, U8, "", lambda: stream.on, lambda value: stream.switch(value == 1), 0, 1)
+
+
+def _own_logic(running: Running) -> Iterator[Parameter]:
+    """What modules of the user's have declared as Tunable."""
+    logic = running.core.logic
+    for own in () if logic is None else logic.loaded.parameters:
+        array, scalar = running.core.named[own.block].memory[own.name], SCALARS[own.base]
+        yield Parameter(
+            f"{GROUP}.{own.name}", scalar, own.mark.unit, partial(array.item, 0), partial(array.__setitem__, 0),
+            own.mark.low, own.mark.high, persistent=True,
+        )  # fmt: skip
 
 
 class _Effects:

@@ -6,6 +6,7 @@ and cause are log variables (`supervisor.state`, `supervisor.cause`). The way ba
     silence         no accepted pose for 500 ms (parameter): the next accepted pose ends it
     out of bounds   the estimator was held at its bounds for 200 ms: ends after 500 ms inside them
     disarmed        by request: ends with the request to arm
+    not finite      own logic put out NaN or infinity, the controller or the estimator: as after an emergency stop
     emergency stop  by request, or because a started emergency stop watchdog was not fed for 1 s: ends only with a
                     recovery request (or a reboot)
     low battery     below the limit for 5 s: ends only with a recovery request when the voltage is back above it
@@ -55,6 +56,8 @@ class Supervisor:
         self._estimator = estimator
         self._announce = announce
         self._stopped = False
+        self._not_finite = Cause.NONE
+        self._controller_faults = self._estimator_faults = 0
         self._battery_empty = False
         self._battery_good_us = 0
         self._watchdog_us: int | None = None  # instant at which it bites, None until it is fed once
@@ -69,7 +72,7 @@ class Supervisor:
     @property
     def can_be_armed(self) -> bool:
         """Whether a request to arm is obeyed: neither a stop nor the battery is in its way."""
-        return not self._stopped and not self._battery_empty
+        return not self._stopped and not self._battery_empty and self._not_finite is Cause.NONE
 
     @property
     def can_fly(self) -> bool:
@@ -114,13 +117,22 @@ class Supervisor:
         return True
 
     def recover(self, now_us: int) -> bool:
-        """Leave the emergency stop and, with a good voltage, the low battery; False when something remains."""
+        """Leave what lasts: stop, logic that failed, and with a good voltage the low battery; False when one remains."""
         self._stopped = False
+        self._not_finite = Cause.NONE
         self._watchdog_us = None
         if self.battery_mv >= self.low_battery_mv:
             self._battery_empty = False
             self._battery_good_us = now_us
         return not self._battery_empty
+
+    def see_logic(self, controller_faults: int, estimator_faults: int) -> None:
+        """Take in how often own logic has put out NaN or infinity."""
+        if estimator_faults > self._estimator_faults:
+            self._not_finite = Cause.ESTIMATOR_NOT_FINITE
+        elif controller_faults > self._controller_faults:
+            self._not_finite = Cause.CONTROLLER_NOT_FINITE
+        self._controller_faults, self._estimator_faults = controller_faults, estimator_faults
 
     def see_battery(self, now_us: int, battery_mv: int) -> None:
         """Take in the supply voltage [mV]."""
@@ -133,6 +145,8 @@ class Supervisor:
     def _state(self, now_us: int) -> tuple[State, Cause]:
         if self._stopped:
             return State.FAILSAFE, Cause.EMERGENCY_STOP
+        if self._not_finite is not Cause.NONE:
+            return State.FAILSAFE, self._not_finite
         if self._battery_empty:
             return State.FAILSAFE, Cause.LOW_BATTERY
         if not self.armed:

@@ -71,6 +71,8 @@ def stabilizer_task(
         if kernel.tick_count >= control_tick:
             control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
             yield from kernel.work(costs.control_us())
+            if core.guard is not None:
+                supervisor.see_logic(int(core.guard.controller_faults), int(core.guard.estimator_faults))
             core.data.fields.mode = i32(supervisor.mode(kernel.now_us))
             yield from kernel.yield_if_pending()
             core.run.control()

@@ -23,6 +23,7 @@ from firmware_py.links.log import LogVariable
 from firmware_py.links.memories import Tester
 from firmware_py.links.platform import PlatformService, supervisor_bits
 from firmware_py.links.stream import ReadBlock
+from firmware_py.logic.plugs import GROUP
 from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.rtos import Queue
@@ -39,6 +40,7 @@ BATTERY_FULL_MV = 4200
 PM_BATTERY, PM_LOW = 0, 3  # pm.state
 
 F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
+SCALARS = {"f32": F32, "i32": Scalar.I32}  # by the core's types
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +86,7 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         *_localisation(running.localisation, estimator),
         *_kalman(estimator),
         *_counters(running),
+        *_own_logic(running.core),
     )
 
 
@@ -183,6 +186,14 @@ def _counters(running: Running) -> Iterator[LogVariable]:
     yield LogVariable("sensors.dropped", U32, "", partial(getattr, running.measurements, "dropped"))
     yield LogVariable("app.overflows", U32, "", partial(getattr, running.platform, "app_overflows"))
     yield LogVariable("memTst.errCntW", U32, "", partial(getattr, running.tester, "errors"))
+
+
+def _own_logic(core: CoreBlocks) -> Iterator[LogVariable]:
+    """What modules of the user's have declared as Logged."""
+    for own in () if core.logic is None else core.logic.loaded.variables:
+        array = core.named[own.block].memory[own.field]
+        read = partial(array.item, 0) if own.index is None else partial(array.item, 0, own.index)
+        yield LogVariable(f"{GROUP}.{own.name}", SCALARS[own.base], own.unit, read)
 
 
 def _rejected(estimator: Estimator) -> int:

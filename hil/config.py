@@ -13,7 +13,9 @@ from typing import Any, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from firmware_py.config import FirmwareConfig
+from firmware_py.config import FirmwareConfig, LogicConfig
+from firmware_py.errors import FirmwareError
+from firmware_py.logic.loading import load_logic
 from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
 from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, RadioConfig, SerialConfig
 from hil.errors import LabError
@@ -73,10 +75,24 @@ def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -
     tree = _read_profile(profile, ())
     for override in overrides:
         _apply(tree, override)
+    _locate_logic(tree, Path.cwd())
     try:
-        return LabConfig.model_validate(tree)
+        config = LabConfig.model_validate(tree)
+        load_logic(config.logic)
     except ValidationError as error:
         raise LabError("; ".join(_explain(tree, detail) for detail in error.errors()[:3])) from None
+    except FirmwareError as error:
+        raise LabError(str(error)) from None
+    return config
+
+
+def _locate_logic(tree: dict[str, Any], folder: Path) -> None:
+    """Make the paths in `[logic]`, which begin at this folder, absolute."""
+    section = tree.get("logic")
+    if isinstance(section, dict):
+        for key in LogicConfig.model_fields.keys() & section.keys():
+            if isinstance(section[key], str) and section[key]:
+                section[key] = str((folder / section[key]).resolve())
 
 
 def _read_profile(profile: str, children: tuple[Path, ...]) -> dict[str, Any]:
@@ -87,6 +103,7 @@ def _read_profile(profile: str, children: tuple[Path, ...]) -> dict[str, Any]:
         raise LabError(f"profile {profile}: {error.strerror or error}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise LabError(f"profile {path}: not TOML: {error}") from None
+    _locate_logic(tree, path.parent)
     base = tree.pop("base", None)
     if base is None:
         return tree

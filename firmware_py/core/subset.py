@@ -14,6 +14,7 @@ NUMBA_DISABLE_JIT=1 they stay plain Python that a debugger can step through.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeAlias, TypeVar, cast
 
@@ -37,19 +38,40 @@ S_co = TypeVar("S_co", bound="Struct", covariant=True)
 Memory: TypeAlias = Sequence[S]  # a one-element array of structs: what an entry kernel takes
 
 
+@dataclass(frozen=True, slots=True)
+class Tunable:
+    """Marks a field as a parameter of own logic: `Annotated[f32, Tunable(0.5, "rad/m", low=-5.0, high=5.0)]`.
+
+    The bounds are inclusive; the unit of a pure number is "".
+    """
+
+    default: float
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Logged:
+    """Marks a field of own logic's memory as a log variable: `Annotated[f32, Logged("m s")]`."""
+
+    unit: str
+
+
 class Block(Generic[S_co]):
-    """The memory of one struct instance.
+    """The memory of one struct instance, of which `kind` is the class.
 
     `memory` is a structured array of shape (1,), `fields` gives attribute access to it from outside the core, as if it
     were the struct (array fields are views), `arg` is what an entry kernel takes: the memory, or the fields when nothing
     is compiled.
     """
 
-    __slots__ = ("arg", "fields", "memory")
+    __slots__ = ("arg", "fields", "kind", "memory")
 
-    def __init__(self, dtype: np.dtype[Any], view: type[Any]) -> None:
-        self.memory: NDArray[Any] = np.zeros(1, dtype)
-        self.fields = cast(S_co, view(self.memory))
+    def __init__(self, kind: type[S_co]) -> None:
+        self.kind = kind
+        self.memory: NDArray[Any] = np.zeros(1, kind.dtype)
+        self.fields = cast(S_co, kind._view(self.memory))
         self.arg = cast(Memory[S_co], [self.fields] if compiling.PLAIN else self.memory)
 
     def bytes(self) -> bytes:
@@ -72,7 +94,7 @@ def _scalar_property(name: str) -> property:
 class Struct:
     """Base of the state structs; annotations are the fields in the order of the C struct.
 
-    Array fields are written `Annotated[F32s, 16, 16]` or `Annotated[I32s, 3]`.
+    Array fields are written `Annotated[F32s, 16, 16]` or `Annotated[I32s, 3]`; own logic adds `Tunable` and `Logged`.
     """
 
     dtype: ClassVar[np.dtype[Any]]
@@ -81,8 +103,10 @@ class Struct:
     def __init_subclass__(cls) -> None:
         columns: list[Any] = []
         for name, kind in cls.__annotations__.items():
-            shape = getattr(kind, "__metadata__", ())
-            element = kind if not shape else f32 if kind.__origin__ == F32s else i32
+            shape = tuple(size for size in getattr(kind, "__metadata__", ()) if isinstance(size, int))
+            element = getattr(kind, "__origin__", kind)
+            if shape:
+                element = f32 if element == F32s else i32
             columns.append((name, element, shape) if shape else (name, element))
         cls.dtype = np.dtype(columns, align=True)
         scalars = tuple(column[0] for column in columns if len(column) == 2)
@@ -102,4 +126,4 @@ class Struct:
     @classmethod
     def allocate(cls) -> Block[Self]:
         """Return a zeroed instance."""
-        return Block(cls.dtype, cls._view)
+        return Block(cls)

@@ -3,23 +3,27 @@
 from functools import partial
 from pathlib import Path
 
+from firmware_py.config import LogicConfig
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from firmware_py.export.arm_image import build_image, build_meter
-from firmware_py.export.c99 import translate
 from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
 from firmware_py.export.native import NativeRunner, build
+from firmware_py.logic.loading import translation_of
 
 PYTHON, C, CORTEX_M4 = "python", "c", "cortex-m4"
 BOARDS = (PYTHON, C, CORTEX_M4)
 
 
-def runner_of(board: str, folder: Path) -> RunnerFactory:
-    """Return what executes the core on a board; `folder` keeps what is compiled. Raises `ExportError`."""
+def runner_of(board: str, folder: Path, logic: LogicConfig) -> RunnerFactory:
+    """Return what executes the core on a board; `folder` keeps what is compiled.
+
+    Raises `ExportError`, and `LogicError` as `load_logic` does.
+    """
     if board == PYTHON:
         return PythonRunner
     if board == CORTEX_M4:
         find_emulator()
-    core = translate()
+    core = translation_of(logic)
     if board == C:
         return partial(NativeRunner, library=build(core, folder))
     image = build_image(core.source, core.header, folder)

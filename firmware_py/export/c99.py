@@ -12,15 +12,18 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 
 from firmware_py import core
-from firmware_py.core import structs
 from firmware_py.export.errors import ExportError
 from firmware_py.export.functions import C_TYPES, FunctionPrinter, block_comment, constant_definition
 from firmware_py.export.locals import find_writes
 from firmware_py.export.reading import read_modules
 from firmware_py.export.syntax import SHARED, Constant, Kernel, Module, StructType
+
+NO_PATHS: Mapping[str, str] = {}
+WORD = 4  # bytes of every number
 
 __all__ = ["ExportError", "Translation", "core_texts", "translate"]
 
@@ -58,11 +61,14 @@ def core_texts() -> dict[str, str]:
     return {path.stem: path.read_text("utf-8") for path in paths if path.stem not in ("__init__", "subset")}
 
 
-def translate(texts: Mapping[str, str] | None = None) -> Translation:
-    """Return the core as C; `texts` replaces its sources. Raises `ExportError` for anything outside the subset."""
+def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = NO_PATHS) -> Translation:
+    """Return the core as C; `texts` replaces its sources, `own` has the files of those that are the user's.
+
+    Raises `ExportError` for anything outside the subset.
+    """
     texts = core_texts() if texts is None else texts
-    modules = read_modules(texts)
-    kernels = [thing for module in modules for thing in module.own if isinstance(thing, Kernel)]
+    modules = read_modules(texts, own)
+    kernels = [thing for module in modules for thing in module.defined if isinstance(thing, Kernel)]
     _tell_constants_apart(modules)
     for kernel in kernels:
         find_writes(kernel)
@@ -81,7 +87,7 @@ def translate(texts: Mapping[str, str] | None = None) -> Translation:
 
 def _tell_constants_apart(modules: list[Module]) -> None:
     """Put the module's name before the constants that several modules define."""
-    owned = [(module, thing) for module in modules for thing in module.own if isinstance(thing, Constant)]
+    owned = [(module, thing) for module in modules for thing in module.defined if isinstance(thing, Constant)]
     counts = Counter(constant.c_name for _, constant in owned)
     for module, constant in owned:
         if counts[constant.c_name] > 1:
@@ -90,13 +96,13 @@ def _tell_constants_apart(modules: list[Module]) -> None:
 
 def _header(modules: list[Module], public: list[FunctionPrinter], version: str) -> str:
     shared = next((module for module in modules if module.name == SHARED), None)
-    own = shared.own if shared else []
+    own = shared.defined if shared else []
     parts = [
         block_comment(f"The flight core of Floaty.\n\n{shared.doc if shared else ''}\n\n{GENERATED}"),
         "#ifndef FLOATY_CORE_H\n#define FLOATY_CORE_H\n\n#include <stdint.h>\n\n",
         f'#define FLOATY_CORE_VERSION "{version}"  // hash of the Python sources\n\n',
         "".join(constant_definition(thing) + "\n" for thing in own if isinstance(thing, Constant)),
-        *(f"\n{_struct(thing)}" for thing in own if isinstance(thing, StructType)),
+        *(f"\n{_struct(thing)}" for thing in _structs(modules)),
         "\n/* A profile as written by profile_c.py: a hash of its values, and the call that writes them. */\n",
         "extern const char floaty_profile_hash[];\n",
         "void floaty_core_init(FloatyParameters *parameters);\n",
@@ -106,6 +112,10 @@ def _header(modules: list[Module], public: list[FunctionPrinter], version: str) 
         parts.append(f"\n{block_comment(doc)}{printer.signature()};\n")
     parts.append("\n#endif\n")
     return "".join(parts)
+
+
+def _structs(modules: list[Module]) -> list[StructType]:
+    return [thing for module in modules for thing in module.defined if isinstance(thing, StructType)]
 
 
 def _struct(struct: StructType) -> str:
@@ -129,16 +139,17 @@ def _source(modules: list[Module], printed: Mapping[str, str], used: set[int]) -
     for module in modules:
         own = [
             thing
-            for thing in module.own
+            for thing in module.defined
             if isinstance(thing, Constant) and not thing.shared and id(thing) in used
         ]
         functions = [
             printed[thing.c_name]
-            for thing in module.own
+            for thing in module.defined
             if isinstance(thing, Kernel) and thing.c_name in printed
         ]
         if own or functions:
-            parts.append("\n" + block_comment(f"{module.path}\n\n{module.doc}"))
+            path = Path(module.path).name if module.own else module.path
+            parts.append("\n" + block_comment(f"{path}\n\n{module.doc}"))
         if own:
             parts.append("\n" + "".join(f"{constant_definition(thing)}\n" for thing in own))
         parts += [f"\n{function}" for function in functions]
@@ -148,10 +159,10 @@ def _source(modules: list[Module], printed: Mapping[str, str], used: set[int]) -
 def _layout(modules: list[Module]) -> str:
     """Return checks that the structs lie in memory as numpy lays them out."""
     lines = ["\n/* The structs lie in memory as the emulator has them. */\n", CHECK]
-    for struct in (thing for module in modules for thing in module.own if isinstance(thing, StructType)):
-        dtype = getattr(structs, struct.name).dtype
-        name = f"Floaty{struct.name}"
-        lines.append(f"LAYOUT({name}, sizeof({name}) == {dtype.itemsize});\n")
-        for column, (_, offset) in ((column, dtype.fields[column][:2]) for column in dtype.names):
-            lines.append(f"LAYOUT({name}_{column}, offsetof({name}, {column}) == {offset});\n")
+    for struct in _structs(modules):
+        name, place, offsets = f"Floaty{struct.name}", 0, []
+        for field in struct.fields.values():
+            offsets.append(f"LAYOUT({name}_{field.name}, offsetof({name}, {field.name}) == {place});\n")
+            place += WORD * prod(field.kind.shape)
+        lines += [f"LAYOUT({name}, sizeof({name}) == {place});\n", *offsets]
     return "".join(lines)

@@ -11,17 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.core.structs import Control, Estimator, Input, Parameters
-from firmware_py.core.subset import Block, Struct, f32, i32
-from firmware_py.core_runner import CoreBlocks
+from firmware_py.core.subset import f32, i32
 
-STRUCTS = (Parameters, Input, Estimator, Control)
 WORD = np.dtype(np.uint32)
-
-
-def blocks_of(blocks: CoreBlocks) -> tuple[Block[Struct], Block[Struct], Block[Struct], Block[Struct]]:
-    """Return the blocks in the order of `STRUCTS`."""
-    return blocks.parameters, blocks.data, blocks.estimator, blocks.control
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The flight core as ARM machine code, executed instruction by instruction by the emulator unicorn.
 
-An emulated Cortex-M4F has the image in flash and the four structs with a stack in RAM. A call copies the structs in,
+An emulated Cortex-M4F has the image in flash and the structs with a stack in RAM. A call copies the structs in,
 runs one entry point to its end and copies them out: what comes back is what the board would compute. On the way,
 `arm/meter.c` counts instructions and cycles, which become the processor time of the tasks: upper figures of ARM's manual
 for every instruction, flash read through a cache that is empty when the call begins, 168 MHz.
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.arm_image import FLASH, FLASH_SIZE, Image
@@ -25,6 +26,8 @@ RAM = 0x2000_0000
 RAM_SIZE = 0x8000
 STACK_TOP = RAM + RAM_SIZE  # full descending
 STACK_PATTERN = 0xA5
+STACK_LEAST = 0x1000
+REGISTERS = 4  # that carry arguments
 ALIGNMENT = 16
 UNDEFINED = b"\xde"  # two of them are UDF: whoever goes astray in empty flash is stopped
 LANDING = FLASH + FLASH_SIZE - 16  # where a call returns to, and stops
@@ -71,7 +74,7 @@ class Usage:
     """What the core takes of the board: memory, and by entry point processor time."""
 
     flash_bytes: int
-    ram_bytes: int  # the four structs
+    ram_bytes: int  # the structs
     stack_bytes: int  # the deepest that it has been
     entries: dict[str, Load]
 
@@ -89,7 +92,7 @@ class CortexM4Runner:
     """A `CoreRunner` and a `CoreCosts`; `load` counts by entry point, `instructions` is that of the last call.
 
     `blocks` must have the layout for which the image was exported; `meter` is what `build_meter` returned.
-    Raises `ExportError` when unicorn is missing.
+    Raises `ExportError` when unicorn is missing, or the blocks are too large for the RAM.
     """
 
     def __init__(self, blocks: CoreBlocks, image: Image, meter: Path) -> None:
@@ -110,27 +113,28 @@ class CortexM4Runner:
         self._ram[:] = STACK_PATTERN
         ram = self._ram.ctypes.data
         self._cpu.mem_map_ptr(RAM, RAM_SIZE, unicorn_const.UC_PROT_READ | unicorn_const.UC_PROT_WRITE, ram)
-        shared = (blocks.parameters, blocks.data, blocks.estimator, blocks.control)
-        self._here = tuple(block.memory.view(np.uint8) for block in shared)
+        self._here = tuple(block.memory.view(np.uint8) for block in blocks.named.values())
         sizes = [-(-memory.size // ALIGNMENT) * ALIGNMENT for memory in self._here]
         places = [sum(sizes[:index]) for index in range(len(sizes) + 1)]
         self._stack_end = places[-1]
+        if self._stack_end > RAM_SIZE - STACK_LEAST:
+            raise ExportError(
+                f"the core's memory is {self._stack_end} bytes: at most {RAM_SIZE - STACK_LEAST} fit"
+            )
         self._there = tuple(
             self._ram[place : place + memory.size]
             for place, memory in zip(places[:-1], self._here, strict=True)
         )
-        p, d, e, c = (RAM + place for place in places[:-1])
-        arguments = {
-            "reset": (p, e),
-            "file_pose": (p, d, e),
-            "estimate": (p, d, e, c),
-            "control": (p, d, e, c),
-        }
+        addresses = dict(zip(blocks.named, (RAM + place for place in places), strict=False))
         r0, sp, lr = self._result, arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_LR
-        self._registers = {
-            name: ((sp, STACK_TOP), (lr, LANDING | 1), *((r0 + i, place) for i, place in enumerate(given)))
-            for name, given in arguments.items()
-        }
+        self._registers = {}
+        self._stacked: dict[str, NDArray[np.uint32]] = {}  # the arguments behind the fourth
+        for name, listed in blocks.calls.items():
+            given = [addresses[block] for block in listed]
+            self._stacked[name] = np.array(given[REGISTERS:], np.uint32)
+            top = STACK_TOP - -(-self._stacked[name].nbytes // 8) * 8
+            registers = ((r0 + i, place) for i, place in enumerate(given[:REGISTERS]))
+            self._registers[name] = ((sp, top), (lr, LANDING | 1), *registers)
         self._meter = Meter(image, meter, self._cpu)
         self._filed_cycles = 0  # for poses since the last step of the estimator
         self._ahead: tuple[str, bytes] | None = None  # the call that RAM holds the results of, and its inputs
@@ -175,7 +179,7 @@ class CortexM4Runner:
 
     @property
     def ram_bytes(self) -> int:
-        """The memory of the four structs."""
+        """The memory of the structs."""
         return sum(memory.size for memory in self._here)
 
     @property
@@ -206,6 +210,10 @@ class CortexM4Runner:
         for here, there in zip(self._here, self._there, strict=True):
             there[:] = here
         self._cpu.reg_write_batch(self._registers[name])
+        stacked = self._stacked[name].view(np.uint8)
+        if stacked.size:
+            top = self._registers[name][0][1] - RAM
+            self._ram[top : top + stacked.size] = stacked
         self._meter.start()
         try:
             self._cpu.emu_start(self.image.entries[name], LANDING)

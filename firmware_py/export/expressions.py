@@ -9,6 +9,7 @@ import ast
 from dataclasses import dataclass
 
 from firmware_py.export.errors import ExportError, refusal
+from firmware_py.export.hints import CONSTRUCTS, FUNCTIONS, instead
 from firmware_py.export.reading import constant_literal
 from firmware_py.export.syntax import (
     BOOL,
@@ -18,7 +19,6 @@ from firmware_py.export.syntax import (
     Kernel,
     Kind,
     Module,
-    StructType,
 )
 
 PRIMARY, UNARY, PRODUCT, SUM, COMPARISON, AND, OR = 9, 8, 7, 6, 5, 3, 2
@@ -96,7 +96,8 @@ class Expressions:
                 return self._boolean(node)
             case ast.Call():
                 return self._call(node, alone)
-        raise self.refuse(node, f"{type(node).__name__} expression")
+        name = type(node).__name__
+        raise self.refuse(node, f"{name} expression{instead(CONSTRUCTS, name)}")
 
     def _literal(self, node: ast.Constant) -> Value:
         if isinstance(node.value, bool):
@@ -121,8 +122,8 @@ class Expressions:
     def _field(self, node: ast.Attribute) -> Value:
         if not isinstance(node.value, ast.Name) or node.value.id not in self.names:
             raise self.refuse(node, f"{ast.unparse(node)} is no field of a struct")
-        struct = self.module.names.get(self.names[node.value.id].base)
-        if not isinstance(struct, StructType) or node.attr not in struct.fields:
+        struct = self.names[node.value.id].struct
+        if struct is None or node.attr not in struct.fields:
             raise self.refuse(node, f"{ast.unparse(node)} is no field of a struct")
         self.read.add(node.value.id)
         return Value(f"{node.value.id}->{node.attr}", struct.fields[node.attr].kind)
@@ -150,10 +151,12 @@ class Expressions:
         left, right = self.value(node.left), self.value(node.right)
         name = type(node.op).__name__
         if left.kind != right.kind or left.kind not in (F32, I32):
-            raise self.refuse(node, f"{name} of {describe(left.kind)} and {describe(right.kind)}")
+            raise self.refuse(
+                node, f"{name} of {describe(left.kind)} and {describe(right.kind)}{instead(CONSTRUCTS, name)}"
+            )
         operators = FLOAT_OPERATORS if left.kind == F32 else INTEGER_OPERATORS
         if type(node.op) not in operators:
-            raise self.refuse(node, f"{name} of {describe(left.kind)}")
+            raise self.refuse(node, f"{name} of {describe(left.kind)}{instead(CONSTRUCTS, name)}")
         sign, strength = operators[type(node.op)]
         return Value(f"{left.within(strength)} {sign} {right.within(strength + 1)}", left.kind, strength)
 
@@ -194,7 +197,7 @@ class Expressions:
             return Value(f"{FLOAT_FUNCTIONS[name]}({self.scalar(node.args[0], F32, f'{name} of').text})", F32)
         kernel = self.module.names.get(name)
         if not isinstance(kernel, Kernel):
-            raise self.refuse(node, f"call of {name}, which is no kernel")
+            raise self.refuse(node, f"call of {name}, which is no kernel{instead(FUNCTIONS, name)}")
         if kernel.writes and not alone:
             raise self.refuse(
                 node, f"{name} writes through its arguments: its call stands alone in a statement"

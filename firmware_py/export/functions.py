@@ -4,6 +4,7 @@ import ast
 import textwrap
 
 from firmware_py.export.expressions import Expressions, describe
+from firmware_py.export.hints import CONSTRUCTS, instead
 from firmware_py.export.locals import find_locals
 from firmware_py.export.syntax import BOOL, I32, VOID, Constant, Kernel, Kind
 
@@ -21,7 +22,7 @@ class FunctionPrinter:
         self._lines: list[str] = []
         self._said = kernel.node.body[0].end_lineno or 0  # comments up to this line are printed
         self._body = kernel.node.body[1:] if ast.get_docstring(kernel.node) else kernel.node.body
-        if not ast.get_docstring(kernel.node):
+        if not (kernel.scope.own or ast.get_docstring(kernel.node)):
             raise self._print.refuse(kernel.node, "no docstring")
 
     @property
@@ -97,7 +98,8 @@ class FunctionPrinter:
             case ast.For():
                 self._for(node, depth)
             case _:
-                raise self._print.refuse(node, f"{type(node).__name__} statement")
+                name = type(node).__name__
+                raise self._print.refuse(node, f"{name} statement{instead(CONSTRUCTS, name)}")
 
     def _assign_local(self, node: ast.Assign, target: ast.Name, depth: int) -> None:
         name, local = target.id, self._locals[target.id]

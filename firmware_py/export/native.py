@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from firmware_py.core.subset import Block, Struct
 from firmware_py.core_runner import CoreBlocks
@@ -112,18 +113,17 @@ class NativeRunner:
     def __init__(self, blocks: CoreBlocks, library: Path) -> None:
         self._blocks = blocks  # keeps the memory alive
         code = ctypes.CDLL(str(library.absolute()))
-        for function in (code.floaty_core_reset, code.floaty_core_estimate, code.floaty_core_control):
-            function.restype = None
-        everything = (blocks.parameters, blocks.data, blocks.estimator, blocks.control)
-        parameters, data, estimator, control = map(_address, everything)
-        self.reset: Callable[[], None] = partial(code.floaty_core_reset, parameters, estimator)
-        self.file_pose: Callable[[], int] = partial(code.floaty_core_file_pose, parameters, data, estimator)
-        self.estimate: Callable[[], None] = partial(
-            code.floaty_core_estimate, parameters, data, estimator, control
-        )
-        self.control: Callable[[], None] = partial(
-            code.floaty_core_control, parameters, data, estimator, control
-        )
+        places = {name: _address(block) for name, block in blocks.named.items()}
+
+        def call(name: str) -> Callable[[], Any]:
+            function = code[f"floaty_core_{name}"]
+            function.restype = ctypes.c_int32 if name == "file_pose" else None
+            return partial(function, *(places[block] for block in blocks.calls[name]))
+
+        self.reset: Callable[[], None] = call("reset")
+        self.file_pose: Callable[[], int] = call("file_pose")
+        self.estimate: Callable[[], None] = call("estimate")
+        self.control: Callable[[], None] = call("control")
 
 
 def _address(block: Block[Struct]) -> ctypes.c_void_p:

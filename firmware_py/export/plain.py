@@ -1,9 +1,11 @@
 """The flight core as plain Python, in a process of its own: numba is switched on or off for a whole process.
 
 `PlainRunner` is the parent's end, `serve` the child's. A call goes over the pipe as one byte, its index in `CALLS`, and the
-memory of the four blocks; the result, an int32, and the memory come back.
+memory of all blocks; the result, an int32, and the memory come back. The child learns from its arguments which logic of
+the user's own flies.
 """
 
+import json
 import os
 import signal
 import struct
@@ -16,13 +18,13 @@ from typing import BinaryIO
 import numpy as np
 
 from firmware_py.compiling import PLAIN
+from firmware_py.config import LogicConfig
 from firmware_py.core.structs import Parameters
 from firmware_py.core_runner import CoreBlocks, PythonRunner
-from firmware_py.export.compare import STRUCTS, blocks_of
 from firmware_py.export.errors import ExportError
+from firmware_py.logic.loading import Logic, load_logic
 
 CALLS = ("reset", "file_pose", "estimate", "control")
-SIZES = tuple(kind.dtype.itemsize for kind in STRUCTS)
 RESULT = struct.Struct("<i")
 
 
@@ -32,9 +34,10 @@ class PlainRunner:
     def __init__(self, blocks: CoreBlocks) -> None:
         root = str(Path(__file__).parents[2])
         path = os.pathsep.join((root, *filter(None, (os.environ.get("PYTHONPATH"),))))
-        self._memories = [block.memory for block in blocks_of(blocks)]
+        self._memories = _memories(blocks)
+        files = {} if blocks.logic is None else dict(blocks.logic.loaded.files)
         self._child = subprocess.Popen(
-            [sys.executable, "-m", "firmware_py.export.plain"],
+            [sys.executable, "-m", "firmware_py.export.plain", json.dumps(files)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": path},
@@ -74,12 +77,21 @@ class PlainRunner:
             up.flush()
         except BrokenPipeError:
             raise ExportError("plain Python: the child process has ended") from None
-        answer = down.read(RESULT.size + sum(SIZES))
-        if len(answer) < RESULT.size + sum(SIZES):
+        size = RESULT.size + _size(self._memories)
+        answer = down.read(size)
+        if len(answer) < size:
             raise ExportError("plain Python: the child process has ended in the middle of a call")
         _spread(answer[RESULT.size :], self._memories)
         result: int = RESULT.unpack_from(answer)[0]
         return result
+
+
+def _memories(blocks: CoreBlocks) -> list[np.ndarray]:
+    return [block.memory for block in blocks.named.values()]
+
+
+def _size(memories: list[np.ndarray]) -> int:
+    return sum(memory.nbytes for memory in memories)
 
 
 def _spread(data: bytes, memories: list[np.ndarray]) -> None:
@@ -90,11 +102,12 @@ def _spread(data: bytes, memories: list[np.ndarray]) -> None:
         offset += memory.nbytes
 
 
-def serve(calls: BinaryIO, answers: BinaryIO) -> None:
+def serve(calls: BinaryIO, answers: BinaryIO, logic: Logic | None) -> None:
     """Execute calls until the other end closes."""
-    blocks = CoreBlocks(Parameters.allocate(), PythonRunner)
-    memories = [block.memory for block in blocks_of(blocks)]
-    while len(call := calls.read(1 + sum(SIZES))) == 1 + sum(SIZES):
+    blocks = CoreBlocks(Parameters.allocate(), PythonRunner, logic)
+    memories = _memories(blocks)
+    size = 1 + _size(memories)
+    while len(call := calls.read(size)) == size:
         _spread(call[1:], memories)
         with np.errstate(all="ignore"):  # infinities and NaN are the comparison's business
             result = getattr(blocks.run, CALLS[call[0]])()
@@ -105,4 +118,4 @@ def serve(calls: BinaryIO, answers: BinaryIO) -> None:
 if __name__ == "__main__":
     assert PLAIN
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
-    serve(sys.stdin.buffer, sys.stdout.buffer)
+    serve(sys.stdin.buffer, sys.stdout.buffer, load_logic(LogicConfig(**json.loads(sys.argv[1]))))

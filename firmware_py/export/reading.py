@@ -7,16 +7,20 @@ import ast
 import io
 import tokenize
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from firmware_py.export.errors import refusal
+from firmware_py.core.subset import Logged, Tunable
+from firmware_py.export import hints
+from firmware_py.export.errors import ExportError, refusal
 from firmware_py.export.syntax import (
     ARRAYS,
     C_KEYWORDS,
     ENTRY,
     F32,
     I32,
+    OWN,
     PACKAGE,
     SCALARS,
     SHARED,
@@ -31,33 +35,48 @@ from firmware_py.export.syntax import (
     StructType,
 )
 
+MARKS: Mapping[str, type[Any]] = {"Tunable": Tunable, "Logged": Logged}
+MARK_FORM = 'Tunable(default, "unit", low=.., high=..) of a parameter, or Logged("unit") of the memory'
 
-def read_modules(texts: Mapping[str, str]) -> list[Module]:
-    """Return the modules that the entry module needs, each after those that it imports; texts by module name."""
+
+def read_modules(texts: Mapping[str, str], own: Mapping[str, str], first: str = ENTRY) -> list[Module]:
+    """Return the modules that the `first` one needs, each after those that it imports; texts by module name.
+
+    `own` has the files of those that are the user's, for whom errors say what to write instead.
+    """
     done: dict[str, Module] = {}
-    _read_after_imports(ENTRY, texts, done, ())
+    _read_after_imports(first, texts, own, done, ())
     return list(done.values())
 
 
 def _read_after_imports(
-    name: str, texts: Mapping[str, str], done: dict[str, Module], chain: tuple[str, ...]
+    name: str,
+    texts: Mapping[str, str],
+    own: Mapping[str, str],
+    done: dict[str, Module],
+    chain: tuple[str, ...],
 ) -> None:
     if name in done:
         return
-    path = f"firmware_py/core/{name}.py"
-    tree = ast.parse(texts[name], path)
+    path = own.get(name, f"firmware_py/core/{name}.py")
+    try:
+        tree = ast.parse(texts[name], path)
+    except SyntaxError as error:
+        raise ExportError(f"{path}:{error.lineno}: {error.msg}") from None
     for node in tree.body:
         for needed in _imported_modules(node):
             if needed in chain or needed == name or needed not in texts:
                 raise refusal(path, node, f"cannot import {needed}: not a module of the core, or in a circle")
-            _read_after_imports(needed, texts, done, (*chain, name))
-    done[name] = _Reader(name, path, texts[name], tree, done).module
+            _read_after_imports(needed, texts, own, done, (*chain, name))
+    done[name] = _Reader(
+        Module(name, path, ast.get_docstring(tree) or "", name in own), texts[name], tree, done
+    ).module
 
 
 def _imported_modules(node: ast.stmt) -> list[str]:
     if not isinstance(node, ast.ImportFrom):
         return []
-    if node.module == PACKAGE:
+    if node.module in (PACKAGE, OWN):
         return [alias.name for alias in node.names]
     if node.module and node.module.startswith(PACKAGE + ".") and node.module != SUBSET:
         return [node.module.removeprefix(PACKAGE + ".")]
@@ -67,8 +86,9 @@ def _imported_modules(node: ast.stmt) -> list[str]:
 class _Reader:
     """Reads one module."""
 
-    def __init__(self, name: str, path: str, text: str, tree: ast.Module, done: dict[str, Module]) -> None:
-        self.module = Module(name, path, ast.get_docstring(tree) or "")
+    def __init__(self, module: Module, text: str, tree: ast.Module, done: dict[str, Module]) -> None:
+        self.module = module
+        self._tree = tree
         self._done = done
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
             if token.type == tokenize.COMMENT:
@@ -84,29 +104,37 @@ class _Reader:
         match node:
             case ast.Expr(value=ast.Constant(value=str())):
                 return
+            case ast.Import() | ast.ImportFrom(module="numpy" | "math"):
+                place, reason = hints.first_use(self._tree, node)
+                raise refusal(self.module.path, place, reason)
             case ast.ImportFrom():
                 self._import(node)
             case ast.Assign(targets=[ast.Name(id=name)]):
                 self._assign(node, name)
             case ast.ClassDef():
-                self._define(node.name, self._struct(node))
+                self._define(node.name, self._struct(node), node)
             case ast.FunctionDef():
-                self._define(node.name, self._kernel(node))
+                self._define(node.name, self._kernel(node), node)
             case _:
                 raise refusal(self.module.path, node, f"{type(node).__name__} at the top of a module")
 
-    def _define(self, name: str, thing: Named) -> None:
+    def _define(self, name: str, thing: Named, node: ast.stmt) -> None:
+        if name in self.module.names or name in self.module.builtins:
+            raise refusal(self.module.path, node, f"{name}: this name exists already")
         self.module.names[name] = thing
-        self.module.own.append(thing)
+        self.module.defined.append(thing)
 
     def _import(self, node: ast.ImportFrom) -> None:
         if node.module == SUBSET:
             self.module.builtins |= {alias.name for alias in node.names}
-        elif node.module == PACKAGE:
+        elif node.module in (PACKAGE, OWN):
             self.module.names |= {alias.name: self._done[alias.name] for alias in node.names}
         elif node.module and node.module.startswith(PACKAGE + "."):
             source = self._done[node.module.removeprefix(PACKAGE + ".")]
-            self.module.names |= {alias.name: source.names[alias.name] for alias in node.names}
+            for alias in node.names:
+                if alias.name not in source.names:
+                    raise refusal(self.module.path, node, f"{node.module} has no {alias.name}")
+                self.module.names[alias.name] = source.names[alias.name]
         elif node.module != "typing":
             raise refusal(self.module.path, node, f"import from {node.module}")
         if any(alias.asname for alias in node.names):
@@ -126,7 +154,7 @@ class _Reader:
         kind, text = literal
         shared = self.module.name == SHARED
         c_name = f"FLOATY_{name}" if shared else name
-        self._define(name, Constant(c_name, kind, text, self.module.comment(node), shared))
+        self._define(name, Constant(c_name, kind, text, self.module.comment(node), shared), node)
 
     def _struct(self, node: ast.ClassDef) -> StructType:
         if [ast.unparse(base) for base in node.bases] != ["Struct"]:
@@ -135,26 +163,48 @@ class _Reader:
         for line in node.body:
             if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name) and line.value is None:
                 name = self._identifier(line.target.id, line)
-                kind = self._field_kind(line.annotation, line)
-                fields[name] = StructField(
-                    name, kind, self.module.above(line.lineno), self.module.comment(line)
-                )
+                if name in fields:
+                    raise refusal(self.module.path, line, f"{name}: this name exists already")
+                kind, mark = self._field_kind(line.annotation, line)
+                above, comment = self.module.above(line.lineno), self.module.comment(line)
+                fields[name] = StructField(name, kind, above, comment, line.lineno, mark)
             elif not (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant)):
                 raise refusal(self.module.path, line, "a struct has nothing but fields")
-        return StructType(node.name, ast.get_docstring(node) or "", fields)
+        if not fields:
+            raise refusal(self.module.path, node, f"struct {node.name} has no field")
+        prefix = self.module.name.removeprefix("own_").capitalize() if self.module.own else ""
+        return StructType(prefix + node.name, ast.get_docstring(node) or "", fields)
 
-    def _field_kind(self, annotation: ast.expr, node: ast.stmt) -> Kind:
+    def _field_kind(self, annotation: ast.expr, node: ast.stmt) -> tuple[Kind, Tunable | Logged | None]:
         match annotation:
             case ast.Name(id="f32" | "i32" as base):
-                return Kind(base)
+                return Kind(base), None
             case ast.Subscript(
-                value=ast.Name(id="Annotated"), slice=ast.Tuple(elts=[ast.Name(id=array), *sizes])
+                value=ast.Name(id="Annotated"), slice=ast.Tuple(elts=[ast.Name(id=name), *rest])
             ):
-                values = [size.value for size in sizes if isinstance(size, ast.Constant)]
+                mark = self._mark(rest.pop(), node) if rest and isinstance(rest[-1], ast.Call) else None
+                values = [size.value for size in rest if isinstance(size, ast.Constant)]
                 shape = tuple(value for value in values if isinstance(value, int))
-                if array in ARRAYS and len(shape) == len(sizes) in (1, 2):
-                    return Kind(ARRAYS[array], len(shape), shape)
+                if name in ARRAYS and len(shape) == len(rest) in (1, 2):
+                    return Kind(ARRAYS[name], len(shape), shape), mark
+                if name in ("f32", "i32") and not rest:
+                    return Kind(name), mark
         raise refusal(self.module.path, node, f"field type {ast.unparse(annotation)}")
+
+    def _mark(self, call: ast.expr, node: ast.stmt) -> Tunable | Logged:
+        """Return what makes a field a parameter or a log variable."""
+        assert isinstance(call, ast.Call)
+        name = ast.unparse(call.func)
+        try:
+            given = [ast.literal_eval(argument) for argument in call.args]
+            named = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
+            mark: Tunable | Logged = MARKS[name](*given, **named)
+            numbers = (mark.default, mark.low, mark.high) if isinstance(mark, Tunable) else ()
+            if isinstance(mark.unit, str) and all(type(number) in (int, float) for number in numbers):
+                return mark
+        except (KeyError, TypeError, ValueError):
+            pass
+        raise refusal(self.module.path, node, f"{ast.unparse(call)}: expected {MARK_FORM}")
 
     def _kernel(self, node: ast.FunctionDef) -> Kernel:
         if [ast.unparse(decorator) for decorator in node.decorator_list] != ["kernel"]:
@@ -181,12 +231,12 @@ class _Reader:
                 return SCALARS[name]
             case ast.Name(id=name) if name in ARRAYS:
                 return Kind(ARRAYS[name], 1)
-            case ast.Name(id=name) if isinstance(self.module.names.get(name), StructType):
-                return Kind(name)
+            case ast.Name(id=name) if isinstance(struct := self.module.names.get(name), StructType):
+                return Kind(struct.name, struct=struct)
             case ast.Subscript(value=ast.Name(id="Memory"), slice=ast.Name(id=name)) if isinstance(
-                self.module.names.get(name), StructType
+                struct := self.module.names.get(name), StructType
             ):
-                return Kind(name, memory=True)
+                return Kind(struct.name, memory=True, struct=struct)
         raise refusal(
             self.module.path, argument, f"argument {argument.arg} of {node.name} has no type of the subset"
         )

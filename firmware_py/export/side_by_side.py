@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from firmware_py.core.structs import Parameters
 from firmware_py.core.subset import Block
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
-from firmware_py.export.compare import STRUCTS, Difference, blocks_of, differing_bits
+from firmware_py.export.compare import Difference, differing_bits
 from firmware_py.export.errors import ExportError
 
 
@@ -36,9 +36,9 @@ class Target:
 
     __slots__ = ("blocks", "calls", "divergence", "name", "ticks")
 
-    def __init__(self, name: str, parameters: Block[Parameters], factory: RunnerFactory) -> None:
+    def __init__(self, name: str, reference: CoreBlocks, factory: RunnerFactory) -> None:
         self.name = name
-        self.blocks = CoreBlocks(parameters, factory)
+        self.blocks = CoreBlocks(_copy_of(reference.parameters), factory, reference.logic)
         self.divergence: Divergence | None = None
         self.calls = 0  # that were compared
         self.ticks = 0  # of the estimator, likewise
@@ -48,11 +48,9 @@ class SideBySide:
     """A `CoreRunner` that runs Python on the flight's memory and every target beside it."""
 
     def __init__(self, blocks: CoreBlocks, targets: Mapping[str, RunnerFactory]) -> None:
-        self.targets = [
-            Target(name, _copy_of(blocks.parameters), factory) for name, factory in targets.items()
-        ]
+        self.targets = [Target(name, blocks, factory) for name, factory in targets.items()]
         self._reference = PythonRunner(blocks)
-        self._blocks = blocks_of(blocks)
+        self._blocks = blocks
         self._tick = 0
 
     def reset(self) -> None:
@@ -75,13 +73,12 @@ class SideBySide:
         self._call("control")
 
     def _call(self, name: str) -> int:
-        inputs = self._blocks[:2]
         running = [target for target in self.targets if target.divergence is None]
         for target in running:
-            for source, copy in zip(inputs, blocks_of(target.blocks), strict=False):
+            for source, copy in zip(self._blocks.inputs, target.blocks.inputs, strict=True):
                 copy.memory[:] = source.memory
         result = _answer(self._reference, name)
-        memories = [block.bytes() for block in self._blocks]
+        memories = [block.bytes() for block in self._blocks.named.values()]
         for target in running:
             target.calls += 1
             try:
@@ -98,9 +95,9 @@ class SideBySide:
         if answer != result:
             patterns = (result & 0xFFFFFFFF, answer & 0xFFFFFFFF)
             return Divergence(self._tick, call, "answer", (Difference("value", (result, answer), patterns),))
-        for kind, memory, block in zip(STRUCTS, memories, blocks_of(blocks), strict=True):
-            if found := differing_bits(memory, block.bytes(), kind.dtype):
-                return Divergence(self._tick, call, kind.__name__, found)
+        for memory, block in zip(memories, blocks.named.values(), strict=True):
+            if found := differing_bits(memory, block.bytes(), block.kind.dtype):
+                return Divergence(self._tick, call, block.kind.__name__, found)
         return None
 
 

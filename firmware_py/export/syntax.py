@@ -3,9 +3,13 @@
 import ast
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Union
+
+from firmware_py.core.subset import Logged, Tunable
 
 PACKAGE = "firmware_py.core"
 SUBSET = f"{PACKAGE}.subset"
+OWN = "own_logic"  # the package in which the entry module finds modules of the user's
 ENTRY = "entry"  # the module whose kernels are the C API
 SHARED = "structs"  # the module whose constants and structs stand in the header
 C_KEYWORDS = frozenset(
@@ -29,6 +33,7 @@ class Kind:
     rank: int = 0
     shape: tuple[int, ...] = ()
     memory: bool = False
+    struct: Union["StructType", None] = field(default=None, compare=False)
 
 
 F32, I32, BOOL, VOID = Kind("f32"), Kind("i32"), Kind("bool"), Kind("void")
@@ -49,17 +54,19 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class StructField:
-    """A field of a struct, with the comments above and beside it."""
+    """A field of a struct, with the comments above and beside it, and what makes it a parameter or a log variable."""
 
     name: str
     kind: Kind
     above: str
     comment: str
+    line: int
+    mark: Tunable | Logged | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class StructType:
-    """A state struct."""
+    """A state struct; `name` is that of the C."""
 
     name: str
     doc: str
@@ -86,14 +93,15 @@ Named = Constant | StructType | Kernel
 
 @dataclass(slots=True)
 class Module:
-    """A module of the core: every name that it defines or imports, and its comments by line."""
+    """A module of the core, or of the user's: every name that it defines or imports, and its comments by line."""
 
     name: str
     path: str
     doc: str
+    own: bool = False  # the user's
     names: dict[str, "Named | Module"] = field(default_factory=dict)
     builtins: set[str] = field(default_factory=set)  # names imported from the subset
-    own: list[Named] = field(default_factory=list)  # defined here, in order
+    defined: list[Named] = field(default_factory=list)  # here, in order
     trailing: dict[int, str] = field(default_factory=dict)
     standing: dict[int, str] = field(default_factory=dict)  # comments that have a line of their own
 

@@ -22,6 +22,7 @@ PREFIXES = {  # of parameters, by group
     "stabilizer": "STAB",
     "supervisor": "SUP",
     "telemetry": "TLM",
+    "logic": "OWN",
     "memTst": "MEM",
     "deck": "DK",
     "imu_sensors": "IMU",

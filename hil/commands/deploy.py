@@ -82,7 +82,7 @@ def check(
     flights = plan(
         experiment, every, profile, overrides, seed, duration, [parse(text) for text in fault_texts]
     )
-    toolbox = Toolbox(names, _read(source) if source else None, elf)
+    toolbox = Toolbox(names, flights[0].config.logic, _read(source) if source else None, elf)
     announce_compilation()
     checked: list[Checked] = []
     for request in flights:

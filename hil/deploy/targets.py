@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from firmware_py.config import LogicConfig
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
 from firmware_py.export.arm_image import Image, build_image, build_meter, read_image
-from firmware_py.export.c99 import translate
 from firmware_py.export.cortex_m4 import CortexM4Runner, Load
 from firmware_py.export.errors import ExportError
 from firmware_py.export.native import NativeRunner, build
 from firmware_py.export.plain import PlainRunner
+from firmware_py.logic.loading import translation_of
 from hil.errors import LabError
 from hil.laboratory.run import BUILD
 
@@ -70,20 +71,22 @@ class MachineCode:
 class Toolbox:
     """Builds what the targets need, once.
 
-    `source` is the text of a floaty_core.c in place of the exported one, `elf` a linked firmware whose core is the
-    machine code.
+    `logic` is what flies beside the core, `source` is the text of a floaty_core.c in place of the exported one, `elf` a
+    linked firmware whose core is the machine code.
 
     Raises `LabError` for a compiler or package that is missing and for C that cannot be compiled.
     """
 
-    def __init__(self, names: Sequence[str], source: str | None = None, elf: Path | None = None) -> None:
+    def __init__(
+        self, names: Sequence[str], logic: LogicConfig, source: str | None = None, elf: Path | None = None
+    ) -> None:
         self.machine_code: MachineCode | None = None
         self._native: dict[str, RunnerFactory] = {}
         self._names = names
         if elf and CORTEX_M4 not in names:
             raise LabError(f"--elf {elf}: nothing to check it with: --targets has no {CORTEX_M4}")
         try:
-            c = translate()
+            c = translation_of(logic)
             c = c if source is None else replace(c, source=source)
             for name in names:
                 if name in OPTIMISATION:

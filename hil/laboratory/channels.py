@@ -6,7 +6,8 @@ Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from firmware_py.firmware import DEADLINES_US
+from firmware_py.firmware import DEADLINES_US, Firmware
+from firmware_py.logic.plugs import GROUP
 from firmware_py.signals import COUNTERS
 from ground_station.tracker import Tracker
 from ground_station.trajectory import Trajectory
@@ -57,6 +58,22 @@ def tracker_channel(tracker: Tracker) -> Channel:
         lambda: (tracker.quality, counters.refused, counters.restarts),
         (quantity("tracker", "quality refused restarts"),),
     )
+
+
+def logic_channels(firmware: Firmware) -> tuple[Channel, ...]:
+    """Return what logic of the user's own logs."""
+    own = [variable for variable in firmware.variables if variable.name.startswith(f"{GROUP}.")]
+    channels = []
+    for dtype, is_float in (("float32", True), ("int32", False)):
+        chosen = [variable for variable in own if variable.scalar.is_float is is_float]
+        quantities = tuple(Quantity((variable.name,), variable.unit) for variable in chosen)
+        if chosen:
+            channels.append(Channel(dtype, _all([variable.read for variable in chosen]), quantities))
+    return tuple(channels)
+
+
+def _all(reads: Sequence[Callable[[], float]]) -> Callable[[], list[float]]:
+    return lambda: [read() for read in reads]
 
 
 def fault_channel(active: Sequence[Fault]) -> Channel:

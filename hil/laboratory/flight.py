@@ -12,11 +12,18 @@ from pathlib import Path
 from typing import Protocol
 
 from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.wire.supervisor import Cause
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock
 from hil.config import LabConfig
 from hil.events import EventQueue
-from hil.laboratory.channels import battery_channel, fault_channel, flight_channels, marker_channel
+from hil.laboratory.channels import (
+    battery_channel,
+    fault_channel,
+    flight_channels,
+    logic_channels,
+    marker_channel,
+)
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.laboratory import Laboratory, Progress
 from hil.laboratory.recorder import Channel, Recorder
@@ -26,6 +33,7 @@ from hil.laboratory.schedule import WINDOW_US, ScheduleTrace
 RECORD_PERIOD_US = 10_000
 RECORD_PHASE_US = 250  # just after the controller
 DROP_NOTE_PERIOD_US = 1_000_000
+NOT_FINITE = (Cause.CONTROLLER_NOT_FINITE, Cause.ESTIMATOR_NOT_FINITE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +134,7 @@ class Flight:
         self.lab = Laboratory(clock)
         self.recorder: Recorder | None = None
         self.lost: str | None = None
+        self.logic_failed: str | None = None  # what own logic did, and when
         self.over = False
         self._duration_us = round(duration_s * 1e6)
         self._trace_all = trace_all
@@ -178,7 +187,8 @@ class Flight:
         markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
         faults = (fault_channel(self.switchboard.active),) if self.faults else ()
         line, tracker = self.line.channels()
-        return (*channels, *line, battery_channel(robot.battery), *tracker, *markers, *faults)
+        own = logic_channels(robot.firmware)
+        return (*channels, *line, battery_channel(robot.battery), *tracker, *markers, *faults, *own)
 
     def run(self, progress: Progress | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C; the log is left open for the caller to close."""
@@ -206,6 +216,7 @@ class Flight:
         if self.recorder is not None:
             self.recorder.row(now_us)
         self.robot.firmware.check_watchdog()
+        self._watch_logic(now_us)
         self._note_drops(now_us)
         for source, text in self.line.look(now_us):
             self.note(source, text)
@@ -215,6 +226,14 @@ class Flight:
             self.lost = lost
             self.lab.end_us = now_us
             self.note("lab", f"lost: {lost}")
+
+    def _watch_logic(self, now_us: int) -> None:
+        """Keep which module of the user's first put out NaN or infinity."""
+        cause = self.robot.firmware.signals.supervisor.cause
+        if self.logic_failed is None and cause in NOT_FINITE:
+            what = cause.name.lower().replace("_", " ")
+            self.logic_failed = f"own {what} at {(now_us - self.release_us) * 1e-6:.2f} s: failsafe"
+            self.note("lab", self.logic_failed)
 
     def _note_drops(self, now_us: int) -> None:
         """Say which queue drops, once per second at most."""

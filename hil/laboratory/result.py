@@ -57,6 +57,7 @@ class Origin:
     versions: Annotated[Mapping[str, str], AsText]  # of what computed the flight
     commit: str
     source: Annotated[Source | None, AsText]  # of an experiment that does not ship
+    logic: str  # hash of the user's modules in the core, empty without
 
     def fields(self) -> dict[str, Any]:
         """Return them by name, also of a `Result`."""

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.cortex_m4 import CortexM4Runner
-from firmware_py.export.errors import ExportError
+from firmware_py.logic.loading import digest_of
 from firmware_py.rtos import WatchdogError
 from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Clock
@@ -98,7 +99,7 @@ class Request:
         faults = tuple(map(str, (*self.experiment.faults, *self.faults)))
         return Origin(
             self.experiment.name, self.profile, self.overrides, self.seed, self.duration_s, self.link, self.board,
-            faults, versions(), commit(), self.experiment.source,
+            faults, versions(), commit(), self.experiment.source, digest_of(self.config.logic),
         )  # fmt: skip
 
 
@@ -138,6 +139,8 @@ def fly(
         end = flight.run(on_progress)
         outcome = "interrupted" if end.interrupted else "lost" if end.lost else "completed"
         cause = end.lost
+        if flight.logic_failed is not None and not end.interrupted:
+            outcome, cause = "error", "; ".join(filter(None, (flight.logic_failed, cause)))
     except WatchdogError as error:
         outcome, cause = "lost", str(error)
         recorder.note(flight.now_us, "board", cause)
@@ -152,7 +155,7 @@ def fly(
         flight.write_schedule(folder)
     log = load_log(folder)
     experiment = request.experiment
-    metrics = measure(log, outcome == "lost") | dict.fromkeys(experiment.metrics, math.nan)
+    metrics = measure(log, outcome == "lost" or flight.lost is not None) | dict.fromkeys(experiment.metrics, math.nan)
     if (free := free_flight(log)).num_rows > 1:
         metrics.update(experiment.measured(free))
     firmware = flight.robot.firmware
@@ -199,8 +202,8 @@ class _Pace:
 def lockstep(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` when its board cannot be had here."""
     try:
-        runner = runner_of(request.board, BUILD)
-    except ExportError as error:
+        runner = runner_of(request.board, BUILD, request.config.logic)
+    except FirmwareError as error:
         raise LabError(f"--board {request.board}: {error}") from None
     return lockstep_flight(
         request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all,

@@ -5,6 +5,7 @@ Lengths in cm, angles in degrees, times in ms. Colours are those of Okabe and It
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -108,6 +109,26 @@ def processor(names: Iterable[str]) -> Curves:
 
     colours = tuple(TASK_COLOURS[index % len(TASK_COLOURS)] for index in range(len(tasks)))
     return Curves(tuple(name.removeprefix("cpu.") for name in tasks), colours, "%", load)
+
+
+def own_logic(rows: pa.Table) -> list[Curves]:
+    """Return what logic of the user's own has logged, a set of curves for each unit."""
+    by_unit: dict[str, list[str]] = {}
+    for field in rows.schema:
+        if field.name.startswith("logic."):
+            by_unit.setdefault((field.metadata or {}).get(b"unit", b"").decode(), []).append(field.name)
+    return [
+        Curves(
+            tuple(name.removeprefix("logic.") for name in names),
+            tuple(TASK_COLOURS[index % len(TASK_COLOURS)] for index in range(len(names))),
+            unit, partial(_columns, tuple(names)),
+        )
+        for unit, names in by_unit.items()
+    ]  # fmt: skip
+
+
+def _columns(names: tuple[str, ...], rows: pa.Table) -> NDArray[np.float64]:
+    return column(rows, *names).reshape(-1, len(names))
 
 
 def latency(rows: pa.Table) -> NDArray[np.float64]:

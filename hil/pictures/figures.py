@@ -225,6 +225,16 @@ def estimate(rows: pa.Table) -> Figure:
     return figure
 
 
+def own_logic(rows: pa.Table) -> Figure:
+    """Draw what logic of the user's own logs, one axis for each unit."""
+    plots = curves.own_logic(rows)
+    figure, axes = stack((1.5,) * len(plots))
+    for one, plot in zip(axes, plots, strict=True):
+        _lines(one, _seconds(rows), plot, plot.read(rows), "own logic")
+    shade(axes, rows)
+    return figure
+
+
 def schedule(table: pa.Table) -> Figure:
     """Draw which task has the processor, over the first 20 ms of a schedule."""
     figure = Figure(figsize=(WIDTH, 2.4), layout="constrained")
@@ -296,6 +306,7 @@ PICTURES = (
         estimate,
     ),
 )
+OWN_LOGIC = Picture("Own logic", "What the modules of `[logic]` log of their memory.", own_logic)
 WAY = Picture(
     "Way of the poses",
     "Where poses spent their time from the exposure to the board, as the ground station told each that it sent.",

@@ -21,7 +21,8 @@ from hil.laboratory.metrics import METRICS, SHOWN
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
-from hil.pictures.figures import PICTURES, SCHEDULE, WAY
+from hil.pictures.curves import own_logic
+from hil.pictures.figures import OWN_LOGIC, PICTURES, SCHEDULE, WAY
 from hil.pictures.gallery import pictures_of
 from hil.pictures.pages import data_uri, write_page
 from hil.pictures.picture import Picture
@@ -71,6 +72,8 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     experiment = experiment or find_again(result.experiment, result.source)
     own = pictures_of(experiment) if experiment else ()
     shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
+    if own_logic(log):
+        shown.append(_show(OWN_LOGIC, log))
     shown += [
         _show(picture, table)
         for picture, table in ((WAY, told(folder)), (SCHEDULE, load_schedule(folder)))

@@ -1,0 +1,51 @@
+"""What stands behind logic of one's own: only numbers get past it, and whoever hands over something else is counted.
+
+The default core has no such logic and does without.
+"""
+
+from firmware_py.core.controller import FLAP_LIMIT, release, sign
+from firmware_py.core.maths import ZERO, clamp, finite
+from firmware_py.core.structs import MODE_FLY, STATES, Control, Estimator, Input, Parameters
+from firmware_py.core.subset import Struct, i32, kernel
+
+
+class Guard(Struct):
+    """How often own logic has put out NaN or infinity."""
+
+    controller_faults: i32  # ticks
+    estimator_faults: i32
+
+
+@kernel
+def closed(data: Input) -> bool:
+    """Return whether the loop is closed."""
+    return bool(data.mode == MODE_FLY)
+
+
+@kernel
+def guard_control(parameters: Parameters, control: Control, guard: Guard) -> None:
+    """Let the law's flap angles pass, limited; when an angle or an input is no number, the flaps go to hover."""
+    sound = True
+    for i in range(4):
+        if not finite(control.flap[i]) or not finite(control.u[i]):
+            sound = False
+    if not sound:
+        guard.controller_faults = i32(guard.controller_faults + 1)
+        release(control)
+        for flap in range(4):
+            control.flap[flap] = sign(flap) * parameters.hover_angle
+    for flap in range(4):
+        control.flap[flap] = clamp(control.flap[flap], -FLAP_LIMIT, FLAP_LIMIT)
+        control.command[flap] = control.flap[flap] - sign(flap) * parameters.hover_angle
+
+
+@kernel
+def guard_estimate(estimator: Estimator, guard: Guard) -> None:
+    """Put zeros in place of an estimate that is no number: the controller sees none."""
+    sound = True
+    for i in range(STATES):
+        if not finite(estimator.now[i]):
+            sound = False
+            estimator.now[i] = ZERO
+    if not sound:
+        guard.estimator_faults = i32(guard.estimator_faults + 1)

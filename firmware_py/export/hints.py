@@ -1,0 +1,63 @@
+"""What to write in the flight core instead of what its subset of Python does not have."""
+
+import ast
+from collections.abc import Mapping
+
+FOREIGN = ("numpy", "math")
+_MATHS = "from firmware_py.core.maths"
+_NONE = "there is none: put it together from + - * / and sqrt, as firmware_py/core/maths.py does"
+_LOOP = "loop over range(..)"
+_FIELD = "a field Annotated[F32s, n] of the memory struct"
+FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
+    **dict.fromkeys(("abs", "absolute", "fabs"), "abs(x)"),
+    "sqrt": "sqrt(x), from firmware_py.core.subset",
+    "sin": f"sin(x), {_MATHS}",
+    "cos": f"cos(x), {_MATHS}",
+    **dict.fromkeys(("arctan2", "atan2"), f"atan2(y, x), {_MATHS}"),
+    **dict.fromkeys(("arctan", "atan"), f"atan2(x, ONE), {_MATHS}"),
+    **dict.fromkeys(("arcsin", "asin"), f"asin(x), {_MATHS}"),
+    "clip": f"clamp(x, low, high), {_MATHS}",
+    "pi": f"PI, {_MATHS}",
+    **dict.fromkeys(("isfinite", "isnan", "isinf"), f"finite(x), {_MATHS}"),
+    **dict.fromkeys(("float32", "float64", "float"), "f32(x)"),
+    **dict.fromkeys(("int32", "int64", "int"), "i32(x)"),
+    **dict.fromkeys(("minimum", "maximum", "min", "max", "sign", "copysign", "where"), "if and else"),
+    **dict.fromkeys(("dot", "matmul", "inner", "sum", "mean", "cumsum"), _LOOP),
+    **dict.fromkeys(("zeros", "ones", "empty", "array", "asarray", "full", "copy"), _FIELD),
+    **dict.fromkeys(("power", "pow", "square"), "x * x"),
+    **dict.fromkeys(("exp", "log", "tan", "tanh", "hypot"), _NONE),
+    "print": "a field of the memory struct marked Logged(unit)",
+}
+CONSTRUCTS: Mapping[str, str] = {
+    "AugAssign": "x = x + y",
+    "AnnAssign": "x = value",
+    "While": _LOOP,
+    "IfExp": "if and else on lines of their own",
+    "ListComp": _LOOP,
+    "Pow": "x * x",
+    "MatMult": "loops over range(..)",
+}
+
+
+def instead(table: Mapping[str, str], name: str) -> str:
+    """Return ": write ..." for a name that the table has, else nothing."""
+    return f": write {table[name]}" if name in table else ""
+
+
+def first_use(tree: ast.Module, node: ast.Import | ast.ImportFrom) -> tuple[ast.AST, str]:
+    """Return where a module first uses what it imports from outside, and what to write there."""
+    names = {
+        alias.asname or alias.name.partition(".")[0]: "" if isinstance(node, ast.Import) else alias.name
+        for alias in node.names
+    }
+    uses: list[ast.Attribute | ast.Name] = [
+        part
+        for part in ast.walk(tree)
+        if (isinstance(part, ast.Attribute) and isinstance(part.value, ast.Name) and part.value.id in names)
+        or (isinstance(part, ast.Name) and names.get(part.id))
+    ]
+    if not uses:
+        return node, f"{ast.unparse(node)} is outside the subset, and not used: leave it out"
+    first = min(uses, key=lambda use: (use.lineno, use.col_offset))
+    name = first.attr if isinstance(first, ast.Attribute) else names[first.id]
+    return first, f"{ast.unparse(first)} is outside the subset{instead(FUNCTIONS, name)}"

@@ -1,0 +1,202 @@
+"""From the profile's `[logic]` to code that flies: the modules are read, checked, joined with the core and loaded.
+
+What is loaded is named by a hash of the text. So a module that was edited is never mistaken for what it was, neither in
+one process nor in what numba keeps on disk.
+"""
+
+import difflib
+import hashlib
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from firmware_py.config import LogicConfig
+from firmware_py.core.guard import Guard
+from firmware_py.core.subset import Block, Struct
+from firmware_py.export.c99 import Translation, core_texts, translate
+from firmware_py.export.reading import read_modules
+from firmware_py.export.syntax import OWN as PACKAGE
+from firmware_py.logic.entry import GUARD, compose
+from firmware_py.logic.errors import LogicError
+from firmware_py.logic.plugs import POINTS, OwnParameter, OwnVariable, Plug, read_plug
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """Logic that is ready to fly, with what its modules declare as the defaults."""
+
+    plugs: tuple[Plug, ...]
+    digest: str  # of the modules' texts
+    entry: ModuleType
+    calls: Mapping[str, tuple[str, ...]]
+    translation: Translation
+    structs: Mapping[str, type[Struct]]  # of the blocks that come to the core's
+    files: Mapping[str, str]  # by plug point
+
+    @property
+    def parameters(self) -> tuple[OwnParameter, ...]:
+        """All parameters."""
+        return tuple(parameter for plug in self.plugs for parameter in plug.parameters)
+
+    @property
+    def variables(self) -> tuple[OwnVariable, ...]:
+        """All log variables."""
+        return tuple(variable for plug in self.plugs for variable in plug.variables)
+
+
+@dataclass(frozen=True, slots=True)
+class Logic:
+    """What flies beside the core: the modules, and the profile's values of their parameters."""
+
+    loaded: Loaded
+    values: Mapping[str, float]  # of every parameter
+
+    def allocate(self) -> dict[str, Block[Struct]]:
+        """Return the memory, with the parameters in it."""
+        blocks = {name: kind.allocate() for name, kind in self.loaded.structs.items()}
+        for parameter in self.loaded.parameters:
+            blocks[parameter.block].memory[parameter.name] = self.values[parameter.name]
+        return blocks
+
+
+def load_logic(config: LogicConfig) -> Logic | None:
+    """Return the logic of a profile, None when the default core flies.
+
+    Raises `LogicError` for a file or value that cannot be, `ExportError` for text outside the subset.
+    """
+    files = {point.name: getattr(config, point.name) for point in POINTS if getattr(config, point.name)}
+    if not files:
+        if config.values:
+            name = next(iter(config.values))
+            raise LogicError(
+                f"logic.{name}: neither a controller nor an estimator of your own is given in [logic]"
+            )
+        return None
+    texts = []
+    for name, file in files.items():
+        try:
+            texts.append((name, file, Path(file).read_text(encoding="utf-8")))
+        except (OSError, UnicodeDecodeError) as error:
+            raise LogicError(f"logic.{name} = {file}: {getattr(error, 'strerror', None) or error}") from None
+    loaded = _load(tuple(texts))
+    return Logic(loaded, _values(config.values, loaded.parameters))
+
+
+def translation_of(config: LogicConfig) -> Translation:
+    """Return the core as C, with the logic of a profile in it. Raises as `load_logic` does."""
+    logic = load_logic(config)
+    return translate() if logic is None else logic.loaded.translation
+
+
+def digest_of(config: LogicConfig) -> str:
+    """Return a hash of the modules' texts; empty when the default core flies. Raises as `load_logic` does."""
+    logic = load_logic(config)
+    return "" if logic is None else logic.loaded.digest
+
+
+def _values(given: Mapping[str, float], parameters: tuple[OwnParameter, ...]) -> dict[str, float]:
+    """Return the value of every parameter: the profile's, or the default."""
+    known = {parameter.name: parameter.mark for parameter in parameters}
+    bases = {parameter.name: parameter.base for parameter in parameters}
+    for name, value in given.items():
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1, 0.5)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known) or 'none'}"
+            raise LogicError(f"logic.{name}: no parameter of that name; {hint}")
+        if not known[name].low <= value <= known[name].high:
+            bounds = f"{known[name].low:g}..{known[name].high:g} {known[name].unit}".rstrip()
+            raise LogicError(f"logic.{name} = {value:g}: outside {bounds}")
+        if bases[name] == "i32" and value != int(value):
+            raise LogicError(f"logic.{name} = {value:g}: expected a whole number")
+    return {name: given.get(name, mark.default) for name, mark in known.items()}
+
+
+@lru_cache(maxsize=64)
+def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
+    """Load modules, each given as plug point, file and text."""
+    texts = core_texts() | {f"own_{name}": text for name, _, text in modules}
+    shown = {f"own_{name}": _shown(file) for name, file, _ in modules}
+    plugs = tuple(
+        read_plug(point, read_modules(texts, shown, f"own_{point.name}")[-1])
+        for point in POINTS
+        if f"own_{point.name}" in texts
+    )
+    _check_names(plugs, shown)
+    digest = hashlib.sha256(repr([(name, text) for name, _, text in modules]).encode()).hexdigest()
+    entry = compose(plugs, PACKAGE)
+    translation = translate(texts | {"entry": entry.text}, shown)
+    files = {name: file for name, file, _ in modules}
+    package = f"{PACKAGE}_{digest[:16]}"
+    run = _execute(modules, compose(plugs, package).text, package)
+    structs: dict[str, type[Struct]] = {GUARD: Guard}
+    for plug in plugs:
+        for argument, struct in plug.structs.items():
+            module = getattr(sys.modules[package], f"own_{plug.point.name}")
+            name = struct.name.removeprefix(plug.point.name.capitalize())
+            structs[plug.block(argument)] = getattr(module, name)
+    return Loaded(plugs, digest, run, entry.calls, translation, structs, files)
+
+
+def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
+    """Refuse names that clients could not tell apart."""
+    for kind in ("parameters", "variables"):
+        seen: dict[str, str] = {}
+        for plug in plugs:
+            path = shown[f"own_{plug.point.name}"]
+            for thing in getattr(plug, kind):
+                key = thing.name.upper()  # MAVLink knows no small letters
+                if key in seen:
+                    raise LogicError(f"{path}: {thing.name}: this name exists already: {seen[key]}")
+                seen[key] = f"{thing.name} in {path}"
+
+
+def _execute(modules: tuple[tuple[str, str, str], ...], entry: str, package: str) -> ModuleType:
+    """Run the modules' texts and the entry module's; each in a Python module of its own, below `package`."""
+    parent = sys.modules[package] = ModuleType(package)
+    for name, file, text in modules:
+        try:
+            module = _run(f"{package}.own_{name}", Path(file), text)
+        except Exception as error:
+            raise LogicError(f"{_shown(file)}: {type(error).__name__}: {error}") from error
+        setattr(parent, f"own_{name}", module)
+    stems = "_".join(Path(file).stem for _, file, _ in modules)
+    path = _written(Path(modules[0][1]).parent, f"floaty_entry_{stems}.py", entry)
+    return _run(f"{package}.entry", path, entry)
+
+
+def _run(name: str, path: Path, text: str) -> ModuleType:
+    module: Any = ModuleType(name)
+    module.__file__ = str(path)
+    sys.modules[name] = module
+    exec(compile(text, str(path), "exec"), module.__dict__)
+    return module  # type: ignore[no-any-return]
+
+
+def _written(folder: Path, name: str, text: str) -> Path:
+    """Write a text where compiled code of that folder is kept, or else where the user's is; return its path."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    hashed = hashlib.sha256(str(folder).encode()).hexdigest()[:16]
+    places = (folder / "__pycache__", home / "floaty" / hashed)
+    for place in places:
+        path, partial = place / name, place / f"{name}.{os.getpid()}"
+        try:
+            if path.is_file() and path.read_text(encoding="utf-8") == text:
+                return path
+            place.mkdir(parents=True, exist_ok=True)
+            partial.write_text(text, encoding="utf-8")
+            partial.replace(path)
+        except OSError:
+            continue
+        return path
+    raise LogicError(f"{places[0]}, {places[1]}: neither can be written")
+
+
+def _shown(file: str) -> str:
+    """Return a file's path as a user reads it: from the working folder on, where that is shorter."""
+    path = Path(file)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else file

@@ -1,0 +1,155 @@
+"""The plug points of the core, and what a module of the user's brings for them, read from its text.
+
+A hook is a kernel with a fixed name. It takes those of these arguments that it names:
+
+    parameters: Parameters, data: Input, estimator: Estimator, control: Control     of the core
+    own: a struct whose fields are all Tunable                                      the module's parameters
+    memory: a struct                                                                what it remembers; fields may be Logged
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from firmware_py.core.subset import Logged, Tunable
+from firmware_py.export.errors import ExportError
+from firmware_py.export.locals import find_writes
+from firmware_py.export.syntax import I32, VOID, Kernel, Kind, Module, StructType
+from firmware_py.wire.toc import MAX_NAME
+
+GROUP = "logic"  # of parameters, log variables and columns of the log
+PARAMETER_ROOM = 12  # characters: MAVLink has 16, of which OWN_ takes four
+VARIABLE_ROOM = MAX_NAME - len(GROUP)
+CORE_STRUCTS = {"parameters": "Parameters", "data": "Input", "estimator": "Estimator", "control": "Control"}
+OWN, MEMORY = "own", "memory"
+
+
+@dataclass(frozen=True, slots=True)
+class PlugPoint:
+    """A place for a module of the user's: its hooks with their results, and which arguments they may write."""
+
+    name: str  # the key of the profile
+    hooks: Mapping[str, Kind]
+    writes: frozenset[str]
+
+
+CONTROLLER = PlugPoint("controller", {"control_law": VOID, "reset_law": VOID}, frozenset({"control", MEMORY}))
+ESTIMATOR = PlugPoint(
+    "estimator", {"reset": VOID, "file_pose": I32, "estimate": VOID}, frozenset({"estimator", MEMORY})
+)
+POINTS = (CONTROLLER, ESTIMATOR)
+
+
+@dataclass(frozen=True, slots=True)
+class OwnParameter:
+    """A field of an `own` struct: what clients may set."""
+
+    name: str
+    base: str  # f32 or i32
+    block: str
+    mark: Tunable
+
+
+@dataclass(frozen=True, slots=True)
+class OwnVariable:
+    """A field of a `memory` struct, or one element of it: what is logged."""
+
+    name: str
+    base: str
+    block: str
+    field: str
+    index: int | None  # in an array
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Plug:
+    """A module in its place."""
+
+    point: PlugPoint
+    hooks: Mapping[str, tuple[str, ...]]  # the arguments of those that it has
+    structs: Mapping[str, StructType]  # by argument: own, memory
+    parameters: tuple[OwnParameter, ...]
+    variables: tuple[OwnVariable, ...]
+
+    def block(self, argument: str) -> str:
+        """Return the name of the memory that an argument of a hook stands for."""
+        return argument if argument in CORE_STRUCTS else f"{self.point.name}_{argument}"
+
+
+def read_plug(point: PlugPoint, module: Module) -> Plug:
+    """Return what a module brings. Raises `ExportError` with file, line and what is expected."""
+    hooks: dict[str, tuple[str, ...]] = {}
+    structs: dict[str, StructType] = {}
+    kernels = [thing for thing in module.defined if isinstance(thing, Kernel)]
+    for kernel in kernels:
+        find_writes(kernel)
+        if kernel.node.name in point.hooks:
+            _check_signature(point, kernel, structs)
+            hooks[kernel.node.name] = tuple(kernel.arguments)
+    for name in point.hooks:
+        if name not in hooks and not (name == "reset_law" and MEMORY not in structs):
+            there = ", ".join(kernel.node.name for kernel in kernels) or "none"
+            raise _refusal(module, 1, f"no function {name}; functions there: {there}")
+    parameters = tuple(_parameters(point, module, structs))
+    return Plug(point, hooks, structs, parameters, tuple(_variables(point, module, structs)))
+
+
+def _refusal(module: Module, line: int, reason: str) -> ExportError:
+    return ExportError(f"{module.path}:{line}: {reason}")
+
+
+def _check_signature(point: PlugPoint, kernel: Kernel, structs: dict[str, StructType]) -> None:
+    """Check what a hook takes and writes, and note the module's own structs."""
+    name, module, line = kernel.node.name, kernel.scope, kernel.node.lineno
+    for argument, kind in kernel.arguments.items():
+        fits = kind.base == CORE_STRUCTS.get(argument)
+        if argument in (OWN, MEMORY) and any(kind.struct is thing for thing in module.defined):
+            assert kind.struct is not None
+            fits = structs.setdefault(argument, kind.struct) is kind.struct
+        if not fits:
+            known = ", ".join(f"{key}: {value}" for key, value in CORE_STRUCTS.items())
+            text = f"{name}: argument {argument}: expected any of {known}, own and memory, one struct of this file each"
+            raise _refusal(module, line, text)
+        if argument in kernel.writes and argument not in point.writes:
+            raise _refusal(
+                module, line, f"{name} writes {argument}: it may write {' and '.join(sorted(point.writes))}"
+            )
+    if kernel.result != point.hooks[name]:
+        result = {"void": "None"}.get(point.hooks[name].base, point.hooks[name].base)
+        raise _refusal(module, line, f"{name}: expected -> {result}")
+
+
+def _parameters(
+    point: PlugPoint, module: Module, structs: Mapping[str, StructType]
+) -> Iterator[OwnParameter]:
+    for field in structs[OWN].fields.values() if OWN in structs else ():
+        name, mark = field.name, field.mark
+        if not isinstance(mark, Tunable) or field.kind.rank:
+            form = 'Annotated[f32, Tunable(default, "unit", low=.., high=..)]'
+            raise _refusal(module, field.line, f"{name}: a parameter is {form}")
+        if not mark.low <= mark.default <= mark.high:
+            text = f"{name}: default {mark.default:g} is outside {mark.low:g}..{mark.high:g}"
+            raise _refusal(module, field.line, text)
+        if any(point.name == name for point in POINTS):
+            raise _refusal(module, field.line, f"{name}: this name exists already, as a key of [logic]")
+        if len(name) > PARAMETER_ROOM:
+            text = f"{name}: {len(name)} characters; MAVLink leaves a parameter's name {PARAMETER_ROOM}"
+            raise _refusal(module, field.line, text)
+        yield OwnParameter(name, field.kind.base, f"{point.name}_{OWN}", mark)
+
+
+def _variables(point: PlugPoint, module: Module, structs: Mapping[str, StructType]) -> Iterator[OwnVariable]:
+    for field in structs[MEMORY].fields.values() if MEMORY in structs else ():
+        mark, kind = field.mark, field.kind
+        if mark is None:
+            continue
+        if not isinstance(mark, Logged) or kind.rank == 2:
+            text = f"{field.name}: in the memory numbers and lists of them may be Logged; parameters stand in `own`"
+            raise _refusal(module, field.line, text)
+        elements: Iterable[int | None] = range(kind.shape[0]) if kind.rank else (None,)
+        for index in elements:
+            name = field.name if index is None else f"{field.name}{index + 1}"
+            if len(name) > VARIABLE_ROOM:
+                text = f"{name}: {len(name)} characters; a log variable's name has at most {VARIABLE_ROOM}"
+                raise _refusal(module, field.line, text)
+            yield OwnVariable(name, kind.base, f"{point.name}_{MEMORY}", field.name, index, mark.unit)
