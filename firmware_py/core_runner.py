@@ -4,24 +4,18 @@ The tasks call the core through a `CoreRunner` on the memory of `CoreBlocks`: Py
 under `firmware_py.export` the same core as C on this machine and as machine code of a Cortex-M4.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from firmware_py.config import CpuConfig
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Parameters
 from firmware_py.core.subset import Block, Struct
+from firmware_py.logic.plugs import CALLS
 
 if TYPE_CHECKING:
     from firmware_py.core.guard import Guard
     from firmware_py.logic.loading import Logic
-
-CALLS: Mapping[str, tuple[str, ...]] = {  # the default core's entry points, and the blocks that they take
-    "reset": ("parameters", "estimator"),
-    "file_pose": ("parameters", "data", "estimator"),
-    "estimate": ("parameters", "data", "estimator", "control"),
-    "control": ("parameters", "data", "estimator", "control"),
-}
 
 
 class CoreRunner(Protocol):

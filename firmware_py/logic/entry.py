@@ -6,8 +6,7 @@ Each call takes the memory that it needs and no more; `Entry.calls` names it, in
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from firmware_py.core_runner import CALLS
-from firmware_py.logic.plugs import CONTROLLER, CORE_STRUCTS, ESTIMATOR, Plug
+from firmware_py.logic.plugs import CALLS, CONTROLLER, CORE_STRUCTS, ESTIMATOR, Plug
 
 GUARD = "guard"
 HEAD = '''"""The calls by which the firmware enters the core with {which}; every argument is the memory of one struct."""

@@ -21,6 +21,12 @@ PARAMETER_ROOM = 12  # characters: MAVLink has 16, of which OWN_ takes four
 VARIABLE_ROOM = MAX_NAME - len(GROUP)
 CORE_STRUCTS = {"parameters": "Parameters", "data": "Input", "estimator": "Estimator", "control": "Control"}
 OWN, MEMORY = "own", "memory"
+CALLS: Mapping[str, tuple[str, ...]] = {  # the default core's entry points, and the blocks that they take
+    "reset": ("parameters", "estimator"),
+    "file_pose": ("parameters", "data", "estimator"),
+    "estimate": ("parameters", "data", "estimator", "control"),
+    "control": ("parameters", "data", "estimator", "control"),
+}
 
 
 @dataclass(frozen=True, slots=True)
