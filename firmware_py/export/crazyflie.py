@@ -19,16 +19,24 @@ from firmware_py.config import (
     parameters_of,
 )
 from firmware_py.core.subset import f32
-from firmware_py.export.c99 import translate
+from firmware_py.export.app_logic import calls_header, own_logs
 from firmware_py.export.errors import ExportError
 from firmware_py.export.profile_c import profile_source
 from firmware_py.export.reading import float_literal
+from firmware_py.logic.loading import load_logic, translation_of
+from firmware_py.logic.plugs import GROUP
 from firmware_py.parameters import FLAPS, GAINS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits
 
 TEMPLATES = Path(__file__).parent / "app"
 MARKER = Path("src") / "floaty_app.c"  # a folder with this file is an app and may be written over
-PARAM_TYPES = {"F32": "PARAM_FLOAT", "U16": "PARAM_UINT16", "I16": "PARAM_INT16", "U8": "PARAM_UINT8"}
-C_TYPES = {"F32": "float", "U16": "uint16_t", "I16": "int16_t", "U8": "uint8_t"}
+PARAM_TYPES = {
+    "F32": "PARAM_FLOAT",
+    "I32": "PARAM_INT32",
+    "U16": "PARAM_UINT16",
+    "I16": "PARAM_INT16",
+    "U8": "PARAM_UINT8",
+}
+C_TYPES = {"F32": "float", "I32": "int32_t", "U16": "uint16_t", "I16": "int16_t", "U8": "uint8_t"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +82,14 @@ def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
         c = f"floaty_supervisor.{key}"
         return AppParameter(name, "U16", c, "I32", value // scale, low / scale, high / scale, scale)
 
+    logic = load_logic(config.logic)
+    own = [] if logic is None else [
+        AppParameter(
+            f"{GROUP}.{one.name}", one.base.upper(), f"floaty_{one.block}.{one.name}", one.base.upper(),
+            logic.values[one.name], one.mark.low, one.mark.high,
+        )
+        for one in logic.loaded.parameters
+    ]  # fmt: skip
     manual = AppParameter("extCtrl.manual", "U8", "floaty_supervisor.manual", "U8", 0, 0, 2, persistent=False)
     return (
         *(
@@ -111,6 +127,7 @@ def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
         AppParameter("extPose.absolute", "U8", "floaty_absolute", "U8", 0, 0, 1),
         supervision("supervisor.poseTimeout", "pose_timeout_us", 1000),
         supervision("supervisor.lowBattery", "low_battery_mv", 1),
+        *own,
     )  # fmt: skip
 
 
@@ -121,12 +138,14 @@ def app_files(config: FirmwareConfig, profile: str) -> dict[str, str]:
         for path in sorted(TEMPLATES.rglob("*"))
         if path.is_file()
     }
-    core = translate()
+    core = translation_of(config.logic)
     files["src/floaty_core.h"] = core.header
     files["src/floaty_core.c"] = core.source
     files["src/floaty_profile.c"] = profile_source(config)
     files["src/floaty_settings.h"] = _settings(config, profile)
-    files["src/floaty_toc.c"] = _toc(files["src/floaty_toc.c"], app_parameters(config))
+    files["src/floaty_calls.h"] = calls_header(config.logic)
+    toc = files["src/floaty_toc.c"].replace("/* @logs */", own_logs(config.logic))
+    files["src/floaty_toc.c"] = _toc(toc, app_parameters(config))
     return files
 
 

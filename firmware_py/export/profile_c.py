@@ -6,7 +6,8 @@ import numpy as np
 
 from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.core.structs import Parameters
-from firmware_py.export.reading import float_literal
+from firmware_py.export.app_logic import own_bytes, own_memory
+from firmware_py.export.reading import literal
 
 TEMPLATE = """\
 /* The parameters of a profile. Written by `floaty deploy`; edit the profile, not this file. */
@@ -22,7 +23,7 @@ void floaty_core_init(FloatyParameters *parameters) {{
 
 def profile_hash(config: FirmwareConfig) -> str:
     """Return a short hash of the parameters' bytes, as they lie in memory on board."""
-    return hashlib.sha256(parameters_of(config).bytes()).hexdigest()[:12]
+    return hashlib.sha256(parameters_of(config).bytes() + own_bytes(config.logic)).hexdigest()[:12]
 
 
 def profile_source(config: FirmwareConfig) -> str:
@@ -34,11 +35,7 @@ def profile_source(config: FirmwareConfig) -> str:
     for name in names:
         values = memory[name][0]
         if np.ndim(values) == 0:
-            lines.append(f"    parameters->{name} = {_literal(values)};")
+            lines.append(f"    parameters->{name} = {literal(values)};")
         else:
-            lines += [f"    parameters->{name}[{i}] = {_literal(value)};" for i, value in enumerate(values)]
-    return TEMPLATE.format(hash=profile_hash(config), lines="\n".join(lines))
-
-
-def _literal(value: np.float32 | np.int32) -> str:
-    return float_literal(value) if isinstance(value, np.float32) else str(value)
+            lines += [f"    parameters->{name}[{i}] = {literal(value)};" for i, value in enumerate(values)]
+    return TEMPLATE.format(hash=profile_hash(config), lines="\n".join(lines)) + own_memory(config.logic)

@@ -269,6 +269,11 @@ def float_literal(value: np.float32) -> str:
     return f"{text if '.' in text or 'e' in text else text + '.0'}f"
 
 
+def literal(value: np.float32 | np.int32) -> str:
+    """Return the C literal of a number."""
+    return float_literal(value) if isinstance(value, np.float32) else str(value)
+
+
 def _number(node: ast.expr) -> int | float | None:
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):

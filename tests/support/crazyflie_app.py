@@ -10,7 +10,7 @@ from pathlib import Path
 from firmware_py.core.structs import Estimator
 from firmware_py.export.crazyflie import write_app
 from firmware_py.export.native import compilers
-from hil.config import load_config
+from hil.config import LabConfig, load_config
 from support.paths import STUBS
 
 TIMER_REGISTERS = "CR1 CR2 SMCR DIER SR EGR CCMR1 CCMR2 CCER CNT PSC ARR RCR CCR1 CCR2 CCR3 CCR4"
@@ -27,9 +27,12 @@ class Supervisor(ctypes.Structure):
         *((name, ctypes.c_int64) for name in (
             "last_pose_us", "battery_good_us", "episode_start_us", "bounded_us", "outside_until_us",
         )),
-        *((name, ctypes.c_int32) for name in ("pose_timeout_us", "low_battery_mv", "battery_mv", "bounded")),
+        *((name, ctypes.c_int32) for name in (
+            "pose_timeout_us", "low_battery_mv", "battery_mv", "bounded", "controller_faults", "estimator_faults",
+        )),
         *((name, ctypes.c_uint8) for name in (
             "state", "cause", "manual", "calibrated", "armed", "pose_seen", "stopped", "battery_empty",
+            "not_finite",
         )),
     )  # fmt: skip
 
@@ -89,9 +92,9 @@ class Pins(ctypes.Structure):
     )
 
 
-def build_app(folder: Path) -> Path:
-    """Export the app of the default profile and return it as a shared library."""
-    write_app(load_config(), "floaty", folder)
+def build_app(folder: Path, config: LabConfig | None = None) -> Path:
+    """Export the app, of the default profile unless told otherwise, and return it as a shared library."""
+    write_app(config or load_config(), "floaty", folder)
     compiler = min(
         compilers(), key=lambda one: one.name == "zig"
     )  # the system's, if there is one: it is faster
@@ -132,6 +135,7 @@ class App:
         c.floaty_supervisor_mode.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32)
         c.floaty_supervisor_arm.argtypes = (ctypes.c_void_p, ctypes.c_bool)
         c.floaty_supervisor_recover.argtypes = (ctypes.c_void_p, ctypes.c_int64)
+        c.floaty_supervisor_see_logic.argtypes = (ctypes.c_void_p, ctypes.c_int32, ctypes.c_int32)
         c.floaty_supervisor_see_battery.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32)
         c.floaty_supervisor_arm.restype = c.floaty_supervisor_recover.restype = ctypes.c_bool
         c.floaty_pose_decode.argtypes = (ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int64, ctypes.c_void_p)

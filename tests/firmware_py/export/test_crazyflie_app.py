@@ -722,6 +722,7 @@ OPERATIONS = st.one_of(
     st.tuples(st.just("arm"), st.just(0), st.integers(0, 1)),
     st.tuples(st.just("recover"), st.integers(0, 10_000), st.just(0)),
     st.tuples(st.just("battery"), st.integers(0, 3_000_000), st.integers(3000, 3400)),
+    st.tuples(st.just("logic"), st.integers(0, 1), st.integers(0, 1)),
     st.tuples(st.just("manual"), st.just(0), st.integers(0, 2)),
 )
 
@@ -741,7 +742,7 @@ def test_supervisor_decides_as_the_laboratorys(
     python = reference.Supervisor(config, estimator, lambda text: None)
     c, here = functions.c, Supervisor()
     c.floaty_supervisor_init(ctypes.byref(here), config.pose_timeout_us, config.low_battery_mv)
-    now = 0
+    now, faults = 0, [0, 0]
     steps = (
         step
         for name, wait_us, value in operations
@@ -766,6 +767,10 @@ def test_supervisor_decides_as_the_laboratorys(
             assert c.floaty_supervisor_arm(this, bool(value)) == python.arm(bool(value))
         elif name == "recover":
             assert c.floaty_supervisor_recover(this, now) == python.recover(now)
+        elif name == "logic":
+            faults = [faults[0] + wait_us, faults[1] + value]
+            python.see_logic(*faults)
+            c.floaty_supervisor_see_logic(this, *faults)
         elif name == "battery":
             python.see_battery(now, value)
             c.floaty_supervisor_see_battery(this, now, value)

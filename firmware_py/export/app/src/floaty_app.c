@@ -15,7 +15,7 @@
  */
 #define DEBUG_MODULE "FLOATY"
 
-#include "floaty_app.h"
+#include "floaty_calls.h"
 
 #include <math.h>
 #include <string.h>
@@ -76,17 +76,16 @@ static QueueHandle_t pose_queue;
 void floaty_begin(void) {
   pose_queue = xQueueCreateStatic(POSE_QUEUE, sizeof(FloatyPose), pose_queue_storage, &pose_queue_buffer);
   floaty_core_init(&floaty_parameters);
-  floaty_core_reset(&floaty_parameters, &floaty_estimator);
+  call_reset();
   floaty_supervisor_init(&floaty_supervisor, FLOATY_POSE_TIMEOUT_US, FLOATY_LOW_BATTERY_MV);
-  floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control); /* mode 0: hover */
+  call_control(); /* mode 0: hover */
   floaty_servos_init(floaty_control.count);
 }
 
 void floaty_hover(void) {
-  static const FloatyInput input; /* mode 0 */
   FloatyControl control;
   memset(&control, 0, sizeof control);
-  floaty_core_control(&floaty_parameters, &input, &floaty_estimator, &control);
+  call_hover(&control);
   floaty_servos_write(control.count);
 }
 
@@ -143,7 +142,7 @@ static void hand_pose_to_core(FloatyPose *pose, stabilizerStep_t step) {
     const int32_t steps_to_go = (int32_t)((ESTIMATOR_PHASE + STEPS - step % STEPS) % STEPS);
     floaty_input.pose_age_us = (int32_t)waited_us + pose->age_us + steps_to_go * STEP_US;
   }
-  if (floaty_core_file_pose(&floaty_parameters, &floaty_input, &floaty_estimator) == POSE_ON_TIME) {
+  if (call_file_pose() == POSE_ON_TIME) {
     floaty_supervisor.last_pose_us = loop_us() - waited_us;
     floaty_supervisor.pose_seen = true;
   }
@@ -246,7 +245,7 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
     return; /* without a gyro Floaty stays calibrating, flaps at hover */
   }
   if (asked(&floaty_requests.reset)) {
-    floaty_core_reset(&floaty_parameters, &floaty_estimator);
+    call_reset();
   }
   if (floaty_absolute && floaty_supervisor.state == FLOATY_FLYING) {
     /* Less than one step of the motors' PWM: no pulse. But the firmware's supervisor, which looks at this next, sees
@@ -257,7 +256,7 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (stabilizerStep % STEPS != ESTIMATOR_PHASE) {
     return;
   }
-  floaty_core_estimate(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control);
+  call_estimate();
   memset(floaty_input.gyro_sum, 0, sizeof floaty_input.gyro_sum);
   floaty_input.gyro_samples = 0;
   tell_state(state, stabilizerStep);
@@ -300,11 +299,12 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     floaty_goal_move(&goal, setpoint);
   }
   if (stabilizerStep % STEPS == CONTROL_PHASE) {
+    call_guard();
     floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
     if (floaty_input.mode == MODE_MANUAL && !crtpIsConnected()) {
       floaty_input.mode = MODE_HOVER; /* nobody is there who could take the angles back */
     }
-    floaty_core_control(&floaty_parameters, &floaty_input, &floaty_estimator, &floaty_control);
+    call_control();
     floaty_servos_write(floaty_control.count);
     controlled_tick = xTaskGetTickCount();
   }

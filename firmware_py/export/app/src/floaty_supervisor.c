@@ -41,6 +41,9 @@ static FloatyCause cause_of_failsafe(const FloatySupervisor *self, int64_t now_u
   if (self->stopped) {
     return FLOATY_EMERGENCY_STOP;
   }
+  if (self->not_finite != FLOATY_NONE) {
+    return (FloatyCause)self->not_finite;
+  }
   if (self->battery_empty) {
     return FLOATY_LOW_BATTERY;
   }
@@ -76,7 +79,7 @@ int32_t floaty_supervisor_mode(FloatySupervisor *self, int64_t now_us, int32_t b
 }
 
 bool floaty_supervisor_arm(FloatySupervisor *self, bool armed) {
-  if (armed && (self->stopped || self->battery_empty)) {
+  if (armed && (self->stopped || self->battery_empty || self->not_finite != FLOATY_NONE)) {
     return false;
   }
   self->armed = armed;
@@ -85,11 +88,22 @@ bool floaty_supervisor_arm(FloatySupervisor *self, bool armed) {
 
 bool floaty_supervisor_recover(FloatySupervisor *self, int64_t now_us) {
   self->stopped = false;
+  self->not_finite = FLOATY_NONE;
   if (self->battery_mv >= self->low_battery_mv) {
     self->battery_empty = false;
     self->battery_good_us = now_us;
   }
   return !self->battery_empty;
+}
+
+void floaty_supervisor_see_logic(FloatySupervisor *self, int32_t controller_faults, int32_t estimator_faults) {
+  if (estimator_faults > self->estimator_faults) {
+    self->not_finite = FLOATY_ESTIMATOR_NOT_FINITE;
+  } else if (controller_faults > self->controller_faults) {
+    self->not_finite = FLOATY_CONTROLLER_NOT_FINITE;
+  }
+  self->controller_faults = controller_faults;
+  self->estimator_faults = estimator_faults;
 }
 
 void floaty_supervisor_see_battery(FloatySupervisor *self, int64_t now_us, int32_t battery_mv) {

@@ -23,6 +23,8 @@ typedef enum {
   FLOATY_LOW_BATTERY = 4,
   FLOATY_DISARMED = 5,
   FLOATY_NO_CONTROL = 6, /* no controller step comes: the loop stands still, or another controller runs */
+  FLOATY_CONTROLLER_NOT_FINITE = 7, /* own logic put out NaN or infinity */
+  FLOATY_ESTIMATOR_NOT_FINITE = 8,
 } FloatyCause;
 
 typedef enum {
@@ -41,6 +43,8 @@ typedef struct {
   int32_t low_battery_mv;
   int32_t battery_mv;
   int32_t bounded; /* the estimator's counter when it was last looked at */
+  int32_t controller_faults; /* of own logic, when they were last looked at */
+  int32_t estimator_faults;
   uint8_t state;   /* FloatyState */
   uint8_t cause;   /* FloatyCause */
   uint8_t manual;  /* FloatyManual */
@@ -49,6 +53,7 @@ typedef struct {
   bool pose_seen;
   bool stopped;
   bool battery_empty;
+  uint8_t not_finite; /* FloatyCause */
 } FloatySupervisor;
 
 /* Starts calibrating and armed. */
@@ -60,8 +65,11 @@ int32_t floaty_supervisor_mode(FloatySupervisor *self, int64_t now_us, int32_t b
 /* Arms or disarms; false when the request to arm was refused. */
 bool floaty_supervisor_arm(FloatySupervisor *self, bool armed);
 
-/* Leaves the emergency stop and, with a good voltage, the low battery; false when something remains. */
+/* Leaves what lasts: stop, logic that failed, and with a good voltage the low battery; false when one remains. */
 bool floaty_supervisor_recover(FloatySupervisor *self, int64_t now_us);
+
+/* Takes in how often own logic has put out NaN or infinity. */
+void floaty_supervisor_see_logic(FloatySupervisor *self, int32_t controller_faults, int32_t estimator_faults);
 
 /* Takes in the supply voltage. */
 void floaty_supervisor_see_battery(FloatySupervisor *self, int64_t now_us, int32_t battery_mv);

@@ -65,7 +65,8 @@ static void receive_localisation(CRTPPacket *packet) {
 static void announce_state(void) {
   static const char *const STATES[] = {"calibrating", "waiting", "flying", "failsafe"};
   static const char *const CAUSES[] = {"",           ", silence",  ", out of bounds", ", emergency stop",
-                                       ", low battery", ", disarmed", ", no control"};
+                                       ", low battery", ", disarmed", ", no control",
+                                       ", controller not finite", ", estimator not finite"};
   static uint8_t state = FLOATY_CALIBRATING, cause = FLOATY_NONE;
   const uint8_t new_state = floaty_supervisor.state, new_cause = floaty_supervisor.cause;
   if (new_state != state || new_cause != cause) {

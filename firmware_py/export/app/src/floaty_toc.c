@@ -6,7 +6,7 @@
  */
 #define DEBUG_MODULE "FLOATY"
 
-#include "floaty_app.h"
+#include "floaty_calls.h"
 
 #include "debug.h"
 #include "log.h"
@@ -203,6 +203,8 @@ LOG_ADD(LOG_FLOAT, P_x_x, &floaty_estimator.P[0][0])
 LOG_ADD(LOG_FLOAT, P_x_vx, &floaty_estimator.P[0][FLOATY_VELOCITY])
 LOG_ADD(LOG_FLOAT, P_vx_vx, &floaty_estimator.P[FLOATY_VELOCITY][FLOATY_VELOCITY])
 LOG_GROUP_STOP(Uncertainty)
+
+/* @logs */
 
 LOG_GROUP_START(delayComp)
 LOG_ADD(LOG_UINT8, horizon, &floaty_estimator.horizon)
