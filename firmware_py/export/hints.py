@@ -6,7 +6,7 @@ from collections.abc import Mapping
 FOREIGN = ("numpy", "math")
 _MATHS = "from firmware_py.core.maths"
 _NONE = "there is none: put it together from + - * / and sqrt, as firmware_py/core/maths.py does"
-_LOOP = "loop over range(..)"
+_LOOP = "a loop over range(..)"
 _FIELD = "a field Annotated[F32s, n] of the memory struct"
 FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
     **dict.fromkeys(("abs", "absolute", "fabs"), "abs(x)"),
@@ -21,7 +21,7 @@ FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
     **dict.fromkeys(("isfinite", "isnan", "isinf"), f"finite(x), {_MATHS}"),
     **dict.fromkeys(("float32", "float64", "float"), "f32(x)"),
     **dict.fromkeys(("int32", "int64", "int"), "i32(x)"),
-    **dict.fromkeys(("minimum", "maximum", "min", "max", "sign", "copysign", "where"), "if and else"),
+    **dict.fromkeys(("minimum", "maximum", "min", "max", "sign", "copysign", "where"), "an if"),
     **dict.fromkeys(("dot", "matmul", "inner", "sum", "mean", "cumsum"), _LOOP),
     **dict.fromkeys(("zeros", "ones", "empty", "array", "asarray", "full", "copy"), _FIELD),
     **dict.fromkeys(("power", "pow", "square"), "x * x"),
@@ -32,16 +32,18 @@ CONSTRUCTS: Mapping[str, str] = {
     "AugAssign": "x = x + y",
     "AnnAssign": "x = value",
     "While": _LOOP,
-    "IfExp": "if and else on lines of their own",
+    "IfExp": "an if on lines of its own",
     "ListComp": _LOOP,
     "Pow": "x * x",
-    "MatMult": "loops over range(..)",
+    "MatMult": _LOOP,
 }
 
 
 def instead(table: Mapping[str, str], name: str) -> str:
     """Return ": write ..." for a name that the table has, else nothing."""
-    return f": write {table[name]}" if name in table else ""
+    if name not in table:
+        return ""
+    return f": {table[name]}" if table[name] is _NONE else f": write {table[name]}"
 
 
 def first_use(tree: ast.Module, node: ast.Import | ast.ImportFrom) -> tuple[ast.AST, str]:

@@ -1,0 +1,312 @@
+"""What a module of the user's may hold, and what it is told when it does not: file, line, and what to write instead."""
+
+from pathlib import Path
+
+import pytest
+
+from firmware_py.config import LogicConfig, parameters_of
+from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.export.errors import ExportError
+from firmware_py.logic.loading import load_logic
+from hil.config import load_config
+from hil.errors import LabError
+from support.command import floaty
+from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, make_project, own_config
+
+
+def line_of(text: str, part: str) -> int:
+    return text[: text.index(part)].count("\n") + 1
+
+
+def changed(text: str, old: str, new: str) -> str:
+    assert text.count(old) == 1, old
+    return text.replace(old, new)
+
+
+IN_LAW = "    memory.ticks = i32(memory.ticks + 1)\n"
+GAIN = '    gain_iy: Annotated[f32, Tunable(-0.4, "rad/m/s", low=-2.0, high=2.0)]\n'
+HOOK = "estimator: Estimator, control: Control, own: Gains, memory: Memory) -> None:"
+IMPORTS = "from typing import Annotated\n"
+CALLS_NUMPY = (IMPORTS, IMPORTS + "import numpy as np\n")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "at", "told"),
+    [
+        (
+            "def control_law",
+            "def control_low",
+            "",
+            "no function control_law; functions there: reset_law, control_low",
+        ),
+        ("def reset_law", "def forget", "", "no function reset_law; functions there: forget, control_law"),
+        (
+            HOOK,
+            HOOK.replace("own: Gains", "gains: Gains"),
+            "@kernel\ndef control_law",
+            "control_law: argument gains: expected any of",
+        ),
+        (
+            HOOK,
+            HOOK.replace("own: Gains", "own: Parameters"),
+            "@kernel\ndef control_law",
+            "control_law: argument own: expected any of",
+        ),
+        (
+            HOOK,
+            HOOK.replace("-> None", "-> f32"),
+            "@kernel\ndef control_law",
+            "control_law: expected -> None",
+        ),
+        (
+            HOOK,
+            HOOK.replace("estimator: Estimator", "estimator"),
+            "@kernel\ndef control_law",
+            "argument estimator of control_law has no type",
+        ),
+        (
+            IN_LAW,
+            IN_LAW + "    parameters.gain_z = ZERO\n",
+            "@kernel\ndef control_law",
+            "control_law writes parameters: it may write control and memory",
+        ),
+        (
+            IN_LAW,
+            IN_LAW + "    own.after = i32(1)\n",
+            "@kernel\ndef control_law",
+            "control_law writes own: it may write control and memory",
+        ),
+        (
+            IN_LAW,
+            IN_LAW + "    control.u[1] = 0.5\n",
+            "    control.u[1]",
+            "float literal 0.5 without f32(..)",
+        ),
+        (
+            IN_LAW,
+            IN_LAW + "    control.u[1] += ZERO\n",
+            "    control.u[1]",
+            "AugAssign statement: write x = x + y",
+        ),
+        (
+            IN_LAW,
+            IN_LAW + "    control.u[1] = max(ZERO, own.gain_iy)\n",
+            "    control.u[1]",
+            "call of max, which is no kernel: write an if",
+        ),
+        (
+            IN_LAW,
+            IN_LAW + "    control.u[1] = own.gain_iy ** 2\n",
+            "    control.u[1]",
+            "Pow of f32 and i32: write x * x",
+        ),
+        (
+            IN_LAW,
+            IN_LAW + "    while True:\n        return\n",
+            "    while",
+            "While statement: write a loop over range(..)",
+        ),
+        (
+            IN_LAW,
+            IN_LAW + "    control.u[1] = own.gain_jy\n",
+            "    control.u[1]",
+            "own.gain_jy is no field of a struct",
+        ),
+        (
+            GAIN,
+            "    gain_iy: f32\n",
+            "    gain_iy",
+            "gain_iy: a parameter is Annotated[f32, Tunable(default,",
+        ),
+        (
+            GAIN,
+            "    gain_iy: Annotated[f32, Tunable(0.4)]\n",
+            "    gain_iy",
+            'Tunable(0.4): expected Tunable(default, "unit", low=.., high=..)',
+        ),
+        (
+            GAIN,
+            '    gain_iy: Annotated[f32, Tunable(0.4, "rad")]\n',
+            "    gain_iy",
+            "Tunable(0.4, 'rad'): expected Tunable(default,",
+        ),
+        (
+            GAIN,
+            "    gain_iy: Annotated[f32, Tunable(0.4, low=0.0, high=1.0)]\n",
+            "    gain_iy",
+            "expected Tunable(default,",
+        ),
+        (GAIN, GAIN.replace("-0.4", "-2.4"), "    gain_iy", "gain_iy: default -2.4 is outside -2..2"),
+        (
+            GAIN,
+            GAIN.replace("gain_iy", "a_gain_of_mine"),
+            "    a_gain",
+            "a_gain_of_mine: 14 characters; MAVLink leaves a parameter's name 12",
+        ),
+        (
+            GAIN,
+            GAIN + GAIN.replace("-0.4", "0.4"),
+            "    gain_iy: Annotated[f32, Tunable(0.4,",
+            "gain_iy: this name exists already",
+        ),
+        (
+            GAIN,
+            GAIN.replace("gain_iy", "estimator"),
+            "    estimator: Ann",
+            "estimator: this name exists already, as a key of [logic]",
+        ),
+        ("DT = f32(0.01)", "DT = f32(0.01)\nZERO = f32(0.0)", "ZERO = f32", "ZERO: this name exists already"),
+        (
+            "integral: Annotated",
+            "a_very_long_name_for_a_log: Annotated",
+            "    a_very",
+            "26 characters; a log variable's name has at most 19",
+        ),
+        (
+            "hidden: f32",
+            'hidden: Annotated[f32, Tunable(0.0, "", low=0.0, high=1.0)]',
+            "    hidden",
+            "hidden: in the memory",
+        ),
+        (
+            IMPORTS,
+            IMPORTS + "from firmware_py.core.maths import tan\n",
+            "from firmware_py.core.maths import tan",
+            "firmware_py.core.maths has no tan",
+        ),
+        (IMPORTS, IMPORTS + "from os import path\n", "from os", "import from os"),
+        ("DT = f32(0.01)", "DT = f32(0.01", "DT", "'(' was never closed"),
+    ],
+)
+def test_a_mistake_is_told_with_file_line_and_what_is_expected(
+    tmp_path: Path, old: str, new: str, at: str, told: str
+) -> None:
+    text = changed(LAW, old, new)
+    with pytest.raises(LabError) as error:
+        own_config(tmp_path, text)
+    line = line_of(text, at) + at.count("\n") if at else 1
+    assert str(error.value).startswith(f"{tmp_path / 'controller.py'}:{line}: ")
+    assert told in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        ("np.sin(own.gain_iy)", "np.sin is outside the subset: write sin(x), from firmware_py.core.maths"),
+        (
+            "np.clip(own.gain_iy, ZERO, ZERO)",
+            "np.clip is outside the subset: write clamp(x, low, high), from",
+        ),
+        (
+            "np.zeros(3)",
+            "np.zeros is outside the subset: write a field Annotated[F32s, n] of the memory struct",
+        ),
+        ("np.tanh(own.gain_iy)", "np.tanh is outside the subset: there is none"),
+        ("np.i0(own.gain_iy)", "np.i0 is outside the subset"),
+    ],
+)
+def test_a_call_of_numpy_is_told_where_it_stands_and_what_to_write(
+    tmp_path: Path, call: str, told: str
+) -> None:
+    text = changed(changed(LAW, *CALLS_NUMPY), IN_LAW, f"{IN_LAW}    control.u[1] = {call}\n")
+    with pytest.raises(LabError) as error:
+        own_config(tmp_path, text)
+    assert str(error.value).startswith(
+        f"{tmp_path / 'controller.py'}:{line_of(text, '    control.u[1]')}: {told}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ("gain_iz = 1.0", "logic.gain_iz: no parameter of that name; did you mean gain_iy?"),
+        ("gain_iy = 2.5", "logic.gain_iy = 2.5: outside -2..2 rad/m/s"),
+        ("after = 1.5", "logic.after = 1.5: expected a whole number"),
+        ('gain_iy = "much"', "logic.gain_iy = 'much'"),
+        ("gain_iy = nan", "logic.gain_iy = nan"),
+    ],
+)
+def test_a_value_of_the_profile_is_refused_with_what_is_allowed(
+    tmp_path: Path, values: str, told: str
+) -> None:
+    with pytest.raises(LabError) as error:
+        own_config(tmp_path, values=values)
+    assert str(error.value).startswith(told)
+
+
+def test_names_of_two_modules_that_clients_could_not_tell_apart_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        LabError, match=r"estimator.py: GAIN_IY: this name exists already: gain_iy in .*controller.py"
+    ):
+        own_config(tmp_path, LAW, ESTIMATOR.replace("until", "GAIN_IY"))
+
+
+def test_a_value_without_own_logic_is_refused() -> None:
+    with pytest.raises(LabError, match=r"logic.gain_y: neither a controller nor an estimator"):
+        load_config(overrides=["logic.gain_y=1.0"])
+
+
+def test_a_file_that_is_not_there_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    profile = make_project(tmp_path)
+    (tmp_path / "controller.py").unlink()
+    assert floaty(monkeypatch, "fly", "hover", "--profile", profile) == 2
+    said = capsys.readouterr().err
+    assert said == f"floaty: logic.controller = {tmp_path / 'controller.py'}: No such file or directory\n"
+
+
+def test_a_mistake_in_a_module_is_one_line_and_exit_code_two_wherever_it_would_fly(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_project(tmp_path, changed(LAW, "f32(0.01)", "0.01"))
+    for command in (("fly", "hover"), ("deploy", "check"), ("deploy", "export", "app")):
+        assert floaty(monkeypatch, *command, "--profile", "profile.toml") == 2
+        said = capsys.readouterr().err
+        assert said == "floaty: controller.py:11: constant DT is neither f32(number) nor a 32-bit integer\n"
+
+
+def test_paths_begin_at_the_profile_that_names_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    project, child = tmp_path / "project", tmp_path / "child"
+    project.mkdir()
+    child.mkdir()
+    make_project(project, AS_BUILT_IN)
+    (child / "mine.toml").write_text('base = "../project/profile.toml"\n', encoding="utf-8")
+    config = load_config(str(child / "mine.toml"))
+    assert config.logic.controller == str(project / "controller.py")
+    monkeypatch.chdir(project)
+    assert load_config(overrides=["logic.controller=controller.py"]).logic == config.logic
+    assert load_config("profile.toml", ["logic.controller=''"]).logic.controller == ""
+
+
+def test_an_edited_module_is_never_mistaken_for_what_it_was(tmp_path: Path) -> None:
+    def after_one_tick(factor: str) -> float:
+        law = AS_BUILT_IN + f"    control.u[0] = f32({factor})\n"
+        config = own_config(tmp_path, law)
+        blocks = CoreBlocks(parameters_of(config), PythonRunner, load_logic(config.logic))
+        blocks.data.fields.mode = 1
+        blocks.run.control()
+        return float(blocks.control.fields.u[0])
+
+    assert [after_one_tick(factor) for factor in ("0.25", "0.5", "0.25")] == [0.25, 0.5, 0.25]
+
+
+def test_what_is_loaded_needs_no_writable_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    project.mkdir()
+    (project / "__pycache__").touch()  # no folder can be made there, not even by root
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    config = own_config(project, AS_BUILT_IN)
+    logic = load_logic(config.logic)
+    assert logic is not None
+    assert Path(str(logic.loaded.entry.__file__)).is_relative_to(tmp_path / "cache" / "floaty")
+
+
+def test_text_outside_the_subset_is_an_export_error(tmp_path: Path) -> None:
+    (tmp_path / "law.py").write_text(changed(LAW, IN_LAW, "    print(own.after)\n"), encoding="utf-8")
+    with pytest.raises(
+        ExportError, match=r"call of print, which is no kernel: write a field of the memory struct"
+    ):
+        load_logic(LogicConfig(controller=str(tmp_path / "law.py")))
