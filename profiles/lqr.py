@@ -7,7 +7,7 @@ the flaps, so that 16 numbers are the whole matrix. Its errors are limited and i
 
 from typing import Annotated
 
-from firmware_py.core.controller import allocate
+from firmware_py.core.guard import allocate
 from firmware_py.core.maths import clamp, cos, sin, wrap
 from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, Control, Estimator, Parameters
 from firmware_py.core.subset import Struct, Tunable, f32, kernel

@@ -3,10 +3,13 @@
 The default core has no such logic and does without.
 """
 
+from firmware_py.core import controller
 from firmware_py.core.controller import FLAP_LIMIT, release, sign
 from firmware_py.core.maths import ZERO, clamp, finite
 from firmware_py.core.structs import MODE_FLY, STATES, Control, Estimator, Input, Parameters
 from firmware_py.core.subset import Struct, i32, kernel
+
+_allocate = controller.allocate
 
 
 class Guard(Struct):
@@ -20,6 +23,15 @@ class Guard(Struct):
 def closed(data: Input) -> bool:
     """Return whether the loop is closed."""
     return bool(data.mode == MODE_FLY)
+
+
+@kernel
+def allocate(parameters: Parameters, control: Control) -> None:
+    """Write flap angles as the built-in law does, height last; an input u4 that is no number stays so, to be noticed."""
+    u4 = control.u[3]
+    _allocate(parameters, control)
+    if not finite(u4):
+        control.u[3] = u4
 
 
 @kernel

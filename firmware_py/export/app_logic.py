@@ -64,7 +64,7 @@ def calls_header(config: LogicConfig) -> str:
         name: f"&floaty_{name}" for name in (*CORE_STRUCTS, *types) if name != "data"
     }
     calls = CALLS if logic is None else logic.loaded.calls
-    scratch = [name for name in types if not name.endswith(f"_{OWN}")]
+    scratch = [name for name in calls["control"] if name in types and not name.endswith(f"_{OWN}")]
     alone = places | {"data": "&input", "control": "control"} | {name: f"&{name}" for name in scratch}
     guard = (
         "  floaty_supervisor_see_logic(&floaty_supervisor, floaty_guard.controller_faults, "

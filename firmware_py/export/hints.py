@@ -28,6 +28,9 @@ FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
     **dict.fromkeys(("exp", "log", "tan", "tanh", "hypot"), _NONE),
     "print": "a field of the memory struct marked Logged(unit)",
 }
+GUARDED: Mapping[str, str] = {  # what logic of the user's own may not call, by its name in C
+    "controller_allocate": "allocate, from firmware_py.core.guard: it does not make a number of NaN",
+}
 CONSTRUCTS: Mapping[str, str] = {
     "AugAssign": "x = x + y",
     "AnnAssign": "x = value",

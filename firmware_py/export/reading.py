@@ -124,6 +124,13 @@ class _Reader:
         self.module.names[name] = thing
         self.module.defined.append(thing)
 
+    def _take(self, name: str, thing: "Named | Module", node: ast.stmt) -> None:
+        """Take a name from another module."""
+        if self.module.own and isinstance(thing, Kernel) and thing.c_name in hints.GUARDED:
+            text = f"{thing.node.name} of {thing.scope.path}{hints.instead(hints.GUARDED, thing.c_name)}"
+            raise refusal(self.module.path, node, text)
+        self.module.names[name] = thing
+
     def _import(self, node: ast.ImportFrom) -> None:
         if node.module == SUBSET:
             self.module.builtins |= {alias.name for alias in node.names}
@@ -134,7 +141,7 @@ class _Reader:
             for alias in node.names:
                 if alias.name not in source.names:
                     raise refusal(self.module.path, node, f"{node.module} has no {alias.name}")
-                self.module.names[alias.name] = source.names[alias.name]
+                self._take(alias.name, source.names[alias.name], node)
         elif node.module != "typing":
             raise refusal(self.module.path, node, f"import from {node.module}")
         if any(alias.asname for alias in node.names):
@@ -144,7 +151,7 @@ class _Reader:
         if isinstance(node.value, ast.Attribute) and isinstance(node.value.value, ast.Name):
             source = self.module.names.get(node.value.value.id)
             if isinstance(source, Module) and node.value.attr in source.names:
-                self.module.names[name] = source.names[node.value.attr]
+                self._take(name, source.names[node.value.attr], node)
                 return
         literal = constant_literal(node.value)
         if literal is None:

@@ -232,7 +232,7 @@ class Flight:
         cause = self.robot.firmware.signals.supervisor.cause
         if self.logic_failed is None and cause in NOT_FINITE:
             what = cause.name.lower().replace("_", " ")
-            self.logic_failed = f"own {what} at {(now_us - self.release_us) * 1e-6:.2f} s: failsafe"
+            self.logic_failed = f"own {what} at {now_us * 1e-6:.2f} s of simulated time: failsafe"
             self.note("lab", self.logic_failed)
 
     def _note_drops(self, now_us: int) -> None:

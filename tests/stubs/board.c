@@ -285,6 +285,7 @@ double stub_log_value(int i) {
     case LOG_UINT8: return *(uint8_t *)entry->address;
     case LOG_UINT16: return *(uint16_t *)entry->address;
     case LOG_UINT32: return *(uint32_t *)entry->address;
+    case LOG_INT32: return *(int32_t *)entry->address;
     case LOG_FLOAT: return (double)*(float *)entry->address;
     default: return (double)NAN;
   }
@@ -312,6 +313,7 @@ double stub_param_get(int i) {
     case PARAM_UINT8: return *(uint8_t *)entry->address;
     case PARAM_UINT16: return *(uint16_t *)entry->address;
     case PARAM_INT16: return *(int16_t *)entry->address;
+    case PARAM_INT32: return *(int32_t *)entry->address;
     case PARAM_FLOAT: return (double)*(float *)entry->address;
     default: return (double)NAN;
   }
@@ -323,6 +325,7 @@ void stub_param_load(int i, double value) {
     case PARAM_UINT8: *(uint8_t *)entry->address = (uint8_t)value; break;
     case PARAM_UINT16: *(uint16_t *)entry->address = (uint16_t)value; break;
     case PARAM_INT16: *(int16_t *)entry->address = (int16_t)value; break;
+    case PARAM_INT32: *(int32_t *)entry->address = (int32_t)value; break;
     case PARAM_FLOAT: *(float *)entry->address = (float)value; break;
   }
 }

@@ -16,6 +16,7 @@ struct log_s {
 #define LOG_UINT8 1
 #define LOG_UINT16 2
 #define LOG_UINT32 3
+#define LOG_INT32 6
 #define LOG_FLOAT 7
 #define LOG_GROUP 0x80
 #define LOG_START 1

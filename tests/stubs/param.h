@@ -19,6 +19,7 @@ struct param_s {
 #define PARAM_UINT8 0x08
 #define PARAM_UINT16 0x09
 #define PARAM_INT16 0x01
+#define PARAM_INT32 0x02
 #define PARAM_FLOAT 0x06
 #define PARAM_GROUP (0x01 << 7)
 #define PARAM_EXTENDED (1 << 4)

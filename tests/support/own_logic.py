@@ -8,7 +8,8 @@ HEAD = '''"""A law of the tests."""
 
 from typing import Annotated
 
-from firmware_py.core.controller import allocate, feedback
+from firmware_py.core.controller import feedback
+from firmware_py.core.guard import allocate
 from firmware_py.core.maths import ZERO, clamp, sin
 from firmware_py.core.structs import POSITION, Control, Estimator, Input, Parameters
 from firmware_py.core.subset import F32s, Logged, Struct, Tunable, f32, i32, kernel, sqrt

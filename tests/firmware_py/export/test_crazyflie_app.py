@@ -35,8 +35,9 @@ from firmware_py.geometry import (
 )
 from firmware_py.wire import WireError, crtp, telemetry
 from firmware_py.wire.mavlink_numbers import Result
-from hil.config import load_config
+from hil.config import LabConfig, load_config
 from support.crazyflie_app import LOCALISATION, STUBS, App, GyroZero, Pose, Setpoint, Supervisor, build_app
+from support.own_logic import ESTIMATOR, LAW, own_config
 
 ARM = "arm-none-eabi-gcc"
 ARM_FLAGS = (  # of the Crazyflie firmware
@@ -71,13 +72,13 @@ class Laboratory:
 
     uart_overruns = 0
 
-    def __init__(self) -> None:
+    def __init__(self, config: LabConfig | None = None) -> None:
         self.imu: ImuCounts = (0, 0, 0, 0, 0, 1365)
         self.battery_mv = 3900
         self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
         self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
         self.counts: list[int] = []
-        config = load_config()
+        config = config or load_config()
         costs = dict.fromkeys(type(config.cpu).model_fields, 0)
         self.firmware = Firmware(config.model_copy(update={"cpu": config.cpu.model_copy(update=costs)}), self)
         self.parameters = {parameter.name: parameter for parameter in self.firmware.parameters}
@@ -209,6 +210,63 @@ def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -
     state = app.state()
     assert state == pytest.approx({name: shown[name] for name in state}, rel=1e-6)
     assert abs(state["stateEstimate.pitch"]) > 0.5  # [deg]
+
+
+def test_own_logic_flies_in_the_app_as_in_the_laboratory_until_it_fails_in_both(tmp_path: Path) -> None:
+    config = own_config(tmp_path, LAW, ESTIMATOR, "gain_iy = 0.5")
+    app, laboratory = App(build_app(tmp_path / "app", config), tmp_path / "copy.so"), Laboratory(config)
+    rng, states, integrals = np.random.default_rng(3), set(), set()
+    names = ("logic.gain_iy", "logic.twelve_chars", "logic.after", "logic.until")
+    read = {variable.name: variable.read for variable in laboratory.firmware.variables}
+    logged = sorted(name for name in read if name.startswith("logic."))
+    app.boot()
+    assert {name for name in app.params if name.startswith("logic.")} == set(names)
+    assert {name for name in app.logs if name.startswith("logic.")} == set(logged)
+    for name in names:
+        twin = laboratory.parameters[name]
+        assert app.get(name) == twin.read(), name
+        assert app.c.stub_param_type(app.params[name]) == twin.scalar.parameter_number, name
+        assert app.c.stub_param_persistent(app.params[name]) == twin.persistent is True, name
+    for step in range(1, 1500):
+        sample = [int(v) for v in np.rint(BIAS + rng.normal(0, 2, 3))]
+        laboratory.imu = (*sample, 0, 0, 1365)  # type: ignore[assignment]
+        app.gyro[:] = sample
+        laboratory.advance(step * 1000 - 900)
+        laboratory.firmware.imu_ready()
+        laboratory.advance(step * 1000 - 800)
+        app.now.value = step * 1000 - 800
+        if step > 600 and step % 20 == 3:
+            pose(crtp.encode_ext_pose((0.01, -0.03, 0.02), (1.0, 0.0, 0.0, 0.0), 40_000))(app, laboratory)
+        for at, name, value in (
+            (900, "logic.twelve_chars", 9.0),
+            (1000, "logic.gain_iy", -1.5),
+            (1200, "logic.after", 50),
+        ):
+            if step == at:
+                app.set(name, value)
+                laboratory.parameters[name].set(value)
+        laboratory.advance(step * 1000 - 800)
+        laboratory.advance(step * 1000)
+        app.step(step)
+        assert app.counts() == laboratory.counts, f"step {step}"
+        assert (app.supervisor.state, app.supervisor.cause) == (
+            laboratory.firmware._supervisor.state, laboratory.firmware._supervisor.cause,
+        ), f"step {step}"  # fmt: skip
+        assert [app.log(name) for name in logged] == [read[name]() for name in logged], f"step {step}"
+        states.add((app.supervisor.state, app.supervisor.cause))
+        integrals.add(app.log("logic.integral"))
+    assert len(integrals) > 50
+    assert states == {(0, 0), (1, 0), (2, 0), (3, reference.Cause.CONTROLLER_NOT_FINITE)}
+    app.c.stub_run_app(1)
+    assert "supervisor: failsafe, controller not finite\n" in app.console()
+
+
+def test_an_app_with_own_logic_compiles_as_the_default_does(tmp_path: Path) -> None:
+    if shutil.which(ARM) is None:
+        pytest.skip(f"no {ARM} here: apt-get install gcc-arm-none-eabi")
+    source = compile_for_arm(own_config(tmp_path, LAW, ESTIMATOR, "after = 7"), tmp_path / "app")
+    assert (source / "floaty_core.o").is_file()
+    assert ".after = 7," in (source / "floaty_profile.c").read_text()
 
 
 def test_servos_hang_on_the_originals_pins_at_400_hz(app: App) -> None:
@@ -884,8 +942,12 @@ def names_in(c: str) -> set[str]:
 def arm_build(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if shutil.which(ARM) is None:
         pytest.skip(f"no {ARM} here: apt-get install gcc-arm-none-eabi")
-    folder = tmp_path_factory.mktemp("arm")
-    write_app(load_config(), "floaty", folder)
+    return compile_for_arm(load_config(), tmp_path_factory.mktemp("arm"))
+
+
+def compile_for_arm(config: LabConfig, folder: Path) -> Path:
+    """Export an app and compile its files as the Crazyflie's firmware is; returns their folder."""
+    write_app(config, "floaty", folder)
     kbuild = (folder / "src" / "Kbuild").read_text()
     for name in re.findall(r"^obj-y \+= (\S+)$", kbuild, re.M):
         own = re.findall(rf"^CFLAGS_{re.escape(name)} := (.*)$", kbuild, re.M)

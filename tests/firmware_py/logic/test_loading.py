@@ -175,6 +175,18 @@ CALLS_NUMPY = (IMPORTS, IMPORTS + "import numpy as np\n")
             "firmware_py.core.maths has no tan",
         ),
         (IMPORTS, IMPORTS + "from os import path\n", "from os", "import from os"),
+        (
+            "from firmware_py.core.guard import allocate",
+            "from firmware_py.core.controller import allocate",
+            "from firmware_py.core.controller import allocate",
+            ": write allocate, from firmware_py.core.guard",
+        ),
+        (
+            "DT = f32(0.01)",
+            "from firmware_py.core import controller\n_mix = controller.allocate\nDT = f32(0.01)",
+            "_mix",
+            ": write allocate, from firmware_py.core.guard",
+        ),
         ("DT = f32(0.01)", "DT = f32(0.01", "DT", "'(' was never closed"),
     ],
 )
@@ -265,7 +277,8 @@ def test_a_mistake_in_a_module_is_one_line_and_exit_code_two_wherever_it_would_f
     for command in (("fly", "hover"), ("deploy", "check"), ("deploy", "export", "app")):
         assert floaty(monkeypatch, *command, "--profile", "profile.toml") == 2
         said = capsys.readouterr().err
-        assert said == "floaty: controller.py:11: constant DT is neither f32(number) nor a 32-bit integer\n"
+        at = f"controller.py:{line_of(LAW, 'DT =')}"
+        assert said == f"floaty: {at}: constant DT is neither f32(number) nor a 32-bit integer\n"
 
 
 def test_paths_begin_at_the_profile_that_names_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

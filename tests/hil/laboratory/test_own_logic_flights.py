@@ -1,0 +1,119 @@
+"""Flights with a controller and an estimator of the user's own, on every board; the laws that ship."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.wire.supervisor import State
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.metrics import column
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, Result, fly, prepare
+from hil.pictures.report import write_report
+from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, make_project
+from support.paths import ROOT
+
+HOVER = EXPERIMENTS["hover"]
+
+
+def go(
+    folder: Path, profile: str | Path, duration_s: float, *overrides: str, board: str = "python"
+) -> Result:
+    prepare(folder)
+    return fly(Request.of(HOVER, str(profile), overrides, duration_s=duration_s, board=board), folder)
+
+
+def test_modules_that_compute_what_the_core_does_make_the_same_flight(tmp_path: Path) -> None:
+    profile = make_project(tmp_path, AS_BUILT_IN, ESTIMATOR)
+    usual, own = go(tmp_path / "usual", "floaty", 0.5), go(tmp_path / "own", profile, 0.5)
+    assert own.hash == usual.hash
+    logic = json.loads((tmp_path / "own" / "result.json").read_text())["logic"]
+    assert set(logic) == {"hash", "controller", "estimator"}
+    assert json.loads((tmp_path / "usual" / "result.json").read_text())["logic"] == {}
+
+
+@pytest.fixture(scope="module")
+def failed(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """A flight whose law divides nothing by nothing after 80 ticks."""
+    folder = tmp_path_factory.mktemp("failed")
+    profile = make_project(folder, LAW)
+    return go(folder / "run", profile, 0.5, "logic.after=80", "logic.gain_iy=0.5")
+
+
+def test_a_law_that_puts_out_nan_is_a_failed_flight_that_names_it(failed: Result) -> None:
+    assert failed.outcome == "error"
+    assert not failed.passed
+    assert failed.cause is not None
+    assert failed.cause.startswith("own controller not finite at 1.3")
+    content = json.loads((failed.folder / "result.json").read_text())
+    assert (content["outcome"], content["cause"], content["passed"]) == ("error", failed.cause, False)
+    texts = [(event["source"], event["text"]) for event in load_events(failed.folder)]
+    assert ("board", "supervisor: failsafe, controller not finite") in texts
+    assert ("lab", failed.cause.split(";")[0]) in texts
+    log = load_log(failed.folder)
+    failsafe = column(log, "supervisor.state") == State.FAILSAFE
+    assert 10 < failsafe.sum() < 50
+    flaps = column(log, *(f"control.flap_{number}" for number in (1, 2, 3, 4)))
+    assert flaps[failsafe] == pytest.approx(np.tile([0.436332, -0.436332], (failsafe.sum(), 2)), abs=1e-6)
+    assert np.isfinite(flaps).all()
+
+
+def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
+    log = load_log(failed.folder)
+    own = {field.name: field.metadata[b"unit"] for field in log.schema if field.name.startswith("logic.")}
+    errors = {f"logic.errors{axis}": b"m" for axis in (1, 2, 3)}
+    assert own == {"logic.integral": b"m s", **errors, "logic.ticks": b""}
+    flying = column(log, "supervisor.state") == State.FLYING
+    assert column(log, "logic.errors1")[flying] == pytest.approx(-column(log, "estimate.x")[flying], abs=1e-6)
+    assert np.abs(column(log, "logic.integral")).max() > 0.0
+    assert (
+        write_report(failed.folder).read_text().count("Own logic") == 2
+    )  # of the figure: its title and its text
+
+
+@pytest.mark.parametrize("board", ["c", pytest.param("cortex-m4", marks=pytest.mark.long)])
+def test_the_same_flight_on_another_board_is_alike_to_the_last_bit(
+    failed: Result, tmp_path: Path, board: str
+) -> None:
+    again = go(tmp_path, failed.request.profile, 0.5, *failed.request.overrides, board=board)
+    assert again.hash == failed.hash
+    assert again.cause == failed.cause
+
+
+@pytest.mark.long
+def test_without_numba_the_same_text_makes_the_same_flight(failed: Result) -> None:
+    command = ("hover", "--duration", "0.01", "--profile", failed.request.profile)
+    hashes = set()
+    for plain in ("0", "1"):
+        out = failed.folder.parent / f"plain-{plain}"
+        done = subprocess.run(
+            (sys.executable, "-m", "hil.commands", "fly", *command, "--set", "flight.release_us=700000", "--out", out),
+            env=os.environ | {"NUMBA_DISABLE_JIT": plain}, cwd=ROOT, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode in (0, 1), done.stderr
+        hashes.add(json.loads((out / "result.json").read_text())["hash"])
+    assert len(hashes) == 1
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("profile", ["original", "lqr"])
+def test_the_laws_that_ship_hover_within_the_limits_and_alike_on_every_board(
+    tmp_path: Path, profile: str
+) -> None:
+    results = [go(tmp_path / board, profile, 30.0, board=board) for board in ("python", "c", "cortex-m4")]
+    assert [result.passed for result in results] == [True] * 3
+    assert len({result.hash for result in results}) == 1
+
+
+def test_the_laws_that_ship_take_off(tmp_path: Path) -> None:
+    for profile in ("original", "lqr"):
+        result = go(tmp_path / profile, profile, 2.0)
+        assert result.passed, result.verdicts
+        assert (
+            result.hash != go(tmp_path / "usual", "as-flown" if profile == "original" else "floaty", 2.0).hash
+        )
