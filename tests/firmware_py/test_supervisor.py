@@ -100,6 +100,8 @@ EVENTS = pytest.mark.parametrize(
         (Supervisor.emergency_stop, Cause.EMERGENCY_STOP, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
         (ran_down, Cause.LOW_BATTERY, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
         (lambda supervisor: supervisor.arm(False), Cause.DISARMED, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (lambda s: s.see_logic(1, 0), Cause.CONTROLLER_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (lambda s: s.see_logic(1, 1), Cause.ESTIMATOR_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
     ],
 )
 
@@ -113,7 +115,7 @@ def in_flight(happen: Callable[[Supervisor], object]) -> Supervisor:
 
 @EVENTS
 @pytest.mark.parametrize("manual", Manual)
-def test_angles_from_outside_move_the_flaps_unless_somebody_or_the_battery_stopped_the_robot(
+def test_angles_from_outside_move_the_flaps_unless_somebody_the_battery_or_own_logic_stopped_the_robot(
     happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int], manual: Manual
 ) -> None:
     supervisor = in_flight(happen)

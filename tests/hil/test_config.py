@@ -12,7 +12,7 @@ from hil.errors import LabError
 
 
 def test_shipped_profiles_load() -> None:
-    assert profile_names() == ["as-flown", "floaty"]
+    assert profile_names() == ["as-flown", "floaty", "lqr", "original"]
     for name in profile_names():
         load_config(name)
 
