@@ -25,6 +25,7 @@ from firmware_py.core.structs import Estimator
 from firmware_py.drivers.imu import GyroZero as PythonGyroZero
 from firmware_py.export.crazyflie import write_app
 from firmware_py.export.errors import ExportError
+from firmware_py.export.profile_c import profile_hash
 from firmware_py.firmware import Firmware
 from firmware_py.geometry import (
     Quaternion,
@@ -267,6 +268,10 @@ def test_an_app_with_own_logic_compiles_as_the_default_does(tmp_path: Path) -> N
     source = compile_for_arm(own_config(tmp_path, LAW, ESTIMATOR, "after = 7"), tmp_path / "app")
     assert (source / "floaty_core.o").is_file()
     assert ".after = 7," in (source / "floaty_profile.c").read_text()
+    assert (
+        profile_hash(own_config(tmp_path, LAW, ESTIMATOR, "after = 8"))
+        not in (source / "floaty_profile.c").read_text()
+    )
 
 
 def test_servos_hang_on_the_originals_pins_at_400_hz(app: App) -> None:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -35,6 +36,14 @@ def test_modules_that_compute_what_the_core_does_make_the_same_flight(tmp_path: 
     logic = json.loads((tmp_path / "own" / "result.json").read_text())["logic"]
     assert set(logic) == {"hash", "controller", "estimator"}
     assert json.loads((tmp_path / "usual" / "result.json").read_text())["logic"] == {}
+
+
+def test_the_law_in_the_documentation_flies(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "own-logic.md").read_text(encoding="utf-8")
+    law = dedent(text.split("## A control law")[1].split("\n`control_law`")[0])
+    own = go(tmp_path / "own", make_project(tmp_path, law, "", "gain_z = 4.0"), 0.5)
+    assert own.passed
+    assert np.abs(column(load_log(own.folder), "logic.integral")).max() > 0.0
 
 
 @pytest.fixture(scope="module")
