@@ -67,7 +67,9 @@ def test_parameters_are_taken_inside_their_bounds_and_can_be_stored(bench: Bench
 def test_what_the_memory_marks_is_logged_and_nothing_else(bench: Bench) -> None:
     names = [variable.name for variable in bench.firmware.variables if variable.name.startswith("logic.")]
     assert names == ["logic.integral", "logic.errors1", "logic.errors2", "logic.errors3", "logic.ticks"]
-    assert bench.read("logic.errors2") == pytest.approx(-0.05, abs=1e-3)
+    y = bench.read("stateEstimate.y")
+    assert bench.read("logic.errors2") == pytest.approx(-y, abs=2e-3)  # of the last step
+    assert y == pytest.approx(0.05, abs=5e-3)
     assert bench.read("logic.integral") < 0.0
     before = bench.read("logic.ticks")
     bench.run(bench.now_us + 100_000)
