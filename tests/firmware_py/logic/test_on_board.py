@@ -86,9 +86,9 @@ def test_mavlink_has_room_for_the_longest_name(config: LabConfig) -> None:
 
 
 def test_a_law_that_fails_puts_the_flaps_to_hover_at_once_until_it_is_asked_to_recover(
-    tmp_path: Path,
+    config: LabConfig,
 ) -> None:
-    bench = Bench(tmp_path)
+    bench = Bench(config)
     bench.run(GYRO_ZERO_US + 300_000)
     assert bench.supervisor.state is State.FLYING
     assert bench.writes[-1][1] != HOVER_COUNTS
