@@ -148,7 +148,9 @@ def test_a_failed_limit_is_told_first(folder: Path) -> None:
         passed=False,
         outcome="lost",
         cause="fell",
-        verdicts=[{"metric": "max_z", "value": 0.5, "bound": 0.1, "holds": False}],
+        verdicts=[
+            {"metric": "max_z", "value": 0.5, "bound": 0.1, "holds": False, "unit": "m", "sense": "max"}
+        ],
     )
     first = report(folder).tables["metrics"][1]
     assert first[:1] + first[2:5] == ["max_z", "cm", "≤ 10", "fails"]
@@ -188,7 +190,7 @@ def test_without_a_log_there_is_no_report(tmp_path: Path) -> None:
 
 
 def test_a_metric_without_a_value_is_a_dash_and_fails(folder: Path) -> None:
-    verdict = {"metric": "rms_x", "value": None, "bound": 0.1, "holds": False}
+    verdict = {"metric": "rms_x", "value": None, "bound": 0.1, "holds": False, "unit": "m", "sense": "max"}
     change_result(folder, metrics={"rms_x": None}, verdicts=[verdict])
     rows = {row.name: row for row in metric_rows(read_result(folder))}
     assert (rows["rms_x"].value, rows["rms_x"].holds) == ("–", False)
