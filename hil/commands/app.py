@@ -12,6 +12,7 @@ from hil.commands.deploy import deploy
 from hil.commands.drag_model import drag_model
 from hil.commands.fly import fly
 from hil.commands.listing import list_experiments
+from hil.commands.new import new
 from hil.commands.options import INTERRUPTED
 from hil.commands.paper import paper, study
 from hil.commands.pictures import report, view
@@ -27,7 +28,7 @@ def app() -> None:
 
 
 for command in (
-    fly, list_experiments, view, report, serve, station, compare, paper, study, drag_model, deploy,
+    fly, new, list_experiments, view, report, serve, station, compare, paper, study, drag_model, deploy,
 ):  # fmt: skip
     app.add_command(command)
 

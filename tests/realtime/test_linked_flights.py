@@ -79,3 +79,41 @@ def test_faults_of_the_command_line_begin_after_the_release() -> None:
     with serve("--udp", "0", "--station", "--fault", "imu.freeze@0.5:0.1") as served:
         served.wait_for("board 1: released", 60.0)
         served.wait_for(r"fault imu\.freeze@0\.5:0\.1 ends", 60.0)
+
+
+EIGHT = """
+from hil import Along, Experiment
+
+wide = Experiment("wide", "a step in y", 4.0, {"lost": 0.0}, Along(lambda t: (0.0, 0.05 if t > 1.0 else 0.0, 0.0)))
+"""
+
+
+def test_the_station_flies_the_trajectory_of_an_own_file(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(EIGHT)
+    result = fly(tmp_path / "run", f"{tmp_path / 'own.py'}:wide", "--link", DONGLE)
+    assert result["passed"], result["verdicts"]
+    log = load_log(tmp_path / "run")
+    assert column(log, "goal.y")[-1] == pytest.approx(0.05)
+    assert column(log, "truth.y")[-100:].mean() == pytest.approx(0.05, abs=0.02)
+
+
+def test_the_tests_of_a_project_fly_over_a_real_link(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("""
+        import pytest
+
+        def test_it(floaty):
+            flight = floaty.fly(duration_s=2.0)
+            assert flight.result.link.startswith("radio://")
+            assert flight.outcome == "completed"
+
+        @pytest.mark.floaty(boards=["c"])
+        def test_c(floaty):
+            floaty.fly()
+
+        @pytest.mark.floaty(needs="lockstep")
+        def test_bits(floaty):
+            floaty.fly()
+        """)
+    result = pytester.runpytest_inprocess(f"--floaty-link={DONGLE}")
+    result.assert_outcomes(passed=1, skipped=2)
+    result.stdout.fnmatch_lines(["floaty: 1 not flown: needs lockstep: this flies over radio://*"])

@@ -1,0 +1,168 @@
+"""`floaty new`: what it makes flies and tests at once, in the clone and where the package is installed as a wheel."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+import hil
+from hil.experiments import find_experiment
+from hil.laboratory.result import read_result
+from support.command import floaty
+
+ROOT = Path(hil.__file__).parent.parent
+FILES = [
+    ".gitignore",
+    "README.md",
+    "controller.py",
+    "experiments.py",
+    "profile.toml",
+    "pyproject.toml",
+    "tests/test_flight.py",
+]
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def files_in(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_project_has_everything_that_a_flight_and_a_test_need(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "new", "deep/My Law") == 0
+    project = Path("deep/My Law")
+    assert files_in(project) == sorted(FILES)
+    assert "cd deep/My Law; floaty fly hover --profile profile.toml" in capsys.readouterr().out
+    assert 'name = "my-law"' in (project / "pyproject.toml").read_text()
+    assert all("{{" not in (project / name).read_text(encoding="utf-8") for name in FILES)
+    assert find_experiment(f"{project}/experiments.py:figure_eight").duration_s == 12.0
+
+
+def test_an_empty_folder_becomes_a_project(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("law").mkdir()
+    assert floaty(monkeypatch, "new", "law") == 0
+    assert files_in(Path("law")) == sorted(FILES)
+
+
+def test_the_present_folder_becomes_a_project_of_its_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert floaty(monkeypatch, "new", ".") == 0
+    assert 'name = "here"' in Path("pyproject.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("folder", "told"),
+    [
+        ("taken", "floaty: new taken: there is something already; choose a folder that is new or empty\n"),
+        ("file", "floaty: new file: there is something already; choose a folder that is new or empty\n"),
+        ("---", "floaty: new ---: a project's name, its folder's, has letters a to z or digits\n"),
+        ("file/law", "floaty: new file/law: Not a directory\n"),
+    ],
+)
+def test_a_folder_that_cannot_be_is_one_line_and_nothing_is_written(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    folder: str,
+    told: str,
+) -> None:
+    Path("taken").mkdir()
+    Path("taken/controller.py").write_text("years of work")
+    Path("file").touch()
+    assert floaty(monkeypatch, "new", "--", folder) == 2
+    assert capsys.readouterr().err == told
+    assert files_in(tmp_path) == ["file", "taken/controller.py"]
+    assert Path("taken/controller.py").read_text() == "years of work"
+
+
+@pytest.mark.long
+def test_a_project_flies_and_its_tests_pass(
+    monkeypatch: pytest.MonkeyPatch, pytester: pytest.Pytester
+) -> None:
+    monkeypatch.chdir(pytester.path)
+    assert floaty(monkeypatch, "new", "law") == 0
+    monkeypatch.chdir("law")
+    assert floaty(monkeypatch, "fly", "hover", "--profile", "profile.toml", "--duration", "3") == 0
+    flown = read_result(Path("runs/hover-1"))
+    assert flown.logic["controller"].endswith("law/controller.py")
+    assert [verdict.metric for verdict in flown.verdicts] == ["lost", "in_box", "within_6cm_y"]
+    pytester.runpytest_inprocess().assert_outcomes(passed=4)
+
+
+def run(folder: Path, *command: str | Path) -> str:
+    """Run a command as a user of the wheel would, and return what it prints."""
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PYTEST"))
+    }
+    ran = subprocess.run(
+        list(map(str, command)), cwd=folder, env=environment, capture_output=True, text=True, timeout=500
+    )
+    assert ran.returncode == 0, ran.stdout[-4000:] + ran.stderr[-4000:]
+    return ran.stdout
+
+
+@pytest.mark.long
+def test_a_project_outside_the_clone_flies_tests_checks_and_exports_with_the_wheel(tmp_path: Path) -> None:
+    run(ROOT, sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
+    (wheel,) = tmp_path.glob("floaty_hil-*.whl")
+    run(tmp_path, sys.executable, "-m", "venv", "--without-pip", "site")
+    python = tmp_path / "site" / "bin" / "python"
+    run(
+        tmp_path,
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        python,
+        "install",
+        "--quiet",
+        "--no-index",
+        "--no-deps",
+        wheel,
+    )
+    purelib = Path(
+        run(tmp_path, python, "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])").strip()
+    )
+    (purelib / "dependencies.pth").write_text(
+        sysconfig.get_paths()["purelib"]
+    )  # theirs alone: no .pth is read there
+    assert run(tmp_path, python, "-c", "import hil; print(hil.__file__)").startswith(str(purelib))
+
+    command = tmp_path / "site" / "bin" / "floaty"
+    run(tmp_path, command, "new", "law")
+    project = tmp_path / "law"
+    run(project, command, "fly", "hover", "--profile", "profile.toml", "--duration", "5")
+    run(project, python, "-m", "pytest", "-q", "--junitxml=junit.xml")
+    properties = [
+        (one.attrib["name"], one.attrib["value"])
+        for one in ElementTree.parse(project / "junit.xml").iter("property")
+    ]
+    assert ("floaty.hash", read_result(project / "runs" / "hover-1").hash) in properties
+    checked = run(
+        project,
+        command,
+        "deploy",
+        "check",
+        "hover",
+        "--profile",
+        "profile.toml",
+        "--duration",
+        "0.5",
+        "--targets",
+        "c-O2",
+    )
+    assert "no bit differs" in checked
+    run(project, command, "deploy", "export", "app", "--profile", "profile.toml")
+    assert any("integral" in path.read_text() for path in (project / "app").rglob("*.c"))
