@@ -23,6 +23,11 @@ _closed = guard.closed
 _guard_control = guard.guard_control
 _guard_estimate = guard.guard_estimate
 '''
+PREDICTOR = {
+    "reset": "reset",
+    "file_pose": "pose_into_history",
+    "estimate": "estimate",
+}  # who is called by default
 DOCS = {
     "reset": "Start the estimator.",
     "file_pose": "File the pose in the input under the instant at which it was true.",
@@ -58,7 +63,7 @@ def compose(plugs: Sequence[Plug], package: str) -> Entry:
         "control": _control_body(by_name.get(CONTROLLER.name))
     }
     if ESTIMATOR.name not in by_name:
-        lines += [f"_{hook} = predictor.{hook}\n" for hook in ESTIMATOR.hooks]
+        lines += [f"_{hook} = predictor.{kernel}\n" for hook, kernel in PREDICTOR.items()]
     calls = {}
     for name, body in bodies.items():
         calls[name] = tuple(block for block in types if f"{block}[0]" in body)

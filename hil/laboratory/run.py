@@ -155,7 +155,9 @@ def fly(
         flight.write_schedule(folder)
     log = load_log(folder)
     experiment = request.experiment
-    metrics = measure(log, outcome == "lost" or flight.lost is not None) | dict.fromkeys(experiment.metrics, math.nan)
+    metrics = measure(log, outcome == "lost" or flight.lost is not None) | dict.fromkeys(
+        experiment.metrics, math.nan
+    )
     if (free := free_flight(log)).num_rows > 1:
         metrics.update(experiment.measured(free))
     firmware = flight.robot.firmware

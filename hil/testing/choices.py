@@ -10,6 +10,7 @@ from functools import cache
 from itertools import product
 from typing import Any
 
+from firmware_py.config import LogicConfig
 from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.errors import ExportError
 from hil.config import DEFAULT_PROFILE
@@ -117,7 +118,7 @@ def why_not(choice: Choice, needs: Iterable[str]) -> str:
 def why_no_board(board: str) -> str:
     """Return why a board cannot be had on this machine, empty when it can."""
     try:
-        runner_of(board, BUILD)
+        runner_of(board, BUILD, LogicConfig())
     except ExportError as error:
         return f"board {board} cannot be had here: {error}"
     return ""

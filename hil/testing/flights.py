@@ -114,7 +114,7 @@ class Flights:
             raise LabError(f"board: link {link!r}: expected {RADIO} or {MAVLINK}")
         self._need(self.choice.board)
         config = load_config(self._placed(profile or self.choice.profile), overrides)
-        return BareBoard(config, runner_of(self.choice.board, BUILD), link == MAVLINK)
+        return BareBoard(config, runner_of(self.choice.board, BUILD, config.logic), link == MAVLINK)
 
     def _need(self, board: str) -> None:
         if reason := why_no_board(board):

@@ -77,7 +77,7 @@ from firmware_py.core.structs import Control, Estimator, Input, Parameters
 from firmware_py.core.subset import Struct, Tunable, f32, i32, kernel
 
 _reset = predictor.reset
-_file_pose = predictor.file_pose
+_file_pose = predictor.pose_into_history
 _estimate = predictor.estimate
 
 

@@ -17,7 +17,7 @@ from firmware_py.wire.parameters import EINVAL, OK
 from firmware_py.wire.supervisor import Cause, State
 from hil.config import LabConfig
 from support.firmware_bench import HOVER_COUNTS, FirmwareBench
-from support.mavlink_client import GYRO_ZERO_US, Client
+from support.mavlink_client import GYRO_ZERO_US, MavlinkClient
 from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, own_config
 from support.paths import ROOT
 
@@ -77,7 +77,7 @@ def test_what_the_memory_marks_is_logged_and_nothing_else(bench: Bench) -> None:
 
 
 def test_mavlink_has_room_for_the_longest_name(config: LabConfig) -> None:
-    client = Client(f"logic.controller={config.logic.controller!r}")
+    client = MavlinkClient(f"logic.controller={config.logic.controller!r}")
     client.run(20_000)
     client.send("param_request_read", 1, 1, b"OWN_TWELVE_CHARS", -1)
     client.run(client.now_us + 20_000)
