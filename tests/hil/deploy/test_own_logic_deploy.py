@@ -14,7 +14,8 @@ from scipy.linalg import solve_discrete_are
 from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core import model
 from firmware_py.core.structs import MODE_FLY
-from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
+from firmware_py.export.side_by_side import SideBySide
 from firmware_py.logic.loading import Logic, load_logic, translation_of
 from hil.config import load_config
 from support.command import floaty
@@ -67,6 +68,22 @@ def test_one_changed_operator_in_the_c_of_own_logic_is_exit_one_and_named(
     assert floaty(monkeypatch, "deploy", "check", *SHORT, "--targets", "c-O2", "--source", "changed.c") == 1
     shown = capsys.readouterr().out
     assert re.search(rf"c-O2 .* DIFFERS first in tick \d+, after control: {re.escape(where)}", shown)
+
+
+def test_a_parameter_that_is_set_in_flight_reaches_every_target(project: Path) -> None:
+    config, made = load_config("profile.toml"), []
+
+    def side_by_side(blocks: CoreBlocks) -> CoreRunner:
+        made.append(SideBySide(blocks, {"python": PythonRunner}))
+        return made[0]
+
+    core = CoreBlocks(parameters_of(config), side_by_side, load_logic(config.logic))
+    core.data.fields.mode = MODE_FLY
+    core.named["controller_own"].memory["gain_iy"] = 1.5
+    core.parameters.fields.target[1] = 0.1
+    core.run.control()
+    assert made[0].targets[0].calls == 1
+    assert made[0].targets[0].divergence is None
 
 
 def test_export_from_a_folder_of_the_users_writes_an_app_with_the_c_that_is_checked(
