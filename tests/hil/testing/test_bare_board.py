@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from firmware_py.config import LogicConfig
 from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.wire import crtp
 from firmware_py.wire.crtp import Packet
@@ -132,7 +133,7 @@ def test_with_a_serial_line_it_speaks_mavlink() -> None:
 def test_every_target_runs_the_same_board() -> None:
     seen = []
     for name in BOARDS:
-        board = BareBoard(load_config(), runner_of(name, BUILD))
+        board = BareBoard(load_config(), runner_of(name, BUILD, LogicConfig()))
         board.expect("gyro zero", within_ms=2000)
         board.receive(POSE, every_ms=20)
         board.feed_imu(omega_B=(0.3, 0.2, 0.1))

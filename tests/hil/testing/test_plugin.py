@@ -250,7 +250,7 @@ def test_paths_begin_at_the_root_folder_and_the_ini_file_names_the_usual_profile
 def test_a_board_that_cannot_be_had_is_skipped_and_the_summary_says_so(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def runner_of(board: str, folder: Path) -> None:
+    def runner_of(board: str, folder: Path, logic: object) -> None:
         if board != "python":
             raise ExportError("no C compiler on this machine")
 
