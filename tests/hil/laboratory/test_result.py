@@ -20,7 +20,7 @@ from hil.laboratory.result import RESULT, Origin, QueueReport, Result, read_resu
 from support.command import floaty
 
 KEYS = """
-    experiment profile overrides seed duration_s link board faults source outcome cause metrics
+    experiment profile overrides seed duration_s link board faults source logic outcome cause metrics
     own_metrics verdicts passed tasks queues usage ages hash versions commit real_time_factor
     stood_still_ms
 """.split()  # noqa: SIM905  of result.json, which programs of users read
@@ -30,7 +30,7 @@ KEYS = """
 def result(tmp_path: Path) -> Result:
     return Result(
         "hover", "floaty", ("predictor.enabled=false",), 7, 2.5, "radio", "cortex-m4", ("push.y@1:0.3=2",),
-        {"python": "3.11.2"}, "0123456789ab+", Source("/home/anna/eights.py:wide", "5e" * 32, "eights 1.0"),
+        {"python": "3.11.2"}, "0123456789ab+", Source("/home/anna/eights.py:wide", "5e" * 32, "eights 1.0"), "1c" * 32,
         outcome="lost", cause="fell", metrics={"rms_x": 0.01, "settle": math.nan, "rise": math.inf, "lap": 9.5},
         own_metrics={"lap": Metric("s", "max", "time of a lap")},
         verdicts=(Verdict("rms_x", 0.01, 0.02, True, "m", "max"), Verdict("settle", math.nan, 0.5, False, "s", "max")),
