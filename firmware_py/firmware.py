@@ -179,10 +179,15 @@ class Firmware:
         if not self.kernel.interrupts_off:
             self._imu_ready.give_from_isr()
 
-    def radio_received(self, data: bytes) -> None:
+    def radio_received(self, data: bytes, broadcast: bool = False) -> None:
         """Interrupt: the radio chip has a packet. While interrupts are off, packets are lost."""
         if not self.kernel.interrupts_off:
-            self.link.received(data)
+            self.link.received(data, broadcast)
+
+    def radio_polled(self) -> None:
+        """Interrupt: the radio chip has an empty packet."""
+        if not self.kernel.interrupts_off:
+            self.link.polled()
 
     def uart_ready(self) -> None:
         """Interrupt: the UART has bytes. While interrupts are off, they stay where they are."""

@@ -4,6 +4,8 @@ Uplink: radio interrupt -> SYSLINK (queue 8) -> CRTP-RX (delivery queue 5) -> a 
 Downlink: services -> transmit queue (120) -> CRTP-TX -> radio chip.
 Replies of the services' own tasks wait for space in the transmit queue. What is sent unasked, and what the receiving
 task answers itself, is dropped when the queue is full: a deaf partner must not keep poses from coming in.
+A partner of whom the radio chip has heard nothing for a second, not even an empty poll, is gone, as in the Crazyflie
+firmware: whoever sends unasked then stops, and throws away what waits (`hang_up`), so that the next one gets no old rows.
 """
 
 from collections.abc import Callable, Generator
@@ -24,6 +26,7 @@ SYSLINK_QUEUE = 8
 DELIVERY_QUEUE = 5
 TRANSMIT_QUEUE = 120
 PORT_QUEUE = 16  # Crazyflie firmware
+SILENCE_US = 1_000_000  # Crazyflie firmware: RADIO_ACTIVITY_TIMEOUT_MS
 
 
 class CrtpStack:
@@ -34,6 +37,9 @@ class CrtpStack:
         self.cost = cost
         self.malformed = 0  # packets that no service could read
         self.unserved = 0  # well-formed packets of ports that nobody serves
+        self.unicasts = 0  # packets to this board
+        self.broadcasts = 0  # packets to all boards
+        self._heard_us = 0  # when the radio chip last heard the partner
         self._board = board
         self._handlers: dict[int, Handler] = {}
         self._ports: dict[int, Queue[Packet]] = {}
@@ -50,9 +56,25 @@ class CrtpStack:
         link = self._syslink.dropped + self._delivery.dropped + self._transmit.dropped
         return link + sum(queue.dropped for queue in self._ports.values())
 
-    def received(self, data: bytes) -> None:
+    @property
+    def connected(self) -> bool:
+        """Whether somebody has been heard within the last second."""
+        return self.kernel.now_us - self._heard_us < SILENCE_US
+
+    def received(self, data: bytes, broadcast: bool = False) -> None:
         """Take a packet from the radio chip; called from its interrupt."""
-        self._syslink.send_from_isr(data)
+        self._heard_us = self.kernel.now_us
+        if self._syslink.send_from_isr(data):
+            self.broadcasts += broadcast
+            self.unicasts += not broadcast
+
+    def polled(self) -> None:
+        """Notice that the radio chip has heard an empty packet; called from its interrupt."""
+        self._heard_us = self.kernel.now_us
+
+    def hang_up(self) -> Task:
+        """Throw away what waits to be sent."""
+        yield from self._transmit.reset()
 
     def handle(self, port: int, handler: Handler) -> None:
         """Let the receiving task run `handler` for each packet of the port; it must not wait."""

@@ -1,7 +1,8 @@
 """The log service: clients put variables together to blocks, the board sends each block at its period.
 
 Port 5: channel 0 is the TOC, 1 makes, starts and stops blocks (version 2), 2 carries the data. Periods count in 10 ms,
-or with the newer command in 1 ms; 0 sends a block once. A refused request leaves everything as it was.
+or with the newer command in 1 ms; 0 sends a block once. A refused request leaves everything as it was. When the partner is
+gone, the first block that falls due deletes them all, as in the Crazyflie firmware.
 """
 
 import struct
@@ -156,9 +157,14 @@ class LogService:
             )
             if packet is not None:
                 yield from self._stack.answer(packet, self.answer)
-            for number, block in self.blocks.items():
-                if block.due_tick is not None and block.due_tick <= kernel.tick_count:
-                    yield from self._send(number, block, kernel.tick_count)
+            for number, block in list(self.blocks.items()):
+                if block.due_tick is None or block.due_tick > kernel.tick_count:
+                    continue
+                if not self._stack.connected:
+                    self.blocks.clear()
+                    yield from self._stack.hang_up()
+                    break
+                yield from self._send(number, block, kernel.tick_count)
 
     def _send(self, number: int, block: Block, tick: int) -> Task:
         """Send a block that is due; the next time is planned from this one, missed ones are left out."""

@@ -1,4 +1,7 @@
-"""The telemetry of a flight: four fixed log blocks at 50 Hz, all with the same time stamp, while they are wanted."""
+"""The telemetry of a flight: four fixed log blocks at 50 Hz, all with the same time stamp, while they are wanted.
+
+It ends with its partner, as log blocks do.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -37,6 +40,10 @@ class TelemetryStream:
                 yield from self._switched.take()
                 continue
             yield from kernel.delay_until(kernel.tick_count // period * period + period)
+            if not self._stack.connected:
+                self._on = False
+                yield from self._stack.hang_up()
+                continue
             stamp_ms = kernel.tick_count
             yield from kernel.work(cost.log_us * len(telemetry.BLOCKS))
             for block in telemetry.BLOCKS:

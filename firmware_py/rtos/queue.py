@@ -164,6 +164,19 @@ class Queue(Generic[T]):
         self.high_water = 1
         return kernel.switch_if(kernel.wake(self._receivers.pop(0))) if self._receivers else GO_ON
 
+    def reset(self) -> Iterable[int]:
+        """Empties the queue; one sender that waited for space goes on, as with xQueueReset.
+
+        `yield from queue.reset()` lets it run at once if its priority is higher; the plain call, at the caller's next
+        `yield from` that blocks, yields or works.
+        """
+        kernel = self._kernel
+        if kernel.context == IN_INTERRUPT:
+            raise kernel.misplaced(f"queue {self.name}: reset")
+        kernel.count_call()
+        self._items.clear()
+        return kernel.switch_if(kernel.wake(self._senders.pop(0))) if self._senders else GO_ON
+
     def peek(self) -> T | None:
         """The oldest item, left in place; None when there is none."""
         return self._items[0] if self._items else None

@@ -1,22 +1,23 @@
 """A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, boards that may hear it.
 
 Here the host is real software, so every exchange happens, empty polls included. What happens to one on the air is
-`hil.devices.shockburst`.
+`hil.devices.shockburst`. With acknowledgements switched off a packet is sent once and the host reads nothing. What goes to
+the address of all boards reaches every board on that channel, and none of them answers.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from hil.devices.config import RadioConfig
-from hil.devices.nrf51 import Nrf51, RadioSettings
+from hil.devices.nrf51 import RATES, Nrf51, RadioSettings
 from hil.devices.shockburst import MAX_PACKET, RETRIES, Air, Exchange, Transmitter
 from hil.events import EventQueue
 
 Answer = Callable[[int, bytes], None]  # (now_us, what the host reads from the dongle)
 
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_RETRIES, SET_ACKS = 0x01, 0x02, 0x03, 0x06, 0x10  # vendor requests
-RATES = (250_000, 1_000_000, 2_000_000)  # by number of the vendor request
 ACKNOWLEDGED = 0x01  # status byte; retries are in its upper half
 NOT_ACKNOWLEDGED = b"\x00"
 NOWHERE = Air(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # to a board that is not there
@@ -51,8 +52,20 @@ class VirtualDongle:
 
     def transmit(self, now_us: int, packet: bytes, answer: Answer) -> None:
         """Send a packet of 1..32 bytes; `answer` is called once, unless acknowledgements are switched off."""
+        if not self._acks and len(packet) > MAX_PACKET:  # two packets in one transfer
+            half = len(packet) // 2
+            self.transmit(now_us, packet[:half], answer)
+            packet = packet[half:]
         packet = packet[:MAX_PACKET]
         settings, acks = self._settings, self._acks
+        retries = self._retries if acks else 0
+        for board in self._boards:
+            if packet and board.hears_all(settings):
+                hear_too = partial(board.overhear, data=packet)
+                to_all = Exchange(
+                    len(packet), settings.bits_per_second, board.air, retries, hear_too, _nobody_waits
+                )
+                self._transmitter.send(now_us, to_all)
         payload: bytes | None = None  # of the last answer
         board = next((board for board in self._boards if packet and board.hears(settings)), None)
         air = NOWHERE if board is None else board.air
@@ -72,6 +85,9 @@ class VirtualDongle:
                 answer(now_us, NOT_ACKNOWLEDGED)
 
         jitter_us = int(self._rng.random() * air.uplink_jitter_us) if air.uplink_jitter_us else 0
-        retries = self._retries if acks else 0
         exchange = Exchange(len(packet), settings.bits_per_second, air, retries, hear, ended)
         self._transmitter.send(now_us + jitter_us, exchange)
+
+
+def _nobody_waits(repetitions: int | None, now_us: int) -> None:
+    """End an exchange that has no answer."""

@@ -3,6 +3,7 @@
 Every packet heard is acknowledged with the head of a queue of 8. Safelink's counters stand in the headers' two spare bits:
 a packet that repeats the last one is not passed on again, and an answer is repeated until the host's says that it arrived.
 With nothing else to say the firmware acknowledges with its signal strength, the bootloader with nothing at all.
+The firmware also hears what is sent to all boards on its channel, which nobody acknowledges.
 Facts: Bitcraze's nRF51 firmware and bootloader, reference/crazyflie-clients-and-protocol.md 3.3 and 3.5.
 """
 
@@ -20,9 +21,18 @@ NULL, NULL_MASK = 0xF3, 0xF3  # an empty packet's header; the other bits are saf
 SIGNAL_STRENGTH = 1  # type of the answer that carries it
 SIGNAL_DBM = 40  # below 0 dBm: a board in the same room
 SAFELINK = 5  # type of the packet that switches it
+RADIO = 3  # type of the packets that set channel, data rate and power of the radio itself
 RESET_DELAY_US = 100_000
+RETUNE_DELAY_US = 1_000  # the answer leaves first
+BROADCAST = bytes.fromhex("FFE7E7E7E7")  # address of all boards
+RATES = (
+    250_000,
+    1_000_000,
+    2_000_000,
+)  # [bit/s] by number, in vendor requests, commands and the configuration block
 
 ALL_OFF, SYSTEM_OFF, SYSTEM_ON, BATTERY, RESET, RESET_INIT = 0x01, 0x02, 0x03, 0x04, 0xF0, 0xFF
+SET_CHANNEL, SET_RATE = 1, 2  # commands of the type RADIO; that for the power changes nothing here
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +73,12 @@ class Processor(Protocol):
         """Notice that a new client is on the radio."""
         ...
 
-    def received(self, now_us: int, data: bytes) -> None:
+    def received(self, now_us: int, data: bytes, broadcast: bool) -> None:
         """Take a packet from the radio."""
+        ...
+
+    def polled(self, now_us: int) -> None:
+        """Notice an empty packet from the radio."""
         ...
 
 
@@ -109,6 +123,12 @@ class Nrf51:
         booting = self.power is Power.BOOTLOADER
         return settings == (self._bootloader_settings if booting else self.settings)
 
+    def hears_all(self, settings: RadioSettings) -> bool:
+        """Whether a packet sent with these settings reaches this board among all others."""
+        own = self.settings
+        firmware = self.power in (Power.RADIO_ONLY, Power.RUNNING)
+        return firmware and settings == RadioSettings(own.channel, own.bits_per_second, BROADCAST)
+
     def send(self, now_us: int, data: bytes) -> bool:
         """Take a packet of the STM32 for the ground; False when the queue is full."""
         return self._end.put(Waiting(now_us + syslink_us(data), now_us, data))
@@ -124,7 +144,7 @@ class Nrf51:
             answer = self._next_answer(now_us)
             self._bootload(now_us, data)
             return answer
-        kind = data[1] if len(data) > 1 and data[0] & NULL_MASK == NULL else None
+        kind = _kind(data)
         if kind == NRF51:
             answer = self._next_answer(now_us)
             self._command(now_us, data)
@@ -135,9 +155,33 @@ class Nrf51:
             end.switch(bool(data[2]))
             self._processor.greet(now_us)
             return answer
-        if end.takes(data[0] >> 3 & 1) and (len(data) > 1 or data[0] & NULL_MASK != NULL):
-            self._events.at(now_us + syslink_us(data), partial(self._pass_on, data))
+        if end.takes(data[0] >> 3 & 1):
+            self._take(now_us, data, broadcast=False)
         return self._next_answer(now_us) if end.answered(data[0] >> 2 & 1) else self._answer
+
+    def overhear(self, now_us: int, data: bytes) -> None:
+        """Take a packet to all boards from the air."""
+        if _kind(data) == NRF51:
+            self._command(now_us, data)
+        else:
+            self._take(now_us, data, broadcast=True)
+
+    def _take(self, now_us: int, data: bytes, broadcast: bool) -> None:
+        """Do what a packet of the firmware is for."""
+        if _kind(data) == RADIO and len(data) > 3:
+            self._events.at(now_us + RETUNE_DELAY_US, partial(self._retune, data[2], data[3]))
+        elif len(data) > 1 or data[0] & NULL_MASK != NULL:
+            self._events.at(now_us + syslink_us(data), partial(self._pass_on, data, broadcast))
+        elif self.power is Power.RUNNING:
+            self._processor.polled(now_us)
+
+    def _retune(self, command: int, value: int, now_us: int) -> None:
+        """Set the radio until the next start of the processor, which sets it to what its EEPROM says."""
+        own = self.settings
+        if command == SET_CHANNEL:
+            self.settings = RadioSettings(value, own.bits_per_second, own.address)
+        elif command == SET_RATE and value < len(RATES):
+            self.settings = RadioSettings(own.channel, RATES[value], own.address)
 
     def _next_answer(self, now_us: int) -> bytes:
         """Return what comes after the answer that has arrived."""
@@ -154,9 +198,9 @@ class Nrf51:
             self._answer = bytes((NULL | end.down << 2, SIGNAL_STRENGTH, SIGNAL_DBM))
         return self._answer
 
-    def _pass_on(self, data: bytes, now_us: int) -> None:
+    def _pass_on(self, data: bytes, broadcast: bool, now_us: int) -> None:
         if self.power is Power.RUNNING:
-            self._processor.received(now_us, data)
+            self._processor.received(now_us, data, broadcast)
 
     # Power and resets
 
@@ -217,3 +261,8 @@ class Nrf51:
         if self.power in (Power.OFF, Power.BOOTLOADER):
             self._forget()
             self._start(now_us)
+
+
+def _kind(data: bytes) -> int | None:
+    """Return the type of a packet to the radio chip, None of one to the processor."""
+    return data[1] if len(data) > 1 and data[0] & NULL_MASK == NULL else None

@@ -61,6 +61,10 @@ class DirectionCounters:
             self.latency_max_us = latency_us
 
 
+def _nobody_asks(now_us: int) -> None:
+    """Let a poll pass: its host is no dongle."""
+
+
 class VirtualRadio:
     """Carries packets of 1..32 bytes both ways through `medium`; `connect` it before use."""
 
@@ -85,10 +89,13 @@ class VirtualRadio:
         self._uploading: Waiting | None = None  # kept until it is answered
         self._answer_size: int | None = None  # of the exchange under way, once the board has heard it
 
-    def connect(self, on_board: Receiver, on_ground: Receiver) -> None:
-        """Name the receivers of the uplink and of the downlink."""
+    def connect(
+        self, on_board: Receiver, on_ground: Receiver, on_poll: Callable[[int], object] = _nobody_asks
+    ) -> None:
+        """Name the receivers of the uplink, of the downlink, and of empty polls that fetch something."""
         self._on_board = on_board
         self._on_ground = on_ground
+        self._on_poll = on_poll
 
     def uplink(self, now_us: int, data: bytes) -> None:
         """Take a packet for the board; when the host's queue is full its oldest packet is dropped."""
@@ -183,6 +190,8 @@ class VirtualRadio:
             if self._board.takes(self._counter) and self._uploading is not None:
                 deliver = partial(self._deliver_up, self._uploading)
                 self._events.at(now_us + syslink_us(self._uploading.data), deliver)
+            else:
+                self._on_poll(now_us)
             answer = self._board.answer(now_us)
             self._answer_size = EMPTY_ACK_BYTES if answer is None else len(answer)
         return self._answer_size

@@ -45,7 +45,7 @@ class ModelledLine:
         self.station = GroundStation(
             self._link, self.trajectory, self._telemetry, config.station, self.tracker
         )
-        self.radio.connect(robot.packet_received, self.station.on_packet)
+        self.radio.connect(robot.packet_received, self.station.on_packet, robot.polled)
         if robot.uart is not None:
             robot.uart.connect(robot.uart_ready, self.station.on_packet)
         robot.seen_by(lambda frame, now_us, _: self.station.on_frame(frame, now_us))

@@ -170,10 +170,15 @@ class Robot:
 
     # Interrupts
 
-    def packet_received(self, now_us: int, data: bytes) -> None:
+    def packet_received(self, now_us: int, data: bytes, broadcast: bool = False) -> None:
         """The radio chip has a packet."""
         if self.powered:
-            self.firmware.radio_received(data)
+            self.firmware.radio_received(data, broadcast)
+
+    def polled(self, now_us: int) -> None:
+        """The radio chip has an empty packet."""
+        if self.powered:
+            self.firmware.radio_polled()
 
     def uart_ready(self, now_us: int) -> None:
         """The UART has bytes."""

@@ -15,7 +15,7 @@ from ground_station.station import GroundStation
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Readers
-from hil.devices.nrf51 import Nrf51, RadioSettings
+from hil.devices.nrf51 import RATES, Nrf51, RadioSettings
 from hil.devices.radio import VirtualRadio
 from hil.errors import LabError
 from hil.laboratory.robot import Robot
@@ -23,7 +23,6 @@ from hil.servers.serial_server import Address, Endpoint
 from hil.servers.udp_server import UdpServer
 
 CHANNEL = 80
-RATES = (250_000, 1_000_000, 2_000_000)  # by number in the configuration block
 RATE_NAMES = ("250K", "1M", "2M")  # in a URI
 UDP_RETRY_US = 500_000
 UDP_QUEUE = 1000  # packets of a program that wait at the host: cflib does not repeat over UDP
@@ -45,7 +44,11 @@ class ServedRobot:
     """One robot and its ends; it implements `hil.devices.nrf51.Processor` towards its radio chip, and boots the robot."""
 
     def __init__(
-        self, number: int, robot: Robot, rng: np.random.Generator, say: Callable[[str], None]
+        self,
+        number: int,
+        robot: Robot,
+        rng: np.random.Generator,
+        say: Callable[[str], None],
     ) -> None:
         config, events = robot.config, robot.events
         assert robot.air is not None
@@ -133,9 +136,13 @@ class ServedRobot:
         if self.udp is not None:
             self.udp.end_session()
 
-    def received(self, now_us: int, data: bytes) -> None:
+    def received(self, now_us: int, data: bytes, broadcast: bool) -> None:
         """Take a packet from the radio chip."""
-        self.robot.packet_received(now_us, data)
+        self.robot.packet_received(now_us, data, broadcast)
+
+    def polled(self, now_us: int) -> None:
+        """Notice an empty packet from the radio chip."""
+        self.robot.polled(now_us)
 
     def _open_udp(self, now_us: int) -> None:
         """Listen again; while the board was off, another program may have taken the port: then try until it is free."""

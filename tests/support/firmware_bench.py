@@ -24,6 +24,7 @@ class FirmwareBench:
         self.imu: ImuCounts = (3, -2, 1, 0, 0, 1365)
         self.imu_alive = True
         self.radio_open = True
+        self.polling = True  # the dongle asks all the time, as every real one
         self.writes: list[tuple[int, list[int]]] = []
         self.sent: list[tuple[int, bytes]] = []
         self.console: list[str] = []
@@ -61,6 +62,8 @@ class FirmwareBench:
     def _sample(self, now_us: int) -> None:
         if self.imu_alive:
             self.firmware.imu_ready()
+        if self.polling:
+            self.firmware.radio_polled()
         self.events.at(now_us + 1000, self._sample)
 
     def pose(

@@ -241,6 +241,47 @@ def test_stream_is_a_parameter_that_can_be_switched_off_and_on(client: CrtpClien
         assert len(client.packets(LOG, 2)) == count * len(telemetry.BLOCKS)
 
 
+@pytest.mark.parametrize("kind", ["blocks", "stream"])
+def test_rows_end_a_second_after_the_partner_fell_silent_and_the_next_one_gets_none_of_them(
+    client: CrtpClient, logs, kind: str
+) -> None:
+    if kind == "stream":
+        client.stream(client.now_us)
+    else:
+        assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
+        assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, 0))
+    client.run(client.now_us + 3_000_000)  # the radio chip is polled, that is enough
+    client.sent.clear()
+    client.polling = False
+    silent_us = client.now_us
+    client.run(silent_us + 500_000)
+    client.radio_open = False  # nobody fetches the chip's packets any more
+    client.run(silent_us + 3_000_000)
+    client.radio_open = client.polling = True
+    client.run(client.now_us + 500_000)
+    rows = client.packets(LOG, 2)
+    last_ms = max(int.from_bytes(row[1:4], "little") for row in rows)
+    assert last_ms <= silent_us // 1000 + 510  # one was already on its way to the chip
+    assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, errno.ENOENT))
+    client.stream(client.now_us)
+    client.run(client.now_us + 100_000)
+    assert client.packets(LOG, 2)
+
+
+def test_without_polls_it_is_a_packet_within_a_second_that_keeps_rows_coming(
+    client: CrtpClient, logs
+) -> None:
+    assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
+    assert client.one(LOG, 1, bytes((3, 1, 1))) == bytes((3, 1, 0))
+    client.polling = False
+    for _ in range(3):
+        client.run(client.now_us + 990_000)
+        client.firmware.radio_received(b"\xff\0")
+    client.sent.clear()
+    client.run(client.now_us + 2_000_000)
+    assert 99 <= len(client.packets(LOG, 2)) <= 101
+
+
 def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: CrtpClient, logs) -> None:
     client.poses(605_000, 2_000_000, (0.01, 0.02, -0.03))
     client.run(1_000_000)

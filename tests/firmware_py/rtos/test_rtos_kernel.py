@@ -550,6 +550,34 @@ def test_timers_expire_at_their_ticks_and_obey_stop_reset_and_period():
     assert expired == [("again", 4), ("once", 5), ("again", 8), ("again", 16)]
 
 
+@pytest.mark.parametrize("priority", [1, 3])
+def test_a_reset_queue_is_empty_and_lets_the_sender_that_waited_longest_go_on(priority):
+    kernel = Kernel(preemption=True)
+    queue = kernel.create_queue(2, "queue")
+    order = []
+
+    def sender(number):
+        yield from kernel.delay(1 + number)
+        yield from queue.send(f"waiting {number}")
+        order.append(f"sent {number}")
+
+    def resetter():
+        queue.send_nowait("old")
+        queue.send_nowait("older")
+        yield from kernel.delay(10)
+        yield from queue.reset()
+        order.append("reset")
+
+    kernel.create_task("resetter", 2, resetter)
+    for number in range(3):
+        kernel.create_task(f"sender {number}", priority, sender, number)
+    kernel.start()
+    kernel.run(12_000)
+    # like xQueueReset, it wakes one of the three; an urgent one goes on before the call returns
+    assert order == (["reset", "sent 0"] if priority == 1 else ["sent 0", "reset"])
+    assert (len(queue), queue.peek()) == (1, "waiting 0")
+
+
 def test_a_mailbox_holds_the_newest_item_and_wakes_its_reader_when_the_writer_gives_way():
     kernel = Kernel()
     mailbox = kernel.create_queue(1, "mailbox")
@@ -657,6 +685,7 @@ LOOPS = {
         o.queue.receive_nowait() and (),
     ),
     "overwrite": lambda o: (o.queue.overwrite("item"),),
+    "reset": lambda o: (o.queue.reset(),),
     "take what was not given": lambda o: (o.semaphore.take(0),),
     "give what was not taken": lambda o: (o.semaphore.give(),),
     "give what was not taken without waiting": lambda o: (o.semaphore.give_nowait(),),
@@ -900,6 +929,7 @@ def test_a_task_cannot_make_the_calls_of_interrupts(call, who):
     [
         lambda o: o.queue.send_nowait("item"),
         lambda o: o.queue.overwrite("item"),
+        lambda o: o.queue.reset(),
         lambda o: o.queue.receive_nowait(),
         lambda o: o.queue.wait_for_item(FOREVER),
         lambda o: o.semaphore.give_nowait(),

@@ -27,6 +27,8 @@ class Stm:
 
     def __init__(self) -> None:
         self.packets: list[bytes] = []
+        self.broadcasts: list[bytes] = []
+        self.polls = 0
         self.starts: list[int] = []
         self.stops: list[int] = []
 
@@ -42,8 +44,11 @@ class Stm:
     def greet(self, now_us: int) -> None:
         pass
 
-    def received(self, now_us: int, data: bytes) -> None:
-        self.packets.append(data)
+    def received(self, now_us: int, data: bytes, broadcast: bool) -> None:
+        (self.broadcasts if broadcast else self.packets).append(data)
+
+    def polled(self, now_us: int) -> None:
+        self.polls += 1
 
 
 class DongleWithBoards:
@@ -109,6 +114,7 @@ def test_empty_packets_do_not_reach_the_processor() -> None:
         bench.exchange(bytes((header,)))
     bench.wait(1000)
     assert bench.stms[0].packets == []
+    assert bench.stms[0].polls == 4
 
 
 @pytest.mark.parametrize(("rate", "bits_per_second"), [(0, 250_000), (1, 1_000_000), (2, 2_000_000)])
@@ -169,6 +175,78 @@ def test_ten_boards_hear_only_what_is_for_them() -> None:
         assert bench.exchange(bytes((0x10, n)))[0] & 1
     bench.wait(1000)
     assert [stm.packets for stm in bench.stms] == [[bytes((0x10, n))] for n in range(10)]
+
+
+def test_a_broadcast_reaches_every_board_on_its_channel_once_and_nobody_answers() -> None:
+    bench = DongleWithBoards(boards=3)
+    bench.boards[2].settings = RadioSettings(81, 2_000_000, ADDRESS)
+    bench.tune(80, 2, bytes.fromhex("FFE7E7E7E7"))
+    bench.dongle.control(0x10, 0, b"")
+    answers: list[bytes] = []
+    first, second = b"\x85" + bytes(range(31)), b"\x85" + bytes(range(31, 62))
+    for transfer in (b"\x6d\x08pose", first + second):  # longer ones are two packets
+        bench.dongle.transmit(bench.events.now_us, transfer, lambda _, answer: answers.append(answer))
+        bench.wait(5000)
+    assert [stm.broadcasts for stm in bench.stms] == [[b"\x6d\x08pose", first, second]] * 2 + [[]]
+    assert [stm.packets for stm in bench.stms] == [[]] * 3
+    assert answers == []
+
+
+def test_a_broadcast_does_not_count_in_the_conversation_with_one_board() -> None:
+    bench = DongleWithBoards()
+    host = cflib_host(bench)
+    next(host)
+    for number in range(10):
+        bench.tune(80, 2, bytes.fromhex("FFE7E7E7E7"))
+        bench.dongle.control(0x10, 0, b"")
+        bench.dongle.transmit(bench.events.now_us, b"\x6d\x08pose", lambda _, answer: None)
+        bench.wait(5000)
+        bench.tune(80, 2, ADDRESS)
+        bench.dongle.control(0x10, 1, b"")
+        host.send(bytes((0x10, number)))
+    bench.wait(1000)
+    assert [packet[1] for packet in bench.stms[0].packets] == list(range(10))
+    assert len(bench.stms[0].broadcasts) == 10
+
+
+def test_a_broadcast_is_lost_for_each_board_on_its_own() -> None:
+    bench = DongleWithBoards(boards=2, uplink_loss=0.4)
+    bench.tune(80, 2, bytes.fromhex("FFE7E7E7E7"))
+    bench.dongle.control(0x10, 0, b"")
+    for number in range(2000):
+        bench.dongle.transmit(bench.events.now_us, struct.pack("<BH", 0x10, number), lambda _, answer: None)
+        bench.wait(2000)
+    heard = [set(stm.broadcasts) for stm in bench.stms]
+    assert [len(packets) / 2000 for packets in heard] == pytest.approx([0.6, 0.6], abs=0.04)
+    assert len(heard[0] & heard[1]) / 2000 == pytest.approx(0.36, abs=0.04)
+
+
+def test_without_acknowledgements_a_packet_is_sent_once() -> None:
+    bench = DongleWithBoards(uplink_loss=0.5)
+    bench.dongle.control(0x10, 0, b"")
+    for _ in range(1000):
+        bench.dongle.transmit(bench.events.now_us, b"\x10hello", lambda _, answer: None)
+        bench.wait(5000)
+    assert len(bench.stms[0].packets) / 1000 == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("command", "value", "channel", "rate"),
+    [(1, 90, 90, 2), (2, 0, 80, 0), (2, 1, 80, 1), (2, 3, 80, 2), (3, 2, 80, 2)],
+    ids=["channel", "250K", "1M", "no rate", "power"],
+)
+def test_the_radio_chip_is_tuned_by_a_command_until_the_next_start(
+    command: int, value: int, channel: int, rate: int
+) -> None:
+    bench = DongleWithBoards()
+    assert bench.exchange(bytes((0xFF, 0x03, command, value)))[0] & 1  # answered where it was asked
+    bench.wait(5000)
+    assert bench.stms[0].packets == []
+    bench.tune(channel, rate, ADDRESS)
+    assert bench.exchange(NULL)[0] & 1
+    if (channel, rate) != (80, 2):
+        bench.tune(80, 2, ADDRESS)
+        assert bench.exchange(NULL) == b"\x00"
 
 
 def cflib_host(bench: DongleWithBoards) -> Iterator[bytes | None]:
