@@ -66,6 +66,10 @@ BOARDS_MAX = 10
     help="Which of the axes that Motive streams points up.",
 )  # fmt: skip
 @click.option("--multicast", is_flag=True, help="Motive sends frames to its group instead of to each client.")
+@click.option(
+    "--state", type=click.Path(path_type=Path), metavar="DIR",
+    help="Keep each board's EEPROM and deck memory in this folder, over restarts of the server.",
+)  # fmt: skip
 @fault_option
 @seed_option
 @profile_option
@@ -83,6 +87,7 @@ def serve(
     natnet_port: int,
     up: Up,
     multicast: bool,
+    state: Path | None,
     fault_texts: tuple[str, ...],
     seed: int,
     profile: str,
@@ -119,7 +124,7 @@ def serve(
     faults = [parse(text) for text in fault_texts]
     check(faults, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
     announce_compilation()
-    server = Server(config, boards, seed, say, mavlink=bool(ends), faults=faults)
+    server = Server(config, boards, seed, say, mavlink=bool(ends), faults=faults, state=state)
     try:
         if radio:
             address = server.ends.serve_radio(radio_port)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from hil.devices.nrf51 import RATES, Nrf51, RadioSettings
 from hil.devices.radio import VirtualRadio
 from hil.errors import LabError
 from hil.laboratory.robot import Robot
+from hil.servers.board_files import BoardFiles
 from hil.servers.serial_server import Address, Endpoint
 from hil.servers.udp_server import UdpServer
 
@@ -49,6 +51,7 @@ class ServedRobot:
         robot: Robot,
         rng: np.random.Generator,
         say: Callable[[str], None],
+        state: Path | None = None,
     ) -> None:
         config, events = robot.config, robot.events
         assert robot.air is not None
@@ -69,6 +72,9 @@ class ServedRobot:
         robot.send_packet = self._send
         robot.restart = self.start
         robot.board.eeprom[:CONFIG_SIZE] = self._factory_config()
+        self._files = BoardFiles(state, number, robot.board) if state is not None else None
+        if self._files is not None:
+            self._files.load()
         self.start(0)
 
     @property
@@ -89,8 +95,14 @@ class ServedRobot:
         self._line_end = address.open(readers, self.robot.uart.uplink)
         return self._line_end.master
 
+    def keep(self) -> None:
+        """Write down what survives a restart of the server."""
+        if self._files is not None:
+            self._files.keep()
+
     def close(self) -> None:
         """Close what was opened for clients."""
+        self.keep()
         if self.udp is not None:
             self.udp.close()
         if self._line_end is not None:

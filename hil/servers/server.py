@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 from firmware_py.rtos import WatchdogError
 from hil.clock import Paced, Readers
@@ -95,7 +96,8 @@ def name_of(number: int) -> str:
 class Server:
     """`count` robots that are let go when they fly, and put back when they are lost; `run` them after opening ends.
 
-    `faults` act from the first release of each robot on. `say` gets lines for the user.
+    `faults` act from the first release of each robot on. `say` gets lines for the user. EEPROM and deck memories are kept
+    in the folder `state`.
     """
 
     def __init__(
@@ -106,6 +108,7 @@ class Server:
         say: Callable[[str], None],
         mavlink: bool = False,
         faults: Sequence[Fault] = (),
+        state: Path | None = None,
     ) -> None:
         self.clock = Paced()
         self.lab = Laboratory(self.clock)
@@ -113,6 +116,7 @@ class Server:
         self.switchboards: list[Switchboard] = []
         self._say = say
         self._faults = faults
+        self._state = state
         self._holders: list[Holder] = []
         for number in range(1, count + 1):
             own = with_system(config, config.mavlink.system + number - 1) if mavlink else config
@@ -123,7 +127,7 @@ class Server:
             self._say(f"board {number}: {text}")
 
         robot = Robot(config, self.lab.events, streams, say, radio=True, mavlink=mavlink)
-        served = ServedRobot(number, robot, streams.radio, self._say)
+        served = ServedRobot(number, robot, streams.radio, self._say, self._state)
         robot.plant.hold()
         self.lab.robots.append(robot)
         self.ends.robots.append(served)
@@ -159,6 +163,7 @@ class Server:
     def _look(self, served: ServedRobot, holder: Holder, now_us: int) -> None:
         robot, nrf51 = served.robot, served.nrf51
         lost = robot.look(now_us)
+        served.keep()
         if nrf51.power in (Power.OFF, Power.BOOTLOADER) and now_us - nrf51.heard_us > BUTTON_US:
             robot.say("lab", "power button pressed")
             nrf51.press_button(now_us)

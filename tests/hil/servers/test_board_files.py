@@ -1,0 +1,59 @@
+"""What a server keeps of its boards over a restart."""
+
+from pathlib import Path
+
+import pytest
+
+from firmware_py.links.storage import ParameterStorage
+from hil.config import load_config
+from hil.errors import LabError
+from hil.servers.server import Server
+
+
+def serve(state: Path | None, boards: int = 1) -> Server:
+    return Server(load_config(), boards, 1, lambda line: None, state=state)
+
+
+def test_eeprom_and_deck_memory_of_each_board_are_kept_over_a_restart(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "boards"
+    first = serve(folder, 2)
+    one, two = (served.robot.board for served in first.ends.robots)
+    ParameterStorage(one.eeprom).store("supervisor.poseTimeout", (321).to_bytes(2, "little"))
+    one.deck_memory[100:103] = b"abc"
+    two.eeprom[8000:8003] = b"two"
+    first.ends.close()
+
+    again = serve(folder, 2)
+    for served, before in zip(again.ends.robots, (one, two), strict=True):
+        assert served.robot.board.eeprom == before.eeprom
+        assert served.robot.board.deck_memory == before.deck_memory
+    assert again.ends.robots[0].robot.firmware.signals.supervisor.pose_timeout_us == 321_000
+    again.ends.close()
+
+
+def test_what_changes_while_the_server_runs_is_written_at_once(tmp_path: Path) -> None:
+    server = serve(tmp_path)
+    server.ends.robots[0].robot.board.eeprom[8000:8003] = b"new"
+    server.lab.end_us = 30_000
+    server.lab.run()
+    assert (tmp_path / "board-1.eeprom").read_bytes()[8000:8003] == b"new"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["board-1.deck", "board-1.eeprom"]
+
+
+def test_without_a_folder_every_server_begins_with_new_boards() -> None:
+    server = serve(None)
+    server.ends.robots[0].robot.board.eeprom[8000:8003] = b"new"
+    server.ends.close()
+    assert serve(None).ends.robots[0].robot.board.eeprom[8000:8003] == b"\xff" * 3
+
+
+def test_a_file_that_is_no_such_memory_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "board-1.eeprom").write_bytes(b"short")
+    with pytest.raises(LabError, match=r"board-1.eeprom: 5 bytes; this memory has 8192"):
+        serve(tmp_path)
+
+
+def test_a_folder_that_cannot_be_one_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LabError, match=r"--state .*file: File exists"):
+        serve(tmp_path / "file")
