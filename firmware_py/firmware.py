@@ -16,7 +16,7 @@ from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogService
 from firmware_py.links.memories import MemoryService, Tester, memories
-from firmware_py.links.parameters import ParameterService
+from firmware_py.links.parameters import Parameter, ParameterService
 from firmware_py.links.platform import PlatformService
 from firmware_py.links.storage import ParameterStorage
 from firmware_py.links.stream import ReadBlock, TelemetryStream
@@ -26,11 +26,13 @@ from firmware_py.measurements import Measurement
 from firmware_py.parameters import parameters
 from firmware_py.rtos import Kernel, Queue, WatchdogError
 from firmware_py.rtos.statistics import Statistics
+from firmware_py.running import Running, StockState
 from firmware_py.signals import Signals
+from firmware_py.stock_names import stock_parameters
 from firmware_py.supervisor import Supervisor
 from firmware_py.tasks import estimator_task, power_task, sensors_task, stabilizer_task
 from firmware_py.thief import PRIORITY, Thief, thief_task
-from firmware_py.variables import Running, log_variables, telemetry_reader
+from firmware_py.variables import log_variables, telemetry_reader
 from firmware_py.wire import WireError
 from firmware_py.wire.memories import (
     CONFIG_SIZE,
@@ -107,7 +109,7 @@ class Firmware:
         settings = _radio_settings(board)
         if all(byte == 0xFF for byte in board.deck_memory):
             board.deck_memory[:] = encode_one_wire(*DECK)
-        tester = Tester()
+        tester, storage = Tester(), ParameterStorage(board.eeprom)
         running = Running(
             board=board,
             core=core,
@@ -118,17 +120,21 @@ class Firmware:
             localisation=LocalisationService(link, self.measurements, supervisor, settings.address & 0xFF),
             platform=PlatformService(link, supervisor),
             tester=tester,
+            storage=storage,
+            gyro_zero=self._zero,
+            stock=StockState(),
+            say=self._console.write,
             mavlink=self.mavlink,
         )
         self.variables = log_variables(running)
         read = telemetry_reader(self.variables)
-        self.parameters = parameters(running, TelemetryStream(link, read))
+        own = parameters(running, TelemetryStream(link, read))
+        self.parameters = (*own, *stock_parameters(running))
         LogService(link, self.variables)
-        storage = ParameterStorage(board.eeprom)
         ParameterService(link, self.parameters, storage)
         MemoryService(link, memories(board.eeprom, board.deck_memory, tester))
         if self.mavlink is not None:
-            self._start_mavlink_services(self.mavlink, config.mavlink, running, storage, read)
+            self._start_mavlink_services(self.mavlink, config.mavlink, running, own, read)
 
     def _mavlink_stack(self, config: FirmwareConfig) -> "MavlinkStack":
         from firmware_py.links.mavlink_stack import MavlinkStack
@@ -140,7 +146,7 @@ class Firmware:
         stack: "MavlinkStack",
         config: MavlinkConfig,
         running: Running,
-        storage: ParameterStorage,
+        own: tuple[Parameter, ...],
         read: ReadBlock,
     ) -> None:
         """Create what MAVLink clients find."""
@@ -159,8 +165,8 @@ class Firmware:
         messages = FlightMessages(stack, supervisor, world, core.control.fields, read)
         requested = RequestedMessages(supervisor, world, self._measured, config.home)
         streams = StreamService(stack, (*messages.streams(config.rates), *requested.streams()))
-        MavlinkParameters(stack, self.parameters)
-        CommandService(stack, self._board, supervisor, streams, self.parameters, storage)
+        MavlinkParameters(stack, own)
+        CommandService(stack, self._board, supervisor, streams, own, running.storage)
         answer_for_what_is_not_there(stack)
         self._console.listeners.append(stack.say)
 

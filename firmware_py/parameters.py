@@ -25,8 +25,9 @@ from firmware_py.core.subset import F32s
 from firmware_py.links.parameters import Parameter
 from firmware_py.links.stream import TelemetryStream
 from firmware_py.logic.plugs import GROUP
+from firmware_py.running import Running
 from firmware_py.supervisor import Manual
-from firmware_py.variables import F32, I16, SCALARS, U8, U16, U32, Running
+from firmware_py.variables import F32, I8, I16, SCALARS, U8, U16, U32
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import STREAM
 
@@ -69,7 +70,9 @@ def parameters(running: Running, stream: TelemetryStream) -> tuple[Parameter, ..
         *_kalman(running),
         *_supervision(running, stream),
         *_own_logic(running),
-        *_test_subjects(running),
+        Parameter(
+            "memTst.resetW", U8, "", lambda: 0, lambda value: setattr(running.tester, "errors", 0), 0, 255
+        ),
         *_identity(),
     )  # fmt: skip
 
@@ -112,24 +115,6 @@ def _element(name: str, unit: str, array: F32s, index: int, limit: float) -> Par
         -limit,
         limit,
     )
-
-
-def _attribute(
-    name: str,
-    scalar: Scalar,
-    unit: str,
-    owner: object,
-    attribute: str,
-    low: float,
-    high: float,
-    persistent: bool,
-) -> Parameter:
-    """A whole number that is an attribute of an object."""
-    return Parameter(
-        name, scalar, unit,
-        lambda: getattr(owner, attribute), lambda value: setattr(owner, attribute, int(value)),
-        low, high, persistent,
-    )  # fmt: skip
 
 
 def _manual(running: Running) -> Iterator[Parameter]:
@@ -203,7 +188,10 @@ def _supervision(running: Running, stream: TelemetryStream) -> Iterator[Paramete
         lambda value: setattr(supervisor, "pose_timeout_us", int(value) * 1000),
         low_us / 1000, high_us / 1000, persistent=True,
     )  # fmt: skip
-    yield _attribute("supervisor.lowBattery", U16, "mV", supervisor, "low_battery_mv", low_mv, high_mv, True)
+    yield Parameter(
+        "supervisor.lowBattery", U16, "mV", lambda: supervisor.low_battery_mv,
+        lambda value: setattr(supervisor, "low_battery_mv", int(value)), low_mv, high_mv, persistent=True,
+    )  # fmt: skip
     yield Parameter(STREAM, U8, "", lambda: stream.on, lambda value: stream.switch(value == 1), 0, 1)
 
 
@@ -218,21 +206,6 @@ def _own_logic(running: Running) -> Iterator[Parameter]:
         )  # fmt: skip
 
 
-class _Effects:
-    """What Bitcraze's crazyflie-testing sets, stores and finds again after a reboot; Floaty neither sounds nor glows."""
-
-    def __init__(self) -> None:
-        self.sound = 0
-        self.ring = 0
-
-
-def _test_subjects(running: Running) -> Iterator[Parameter]:
-    effects, tester = _Effects(), running.tester
-    yield _attribute("sound.effect", U8, "", effects, "sound", 0, 255, True)
-    yield _attribute("ring.effect", U8, "", effects, "ring", 0, 255, True)
-    yield Parameter("memTst.resetW", U8, "", lambda: 0, lambda value: setattr(tester, "errors", 0), 0, 255)
-
-
 # cfclient's flight and lighthouse tabs read these without asking whether there are any: without them its callbacks end in
 # KeyError. Of other decks that are not there the table says nothing.
 ABSENT_DECKS = ("bcDWM1000", "bcFlow", "bcFlow2", "bcLighthouse4", "bcLoco", "bcZRanger", "bcZRanger2")
@@ -241,9 +214,7 @@ ABSENT_DECKS = ("bcDWM1000", "bcFlow", "bcFlow2", "bcLighthouse4", "bcLoco", "bc
 def _identity() -> Iterator[Parameter]:
     """What the board is; read only."""
     for name, scalar, value in (
-        ("system.selftestPassed", U8, 1),
-        ("stabilizer.estimator", U8, 2),  # Kalman
-        ("stabilizer.controller", U8, 0),  # the only one
+        ("system.selftestPassed", I8, 1),
         ("deck.bcFloaty", U8, 1),
         *((f"deck.{name}", U8, 0) for name in ABSENT_DECKS),
         ("imu_sensors.BMI088", U8, 1),

@@ -6,34 +6,28 @@ frame: what the board knows is its error.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from math import degrees
 from typing import TYPE_CHECKING
 
-from firmware_py.board import Board
 from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, Control, Estimator
 from firmware_py.core.subset import F32s, I32s
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.drivers.imu import acceleration, rates
 from firmware_py.geometry import from_euler_zyx
-from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
-from firmware_py.links.memories import Tester
-from firmware_py.links.platform import PlatformService, supervisor_bits
+from firmware_py.links.platform import supervisor_bits
 from firmware_py.links.stream import ReadBlock
 from firmware_py.logic.plugs import GROUP
-from firmware_py.manual import ManualFlaps
-from firmware_py.measurements import Measurement
-from firmware_py.rtos import Queue
-from firmware_py.supervisor import Supervisor
+from firmware_py.running import Running
+from firmware_py.stock_names import stock_variables
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import BLOCKS, LEGACY_DEGREES
 
 if TYPE_CHECKING:
-    from firmware_py.links.mavlink_stack import MavlinkStack
+    pass
 
 AGE_UNIT_US = 100  # locSrv.age counts tenths of a millisecond
 BATTERY_FULL_MV = 4200
@@ -41,22 +35,6 @@ PM_BATTERY, PM_LOW = 0, 3  # pm.state
 
 F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
 SCALARS = {"f32": F32, "i32": Scalar.I32}  # by the core's types
-
-
-@dataclass(frozen=True, slots=True)
-class Running:
-    """The parts of a running board that variables and parameters look into."""
-
-    board: Board
-    core: CoreBlocks
-    supervisor: Supervisor
-    manual: ManualFlaps
-    measurements: Queue[Measurement]
-    stack: CrtpStack
-    localisation: LocalisationService
-    platform: PlatformService
-    tester: Tester
-    mavlink: "MavlinkStack | None"
 
 
 def log_variables(running: Running) -> tuple[LogVariable, ...]:
@@ -87,6 +65,7 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         *_kalman(estimator),
         *_counters(running),
         *_own_logic(running.core),
+        *stock_variables(running),
     )
 
 

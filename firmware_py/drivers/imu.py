@@ -43,6 +43,7 @@ class GyroZero:
 
     def __init__(self) -> None:
         self.bias: tuple[float, float, float] | None = None  # [counts] sensor frame; None while searching
+        self.variance = (0.0, 0.0, 0.0)  # [counts^2] sensor frame, of the last window
         self.windows_refused = 0
         self._window: list[ImuCounts] = []
 
@@ -54,9 +55,13 @@ class GyroZero:
         window, self._window = self._window, []
         sums = [sum(sample[axis] for sample in window) for axis in range(3)]
         squares = [sum(sample[axis] ** 2 for sample in window) for axis in range(3)]
-        for total, square in zip(sums, squares, strict=True):
-            if square * SAMPLES - total * total > VARIANCE_LIMIT * SAMPLES * SAMPLES:
-                self.windows_refused += 1
-                return False
+        x, y, z = (
+            (square * SAMPLES - total * total) / (SAMPLES * SAMPLES)
+            for total, square in zip(sums, squares, strict=True)
+        )
+        self.variance = (x, y, z)
+        if max(self.variance) > VARIANCE_LIMIT:
+            self.windows_refused += 1
+            return False
         self.bias = (sums[0] / SAMPLES, sums[1] / SAMPLES, sums[2] / SAMPLES)
         return True

@@ -7,7 +7,7 @@ from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.rtos import Queue
 from firmware_py.wire.crtp import MAX_DATA, PORT_CONSOLE, Packet, encode
 
-LINE_QUEUE = 16
+LINE_QUEUE = 40  # a task dump at once
 LINE_LIMIT = 200  # letters
 
 

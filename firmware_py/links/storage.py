@@ -19,6 +19,16 @@ class ParameterStorage:
     def __init__(self, eeprom: bytearray) -> None:
         self._eeprom = eeprom
 
+    @property
+    def size(self) -> int:
+        """Bytes that there are for the list."""
+        return len(self._eeprom) - START
+
+    @property
+    def used(self) -> int:
+        """Bytes that the list takes."""
+        return _HEAD.size + len(_records(self.load()))
+
     def load(self) -> dict[str, bytes]:
         """Return the stored values by name."""
         magic, length, checksum = _HEAD.unpack_from(self._eeprom, START)
@@ -47,15 +57,20 @@ class ParameterStorage:
         return values.pop(name, None) is not None and self._write(values)
 
     def _write(self, values: dict[str, bytes]) -> bool:
-        records = b"".join(
-            bytes((len(name),)) + name.encode("latin-1") + bytes((len(value),)) + value
-            for name, value in values.items()
-        )
+        records = _records(values)
         content = _HEAD.pack(_MAGIC, len(records), crc32(records)) + records
         if START + len(content) > len(self._eeprom):
             return False
         self._eeprom[START : START + len(content)] = content
         return True
+
+
+def _records(values: Mapping[str, bytes]) -> bytes:
+    """The list without its head."""
+    return b"".join(
+        bytes((len(name),)) + name.encode("latin-1") + bytes((len(value),)) + value
+        for name, value in values.items()
+    )
 
 
 def _split(records: bytes) -> tuple[bytes, bytes]:

@@ -59,11 +59,11 @@ class VirtualDongle:
         packet = packet[:MAX_PACKET]
         settings, acks = self._settings, self._acks
         retries = self._retries if acks else 0
-        for board in self._boards:
-            if packet and board.hears_all(settings):
-                hear_too = partial(board.overhear, data=packet)
+        for any_board in self._boards:
+            if packet and any_board.hears_all(settings):
+                hear_too = partial(any_board.overhear, data=packet)
                 to_all = Exchange(
-                    len(packet), settings.bits_per_second, board.air, retries, hear_too, _nobody_waits
+                    len(packet), settings.bits_per_second, any_board.air, retries, hear_too, _nobody_waits
                 )
                 self._transmitter.send(now_us, to_all)
         payload: bytes | None = None  # of the last answer

@@ -1,0 +1,49 @@
+"""The parts of a running board, as its tables of variables and parameters see them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from firmware_py.board import Board
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.drivers.imu import GyroZero
+from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.links.localisation import LocalisationService
+from firmware_py.links.memories import Tester
+from firmware_py.links.platform import PlatformService
+from firmware_py.links.storage import ParameterStorage
+from firmware_py.manual import ManualFlaps
+from firmware_py.measurements import Measurement
+from firmware_py.rtos import Queue
+from firmware_py.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from firmware_py.links.mavlink_stack import MavlinkStack
+
+
+@dataclass(slots=True)
+class StockState:
+    """What clients have set, by name."""
+
+    settings: dict[str, float] = field(default_factory=dict)
+    test_value: float = 0.0  # system.testLogParam, shown by sys.testLogParam
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """The parts of a running board that variables and parameters look into."""
+
+    board: Board
+    core: CoreBlocks
+    supervisor: Supervisor
+    manual: ManualFlaps
+    measurements: Queue[Measurement]
+    stack: CrtpStack
+    localisation: LocalisationService
+    platform: PlatformService
+    tester: Tester
+    storage: ParameterStorage
+    gyro_zero: GyroZero
+    stock: StockState
+    say: Callable[[str], None]  # on the console
+    mavlink: "MavlinkStack | None"

@@ -1,0 +1,194 @@
+"""Names of the stock Crazyflie firmware that its clients use, beside those that Floaty has a quantity of its own for.
+
+Live where the board has the quantity. The rest belongs to hardware or controllers that Floaty has not: as on a Crazyflie
+without that deck, or with another controller in charge, the values are there, can be set and stored, and do nothing.
+`tests/vectors/stock_names.json` holds the clients' list with the types of crazyflie-firmware 2a18fc29.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from math import degrees
+
+from firmware_py.geometry import rotate, yaw_quaternion
+from firmware_py.links.log import LogVariable
+from firmware_py.links.parameters import Parameter
+from firmware_py.running import Running
+from firmware_py.wire.scalars import Scalar
+
+F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
+SIGNAL_DBM = 40  # radio.rssi: below 0 dBm, what the virtual radio chip measures
+INTEGER_LIMITS = {U8: 0xFF, U16: 0xFFFF, U32: 0xFFFFFFFF}
+FLOAT_LIMIT = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """Log variables of one group that stay as they are."""
+
+    group: str
+    names: str
+    scalar: Scalar
+    unit: str
+    value: float = 0.0
+
+
+RESTING = (
+    Rest("controller", "roll pitch", F32, "deg"),  # Floaty's controller wants the body level
+    Rest("controller", "rollRate pitchRate yawRate", F32, "deg/s"),
+    Rest("posCtl", "targetVX targetVY targetVZ", F32, "m/s"),
+    Rest("health", "motorPass", U8, ""),  # no propellers: never tested
+    Rest("health", "batterySag", F32, "V"),
+    Rest("radio", "rssi", U8, "dBm", SIGNAL_DBM),
+    Rest("colorLedBot", "throttlePct", U8, "%"),
+    Rest("colorLedTop", "throttlePct", U8, "%"),
+    Rest("lighthouse", "bsActive bsAvailable bsCalCon bsCalUd bsCalVal bsGeoVal bsReceive", U16, ""),
+    Rest("lighthouse", "status", U8, ""),  # no base stations
+    Rest("loco", "mode", U8, ""),
+    Rest("motion", "deltaX deltaY", I16, ""),
+    Rest("range", "back front left right up zrange", U16, "mm"),
+    Rest("ranging", " ".join(f"distance{anchor}" for anchor in range(8)), F32, "m"),
+    Rest("ring", "fadeTime", F32, "s"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Parameters of one group that are kept and do nothing: names, and the stock defaults of all of them."""
+
+    group: str
+    names: str
+    scalar: Scalar
+    defaults: tuple[float, ...]
+    persistent: bool = False
+    unit: str = ""
+
+
+SETTINGS = (
+    Setting("activeMarker", "back", U8, (3,), True),
+    Setting("colorLedBot", "brightCorr", U8, (1,)),
+    Setting("colorLedBot", "wrgb8888", U32, (0,)),
+    Setting("colorLedTop", "brightCorr", U8, (1,)),
+    Setting("colorLedTop", "wrgb8888", U32, (0,)),
+    Setting("commander", "enHighLevel", U8, (0,)),  # without effect on the stock board, too
+    Setting("flightmode", "althold", U8, (0,)),
+    Setting("kalman", "initialX initialY initialZ", F32, (0, 0, 0), unit="m"),  # the next pose decides
+    Setting("kalman", "initialYaw", F32, (0,), unit="rad"),
+    Setting("led", "bitmask", U8, (0,)),
+    Setting("led_deck_ctrl", "rgb888", U32, (0,)),
+    Setting("lighthouse", "bsCalibReset", U8, (0,)),
+    Setting("lighthouse", "systemType", U8, (2,)),
+    Setting("locSrv", "enLhAngleStream", U8, (0,)),
+    Setting("loco", "mode", U8, (0,)),
+    Setting("pid_attitude", "roll_kp roll_ki roll_kd", F32, (6, 3, 0), True),
+    Setting("pid_attitude", "pitch_kp pitch_ki pitch_kd", F32, (6, 3, 0), True),
+    Setting("pid_attitude", "yaw_kp yaw_ki yaw_kd", F32, (6, 1, 0.35), True),
+    Setting("pid_rate", "roll_kp roll_ki roll_kd", F32, (250, 500, 2.5), True),
+    Setting("pid_rate", "pitch_kp pitch_ki pitch_kd", F32, (250, 500, 2.5), True),
+    Setting("pid_rate", "yaw_kp yaw_ki yaw_kd", F32, (120, 16.7, 0), True),
+    Setting("posCtlPid", "xKp xKi xKd", F32, (2, 0, 0), True),
+    Setting("posCtlPid", "yKp yKi yKd", F32, (2, 0, 0), True),
+    Setting("posCtlPid", "zKp zKi zKd", F32, (2, 0.5, 0), True),
+    Setting("posCtlPid", "thrustBase", U16, (36000,), True),
+    Setting("velCtlPid", "vxKp vxKi vxKd vxKFF", F32, (25, 1, 0, 0), True),
+    Setting("velCtlPid", "vyKp vyKi vyKd vyKFF", F32, (25, 1, 0, 0), True),
+    Setting("velCtlPid", "vzKp vzKi vzKd", F32, (25, 15, 0), True),
+    Setting("ring", "effect", U8, (0,), True),
+    Setting("ring", "fadeColor", U32, (0,)),
+    Setting("ring", "fadeTime", F32, (0.5,), unit="s"),
+    Setting("ring", "headlightEnable", U8, (0,)),
+    Setting("ring", "solidRed solidGreen solidBlue", U8, (20, 20, 20)),
+    Setting("sound", "effect", U8, (0,), True),
+    Setting("stabilizer", "estimator", U8, (2,)),  # whatever it says, Floaty's own estimates
+    Setting("stabilizer", "controller", U8, (0,)),  # and controls
+    Setting("tdoaEngine", "logId logOthrId", U8, (0, 0)),
+)
+
+
+def stock_variables(running: Running) -> Iterator[LogVariable]:
+    """Yield the log variables."""
+    stack, supervisor, zero = running.stack, running.supervisor, running.gyro_zero
+    target = running.core.parameters.fields.target
+
+    def across(axis: int) -> float:
+        """The target in axes that turn with the body's yaw."""
+        yaw = running.core.estimator.fields.now.item(8)
+        return rotate(yaw_quaternion(-yaw), (target.item(0), target.item(1), target.item(2)))[axis]
+
+    for axis, name in enumerate("xyz"):
+        yield LogVariable(f"gyro.{name}Variance", F32, "counts^2", lambda axis=axis: zero.variance[axis])  # type: ignore[misc]
+        yield LogVariable(f"ctrltarget.{name}", F32, "m", partial(target.item, axis))
+        yield LogVariable(f"posCtl.target{name.upper()}", F32, "m", partial(across, axis))
+    yield LogVariable("controller.yaw", F32, "deg", lambda: degrees(target.item(3)))
+    yield LogVariable("radio.isConnected", U8, "", lambda: stack.connected)
+    yield LogVariable("radio.numRxUc", U16, "", lambda: stack.unicasts & 0xFFFF)
+    yield LogVariable("radio.numRxBc", U16, "", lambda: stack.broadcasts & 0xFFFF)
+    yield LogVariable(
+        "health.batteryPass", U8, "", lambda: supervisor.battery_mv >= supervisor.low_battery_mv
+    )
+    yield LogVariable("sys.testLogParam", I8, "", lambda: running.stock.test_value)
+    for rest in RESTING:
+        for name in rest.names.split():
+            yield LogVariable(f"{rest.group}.{name}", rest.scalar, rest.unit, lambda rest=rest: rest.value)  # type: ignore[misc]
+
+
+def stock_parameters(running: Running) -> Iterator[Parameter]:
+    """Yield the parameters."""
+    for setting in SETTINGS:
+        limit = INTEGER_LIMITS.get(setting.scalar)
+        low, high = (-FLOAT_LIMIT, FLOAT_LIMIT) if limit is None else (0, limit)
+        for name, default in zip(setting.names.split(), setting.defaults, strict=True):
+            whole = f"{setting.group}.{name}"
+            running.stock.settings[whole] = default
+            yield Parameter(
+                whole, setting.scalar, setting.unit,
+                partial(running.stock.settings.__getitem__, whole),
+                partial(running.stock.settings.__setitem__, whole),
+                low, high, setting.persistent,
+            )  # fmt: skip
+    yield Parameter("lighthouse.bsAvailable", U16, "", lambda: 0)
+    for name in ("imu_sensors.AK8963", "deck.bcColorLedBot", "deck.bcColorLedTop"):  # not there
+        yield Parameter(name, U8, "", lambda: 0)
+    yield Parameter(
+        "system.testLogParam", U8, "", lambda: running.stock.test_value,
+        lambda value: setattr(running.stock, "test_value", value), 0, 0xFF,
+    )  # fmt: skip
+    for name, tell in (
+        ("system.taskDump", _tell_tasks),
+        ("system.storageStats", _tell_storage),
+        ("system.assertInfo", lambda running: ("No assert information found",)),
+        ("health.startPropTest", lambda running: ("health: there are no propellers to test",)),
+        ("health.startBatTest", _tell_battery),
+    ):
+        yield _button(running, name, tell)
+
+
+def _button(running: Running, name: str, tell: Callable[[Running], Iterable[str]]) -> Parameter:
+    """A parameter that lets the console say something when it is set, and reads 0 again at once."""
+
+    def press(value: float) -> None:
+        if value:
+            for line in tell(running):
+                running.say(line)
+
+    return Parameter(name, U8, "", lambda: 0, press, 0, 0xFF)
+
+
+def _tell_tasks(running: Running) -> Iterator[str]:
+    """The share of the processor's time that each task has taken since boot."""
+    kernel = running.stack.kernel
+    yield "Task dump"
+    yield "Load\tName"
+    for task in kernel.tasks:
+        yield f"{100 * kernel.run_time_us(task) / max(1, kernel.now_us):.2f}\t{task.name}"
+
+
+def _tell_storage(running: Running) -> Iterator[str]:
+    """How full the parameters' memory is."""
+    used, size, items = running.storage.used, running.storage.size, len(running.storage.load())
+    yield f"Used storage: {items} items stored, {used} of {size} bytes ({100 * used // size} %)"
+
+
+def _tell_battery(running: Running) -> Iterator[str]:
+    supervisor = running.supervisor
+    yield f"health: battery {supervisor.battery_mv} mV, at least {supervisor.low_battery_mv} needed"
