@@ -13,6 +13,7 @@ from firmware_py.drivers.imu import GyroZero, acceleration, rates
 from firmware_py.geometry import Vector
 from firmware_py.links.console import Console
 from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.links.high_level import HighLevelService
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogService
 from firmware_py.links.memories import MemoryService, Tester, memories
@@ -20,10 +21,12 @@ from firmware_py.links.parameters import Parameter, ParameterService
 from firmware_py.links.platform import PlatformService
 from firmware_py.links.storage import ParameterStorage
 from firmware_py.links.stream import ReadBlock, TelemetryStream
+from firmware_py.links.trajectories import MEMORY_SIZE
 from firmware_py.logic.loading import load_logic
 from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.parameters import parameters
+from firmware_py.pilot import Pilot
 from firmware_py.rtos import Kernel, Queue, WatchdogError
 from firmware_py.rtos.statistics import Statistics
 from firmware_py.running import Running, StockState
@@ -110,6 +113,9 @@ class Firmware:
         if all(byte == 0xFF for byte in board.deck_memory):
             board.deck_memory[:] = encode_one_wire(*DECK)
         tester, storage = Tester(), ParameterStorage(board.eeprom)
+        pilot = supervisor.goals = Pilot(config.predictor.default_age_us)
+        trajectories = bytearray(MEMORY_SIZE)
+        high_level = HighLevelService(link, pilot, supervisor, trajectories, self._console.write)
         running = Running(
             board=board,
             core=core,
@@ -117,11 +123,15 @@ class Firmware:
             manual=ManualFlaps(supervisor, core.parameters.fields, core.data.fields),
             measurements=self.measurements,
             stack=link,
-            localisation=LocalisationService(link, self.measurements, supervisor, settings.address & 0xFF),
+            localisation=LocalisationService(
+                link, self.measurements, supervisor, pilot, settings.address & 0xFF
+            ),
             platform=PlatformService(link, supervisor),
             tester=tester,
             storage=storage,
             gyro_zero=self._zero,
+            pilot=pilot,
+            commander=high_level.defaults,
             stock=StockState(),
             say=self._console.write,
             mavlink=self.mavlink,
@@ -132,7 +142,7 @@ class Firmware:
         self.parameters = (*own, *stock_parameters(running))
         LogService(link, self.variables)
         ParameterService(link, self.parameters, storage)
-        MemoryService(link, memories(board.eeprom, board.deck_memory, tester))
+        MemoryService(link, memories(board.eeprom, board.deck_memory, tester, trajectories))
         if self.mavlink is not None:
             self._start_mavlink_services(self.mavlink, config.mavlink, running, own, read)
 

@@ -166,6 +166,10 @@ def _kalman(running: Running) -> Iterator[Parameter]:
     yield _field("kalman.maxVel", "m/s", core.parameters.fields, "bound_velocity", EstimatorConfig)
     yield Parameter("kalman.resetEstimation", U8, "", lambda: 0, reset, 0, 1)
     yield Parameter("FloatyKalm.resetKalman", U8, "", lambda: 0, reset, 0, 1)
+    yield Parameter(
+        "locSrv.absolute", U8, "", lambda: running.pilot.absolute,
+        lambda value: setattr(running.pilot, "absolute", value == 1), 0, 1, persistent=True,
+    )  # fmt: skip
     yield deviation("locSrv.extPosStdDev", "m", "measured_position")
     yield deviation("locSrv.extQuatStdDev", "rad", "measured_attitude")
 

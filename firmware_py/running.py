@@ -8,12 +8,14 @@ from firmware_py.board import Board
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.drivers.imu import GyroZero
 from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.links.high_level import Defaults
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.memories import Tester
 from firmware_py.links.platform import PlatformService
 from firmware_py.links.storage import ParameterStorage
 from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
+from firmware_py.pilot import Pilot
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 
@@ -44,6 +46,8 @@ class Running:
     tester: Tester
     storage: ParameterStorage
     gyro_zero: GyroZero
+    pilot: Pilot
+    commander: Defaults
     stock: StockState
     say: Callable[[str], None]  # on the console
     mavlink: "MavlinkStack | None"

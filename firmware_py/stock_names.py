@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from math import degrees
 
-from firmware_py.geometry import rotate, yaw_quaternion
+from firmware_py.core.structs import ATTITUDE
+from firmware_py.geometry import Vector, rotate, wrap_angle, yaw_quaternion
 from firmware_py.links.log import LogVariable
 from firmware_py.links.parameters import Parameter
 from firmware_py.running import Running
@@ -20,6 +21,8 @@ F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scala
 SIGNAL_DBM = 40  # radio.rssi: below 0 dBm, what the virtual radio chip measures
 INTEGER_LIMITS = {U8: 0xFF, U16: 0xFFFF, U32: 0xFFFFFFFF}
 FLOAT_LIMIT = 1e6
+YAW = ATTITUDE + 2
+VELOCITY_LIMITS = (0.01, 10.0)  # [m/s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,18 +111,20 @@ SETTINGS = (
 def stock_variables(running: Running) -> Iterator[LogVariable]:
     """Yield the log variables."""
     stack, supervisor, zero = running.stack, running.supervisor, running.gyro_zero
-    target = running.core.parameters.fields.target
+
+    def along(axis: int) -> float:
+        """The target in the axes of the poses."""
+        return _target(running)[0][axis]
 
     def across(axis: int) -> float:
         """The target in axes that turn with the body's yaw."""
-        yaw = running.core.estimator.fields.now.item(8)
-        return rotate(yaw_quaternion(-yaw), (target.item(0), target.item(1), target.item(2)))[axis]
+        return rotate(yaw_quaternion(-_yaw(running)), _target(running)[0])[axis]
 
     for axis, name in enumerate("xyz"):
         yield LogVariable(f"gyro.{name}Variance", F32, "counts^2", lambda axis=axis: zero.variance[axis])  # type: ignore[misc]
-        yield LogVariable(f"ctrltarget.{name}", F32, "m", partial(target.item, axis))
+        yield LogVariable(f"ctrltarget.{name}", F32, "m", partial(along, axis))
         yield LogVariable(f"posCtl.target{name.upper()}", F32, "m", partial(across, axis))
-    yield LogVariable("controller.yaw", F32, "deg", lambda: degrees(target.item(3)))
+    yield LogVariable("controller.yaw", F32, "deg", lambda: degrees(_target(running)[1]))
     yield LogVariable("radio.isConnected", U8, "", lambda: stack.connected)
     yield LogVariable("radio.numRxUc", U16, "", lambda: stack.unicasts & 0xFFFF)
     yield LogVariable("radio.numRxBc", U16, "", lambda: stack.broadcasts & 0xFFFF)
@@ -130,6 +135,21 @@ def stock_variables(running: Running) -> Iterator[LogVariable]:
     for rest in RESTING:
         for name in rest.names.split():
             yield LogVariable(f"{rest.group}.{name}", rest.scalar, rest.unit, lambda rest=rest: rest.value)  # type: ignore[misc]
+
+
+def _target(running: Running) -> tuple[Vector, float]:
+    """Where to fly in the frame of the poses, position and yaw."""
+    frame = running.pilot.frame(running.stack.kernel.now_us)
+    if frame is not None:
+        return frame.position, frame.yaw
+    x, y, z, yaw = running.core.parameters.fields.target.tolist()
+    return (x, y, z), yaw
+
+
+def _yaw(running: Running) -> float:
+    frame = running.pilot.frame(running.stack.kernel.now_us)
+    yaw: float = running.core.estimator.fields.now.item(YAW)
+    return yaw if frame is None else wrap_angle(yaw + frame.yaw)
 
 
 def stock_parameters(running: Running) -> Iterator[Parameter]:
@@ -146,6 +166,16 @@ def stock_parameters(running: Running) -> Iterator[Parameter]:
                 partial(running.stock.settings.__setitem__, whole),
                 low, high, setting.persistent,
             )  # fmt: skip
+    commander, (slow, fast) = running.commander, VELOCITY_LIMITS
+    for name, attribute in (("vtoff", "take_off_velocity"), ("vland", "landing_velocity")):
+        yield Parameter(
+            f"hlCommander.{name}", F32, "m/s", partial(getattr, commander, attribute),
+            partial(setattr, commander, attribute), slow, fast,
+        )  # fmt: skip
+    yield Parameter(
+        "hlCommander.groupmask", U8, "", lambda: commander.groups,
+        lambda value: setattr(commander, "groups", int(value)), 0, 0xFF,
+    )  # fmt: skip
     yield Parameter("lighthouse.bsAvailable", U16, "", lambda: 0)
     for name in ("imu_sensors.AK8963", "deck.bcColorLedBot", "deck.bcColorLedTop"):  # not there
         yield Parameter(name, U8, "", lambda: 0)

@@ -11,11 +11,13 @@ and cause are log variables (`supervisor.state`, `supervisor.cause`). The way ba
                     recovery request (or a reboot)
     low battery     below the limit for 5 s: ends only with a recovery request when the voltage is back above it
 
-The board arms itself at boot. One outlier pose is refused by the estimator's gate and is no reason for anything here.
+Before the first pose, and with absolute poses while the high-level commander has nothing to do, it waits. The board arms
+itself at boot. One outlier pose is refused by the estimator's gate and is no reason for anything here.
 """
 
 from collections.abc import Callable
 from enum import IntEnum
+from typing import Protocol
 
 from firmware_py.config import SupervisorConfig
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL, Estimator
@@ -37,6 +39,18 @@ class Manual(IntEnum):
     HOVER = 2  # hover angles
 
 
+class GoalSource(Protocol):
+    """Who knows where to fly."""
+
+    def flies(self, now_us: int) -> bool:
+        """Whether there is something to fly to."""
+        ...
+
+    def abort(self) -> None:
+        """Give up what was planned: the robot may not fly."""
+        ...
+
+
 class Supervisor:
     """State machine over the facts in its attributes; `estimator` is the core's fields, read for its bounds."""
 
@@ -53,6 +67,7 @@ class Supervisor:
         self.pose_timeout_us = config.pose_timeout_us
         self.low_battery_mv = config.low_battery_mv
         self.battery_mv = 0
+        self.goals: GoalSource | None = None  # None: there is always something to fly to
         self._estimator = estimator
         self._announce = announce
         self._stopped = False
@@ -84,6 +99,8 @@ class Supervisor:
         self._watch_bounds(now_us)
         if self._watchdog_us is not None and now_us >= self._watchdog_us:
             self._stopped = True
+        if self.goals is not None and not self.can_fly:
+            self.goals.abort()
         state, cause = self._state(now_us)
         if state is not self.state or cause is not self.cause:
             self.state, self.cause = state, cause
@@ -153,7 +170,7 @@ class Supervisor:
             return State.FAILSAFE, Cause.DISARMED
         if not self.calibrated:
             return State.CALIBRATING, Cause.NONE
-        if self.last_pose_us is None:
+        if self.last_pose_us is None or (self.goals is not None and not self.goals.flies(now_us)):
             return State.WAITING, Cause.NONE
         if now_us - self.last_pose_us >= self.pose_timeout_us:
             return State.FAILSAFE, Cause.SILENCE

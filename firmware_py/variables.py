@@ -1,8 +1,8 @@
 """The log variables of the firmware: names as on the Crazyflie and on the original Floaty, values from the running core.
 
 Units are Floaty's (angles in rad) except where Crazyflie's own programs look: attitudes in `stateEstimate` and `stabilizer`
-are in degrees with the nose up positive, `gyro` and `acc` in deg/s and g. Position, velocity and yaw are those of the goal
-frame: what the board knows is its error.
+are in degrees with the nose up positive, `gyro` and `acc` in deg/s and g. Position, velocity and yaw are those of the frame
+of the poses: of corrections the goal frame, what the board knows is its error; of absolute poses the cameras'.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +14,7 @@ from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, C
 from firmware_py.core.subset import F32s, I32s
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.drivers.imu import acceleration, rates
-from firmware_py.geometry import from_euler_zyx
+from firmware_py.geometry import from_euler_zyx, rotate, wrap_angle, yaw_quaternion
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
 from firmware_py.links.platform import supervisor_bits
@@ -45,8 +45,8 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         running.supervisor,
     )
     return (
-        *_state_estimate(estimator, control),
-        *_crazyflie(running, estimator),
+        *_state_estimate(running, estimator, control),
+        *_crazyflie(running),
         *_each("motor", "m1 m2 m3 m4", U16, "counts", control.count),
         *_each("controller", "u1 u2 u3 u4", F32, "rad", control.u),
         *_each("controller", "m1 m2 m3 m4", F32, "rad", control.command),  # deviation from the hover angle
@@ -62,7 +62,7 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         LogVariable("sys.isFlying", U8, "", lambda: supervisor.state is State.FLYING),
         LogVariable("sys.isTumbled", U8, "", lambda: 0),
         *_localisation(running.localisation, estimator),
-        *_kalman(estimator),
+        *_kalman(running, estimator),
         *_counters(running),
         *_own_logic(running.core),
         *stock_variables(running),
@@ -89,27 +89,49 @@ def _parts(group: str, names: str, unit: str, read: Callable[[int], float]) -> I
         yield LogVariable(f"{group}.{name}", F32, unit, partial(read, index))
 
 
-def _state_estimate(estimator: Estimator, control: Control) -> Iterator[LogVariable]:
+def _state_estimate(running: Running, estimator: Estimator, control: Control) -> Iterator[LogVariable]:
     now, flap, command = estimator.now, control.flap, control.command
     angles = "flap_1 flap_2 flap_3 flap_4"
-    yield from _each("stateEstimate", "x y z", F32, "m", now, POSITION)
-    yield from _each("stateEstimate", "vx vy vz", F32, "m/s", now, VELOCITY)
-    yield from _parts("stateEstimate", "roll pitch yaw", "deg", partial(_legacy_angle, estimator))
+    yield from _parts("stateEstimate", "x y z", "m", partial(_position, running))
+    yield from _parts("stateEstimate", "vx vy vz", "m/s", partial(_velocity, running))
+    yield from _parts("stateEstimate", "roll pitch yaw", "deg", partial(_legacy_angle, running))
     yield from _each("stateEstimate", "roll_rate pitch_rate yaw_rate", F32, "rad/s", now, RATE)
     yield from _parts("stateEstimate", angles, "rad", lambda i: now[FLAP + i] + (flap[i] - command[i]))
     yield from _parts(
         "stateEstimate",
         "qw qx qy qz",
         "",
-        lambda i: from_euler_zyx(*now[ATTITUDE : ATTITUDE + 3].tolist())[i],
+        lambda i: from_euler_zyx(*(_angle(running, axis) for axis in range(3)))[i],
     )
 
 
-def _legacy_angle(estimator: Estimator, axis: int) -> float:
-    return LEGACY_DEGREES[axis] * estimator.now.item(ATTITUDE + axis)
+def _position(running: Running, axis: int) -> float:
+    now, frame = running.core.estimator.fields.now, running.pilot.frame(running.stack.kernel.now_us)
+    if frame is None:
+        return now.item(POSITION + axis)
+    x, y, z = now[POSITION : POSITION + 3].tolist()
+    return frame.position[axis] + rotate(yaw_quaternion(frame.yaw), (x, y, z))[axis]
 
 
-def _crazyflie(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
+def _velocity(running: Running, axis: int) -> float:
+    now, frame = running.core.estimator.fields.now, running.pilot.frame(running.stack.kernel.now_us)
+    if frame is None:
+        return now.item(VELOCITY + axis)
+    x, y, z = now[VELOCITY : VELOCITY + 3].tolist()
+    return frame.velocity[axis] + rotate(yaw_quaternion(frame.yaw), (x, y, z))[axis]
+
+
+def _angle(running: Running, axis: int) -> float:
+    angle = running.core.estimator.fields.now.item(ATTITUDE + axis)
+    frame = running.pilot.frame(running.stack.kernel.now_us) if axis == 2 else None
+    return angle if frame is None else wrap_angle(angle + frame.yaw)
+
+
+def _legacy_angle(running: Running, axis: int) -> float:
+    return LEGACY_DEGREES[axis] * _angle(running, axis)
+
+
+def _crazyflie(running: Running) -> Iterator[LogVariable]:
     """What only Crazyflie's own programs look at."""
     board, bias = running.board, running.core.data.fields.gyro_bias
 
@@ -124,7 +146,7 @@ def _crazyflie(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
     def battery_state() -> float:
         return PM_LOW if board.read_battery_mv() < running.supervisor.low_battery_mv else PM_BATTERY
 
-    yield from _parts("stabilizer", "roll pitch yaw", "deg", partial(_legacy_angle, estimator))
+    yield from _parts("stabilizer", "roll pitch yaw", "deg", partial(_legacy_angle, running))
     yield LogVariable("stabilizer.thrust", F32, "", lambda: 0.0)
     yield from _parts("gyro", "x y z", "deg/s", rate)
     yield from _parts("acc", "x y z", "g", lambda axis: acceleration(board.read_imu())[axis])
@@ -143,10 +165,10 @@ def _localisation(service: LocalisationService, estimator: Estimator) -> Iterato
     yield LogVariable("locSrv.positions", U32, "", partial(getattr, service, "positions"))
 
 
-def _kalman(estimator: Estimator) -> Iterator[LogVariable]:
+def _kalman(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
     covariance = estimator.P.reshape(-1)
     variances = estimator.P.diagonal()
-    yield from _each("kalman", "stateX stateY stateZ", F32, "m", estimator.now, POSITION)
+    yield from _parts("kalman", "stateX stateY stateZ", "m", partial(_position, running))
     yield from _each("kalman", "statePX statePY statePZ", F32, "m/s", estimator.now, VELOCITY)
     yield from _each("kalman", "varX varY varZ", F32, "m^2", variances, POSITION)
     yield from _each("kalman", "varPX varPY varPZ", F32, "m^2/s^2", variances, VELOCITY)

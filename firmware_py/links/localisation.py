@@ -1,11 +1,12 @@
 """Poses from outside into the measurement queue, and the emergency stop; runs in the receiving task.
 
 A position without attitude is counted and can be logged, but not fused, as in the original. Packed items count when they
-carry the last byte of the board's radio address.
+carry the last byte of the board's radio address. The pilot makes errors of the poses.
 """
 
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.measurements import POSE, Measurement, PoseMeasurement
+from firmware_py.pilot import Pilot
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import WireError, crtp, localisation
@@ -18,13 +19,19 @@ class LocalisationService:
     """`address` is the last byte of the radio address; `last` and `positions` are for the log."""
 
     def __init__(
-        self, stack: CrtpStack, measurements: Queue[Measurement], supervisor: Supervisor, address: int
+        self,
+        stack: CrtpStack,
+        measurements: Queue[Measurement],
+        supervisor: Supervisor,
+        pilot: Pilot,
+        address: int,
     ) -> None:
         self.last = PoseMessage((0.0, 0.0, 0.0), UPRIGHT, None)
         self.positions = 0
         self._stack = stack
         self._measurements = measurements
         self._supervisor = supervisor
+        self._pilot = pilot
         self._address = address
         stack.handle(crtp.PORT_LOCALISATION, self._handle)
 
@@ -58,4 +65,5 @@ class LocalisationService:
 
     def _measure(self, now_us: int, pose: PoseMessage) -> Task:
         self.last = pose
-        yield from self._measurements.send((POSE, PoseMeasurement(now_us, pose)), 0)
+        error = self._pilot.error(pose, now_us)
+        yield from self._measurements.send((POSE, PoseMeasurement(now_us, error)), 0)

@@ -1,4 +1,4 @@
-"""Memories on port 4: the EEPROM, a deck's one-wire memory, and the memory tester.
+"""Memories on port 4: the EEPROM, a deck's one-wire memory, the memory tester, the commander's trajectories.
 
 Channel 0 tells which there are, 1 reads, 2 writes. The tester's byte at any address is the address modulo 256: reading
 gives it, writing compares with it and counts what differs.
@@ -11,7 +11,7 @@ from typing import Protocol
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import PORT_MEMORIES, Packet
-from firmware_py.wire.memories import TYPE_EEPROM, TYPE_ONE_WIRE, TYPE_TESTER
+from firmware_py.wire.memories import TYPE_EEPROM, TYPE_ONE_WIRE, TYPE_TESTER, TYPE_TRAJECTORIES
 
 INFO, READ, WRITE = 0, 1, 2  # channels
 GET_COUNT, GET_INFO = 1, 2
@@ -120,10 +120,13 @@ class MemoryService:
         return number < len(self._memories) and address + length <= self._memories[number].size
 
 
-def memories(eeprom: bytearray, deck_memory: bytearray, tester: Tester) -> tuple[Memory, ...]:
+def memories(
+    eeprom: bytearray, deck_memory: bytearray, tester: Tester, trajectories: bytearray
+) -> tuple[Memory, ...]:
     """Return the memories of a Floaty board."""
     return (
         Storage(TYPE_EEPROM, eeprom),
         Storage(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
         tester,
+        Storage(TYPE_TRAJECTORIES, trajectories),
     )

@@ -6,8 +6,6 @@ from firmware_py.supervisor import Supervisor
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import (
     MAX_DATA,
-    PORT_COMMANDER,
-    PORT_GENERIC_SETPOINT,
     PORT_LINK,
     PORT_PLATFORM,
     PORT_SUPERVISOR,
@@ -35,10 +33,7 @@ REPLY = 0x80
 
 
 class PlatformService:
-    """Answers on the ports of link, platform and supervisor; set-points are accepted and change nothing.
-
-    The application echoes what comes on its channel.
-    """
+    """Answers on the ports of link, platform and supervisor. The application echoes what comes on its channel."""
 
     def __init__(self, stack: CrtpStack, supervisor: Supervisor) -> None:
         self._stack = stack
@@ -48,8 +43,6 @@ class PlatformService:
         self._requests = stack.open_port(PORT_PLATFORM)
         stack.serve("CRTP-SRV", 0, PORT_LINK, answer_link)
         stack.handle(PORT_SUPERVISOR, lambda packet: stack.answer(packet, self.answer_supervisor, 0))
-        for port in (PORT_COMMANDER, PORT_GENERIC_SETPOINT):
-            stack.handle(port, _accept)
         kernel.create_task("PLATFORM-SRV", 0, self._platform_task)
         kernel.create_task("APP", 0, self._app_task)
 
@@ -143,8 +136,3 @@ def _version(command: int) -> bytes:
     if command not in texts:
         raise WireError(f"version {command} is unknown")
     return texts[command].encode("ascii") + b"\0"
-
-
-def _accept(packet: Packet) -> Task:
-    """Take a set-point: Floaty follows poses, so that there is nothing to do."""
-    yield from ()

@@ -7,7 +7,7 @@ class State(IntEnum):
     """What the robot is allowed to do."""
 
     CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
-    WAITING = 1  # no pose has come yet: flaps at hover
+    WAITING = 1  # no pose has come yet, or there is nothing to fly to: flaps at hover
     FLYING = 2  # loop closed
     FAILSAFE = 3  # flaps at hover, see the cause
 

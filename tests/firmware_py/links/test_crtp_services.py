@@ -120,6 +120,7 @@ def test_setpoints_and_notify_stop_are_accepted_without_effect(client: CrtpClien
     client.run(client.now_us + 20_000)
     assert client.writes[-1][1] == before
     assert client.firmware.link.malformed == client.firmware.link.unserved == 0
+    assert not any("commander" in line for line in client.console)
 
 
 # Tables of contents
@@ -580,12 +581,12 @@ class Handler:
         element.write_done(element, address)
 
 
-def test_three_memories_announce_themselves(client: CrtpClient) -> None:
-    assert client.one(MEM, 0, b"\1") == b"\1\3"
-    kinds = [struct.unpack_from("<BBBI", client.one(MEM, 0, bytes((2, number)))) for number in range(3)]
-    assert kinds == [(2, 0, 0x00, 8192), (2, 1, 0x01, 112), (2, 2, 0x15, 0x1000)]
-    assert all(len(client.one(MEM, 0, bytes((2, number)))) == 15 for number in range(3))
-    assert client.one(MEM, 0, b"\2\3") == b"\2\3"
+def test_four_memories_announce_themselves(client: CrtpClient) -> None:
+    assert client.one(MEM, 0, b"\1") == b"\1\4"
+    kinds = [struct.unpack_from("<BBBI", client.one(MEM, 0, bytes((2, number)))) for number in range(4)]
+    assert kinds == [(2, 0, 0x00, 8192), (2, 1, 0x01, 112), (2, 2, 0x15, 0x1000), (2, 3, 0x12, 4096)]
+    assert all(len(client.one(MEM, 0, bytes((2, number)))) == 15 for number in range(4))
+    assert client.one(MEM, 0, b"\2\4") == b"\2\4"
 
 
 def test_cflib_reads_and_writes_the_configuration_block(client: CrtpClient) -> None:

@@ -1,0 +1,185 @@
+"""The high-level commander on port 8, its trajectory memory, and the set-points of ports 3 and 7, which are not flown.
+
+Commands are few and planned at once, in the receiving task. Each is answered with the head of itself and a status in the
+fourth byte, as the stock firmware answers.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from firmware_py.links.crtp_stack import CrtpStack, Task
+from firmware_py.links.trajectories import decode_trajectory
+from firmware_py.pilot import Pilot
+from firmware_py.planner import Motion, Phase, go_to, straight_up
+from firmware_py.supervisor import Supervisor
+from firmware_py.wire import WireError, high_level
+from firmware_py.wire.crtp import PORT_COMMANDER, PORT_GENERIC_SETPOINT, Packet
+from firmware_py.wire.high_level import (
+    Command,
+    Define,
+    GoTo,
+    Start,
+    Vertical,
+    VerticalWithVelocity,
+    decode,
+)
+
+OK, REFUSED, ENOEXEC, EBUSY = 0, 1, 8, 16
+SETPOINT_CHANNEL = 0  # of port 7; 1 carries notices
+SETPOINT_STOP = 0
+SETPOINT_NAMES = {
+    1: "velocity", 2: "height and attitude", 4: "PPM", 5: "hover", 6: "full state", 7: "position", 8: "velocity",
+    9: "height and attitude", 10: "hover", 11: "manual",
+}  # fmt: skip
+LINE_PERIOD_US = 1_000_000  # set-points that come on without a pause of this length are refused once
+
+
+@dataclass(slots=True)
+class Defaults:
+    """Parameters of the commander."""
+
+    groups: int = 0  # bits; 0: takes every command
+    take_off_velocity: float = 0.5  # [m/s]
+    landing_velocity: float = 0.5
+
+
+class HighLevelService:
+    """Hands paths to the pilot's planner."""
+
+    def __init__(
+        self,
+        stack: CrtpStack,
+        pilot: Pilot,
+        supervisor: Supervisor,
+        memory: bytearray,
+        say: Callable[[str], None],
+    ) -> None:
+        self.defaults = Defaults()
+        self._stack = stack
+        self._pilot = pilot
+        self._supervisor = supervisor
+        self._memory = memory
+        self._say = say
+        self._definitions: dict[int, Define] = {}
+        self._setpoint_us: dict[str, int] = {}  # when each kind came last
+        stack.handle(high_level.PORT, lambda packet: stack.answer(packet, self.answer, 0))
+        stack.handle(PORT_COMMANDER, self._see_attitude)
+        stack.handle(PORT_GENERIC_SETPOINT, self._see_setpoint)
+
+    def answer(self, packet: Packet) -> tuple[bytes, ...]:
+        """Obey a command and return the reply."""
+        try:
+            status = self._obey(*decode(packet.data))
+        except WireError as error:
+            self._say(f"commander: {error}")
+            status = ENOEXEC
+        return (packet.data[:3].ljust(3, b"\0") + bytes((status,)),)
+
+    def _obey(self, command: Command, fields: tuple[float, ...]) -> int:
+        if command is Command.DEFINE:
+            definition = Define(*map(int, fields))
+            if definition.trajectory >= high_level.MAX_TRAJECTORIES:
+                return ENOEXEC
+            self._definitions[definition.trajectory] = definition
+            return OK
+        if command is Command.SET_GROUP_MASK:
+            self.defaults.groups = int(fields[0])
+            return OK
+        groups = int(fields[0])
+        if command is not Command.STOP and not self._supervisor.can_fly:
+            return EBUSY
+        if groups and not groups & self.defaults.groups:
+            return OK  # for others
+        if command is Command.STOP:
+            self._pilot.planner.stop()
+            return OK
+        begin = self._pilot.begin(self._stack.kernel.now_us)
+        if begin is None:
+            self._say("commander: no pose has come yet")
+            return EBUSY
+        return self._plan(command, fields, begin)
+
+    def _plan(self, command: Command, fields: tuple[float, ...], begin: Motion) -> int:
+        """Turn a command to fly into a path."""
+        if command is Command.GO_TO:
+            return self._go_to(GoTo._make(fields), begin)
+        if command is Command.GO_TO_1:
+            groups, relative, *rest = fields
+            return self._go_to(GoTo(groups, relative, False, *rest), begin)  # type: ignore[arg-type]
+        if command is Command.START:
+            return self._start(Start._make(fields), begin)
+        if command is Command.START_1:
+            groups, relative, reverse, number, timescale = fields
+            return self._start(Start(groups, relative, False, reverse, number, timescale), begin)  # type: ignore[arg-type]
+        if command is Command.SPIRAL:
+            self._say("commander: a spiral is not flown")
+            return ENOEXEC
+        lands = command in (Command.LAND, Command.LAND_1, Command.LAND_WITH_VELOCITY)
+        return self._climb(self._vertical(command, fields, begin, lands), begin, lands)
+
+    def _vertical(self, command: Command, fields: tuple[float, ...], begin: Motion, lands: bool) -> Vertical:
+        """Bring the three ways to take off or to land to one."""
+        if command in (Command.TAKE_OFF, Command.LAND):
+            return Vertical._make(fields)
+        if command in (Command.TAKE_OFF_1, Command.LAND_1):
+            groups, height, duration = fields
+            return Vertical(int(groups), height, 0.0, False, duration)
+        wish = VerticalWithVelocity._make(fields)
+        z = begin.position[2]
+        height = wish.height
+        if wish.relative:
+            height = z - height if lands else z + height
+        default = self.defaults.landing_velocity if lands else self.defaults.take_off_velocity
+        velocity = wish.velocity if wish.velocity > 0.0 else default
+        return Vertical(wish.groups, height, wish.yaw, wish.current_yaw, abs(height - z) / velocity)
+
+    def _climb(self, wish: Vertical, begin: Motion, lands: bool) -> int:
+        planner, now_us = self._pilot.planner, self._stack.kernel.now_us
+        phase = planner.phase(now_us)
+        if phase is Phase.LANDING if lands else phase is not Phase.IDLE:
+            return REFUSED
+        yaw = begin.yaw if wish.current_yaw else wish.yaw
+        planner.follow(straight_up(begin, wish.height, yaw, wish.duration), now_us, lands)
+        return OK
+
+    def _go_to(self, wish: GoTo, begin: Motion) -> int:
+        path = go_to(
+            begin, (wish.x, wish.y, wish.z), wish.yaw, wish.duration, bool(wish.relative), bool(wish.linear)
+        )
+        self._pilot.planner.follow(path, self._stack.kernel.now_us)
+        return OK
+
+    def _start(self, wish: Start, begin: Motion) -> int:
+        definition = self._definitions.get(wish.trajectory)
+        if definition is None:
+            raise WireError(f"trajectory {wish.trajectory} is not defined")
+        if wish.timescale <= 0.0:
+            raise WireError(f"time scale {wish.timescale:g}: must be above 0")
+        path = decode_trajectory(self._memory, definition)
+        path = replace(path, timescale=wish.timescale, reverse=bool(wish.reverse))
+        if wish.relative:
+            path = path.begun_at(begin.position, begin.yaw if wish.relative_yaw else None)
+        self._pilot.planner.follow(path, self._stack.kernel.now_us)
+        return OK
+
+    def _see_attitude(self, packet: Packet) -> Task:
+        """Port 3: roll, pitch, yaw rate and thrust. Without thrust it is what clients send when they leave."""
+        if any(packet.data[12:14]):
+            self._refuse("attitude")
+        yield from self._stack.kernel.yield_if_pending()
+
+    def _see_setpoint(self, packet: Packet) -> Task:
+        """Port 7: a stop is obeyed; that a client sends no more set-points changes nothing."""
+        if packet.channel == SETPOINT_CHANNEL and packet.data:
+            if packet.data[0] == SETPOINT_STOP:
+                self._pilot.planner.stop()
+            else:
+                self._refuse(SETPOINT_NAMES.get(packet.data[0], f"type {packet.data[0]}"))
+        yield from self._stack.kernel.yield_if_pending()
+
+    def _refuse(self, kind: str) -> None:
+        """Say once that set-points of this kind are not flown."""
+        now_us = self._stack.kernel.now_us
+        if now_us - self._setpoint_us.get(kind, -LINE_PERIOD_US) >= LINE_PERIOD_US:
+            self._say(f"commander: {kind} set-points are not flown, the high-level commander's are")
+        self._setpoint_us[kind] = now_us

@@ -1,0 +1,58 @@
+"""Where to fly, as the high-level commander has it, and external poses as errors against that.
+
+Poses come in a frame X: corrections are in the goal frame of the ground station, absolute ones in that of the cameras.
+The error that the estimator takes is the pose as it looks from the goal, which the planner moves in X, at the instant at
+which the pose was true. While the planner is idle, corrections are errors already (the goal is X's origin); with absolute
+poses there is nothing to fly to: the goal stays under the robot, and the supervisor keeps the flaps at hover.
+"""
+
+from firmware_py.geometry import in_goal_frame, to_euler_zyx
+from firmware_py.planner import Motion, Phase, Planner
+from firmware_py.wire.crtp import PoseMessage
+
+ORIGIN = Motion((0.0, 0.0, 0.0), 0.0)
+
+
+class Pilot:
+    """`absolute` says what poses are. `goal` is what the last error was formed against, None for a correction as it came."""
+
+    def __init__(self, default_age_us: int) -> None:
+        self.planner = Planner()
+        self.absolute = False
+        self.goal: Motion | None = None
+        self.here: Motion | None = None  # the last absolute pose
+        self._default_age_us = default_age_us
+
+    def flies(self, now_us: int) -> bool:
+        """Whether there is something to fly to; what comes over other links than CRTP is not the pilot's."""
+        idle = self.planner.phase(now_us) is Phase.IDLE
+        return not (self.absolute and idle and self.here is not None)
+
+    def abort(self) -> None:
+        """Give up the path: the robot may not fly."""
+        self.planner.stop()
+
+    def begin(self, now_us: int) -> Motion | None:
+        """Where a new path begins: where the present one is, else where the robot is; None when nobody knows."""
+        if self.planner.phase(now_us) is not Phase.IDLE:
+            return self.planner.at(now_us)
+        return self.here if self.absolute else ORIGIN
+
+    def frame(self, now_us: int) -> Motion | None:
+        """Where the origin of the estimate is in X now; None while they are the same."""
+        return self.planner.at(now_us) if self.planner.phase(now_us) is not Phase.IDLE else self.goal
+
+    def error(self, pose: PoseMessage, now_us: int) -> PoseMessage:
+        """Return what the estimator takes for a pose that has just arrived."""
+        age_us = self._default_age_us if pose.age_us is None else pose.age_us
+        if self.absolute:
+            self.here = Motion(pose.p_GB, to_euler_zyx(pose.q_GB)[2])
+        if self.planner.phase(now_us) is not Phase.IDLE:
+            self.goal = self.planner.at(now_us - age_us)
+        else:
+            self.goal = self.here if self.absolute else None
+        if self.goal is None:
+            return pose
+        return PoseMessage(
+            *in_goal_frame(pose.p_GB, pose.q_GB, self.goal.position, self.goal.yaw), pose.age_us
+        )

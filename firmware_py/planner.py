@@ -1,0 +1,257 @@
+"""The planner behind the high-level commander: from "take off", "go to" or a stored trajectory to where to fly when.
+
+A path is a row of pieces, each a polynomial of 7th degree in time for x, y, z and yaw. Between two states of motion it is
+the one whose jerk vanishes at both ends. Positions in the frame of the external poses [m], angles in rad, times in seconds
+from the begin of the path. Only + - * / in a fixed order, and the functions of `elementary`: the same bits everywhere.
+Meaning of the commands: crazyflie-firmware 2a18fc29 (crtp_commander_high_level.c, planner.c).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum, auto
+from math import comb
+
+from firmware_py.geometry import Vector, rotate, wrap_angle, yaw_quaternion
+
+DEGREE = 7
+AXES = 4  # x, y, z, yaw
+Coefficients = tuple[float, ...]  # ascending powers of the time in a piece
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Where the path is at an instant, and how it moves."""
+
+    position: Vector
+    yaw: float
+    velocity: Vector = (0.0, 0.0, 0.0)  # [m/s]
+    acceleration: Vector = (0.0, 0.0, 0.0)  # [m/s^2]
+    yaw_rate: float = 0.0  # [rad/s]
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Four polynomials that hold for a while."""
+
+    duration: float
+    axes: tuple[Coefficients, Coefficients, Coefficients, Coefficients]
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Pieces one after the other, slower by `timescale`, perhaps backwards, perhaps turned and moved to another begin."""
+
+    pieces: tuple[Piece, ...]
+    timescale: float = 1.0
+    reverse: bool = False
+    turn: float = 0.0  # about the path's begin, then
+    shift: Vector = (0.0, 0.0, 0.0)
+
+    @property
+    def duration(self) -> float:
+        """How long it takes."""
+        return sum(piece.duration for piece in self.pieces) * self.timescale
+
+    def at(self, t: float) -> Motion:
+        """The motion at a time; before the begin and after the end it stands there."""
+        stands = not 0.0 <= t < self.duration
+        t = min(max(t, 0.0), self.duration) / self.timescale
+        if self.reverse:
+            t = self.duration / self.timescale - t
+        motion = self._placed(_evaluate(*_find(self.pieces, t)))
+        if stands:
+            return Motion(motion.position, motion.yaw)
+        rate = (-1.0 if self.reverse else 1.0) / self.timescale
+        return Motion(
+            motion.position,
+            motion.yaw,
+            _scaled(motion.velocity, rate),
+            _scaled(motion.acceleration, rate * rate),
+            motion.yaw_rate * rate,
+        )
+
+    def _placed(self, motion: Motion) -> Motion:
+        if self.turn == 0.0:
+            return Motion(
+                _sum(motion.position, self.shift),
+                motion.yaw,
+                motion.velocity,
+                motion.acceleration,
+                motion.yaw_rate,
+            )
+        first, q = self._first(), yaw_quaternion(self.turn)
+        offset = rotate(q, _sum(motion.position, _scaled(first, -1.0)))
+        return Motion(
+            _sum(_sum(first, offset), self.shift),
+            motion.yaw + self.turn,
+            rotate(q, motion.velocity),
+            rotate(q, motion.acceleration),
+            motion.yaw_rate,
+        )
+
+    def _first(self) -> Vector:
+        """Where the pieces begin, or end when they are flown backwards."""
+        t = sum(piece.duration for piece in self.pieces) if self.reverse else 0.0
+        return _evaluate(*_find(self.pieces, t)).position
+
+    def begun_at(self, position: Vector, yaw: float | None) -> "Path":
+        """The same path, moved so that it begins at a position and, if that is given, with a yaw."""
+        begin = self.at(0.0)
+        turn = 0.0 if yaw is None else wrap_angle(yaw - begin.yaw)
+        shift = _sum(position, _scaled(begin.position, -1.0))
+        return Path(self.pieces, self.timescale, self.reverse, turn, shift)
+
+
+class Phase(IntEnum):
+    """What the planner does."""
+
+    IDLE = auto()
+    FLYING = auto()
+    LANDING = auto()
+
+
+class Planner:
+    """Holds the path in force; instants are the board's time in us."""
+
+    def __init__(self) -> None:
+        self._phase = Phase.IDLE
+        self._path = Path(())
+        self._begin_us = 0
+
+    def phase(self, now_us: int) -> Phase:
+        """What it does now: the end of a landing is the end of the flight."""
+        if self._phase is Phase.LANDING and self._time(now_us) >= self._path.duration:
+            self._phase = Phase.IDLE
+        return self._phase
+
+    def at(self, t_us: int) -> Motion:
+        """Where to be at an instant; only while it is not idle."""
+        return self._path.at(self._time(t_us))
+
+    def stop(self) -> None:
+        """End the flight where it is."""
+        self._phase = Phase.IDLE
+
+    def follow(self, path: Path, now_us: int, landing: bool = False) -> None:
+        """Take up a path, from now on."""
+        self._path, self._begin_us = path, now_us
+        self._phase = Phase.LANDING if landing else Phase.FLYING
+
+    def _time(self, t_us: int) -> float:
+        return (t_us - self._begin_us) * 1e-6
+
+
+def straight_up(begin: Motion, height: float, yaw: float, duration: float) -> Path:
+    """To a height above or below, from rest to rest, turning to a yaw on the shorter side."""
+    x, y, _ = begin.position
+    return between(
+        Motion(begin.position, begin.yaw),
+        Motion((x, y, height), begin.yaw + wrap_angle(yaw - begin.yaw)),
+        duration,
+    )
+
+
+def go_to(begin: Motion, position: Vector, yaw: float, duration: float, relative: bool, linear: bool) -> Path:
+    """From a motion to a position and a yaw: to rest, or in a straight line at constant speed."""
+    if relative:
+        position, yaw = _sum(begin.position, position), begin.yaw + yaw
+    turn = wrap_angle(yaw - begin.yaw)
+    end = Motion(position, begin.yaw + turn)
+    if linear and duration > 0.0:
+        velocity = _scaled(_sum(position, _scaled(begin.position, -1.0)), 1.0 / duration)
+        rate = turn / duration
+        begin = Motion(begin.position, begin.yaw, velocity, (0.0, 0.0, 0.0), rate)
+        end = Motion(end.position, end.yaw, velocity, (0.0, 0.0, 0.0), rate)
+    return between(begin, end, duration)
+
+
+def between(begin: Motion, end: Motion, duration: float) -> Path:
+    """The one piece from one motion to another without jerk at its ends; without time for it, the end at once."""
+    if duration <= 0.0:
+        axes = ((end.position[0],), (end.position[1],), (end.position[2],), (end.yaw,))
+        return Path((Piece(0.0, axes),))
+    first, second, third = (
+        _connect(
+            (begin.position[i], begin.velocity[i], begin.acceleration[i]),
+            (end.position[i], end.velocity[i], end.acceleration[i]),
+            duration,
+        )
+        for i in range(3)
+    )
+    turn = _connect((begin.yaw, begin.yaw_rate, 0.0), (end.yaw, end.yaw_rate, 0.0), duration)
+    return Path((Piece(duration, (first, second, third, turn)),))
+
+
+def bezier(points: Sequence[float], duration: float) -> Coefficients:
+    """The polynomial whose Bezier curve over a duration has these control points (1 to 8)."""
+    n = len(points) - 1
+    powers = []
+    scale = 1.0
+    for j in range(n + 1):
+        total = 0.0
+        for i in range(j + 1):
+            total += (-1.0) ** (i + j) * comb(j, i) * points[i]
+        powers.append(comb(n, j) * total / scale)
+        scale *= duration
+    return tuple(powers)
+
+
+def _connect(begin: Vector, end: Vector, duration: float) -> Coefficients:
+    """Solve for the powers 4 to 7: value, first and second derivative at both ends are given, the third is 0 there.
+
+    In the share s of the duration: what is missing at s = 1 after the powers 0 to 2 is d; the inverse of the four
+    equations for position, velocity, acceleration and jerk at s = 1 stands here as numbers.
+    """
+    x0, v0, a0 = begin[0], begin[1] * duration, begin[2] * duration * duration
+    x1, v1, a1 = end[0], end[1] * duration, end[2] * duration * duration
+    d0 = x1 - x0 - v0 - 0.5 * a0
+    d1 = v1 - v0 - a0
+    d2 = a1 - a0
+    shares = (
+        x0,
+        v0,
+        0.5 * a0,
+        0.0,
+        35.0 * d0 - 15.0 * d1 + 2.5 * d2,
+        -84.0 * d0 + 39.0 * d1 - 7.0 * d2,
+        70.0 * d0 - 34.0 * d1 + 6.5 * d2,
+        -20.0 * d0 + 10.0 * d1 - 2.0 * d2,
+    )
+    powers = []
+    scale = 1.0
+    for share in shares:
+        powers.append(share / scale)
+        scale *= duration
+    return tuple(powers)
+
+
+def _find(pieces: Sequence[Piece], t: float) -> tuple[Piece, float]:
+    """The piece at a time, and the time in it."""
+    for piece in pieces[:-1]:
+        if t < piece.duration:
+            return piece, t
+        t -= piece.duration
+    return pieces[-1], min(t, pieces[-1].duration)
+
+
+def _evaluate(piece: Piece, t: float) -> Motion:
+    (x, vx, ax), (y, vy, ay), (z, vz, az), (yaw, yaw_rate, _) = (_derivatives(axis, t) for axis in piece.axes)
+    return Motion((x, y, z), yaw, (vx, vy, vz), (ax, ay, az), yaw_rate)
+
+
+def _derivatives(powers: Coefficients, t: float) -> Vector:
+    """Value, first and second derivative, by Horner's scheme."""
+    value = first = second = 0.0
+    for coefficient in reversed(powers):
+        second = second * t + 2.0 * first
+        first = first * t + value
+        value = value * t + coefficient
+    return value, first, second
+
+
+def _sum(a: Vector, b: Vector) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _scaled(a: Vector, factor: float) -> Vector:
+    return a[0] * factor, a[1] * factor, a[2] * factor

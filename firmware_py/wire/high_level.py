@@ -1,0 +1,120 @@
+"""The commands of the high-level commander on port 8.
+
+A command is one byte, for most the groups that it is for, and its fields; short ones are filled with zeros, as the stock
+firmware's buffer is. Facts: crazyflie-firmware 2a18fc29, cflib 0.1.34.
+"""
+
+import struct
+from enum import IntEnum
+from math import isfinite
+from typing import NamedTuple
+
+from firmware_py.wire import WireError
+
+PORT = 8
+MAX_TRAJECTORIES = 10
+
+
+class Command(IntEnum):
+    """The first byte. Those that end in 1 are older than cflib's."""
+
+    SET_GROUP_MASK = 0
+    TAKE_OFF_1 = 1
+    LAND_1 = 2
+    STOP = 3
+    GO_TO_1 = 4
+    START_1 = 5
+    DEFINE = 6
+    TAKE_OFF = 7
+    LAND = 8
+    TAKE_OFF_WITH_VELOCITY = 9
+    LAND_WITH_VELOCITY = 10
+    SPIRAL = 11
+    GO_TO = 12
+    START = 13
+
+
+class Vertical(NamedTuple):
+    """TAKE_OFF and LAND."""
+
+    groups: int
+    height: float
+    yaw: float
+    current_yaw: bool
+    duration: float
+
+
+class VerticalWithVelocity(NamedTuple):
+    """TAKE_OFF_WITH_VELOCITY and LAND_WITH_VELOCITY."""
+
+    groups: int
+    height: float
+    relative: bool
+    yaw: float
+    current_yaw: bool
+    velocity: float
+
+
+class GoTo(NamedTuple):
+    """GO_TO."""
+
+    groups: int
+    relative: bool
+    linear: bool
+    x: float
+    y: float
+    z: float
+    yaw: float
+    duration: float
+
+
+class Start(NamedTuple):
+    """START, of a trajectory that was defined."""
+
+    groups: int
+    relative: bool
+    relative_yaw: bool
+    reverse: bool
+    trajectory: int
+    timescale: float
+
+
+class Define(NamedTuple):
+    """DEFINE."""
+
+    trajectory: int
+    location: int
+    type: int
+    offset: int
+    pieces: int
+
+
+_LAYOUTS = {
+    Command.SET_GROUP_MASK: struct.Struct("<B"),
+    Command.TAKE_OFF_1: struct.Struct("<Bff"),
+    Command.LAND_1: struct.Struct("<Bff"),
+    Command.STOP: struct.Struct("<B"),
+    Command.GO_TO_1: struct.Struct("<BBfffff"),
+    Command.START_1: struct.Struct("<BBBBf"),
+    Command.DEFINE: struct.Struct("<BBBIB"),
+    Command.TAKE_OFF: struct.Struct("<Bff?f"),
+    Command.LAND: struct.Struct("<Bff?f"),
+    Command.TAKE_OFF_WITH_VELOCITY: struct.Struct("<Bf?f?f"),
+    Command.LAND_WITH_VELOCITY: struct.Struct("<Bf?f?f"),
+    Command.SPIRAL: struct.Struct("<BBBfffff"),
+    Command.GO_TO: struct.Struct("<B??fffff"),
+    Command.START: struct.Struct("<B???Bf"),
+}
+
+
+def decode(data: bytes) -> tuple[Command, tuple[float, ...]]:
+    """The command and its fields as they travel; `WireError` for an unknown one or a number that is none."""
+    try:
+        command = Command(data[0])
+    except (IndexError, ValueError):
+        raise WireError(f"high-level command {data.hex()}: unknown") from None
+    layout = _LAYOUTS[command]
+    fields = layout.unpack(data[1 : 1 + layout.size].ljust(layout.size, b"\0"))
+    if not all(isfinite(value) for value in fields):
+        raise WireError(f"high-level command {command.name.lower()} {fields}: must be finite")
+    return command, fields

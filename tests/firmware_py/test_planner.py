@@ -1,0 +1,152 @@
+"""The planner's polynomials against numpy's linear algebra and scipy's Bezier curves; its paths by their laws."""
+
+from math import pi
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial import Polynomial
+from scipy.interpolate import BPoly
+
+from firmware_py.planner import Motion, Path, Phase, Piece, Planner, between, bezier, go_to, straight_up
+
+NUMBERS = st.floats(-2.0, 2.0)
+VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
+MOTIONS = st.builds(Motion, VECTORS, NUMBERS, VECTORS, VECTORS, NUMBERS)
+DURATIONS = st.floats(0.3, 8.0)
+POINTS = st.lists(NUMBERS, min_size=1, max_size=8)
+REST = Motion((0.1, -0.2, 0.3), 0.4)
+
+
+def coefficients(
+    begin: tuple[float, float, float], end: tuple[float, float, float], duration: float
+) -> Polynomial:
+    """The polynomial of 7th degree with these values and first two derivatives at both ends, the third 0."""
+    rows, wanted = [], [*begin, 0.0, *end, 0.0]
+    for t in (0.0, duration):
+        for order in range(4):
+            rows.append([Polynomial.basis(k).deriv(order)(t) if order else t**k for k in range(8)])
+    return Polynomial(np.linalg.solve(np.array(rows), np.array(wanted)))
+
+
+@given(MOTIONS, MOTIONS, DURATIONS)
+@settings(max_examples=15, deadline=None)
+def test_between_two_motions_lies_the_polynomial_without_jerk_at_its_ends(
+    begin: Motion, end: Motion, duration: float
+) -> None:
+    path = between(begin, end, duration)
+    for axis in range(3):
+        states = [(m.position[axis], m.velocity[axis], m.acceleration[axis]) for m in (begin, end)]
+        expected = coefficients(*states, duration)
+        for t in np.linspace(0.0, duration * 0.999, 7):
+            motion = path.at(float(t))
+            ours = motion.position[axis], motion.velocity[axis], motion.acceleration[axis]
+            theirs = [(expected.deriv(order) if order else expected)(t) for order in range(3)]
+            assert ours == pytest.approx(theirs, abs=1e-6 * (1 + 1 / duration**2))
+    yaw = coefficients((begin.yaw, begin.yaw_rate, 0.0), (end.yaw, end.yaw_rate, 0.0), duration)
+    assert path.at(0.4 * duration).yaw == pytest.approx(yaw(0.4 * duration), abs=1e-6)
+    assert path.at(0.4 * duration).yaw_rate == pytest.approx(yaw.deriv()(0.4 * duration), abs=1e-5)
+
+
+@given(POINTS, DURATIONS)
+@settings(max_examples=50, deadline=None)
+def test_a_bezier_curve_is_scipys(points: list[float], duration: float) -> None:
+    ours, theirs = Polynomial(bezier(points, duration)), BPoly(np.array(points)[:, None], [0.0, duration])
+    for t in np.linspace(0.0, duration, 9):
+        assert ours(t) == pytest.approx(float(theirs(t)), abs=1e-7)
+
+
+def wavy(pieces: int = 3) -> Path:
+    rng = np.random.default_rng(1)
+    return Path(
+        tuple(
+            Piece(0.5 + 0.25 * number, tuple(tuple(row) for row in rng.normal(size=(4, 8)).tolist()))  # type: ignore[arg-type]
+            for number in range(pieces)
+        )
+    )
+
+
+def test_pieces_follow_one_another_and_the_end_is_held_at_rest() -> None:
+    path = wavy()
+    assert path.duration == 0.5 + 0.75 + 1.0
+    x = Polynomial(path.pieces[1].axes[0])
+    assert path.at(0.5 + 0.3).position[0] == pytest.approx(x(0.3))
+    assert path.at(0.5 + 0.3).velocity[0] == pytest.approx(x.deriv()(0.3))
+    end = Motion(
+        tuple(Polynomial(axis)(1.0) for axis in path.pieces[2].axes[:3]),
+        Polynomial(path.pieces[2].axes[3])(1.0),
+    )  # type: ignore[arg-type]
+    for t in (2.25, 100.0):
+        assert path.at(t).position == pytest.approx(end.position)
+        assert path.at(t).velocity == path.at(t).acceleration == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("timescale", [0.5, 1.0, 3.0])
+def test_a_slower_path_is_the_same_path_and_a_reversed_one_runs_back(timescale: float, reverse: bool) -> None:
+    path = wavy()
+    other = Path(path.pieces, timescale, reverse)
+    assert other.duration == pytest.approx(timescale * path.duration)
+    for t in (0.2, 0.9, 1.7):
+        ours, there = other.at(timescale * (path.duration - t if reverse else t)), path.at(t)
+        rate = (-1 if reverse else 1) / timescale
+        assert ours.position == pytest.approx(there.position)
+        assert ours.velocity == pytest.approx([v * rate for v in there.velocity])
+        assert ours.acceleration == pytest.approx([a * rate * rate for a in there.acceleration])
+        assert ours.yaw_rate == pytest.approx(there.yaw_rate * rate)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_relative_path_begins_where_the_robot_is_and_turns_with_it(reverse: bool) -> None:
+    path = Path(wavy().pieces, 1.0, reverse)
+    begin = path.at(0.0)
+    moved = path.begun_at((1.0, 2.0, 3.0), None)
+    turned = path.begun_at((1.0, 2.0, 3.0), begin.yaw + 0.5 * pi)
+    assert moved.at(0.0).position == pytest.approx((1.0, 2.0, 3.0))
+    assert moved.at(0.0).yaw == pytest.approx(begin.yaw)
+    assert turned.at(0.0).position == pytest.approx((1.0, 2.0, 3.0))
+    there, here, here_turned = path.at(0.8), moved.at(0.8), turned.at(0.8)
+    offset = np.array(there.position) - begin.position
+    assert np.array(here.position) - (1, 2, 3) == pytest.approx(offset)
+    assert np.array(here_turned.position) - (1, 2, 3) == pytest.approx([-offset[1], offset[0], offset[2]])
+    assert here_turned.yaw == pytest.approx(there.yaw + 0.5 * pi)
+    x, y, z = there.velocity
+    assert here_turned.velocity == pytest.approx((-y, x, z))
+
+
+def test_up_and_down_keep_the_place_and_turn_on_the_shorter_side() -> None:
+    path = straight_up(Motion((0.1, 0.2, 0.3), 3.0), 1.5, -3.0, 2.0)
+    assert path.at(2.0).position == pytest.approx((0.1, 0.2, 1.5))
+    assert path.at(1.0).position == pytest.approx((0.1, 0.2, 0.9))
+    assert path.at(2.0).yaw == pytest.approx(2 * pi - 3.0)
+
+
+def test_going_there_is_absolute_or_relative_smooth_or_straight() -> None:
+    smooth = go_to(REST, (1.0, 0.0, 0.0), 0.0, 2.0, relative=False, linear=False)
+    assert smooth.at(2.0).position == pytest.approx((1.0, 0.0, 0.0))
+    assert smooth.at(0.0).velocity == (0.0, 0.0, 0.0)
+    relative = go_to(REST, (1.0, 0.0, 0.0), 0.5, 2.0, relative=True, linear=False)
+    assert relative.at(2.0).position == pytest.approx((1.1, -0.2, 0.3))
+    assert relative.at(2.0).yaw == pytest.approx(0.9)
+    straight = go_to(REST, (1.1, -0.2, 0.3), 0.4, 2.0, relative=False, linear=True)
+    for t in (0.0, 0.5, 1.9):
+        assert straight.at(t).position == pytest.approx((0.1 + 0.5 * t, -0.2, 0.3))
+        assert straight.at(t).velocity == pytest.approx((0.5, 0.0, 0.0))
+    assert go_to(REST, (1.0, 2.0, 3.0), 0.0, 0.0, relative=False, linear=True).at(0.0).position == (
+        1.0,
+        2.0,
+        3.0,
+    )
+
+
+def test_a_landing_ends_idle_and_everything_else_goes_on() -> None:
+    planner = Planner()
+    assert planner.phase(0) is Phase.IDLE
+    planner.follow(straight_up(REST, 1.0, 0.0, 2.0), 1_000_000)
+    assert planner.phase(9_000_000) is Phase.FLYING
+    assert planner.at(9_000_000).position[2] == pytest.approx(1.0)
+    assert planner.at(0).position == pytest.approx(REST.position)  # a pose from before the begin
+    planner.follow(straight_up(planner.at(9_000_000), 0.2, 0.0, 2.0), 9_000_000, landing=True)
+    assert planner.phase(10_999_999) is Phase.LANDING
+    assert planner.phase(11_000_000) is Phase.IDLE
