@@ -91,9 +91,7 @@ def pose_into_history(parameters: Parameters, data: Input, estimator: Estimator)
         estimator.invalid = i32(estimator.invalid + 1)
         return i32(POSE_INVALID)
     age_us = data.pose_age_us
-    if parameters.predict == 0:
-        age_us = i32(0)
-    elif parameters.age_measured == 0:
+    if parameters.predict != 0 and parameters.age_measured == 0:
         age_us = i32(clamp_horizon(parameters.horizon) * TICK_US)
     elif age_us < 0:
         age_us = parameters.default_age_us
@@ -101,6 +99,9 @@ def pose_into_history(parameters: Parameters, data: Input, estimator: Estimator)
         age_us = i32(0)
     if age_us > (HORIZON_LIMIT + 1) * TICK_US:
         age_us = i32((HORIZON_LIMIT + 1) * TICK_US)
+    reported_us = i32(age_us)
+    if parameters.predict == 0:
+        age_us = i32(0)
     ticks = (age_us + TICK_US // 2) // TICK_US
     if ticks >= estimator.horizon:
         estimator.quiet_ticks = i32(0)
@@ -121,7 +122,7 @@ def pose_into_history(parameters: Parameters, data: Input, estimator: Estimator)
         estimator.pose[row, 3 + axis] = estimator.work_1[axis]
     estimator.pose_lag[row] = f32(age_us - ticks * TICK_US) * SECONDS_PER_US
     estimator.pose_waiting[row] = i32(1)
-    estimator.pose_age_us = age_us
+    estimator.pose_age_us = reported_us
     return i32(POSE_ON_TIME)
 
 

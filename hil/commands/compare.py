@@ -52,6 +52,7 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
         shown = ("–" if math.isnan(number) else f"{number:.4g}" for number in numbers)
         table.add_row(pair.name, *shown, pair.unit)
     console.print(table)
+    console.print(comparison.span, soft_wrap=True)
     for name, x, y in comparison.settings:
         console.print(f"{name}: {x} | {y}", soft_wrap=True)
     for folder, missing in zip((first, second), comparison.missing, strict=True):

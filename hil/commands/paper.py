@@ -39,7 +39,7 @@ seeds_option = click.option(
 def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
     """Fly the paper's experiments on both profiles, and the robustness studies; write one report.
 
-    Exit code 0: every verdict holds for the default profile; 1: one fails; 2: bad input; 130: interrupted, with a report
+    Exit code 0: all limits hold for the default profile; 1: one fails; 2: bad input; 130: interrupted, with a report
     of what was flown.
     """
     from hil.studies.catalogue import STUDIES

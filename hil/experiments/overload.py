@@ -56,16 +56,21 @@ def thief_load(flight: pa.Table) -> NDArray[np.float64]:
 
 
 def loads_that_hurt(flight: pa.Table) -> Mapping[str, float]:
-    """Return the loads at which things begin to go wrong; 1 when they never do."""
+    """Return the loads at which tasks are late first, infinity when they never are, and the last step inside the box."""
     load, error = thief_load(flight), np.abs(position_error(flight))
 
     def first(wrong: Any) -> float:
-        return float(np.round(load[np.argmax(wrong)], 2)) if wrong.any() else 1.0
+        return float(np.round(load[np.argmax(wrong)], 2)) if wrong.any() else np.inf
+
+    def last_before(wrong: Any) -> float:
+        percent = STEP_PERCENT * np.round(load * 100 / STEP_PERCENT)
+        whole = percent[percent < percent[np.argmax(wrong)]] if wrong.any() else percent
+        return float(whole.max(initial=0.0)) / 100 if len(whole) else np.nan
 
     return {
         "estimator_late_from": first(np.diff(column(flight, "late.KALMAN"), prepend=0.0) > 0),
         "controller_late_from": first(np.diff(column(flight, "late.STABILIZER"), prepend=0.0) > 0),
-        "held_up_to": first((error > BOX).any(axis=1)),
+        "held_up_to": last_before((error > BOX).any(axis=1)),
     }
 
 

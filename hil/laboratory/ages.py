@@ -32,15 +32,23 @@ def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
 
 
 def told(folder: Path) -> pa.Table:
-    """What the station said of the poses that it sent: `t` [s] by its clock, from the first one on, and each stage [ms].
+    """What the station said of the poses that it sent: `t` [us] by its clock, and each stage [ms].
 
     A stage of which it does not know is NaN. The last line of the file may be cut.
     """
     times = _read(folder / TELEMETRY, (TIME_COLUMN, *AGE_COLUMNS))
     times = times[~np.isnan(times[:, -1])]
-    times[:, 0] -= times[:1, 0].sum()
-    times[:, 1:] *= 1e3
+    times *= (1e6, *len(STAGES) * (1e3,))
     return pa.table(dict(zip(("t", *STAGES), times.T, strict=True)))
+
+
+def told_in_time_of(log: pa.Table, folder: Path) -> pa.Table:
+    """What `told` says, with `t` [us] in the log's time instead of the station's, and the log's metadata."""
+    table = told(folder)
+    if STATION_CLOCK in log.column_names:
+        times_us = np.interp(column(table, "t"), column(log, STATION_CLOCK), column(log, "t"))
+        table = table.set_column(0, "t", pa.array(times_us))
+    return table.replace_schema_metadata(log.schema.metadata)
 
 
 def goals_sent(telemetry: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
+from hil.laboratory.recorder import release_of
 
 if TYPE_CHECKING:
     from hil.laboratory.robot import Robot
@@ -107,10 +108,7 @@ def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
     known = metadata or {}
     texts = json.loads(known.get(b"faults", b"[]"))
     faults = [parse(text) for text in texts if text.partition("@")[0] in KINDS]
-    if not faults:
-        return []
-    planned_us = json.loads(known[b"config"])["flight"]["release_us"]
-    return spans(faults, int(known.get(b"release_us", planned_us)))
+    return spans(faults, release_of(known))
 
 
 class Switchboard:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, PlainSerializer
 
 from firmware_py.geometry import euler_zyx_of
 from firmware_py.wire.supervisor import State
@@ -40,7 +40,9 @@ SHOWN = {
 
 
 def show(value: float, unit: str) -> str:
-    """Return a value as people read it: lengths in cm, angles in deg, shares in percent."""
+    """Return a value as people read it: lengths in cm, angles in deg, shares in percent; infinity is never."""
+    if np.isposinf(value):
+        return "never"
     scale, shown = SHOWN.get(unit, (1.0, unit))
     return f"{value * scale:.4g} {shown}".strip()
 
@@ -89,7 +91,9 @@ METRICS: Mapping[str, Metric] = {
     "controller_late_from": Metric(
         "share", "min", "thief's load at which STABILIZER first misses a deadline"
     ),
-    "held_up_to": Metric("share", "min", "thief's load up to which the robot stays inside the 20 cm box"),
+    "held_up_to": Metric(
+        "share", "min", "thief's largest load, in steps, with which the robot stays inside the 20 cm box"
+    ),
     "power": Metric("W", "max", "mean power from the battery"),
     "specific_power": Metric("W/kg", "max", "that power over the robot's mass"),
     "endurance": Metric("min", "min", "flight until the supervisor finds the battery empty"),
@@ -105,7 +109,11 @@ METRICS: Mapping[str, Metric] = {
 }
 
 
-Figure = Annotated[float, BeforeValidator(lambda value: np.nan if value is None else value)]  # null in a file
+Figure = Annotated[  # in a file NaN is null, infinity "inf"
+    float,
+    BeforeValidator(lambda value: np.nan if value is None else value),
+    PlainSerializer(lambda value: "inf" if np.isinf(value) else value, when_used="json"),
+]
 
 
 @dataclass(frozen=True, slots=True)

@@ -149,6 +149,14 @@ def load_log(folder: Path) -> pa.Table:
     raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
 
 
+def release_of(metadata: Mapping[bytes, bytes] | None) -> int:
+    """Return when the robot of a log was released [us], or when it was to be; 0 of a log that says neither."""
+    known = metadata or {}
+    if RELEASE_US in known:
+        return int(known[RELEASE_US])
+    return int(json.loads(known.get(b"config", b"{}")).get("flight", {}).get("release_us", 0))
+
+
 def load_events(folder: Path) -> list[dict[str, Any]]:
     """Return the texts of a run: dicts with `t_us`, `source` and `text`."""
     path = folder / EVENTS

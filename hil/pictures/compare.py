@@ -6,7 +6,7 @@ Logs are compared bit for bit, row by row, in the columns that both have; a NaN 
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,14 @@ import numpy as np
 import pyarrow as pa
 
 from hil.errors import LabError
-from hil.laboratory.metrics import METRICS, SHOWN
+from hil.experiments import find_again
+from hil.laboratory.metrics import METRICS, SHOWN, free_flight, measure
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import Result, read_result
-from hil.pictures.overlays import pair
+from hil.pictures.overlays import pair, since_release
 from hil.pictures.pages import data_uri, write_page
 
+ROW_S = 0.01
 PICTURE, PAGE = "compare.png", "compare.html"
 SETTINGS = (
     "experiment",
@@ -46,13 +48,13 @@ class Difference:
     """The first place at which two logs differ; a value is None where that log has ended."""
 
     row: int
-    t_us: int
+    t_s: float  # from the release
     column: str
     values: tuple[float | None, float | None]
 
     def __str__(self) -> str:
         a, b = ("the log has ended" if value is None else f"{value!r}" for value in self.values)
-        return f"row {self.row}, {self.t_us * 1e-6:.6f} s, {self.column}: {a} | {b}"
+        return f"row {self.row}, {self.t_s:.6f} s from the release, {self.column}: {a} | {b}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +79,7 @@ class Comparison:
     missing: tuple[
         tuple[str, ...], tuple[str, ...]
     ]  # columns of the other one that the first, the second lacks
+    span: str  # of the metrics
     metrics: tuple[MetricPair, ...]
     settings: tuple[tuple[str, str, str], ...]  # name, first, second: those that differ
 
@@ -98,13 +101,15 @@ def compare(a: Run, b: Run) -> Comparison:
     """Compare two runs."""
     names_a, names_b = a.log.column_names, b.log.column_names
     common = [name for name in names_a if name in names_b]
+    flown_s = tuple(_flown_s(run) for run in (a, b))
     return Comparison(
         _first_difference(a.log, b.log, common),
         (
             tuple(name for name in names_b if name not in common),
             tuple(name for name in names_a if name not in common),
         ),
-        tuple(_metric_pairs(a.result, b.result)),
+        _span(*flown_s),
+        tuple(_metric_pairs(*(_up_to(run, min(flown_s)) for run in (a, b)))),
         tuple(_differing_settings(a, b)),
     )
 
@@ -132,11 +137,37 @@ def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Differenc
             row, column = int(np.argmax(differs)), name
     if column:
         x, y = (table.column(column)[row].as_py() for table in (a, b))
-        return Difference(row, a.column("t")[row].as_py(), column, (x, y))
+        return Difference(row, float(since_release(a)[row]), column, (x, y))
     if a.num_rows == b.num_rows:
         return None
     times = [table.column("t")[rows].as_py() if table.num_rows > rows else None for table in (a, b)]
-    return Difference(rows, next(t for t in times if t is not None), "t", (times[0], times[1]))
+    longer = a if times[0] is not None else b
+    return Difference(rows, float(since_release(longer)[rows]), "t", (times[0], times[1]))
+
+
+def _flown_s(run: Run) -> float:
+    return float(since_release(run.log).max(initial=0.0))
+
+
+def _span(first_s: float, second_s: float) -> str:
+    if abs(first_s - second_s) < ROW_S:
+        return f"Over the {first_s:.2f} s after the release that both flew."
+    return (
+        f"Over the first {min(first_s, second_s):.2f} s after the release, which both flew; the flights go on to "
+        f"{first_s:.2f} s and {second_s:.2f} s."
+    )
+
+
+def _up_to(run: Run, end_s: float) -> Result:
+    """Return the result of a flight with the metrics of its first `end_s` after the release."""
+    if _flown_s(run) < end_s + ROW_S:
+        return run.result
+    log = run.log.filter(since_release(run.log) < end_s + ROW_S / 2)
+    metrics = measure(log, lost=False)
+    known = find_again(run.result.experiment, run.result.source)
+    if known is not None and (free := free_flight(log)).num_rows > 1:
+        metrics.update(known.measured(free))
+    return replace(run.result, metrics=metrics)
 
 
 def _metric_pairs(a: Result, b: Result) -> list[MetricPair]:

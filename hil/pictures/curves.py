@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from ground_station.latency import STAGES
 from hil.laboratory.faults import Span
 from hil.laboratory.metrics import attitude_error, column, position_error
 
@@ -19,7 +20,18 @@ ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
 )  # fmt: skip
 AXIS_COLOURS = (RED, GREEN, BLUE)  # x, y, z; roll, pitch, yaw
 FLAP_COLOURS = (BLUE, ORANGE, GREEN, PINK)
-TASK_COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, YELLOW, GREY, "#332288", "#882255", "#117733", "#000000")
+SERIES_COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, YELLOW, GREY)
+TASK_COLOURS = {
+    "STABILIZER": BLUE, "KALMAN": ORANGE, "SENSORS": GREEN, "THIEF": PINK, "SYSLINK": "#1b04fa", "TELEMETRY": "#082427",
+    "CRTP-RX": "#7f2a04", "CRTP-TX": "#8ef199", "LOG": "#2571fa", "CRTP-SRV": "#2ce5ff", "PARAM": "#c27934",
+    "CONSOLE": "#97eccd", "PLATFORM-SRV": "#704369", "APP": "#000690", "MEM": "#011d57", "PWRMGNT": "#26b5ff",
+    "Tmr Svc": "#51fb62",
+}  # fmt: skip
+IN_ITS_PLACE = {  # over MAVLink
+    "MAV-RX": "CRTP-RX", "MAV-TX": "CRTP-TX", "MAV-STREAM": "TELEMETRY", "MAV-PARAM": "PARAM", "MAV-SYNC": "CRTP-SRV",
+    "MAV-BOOT": "PLATFORM-SRV",
+}  # fmt: skip
+STAGE_COLOURS = dict(zip(STAGES, SERIES_COLOURS, strict=False))  # of a pose's age
 
 NEAR_CM, ATTITUDE_DEG = 6.0, 20.0  # paper, Hover_figure: errors below 6 cm most of the time, below 20 degrees
 TICK_MS = 10.0  # of the estimator's horizon
@@ -45,6 +57,24 @@ class States:
     column: str
     names: tuple[str, ...]
     colours: tuple[str, ...]
+
+
+def task_colour(name: str) -> str:
+    """Return the one colour of a task in every figure; grey of one that is not the firmware's."""
+    return TASK_COLOURS.get(IN_ITS_PLACE.get(name, name), GREY)
+
+
+def since_fusion(rows: pa.Table) -> NDArray[np.float64]:
+    """Return the time since a pose was fused last [ms], as the log's rows show it, (N, 1); NaN before the first."""
+    times, fused = column(rows, "t"), column(rows, "estimator.fused")
+    latest = np.maximum.accumulate(np.where(np.diff(fused, prepend=0.0) > 0, times, -np.inf))
+    return np.asarray(np.where(np.isfinite(latest), 1e-3 * (times - latest), np.nan)[:, None])
+
+
+def row_of_last_fusion(rows: pa.Table) -> pa.Table:
+    """Return the row that showed the pose that was fused last; no row before the first."""
+    fusions = np.flatnonzero(np.diff(column(rows, "estimator.fused"), prepend=0.0) > 0)
+    return rows.take(fusions[-1:])
 
 
 def _degrees(*names: str) -> Read:
@@ -78,6 +108,7 @@ AGE = Curves(
     ("age of the pose", "horizon"), (BLUE, ORANGE), "ms",
     lambda rows: column(rows, "estimator.pose_age_us", "estimator.horizon") * (1e-3, TICK_MS),
 )  # fmt: skip
+SINCE_FUSION = Curves(("since the last fused pose",), (RED,), "ms", since_fusion)
 PACKETS = Curves(
     ("lost up", "lost down", "sent again"), (RED, ORANGE, BLUE), "packets",
     lambda rows: column(rows, "link.up_dropped", "link.down_dropped", "link.retried"),
@@ -89,7 +120,7 @@ SERIAL_FAULTS = Curves(
     needs="serial.overrun",
 )  # fmt: skip
 QUEUE = Curves(
-    ("longest so far", "dropped"), (BLUE, RED), "poses",
+    ("longest so far", "dropped"), (BLUE, RED), "measurements",
     lambda rows: column(rows, "rtos.measurements_high_water", "rtos.measurements_dropped"),
 )  # fmt: skip
 SUPERVISOR = States(
@@ -107,8 +138,8 @@ def processor(names: Iterable[str]) -> Curves:
         spent = np.diff(column(rows, *tasks), axis=0).reshape(-1, len(tasks))
         return np.asarray(100 * spent / np.diff(column(rows, "t"))[:, None])
 
-    colours = tuple(TASK_COLOURS[index % len(TASK_COLOURS)] for index in range(len(tasks)))
-    return Curves(tuple(name.removeprefix("cpu.") for name in tasks), colours, "%", load)
+    shown = tuple(name.removeprefix("cpu.") for name in tasks)
+    return Curves(shown, tuple(map(task_colour, shown)), "%", load)
 
 
 def own_logic(rows: pa.Table) -> list[Curves]:
@@ -120,7 +151,7 @@ def own_logic(rows: pa.Table) -> list[Curves]:
     return [
         Curves(
             tuple(name.removeprefix("logic.") for name in names),
-            tuple(TASK_COLOURS[index % len(TASK_COLOURS)] for index in range(len(names))),
+            tuple(SERIES_COLOURS[index % len(SERIES_COLOURS)] for index in range(len(names))),
             unit, partial(_columns, tuple(names)),
         )
         for unit, names in by_unit.items()

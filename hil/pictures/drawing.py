@@ -35,5 +35,5 @@ def stack(heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
     """Return a figure of axes one above the other [in] that share their time axis."""
     figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
     axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0].tolist()
-    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlabel("time from the release [s]")
     return figure, axes

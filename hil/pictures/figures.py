@@ -1,6 +1,6 @@
 """The figures of a flight as PNG, after the paper's figure Hover_figure; also of a flight that was lost or never began.
 
-Axes carry cm, degrees, ms and seconds of simulated time. Grey: the robot was still held; red: a fault was in force.
+Axes carry cm, degrees, ms and seconds from the release. Grey: the robot was still held; red: a fault was in force.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,20 +15,18 @@ from numpy.typing import NDArray
 from ground_station.latency import STAGES, stages_told
 from hil.laboratory.faults import spans_of
 from hil.laboratory.metrics import BOX, column, free_flight
+from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, scene
 from hil.pictures.curves import Curves
 from hil.pictures.drawing import WIDTH, stack
+from hil.pictures.overlays import since_release
 from hil.pictures.picture import Picture
 
 TENTH, SECOND = 10, 100  # rows
 BUSY_PERCENT = 0.02  # of the processor, that makes a task worth a colour
 SCHEDULE_US = 20_000  # of the scheduler's picture
 BOX_CM = 100 * BOX
-
-
-def _seconds(rows: pa.Table) -> NDArray[np.float64]:
-    return 1e-6 * column(rows, "t")
 
 
 def _lines(
@@ -47,15 +45,17 @@ def _limits(axes: Axes, limit: float) -> None:
 
 def shade(axes: Sequence[Axes], rows: pa.Table) -> None:
     """Shade when the robot was held and when a fault was in force, which the first of the axes names."""
-    times = _seconds(rows)
+    times = since_release(rows)
     held = times[column(rows, "flight.free") < 0.5]
     for one in axes:
         one.margins(x=0)
         if len(held) > 1:
             one.axvspan(held[0], held[-1], color=curves.GREY, alpha=0.2, linewidth=0)
     names: dict[float, list[str]] = {}  # by begin
+    release_us = release_of(rows.schema.metadata)
     for span in spans_of(rows.schema.metadata):
-        begin, end = 1e-6 * span.begin_us, min(1e-6 * span.end_us, times[-1] if len(times) else 0.0)
+        begin, end = (1e-6 * (us - release_us) for us in (span.begin_us, span.end_us))
+        end = min(end, times[-1] if len(times) else begin)
         if begin >= end:
             continue
         for one in axes:
@@ -103,7 +103,7 @@ def track(rows: pa.Table) -> Figure:
 def errors(rows: pa.Table) -> Figure:
     """Draw position and attitude errors over time with the paper's limits."""
     figure, axes = stack((2.1, 2.1))
-    times = _seconds(rows)
+    times = since_release(rows)
     _lines(axes[0], times, curves.POSITION, curves.POSITION.read(rows), "position error")
     _limits(axes[0], curves.NEAR_CM)
     _lines(axes[1], times, curves.ATTITUDE, curves.ATTITUDE.read(rows), "attitude error")
@@ -116,7 +116,7 @@ def flaps(rows: pa.Table) -> Figure:
     """Draw what the flaps were told and what they did."""
     figure = Figure(figsize=(WIDTH, 3.8), layout="constrained")
     grid = figure.subplots(2, 2, sharex=True)
-    times, angles, commands = _seconds(rows), curves.FLAPS.read(rows), curves.FLAPS_COMMAND.read(rows)
+    times, angles, commands = since_release(rows), curves.FLAPS.read(rows), curves.FLAPS_COMMAND.read(rows)
     for index, axes in enumerate((grid[0, 1], grid[0, 0], grid[1, 0], grid[1, 1])):
         axes.plot(times, commands[:, index], color="black", linewidth=0.6, alpha=0.55, label="command")
         axes.plot(times, angles[:, index], color=curves.FLAPS.colours[index], label="true")
@@ -125,28 +125,29 @@ def flaps(rows: pa.Table) -> Figure:
     for axes in grid[:, 0]:
         axes.set_ylabel("angle [deg]")
     for axes in grid[1]:
-        axes.set_xlabel("time [s]")
+        axes.set_xlabel("time from the release [s]")
     shade(list(grid.flat), rows)
     return figure
 
 
 def age(rows: pa.Table) -> Figure:
-    """Draw how old poses are when the estimator takes them."""
-    figure, axes = stack((1.5,))
-    _lines(axes[0], _seconds(rows), curves.AGE, curves.AGE.read(rows), "on board")
+    """Draw how old poses are when the estimator takes them, and for how long there were none."""
+    figure, axes = stack((1.5, 1.2))
+    for one, plot, label in zip(
+        axes, (curves.AGE, curves.SINCE_FUSION), ("on board", "without"), strict=True
+    ):
+        _lines(one, since_release(rows), plot, plot.read(rows), label)
     shade(axes, rows)
     return figure
 
 
 def way(told: pa.Table) -> Figure:
-    """Draw where the poses of `ages.told` spent their time, stage on stage."""
+    """Draw where the poses of `ages.told_in_time_of` spent their time, stage on stage."""
     figure, (axes,) = stack((1.8,))
-    axes.set_xlabel("time [s], by the clock of the ground station")
     columns = {name: told.column(name).to_numpy() for name in STAGES}
     names = stages_told(columns)
-    colours = curves.TASK_COLOURS[: len(names)]
-    seconds = told.column("t").to_numpy()
-    axes.stackplot(seconds, *[columns[name] for name in names], labels=names, colors=colours)
+    colours = [curves.STAGE_COLOURS[name] for name in names]
+    axes.stackplot(since_release(told), *[columns[name] for name in names], labels=names, colors=colours)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), reverse=True)
     axes.margins(x=0.0)
     axes.set_ylabel("age [ms]")
@@ -157,7 +158,7 @@ def radio(rows: pa.Table) -> Figure:
     """Draw the time in the air and the packets that were lost."""
     figure, axes = stack((1.5, 1.5))
     _up_and_down(axes[0], rows, SECOND, curves.latency, "mean latency [ms]")
-    _lines(axes[1], _seconds(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
+    _lines(axes[1], since_release(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
     shade(axes, rows)
     return figure
 
@@ -168,7 +169,9 @@ def serial_line(rows: pa.Table) -> Figure:
     _up_and_down(axes[0], rows, TENTH, curves.line_load, "load of the line [%]")
     axes[0].set_ylim(0.0, 105.0)
     _up_and_down(axes[1], rows, SECOND, curves.latency, "mean latency [ms]")
-    _lines(axes[2], _seconds(rows), curves.SERIAL_FAULTS, curves.SERIAL_FAULTS.read(rows), "bytes or frames")
+    _lines(
+        axes[2], since_release(rows), curves.SERIAL_FAULTS, curves.SERIAL_FAULTS.read(rows), "bytes or frames"
+    )
     shade(axes, rows)
     return figure
 
@@ -180,7 +183,7 @@ def _up_and_down(
     thinned = rows.take(np.arange(0, rows.num_rows, step))
     for index, name in enumerate(("up", "down")):
         axes.plot(
-            _seconds(thinned)[1:], read(thinned)[:, index], color=curves.FLAP_COLOURS[index], label=name
+            since_release(thinned)[1:], read(thinned)[:, index], color=curves.FLAP_COLOURS[index], label=name
         )
     axes.set_ylabel(label)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -188,23 +191,23 @@ def _up_and_down(
 
 def board(rows: pa.Table) -> Figure:
     """Draw the load of the processor by task, the measurement queue and the states."""
-    figure, axes = stack((1.8, 1.1, 0.8))
+    figure, axes = stack((1.8, 1.4, 0.8))
     load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
     shares = load.read(tenths).T
     busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT] or [0]
     axes[0].stackplot(
-        _seconds(tenths)[1:], shares[busy],
+        since_release(tenths)[1:], shares[busy],
         labels=[load.names[index] for index in busy], colors=[load.colours[index] for index in busy],
     )  # fmt: skip
     axes[0].set_ylim(bottom=0.0)
     axes[0].set_ylabel("processor [%]")
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.1), labelspacing=0.25)
-    _lines(axes[1], _seconds(rows), curves.QUEUE, curves.QUEUE.read(rows), "queue")
+    _lines(axes[1], since_release(rows), curves.QUEUE, curves.QUEUE.read(rows), "queue")
     lanes = (curves.SUPERVISOR, curves.RELEASE)
-    end = _seconds(rows)[-1:]
+    end = since_release(rows)[-1:]
     for height, states in enumerate(lanes):
         begins, names = curves.changes(rows, states)
-        edges = np.append(1e-6 * begins, end)
+        edges = np.append(1e-6 * (begins - release_of(rows.schema.metadata)), end)
         for start, stop, name in zip(edges[:-1], edges[1:], names, strict=True):
             colour = states.colours[states.names.index(name)]
             axes[2].barh(height, stop - start, 0.8, start, color=colour, label=name)
@@ -219,8 +222,8 @@ def board(rows: pa.Table) -> Figure:
 def estimate(rows: pa.Table) -> Figure:
     """Draw what the estimator believed, less the truth, in the goal frame."""
     figure, axes = stack((1.8, 1.8))
-    _lines(axes[0], _seconds(rows), curves.POSITION_MISS, curves.POSITION_MISS.read(rows), "position")
-    _lines(axes[1], _seconds(rows), curves.ATTITUDE_MISS, curves.ATTITUDE_MISS.read(rows), "attitude")
+    _lines(axes[0], since_release(rows), curves.POSITION_MISS, curves.POSITION_MISS.read(rows), "position")
+    _lines(axes[1], since_release(rows), curves.ATTITUDE_MISS, curves.ATTITUDE_MISS.read(rows), "attitude")
     shade(axes, rows)
     return figure
 
@@ -230,7 +233,7 @@ def own_logic(rows: pa.Table) -> Figure:
     plots = curves.own_logic(rows)
     figure, axes = stack((1.5,) * len(plots))
     for one, plot in zip(axes, plots, strict=True):
-        _lines(one, _seconds(rows), plot, plot.read(rows), "own logic")
+        _lines(one, since_release(rows), plot, plot.read(rows), "own logic")
     shade(axes, rows)
     return figure
 
@@ -241,6 +244,7 @@ def schedule(table: pa.Table) -> Figure:
     axes = figure.subplots()
     stretches = [run for run in runs(table) if run.task != "IDLE"]
     begin_us = table.column("us")[0].as_py()
+    begin_s = 1e-6 * (begin_us - release_of(table.schema.metadata))
     stretches = [run for run in stretches if run.start_us < begin_us + SCHEDULE_US]
     names = sorted({run.task for run in stretches}, reverse=True)
     for height, name in enumerate(names):
@@ -249,13 +253,11 @@ def schedule(table: pa.Table) -> Figure:
             for r in stretches
             if r.task == name
         ]
-        axes.broken_barh(
-            bars, (height - 0.4, 0.8), color=curves.TASK_COLOURS[height % len(curves.TASK_COLOURS)]
-        )
+        axes.broken_barh(bars, (height - 0.4, 0.8), color=curves.task_colour(name))
     axes.set_yticks(range(len(names)), names)
     axes.set_xlim(0.0, 1e-3 * SCHEDULE_US)
     axes.set_xticks(range(0, SCHEDULE_US // 1000 + 1))
-    axes.set_xlabel(f"time after {1e-6 * begin_us:.3f} s [ms]; a line per tick")
+    axes.set_xlabel(f"time from {begin_s:.3f} s after the release [ms]; a line per tick")
     return figure
 
 
@@ -277,7 +279,8 @@ PICTURES = (
     ),
     Picture(
         "Age",
-        "Age of the pose when the estimator takes it, and the horizon of its predictor.",
+        "Age of the pose when the estimator takes it, and the horizon of its predictor (0: it is switched off); "
+        "time since a pose was fused last, which grows while none comes or each is refused.",
         age,
     ),
     Picture(
@@ -297,7 +300,7 @@ PICTURES = (
     Picture(
         "Board",
         "Share of the processor by task, over 0.1 s, of tasks with 0.02 % or more; fullest state so far of the measurement "
-        "queue and poses dropped from it; states of the supervisor and of the robot.",
+        "queue (poses, gyro and accelerometer samples) and what it dropped; states of the supervisor and of the robot.",
         board,
     ),
     Picture(

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil.laboratory.metrics import column
+from hil.laboratory.recorder import release_of
 from hil.pictures import curves
 from hil.pictures.drawing import WIDTH, png
 
@@ -44,6 +45,5 @@ def _pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Figure:
 
 
 def since_release(log: pa.Table) -> NDArray[np.float64]:
-    """Return the time of every row [s], zero at the release, or at the first row of a log without one."""
-    times, free = column(log, "t"), column(log, "flight.free") > 0.5
-    return np.asarray(1e-6 * (times - (times[np.argmax(free)] if len(times) else 0.0)))
+    """Return the time of every row [s], zero at the release."""
+    return np.asarray(1e-6 * (column(log, "t") - release_of(log.schema.metadata)))

@@ -28,7 +28,8 @@ def draw(rows: pa.Table, *trials: pa.Table) -> Figure:
     for name in late:
         misses = np.diff(column(flight, name), prepend=0.0)
         per_second = [misses[load == share].mean() * ROWS_PER_SECOND for share in shares]
-        axes[0].plot(shares, per_second, "o-", label=name.removeprefix("late."))
+        task = name.removeprefix("late.")
+        axes[0].plot(shares, per_second, "o-", color=curves.task_colour(task), label=task)
     axes[0].set_ylabel("missed deadlines [1/s]")
     axes[0].set_yscale("symlog", linthresh=1.0)
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))

@@ -13,12 +13,12 @@ import pyarrow as pa
 
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
 from hil.experiments import find_again
-from hil.laboratory.ages import told
+from hil.laboratory.ages import told_in_time_of
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
-from hil.laboratory.faults import Span, spans_of
+from hil.laboratory.faults import Fault, spans_of
 from hil.laboratory.metrics import METRICS, SHOWN
-from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.recorder import load_events, load_log, release_of
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.curves import own_logic
@@ -45,7 +45,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class FaultRow:
-    """One line of the table of faults, ready to print; times in simulated seconds."""
+    """One line of the table of faults, ready to print; times in seconds from the release."""
 
     kind: str
     begin_s: str
@@ -71,12 +71,13 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     log, result = load_log(folder), read_result(folder)
     experiment = experiment or find_again(result.experiment, result.source)
     own = pictures_of(experiment) if experiment else ()
+    schedule = load_schedule(folder).replace_schema_metadata(log.schema.metadata)
     shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
     if own_logic(log):
         shown.append(_show(OWN_LOGIC, log))
     shown += [
         _show(picture, table)
-        for picture, table in ((WAY, told(folder)), (SCHEDULE, load_schedule(folder)))
+        for picture, table in ((WAY, told_in_time_of(log, folder)), (SCHEDULE, schedule))
         if table.num_rows
     ]
     config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
@@ -86,8 +87,9 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         result=result,
         found=experiment is not None,
         rows=metric_rows(result),
-        faults=fault_rows(spans_of(log.schema.metadata)),
+        faults=fault_rows(span.fault for span in spans_of(log.schema.metadata)),
         events=load_events(folder),
+        release_us=release_of(log.schema.metadata),
         pictures=shown,
         latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,
@@ -107,21 +109,20 @@ def metric_rows(result: Result) -> list[Row]:
             continue
         sign = "≤" if metric.bound == "max" else "≥"
         limit = "" if verdict is None else f"{sign} {verdict.bound * scale:.4g}"
-        text = "–" if math.isnan(value) else f"{value * scale:.4g}"
+        text = "–" if math.isnan(value) else "never" if math.isinf(value) else f"{value * scale:.4g}"
         rows.append(Row(name, metric.meaning, text, unit, limit, None if verdict is None else verdict.holds))
     return sorted(rows, key=lambda row: row.holds is None)
 
 
-def fault_rows(spans: Iterable[Span]) -> list[FaultRow]:
+def fault_rows(faults: Iterable[Fault]) -> list[FaultRow]:
     """Return one row per fault."""
     rows = []
-    for span in spans:
-        kind = KINDS[span.fault.kind]
-        size = f"{span.fault.size:g} {kind.unit}".strip() if kind.sized else ""
-        begin, end = f"{1e-6 * span.begin_us:.3f}", f"{1e-6 * span.end_us:.3f}"
-        if span.end_us == math.inf:
-            end = "with the flight"
-        rows.append(FaultRow(span.fault.kind, begin, end, size, kind.meaning))
+    for fault in faults:
+        kind = KINDS[fault.kind]
+        size = f"{fault.size:g} {kind.unit}".strip() if kind.sized else ""
+        end_s = fault.start_s + fault.duration_s
+        end = f"{end_s:.3f}" if end_s < math.inf else "with the flight"
+        rows.append(FaultRow(fault.kind, f"{fault.start_s:.3f}", end, size, kind.meaning))
     return rows
 
 

@@ -17,6 +17,7 @@ from hil.experiments import measures
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import spans_of
 from hil.laboratory.metrics import BOX, column, free_flight, position_error
+from hil.laboratory.recorder import release_of
 from hil.pictures.curves import AXIS_COLOURS, GREY
 from hil.pictures.picture import Picture
 
@@ -122,7 +123,7 @@ def _spans(flight: pa.Table) -> list[tuple[float, float, str]]:
     rows = free_flight(flight)
     if rows.num_rows == 0:
         return []
-    release_us, end_us = column(rows, "t")[[0, -1]]
+    release_us, end_us = release_of(flight.schema.metadata), column(rows, "t")[-1]
     return [
         (
             1e-6 * (span.begin_us - release_us), 1e-6 * (min(span.end_us, end_us) - release_us),

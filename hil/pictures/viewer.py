@@ -1,7 +1,7 @@
 """The flight in the rerun viewer: as the file `flight.rrd`, or in a window while it happens.
 
 `Stage` turns rows of the flight log into entities below `/world` (3-D; metres, W), `/plot` (`hil.pictures.curves`),
-`/state` and `/text`, on the timeline `sim_time`. The only file that knows rerun, which comes with the extra `view`:
+`/state` and `/text`, on the timeline `from_release`. The only file that knows rerun, which comes with the extra `view`:
 without it, importing this file raises `LabError`.
 """
 
@@ -22,7 +22,7 @@ from hil.devices.markers import DIAMETER, marker_places
 from hil.errors import LabError
 from hil.laboratory.faults import Span, spans_of
 from hil.laboratory.metrics import BOX, column
-from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.recorder import load_events, load_log, release_of
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures import curves, scene
 from hil.pictures.curves import Curves, States
@@ -36,7 +36,7 @@ except ImportError as error:
     raise LabError(f"the viewer needs rerun: {install_command('view')}") from error
 
 RECORDING = "flight.rrd"
-APPLICATION, TIMELINE = "floaty", "sim_time"
+APPLICATION, TIMELINE = "floaty", "from_release"
 CATCH_UP_S = 5.0  # for the window, at the end of a live flight
 
 METRES_PER_NEWTON = 0.15  # length of the drag arrows
@@ -57,7 +57,8 @@ PLOTS: Mapping[str, Curves] = {
     "inputs": curves.INPUTS,
     "miss/position": curves.POSITION_MISS,
     "miss/attitude": curves.ATTITUDE_MISS,
-    "age": curves.AGE,
+    "age/pose": curves.AGE,
+    "age/without": curves.SINCE_FUSION,
     "link/radio": curves.PACKETS,
     "link/serial": curves.SERIAL_FAULTS,
     "queue": curves.QUEUE,
@@ -82,6 +83,8 @@ class Stage:
         for span in spans_of(schema.metadata):
             self._faults.setdefault(span.fault.kind, []).append(span)
         self._last: pa.Table | None = None  # the last row so far
+        self._fusion = schema.empty_table()  # the row of the last fused pose
+        self._release_us = release_of(schema.metadata)
         recording.set_log_time_enabled(False)
         recording.send_recording_name(
             f"{metadata.get('experiment', 'flight')}, seed {metadata.get('seed', '?')}"
@@ -106,8 +109,11 @@ class Stage:
         self._move(rows)
         if MARKERS_SEEN in rows.column_names:
             self._colour_markers(joined, fresh)
+        since_fusion = pa.concat_tables([self._fusion, rows])
+        self._fusion = curves.row_of_last_fusion(since_fusion)
         for path, plot in self._plots.items():
-            self._send(f"plot/{path}", column(rows, "t"), rr.Scalars.columns(scalars=plot.read(rows)))
+            values = plot.read(since_fusion)[-rows.num_rows :]
+            self._send(f"plot/{path}", column(rows, "t"), rr.Scalars.columns(scalars=values))
         slow = joined.take(np.arange(0, joined.num_rows, SLOW))
         times = column(slow, "t")
         for path, limit in LIMITS.items():
@@ -140,13 +146,16 @@ class Stage:
     def add_events(self, events: Iterable[Mapping[str, Any]]) -> None:
         """Put up texts: `t_us`, `source`, `text`."""
         for event in events:
-            self._recording.set_time(TIMELINE, duration=np.timedelta64(event["t_us"], "us"))
+            self._recording.set_time(
+                TIMELINE, duration=np.timedelta64(event["t_us"] - self._release_us, "us")
+            )
             self._recording.log(f"text/{event['source']}", rr.TextLog(f"{event['source']}: {event['text']}"))
 
     def _send(self, path: str, times_us: NDArray[np.float64], columns: Iterable[Any]) -> None:
         if len(times_us) == 0:
             return
-        index = rr.TimeColumn(TIMELINE, duration=times_us.astype("timedelta64[us]"))
+        since = (times_us - self._release_us).astype("timedelta64[us]")
+        index = rr.TimeColumn(TIMELINE, duration=since)
         self._recording.send_columns(path, [index], columns)
 
     def _move(self, rows: pa.Table) -> None:

@@ -125,9 +125,29 @@ class Paper:
         return found
 
     @property
+    def values_missed(self) -> int:
+        """How many values of the paper are missed, over both profiles."""
+        return sum(
+            bool(trials.missed(row, metric))
+            for _, row, both in self.rows
+            for trials in both
+            for metric in row.claims
+        )
+
+    @property
+    def surprises(self) -> int:
+        """How many expectations of the studies did not come true."""
+        return sum(len(result.surprises(curve)) for result in self.studies for curve in result.curves)
+
+    @property
     def holds(self) -> bool:
-        """Whether every verdict holds for the default profile; the other profile and the studies show what they show."""
-        return not self.interrupted and all(trials[0].holds for _, _, trials in self.rows)
+        """Whether all was flown and all limits hold for the default profile; what else was flown shows what it shows."""
+        return not self.interrupted and self.limits_hold
+
+    @property
+    def limits_hold(self) -> bool:
+        """Whether every flight of the default profile held all its limits."""
+        return all(trials[0].holds for _, _, trials in self.rows)
 
 
 def select(pattern: str | None) -> list[str]:

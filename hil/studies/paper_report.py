@@ -22,6 +22,7 @@ from hil.pictures.figures import PICTURES
 from hil.pictures.gallery import pictures_of
 from hil.pictures.pages import data_uri, write_page
 from hil.studies import drag_model, drag_model_report
+from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_rows import Row
 from hil.studies.study_figures import picture
@@ -58,7 +59,8 @@ def write_paper(out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = ())
     bench = _mounted(out / "drag-model", list(mounted)) if mounted else []
     return write_page(
         out / REPORT, "paper.html.j2", bench=bench, missing=[row for row, _, _ in paper.misses],
-        paper=paper, rows=rows, studies=studies, metrics=METRICS, spread=Spread.of, commit=commit(), versions=versions(),
+        paper=paper, profile=PROFILES[0], rows=rows, studies=studies, metrics=METRICS, spread=Spread.of, commit=commit(),
+        versions=versions(),
     )  # fmt: skip
 
 

@@ -31,7 +31,7 @@ def _draw(result: StudyResult) -> Figure:
     for index, curve in enumerate(flown):
         alive = [cell for cell in curve.cells if cell.errors]
         places = [study.sizes.index(cell.size) for cell in alive]
-        colour = curves.TASK_COLOURS[index % len(curves.TASK_COLOURS)]
+        colour = curves.SERIES_COLOURS[index % len(curves.SERIES_COLOURS)]
         errors = [100 * np.array(cell.errors) for cell in alive]
         above.plot(
             places, [e.mean() for e in errors], "o" + STYLES[index % 3], color=colour, markersize=3,

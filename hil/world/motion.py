@@ -136,7 +136,7 @@ def watch(s: State) -> None:
     elif cos_tilt < s[at.LIMIT_COS_TILT]:
         cause, value = at.TUMBLED, atan2(math.sqrt(1.0 - cos_tilt * cos_tilt), cos_tilt)
     if cause != 0:
-        s[at.LOST], s[at.LOST_US], s[at.LOST_VALUE] = cause, s[at.TIME_US], value
+        s[at.LOST], s[at.LOST_VALUE] = cause, value
 
 
 @compiled

@@ -153,7 +153,7 @@ class Plant:
         cause = int(self._s[at.LOST])
         if cause == 0:
             return None
-        return f"{LOSS_TEXTS[cause].format(self._s[at.LOST_VALUE])} at {self._s[at.LOST_US] * 1e-6:.3f} s"
+        return LOSS_TEXTS[cause].format(self._s[at.LOST_VALUE])
 
     def hold(self) -> None:
         """Clamp the body where it is, at rest; flaps, air and sensors go on."""

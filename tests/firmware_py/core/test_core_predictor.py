@@ -47,6 +47,13 @@ def glide_error(core: Core, ticks: int) -> tuple[float, float]:
     return float(np.linalg.norm(core.now[:3] - p)), abs(float(yaw))
 
 
+@pytest.mark.parametrize("predict", [0, 1])
+def test_the_age_that_is_reported_is_the_poses_own_whether_it_is_used_or_not(predict: int) -> None:
+    core = Core(predict=predict)
+    glide(core, 20, 44_000)
+    assert int(core.fields.pose_age_us) == 44_000
+
+
 @pytest.mark.parametrize(
     "age_us", [0, 4_000, 10_000, 23_000, 38_000, 40_000, 44_000, 77_000, 100_000, 120_000, 124_999]
 )

@@ -564,20 +564,20 @@ def test_report_and_recording_show_the_faults(tmp_path: Path) -> None:
     folder = go(tmp_path / "run", "push.x@0.3=0.5", "servo.slow.2@0.5", duration_s=1.0).folder
     page = write_report(folder).read_text(encoding="utf-8")
     table = page[page.index('<table id="faults">') :].partition("</table>")[0]
-    for cell in ("push.x", "1.300", "1.400", "0.5 N", "servo.slow.2", "1.500", "with the flight"):
+    for cell in ("push.x", "0.300", "0.400", "0.5 N", "servo.slow.2", "0.500", "with the flight"):
         assert f">{cell}<" in table, cell
     lanes: dict[str, list[tuple[int, str]]] = {}
     for chunk in RrdReader(write_run_rrd(folder)).stream():
         batch = chunk.to_record_batch()
-        if chunk.entity_path.startswith("/state/fault/") and "sim_time" in batch.schema.names:
-            times = [moment.value // 1000 for moment in batch.column("sim_time")]
+        if chunk.entity_path.startswith("/state/fault/") and "from_release" in batch.schema.names:
+            times = [moment.value // 1000 for moment in batch.column("from_release")]
             states = [row[0] for row in batch.column("StateChange:state").to_pylist()]
             lanes.setdefault(chunk.entity_path.removeprefix("/state/fault/"), []).extend(
                 zip(times, states, strict=True)
             )
     assert lanes == {
-        "push.x": [(250, "-"), (1_300_250, "acts"), (1_400_250, "-")],
-        "servo.slow.2": [(250, "-"), (1_500_250, "acts")],
+        "push.x": [(-999_750, "-"), (300_250, "acts"), (400_250, "-")],
+        "servo.slow.2": [(-999_750, "-"), (500_250, "acts")],
     }
 
 

@@ -54,7 +54,7 @@ def drop(folder: Path, key: str) -> None:
 def test_a_result_is_read_back_as_it_was_written(result: Result) -> None:
     write_result(result)
     read = read_result(result.folder)
-    metrics = {"rms_x": 0.01, "settle": math.nan, "rise": math.nan, "lap": 9.5}
+    metrics = {"rms_x": 0.01, "settle": math.nan, "rise": math.inf, "lap": 9.5}
     assert repr(read) == repr(
         replace(result, metrics=metrics)
     )  # a NaN does not equal a NaN, but is written alike
@@ -64,7 +64,7 @@ def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_n
     write_result(result)
     content = json.loads((result.folder / RESULT).read_text(encoding="utf-8"))
     assert set(content) == set(KEYS)
-    assert content["metrics"] == {"rms_x": 0.01, "settle": None, "rise": None, "lap": 9.5}
+    assert content["metrics"] == {"rms_x": 0.01, "settle": None, "rise": "inf", "lap": 9.5}
     assert content["verdicts"][1] == {
         "metric": "settle", "value": None, "bound": 0.5, "holds": False, "unit": "s", "sense": "max",
     }  # fmt: skip

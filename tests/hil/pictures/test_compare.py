@@ -1,8 +1,10 @@
 """Comparing flights: the first difference is the first, and what differs besides is told."""
 
+import colorsys
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,15 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.colors import to_rgb
 
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
+from hil.laboratory.metrics import measure
 from hil.laboratory.recorder import load_log
 from hil.laboratory.run import Request, fly, prepare
-from hil.pictures.compare import Run, compare, load_run
+from hil.pictures import overlays
+from hil.pictures.compare import Run, compare, load_run, write_comparison
 from support.command import floaty
 
 
@@ -65,7 +70,8 @@ def test_the_first_difference_is_the_first_by_row_then_by_column(runs: dict[str,
     first = compare(a, b).first
     assert first is not None
     assert (first.row, first.column, *first.values) == found
-    assert first.t_us == a.log.column("t")[first.row].as_py()
+    release_us = load_config().flight.release_us
+    assert first.t_s == pytest.approx(1e-6 * (a.log.column("t")[first.row].as_py() - release_us))
 
 
 @settings(deadline=None, max_examples=40)
@@ -90,7 +96,7 @@ def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) ->
     for a, b, ended in ((run, short, 1), (short, run, 0)):
         first = compare(a, b).first
         assert first is not None
-        assert (first.row, first.t_us) == (20, run.log.column("t")[20].as_py())
+        assert (first.row, first.t_s) == (20, pytest.approx(-0.79975))
         assert first.values[ended] is None
         assert "the log has ended" in str(first)
 
@@ -117,6 +123,34 @@ def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Pat
     assert told["rms_x"].values == pytest.approx((100 * a["rms_x"], 100 * b["rms_x"]))
     assert told["rms_x"].unit == "cm"
     assert told["rms_x"].difference == pytest.approx(100 * (b["rms_x"] - a["rms_x"]))
+
+
+def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_both_flew(
+    runs: dict[str, Path],
+) -> None:
+    long = load_run(runs["one"])
+    rows = long.log.num_rows - 30  # 0.3 s less
+    short = Run(
+        long.log.slice(0, rows),
+        replace(long.result, metrics=measure(long.log.slice(0, rows), lost=False)),
+    )
+    for a, b in ((long, short), (short, long)):
+        comparison = compare(a, b)
+        assert all(pair.difference == 0 for pair in comparison.metrics)
+        assert comparison.span.startswith("Over the first 0.19 s after the release, which both flew")
+    assert compare(long, long).span == "Over the 0.49 s after the release that both flew."
+    whole = {pair.name: pair.values[0] for pair in compare(long, long).metrics}
+    assert whole["flown"] == pytest.approx(long.result.metrics["flown"]), "nothing is cut of equal flights"
+
+
+def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
+    a, b = load_run(runs["one"]), load_run(runs["two"])
+    figure = overlays._pair((a.log, b.log), ("a", "b"))
+    hues = [colorsys.rgb_to_hsv(*to_rgb(line.get_color()))[0] * 360 for line in figure.axes[0].lines]
+    assert 180 < hues[0] < 260, "blue"
+    assert 20 < hues[1] < 50, "orange"
+    page = write_comparison(tmp_path, a, b, compare(a, b)).read_text(encoding="utf-8")
+    assert f"Blue: {a.result.folder}; orange: {b.result.folder}." in page
 
 
 @pytest.mark.long

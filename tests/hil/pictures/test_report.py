@@ -1,5 +1,6 @@
 """The report: one self-contained page that tells every metric, for every way in which a flight can end."""
 
+import dataclasses
 import json
 import math
 import shutil
@@ -16,9 +17,9 @@ from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory import ages
-from hil.laboratory.metrics import METRICS
+from hil.laboratory.metrics import METRICS, judge
 from hil.laboratory.recorder import load_log
-from hil.laboratory.result import read_result
+from hil.laboratory.result import read_result, write_result
 from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.figures import PICTURES, way
@@ -179,14 +180,29 @@ def test_a_killed_flight_has_a_report(folder: Path) -> None:
 @pytest.mark.usefixtures("few_pictures")
 def test_texts_of_a_flight_cannot_become_markup(folder: Path) -> None:
     text = "<script>alert(1)</script> & <b>"
-    (folder / "events.jsonl").write_text(json.dumps({"t_us": 5, "source": "<i>", "text": text}) + "\n")
+    (folder / "events.jsonl").write_text(json.dumps({"t_us": 500_000, "source": "<i>", "text": text}) + "\n")
     change_result(folder, cause=text, profile=text, overrides=[text])
-    assert report(folder).tables["events"][1] == ["0.000", "<i>", text]
+    assert report(folder).tables["events"][1] == ["-0.500", "<i>", text]
 
 
 def test_without_a_log_there_is_no_report(tmp_path: Path) -> None:
     with pytest.raises(LabError, match="expected a run folder"):
         write_report(tmp_path)
+
+
+def test_what_never_happened_reads_never_and_holds_the_limit(folder: Path) -> None:
+    result = read_result(folder)
+    (verdict,) = judge({"controller_late_from": math.inf}, {"controller_late_from": 0.6}, {})
+    never = dataclasses.replace(
+        result, metrics={"controller_late_from": math.inf, "rms_x": math.nan}, verdicts=(verdict,)
+    )
+    write_result(never)
+    told = read_result(folder)
+    assert told.metrics["controller_late_from"] == math.inf
+    assert math.isnan(told.metrics["rms_x"])
+    (row,) = metric_rows(told)
+    assert (row.value, row.holds) == ("never", True)
+    assert str(told.verdicts[0]).startswith("controller_late_from = never")
 
 
 def test_a_metric_without_a_value_is_a_dash_and_fails(folder: Path) -> None:

@@ -37,6 +37,7 @@ from hil.world import layout as at
 from hil.world.body import place_plates
 from hil.world.config import PlantConfig
 
+RELEASE_US = load_config().flight.release_us
 angles = st.floats(-1.5, 1.5)
 
 
@@ -61,8 +62,12 @@ def values(path: Path, entity: str, component: str) -> NDArray[np.float64]:
 
 
 def moments(path: Path, entity: str) -> list[int]:
-    """The instants [ns] of an entity."""
-    return [moment.value for batch in chunks(path, entity) for moment in batch.column(viewer.TIMELINE)]
+    """The instants [ns] of an entity, on the flight's own clock: the viewer's has its zero at the release."""
+    return [
+        moment.value + 1000 * RELEASE_US
+        for batch in chunks(path, entity)
+        for moment in batch.column(viewer.TIMELINE)
+    ]
 
 
 def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 import signal
 import statistics
 import subprocess
@@ -19,7 +20,10 @@ from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
+from hil.studies.paper_report import write_paper
 from hil.studies.paper_rows import OUTSIDE, ROWS, Claim, Row
+from hil.studies.study import Change, Expected, Study, Variant
+from hil.studies.study_run import Cell, Curve, StudyResult
 from support.command import floaty
 from support.html_page import Page
 
@@ -156,6 +160,32 @@ def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -
     assert [(profile, what) for _, profile, what in Paper((("x", row, (good, bad)),), (), False).misses] == [
         ("as-flown", ["settle misses by 0.1 s"])
     ]
+
+
+def test_the_badges_say_which_kind_of_verdict_they_are(result: Result, tmp_path: Path) -> None:
+    good = trials(result, True, True)
+    row = Row("t", "c", "p", {"rms_x": Claim("0", 0.0)}, "why")
+    study = StudyResult(
+        Study("s", "q", "a", "", (0.0, 1.0), ()),
+        (
+            Curve(
+                Variant("v", lambda size: Change(), Expected(holds_to=1.0)),
+                (Cell(0.0, ("degrades",), (0.1,)),),
+            ),
+        ),
+    )
+    for paper, badges in (
+        (
+            Paper((("t", row, (good, good)),), (study,), False),
+            ["limits of floaty: all hold", "the paper's values: 2 missed", "studies: 1 expectation failed"],
+        ),
+        (
+            Paper((("t", Row("t", "c", "p", {}), (trials(result, False),)),), (), True),
+            ["interrupted", "limits of floaty: some fail", "the paper's values: none missed"],
+        ),
+    ):
+        page = write_paper(tmp_path, paper).read_text(encoding="utf-8")
+        assert re.findall(r'class="verdict \w+">([^<]+)<', page) == badges
 
 
 def test_the_representative_trial_has_the_median_error(result: Result) -> None:
