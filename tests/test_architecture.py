@@ -39,7 +39,7 @@ FLOORS = (
     ("config",),
     ("laboratory",),
     ("experiments",),
-    ("pictures",),
+    ("pictures", "exports"),
     ("servers",),
     ("api",),
     ("studies", "deploy", "testing"),
@@ -54,6 +54,7 @@ CORE_LIBRARIES = {"numpy", "typing"}
 CONFINED: dict[str, tuple[str, ...]] = {
     "numba": ("firmware_py/compiling.py",),
     "rerun": ("hil/pictures/viewer.py",),
+    "foxglove": ("hil/exports/mcap.py",),
     "time": ("hil/clock.py", "hil/laboratory/run.py", "ground_station/clock.py"),
     "datetime": (),
     "asyncio": (),
@@ -92,7 +93,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "hypothesis": ("hil/testing/strategies.py",),
     "perfetto": ("hil/pictures/perfetto.py",),
     "matplotlib": ("hil/pictures/", "hil/studies/"),
-    "pyarrow": ("hil/api.py", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/"),
+    "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/"),
 }  # fmt: skip
 # BLAS, LAPACK, the C library's functions and numpy's vector code have other last bits on other processors, so they
 # stay out of all that flies; these files look at what was flown.

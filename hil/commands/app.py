@@ -10,6 +10,7 @@ import click
 from hil.commands.compare import compare
 from hil.commands.deploy import deploy
 from hil.commands.drag_model import drag_model
+from hil.commands.export import export
 from hil.commands.fly import fly
 from hil.commands.listing import list_experiments
 from hil.commands.new import new
@@ -28,7 +29,7 @@ def app() -> None:
 
 
 for command in (
-    fly, new, list_experiments, view, report, serve, station, compare, paper, study, drag_model, deploy,
+    fly, new, list_experiments, view, report, export, serve, station, compare, paper, study, drag_model, deploy,
 ):  # fmt: skip
     app.add_command(command)
 

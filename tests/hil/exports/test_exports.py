@@ -1,0 +1,182 @@
+"""Exports: what other programs read of a flight is what its log holds; read back with those programs' own libraries."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from pymavlink import mavutil
+from scipy.spatial.transform import Rotation
+
+from hil.experiments import EXPERIMENTS
+from hil.exports.mcap import write_mcap
+from hil.exports.tlog import write_tlog
+from hil.exports.wide_csv import write_csv
+from hil.laboratory.metrics import column
+from hil.laboratory.recorder import load_events, load_log, release_of
+from hil.laboratory.run import Request, fly, prepare
+from support.command import floaty
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder with the step in yaw, 1 s after the release, until the robot has turned."""
+    folder = tmp_path_factory.mktemp("export") / "run"
+    prepare(folder)
+    fly(Request.of(EXPERIMENTS["yaw-step"], duration_s=1.6), folder)
+    return folder
+
+
+def test_the_wide_table_has_every_column_with_its_unit_in_seconds_from_the_release(folder: Path) -> None:
+    log = load_log(folder)
+    with write_csv(folder).open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header[0] == "time from the release [s]"
+    assert {"truth.x [m]", "truth.p [rad/s]", "battery.voltage [V]", "supervisor.state []"} < set(header)
+    assert len(header) == log.num_columns
+    table = np.array(rows, float)
+    release_us = release_of(log.schema.metadata)
+    assert table[:, 0] == pytest.approx(1e-6 * (column(log, "t") - release_us), abs=1e-9)
+    assert table[0, 0] < 0 < table[-1, 0]
+    for title, values in zip(header[1:], table.T[1:], strict=True):
+        assert values == pytest.approx(column(log, title.partition(" [")[0]), rel=1e-6), title
+
+
+def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Time [us] and content of everything in an MCAP file, by topic; every topic has a schema."""
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.message_encoding == "json":
+                content = json.loads(message.data)
+                properties = json.loads(schema.data)["properties"]
+                assert content.keys() == properties.keys(), channel.topic
+            else:
+                content = DecoderFactory().decoder_for("protobuf", schema)(message.data)
+                assert schema.name.startswith("foxglove.")
+            found.setdefault(channel.topic, []).append((message.log_time // 1000, content))
+    return found
+
+
+def test_foxglove_reads_every_row_with_its_type_and_its_time(folder: Path) -> None:
+    log, found = load_log(folder), messages(write_mcap(folder))
+    times = log.column("t").to_pylist()
+    poses = {"/truth/pose", "/goal/pose", "/estimate/pose", "/tf"}
+    assert poses | {"/truth/twist", "/estimate/twist", "/flaps", "/link", "/text", "/battery"} <= found.keys()
+    for topic, said in found.items():
+        if topic != "/text":
+            assert [us for us, _ in said] == times, topic
+    truth = [one.pose for _, one in found["/truth/pose"]]
+    assert [[p.position.x, p.position.y, p.position.z] for p in truth] == pytest.approx(
+        column(log, "truth.x", "truth.y", "truth.z")
+    )
+    assert [
+        [p.orientation.w, p.orientation.x, p.orientation.y, p.orientation.z] for p in truth
+    ] == pytest.approx(column(log, "truth.qw", "truth.qx", "truth.qy", "truth.qz"))
+    assert {one.frame_id for _, one in found["/estimate/pose"]} == {"goal"}
+    assert found["/truth/pose"][-1][1].timestamp.ToMicroseconds() == times[-1]
+    assert [one["truth_p"] for _, one in found["/truth/twist"]] == pytest.approx(column(log, "truth.p"))
+    assert [one["control_flap_2"] for _, one in found["/flaps"]] == pytest.approx(
+        column(log, "control.flap_2")
+    )
+    texts = [(us, one.name, one.message) for us, one in found["/text"]]
+    assert texts == [(event["t_us"], event["source"], event["text"]) for event in load_events(folder)]
+
+
+def test_numbers_of_an_mcap_file_cover_the_log_and_name_unit_and_frame(folder: Path) -> None:
+    log, path = load_log(folder), write_mcap(folder)
+    described: dict[str, str] = {}
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        for schema in summary.schemas.values():
+            if schema.encoding == "jsonschema":
+                properties = json.loads(schema.data)["properties"]
+                described |= {name: one["description"] for name, one in properties.items()}
+    assert described["truth_vx"] == "m/s, frame W"
+    assert described["battery_voltage"] == "V"
+    in_poses = {name.replace(".", "_") for name in log.column_names} - described.keys()
+    assert all(name == "t" or name.startswith(("truth_", "goal_", "estimate_")) for name in in_poses)
+    assert len(in_poses) == 1 + 7 + 4 + 6
+
+
+def test_frames_lead_from_the_world_to_the_estimate(folder: Path) -> None:
+    _, last = messages(write_mcap(folder))["/tf"][-1]
+    assert [(one.parent_frame_id, one.child_frame_id) for one in last.transforms] == [
+        ("world", "body"), ("world", "goal"), ("goal", "estimate"),
+    ]  # fmt: skip
+    body, goal, estimate = last.transforms
+
+    def turned(one: Any) -> Rotation:
+        q = one.rotation
+        return Rotation.from_quat([q.x, q.y, q.z, q.w])
+
+    assert abs(turned(goal).as_euler("ZYX")[0]) > 1.0, "the goal has turned"
+    miss = (turned(body).inv() * turned(goal) * turned(estimate)).magnitude()
+    assert miss < np.radians(8.0), "the estimate is near the truth"
+
+
+def test_pymavlink_reads_the_flight_in_the_world_s_frame(folder: Path) -> None:
+    log = load_log(folder)
+    link = mavutil.mavlink_connection(str(write_tlog(folder)))
+    said: dict[str, list[Any]] = {}
+    while (message := link.recv_match()) is not None:
+        assert message.get_type() != "BAD_DATA"
+        said.setdefault(message.get_type(), []).append(message)
+    times = column(log, "t")[::2]
+    assert [one._timestamp for one in said["ATTITUDE"]] == pytest.approx(1e-6 * times, abs=1e-6)
+    yaw = Rotation.from_quat(column(log, "truth.qx", "truth.qy", "truth.qz", "truth.qw")).as_euler("ZYX")[
+        ::2, 0
+    ]
+    assert np.ptp(yaw) > 1.0
+    flown = np.array([-one.yaw for one in said["ATTITUDE"]])
+    jump_us = column(log, "t")[np.argmax(np.diff(column(log, "goal.yaw"), prepend=0.0))]
+    told = (times < jump_us) | (times >= jump_us + 50_000)  # until then the board has not heard of the goal
+    assert np.abs(np.angle(np.exp(1j * (flown - yaw))))[told].max() < np.radians(8.0)
+    assert np.array([[one.x, -one.y, -one.z] for one in said["LOCAL_POSITION_NED"]]) == pytest.approx(
+        column(log, "truth.x", "truth.y", "truth.z")[::2], abs=0.03
+    )
+    mocap = said["ATT_POS_MOCAP"]
+    assert np.array([[one.x, -one.y, -one.z] for one in mocap]) == pytest.approx(
+        column(log, "truth.x", "truth.y", "truth.z")[::2], abs=1e-6
+    )
+    assert {one.get_srcSystem() for one in mocap} == {255}
+    assert "released" in [one.text for one in said["STATUSTEXT"]]
+    assert len(said["SET_POSITION_TARGET_LOCAL_NED"]) == 2, "before and after the step"
+    assert said["SET_POSITION_TARGET_LOCAL_NED"][-1].yaw == pytest.approx(-np.radians(110.0), abs=1e-4)
+    pulses = [one.servo1_raw for one in said["SERVO_OUTPUT_RAW"]]
+    assert pulses == pytest.approx(column(log, "motor.m1")[::2] / 21, abs=1.0)
+
+
+@pytest.mark.parametrize("write", [write_csv, write_mcap, write_tlog])
+def test_a_run_that_was_killed_is_exported_up_to_there(
+    folder: Path, tmp_path: Path, write: Callable[[Path], Path]
+) -> None:
+    import pyarrow as pa
+
+    log = load_log(folder)
+    with pa.ipc.new_stream(str(tmp_path / "log.arrows"), log.schema) as stream:
+        stream.write_table(log.slice(0, 100))
+    assert write(tmp_path).stat().st_size > 1000
+
+
+def test_the_command_writes_what_was_asked_for_and_asks_when_nothing_was(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], folder: Path
+) -> None:
+    for path in folder.glob("flight.*"):
+        path.unlink()
+    assert floaty(monkeypatch, "export", folder, "--csv", "--tlog") == 0
+    assert {path.name for path in folder.glob("flight.*")} == {"flight.csv", "flight.tlog"}
+    assert floaty(monkeypatch, "export", folder, "--mcap") == 0
+    assert (folder / "flight.mcap").is_file()
+    assert floaty(monkeypatch, "export", folder) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("floaty: ")
+    assert "--csv, --mcap, --tlog" in error
