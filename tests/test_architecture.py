@@ -91,7 +91,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "scipy": (),
     "pytest": ("hil/testing/",),
     "hypothesis": ("hil/testing/strategies.py",),
-    "perfetto": ("hil/pictures/perfetto.py",),
+    "perfetto": ("hil/exports/perfetto.py",),
     "matplotlib": ("hil/pictures/", "hil/studies/"),
     "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/"),
 }  # fmt: skip

@@ -80,7 +80,7 @@ def fly(
     if seeds > 1 and (realtime or watch or perfetto):
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
     if perfetto:
-        import hil.pictures.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
+        import hil.exports.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
     from hil.laboratory.faults import parse
     from hil.laboratory.run import Request
 
@@ -126,7 +126,7 @@ def _fly_one(request: Request, folder: Path, realtime: bool, watch: bool, perfet
         progress.update(bar, description="writing recording and report", total=None, now="")
         _write_pictures(folder, request.experiment)
         if perfetto:
-            from hil.pictures.perfetto import write_perfetto
+            from hil.exports.perfetto import write_perfetto
 
             write_perfetto(folder)
         missed = viewer.close() if viewer else 0

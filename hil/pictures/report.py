@@ -26,6 +26,7 @@ from hil.pictures.figures import OWN_LOGIC, PICTURES, SCHEDULE, WAY
 from hil.pictures.gallery import pictures_of
 from hil.pictures.pages import data_uri, write_page
 from hil.pictures.picture import Picture
+from hil.pictures.story import story_of
 
 REPORT = "report.html"
 TEMPLATE = "report.html.j2"
@@ -90,6 +91,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         faults=fault_rows(span.fault for span in spans_of(log.schema.metadata)),
         events=load_events(folder),
         release_us=release_of(log.schema.metadata),
+        story=story_of(log, result),
         pictures=shown,
         latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,

@@ -11,13 +11,13 @@ from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TrackEvent
 
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
+from hil.exports.perfetto import write_perfetto
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import Flight
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import load_schedule, runs
-from hil.pictures.perfetto import write_perfetto
 from hil.pictures.report import write_report
 
 

@@ -7,10 +7,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 import hil.pictures.report
+from firmware_py.wire.supervisor import State
 from ground_station.latency import STAGES
 from ground_station.telemetry_log import TELEMETRY
 from hil.config import load_config
@@ -24,6 +26,7 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.figures import PICTURES, way
 from hil.pictures.report import metric_rows, write_report
+from hil.pictures.story import story_of
 from support.html_page import Page
 
 
@@ -183,6 +186,44 @@ def test_texts_of_a_flight_cannot_become_markup(folder: Path) -> None:
     (folder / "events.jsonl").write_text(json.dumps({"t_us": 500_000, "source": "<i>", "text": text}) + "\n")
     change_result(folder, cause=text, profile=text, overrides=[text])
     assert report(folder).tables["events"][1] == ["-0.500", "<i>", text]
+
+
+@pytest.mark.usefixtures("few_pictures")
+def test_the_report_begins_with_what_was_asked_for_what_failed_and_what_happened(folder: Path) -> None:
+    """Row 150 is 0.5 s after the release; there x leaves the box, failsafe lasts 0.1 s, a flap reaches its limit."""
+    log, result = load_log(folder), read_result(folder)
+    columns = {name: log.column(name).to_numpy().copy() for name in log.column_names}
+    columns["truth.x"][150:] = 0.2
+    columns["supervisor.state"][160:170] = State.FAILSAFE
+    columns["control.flap_2"][155] = -load_config().allocation.opening_max
+    faults = '["push.y@0.3=2", "servo.slow.2@1=0.5"]'
+    metadata = {**log.schema.metadata, b"faults": faults.encode()}
+    changed = pa.table(columns, schema=log.schema.with_metadata(metadata))
+    pq.write_table(changed, folder / "log.parquet")
+    verdicts = judge({"in_box": 0.2, "lost": 1.0}, {"in_box": 0.99, "lost": 0.0}, {})
+    lost = dataclasses.replace(
+        result, outcome="lost", cause="fell", verdicts=tuple(verdicts), overrides=("a.b=c",), faults=("push.y@0.3=2",)
+    )  # fmt: skip
+    write_result(lost)
+    page = write_report(folder).read_text(encoding="utf-8")
+    story = page[page.index('<dl id="story">') : page.index("</dl>")]
+    assert page.index('<dl id="story">') < page.index('<table id="metrics">')
+    assert "--set a.b=c" in story
+    assert "--fault push.y@0.3=2" in story
+    assert story.count(">fails<") == 2
+    told = [(moment.t_s, moment.text) for moment in story_of(changed, lost)]
+    assert [(pytest.approx(t_s, abs=2e-3), text) for t_s, text in told] == [
+        (0.0, "released"),
+        (0.3, "fault push.y@0.3=2 begins"),
+        (0.4, "fault push.y@0.3=2 ends"),
+        (0.5, "first limit passed: in_box"),
+        (0.55, "flap 2 saturates for the first time"),
+        (0.6, "failsafe begins"),
+        (0.7, "failsafe ends"),
+        (1.0, "fault servo.slow.2@1=0.5 begins"),
+        (1.99, "lost: fell"),
+    ]
+    assert all(text in story for _, text in told)
 
 
 def test_without_a_log_there_is_no_report(tmp_path: Path) -> None:
