@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from firmware_py.config import parameters_of
+from firmware_py.config import LogicConfig, parameters_of
 from firmware_py.core.structs import POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD, Parameters
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
 from firmware_py.export.boards import BOARDS, runner_of
@@ -26,7 +26,7 @@ def recording() -> Recording:
 def runner(request: pytest.FixtureRequest) -> Iterator[RunnerFactory]:
     """What makes a runner of each kind."""
     if request.param != PLAIN:
-        yield runner_of(request.param, ROOT / "runs" / "build")
+        yield runner_of(request.param, ROOT / "runs" / "build", LogicConfig())
         return
     children: list[PlainRunner] = []
 

@@ -7,6 +7,7 @@
 #define POSE_SIZE (1 + 7 * 4)
 #define AGE_UNIT_US 500
 #define AGE_UNKNOWN_CODE 255
+#define FAR 1000.0f /* [m] no pose, and false for NaN, too */
 #define NORM2_MIN (0.9f * 0.9f)
 #define NORM2_MAX (1.1f * 1.1f)
 
@@ -18,7 +19,7 @@ bool floaty_pose_decode(const uint8_t *data, uint32_t length, int64_t arrival_us
   memcpy(value, data + 1, sizeof value);
   float norm2 = 0.0f;
   for (int i = 0; i < 3; i++) {
-    if (!isfinite(value[i])) {
+    if (!(fabsf(value[i]) <= FAR)) {
       return false;
     }
     pose->position[i] = value[i];
