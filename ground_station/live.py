@@ -32,7 +32,7 @@ class LiveStation:
     rate: FrameRate
     say: Callable[[str], None]
     stopping: Callable[[], bool]
-    flying: Callable[[int], None]  # called again and again with the instant while the board flies
+    turn: Callable[[int], None]  # called again and again with the instant while the link holds
 
     def run(self) -> None:
         """Fly until told to stop; raises `LinkError` when there are no poses or no board."""
@@ -94,8 +94,7 @@ class LiveStation:
                 self.say(f"no poses for {POSE_TIMEOUT_US * 1e-6:.0f} s")
                 pose_us = now_us
             self._take_telemetry()
-            if self.link.supervisor_state == State.FLYING:
-                self.flying(now_us)
+            self.turn(now_us)
             self._tell()
             self.link.check()
             if now_us - status_us >= STATUS_PERIOD_US:

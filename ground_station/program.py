@@ -5,14 +5,16 @@ It knows nothing of the laboratory: what a profile says of it arrives as `Ground
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
 from ground_station.errors import MocapError
 from ground_station.frame_rate import FrameRate
+from ground_station.links.live_link import LiveLink
 from ground_station.links.schemes import LinkSettings, find_link
 from ground_station.live import LiveStation
 from ground_station.mocap import MocapSource
@@ -22,7 +24,7 @@ from ground_station.sources.replay import ReplaySource
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
-from ground_station.trajectory import Goal, Trajectory, Waiting
+from ground_station.trajectory import FlightPlan, Goal, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +51,24 @@ class Session:
     record: Path | None = None  # frames of motion capture
 
 
+@dataclass(frozen=True, slots=True)
+class Cockpit:
+    """What those have before them who record or steer a flight."""
+
+    link: LiveLink
+    ground: GroundStation
+    plan: FlightPlan
+
+
+Hand = Callable[[Cockpit, int], None]  # called in every turn of the station's loop with its instant
+
+
 def fly(
-    settings: GroundSettings, session: Session, say: Callable[[str], None], stopping: Callable[[], bool]
+    settings: GroundSettings,
+    session: Session,
+    say: Callable[[str], None],
+    stopping: Callable[[], bool],
+    hands: Sequence[Hand] = (),
 ) -> None:
     """Fly until told to stop, or to the end of a replay.
 
@@ -64,18 +82,21 @@ def fly(
     try:
         telemetry = TelemetryLog(session.log) if session.log else None
         source = RecordingSource(source, session.record) if session.record else source
-        trajectory = Waiting(Goal(settings.home, 0.0), session.trajectory)
-        ground = GroundStation(link, trajectory, telemetry, settings.station, tracker)
+        plan = FlightPlan(Goal(settings.home, 0.0), session.trajectory)
+        ground = GroundStation(link, plan, telemetry, settings.station, tracker)
+        cockpit = Cockpit(link, ground, plan)
 
         def over() -> bool:
             return stopping() or (isinstance(played, ReplaySource) and played.over)
 
-        def flying(now_us: int) -> None:
-            if not trajectory.started:
-                trajectory.start(now_us + round(session.start_s * 1e6))
+        def turn(now_us: int) -> None:
+            if plan.start_us is None and link.supervisor_state == State.FLYING:
+                plan.start(now_us + round(session.start_s * 1e6))
+            for hand in hands:
+                hand(cockpit, now_us)
 
         rate = FrameRate(settings.frame_period_us, settings.station.corrections_hz)
-        LiveStation(link, ground, source, rate, say, over, flying).run()
+        LiveStation(link, ground, source, rate, say, over, turn).run()
     finally:
         source.close()
         if telemetry is not None:

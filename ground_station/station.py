@@ -97,8 +97,9 @@ class GroundStation:
         self._trajectory = trajectory
         self._log = log
         self._slots = Slots(round(1e6 / config.corrections_hz))
-        self._last_frame: MocapFrame | None = None
-        self._last_track: Track | None = None
+        self.frame: MocapFrame | None = None  # the last that was used
+        self.track: Track | None = None  # what the tracker made of the last frame
+        self.telemetry: dict[int, Sample] = {}  # the newest of each block, by its number
         self._ask_for_telemetry_us = 0  # put off by every sample that comes
 
     def on_frame(self, frame: MocapFrame, now_us: int) -> None:
@@ -111,12 +112,12 @@ class GroundStation:
         frame = judged(frame)
         due = self._slots.due(frame.t_us)
         if self.tracker is not None:
-            self._last_track = self.tracker.take(frame)
-            frame = self._last_track.frame
+            self.track = self.tracker.take(frame)
+            frame = self.track.frame
         if not frame.valid:
             counters.invalid += 1
             return
-        self._last_frame = frame
+        self.frame = frame
         if not due:
             return
         try:
@@ -143,6 +144,7 @@ class GroundStation:
         self.counters.samples += len(samples)
         for sample in samples:
             self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
+            self.telemetry[sample.block.id] = sample
             if self._log is not None:
                 goal = self._trajectory.at(now_us)
-                self._log.write(now_us, sample, goal, self._last_frame, self._last_track, self.budget)
+                self._log.write(now_us, sample, goal, self.frame, self.track, self.budget)

@@ -39,26 +39,23 @@ class Hold:
         return self.goal
 
 
-class Waiting:
-    """`home` until it is told to `start`, then the trajectory that `make(home, start_us)` returns."""
+class FlightPlan:
+    """What a station flies: `home` until it is told to `start`, then the trajectory that `make(home, start_us)` returns."""
 
     def __init__(self, home: Goal, make: Callable[[Goal, int], Trajectory]) -> None:
-        self._home = home
+        self.home = home
+        self.start_us: int | None = None  # when the trajectory's clock begins, once that is known
         self._make = make
-        self._flown: Trajectory | None = None
-
-    @property
-    def started(self) -> bool:
-        """Whether its clock has been set."""
-        return self._flown is not None
+        self._flown: Trajectory = Hold(home)
 
     def start(self, start_us: int) -> None:
         """Let the trajectory's clock begin at an instant; only the first call counts."""
-        if self._flown is None:
-            self._flown = self._make(self._home, start_us)
+        if self.start_us is None:
+            self.start_us = start_us
+            self._flown = self._make(self.home, start_us)
 
     def at(self, t_us: int) -> Goal:
-        return self._home if self._flown is None else self._flown.at(t_us)
+        return self._flown.at(t_us)
 
 
 Signal = Callable[[int], float]  # time since the start [us], never negative, to an offset [m or rad]

@@ -53,12 +53,21 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
         table.add_row(pair.name, *shown, pair.unit)
     console.print(table)
     console.print(comparison.span, soft_wrap=True)
+    if comparison.apart:
+        apart = Table(title="apart, at the same time since the release")
+        for heading in ("", "rms", "largest", "unit"):
+            apart.add_column(heading, justify="right" if heading in ("rms", "largest") else "left")
+        for one in comparison.apart:
+            apart.add_row(one.name, f"{one.rms:.3g}", f"{one.largest:.3g}", one.unit)
+        console.print(apart)
     for name, x, y in comparison.settings:
         console.print(f"{name}: {x} | {y}", soft_wrap=True)
     for folder, missing in zip((first, second), comparison.missing, strict=True):
         if missing:
             console.print(f"not in {folder}: {', '.join(missing)}", soft_wrap=True)
-    if comparison.first is not None:
+    if comparison.one_is_real:
+        console.print("one flight is real, the other simulated: they share no rows")
+    elif comparison.first is not None:
         console.print(f"first difference: {comparison.first}", soft_wrap=True)
     elif comparison.identical:
         console.print("identical")

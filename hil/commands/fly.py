@@ -16,12 +16,12 @@ from hil.commands.options import (
     profile_option,
     seed_option,
     set_option,
+    write_pictures,
 )
 from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError
 
 if TYPE_CHECKING:
-    from hil.laboratory.experiment import Experiment
     from hil.laboratory.flight import Flight
     from hil.laboratory.run import Request
     from hil.pictures.viewer import LiveViewer
@@ -124,7 +124,7 @@ def _fly_one(request: Request, folder: Path, realtime: bool, watch: bool, perfet
         make = None if request.in_lockstep else linked_flight
         result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto, make)
         progress.update(bar, description="writing recording and report", total=None, now="")
-        _write_pictures(folder, request.experiment)
+        write_pictures(folder, request.experiment)
         if perfetto:
             from hil.exports.perfetto import write_perfetto
 
@@ -147,19 +147,6 @@ def _live_viewer(folder: Path) -> LiveViewer:
     from hil.pictures.viewer import LiveViewer
 
     return LiveViewer(folder)
-
-
-def _write_pictures(folder: Path, experiment: Experiment) -> None:
-    """Write recording and report; what cannot be written is said, for the log is there and can be shown later."""
-    try:
-        from hil.pictures.viewer import write_run_rrd
-
-        write_run_rrd(folder)
-    except LabError as error:
-        notices.print(f"floaty: no recording: {error}", soft_wrap=True)
-    from hil.pictures.report import write_report
-
-    write_report(folder, experiment)
 
 
 def _fly_many(requests: list[Request], parent: Path) -> int:

@@ -1,11 +1,19 @@
 """What several commands share: consoles, exit codes, options, and the word before a long compilation."""
 
+from __future__ import annotations
+
 import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
+
+from hil.errors import LabError
+
+if TYPE_CHECKING:
+    from hil.laboratory.experiment import Experiment
 
 INTERRUPTED = 130
 
@@ -57,3 +65,16 @@ def stop_signals() -> list[int]:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _: stops.append(received))
     return stops
+
+
+def write_pictures(folder: Path, experiment: Experiment) -> None:
+    """Write recording and report; what cannot be written is said, for the log is there and can be shown later."""
+    try:
+        from hil.pictures.viewer import write_run_rrd
+
+        write_run_rrd(folder)
+    except LabError as error:
+        notices.print(f"floaty: no recording: {error}", soft_wrap=True)
+    from hil.pictures.report import write_report
+
+    write_report(folder, experiment)

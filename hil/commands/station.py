@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from firmware_py.extras import install_command
-from hil.commands.options import profile_option, say, set_option, stop_signals
+from hil.commands.options import INTERRUPTED, profile_option, say, set_option, stop_signals, write_pictures
+from hil.commands.tables import print_result
 from hil.errors import LabError
 
 if TYPE_CHECKING:
@@ -45,6 +46,10 @@ if TYPE_CHECKING:
     "--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help="Every frame of motion capture as CSV, for --mocap replay:FILE.",
 )  # fmt: skip
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR",
+    help="Run folder as `floaty fly` writes one: log, telemetry, events, result, report, recording.",
+)  # fmt: skip
 @profile_option
 @set_option
 def station(
@@ -55,37 +60,73 @@ def station(
     duration: float | None,
     log: Path | None,
     record: Path | None,
+    out: Path | None,
     profile: str,
     overrides: tuple[str, ...],
 ) -> int:
     """Fly a board, real or virtual: poses in, poses or corrections out at 50 Hz, telemetry shown and logged.
 
     Ctrl-C ends the flight: nothing more goes up, the board puts its flaps to hover, the link is closed.
+
+    Exit code with --out: as `floaty fly`, by the limits of the trajectory's experiment on what the cameras saw.
     """
     from ground_station.errors import LinkError, MocapError
     from ground_station.program import Session, fly, run_until
     from hil.config import load_config
     from hil.experiments import find_experiment
+    from hil.laboratory.real_flight import RealFlight
 
     config = load_config(profile, overrides)
     experiment = find_experiment(trajectory)
+    if out is not None and log is not None:
+        raise LabError(f"--log {log}: --out {out} has a telemetry.csv of its own")
     for option, path in (("--log", log), ("--record", record)):
         if path is not None and not path.parent.is_dir():
             raise LabError(f"{option} {path}: there is no folder {path.parent}")
-    session = Session(uri, mocap, experiment.trajectory, start_s, log, record)
+    flight = None if out is None else RealFlight(out, experiment, config, profile, overrides, uri, say)
+
+    def tell(text: str) -> None:
+        say(text)
+        if flight is not None:
+            flight.note("station", text)
+
+    session = Session(uri, mocap, experiment.trajectory, start_s, flight.telemetry if flight else log, record)
     stops = stop_signals()
+    failure = ""
     try:
-        fly(settings_of(config), session, say, run_until(lambda: bool(stops), duration))
-    except LinkError as error:
-        raise LabError(f"--link {error}") from None
-    except MocapError as error:
-        raise LabError(str(error)) from None
-    except OSError as error:
-        raise LabError(f"{error.filename}: {error.strerror or error}") from None
-    except ImportError as error:
-        extra = "mavlink" if uri.startswith("mavlink") else "radio"
-        raise LabError(f"--link {uri}: {error}: {install_command(extra)}") from None
-    return 0
+        fly(
+            settings_of(config),
+            session,
+            tell,
+            run_until(lambda: bool(stops), duration),
+            [flight.turn] if flight else [],
+        )
+    except (LinkError, MocapError, OSError, ImportError) as error:
+        failure = _why(error, uri)
+    result = flight.close(failure, bool(stops)) if flight is not None else None
+    if result is not None:
+        write_pictures(result.folder, experiment)
+        print_result(result)
+    if failure:
+        raise LabError(failure)
+    if result is None or result.passed:
+        return 0
+    return INTERRUPTED if result.outcome == "interrupted" else 1
+
+
+def _why(error: Exception, uri: str) -> str:
+    """Return the line that says why the station gave up."""
+    from ground_station.errors import LinkError
+
+    if isinstance(error, LinkError):
+        return f"--link {error}"
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror or error}"
+    if isinstance(error, ImportError):
+        return (
+            f"--link {uri}: {error}: {install_command('mavlink' if uri.startswith('mavlink') else 'radio')}"
+        )
+    return str(error)
 
 
 def settings_of(config: LabConfig) -> GroundSettings:

@@ -66,7 +66,7 @@ def print_result(result: Result) -> None:
     from ground_station.latency import budget_line
     from hil.laboratory.metrics import METRICS
 
-    table = Table(title=f"{result.experiment}, seed {result.seed}, profile {result.profile}")
+    table = Table(title=f"{result.title}, profile {result.profile}")
     table.add_column("metric")
     for heading in ("value", "limit", "verdict"):
         table.add_column(heading, justify="right")
@@ -82,9 +82,8 @@ def print_result(result: Result) -> None:
         table.add_row(name, metric.show(value), limit, mark)
     console.print(table)
     cause = f": {result.cause}" if result.cause else ""
-    console.print(
-        f"{result.outcome}{cause}; {result.real_time_factor:.0f} times real time; hash {result.hash[:16]}"
-    )
+    speed = "" if math.isnan(result.real_time_factor) else f"{result.real_time_factor:.0f} times real time; "
+    console.print(f"{result.outcome}{cause}; {speed}hash {result.hash[:16]}")
     if result.ages:
         console.print(budget_line(result.ages), soft_wrap=True)
     if result.usage is not None:

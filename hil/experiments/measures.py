@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from firmware_py.geometry import euler_zyx_of
 from hil.laboratory.faults import Fault
-from hil.laboratory.metrics import BOX, column, position_error
+from hil.laboratory.metrics import BOX, body, column, position_error
 
 BAND = 0.05  # of a step: settled; physics.md section 8
 RISEN = 0.90  # of a step
@@ -35,13 +35,13 @@ def seconds(flight: pa.Table) -> Signal:
 
 def yaw_and_goal(flight: pa.Table) -> tuple[Signal, Signal]:
     """Return the true yaw without jumps at half turns, and the wanted one [rad]."""
-    yaw = euler_zyx_of(column(flight, "truth.qw", "truth.qx", "truth.qy", "truth.qz"))[:, 2]
+    yaw = euler_zyx_of(body(flight, "qw", "qx", "qy", "qz"))[:, 2]
     return np.unwrap(yaw), column(flight, "goal.yaw")
 
 
 def axis_and_goal(axis: str, flight: pa.Table) -> tuple[Signal, Signal]:
     """Return the true coordinate x, y or z and the wanted one, W [m]."""
-    return column(flight, f"truth.{axis}"), column(flight, f"goal.{axis}")
+    return body(flight, axis), column(flight, f"goal.{axis}")
 
 
 def steps(times: Signal, value: Signal, goal: Signal) -> list[tuple[float, float, float]]:
@@ -73,7 +73,7 @@ def yaw_step(flight: pa.Table) -> Mapping[str, float]:
 
 def peak_rate(flight: pa.Table) -> float:
     """Return the largest rate about z of B [rad/s]."""
-    return float(np.abs(column(flight, "truth.r")).max())
+    return float(np.abs(body(flight, "r")).max())
 
 
 def y_steps(flight: pa.Table) -> Mapping[str, float]:

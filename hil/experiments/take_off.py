@@ -19,7 +19,7 @@ import numpy as np
 
 from firmware_py.wire.crtp import PORT_PLATFORM, Packet, encode
 from hil.laboratory.experiment import Experiment
-from hil.laboratory.metrics import BOX, column, position_error
+from hil.laboratory.metrics import BOX, body, column, position_error
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -89,7 +89,7 @@ def measure(flight: pa.Table) -> Mapping[str, float]:
     """Return when it lifted off and was in the box, and how it touched down; NaN for what did not happen."""
     times = column(flight, "t") * 1e-6
     times = times - times[0]
-    x, y, z, climb = column(flight, "truth.x", "truth.y", "truth.z", "truth.vz").T
+    x, y, z, climb = body(flight, "x", "y", "z", "vz").T
     off = np.asarray(z > STANDING_Z + CLEAR)
     values = dict.fromkeys(
         ("lift_off", "reached_box", "touch_down_speed", "landed_off_axis", "hover_in_box"), float("nan")

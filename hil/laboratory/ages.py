@@ -1,6 +1,10 @@
 """Where the age of a flight's poses came from, out of what its ground station wrote: `telemetry.csv`.
 
 Of a radio in lockstep the station knows no more than what is usual; there its share comes from the flight log.
+
+In the log of a real flight a row is written with the newest pose that there was, which is some 40 ms old; what the cameras
+saw at the row's own instant comes with a later row. `at_exposure` puts it in when the log is read from its stream: between
+the two exposures around the instant, and NaN where those are too far apart, or the second one never came.
 """
 
 from pathlib import Path
@@ -17,6 +21,10 @@ from hil.laboratory.metrics import column
 STATION_CLOCK = (
     "station.clock"  # column of the log: the clock of the computer, by which a station stamps its record
 )
+
+EXPOSED = "cameras.exposed"  # column: when the row's pose was true, by the time of the log [us]
+GAP_US = 100_000  # between two exposures, beyond which nobody knows where the robot was
+ROTATION = ("cameras.qw", "cameras.qx", "cameras.qy", "cameras.qz")
 
 
 def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
@@ -99,3 +107,51 @@ def _on_air(log: pa.Table) -> NDArray[np.float64]:
     delivered, sum_us = np.diff(column(log, "link.up_delivered", "link.up_latency_sum"), axis=0).T
     times: NDArray[np.float64] = sum_us[delivered > 0] / delivered[delivered > 0]
     return times
+
+
+def at_exposure(log: pa.Table) -> pa.Table:
+    """Return a log whose cameras' columns belong to the instants of their rows; one without cameras as it is."""
+    if EXPOSED not in log.column_names:
+        return log
+    names = [name for name in log.column_names if name.startswith("cameras.") and name != EXPOSED]
+    times = log.column("t").to_numpy().astype(np.float64)
+    exposed = log.column(EXPOSED).to_numpy().astype(np.float64)
+    with_pose = np.flatnonzero(np.isfinite(exposed))
+    fresh = with_pose[np.diff(exposed[with_pose], prepend=-np.inf) > 0]
+    if len(fresh) < 2:
+        return _with(log, {name: np.full(len(times), np.nan) for name in names})
+    seen = exposed[fresh]
+    after = np.searchsorted(seen, times).clip(1, len(seen) - 1)
+    gap = seen[after] - seen[after - 1]
+    known = (times >= seen[0]) & (times <= seen[-1]) & (gap <= GAP_US)
+    share = (times - seen[after - 1]) / gap
+    columns = {}
+    for name in names:
+        values = log.column(name).to_numpy()[fresh]
+        columns[name] = np.where(known, (1 - share) * values[after - 1] + share * values[after], np.nan)
+    columns |= _rotations(log, fresh, after, share, known)
+    return _with(log, columns)
+
+
+def _rotations(
+    log: pa.Table,
+    fresh: NDArray[np.int64],
+    after: NDArray[np.int64],
+    share: NDArray[np.float64],
+    known: NDArray[np.bool_],
+) -> dict[str, NDArray[np.float64]]:
+    """Return the quaternions between two, which may have opposite signs for neighbouring rotations."""
+    q = np.stack([log.column(name).to_numpy()[fresh] for name in ROTATION], axis=1)
+    a, b = q[after - 1], q[after]
+    b = b * np.where((a * b).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    between = (1 - share)[:, None] * a + share[:, None] * b
+    between /= np.sqrt((between**2).sum(axis=1))[:, None]
+    between[~known] = np.nan
+    return dict(zip(ROTATION, between.T, strict=True))
+
+
+def _with(log: pa.Table, columns: dict[str, NDArray[np.float64]]) -> pa.Table:
+    for name, values in columns.items():
+        place = log.schema.get_field_index(name)
+        log = log.set_column(place, log.schema.field(place), pa.array(values))
+    return log

@@ -1,22 +1,31 @@
 """What a flight log holds: names, units, frames and where each value comes from.
 
-Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, like in the filter's state.
+Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, like in the filter's state. Of a real flight
+there is what its ground station knows, NaN before that is anything: `station_channels`.
 """
 
 from collections.abc import Callable, Sequence
+from math import nan
 from typing import Any
 
 from firmware_py.firmware import DEADLINES_US, Firmware
 from firmware_py.logic.plugs import GROUP
 from firmware_py.signals import COUNTERS
+from firmware_py.wire.telemetry import BLOCKS
+from ground_station.latency import STAGES
+from ground_station.program import Cockpit
 from ground_station.tracker import Tracker
-from ground_station.trajectory import Trajectory
+from ground_station.trajectory import Goal, Trajectory
 from hil.devices.cameras import VirtualMocap
 from hil.devices.radio import VirtualRadio
 from hil.laboratory.faults import Fault
 from hil.laboratory.recorder import Channel, Quantity
 from hil.laboratory.robot import Robot
 from hil.world.battery import Battery
+
+UNKNOWN_STATE = 4  # of the supervisor, beside those of `firmware_py.wire.supervisor`
+WRAP = 1 << 16  # the board's counters of poses are uint16
+AGE_UNIT_US = 100  # of locSrv.age
 
 
 def quantity(prefix: str, names: str, unit: str = "", frame: str = "") -> Quantity:
@@ -170,4 +179,101 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
                 Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),
             ),
         ),
+    )
+
+
+class Unwrapped:
+    """A counter of 16 bits that goes on where they end; from its first value on, which is NaN before."""
+
+    def __init__(self) -> None:
+        self._last = self._total = nan
+
+    def __call__(self, value: float) -> float:
+        step = (value - self._last) % WRAP
+        self._total = 0.0 if self._total != self._total else self._total + step
+        self._last = value
+        return self._total
+
+
+def station_channels(
+    cockpit: Cockpit, free: Callable[[], bool], goal: Callable[[], Goal], start_us: int
+) -> tuple[Channel, ...]:
+    """Return the channels of a flight that only its ground station sees; `start_us` is when the log's time began."""
+    link, ground = cockpit.link, cockpit.ground
+    count_poses, count_rejected = Unwrapped(), Unwrapped()
+
+    def states() -> tuple[float, ...]:
+        state = link.supervisor_state
+        return (free(), UNKNOWN_STATE if state is None else state)
+
+    def cameras() -> tuple[float, ...]:
+        frame, track = ground.frame, ground.track
+        if frame is None:
+            return (nan,) * 14
+        motion = (nan,) * 6 if track is None else (*track.v_WB, *track.w_B)
+        return (frame.t_us - start_us, *frame.p_WB, *frame.q_WB, *motion)
+
+    def where_to() -> tuple[float, ...]:
+        at = goal()
+        return (*at.p_WG, at.yaw)
+
+    def telemetry() -> tuple[float, ...]:
+        samples = [ground.telemetry.get(block.id) for block in BLOCKS]
+        if None in samples:
+            return (nan,) * 27
+        motion, attitude, flaps, health = (sample.values for sample in samples if sample is not None)
+        *inputs, _, age, poses, rejected = health
+        told = (AGE_UNIT_US * age, count_poses(poses), count_rejected(rejected))
+        return (*motion, *attitude, *flaps, *inputs, *told)
+
+    def counts() -> tuple[float, ...]:
+        counters = ground.counters
+        return (
+            link.sent, link.late, counters.frames, counters.invalid, counters.samples, counters.malformed,
+            link.latency.us,
+        )  # fmt: skip
+
+    tracker = () if ground.tracker is None else (tracker_channel(ground.tracker),)
+    return (
+        Channel("int8", states, (quantity("flight", "free"), quantity("supervisor", "state"))),
+        Channel(
+            "float64",
+            cameras,
+            (
+                quantity("cameras", "exposed", "us"),
+                quantity("cameras", "x y z", "m", "W"),
+                quantity("cameras", "qw qx qy qz", "", "W"),
+                quantity("cameras", "vx vy vz", "m/s", "W"),
+                quantity("cameras", "p q r", "rad/s", "B"),
+            ),
+        ),
+        Channel(
+            "float64", where_to, (quantity("goal", "x y z", "m", "W"), quantity("goal", "yaw", "rad", "W"))
+        ),
+        Channel(
+            "float64",
+            telemetry,
+            (
+                quantity("estimate", "x y z", "m", "G"),
+                quantity("estimate", "vx vy vz", "m/s", "G"),
+                quantity("estimate", "roll pitch yaw", "rad", "G"),
+                quantity("estimate", "p q r", "rad/s", "B"),
+                quantity("telemetry", "flap_1 flap_2 flap_3 flap_4", "rad", "B"),
+                quantity("motor", "m1 m2 m3 m4", "counts"),
+                quantity("control", "u1 u2 u3 u4", "rad"),
+                quantity("estimator", "pose_age_us", "us"),
+                quantity("estimator", "poses rejected"),
+            ),
+        ),
+        Channel(
+            "int64",
+            counts,
+            (
+                quantity("link", "sent late"),
+                quantity("station", "frames unusable samples malformed"),
+                quantity("link", "latency", "us"),
+            ),
+        ),
+        Channel("float64", ground.budget.last, (quantity("age", " ".join(STAGES), "us"),)),
+        *tracker,
     )

@@ -1,4 +1,7 @@
-"""From a flight log to figures and verdicts: computed from the truth, after the release, never from the estimate."""
+"""From a flight log to figures and verdicts, after the release: from the truth, never from the estimate.
+
+In a real flight, whose truth nobody knows, from what the cameras saw; rows without a pose do not count.
+"""
 
 import difflib
 from collections.abc import Mapping
@@ -83,6 +86,7 @@ METRICS: Mapping[str, Metric] = {
     "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
     "frames_refused": Metric("", "max", "frames that the ground station's tracker refused"),
+    "unseen": Metric("s", "max", "time in which the cameras did not see the robot, of a real flight"),
     "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
     "line_up": Metric("share", "max", "mean load of the serial line to the board"),
     "line_down": Metric("share", "max", "mean load of the serial line from the board"),
@@ -139,9 +143,20 @@ def column(table: pa.Table, *names: str) -> NDArray[np.float64]:
     return arrays[0] if len(arrays) == 1 else np.stack(arrays, axis=1)
 
 
+def is_real(table: pa.Table) -> bool:
+    """Whether a log is that of a real flight, or of one that looks like it from the ground."""
+    return "cameras.x" in table.column_names
+
+
+def body(table: pa.Table, *names: str) -> NDArray[np.float64]:
+    """Return columns of the body's motion, like `column`: the truth, or in a real flight what the cameras saw."""
+    source = "cameras" if is_real(table) else "truth"
+    return column(table, *(f"{source}.{name}" for name in names))
+
+
 def position_error(table: pa.Table) -> NDArray[np.float64]:
     """Return the body's position in the goal frame, (N, 3) [m]."""
-    offset = column(table, "truth.x", "truth.y", "truth.z") - column(table, "goal.x", "goal.y", "goal.z")
+    offset = body(table, "x", "y", "z") - column(table, "goal.x", "goal.y", "goal.z")
     yaw = column(table, "goal.yaw")
     c, s = np.cos(yaw), np.sin(yaw)
     return np.stack(
@@ -151,14 +166,30 @@ def position_error(table: pa.Table) -> NDArray[np.float64]:
 
 def attitude_error(table: pa.Table) -> NDArray[np.float64]:
     """Return roll, pitch and yaw relative to the goal, (N, 3) [rad], yaw in -pi..pi."""
-    angles = euler_zyx_of(column(table, "truth.qw", "truth.qx", "truth.qy", "truth.qz"))
+    angles = euler_zyx_of(body(table, "qw", "qx", "qy", "qz"))
     angles[:, 2] = np.angle(np.exp(1j * (angles[:, 2] - column(table, "goal.yaw"))))
     return angles
 
 
 def free_flight(table: pa.Table) -> pa.Table:
-    """Return the rows after the release."""
-    return table.filter(np.asarray(column(table, "flight.free")) > 0.5)
+    """Return the rows after the release; of a real flight, those in which the cameras saw the robot."""
+    return table.filter(_free(table) & (_seen(table) if is_real(table) else True))
+
+
+def _free(table: pa.Table) -> NDArray[np.bool_]:
+    return column(table, "flight.free") > 0.5
+
+
+def _seen(table: pa.Table) -> NDArray[np.bool_]:
+    return np.isfinite(column(table, "cameras.x"))
+
+
+def _unseen(table: pa.Table) -> float:
+    """Return how long [s] the cameras did not see the robot between the release and their last pose of it."""
+    free = table.filter(_free(table))
+    last = np.flatnonzero(_seen(free))[-1]
+    times = column(free, "t")[: last + 1]
+    return float((~_seen(free))[: last + 1].mean() * (times[-1] - times[0]) * 1e-6)
 
 
 def measure(table: pa.Table, lost: bool) -> dict[str, float]:
@@ -180,18 +211,28 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
     values["in_box"] = float((error <= BOX).all(axis=1).mean())
     values["attitude_max"] = float(np.abs(attitude_error(flight)).max())
     values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
-    values["age_mean"] = float(column(flight, "estimator.pose_age_us").mean()) * 1e-6
+    values["age_mean"] = _mean_age(flight)
     in_failsafe = column(flight, "supervisor.state") == State.FAILSAFE
     values["failsafe"] = float(in_failsafe.mean()) * values["flown"]
     if "serial.up_busy" in table.schema.names:
         busy = column(flight, "serial.up_busy", "serial.down_busy")
         values["line_up"], values["line_down"] = (busy[-1] - busy[0]) * 1e-6 / values["flown"]
         values["line_overrun"] = float(column(flight, "serial.overrun")[-1])
-    refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
-    values["poses_refused"] = float(refused[-1])
+    if is_real(table):
+        values["poses_refused"] = float(column(flight, "estimator.rejected")[-1])
+        values["unseen"] = _unseen(table)
+    else:
+        refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
+        values["poses_refused"] = float(refused[-1])
     if "tracker.refused" in table.schema.names:
         values["frames_refused"] = float(column(flight, "tracker.refused")[-1])
     return values
+
+
+def _mean_age(flight: pa.Table) -> float:
+    ages = column(flight, "estimator.pose_age_us")
+    ages = ages[np.isfinite(ages)]  # a real board has not told it before its first telemetry
+    return float(ages.mean()) * 1e-6 if len(ages) else np.nan
 
 
 def judge(

@@ -19,8 +19,9 @@ import pyarrow.parquet
 from numpy.typing import NDArray
 
 from hil.errors import LabError
+from hil.laboratory.ages import at_exposure
 
-ROWS_PER_BATCH = 100
+ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to disk
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
 
@@ -82,7 +83,7 @@ class Recorder:
         for read, block in self._sources:
             block[row] = read()
         self._row = row + 1
-        if self._row == ROWS_PER_BATCH:
+        if self._row == ROWS_PER_BATCH or now_us - self._times[0] >= BATCH_US:
             self._write_batch()
 
     def note(self, now_us: int, source: str, text: str) -> None:
@@ -173,6 +174,17 @@ def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
             return
 
 
+def _with_release(table: pa.Table) -> pa.Table:
+    """Return the log of a real flight with its release, which was not known when the stream began."""
+    if "cameras.x" not in table.column_names:
+        return table
+    free = np.flatnonzero(table.column("flight.free").to_numpy())
+    first_us = table.column("t")[int(free[0]) if len(free) else 0].as_py() if table.num_rows else 0
+    return table.replace_schema_metadata(
+        {**(table.schema.metadata or {}), RELEASE_US: str(first_us).encode()}
+    )
+
+
 def _read_stream(path: Path) -> pa.Table:
     try:
         with pa.ipc.open_stream(str(path)) as reader:
@@ -181,6 +193,6 @@ def _read_stream(path: Path) -> pa.Table:
                 try:
                     batches.append(reader.read_next_batch())
                 except (StopIteration, pa.ArrowInvalid, OSError):
-                    return pa.Table.from_batches(batches, schema)
+                    return _with_release(at_exposure(pa.Table.from_batches(batches, schema)))
     except pa.ArrowInvalid as error:
         raise LabError(f"{path}: not a flight log ({error})") from error

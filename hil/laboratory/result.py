@@ -25,11 +25,13 @@ from hil.laboratory.metrics import Figure, Metric, Verdict, measure
 from hil.laboratory.recorder import load_log
 
 RESULT = "result.json"
+REAL = "real"  # the board of a flight that only its ground station saw
 
 Outcome = Literal["completed", "lost", "interrupted", "error"]
 AsText = BeforeValidator(
     lambda value: json.loads(value) if isinstance(value, str) else value
 )  # in a log's schema
+OrNone = BeforeValidator(lambda value: None if value == "null" else value)  # likewise
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,7 @@ class Origin:
     experiment: str
     profile: str
     overrides: Annotated[tuple[str, ...], AsText]
-    seed: int
+    seed: Annotated[int | None, OrNone]  # None: a real flight has none
     duration_s: float
     link: str
     board: str
@@ -62,6 +64,13 @@ class Origin:
     def fields(self) -> dict[str, Any]:
         """Return them by name, also of a `Result`."""
         return {field.name: getattr(self, field.name) for field in fields(Origin)}
+
+    @property
+    def title(self) -> str:
+        """What a page or a table is headed."""
+        return (
+            f"{self.experiment}, real flight" if self.seed is None else f"{self.experiment}, seed {self.seed}"
+        )
 
     def metadata(self) -> dict[str, str]:
         """Return it as a log's schema holds it."""

@@ -1,11 +1,12 @@
 """One flight against another: where their logs first differ, their metrics side by side, what was configured otherwise.
 
-Logs are compared bit for bit, row by row, in the columns that both have; a NaN equals a NaN.
+Logs are compared bit for bit, row by row, in the columns that both have; a NaN equals a NaN. A real flight and a simulated
+one share no rows: there it is how far they are apart, by the time since the release, that says what the model does not know.
 """
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,15 @@ import pyarrow as pa
 
 from hil.errors import LabError
 from hil.experiments import find_again
-from hil.laboratory.metrics import METRICS, SHOWN, free_flight, measure
+from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import Result, read_result
+from hil.pictures import curves
 from hil.pictures.overlays import pair, since_release
 from hil.pictures.pages import data_uri, write_page
 
 ROW_S = 0.01
+AROUND_US = 1_000_000  # shown before and after what is judged of a real flight
 PICTURE, PAGE = "compare.png", "compare.html"
 SETTINGS = (
     "experiment",
@@ -72,6 +75,16 @@ class MetricPair:
 
 
 @dataclass(frozen=True, slots=True)
+class Apart:
+    """How far two flights are from each other at the same time since the release."""
+
+    name: str
+    unit: str
+    rms: float
+    largest: float
+
+
+@dataclass(frozen=True, slots=True)
 class Comparison:
     """What two runs have and have not in common."""
 
@@ -81,6 +94,8 @@ class Comparison:
     ]  # columns of the other one that the first, the second lacks
     span: str  # of the metrics
     metrics: tuple[MetricPair, ...]
+    apart: tuple[Apart, ...]  # with a real flight among them, if they have time in common
+    one_is_real: bool  # and the other is not
     settings: tuple[tuple[str, str, str], ...]  # name, first, second: those that differ
 
     @property
@@ -110,13 +125,15 @@ def compare(a: Run, b: Run) -> Comparison:
         ),
         _span(*flown_s),
         tuple(_metric_pairs(*(_up_to(run, min(flown_s)) for run in (a, b)))),
+        tuple(_apart(a.log, b.log)),
+        is_real(a.log) != is_real(b.log),
         tuple(_differing_settings(a, b)),
     )
 
 
 def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Path:
     """Write `compare.png` and `compare.html` into a folder; returns the page. Raises `LabError`."""
-    png = pair((a.log, b.log), (str(a.result.folder), str(b.result.folder)))
+    png = pair((_judged(a.log), _judged(b.log)), (str(a.result.folder), str(b.result.folder)))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / PICTURE).write_bytes(png)
@@ -125,6 +142,32 @@ def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Pa
         )
     except OSError as error:
         raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
+
+
+def _judged(log: pa.Table) -> pa.Table:
+    """Return what a picture shows of a flight; a real one may have gone on for long after what was judged."""
+    free = free_flight(log)
+    if not is_real(log) or free.num_rows == 0:
+        return log
+    times, (first_us, last_us) = column(log, "t"), column(free, "t")[[0, -1]]
+    return log.filter((times >= first_us - AROUND_US) & (times <= last_us + AROUND_US))
+
+
+def _apart(a: pa.Table, b: pa.Table) -> Iterator[Apart]:
+    free = [free_flight(log) for log in (a, b)]
+    if not (is_real(a) or is_real(b)) or min(log.num_rows for log in free) < 2:
+        return
+    times, others = (since_release(log) for log in free)
+    common = times <= others[-1]
+    for plot in (curves.POSITION, curves.ATTITUDE, curves.FLAPS):
+        first, second = (plot.read(log) for log in free)
+        for index, name in enumerate(plot.names):
+            miss = np.interp(times[common], others, second[:, index]) - first[common, index]
+            if name == "yaw":
+                miss = (miss + 180) % 360 - 180
+            miss = miss[np.isfinite(miss)]
+            if len(miss):
+                yield Apart(name, plot.unit, float(np.sqrt((miss**2).mean())), float(np.abs(miss).max()))
 
 
 def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Difference | None:
@@ -146,7 +189,10 @@ def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Differenc
 
 
 def _flown_s(run: Run) -> float:
-    return float(since_release(run.log).max(initial=0.0))
+    flown = (
+        free_flight(run.log) if is_real(run.log) else run.log
+    )  # a real one may go on after what was judged
+    return float(since_release(flown).max(initial=0.0))
 
 
 def _span(first_s: float, second_s: float) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ground_station.latency import STAGES
 from hil.laboratory.faults import Span
-from hil.laboratory.metrics import attitude_error, column, position_error
+from hil.laboratory.metrics import attitude_error, column, is_real, position_error
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
     "#e69f00", "#56b4e9", "#009e73", "#b8a900", "#0072b2", "#d55e00", "#cc79a7", "#888888",
@@ -73,6 +73,8 @@ def since_fusion(rows: pa.Table) -> NDArray[np.float64]:
 
 def row_of_last_fusion(rows: pa.Table) -> pa.Table:
     """Return the row that showed the pose that was fused last; no row before the first."""
+    if "estimator.fused" not in rows.column_names:  # a real board does not tell it
+        return rows.slice(0, 0)
     fusions = np.flatnonzero(np.diff(column(rows, "estimator.fused"), prepend=0.0) > 0)
     return rows.take(fusions[-1:])
 
@@ -83,6 +85,11 @@ def _degrees(*names: str) -> Read:
 
 def _four(prefix: str) -> tuple[str, ...]:
     return tuple(f"{prefix}{number}" for number in (1, 2, 3, 4))
+
+
+def _flaps(rows: pa.Table) -> NDArray[np.float64]:
+    """Return the true angles of the flaps [deg], or those that a real board believes."""
+    return np.degrees(column(rows, *_four("telemetry.flap_" if is_real(rows) else "truth.flap_")))
 
 
 _XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
@@ -101,14 +108,19 @@ ATTITUDE_MISS = Curves(
     "deg",
     lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
 )
-FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _degrees(*_four("truth.flap_")))
-FLAPS_COMMAND = Curves(_four("command "), FLAP_COLOURS, "deg", _degrees(*_four("control.flap_")))
+FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _flaps)
+FLAPS_COMMAND = Curves(
+    _four("command "), FLAP_COLOURS, "deg", _degrees(*_four("control.flap_")), needs="control.flap_1"
+)
 INPUTS = Curves(_four("u"), FLAP_COLOURS, "deg", _degrees(*_four("control.u")))
 AGE = Curves(
-    ("age of the pose", "horizon"), (BLUE, ORANGE), "ms",
-    lambda rows: column(rows, "estimator.pose_age_us", "estimator.horizon") * (1e-3, TICK_MS),
+    ("age of the pose",), (BLUE,), "ms", lambda rows: 1e-3 * column(rows, "estimator.pose_age_us")[:, None]
+)
+HORIZON = Curves(
+    ("horizon",), (ORANGE,), "ms", lambda rows: TICK_MS * column(rows, "estimator.horizon")[:, None],
+    needs="estimator.horizon",
 )  # fmt: skip
-SINCE_FUSION = Curves(("since the last fused pose",), (RED,), "ms", since_fusion)
+SINCE_FUSION = Curves(("since the last fused pose",), (RED,), "ms", since_fusion, needs="estimator.fused")
 PACKETS = Curves(
     ("lost up", "lost down", "sent again"), (RED, ORANGE, BLUE), "packets",
     lambda rows: column(rows, "link.up_dropped", "link.down_dropped", "link.retried"),
@@ -119,13 +131,21 @@ SERIAL_FAULTS = Curves(
     lambda rows: column(rows, "serial.overrun", "serial.no_room", "serial.up_bad", "serial.down_bad"),
     needs="serial.overrun",
 )  # fmt: skip
+STATION = Curves(
+    ("poses late", "poses unusable", "telemetry malformed"), (RED, ORANGE, BLUE), "so far",
+    lambda rows: column(rows, "link.late", "station.unusable", "station.malformed"),
+    needs="link.late",
+)  # fmt: skip
 QUEUE = Curves(
     ("longest so far", "dropped"), (BLUE, RED), "measurements",
     lambda rows: column(rows, "rtos.measurements_high_water", "rtos.measurements_dropped"),
+    needs="rtos.measurements_dropped",
 )  # fmt: skip
 SUPERVISOR = States(
-    "supervisor.state", ("calibrating", "waiting", "flying", "failsafe"), (ORANGE, SKY, GREEN, RED)
-)  # firmware_py.supervisor.State
+    "supervisor.state",
+    ("calibrating", "waiting", "flying", "failsafe", "unknown"),
+    (ORANGE, SKY, GREEN, RED, GREY),
+)  # firmware_py.wire.supervisor.State, and that of a board that has not told it
 FAULT_STATES, FAULT_COLOURS = ("-", "acts"), (GREY, RED)
 RELEASE = States("flight.free", ("held", "free"), (GREY, BLUE))
 

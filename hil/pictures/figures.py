@@ -113,13 +113,17 @@ def errors(rows: pa.Table) -> Figure:
 
 
 def flaps(rows: pa.Table) -> Figure:
-    """Draw what the flaps were told and what they did."""
+    """Draw what the flaps were told and what they did; of a real board, what it believes that they did."""
     figure = Figure(figsize=(WIDTH, 3.8), layout="constrained")
     grid = figure.subplots(2, 2, sharex=True)
-    times, angles, commands = since_release(rows), curves.FLAPS.read(rows), curves.FLAPS_COMMAND.read(rows)
+    times, angles = since_release(rows), curves.FLAPS.read(rows)
+    commanded = curves.FLAPS_COMMAND.needs in rows.column_names
+    commands = curves.FLAPS_COMMAND.read(rows) if commanded else None
     for index, axes in enumerate((grid[0, 1], grid[0, 0], grid[1, 0], grid[1, 1])):
-        axes.plot(times, commands[:, index], color="black", linewidth=0.6, alpha=0.55, label="command")
-        axes.plot(times, angles[:, index], color=curves.FLAPS.colours[index], label="true")
+        if commands is not None:
+            axes.plot(times, commands[:, index], color="black", linewidth=0.6, alpha=0.55, label="command")
+        label = "true" if commanded else "by telemetry"
+        axes.plot(times, angles[:, index], color=curves.FLAPS.colours[index], label=label)
         axes.set_title(curves.FLAPS.names[index], loc="left", fontsize=9)
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2)
     for axes in grid[:, 0]:
@@ -131,12 +135,14 @@ def flaps(rows: pa.Table) -> Figure:
 
 
 def age(rows: pa.Table) -> Figure:
-    """Draw how old poses are when the estimator takes them, and for how long there were none."""
-    figure, axes = stack((1.5, 1.2))
-    for one, plot, label in zip(
-        axes, (curves.AGE, curves.SINCE_FUSION), ("on board", "without"), strict=True
-    ):
-        _lines(one, since_release(rows), plot, plot.read(rows), label)
+    """Draw how old poses are when the estimator takes them, and for how long there were none, where that is told."""
+    told = curves.SINCE_FUSION.needs in rows.column_names
+    figure, axes = stack((1.5, 1.2) if told else (1.5,))
+    for plot in (curves.AGE, curves.HORIZON):
+        if plot.needs in rows.column_names:
+            _lines(axes[0], since_release(rows), plot, plot.read(rows), "on board")
+    if told:
+        _lines(axes[1], since_release(rows), curves.SINCE_FUSION, curves.SINCE_FUSION.read(rows), "without")
     shade(axes, rows)
     return figure
 
@@ -189,6 +195,15 @@ def _up_and_down(
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
+def station(rows: pa.Table) -> Figure:
+    """Draw what a real link and its ground station could not use, and the states."""
+    figure, axes = stack((1.5, 0.8))
+    _lines(axes[0], since_release(rows), curves.STATION, curves.STATION.read(rows), "not used")
+    _states(axes[1], rows)
+    shade(axes, rows)
+    return figure
+
+
 def board(rows: pa.Table) -> Figure:
     """Draw the load of the processor by task, the measurement queue and the states."""
     figure, axes = stack((1.8, 1.4, 0.8))
@@ -203,6 +218,13 @@ def board(rows: pa.Table) -> Figure:
     axes[0].set_ylabel("processor [%]")
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.1), labelspacing=0.25)
     _lines(axes[1], since_release(rows), curves.QUEUE, curves.QUEUE.read(rows), "queue")
+    _states(axes[2], rows)
+    shade(axes, rows)
+    return figure
+
+
+def _states(axes: Axes, rows: pa.Table) -> None:
+    """Draw the states of supervisor and robot as bars."""
     lanes = (curves.SUPERVISOR, curves.RELEASE)
     end = since_release(rows)[-1:]
     for height, states in enumerate(lanes):
@@ -210,17 +232,15 @@ def board(rows: pa.Table) -> Figure:
         edges = np.append(1e-6 * (begins - release_of(rows.schema.metadata)), end)
         for start, stop, name in zip(edges[:-1], edges[1:], names, strict=True):
             colour = states.colours[states.names.index(name)]
-            axes[2].barh(height, stop - start, 0.8, start, color=colour, label=name)
-    axes[2].set_yticks(range(len(lanes)), ("supervisor", "robot"))
-    axes[2].grid(visible=False)
-    named = dict(zip(*reversed(axes[2].get_legend_handles_labels()), strict=True))  # one entry per name
-    axes[2].legend(named.values(), named.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.2))
-    shade(axes, rows)
-    return figure
+            axes.barh(height, stop - start, 0.8, start, color=colour, label=name)
+    axes.set_yticks(range(len(lanes)), ("supervisor", "robot"))
+    axes.grid(visible=False)
+    named = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # one entry per name
+    axes.legend(named.values(), named.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.2))
 
 
 def estimate(rows: pa.Table) -> Figure:
-    """Draw what the estimator believed, less the truth, in the goal frame."""
+    """Draw what the estimator believed, less what was, in the goal frame."""
     figure, axes = stack((1.8, 1.8))
     _lines(axes[0], since_release(rows), curves.POSITION_MISS, curves.POSITION_MISS.read(rows), "position")
     _lines(axes[1], since_release(rows), curves.ATTITUDE_MISS, curves.ATTITUDE_MISS.read(rows), "attitude")
@@ -269,18 +289,20 @@ PICTURES = (
     ),
     Picture(
         "Errors",
-        "Truth against the goal. Dashed: 6 cm, which the paper's robot mostly keeps, and 20 degrees, which it always keeps.",
+        "Truth, in a real flight the cameras' poses, against the goal. Dashed: 6 cm, which the paper's robot mostly keeps, "
+        "and 20 degrees, which it always keeps.",
         errors,
     ),
     Picture(
         "Flaps",
-        "True angle of each flap and the angle that the controller asked for, placed as seen from above.",
+        "True angle of each flap and the angle that the controller asked for, placed as seen from above; of a real board, "
+        "the angle that its estimator has.",
         flaps,
     ),
     Picture(
         "Age",
         "Age of the pose when the estimator takes it, and the horizon of its predictor (0: it is switched off); "
-        "time since a pose was fused last, which grows while none comes or each is refused.",
+        "time since the last fused pose, which grows while none comes or each is refused (a real board tells only the age).",
         age,
     ),
     Picture(
@@ -302,10 +324,18 @@ PICTURES = (
         "Share of the processor by task, over 0.1 s, of tasks with 0.02 % or more; fullest state so far of the measurement "
         "queue (poses, gyro and accelerometer samples) and what it dropped; states of the supervisor and of the robot.",
         board,
+        needs="rtos.measurements_dropped",
+    ),
+    Picture(
+        "Station",
+        "Poses that were late or could not be used, telemetry that could not be read, since the start; states of the "
+        "supervisor and of the flight: free while the trajectory is judged.",
+        station,
+        needs="link.late",
     ),
     Picture(
         "Estimate",
-        "What the estimator believed, less the truth, in the goal frame.",
+        "What the estimator believed, less the truth, in the goal frame; of a real flight, less what the cameras saw.",
         estimate,
     ),
 )

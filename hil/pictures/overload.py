@@ -50,4 +50,5 @@ OVERLOAD = Picture(
     "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
     "Dashed: the 20 cm box. A task that starves completes nothing, late or not.",
     draw,
+    needs="cpu.THIEF",
 )

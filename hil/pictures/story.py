@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from firmware_py.wire.supervisor import State
 from hil.laboratory.faults import spans_of
-from hil.laboratory.metrics import BOX, NEAR, attitude_error, column, position_error
+from hil.laboratory.metrics import BOX, NEAR, attitude_error, column, free_flight, position_error
 from hil.laboratory.recorder import release_of
 from hil.laboratory.result import Result
 
@@ -28,7 +28,7 @@ class Moment:
 def story_of(log: pa.Table, result: Result) -> list[Moment]:
     """Return release, faults, the first limit passed, the first saturated flap, failsafes and loss in the order of time."""
     release_us = release_of(log.schema.metadata)
-    free = log.filter(column(log, "flight.free") > 0.5)
+    free = free_flight(log)
     if free.num_rows == 0:
         return []
     seconds = 1e-6 * (column(free, "t") - release_us)
@@ -75,7 +75,9 @@ def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.
 def _saturated(flight: pa.Table) -> Iterator[tuple[int, NDArray[np.bool_]]]:
     """Yield the flaps whose commands reach an end of their range, and the rows in which they do."""
     limits = json.loads((flight.schema.metadata or {}).get(b"config", b"{}")).get("allocation")
-    if limits is None:
+    if (
+        limits is None or "control.flap_1" not in flight.column_names
+    ):  # a real board does not tell its commands
         return
     for flap, sign in ((1, 1), (2, -1), (3, 1), (4, -1)):
         opening = sign * column(flight, f"control.flap_{flap}")

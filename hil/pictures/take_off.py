@@ -65,4 +65,5 @@ TAKE_OFF_LANDING = Picture(
     "Take-off and landing",
     "Height over the net, vertical speed and the air at the robot. Lines: a new speed of the fans; grey: controller on.",
     draw,
+    needs="flow.z",
 )

@@ -178,4 +178,5 @@ AIRSPEED = Picture(
     "Airspeed",
     "Height, and the mean opening of the flaps (target: what the controller asks for), over 0.1 s.",
     partial(follow, (Z, OPENING), (0.0, 60.0)),
+    needs="control.flap_1",
 )

@@ -21,7 +21,7 @@ from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil.devices.markers import DIAMETER, marker_places
 from hil.errors import LabError
 from hil.laboratory.faults import Span, spans_of
-from hil.laboratory.metrics import BOX, column
+from hil.laboratory.metrics import BOX, body, column, is_real
 from hil.laboratory.recorder import load_events, load_log, release_of
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures import curves, scene
@@ -58,9 +58,11 @@ PLOTS: Mapping[str, Curves] = {
     "miss/position": curves.POSITION_MISS,
     "miss/attitude": curves.ATTITUDE_MISS,
     "age/pose": curves.AGE,
+    "age/horizon": curves.HORIZON,
     "age/without": curves.SINCE_FUSION,
     "link/radio": curves.PACKETS,
     "link/serial": curves.SERIAL_FAULTS,
+    "link/station": curves.STATION,
     "queue": curves.QUEUE,
 }
 PALE = "flaps/command"
@@ -86,9 +88,8 @@ class Stage:
         self._fusion = schema.empty_table()  # the row of the last fused pose
         self._release_us = release_of(schema.metadata)
         recording.set_log_time_enabled(False)
-        recording.send_recording_name(
-            f"{metadata.get('experiment', 'flight')}, seed {metadata.get('seed', '?')}"
-        )
+        name = "real flight" if "cameras.x" in schema.names else f"seed {metadata.get('seed', '?')}"
+        recording.send_recording_name(f"{metadata.get('experiment', 'flight')}, {name}")
         self._build_tunnel()
         self._build_robot()
         if MARKERS_SEEN in schema.names:
@@ -119,14 +120,15 @@ class Stage:
         for path, limit in LIMITS.items():
             lines = np.full((len(times) - fresh, 2), (limit, -limit))
             self._send(f"plot/{path}", times[fresh:], rr.Scalars.columns(scalars=lines))
-        self._send("plot/processor", times[1:], rr.Scalars.columns(scalars=self._processor.read(slow)))
+        if self._processor.names:
+            self._send("plot/processor", times[1:], rr.Scalars.columns(scalars=self._processor.read(slow)))
         for path, states in STATES.items():
             begins, names = curves.changes(joined, states)
             self._send(f"state/{path}", begins[fresh:], rr.StateChange.columns(state=names[fresh:]))
         for kind, spans in self._faults.items():
             begins, names = curves.fault_changes(joined, spans)
             self._send(f"state/fault/{kind}", begins[fresh:], rr.StateChange.columns(state=names[fresh:]))
-        track = column(joined, "truth.x", "truth.y", "truth.z")
+        track = body(joined, "x", "y", "z")
         steps = np.stack((track[:-1], track[1:]), axis=1).astype(np.float32)
         self._send("world/trail", column(joined, "t")[1:], rr.LineStrips3D.columns(strips=steps))
 
@@ -160,10 +162,12 @@ class Stage:
 
     def _move(self, rows: pa.Table) -> None:
         """Place everything that has a pose, and the arrows."""
+        if is_real(rows):  # there are no arrows, and poses only when the board and the cameras tell them
+            rows = rows.filter(np.isfinite(column(rows, "cameras.x") + column(rows, "estimate.x")))
         times = column(rows, "t")
-        p_WB = column(rows, "truth.x", "truth.y", "truth.z")
-        q_WB = column(rows, "truth.qw", "truth.qx", "truth.qy", "truth.qz")
-        flaps = column(rows, "truth.flap_1", "truth.flap_2", "truth.flap_3", "truth.flap_4")
+        p_WB = body(rows, "x", "y", "z")
+        q_WB = body(rows, "qw", "qx", "qy", "qz")
+        flaps = np.radians(curves.FLAPS.read(rows))
         self._place("world/robot", times, p_WB, q_WB)
         for flap in range(4):
             turn = scene.turn_quaternion(scene.FLAP_AXES[flap], flaps[:, flap])
@@ -177,6 +181,8 @@ class Stage:
         self._place(
             "world/goal/estimate", times, p_GE, np.array([from_euler_zyx(*row) for row in angles.tolist()])
         )
+        if is_real(rows):
+            return
 
         parts = ("base", "flap1", "flap2", "flap3", "flap4")
         forces = column(rows, *(f"force.{part}_{axis}" for part in parts for axis in "xyz"))
@@ -264,7 +270,8 @@ class Stage:
         log("world/trail", rr.LineStrips3D.from_fields(colors=[0xFFFFFFC0], radii=[0.0018]), static=True)
 
     def _name_curves(self) -> None:
-        for path, plot in {**self._plots, "processor": self._processor}.items():
+        processor = {"processor": self._processor} if self._processor.names else {}
+        for path, plot in {**self._plots, **processor}.items():
             width, opacity = (1.0, 120) if path == PALE else (1.6, 255)
             lines = rr.SeriesLines(
                 names=plot.names,

@@ -311,4 +311,4 @@ def test_the_load_of_the_line_is_its_busy_time_in_percent() -> None:
 
 
 def test_states_have_the_supervisors_names() -> None:
-    assert curves.SUPERVISOR.names == tuple(state.name.lower() for state in State)
+    assert curves.SUPERVISOR.names == (*(state.name.lower() for state in State), "unknown")

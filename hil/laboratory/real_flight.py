@@ -1,0 +1,212 @@
+"""A real flight into a run folder like that of a simulated one: what the ground station sees of the board that it flies.
+
+`log.parquet` has no truth but the cameras' poses (`cameras.*`, W and B), what telemetry tells of estimate, controller and
+flaps, link, tracker and ages. `flight.free` is 1 from the trajectory's start on, for as long as its experiment takes, or
+until the robot has left the flow: that is what metrics and limits are of.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from math import nan, sqrt
+from pathlib import Path
+
+from firmware_py.elementary import cos
+from firmware_py.logic.loading import digest_of
+from firmware_py.wire.supervisor import State
+from ground_station.clock import clock_us
+from ground_station.mocap import MocapFrame
+from ground_station.program import Cockpit
+from ground_station.telemetry_log import TELEMETRY
+from hil.config import LabConfig
+from hil.errors import LabError
+from hil.laboratory.ages import ages_of, told
+from hil.laboratory.channels import station_channels
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.flight import RECORD_PERIOD_US
+from hil.laboratory.metrics import check_limits, free_flight, judge, measure
+from hil.laboratory.recorder import Recorder, load_log
+from hil.laboratory.result import REAL, Origin, Outcome, Result, commit, versions, write_result
+from hil.world.config import LimitsConfig
+
+
+class RealFlight:
+    """Records one flight of `floaty station` into `folder`, which it makes; `turn` is a hand of the station's program.
+
+    Raises `LabError` when something is there already: real flights are not flown again.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        experiment: Experiment,
+        config: LabConfig,
+        profile: str,
+        overrides: tuple[str, ...],
+        uri: str,
+        say: Callable[[str], None],
+        clock: Callable[[], int] = clock_us,
+    ) -> None:
+        self.folder = folder
+        self._experiment = experiment
+        self._config = config
+        self._limits = config.limits.get(experiment.name, experiment.limits)
+        check_limits(self._limits, experiment.metrics)
+        self._origin = Origin(
+            experiment.name, profile, overrides, None, experiment.duration_s, uri, REAL, (), versions(),
+            commit(), experiment.source, digest_of(config.logic),
+        )  # fmt: skip
+        self._say = say
+        self._clock = clock
+        self._start_us = clock()
+        self._early: list[tuple[int, str, str]] = []  # notes from before there is a recorder
+        self._recorder: Recorder | None = None
+        self._now_us = self._next_us = 0
+        self._is_free = False  # the row that is being recorded belongs to what is judged
+        self._whole = False  # all of it was flown
+        self._lost: str | None = None
+        self._state: int | None = None  # the supervisor's
+        self._broken = False  # nothing can be written any more
+        _make(folder)
+
+    @property
+    def telemetry(self) -> Path:
+        """Where the station's own record belongs."""
+        return self.folder / TELEMETRY
+
+    def note(self, source: str, text: str) -> None:
+        """Put a line into the event log."""
+        self._note(self._clock(), source, text)
+
+    def _note(self, now_us: int, source: str, text: str) -> None:
+        if self._recorder is None:
+            self._early.append((now_us, source, text))
+            return
+        self._write(lambda recorder: recorder.note(now_us - self._start_us, source, text))
+
+    def turn(self, cockpit: Cockpit, now_us: int) -> None:
+        """Record a row when it is time to."""
+        if now_us < self._next_us:
+            return
+        if self._recorder is None:
+            self._begin(cockpit)
+        self._now_us = now_us
+        self._next_us = now_us - now_us % RECORD_PERIOD_US + RECORD_PERIOD_US
+        self._look(cockpit, now_us)
+        self._write(lambda recorder: recorder.row(now_us - self._start_us))
+
+    def _begin(self, cockpit: Cockpit) -> None:
+        metadata = {**self._origin.metadata(), "config": self._config.model_dump_json()}
+        channels = station_channels(
+            cockpit, lambda: self._is_free, lambda: cockpit.plan.at(self._now_us), self._start_us
+        )
+        self._recorder = Recorder(self.folder, channels, metadata)
+        for early in self._early:
+            self._note(*early)
+
+    def _write(self, write: Callable[[Recorder], None]) -> None:
+        """Write, as long as that is possible: a full disk ends the record, not the flight."""
+        if self._recorder is None or self._broken:
+            return
+        try:
+            write(self._recorder)
+        except OSError as error:
+            self._broken = True
+            self._say(f"{self.folder}: no more is recorded: {error.strerror or error}")
+
+    def _look(self, cockpit: Cockpit, now_us: int) -> None:
+        """Notice what the board does, the trajectory's begin and end, and a loss."""
+        state = cockpit.link.supervisor_state
+        if state != self._state and state is not None:
+            self._state = state
+            self._note(now_us, "board", f"supervisor: {State(state).name.lower()}")
+        recorder, frame, start_us = self._recorder, cockpit.ground.frame, cockpit.plan.start_us
+        if recorder is None or start_us is None or now_us < start_us:
+            return
+        if recorder.release_us is None:
+            recorder.release_us = start_us - self._start_us
+            self._note(now_us, "lab", f"{self._experiment.name} begins")
+        if not self._whole and now_us - start_us >= 1e6 * self._experiment.duration_s:
+            self._whole = True
+            self._note(now_us, "lab", f"{self._experiment.name} is over; what follows is not judged")
+        self._is_free = not self._whole and self._lost is None
+        if self._is_free and frame is not None:
+            self._lost = why_lost(frame, self._config.plant.limits, self._config.flight.home)
+            if self._lost is not None:
+                self._note(now_us, "lab", f"lost: {self._lost}; what follows is not judged")
+
+    def close(self, failure: str = "", interrupted: bool = False) -> Result | None:
+        """Finish the log and write `result.json`; None for a flight that never began, which leaves no folder.
+
+        `failure` is why the station gave up. Raises `LabError` when it cannot be written.
+        """
+        if self._recorder is None:
+            shutil.rmtree(self.folder)
+            return None
+        self.note("lab", failure or ("interrupted by the user" if interrupted else "the station ends"))
+        try:
+            result = self._result(self._recorder.close(), failure, interrupted)
+            write_result(result)
+        except OSError as error:
+            raise LabError(f"--out {self.folder}: cannot be written ({error.strerror or error})") from None
+        return result
+
+    def _result(self, digest: str, failure: str, interrupted: bool) -> Result:
+        """Return how it went, from the log."""
+        log = load_log(self.folder)
+        own = self._experiment.metrics
+        metrics = measure(log, self._lost is not None) | dict.fromkeys(own, nan)
+        free = free_flight(log)
+        if free.num_rows > 1:
+            try:
+                metrics.update(self._experiment.measured(free))
+            except LabError as error:  # what only a laboratory can see
+                self._say(
+                    f"{self._experiment.name}: its own metrics need {error}, which a real flight has not"
+                )
+        cut_short: Outcome = "error" if failure else "interrupted" if interrupted else "completed"
+        outcome: Outcome = "lost" if self._lost else "completed" if self._whole else cut_short
+        return Result(
+            **self._origin.fields(),
+            outcome=outcome,
+            cause=self._lost or failure or None,
+            metrics=metrics,
+            own_metrics=own,
+            verdicts=tuple(judge(metrics, self._limits, own)),
+            tasks=(),
+            queues=(),
+            usage=None,
+            ages=ages_of(told(self.folder), log, self._origin.link),
+            hash=digest,
+            real_time_factor=nan,
+            stood_still_ms=nan,
+            folder=self.folder,
+        )
+
+
+def _make(folder: Path) -> None:
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise LabError(
+                f"--out {folder}: there is something already, and a real flight is not flown again"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
+
+
+def why_lost(frame: MocapFrame, limits: LimitsConfig, home: tuple[float, float, float]) -> str | None:
+    """Return why a flight is over at a pose, by the limits that the laboratory has; None while it is not."""
+    x, y, z = frame.p_WB
+    _, qx, qy, _ = frame.q_WB
+    upright = 1.0 - 2.0 * (qx * qx + qy * qy)  # cosine of the tilt
+    if (radius := sqrt(x * x + y * y)) > limits.radius:
+        return f"left the flow: {radius:.2f} m from the axis"
+    if z > home[2] + limits.above:
+        return f"left the flow: {z - home[2]:.2f} m above the hover point"
+    if z < home[2] - limits.below:
+        return f"fell: {home[2] - z:.2f} m below the hover point"
+    if upright < cos(limits.tilt):
+        return f"tumbled: tilted beyond {limits.tilt:.2f} rad"
+    return None

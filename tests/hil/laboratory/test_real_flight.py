@@ -1,0 +1,330 @@
+"""A real flight's record: what the cameras saw is judged as the truth would be, whatever ends the flight."""
+
+import json
+import math
+import resource
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hil.pictures.report
+from firmware_py.wire.supervisor import State
+from firmware_py.wire.telemetry import BLOCKS
+from ground_station.config import StationConfig
+from ground_station.latency import LinkLatency
+from ground_station.links.loopback import LoopbackLink
+from ground_station.mocap import MocapFrame
+from ground_station.program import Cockpit
+from ground_station.station import GroundStation
+from ground_station.trajectory import FlightPlan, Goal
+from hil.config import load_config
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.channels import Unwrapped
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.metrics import free_flight, measure
+from hil.laboratory.real_flight import RealFlight
+from hil.laboratory.recorder import Recorder, load_events, load_log
+from hil.laboratory.result import Result, read_result
+from hil.laboratory.run import Request, fly, prepare
+from hil.pictures.compare import compare, load_run
+from hil.pictures.figures import PICTURES
+from hil.pictures.report import write_report
+from support.command import floaty
+from support.html_page import Page
+
+CONFIG = load_config()
+HOME = Goal(CONFIG.flight.home, 0.0)
+STATE = [variable.name for variable in BLOCKS[3].variables].index("supervisor.state")
+TURN_US = 5_000
+AGE_US = 40_000
+
+
+def recorder_of(folder: Path, experiment: str, clock: Any, said: list[str]) -> RealFlight:
+    return RealFlight(
+        folder, EXPERIMENTS[experiment], CONFIG, "floaty", (), "udp://127.0.0.1:19850", said.append, clock
+    )
+
+
+class Link:
+    """What the recorder reads of a link."""
+
+    def __init__(self, ground: GroundStation) -> None:
+        self.latency, self.late, self._ground = LinkLatency("air", 1_400, measured=True), 0, ground
+
+    @property
+    def sent(self) -> int:
+        return self._ground.counters.sent
+
+    @property
+    def supervisor_state(self) -> int | None:
+        sample = self._ground.telemetry.get(BLOCKS[3].id)
+        return None if sample is None else int(sample.values[STATE])
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Run folders of one flight: as the laboratory sees it, and as its ground station does."""
+    folder = tmp_path_factory.mktemp("both")
+    real, simulated = folder / "real", folder / "simulated"
+    simulated.mkdir()
+    experiment = EXPERIMENTS["yaw-step-0"]
+    flight = lockstep_flight(CONFIG, experiment, 4.0, 1, simulated / "telemetry.csv")
+    metadata = {"experiment": experiment.name, "config": CONFIG.model_dump_json()}
+    flight.recorder = Recorder(simulated, flight.channels(), metadata)
+    record = recorder_of(real, experiment.name, lambda: flight.now_us, [])
+    plan = FlightPlan(HOME, experiment.trajectory)
+    plan.start(CONFIG.flight.release_us)
+    cockpit = Cockpit(Link(flight.line.station), flight.line.station, plan)  # type: ignore[arg-type, attr-defined]
+    flight.events.every(TURN_US, TURN_US, lambda now_us: record.turn(cockpit, now_us))
+    flight.run()
+    flight.recorder.close()
+    flight.close()
+    shutil.copy(simulated / "telemetry.csv", real)
+    assert record.close() is not None
+    return real, simulated
+
+
+def test_the_cameras_judge_a_flight_as_the_truth_does(both: tuple[Path, Path]) -> None:
+    """The turn by 110 degrees: poses that stood 40 ms late in the log would settle 40 ms later."""
+    real, truth = (load_log(folder) for folder in both)
+    measured = [
+        measure(log, lost=False) | dict(EXPERIMENTS["yaw-step-0"].measure(free_flight(log)))
+        for log in (real, truth)
+    ]
+    for name in ("rms_x", "rms_y", "rms_z", "max_x", "max_y", "max_z"):
+        assert measured[0][name] == pytest.approx(measured[1][name], abs=0.002), name
+    assert measured[0]["settle"] == pytest.approx(measured[1]["settle"], abs=0.015)
+    assert measured[0]["attitude_max"] == pytest.approx(measured[1]["attitude_max"], abs=0.02)
+    assert measured[0]["peak_rate"] == pytest.approx(measured[1]["peak_rate"], rel=0.05)
+    assert measured[0]["age_mean"] == pytest.approx(measured[1]["age_mean"], abs=0.002)
+    assert measured[0]["poses_refused"] == measured[1]["poses_refused"]
+    assert measured[0]["unseen"] == 0.0
+
+
+def test_the_estimate_of_a_real_board_stands_in_the_log_as_the_board_has_it(both: tuple[Path, Path]) -> None:
+    real, truth = (load_log(folder) for folder in both)
+    names = [f"estimate.{name}" for name in ("x", "vy", "z", "roll", "pitch", "yaw", "r")]
+    names += ["control.u3", "motor.m2", "supervisor.state"]
+    at = np.searchsorted(truth.column("t").to_numpy(), 3_500_000)
+    row = np.searchsorted(real.column("t").to_numpy(), 3_500_000)
+    for name in names:
+        recent = truth.column(name).to_numpy()[at - 5 : at + 1]  # telemetry comes every 20 ms, and takes some
+        told = real.column(name).to_numpy()[row]
+        assert np.abs(recent - told).min() == pytest.approx(0.0, abs=1e-5 + 1e-6 * abs(told)), name
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of the same flight, simulated."""
+    folder = tmp_path_factory.mktemp("simulated") / "run"
+    prepare(folder)
+    fly(Request.of(EXPERIMENTS["yaw-step-0"], seed=1, duration_s=4.0), folder)
+    return folder
+
+
+def test_a_real_flight_lies_over_the_simulated_one(both: tuple[Path, Path], simulated: Path) -> None:
+    comparison = compare(load_run(both[0]), load_run(simulated))
+    apart = {one.name: one for one in comparison.apart}
+    assert apart["z"].rms < 0.3  # [cm] the same flight
+    assert apart["pitch"].rms < 1.0  # [deg]
+    assert apart["flap 1"].rms < 5.0
+    assert comparison.one_is_real
+    assert "truth.x" in comparison.missing[0]
+    assert "cameras.x" in comparison.missing[1]
+
+
+@pytest.mark.long
+def test_the_command_shows_both_and_says_what_only_one_has(
+    both: tuple[Path, Path],
+    simulated: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    assert floaty(monkeypatch, "compare", both[0], simulated, "--out", tmp_path / "out") == 1
+    shown = capsys.readouterr().out
+    assert "not in " in shown
+    assert "cameras.x" in shown
+    assert "first difference" not in shown
+    page = Page((tmp_path / "out" / "compare.html").read_text(encoding="utf-8"))
+    assert len(page.tables["apart"]) == 11
+
+
+def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Path], tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(both[0], tmp_path / "run"))
+    page = Page(write_report(folder).read_text(encoding="utf-8"))
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert "what the cameras saw" in text
+    assert "yaw-step-0, real flight" in text
+    assert "seed" not in {row[0] for row in page.tables["run"]}
+    drawn = [picture.title for picture in PICTURES if picture.needs in load_log(folder).column_names]
+    assert drawn == ["Track", "Errors", "Flaps", "Age", "Station", "Estimate"]
+    assert len(page.pictures) == 1 + len(drawn) + 1  # its own, and the way of the poses
+
+
+class Bench:
+    """A station that sees what the test says; nothing flies."""
+
+    def __init__(self, folder: Path, experiment: str = "hover") -> None:
+        self.now_us = 7_000_000
+        self.said: list[str] = []
+        self.record = recorder_of(folder, experiment, lambda: self.now_us, self.said)
+        self.plan = FlightPlan(HOME, EXPERIMENTS[experiment].trajectory)
+        link = LoopbackLink(lambda now_us, data: None, 1_400)
+        self.ground = GroundStation(link, self.plan, None, StationConfig())
+        self._link = SimpleNamespace(
+            latency=link.latency, late=0, sent=0, supervisor_state=State.FLYING
+        )  # fmt: skip
+        self.cockpit = Cockpit(self._link, self.ground, self.plan)  # type: ignore[arg-type]
+
+    def fly(self, duration_s: float, p: tuple[float, float, float] = HOME.p_WG) -> None:
+        """Turn after turn with the robot at a place."""
+        end_us = self.now_us + round(1e6 * duration_s)
+        while self.now_us < end_us:
+            self.now_us += TURN_US
+            self.ground.on_frame(MocapFrame(self.now_us - AGE_US, p, (1.0, 0.0, 0.0, 0.0), True), self.now_us)
+            self.record.turn(self.cockpit, self.now_us)
+
+    def result(self, **how: Any) -> Result:
+        result = self.record.close(**how)
+        assert result is not None
+        return result
+
+
+def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run", "yaw-step")
+    bench.fly(1.0, (0.2, 0.0, 1.15))
+    bench.plan.start(bench.now_us)
+    bench.fly(EXPERIMENTS["yaw-step"].duration_s + 0.05)  # the cameras see the past
+    bench.fly(2.0, (0.3, 0.0, 1.15))
+    result = bench.result(interrupted=True)
+    assert result.outcome == "completed"
+    assert result.metrics["flown"] == pytest.approx(EXPERIMENTS["yaw-step"].duration_s, abs=0.03)
+    assert result.metrics["max_x"] == pytest.approx(0.0, abs=1e-9)
+    assert load_log(tmp_path / "run").num_rows == pytest.approx(805, abs=2)
+
+
+def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run")
+    bench.plan.start(bench.now_us)
+    bench.fly(1.0)
+    bench.fly(0.2, (0.0, 0.46, 1.15))
+    bench.fly(5.0)
+    result = bench.result()
+    assert (result.outcome, result.cause) == ("lost", "left the flow: 0.46 m from the axis")
+    assert result.metrics["lost"] == 1.0
+    assert result.metrics["flown"] == pytest.approx(1.0, abs=0.05)
+    assert [event["text"] for event in load_events(tmp_path / "run")][-2].startswith("lost: left the flow")
+
+
+@pytest.mark.parametrize(
+    ("how", "outcome", "cause"),
+    [
+        ({"interrupted": True}, "interrupted", None),
+        ({"failure": "udp://…: lost: silent for 2 s"}, "error", "udp://…: lost: silent for 2 s"),
+        ({}, "completed", None),
+    ],
+)
+def test_whatever_ends_a_flight_its_result_is_written(
+    tmp_path: Path, how: dict[str, Any], outcome: str, cause: str | None
+) -> None:
+    bench = Bench(tmp_path / "run")
+    bench.record.note("station", "connected")
+    bench.plan.start(bench.now_us)
+    bench.fly(2.0)
+    bench.result(**how)
+    read = read_result(tmp_path / "run")
+    assert (read.outcome, read.cause, read.seed, read.board) == (outcome, cause, None, "real")
+    assert read.metrics["flown"] == pytest.approx(2.0, abs=0.06)
+    assert {verdict.metric for verdict in read.verdicts} == set(EXPERIMENTS["hover"].limits)
+    texts = [(event["source"], event["text"]) for event in load_events(tmp_path / "run")]
+    assert texts[:3] == [("station", "connected"), ("board", "supervisor: flying"), ("lab", "hover begins")]
+
+
+def test_a_killed_station_leaves_all_but_the_last_second_and_can_be_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hil.pictures.report, "PICTURES", PICTURES[:1])
+    bench = Bench(tmp_path / "run")
+    bench.plan.start(bench.now_us)
+    bench.fly(4.5)
+    left = Path(shutil.copytree(tmp_path / "run", tmp_path / "left"))
+    bench.result()
+    log = load_log(left)
+    assert log.column("t")[-1].as_py() >= 3_500_000
+    assert read_result(left).metrics["flown"] == pytest.approx(4.0, abs=0.1)
+    assert read_result(left).metrics["rms_x"] == pytest.approx(0.0, abs=1e-9)
+    assert "ended before the flight did" in write_report(left).read_text(encoding="utf-8")
+
+
+def test_slow_cameras_do_not_make_more_than_a_second_be_lost(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run")
+    for _ in range(32):
+        bench.now_us += 95_000
+        bench.record.turn(bench.cockpit, bench.now_us)
+    left = Path(shutil.copytree(tmp_path / "run", tmp_path / "left"))
+    bench.record.close()
+    assert load_log(left).column("t")[-1].as_py() > 32 * 95_000 - 1_100_000
+
+
+def test_a_flight_that_never_began_leaves_no_folder(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run")
+    bench.record.note("station", "no board")
+    assert bench.record.close("no answer") is None
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_real_flight_overwrites_nothing(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    Bench(tmp_path / "run").record.close()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "events.jsonl").write_text("{}")
+    with pytest.raises(LabError, match="there is something already"):
+        Bench(tmp_path / "other")
+    with pytest.raises(LabError, match="cannot be written"):
+        Bench(Path("/proc/floaty/run"))
+
+
+@contextmanager
+def small_files() -> Iterator[None]:
+    """No file may become larger than 150 kB, as on a disk that is full."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_a_full_disk_ends_the_record_and_not_the_flight(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run")
+    with small_files():
+        bench.fly(5.0)
+        assert len(bench.said) == 1
+        assert "no more is recorded" in bench.said[0]
+        assert 100 <= load_log(tmp_path / "run").num_rows < 500
+    bench.result()
+    assert read_result(tmp_path / "run").metrics["lost"] == 0.0
+
+
+def test_a_counter_of_sixteen_bits_goes_on_where_it_wraps() -> None:
+    count = Unwrapped()
+    assert [count(value) for value in (65_530.0, 65_535.0, 4.0, 4.0, 10.0)] == [0, 5, 10, 10, 16]
+
+
+def test_an_experiment_that_needs_what_only_a_laboratory_has_is_told_so(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run", "power")
+    bench.plan.start(bench.now_us)
+    bench.fly(1.0)
+    result = bench.result()
+    assert math.isnan(result.metrics["power"])
+    assert not result.passed
+    assert any("battery.power" in line for line in bench.said)
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["seed"] is None
