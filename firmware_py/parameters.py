@@ -1,7 +1,6 @@
 """The parameters of the firmware: what may be changed on the running board, with its limits.
 
-Names are the Crazyflie's and the original Floaty's. Limits are those of the configuration, where there is one. The gains
-`extCtrl.*_P` keep the signs of the original, which counted roll and pitch inputs the other way (u1 = -c1, u2 = -c0).
+Names are the Crazyflie's and the original Floaty's. Limits are those of the configuration, where there is one.
 """
 
 from collections.abc import Iterator
@@ -28,16 +27,10 @@ from firmware_py.logic.plugs import GROUP
 from firmware_py.running import Running
 from firmware_py.supervisor import Manual
 from firmware_py.variables import F32, I8, I16, SCALARS, U8, U16, U32
+from firmware_py.wire.parameter_names import GAINS
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import STREAM
 
-GAINS = {  # name in the original: name in the core, sign
-    "x_P": ("gain_x", -1), "y_P": ("gain_y", -1), "z_P": ("gain_z", 1),
-    "vx_P": ("gain_vx", -1), "vy_P": ("gain_vy", -1), "vz_P": ("gain_vz", 1),
-    "roll_P": ("gain_roll", -1), "pitch_P": ("gain_pitch", -1), "yaw_P": ("gain_yaw", 1),
-    "roll_rate_P": ("gain_p", -1), "pitch_rate_P": ("gain_q", -1), "yaw_rate_P": ("gain_r", 1),
-    "z_I": ("gain_iz", 1),
-}  # fmt: skip
 FLAPS = ("m1", "m2", "m3", "m4")
 TRIM_LIMIT = 12_000  # as in ServoConfig
 SETPOINT_LIMIT = 5.0  # [m]

@@ -6,12 +6,15 @@ It knows nothing of the laboratory: what a profile says of it arrives as `Ground
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from firmware_py.wire import WireError
 from firmware_py.wire.supervisor import State
-from ground_station.clock import clock_us
+from ground_station.clock import clock_us, wait
 from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
+from ground_station.controls import Answer, Request
 from ground_station.errors import MocapError
 from ground_station.frame_rate import FrameRate
 from ground_station.links.live_link import LiveLink
@@ -25,6 +28,8 @@ from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import FlightPlan, Goal, Trajectory
+
+ASK_PERIOD_S = 0.002  # between two looks for an answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +106,18 @@ def fly(
         source.close()
         if telemetry is not None:
             telemetry.close()
+
+
+def ask(link: LiveLink, request: Request) -> Answer:
+    """Ask a board that is connected and not flown from here; raises `LinkError` when it is lost."""
+    link.ask(clock_us(), request)
+    while (answer := link.answer(clock_us())) is None:
+        for t_us, data in link.received():
+            with suppress(WireError):
+                link.receive(t_us, data)
+        link.check()
+        wait(ASK_PERIOD_S)
+    return answer
 
 
 def run_until(stopping: Callable[[], bool], duration_s: float | None) -> Callable[[], bool]:

@@ -40,19 +40,28 @@ class Hold:
 
 
 class FlightPlan:
-    """What a station flies: `home` until it is told to `start`, then the trajectory that `make(home, start_us)` returns."""
+    """What a station flies: `home` until it is told to `start`, then the trajectory that `make(home, start_us)` returns.
+
+    Whoever steers has the last word.
+    """
 
     def __init__(self, home: Goal, make: Callable[[Goal, int], Trajectory]) -> None:
         self.home = home
         self.start_us: int | None = None  # when the trajectory's clock begins, once that is known
         self._make = make
         self._flown: Trajectory = Hold(home)
+        self._steered = False
 
     def start(self, start_us: int) -> None:
         """Let the trajectory's clock begin at an instant; only the first call counts."""
         if self.start_us is None:
             self.start_us = start_us
-            self._flown = self._make(self.home, start_us)
+            if not self._steered:
+                self._flown = self._make(self.home, start_us)
+
+    def steer(self, trajectory: Trajectory) -> None:
+        """Fly something else from now on."""
+        self._flown, self._steered = trajectory, True
 
     def at(self, t_us: int) -> Goal:
         return self._flown.at(t_us)

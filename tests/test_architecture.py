@@ -61,7 +61,9 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "threading": (
         "hil/pictures/window.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
+        "ground_station/terminal.py",
     ),
+    "prompt_toolkit": ("ground_station/terminal.py",),
     "multiprocessing": ("hil/studies/sweep.py",),
     "concurrent": ("hil/studies/sweep.py",),
     "unicorn": ("firmware_py/export/cortex_m4.py",),

@@ -25,7 +25,8 @@ from firmware_py.export.profile_c import profile_source
 from firmware_py.export.reading import float_literal
 from firmware_py.logic.loading import load_logic, translation_of
 from firmware_py.logic.plugs import GROUP
-from firmware_py.parameters import FLAPS, GAINS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits
+from firmware_py.parameters import FLAPS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits
+from firmware_py.wire.parameter_names import GAINS
 
 TEMPLATES = Path(__file__).parent / "app"
 MARKER = Path("src") / "floaty_app.c"  # a folder with this file is an app and may be written over

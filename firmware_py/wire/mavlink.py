@@ -26,7 +26,9 @@ from firmware_py.wire.mavlink_services import (  # offered here, too
     autopilot_version as autopilot_version, command as command, command_ack as command_ack,
     extended_state as extended_state, ftp_nak as ftp_nak, heartbeat as heartbeat, mavlink_name as mavlink_name,
     message_interval as message_interval, named_value as named_value, no_log_data as no_log_data, no_logs as no_logs,
-    no_mission as no_mission, parameter as parameter, parameter_error as parameter_error, ping_answer as ping_answer,
+    no_mission as no_mission, parameter as parameter, parameter_list as parameter_list,
+    parameter_read as parameter_read, parameter_set as parameter_set,
+    parameter_error as parameter_error, ping_answer as ping_answer,
     refused_mission as refused_mission, station_heartbeat as station_heartbeat, status_text as status_text,
     timesync as timesync,
 )  # fmt: skip

@@ -129,6 +129,24 @@ def parameter(name: str, value: float, index: int, count: int) -> Message:
     )
 
 
+def parameter_list(system: int, component: int) -> Message:
+    """A request for all parameters."""
+    return dialect.MAVLink_param_request_list_message(system, component)
+
+
+def parameter_read(system: int, component: int, which: str | int) -> Message:
+    """A request for one parameter, by name or by its index."""
+    name, index = (which, -1) if isinstance(which, str) else ("", which)
+    return dialect.MAVLink_param_request_read_message(system, component, _text(name, NAME_SIZE), index)
+
+
+def parameter_set(system: int, component: int, name: str, value: float) -> Message:
+    """A request to change a parameter, as REAL32."""
+    return dialect.MAVLink_param_set_message(
+        system, component, _text(name, NAME_SIZE), value, dialect.MAV_PARAM_TYPE_REAL32
+    )
+
+
 def command_ack(number: int, result: int, to_system: int, to_component: int) -> Message:
     """The answer to a command: MAV_RESULT 0 accepted, 1 temporarily rejected, 2 denied, 3 unsupported, 4 failed."""
     return dialect.MAVLink_command_ack_message(number, result, 0, 0, to_system, to_component)

@@ -18,15 +18,19 @@ from statistics import median_low
 import cflib.crtp
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig, LogTocElement
+from cflib.crazyflie.param import ParamTocElement
 from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
 
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, decode_log_data, encode_ext_pose
+from firmware_py.wire.scalars import PARAMETER_SCALARS
 from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, Block, Sample
 from ground_station.clock import clock_us
+from ground_station.controls import Answer, Request
 from ground_station.corrections import correct
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency
+from ground_station.links.crtp_controls import PORTS, CrtpControls, Entry
 from ground_station.links.live_link import (
     ANSWER_TIMEOUT_US,
     POLL_S,
@@ -67,6 +71,7 @@ class CrazyradioLink(LiveLink):
         self._blocks: dict[int, Block] = {}
         self._telemetry_us = 0  # the last packet of a log block
         self._quality = self._rate = 0.0  # cflib's [%, 100: no retries; exchanges/s], 0 over UDP
+        self._controls = CrtpControls(lambda data: self._do(partial(self._transmit, data)), self._parameters)
         quiet_cflib()
 
     def _open(self) -> None:
@@ -93,6 +98,8 @@ class CrazyradioLink(LiveLink):
         if crazyflie is None or not self._connected.wait(POLL_S):
             return False
         crazyflie.add_port_callback(CRTPPort.LINKCTRL, self._on_echo)
+        for port in PORTS:
+            crazyflie.add_port_callback(port, self._on_service_packet)
         crazyflie.link_statistics.link_quality_updated.add_callback(self._on_quality)
         crazyflie.link_statistics.uplink_rate_updated.add_callback(self._on_rate)
         self._create_blocks(crazyflie)
@@ -158,6 +165,30 @@ class CrazyradioLink(LiveLink):
         if missing:
             self._notices.append(f"the board has no {', '.join(missing)}: without these blocks of telemetry")
 
+    def _parameters(self) -> dict[str, Entry]:
+        """Return the board's table of parameters, as cflib has fetched it, but those of types that Floaty has not."""
+        groups = {} if self._crazyflie is None else self._crazyflie.param.toc.toc
+        scalars = {ParamTocElement.types[number][0]: scalar for number, scalar in PARAMETER_SCALARS.items()}
+        return {
+            f"{group}.{name}": Entry(
+                element.ident,
+                scalars[element.ctype],
+                element.access == ParamTocElement.RW_ACCESS,
+                element.is_persistent(),
+            )
+            for group, elements in groups.items()
+            for name, element in elements.items()
+            if element.ctype in scalars
+        }
+
+    def ask(self, now_us: int, request: Request) -> None:
+        """Begin an operator's request."""
+        self._controls.ask(now_us, request)
+
+    def answer(self, now_us: int) -> Answer | None:
+        """Return the answer once, when it is there."""
+        return self._controls.answer(now_us)
+
     def start_telemetry(self, now_us: int) -> None:
         """Nothing: the log blocks run since `open`."""
 
@@ -183,6 +214,8 @@ class CrazyradioLink(LiveLink):
         Blocks of a board are not sampled together; here they get the beginning of their period as common time stamp.
         """
         packet = decode(data)
+        if packet.port in PORTS:
+            self._controls.hear(now_us, packet)
         if packet.port != PORT_LOG or packet.channel != CHANNEL_LOG_DATA:
             return ()
         number, timestamp_ms, values = decode_log_data(packet.data)
@@ -203,6 +236,9 @@ class CrazyradioLink(LiveLink):
         if packet.channel == CHANNEL_LOG_DATA:
             self._telemetry_us = clock_us()
             self._hear(bytes((packet.header,)) + bytes(packet.data))
+
+    def _on_service_packet(self, packet: CRTPPacket) -> None:
+        self._hear(bytes((packet.header,)) + bytes(packet.data))
 
     def _ask_for_echo(self, now_us: int) -> None:
         """Let the board send a packet back, well apart from corrections: both would be slower."""

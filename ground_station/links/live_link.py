@@ -14,6 +14,7 @@ from contextlib import suppress
 from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us
+from ground_station.controls import Answer, Request
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency
 from ground_station.mocap import MocapFrame
@@ -107,6 +108,14 @@ class LiveLink(ABC):
     @abstractmethod
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
         """Return the telemetry in what arrived at `now_us`; `WireError` if it is malformed."""
+
+    @abstractmethod
+    def ask(self, now_us: int, request: Request) -> None:
+        """Begin an operator's request; a link is `ground_station.controls.Controls`."""
+
+    @abstractmethod
+    def answer(self, now_us: int) -> Answer | None:
+        """Return the answer once, when it is there."""
 
     @abstractmethod
     def summary(self) -> str:

@@ -18,11 +18,11 @@ from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message,
 from firmware_py.wire.telemetry import BLOCKS, Sample
 from ground_station.latency import LinkLatency
 from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget
+from ground_station.links.mavlink_controls import BOARD_COMPONENT, MavlinkControls
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
 SYSTEM, COMPONENT = 255, 190  # a ground station, as the standard numbers them
-BOARD_COMPONENT = 1  # autopilot
 NO_AUTOPILOT = 8  # in a heartbeat: a ground station's, or a camera's
 EVERYBODY = 0  # system to talk to until the board is known
 LOOK_PERIOD_US = 1_000_000
@@ -82,6 +82,7 @@ class MavlinkLink:
         self._asked = False
         self._samples = 0  # of telemetry since the last look
         self._look_us = 0  # when to look after the link next
+        self.controls = MavlinkControls(self._send, lambda: self._addressee)
         self._time_request_ns = 0  # own clock in the last one
         self._read_us = 0  # when what is being understood was read
         self._handlers: dict[int, Callable[[int, Message], Sequence[Sample]]] = {
@@ -89,6 +90,7 @@ class MavlinkLink:
             mavlink.MSG_TIMESYNC: self._on_timesync,
             mavlink.MSG_DEBUG_FLOAT_ARRAY: self._on_flight_array,
             mavlink.MSG_COMMAND_ACK: self._on_command_ack,
+            mavlink.MSG_PARAM_VALUE: self._on_parameter,
             mavlink.MSG_STATUSTEXT: self._on_text,
         }
 
@@ -186,8 +188,12 @@ class MavlinkLink:
 
     def _on_command_ack(self, now_us: int, message: Message) -> Sequence[Sample]:
         self.answered = True
-        if message.result != ACCEPTED:
+        if not self.controls.hear(self._read_us, message) and message.result != ACCEPTED:
             self.texts.append(f"the board refuses command {message.command}: result {message.result}")
+        return ()
+
+    def _on_parameter(self, now_us: int, message: Message) -> Sequence[Sample]:
+        self.controls.hear(self._read_us, message)
         return ()
 
     def _on_text(self, now_us: int, message: Message) -> Sequence[Sample]:

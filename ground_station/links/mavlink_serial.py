@@ -17,6 +17,7 @@ import serial
 
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us, signing_start
+from ground_station.controls import Answer, Request
 from ground_station.errors import LinkError
 from ground_station.links.live_link import CLOSE_TIMEOUT_S, POLL_S, LiveLink
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
@@ -172,6 +173,16 @@ class MavlinkSerialLink(LiveLink):
     def _send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         with self._link_lock:
             self._link.send(now_us, frame, goal)
+
+    def ask(self, now_us: int, request: Request) -> None:
+        """Begin an operator's request."""
+        with self._link_lock:
+            self._link.controls.ask(now_us, request)
+
+    def answer(self, now_us: int) -> Answer | None:
+        """Return the answer once, when it is there."""
+        with self._link_lock:
+            return self._link.controls.answer(now_us)
 
     def _carry(self, now_us: int, data: bytes) -> None:
         if (port := self._port) is not None:

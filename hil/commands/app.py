@@ -16,6 +16,7 @@ from hil.commands.listing import list_experiments
 from hil.commands.new import new
 from hil.commands.options import INTERRUPTED
 from hil.commands.paper import paper, study
+from hil.commands.param import param
 from hil.commands.pictures import report, view
 from hil.commands.serve import serve
 from hil.commands.station import station
@@ -29,7 +30,7 @@ def app() -> None:
 
 
 for command in (
-    fly, new, list_experiments, view, report, export, serve, station, compare, paper, study, drag_model, deploy,
+    fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, drag_model, deploy,
 ):  # fmt: skip
     app.add_command(command)
 

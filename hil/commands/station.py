@@ -13,7 +13,10 @@ from hil.commands.tables import print_result
 from hil.errors import LabError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ground_station.program import GroundSettings
+    from ground_station.trajectory import Goal, Trajectory
     from hil.config import LabConfig
 
 
@@ -68,13 +71,18 @@ def station(
 
     Ctrl-C ends the flight: nothing more goes up, the board puts its flaps to hover, the link is closed.
 
+    While it flies, lines like goal 0.1 0 1.15, set controller.gain_y -2.0 or stop act at once; help shows what can be typed.
+
     Exit code with --out: as `floaty fly`, by the limits of the trajectory's experiment on what the cameras saw.
     """
     from ground_station.errors import LinkError, MocapError
-    from ground_station.program import Session, fly, run_until
+    from ground_station.operator import COMMANDS, Operator
+    from ground_station.program import Cockpit, Session, fly, run_until
+    from ground_station.terminal import Terminal
     from hil.config import load_config
-    from hil.experiments import find_experiment
+    from hil.experiments import EXPERIMENTS, find_experiment
     from hil.laboratory.real_flight import RealFlight
+    from hil.laboratory.recorder import OPERATOR
 
     config = load_config(profile, overrides)
     experiment = find_experiment(trajectory)
@@ -90,19 +98,28 @@ def station(
         if flight is not None:
             flight.note("station", text)
 
+    def note(text: str) -> None:
+        if flight is not None:
+            flight.note(OPERATOR, text)
+
+    operator = Operator(_trajectory_of, say, note)
+    terminal = Terminal(lambda: (*COMMANDS, *EXPERIMENTS, *operator.known))
+
+    def steer(cockpit: Cockpit, now_us: int) -> None:
+        for line in terminal.lines():
+            operator.take(line)
+        operator.turn(cockpit, now_us)
+
     session = Session(uri, mocap, experiment.trajectory, start_s, flight.telemetry if flight else log, record)
     stops = stop_signals()
+    hands = [steer] if flight is None else [steer, flight.turn]
     failure = ""
     try:
-        fly(
-            settings_of(config),
-            session,
-            tell,
-            run_until(lambda: bool(stops), duration),
-            [flight.turn] if flight else [],
-        )
+        fly(settings_of(config), session, tell, run_until(lambda: bool(stops), duration), hands)
     except (LinkError, MocapError, OSError, ImportError) as error:
-        failure = _why(error, uri)
+        failure = why(error, uri)
+    finally:
+        terminal.close()
     result = flight.close(failure, bool(stops)) if flight is not None else None
     if result is not None:
         write_pictures(result.folder, experiment)
@@ -114,7 +131,17 @@ def station(
     return INTERRUPTED if result.outcome == "interrupted" else 1
 
 
-def _why(error: Exception, uri: str) -> str:
+def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
+    from ground_station.controls import ControlsError
+    from hil.experiments import find_experiment
+
+    try:
+        return find_experiment(name).trajectory
+    except LabError as error:
+        raise ControlsError(str(error)) from None
+
+
+def why(error: Exception, uri: str) -> str:
     """Return the line that says why the station gave up."""
     from ground_station.errors import LinkError
 

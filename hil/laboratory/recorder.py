@@ -22,6 +22,7 @@ from hil.errors import LabError
 from hil.laboratory.ages import at_exposure
 
 ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to disk
+OPERATOR = "operator"  # source of the events that somebody has brought about at the terminal
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
 

@@ -3,9 +3,11 @@
 Lengths in cm, angles in degrees, times in ms. Colours are those of Okabe and Ito, told apart with every colour vision.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from ground_station.latency import STAGES
 from hil.laboratory.faults import Span
 from hil.laboratory.metrics import attitude_error, column, is_real, position_error
+from hil.laboratory.recorder import OPERATOR
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
     "#e69f00", "#56b4e9", "#009e73", "#b8a900", "#0072b2", "#d55e00", "#cc79a7", "#888888",
@@ -34,6 +37,7 @@ IN_ITS_PLACE = {  # over MAVLink
 STAGE_COLOURS = dict(zip(STAGES, SERIES_COLOURS, strict=False))  # of a pose's age
 
 NEAR_CM, ATTITUDE_DEG = 6.0, 20.0  # paper, Hover_figure: errors below 6 cm most of the time, below 20 degrees
+MARKS = b"marks"  # in the metadata of a log that is drawn
 TICK_MS = 10.0  # of the estimator's horizon
 
 Read = Callable[[pa.Table], NDArray[np.float64]]
@@ -214,3 +218,14 @@ def _changes(
 ) -> tuple[NDArray[np.float64], list[str]]:
     begins = np.flatnonzero(np.diff(codes, prepend=-1)) if len(codes) else np.empty(0, np.int64)
     return column(rows, "t")[begins], [names[code] for code in codes[begins]]
+
+
+def with_marks(log: pa.Table, events: Iterable[Mapping[str, Any]]) -> pa.Table:
+    """Return a log whose figures show what an operator did."""
+    marks = [(event["t_us"], event["text"]) for event in events if event["source"] == OPERATOR]
+    return log.replace_schema_metadata({**(log.schema.metadata or {}), MARKS: json.dumps(marks).encode()})
+
+
+def marks_of(log: pa.Table) -> list[tuple[float, str]]:
+    """Return when [us] an operator did what, of a log `with_marks`."""
+    return [(t_us, text) for t_us, text in json.loads((log.schema.metadata or {}).get(MARKS, b"[]"))]

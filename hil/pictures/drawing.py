@@ -9,7 +9,12 @@ import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from hil.laboratory.recorder import release_of
+from hil.pictures.curves import BLUE, marks_of
+
+MARK_LENGTH = 28  # letters
 WIDTH, DPI = 9.2, 115  # [in], 1/in
+MARK_COLOUR = BLUE
 STYLE: Any = {
     "axes.grid": True,
     "axes.spines.right": False,
@@ -29,6 +34,20 @@ def png(draw: Callable[..., Figure], *flights: pa.Table) -> bytes:
         file = io.BytesIO()
         draw(*flights).savefig(file, format="png", dpi=DPI)
     return file.getvalue()
+
+
+def draw_marks(axes: Sequence[Axes], log: pa.Table) -> None:
+    """Draw a line for each mark, which the first of the axes names; the time axis is zero at the release."""
+    release_us = release_of(log.schema.metadata)
+    for t_us, text in marks_of(log):
+        at_s = 1e-6 * (t_us - release_us)
+        for one in axes:
+            one.axvline(at_s, color=MARK_COLOUR, linestyle=":", linewidth=0.9)
+        short = text if len(text) <= MARK_LENGTH else f"{text[: MARK_LENGTH - 1]}…"
+        axes[0].text(
+            at_s, 0.02, short, transform=axes[0].get_xaxis_transform(), color=MARK_COLOUR, fontsize=6.5,
+            rotation=90, ha="right", va="bottom", clip_on=True,
+        )  # fmt: skip
 
 
 def stack(heights: Sequence[float]) -> tuple[Figure, list[Axes]]:

@@ -1,6 +1,7 @@
 """The figures of a flight as PNG, after the paper's figure Hover_figure; also of a flight that was lost or never began.
 
-Axes carry cm, degrees, ms and seconds from the release. Grey: the robot was still held; red: a fault was in force.
+Axes carry cm, degrees, ms and seconds from the release. Grey: the robot was still held; red: a fault was in force; dotted
+blue: an operator did something.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, scene
 from hil.pictures.curves import Curves
-from hil.pictures.drawing import WIDTH, stack
+from hil.pictures.drawing import WIDTH, draw_marks, stack
 from hil.pictures.overlays import since_release
 from hil.pictures.picture import Picture
 
@@ -44,7 +45,7 @@ def _limits(axes: Axes, limit: float) -> None:
 
 
 def shade(axes: Sequence[Axes], rows: pa.Table) -> None:
-    """Shade when the robot was held and when a fault was in force, which the first of the axes names."""
+    """Shade when the robot was held and when a fault was in force, and mark what an operator did; the first axes name it."""
     times = since_release(rows)
     held = times[column(rows, "flight.free") < 0.5]
     for one in axes:
@@ -66,6 +67,7 @@ def shade(axes: Sequence[Axes], rows: pa.Table) -> None:
             begin, 0.98, ", ".join(kinds), transform=axes[0].get_xaxis_transform(), color=curves.RED, fontsize=6.5,
             rotation=90, ha="left", va="top", clip_on=True,
         )  # fmt: skip
+    draw_marks(axes, rows)
 
 
 def track(rows: pa.Table) -> Figure:

@@ -21,7 +21,7 @@ from hil.laboratory.metrics import METRICS, SHOWN
 from hil.laboratory.recorder import load_events, load_log, release_of
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
-from hil.pictures.curves import own_logic
+from hil.pictures.curves import own_logic, with_marks
 from hil.pictures.figures import OWN_LOGIC, PICTURES, SCHEDULE, WAY
 from hil.pictures.gallery import pictures_of
 from hil.pictures.pages import data_uri, write_page
@@ -69,7 +69,8 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
 
     `experiment` is what was flown; without it, it is looked for where the run says.
     """
-    log, result = load_log(folder), read_result(folder)
+    result, events = read_result(folder), load_events(folder)
+    log = with_marks(load_log(folder), events)
     experiment = experiment or find_again(result.experiment, result.source)
     own = pictures_of(experiment) if experiment else ()
     schedule = load_schedule(folder).replace_schema_metadata(log.schema.metadata)
@@ -89,7 +90,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         found=experiment is not None,
         rows=metric_rows(result),
         faults=fault_rows(span.fault for span in spans_of(log.schema.metadata)),
-        events=load_events(folder),
+        events=events,
         release_us=release_of(log.schema.metadata),
         story=story_of(log, result),
         pictures=shown,

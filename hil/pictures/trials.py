@@ -90,6 +90,7 @@ def follow(quantities: tuple[Quantity, ...], window_s: tuple[float, float], *fli
                 )  # fmt: skip
         one.set_ylabel(quantity.label)
         _shade_faults(one, flights[0])
+        _mark(one, flights[0])
         one.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     longest = max(float(measures.seconds(flight).max(initial=0.0)) for flight in free)
     axes[-1].set_xlim(window_s[0], max(min(window_s[1], longest), window_s[0] + 0.1))
@@ -137,6 +138,12 @@ def _spans(flight: pa.Table) -> list[tuple[float, float, str]]:
 def _shade_faults(axes: Axes, flight: pa.Table) -> None:
     for begin_s, end_s, _ in _spans(flight):
         axes.axvspan(begin_s, end_s, color=GREY, alpha=0.15, linewidth=0)
+
+
+def _mark(axes: Axes, flight: pa.Table) -> None:
+    from hil.pictures.drawing import draw_marks
+
+    draw_marks([axes], flight)
 
 
 def _names(flight: pa.Table) -> dict[float, str]:

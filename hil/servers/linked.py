@@ -141,7 +141,7 @@ class StationProcess:
         """Return the station's process; it starts when the laboratory already runs, which may take a while to compile."""
         if self._station is None:
             self._station = subprocess.Popen(
-                self._command, env={**os.environ, **self._environment}, stdout=self._output,
+                self._command, env={**os.environ, **self._environment}, stdin=subprocess.DEVNULL, stdout=self._output,
                 stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
         return self._station

@@ -55,6 +55,10 @@ class Board(LiveLink):
     def receive(self, now_us, data):
         return ()
 
+    def ask(self, now_us, request): ...
+
+    def answer(self, now_us): ...
+
     def summary(self):
         return ""
 

@@ -57,6 +57,16 @@ def test_a_failed_limit_is_exit_code_one(
         (["fly", "hover", "--set", "controler.gain_z=1"], "did you mean controller?"),
         (["fly", "hover", "--out", "/proc/floaty/run"], "--out /proc/floaty/run: cannot be written"),
         (["fly", "hover", "--seeds", "2", "--view"], "--seeds 2"),
+        (
+            ["station", "--link", "udp://127.0.0.1:1", "--out", "a", "--log", "b"],
+            "--log b: --out a has a telemetry.csv",
+        ),
+        (
+            ["param", "set", "controller.gain_z", "--link", "udp://127.0.0.1:1"],
+            "controller.gain_z: expected NAME=VALUE",
+        ),
+        (["param", "set", "a=b", "--link", "udp://127.0.0.1:1"], "a=b: expected NAME=VALUE"),
+        (["param", "list", "--link", "usb://1"], "usb://1: expected radio://"),
         (["fly", "hover", "--seeds", "2", "--perfetto"], "--seeds 2"),
         (["fly", "hover", "--bogus"], "No such option"),
         (["fly"], "Missing argument"),

@@ -29,7 +29,7 @@ def log_of(exposed, times, sign=1.0):
 
 def rows(count):
     times = np.arange(count) * float(PERIOD_US) + 1_000_000
-    return times, (times - AGE_US) // FRAME_US * FRAME_US
+    return times, (times - AGE_US) // FRAME_US * FRAME_US + 2_000  # between two rows
 
 
 def test_a_pose_stands_where_it_was_true():

@@ -33,9 +33,12 @@ from hil.laboratory.real_flight import RealFlight
 from hil.laboratory.recorder import Recorder, load_events, load_log
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import Request, fly, prepare
-from hil.pictures.compare import compare, load_run
+from hil.pictures import figures
+from hil.pictures.compare import _judged, compare, load_run
+from hil.pictures.curves import with_marks
 from hil.pictures.figures import PICTURES
 from hil.pictures.report import write_report
+from hil.pictures.trials import YAW_STEP
 from support.command import floaty
 from support.html_page import Page
 
@@ -169,6 +172,29 @@ def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Pa
     assert len(page.pictures) == 1 + len(drawn) + 1  # its own, and the way of the poses
 
 
+def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[Path, Path]) -> None:
+    events = [
+        {
+            "t_us": 3_000_000,
+            "source": "operator",
+            "text": "set controller.gain_y -2, was -1.6 (extCtrl.y_P 2)",
+        },
+        {"t_us": 2_000_000, "source": "station", "text": "poses 963"},
+    ]
+    log = with_marks(load_log(both[0]), events)
+    for draw in (figures.errors, figures.flaps, YAW_STEP.draw):
+        drawn = draw(log).axes
+        named = [text.get_text() for axes in drawn for text in axes.texts]
+        assert any(text.startswith("set controller.gain_y -2") for text in named)
+        assert not any("poses" in text for text in named)
+        for axes in drawn:
+            assert any(
+                list(line.get_xdata()) == pytest.approx([2.0, 2.0], abs=0.02)  # from the release
+                for line in axes.lines
+                if len(line.get_xdata()) == 2
+            )
+
+
 class Bench:
     """A station that sees what the test says; nothing flies."""
 
@@ -209,6 +235,16 @@ def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(
     assert result.metrics["flown"] == pytest.approx(EXPERIMENTS["yaw-step"].duration_s, abs=0.03)
     assert result.metrics["max_x"] == pytest.approx(0.0, abs=1e-9)
     assert load_log(tmp_path / "run").num_rows == pytest.approx(805, abs=2)
+
+
+def test_a_comparison_shows_what_was_judged_and_a_second_around_it(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run", "yaw-step")
+    bench.fly(5.0)
+    bench.plan.start(bench.now_us)
+    bench.fly(20.0)
+    bench.result()
+    times = _judged(load_log(tmp_path / "run")).column("t").to_numpy()
+    assert (times[0], times[-1]) == pytest.approx((4e6, 11e6), abs=60_000)
 
 
 def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp_path: Path) -> None:

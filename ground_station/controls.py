@@ -1,0 +1,129 @@
+"""What an operator may do with a board beside flying it: its parameters, arming, the emergency stop.
+
+A request begins with `ask`; whoever keeps the link going calls `answer` until there is one. Nobody waits in here, so that
+poses go on. `Dialogue` is what all protocols have in common: a script of exchanges, each repeated until its reply comes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from enum import Enum
+from math import nan
+from typing import Any, Generic, Protocol, TypeVar
+
+REPEAT_US = 100_000  # without a reply, until the request is sent again
+PATIENCE_US = 2_000_000  # without a reply, until it is given up
+
+
+class ControlsError(Exception):
+    """The board refuses, does not know what is meant, or does not answer; the text is one line."""
+
+
+class Action(Enum):
+    """What may be asked for."""
+
+    LIST = "list"  # parameters and their values: all, or at least those whose names begin with a name
+    READ = "read"
+    WRITE = "write"
+    SAVE = "save"  # the persistent parameters, for the next boot
+    ARM = "arm"  # and leave an emergency stop
+    STOP = "stop"  # at once: flaps at hover until the board is armed
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One wish; `name` is the board's own."""
+
+    action: Action
+    name: str = ""
+    value: float = nan
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What became of it: the parameters that were asked for, by the names of the link; `error` is empty if all is well."""
+
+    values: tuple[tuple[str, float], ...]
+    error: str = ""
+
+
+class Controls(Protocol):
+    """One board. A request replaces the one before it."""
+
+    def ask(self, now_us: int, request: Request) -> None:
+        """Begin."""
+        ...
+
+    def answer(self, now_us: int) -> Answer | None:
+        """Return the answer once, when it is there; to be called again and again."""
+        ...
+
+
+M = TypeVar("M")  # a message of the protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange(Generic[M]):
+    """One message and its reply; `take` returns None for a message that is something else."""
+
+    send: Callable[[int], object]
+    take: Callable[[M], Any]
+    waits: bool = False  # the reply comes by itself: send only when it does not
+
+
+Settings = tuple[tuple[str, float], ...]
+Script = Generator[Exchange[M], Any, Settings]
+
+
+class Dialogue(Generic[M]):
+    """`Controls` over any protocol: `script_of` says for a request which exchanges it takes; it raises `ControlsError`."""
+
+    def __init__(self, script_of: Callable[[Request], Script[M]]) -> None:
+        self._script_of = script_of
+        self._script: Script[M] | None = None
+        self._exchange: Exchange[M] | None = None
+        self._answer: Answer | None = None
+        self._again_us = self._give_up_us = 0
+
+    def ask(self, now_us: int, request: Request) -> None:
+        """Begin; an older request is forgotten."""
+        self._answer = None
+        self._script = self._script_of(request)
+        self._go_on(now_us, None)
+
+    def hear(self, now_us: int, message: M) -> bool:
+        """Take a message; whether it was the reply that was waited for."""
+        reply = None if self._exchange is None else self._exchange.take(message)
+        if reply is not None:
+            self._go_on(now_us, reply)
+        return reply is not None
+
+    def answer(self, now_us: int) -> Answer | None:
+        """Return the answer once it is there; repeat what was not replied to."""
+        if self._exchange is not None and now_us >= self._again_us:
+            if now_us >= self._give_up_us:
+                self._end(Answer((), f"no answer within {PATIENCE_US * 1e-6:.0f} s"))
+            else:
+                self._again_us = now_us + REPEAT_US
+                self._exchange.send(now_us)
+        answer, self._answer = self._answer, None
+        return answer
+
+    def _go_on(self, now_us: int, reply: Any) -> None:
+        assert self._script is not None
+        try:
+            exchange = self._script.send(reply)
+        except StopIteration as end:
+            self._end(Answer(end.value))
+        except ControlsError as error:
+            self._end(Answer((), str(error)))
+        else:
+            self._exchange = exchange
+            self._again_us, self._give_up_us = now_us + REPEAT_US, now_us + PATIENCE_US
+            if not exchange.waits:
+                exchange.send(now_us)
+
+    def _end(self, answer: Answer) -> None:
+        self._script = self._exchange = None
+        self._answer = answer

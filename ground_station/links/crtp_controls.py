@@ -1,0 +1,153 @@
+"""An operator's requests over CRTP, sans I/O: the parameter, platform and supervisor ports of a Crazyflie."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+from firmware_py.wire.crtp import (
+    CHANNEL_GENERIC,
+    PORT_LOCALISATION,
+    PORT_PARAMETERS,
+    PORT_PLATFORM,
+    PORT_SUPERVISOR,
+    Packet,
+    encode,
+)
+from firmware_py.wire.localisation import EMERGENCY_STOP
+from firmware_py.wire.parameter_names import OF_PROFILE
+from firmware_py.wire.parameters import (
+    CHANNEL_MISC,
+    CHANNEL_READ,
+    CHANNEL_WRITE,
+    OK,
+    Misc,
+    decode_ident,
+    encode_ident,
+)
+from firmware_py.wire.scalars import Scalar
+from ground_station.controls import Action, ControlsError, Dialogue, Exchange, Request, Script, Settings
+
+PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `hear` wants
+PLATFORM_COMMAND, ARM, RECOVER = 0, 1, 2
+SUPERVISOR_INFO, GET_BITS, REPLY = 0, 0x0C, 0x80
+LOCKED = 1 << 6  # of those bits: stopped until it is recovered
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A parameter in the board's table of contents."""
+
+    number: int
+    scalar: Scalar
+    writable: bool
+    persistent: bool
+
+
+class CrtpControls(Dialogue[Packet]):
+    """`transmit` takes packets' bytes; `table` is the board's table of contents, which is known when it is connected."""
+
+    def __init__(self, transmit: Callable[[bytes], object], table: Callable[[], Mapping[str, Entry]]) -> None:
+        super().__init__(self._script_for)
+        self._transmit = transmit
+        self._table = table
+
+    def _script_for(self, request: Request) -> Script[Packet]:
+        scripts: dict[Action, Callable[[], Script[Packet]]] = {
+            Action.LIST: lambda: self._list(request.name),
+            Action.READ: lambda: self._read(request.name),
+            Action.WRITE: lambda: self._write(request.name, request.value),
+            Action.SAVE: self._save,
+            Action.ARM: self._arm,
+            Action.STOP: self._stop,
+        }
+        return scripts[request.action]()
+
+    def _list(self, group: str) -> Script[Packet]:
+        found: Settings = ()
+        for name in self._table():
+            if name.lower().startswith(group.lower()):
+                found += yield from self._read(name)
+        return found
+
+    def _read(self, name: str) -> Script[Packet]:
+        entry = self._find(name)
+        reply = yield self._exchange_for(CHANNEL_READ, entry)
+        if reply.data[2] != OK:
+            raise ControlsError(f"{name}: the board does not tell it: {reply.data[2]}")
+        return ((name, entry.scalar.unpack(reply.data[3 : 3 + entry.scalar.size])),)
+
+    def _write(self, name: str, value: float) -> Script[Packet]:
+        entry = self._find(name)
+        if not entry.writable:
+            raise ControlsError(f"{name}: can only be read")
+        wanted = entry.scalar.cast(value)
+        if not (wanted == value or entry.scalar.is_float):
+            raise ControlsError(f"{name} = {value:g}: not a value of type {entry.scalar.name}")
+        reply = yield self._exchange_for(CHANNEL_WRITE, entry, entry.scalar.pack(value))
+        in_force = entry.scalar.unpack(reply.data[2 : 2 + entry.scalar.size])
+        if in_force != wanted:
+            raise ControlsError(f"{name} = {value:g}: refused, it stays {in_force:g}")
+        return ((name, in_force),)
+
+    def _save(self) -> Script[Packet]:
+        for name, entry in self._table().items():
+            if not entry.persistent:
+                continue
+            head = bytes((Misc.STORE,)) + encode_ident(entry.number)
+            packet = Packet(PORT_PARAMETERS, CHANNEL_MISC, head)
+            reply = yield self._until(packet, lambda got, head=head: got.data[:3] == head)  # type: ignore[misc]
+            if reply.data[3:4] != bytes((OK,)):
+                raise ControlsError(f"{name}: the board cannot store it")
+        return ()
+
+    def _arm(self) -> Script[Packet]:
+        for what, command in (("recover", bytes((RECOVER,))), ("arm", bytes((ARM, 1)))):
+            packet = Packet(PORT_PLATFORM, PLATFORM_COMMAND, command)
+            reply = yield self._until(packet, lambda got, kind=command[:1]: got.data[:1] == kind)  # type: ignore[misc]
+            if not any(reply.data[1:2]):
+                raise ControlsError(f"the board refuses to {what}")
+        return ()
+
+    def _stop(self) -> Script[Packet]:
+        """Every Crazyflie knows the stop of the localisation port; newer ones tell that they are locked."""
+        stop = Packet(PORT_LOCALISATION, CHANNEL_GENERIC, bytes((EMERGENCY_STOP,)))
+        ask = Packet(PORT_SUPERVISOR, SUPERVISOR_INFO, bytes((GET_BITS,)))
+
+        def send(now_us: int) -> None:
+            self._transmit(encode(stop))
+            self._transmit(encode(ask))
+
+        def take(got: Packet) -> Packet | None:
+            told = got.port == PORT_SUPERVISOR and got.data[:1] == bytes((REPLY | GET_BITS,))
+            return got if told and int.from_bytes(got.data[1:3], "little") & LOCKED else None
+
+        yield Exchange(send, take)
+        return ()
+
+    def _find(self, name: str) -> Entry:
+        table = self._table()
+        if name not in table:
+            raise ControlsError(unknown(name, tuple(table)))
+        return table[name]
+
+    def _exchange_for(self, channel: int, entry: Entry, value: bytes = b"") -> Exchange[Packet]:
+        """Return the exchange whose reply has the channel and the number of the request, and a value behind it."""
+        size = 1 if channel == CHANNEL_READ else entry.scalar.size  # a status, and a value if that is good
+        packet = Packet(PORT_PARAMETERS, channel, encode_ident(entry.number) + value)
+
+        def fits(got: Packet) -> bool:
+            return len(got.data) >= 2 + size and decode_ident(got.data) == entry.number
+
+        return self._until(packet, fits)
+
+    def _until(self, packet: Packet, fits: Callable[[Packet], bool]) -> Exchange[Packet]:
+        def take(got: Packet) -> Packet | None:
+            return got if (got.port, got.channel) == (packet.port, packet.channel) and fits(got) else None
+
+        return Exchange(lambda now_us: self._transmit(encode(packet)), take)
+
+
+def unknown(name: str, known: tuple[str, ...]) -> str:
+    """Return the line that says so, with the nearest name that there is."""
+    near = get_close_matches(name, (*known, *OF_PROFILE), 1, 0.5)
+    return f"parameter {name}: the board has none{f'; did you mean {near[0]}?' if near else ''}"

@@ -1,0 +1,115 @@
+"""An operator's requests over MAVLink, sans I/O: the parameter protocol, and commands with their acknowledgements.
+
+What the board calls `extCtrl.y_P` is `EXT_Y_P` here; a request may have either name.
+"""
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+from firmware_py.wire import mavlink
+from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.scalars import Scalar
+from ground_station.controls import Action, ControlsError, Dialogue, Exchange, Request, Script
+from ground_station.links.crtp_controls import unknown
+
+BOARD_COMPONENT = 1  # autopilot
+FLIGHT_TERMINATION, STORAGE, ARM_DISARM = 185, 245, 400  # MAV_CMD
+ACCEPTED, WRITE_ALL, ARM, TERMINATE = 0, 1, 1, 1
+STOPPED = mavlink.mavlink_name("stabilizer.stop")  # a latch, which arming alone does not open
+
+
+class MavlinkControls(Dialogue[Message]):
+    """`send(now_us, message)` frames and sends; `board` is the system to talk to."""
+
+    def __init__(self, send: Callable[[int, Message], object], board: Callable[[], int]) -> None:
+        super().__init__(self._script_for)
+        self._send = send
+        self._board = board
+        self._names: tuple[str, ...] = ()  # of the board's parameters, once they were listed
+
+    def _script_for(self, request: Request) -> Script[Message]:
+        scripts: dict[Action, Callable[[], Script[Message]]] = {
+            Action.LIST: self._list,
+            Action.READ: lambda: self._read(request.name),
+            Action.WRITE: lambda: self._write(request.name, request.value),
+            Action.SAVE: lambda: self._command(STORAGE, WRITE_ALL),
+            Action.ARM: self._arm,
+            Action.STOP: lambda: self._command(FLIGHT_TERMINATION, TERMINATE),
+        }
+        return scripts[request.action]()
+
+    def _list(self) -> Script[Message]:
+        """Ask for all, and one by one for those that do not come."""
+        found: dict[int, Message] = {}
+
+        def take(message: Message) -> Message | None:
+            if message.get_msgId() != mavlink.MSG_PARAM_VALUE or message.param_index >= message.param_count:
+                return None
+            found[message.param_index] = message
+            return message
+
+        def missing() -> int:
+            return next(number for number in range(len(found) + 1) if number not in found)
+
+        last = yield Exchange(
+            lambda now_us: self._send(now_us, mavlink.parameter_list(self._board(), BOARD_COMPONENT)), take
+        )
+        while len(found) < last.param_count:
+            last = yield Exchange(
+                lambda now_us: self._send(
+                    now_us, mavlink.parameter_read(self._board(), BOARD_COMPONENT, missing())
+                ),
+                take,
+                waits=True,
+            )
+        values = tuple((found[number].param_id, found[number].param_value) for number in sorted(found))
+        self._names = tuple(name for name, _ in values)
+        return values
+
+    def _read(self, name: str) -> Script[Message]:
+        name = yield from self._find(name)
+        message = mavlink.parameter_read(self._board(), BOARD_COMPONENT, name)
+        reply = yield self._until(message, lambda got: _is_value_of(got, name))
+        return ((name, reply.param_value),)
+
+    def _write(self, name: str, value: float) -> Script[Message]:
+        name = yield from self._find(name)
+        message = mavlink.parameter_set(self._board(), BOARD_COMPONENT, name, value)
+        reply = yield self._until(message, lambda got: _is_value_of(got, name))
+        if reply.param_value != Scalar.F32.cast(value):
+            raise ControlsError(f"{name} = {value:g}: refused, it stays {reply.param_value:g}")
+        return ((name, reply.param_value),)
+
+    def _arm(self) -> Script[Message]:
+        yield from self._list_once()
+        if STOPPED in self._names:
+            yield from self._write(STOPPED, 0.0)
+        return (yield from self._command(ARM_DISARM, ARM))
+
+    def _command(self, number: int, *params: float) -> Script[Message]:
+        message = mavlink.command(self._board(), BOARD_COMPONENT, number, *params)
+        reply = yield self._until(
+            message, lambda got: got.get_msgId() == mavlink.MSG_COMMAND_ACK and got.command == number
+        )
+        if reply.result != ACCEPTED:
+            raise ControlsError(f"the board refuses command {number}: result {reply.result}")
+        return ()
+
+    def _list_once(self) -> Script[Message]:
+        if not self._names:
+            yield from self._list()
+        return ()
+
+    def _find(self, name: str) -> Generator[Exchange[Message], Any, str]:
+        yield from self._list_once()
+        for spelt in (name, mavlink.mavlink_name(name)):
+            if spelt in self._names:
+                return spelt
+        raise ControlsError(unknown(name, self._names))
+
+    def _until(self, message: Message, fits: Callable[[Message], bool]) -> Exchange[Message]:
+        return Exchange(lambda now_us: self._send(now_us, message), lambda got: got if fits(got) else None)
+
+
+def _is_value_of(message: Message, name: str) -> bool:
+    return bool(message.get_msgId() == mavlink.MSG_PARAM_VALUE and message.param_id == name)

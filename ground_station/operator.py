@@ -1,0 +1,249 @@
+"""What an operator types while a board flies: a line, an act, an event.
+
+A request to the board is answered while poses go on; the next line waits for the answer, but `stop` for nothing. What cannot
+be done is one line and changes nothing. `say` answers at the terminal, `note` puts what was done into the record.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from difflib import get_close_matches
+from math import degrees, hypot, isfinite, radians
+
+from firmware_py.wire.parameter_names import OF_PROFILE, on_board
+from firmware_py.wire.supervisor import State
+from ground_station.controls import Action, Answer, ControlsError, Request, Settings
+from ground_station.program import Cockpit
+from ground_station.trajectory import Goal, Hold, Trajectory
+
+HELP = """goal X Y Z [YAW]     fly to a place in W [m, deg]; without a yaw as it is
+fly NAME             fly the trajectory of an experiment from here on
+set NAME VALUE       change a parameter: set controller.gain_y -2.0, set extCtrl.y_P 2.0
+get NAME             what a parameter is
+params [GROUP]       all of them, or those whose names begin so
+save                 keep the parameters for the board's next boot
+reset                set those that were changed to the values that last flew well
+arm                  leave the emergency stop, and arm
+stop                 emergency stop: flaps at hover, until armed
+mark TEXT            note something in the record
+help                 this"""
+COMMANDS = tuple(line.split()[0] for line in HELP.splitlines())
+LINES = 100  # that wait for their turn
+REACH = 1.0  # [m] from home, beyond which no goal is meant: the tunnel is 1.2 m wide
+WELL, WELL_US = (
+    0.10,
+    5_000_000,
+)  # values fly well when the robot has kept within 10 cm of its goal that long with them
+
+Talk = Generator[
+    Request, Settings, str
+]  # with the board; returns what was done, empty if there is nothing to note
+FindTrajectory = Callable[[str], Callable[[Goal, int], Trajectory]]
+
+
+class Operator:
+    """`take` lines as they come, `turn` in every turn of the station's loop.
+
+    `find` returns the trajectory of a name, or raises `ControlsError`.
+    """
+
+    def __init__(self, find: FindTrajectory, say: Callable[[str], None], note: Callable[[str], None]) -> None:
+        self._find = find
+        self._say = say
+        self._note = note
+        self._lines: deque[str] = deque()
+        self._talk: Talk | None = None
+        self._line = ""  # that is being done
+        self._set: dict[str, float] = {}  # values that were changed, by the names of the link
+        self._good: dict[str, float] = {}  # those of them that last flew well
+        self._well_since_us: int | None = None
+        self.known: Sequence[str] = tuple(OF_PROFILE)  # names of parameters, for who completes what is typed
+
+    def take(self, line: str) -> None:
+        """Do what a line says when its turn comes."""
+        if line.strip() == "stop":
+            self._lines.clear()
+            self._lines.append(line)
+            self._talk = None
+        elif len(self._lines) < LINES:
+            self._lines.append(line)
+        else:
+            self._say(f"{line}: {LINES} lines wait already; it is not done")
+
+    def turn(self, cockpit: Cockpit, now_us: int) -> None:
+        """Go on with what is being done, or begin the next."""
+        self._watch(cockpit, now_us)
+        if self._talk is not None:
+            answer = cockpit.link.answer(now_us)
+            if answer is not None:
+                self._hear(cockpit, now_us, answer)
+        elif self._lines:
+            self._begin(self._lines.popleft(), cockpit, now_us)
+
+    def _begin(self, line: str, cockpit: Cockpit, now_us: int) -> None:
+        line = self._line = line.strip()
+        try:
+            words = line.split(None, 1) if line.startswith("mark ") else shlex.split(line)
+            if not words:
+                return
+            self._talk = self._talk_of(words[0], words[1:], cockpit, now_us)
+            self._go_on(cockpit, now_us, None)
+        except (ControlsError, ValueError) as error:
+            self._refuse(str(error))
+
+    def _talk_of(self, command: str, words: list[str], cockpit: Cockpit, now_us: int) -> Talk:
+        if command == "goal":
+            return self._goal(words, cockpit, now_us)
+        if command == "fly":
+            return self._fly(words, cockpit, now_us)
+        if command == "set":
+            return self._write(words, now_us)
+        if command == "get":
+            return self._read(words)
+        if command == "params":
+            return self._list(words)
+        if command in ("save", "arm", "stop"):
+            return self._ask(command, words)
+        if command == "reset":
+            return self._reset(words)
+        if command == "mark":
+            return self._mark(words)
+        if command == "help":
+            return self._help()
+        near = get_close_matches(command, COMMANDS, 1)
+        raise ControlsError(
+            f"unknown{f'; did you mean {near[0]}?' if near else '; help shows what there is'}"
+        )
+
+    def _hear(self, cockpit: Cockpit, now_us: int, answer: Answer) -> None:
+        try:
+            if answer.error:
+                raise ControlsError(answer.error)
+            self._go_on(cockpit, now_us, answer.values)
+        except ControlsError as error:
+            self._refuse(str(error))
+
+    def _refuse(self, why: str) -> None:
+        self._talk = None
+        self._say(f"{self._line}: {why}")
+
+    def _go_on(self, cockpit: Cockpit, now_us: int, values: Settings | None) -> None:
+        assert self._talk is not None
+        try:
+            request = next(self._talk) if values is None else self._talk.send(values)
+        except StopIteration as done:
+            self._talk = None
+            if done.value:
+                self._note(done.value)
+                self._say(done.value)
+        else:
+            cockpit.link.ask(now_us, request)
+
+    # What can be typed; those that ask the board nothing yield nothing
+
+    def _goal(self, words: list[str], cockpit: Cockpit, now_us: int) -> Talk:
+        numbers = [_number(word) for word in words]
+        if len(numbers) not in (3, 4):
+            raise ControlsError("expected goal X Y Z [YAW], metres in W and degrees")
+        place = (numbers[0], numbers[1], numbers[2])
+        home = cockpit.plan.home.p_WG
+        if max(abs(a - b) for a, b in zip(place, home, strict=True)) > REACH:
+            raise ControlsError(f"more than {REACH:g} m from home, {' '.join(f'{x:g}' for x in home)}")
+        yaw = radians(numbers[3]) if len(numbers) == 4 else cockpit.plan.at(now_us).yaw
+        cockpit.plan.steer(Hold(Goal(place, yaw)))
+        return f"goal {' '.join(f'{x:g}' for x in place)} m, yaw {degrees(yaw):.4g} deg"
+        yield
+
+    def _fly(self, words: list[str], cockpit: Cockpit, now_us: int) -> Talk:
+        (name,) = _words(words, "fly NAME", 1)
+        cockpit.plan.steer(self._find(name)(cockpit.plan.home, now_us))
+        return f"fly {name}"
+        yield
+
+    def _write(self, words: list[str], now_us: int) -> Talk:
+        typed, text = _words(words, "set NAME VALUE", 2)
+        (name, factor), value = on_board(typed), _number(text)
+        ((known, before),) = yield Request(Action.READ, name)
+        ((known, after),) = yield Request(Action.WRITE, name, factor * value)
+        self._good.setdefault(known, before)
+        self._set[known] = after
+        self._well_since_us = None
+        own = f" ({known} {after:.6g})" if known != typed else ""
+        return f"set {typed} {after / factor:.6g}, was {before / factor:.6g}{own}"
+
+    def _read(self, words: list[str]) -> Talk:
+        (typed,) = _words(words, "get NAME", 1)
+        name, factor = on_board(typed)
+        ((known, value),) = yield Request(Action.READ, name)
+        own = f" ({known} {value:.6g})" if known != typed else ""
+        self._say(f"{typed} {value / factor:.6g}{own}")
+        return ""
+
+    def _list(self, words: list[str]) -> Talk:
+        group = words[0].lower() if words else ""
+        values = yield Request(Action.LIST, group)
+        self.known = tuple(dict.fromkeys((*self.known, *(name for name, _ in values))))
+        chosen = [f"{name} {value:.6g}" for name, value in values if name.lower().startswith(group)]
+        if not chosen:
+            raise ControlsError(f"params {words[0]}: no parameter begins so")
+        for line in chosen:
+            self._say(line)
+        return ""
+
+    def _ask(self, command: str, words: list[str]) -> Talk:
+        _words(words, command, 0)
+        if command == "stop":
+            self._note("stop")  # whether it was acknowledged or not
+        yield Request(Action(command))
+        done = {"save": "saved", "arm": "armed", "stop": "stopped"}
+        return done[command]
+
+    def _reset(self, words: list[str]) -> Talk:
+        _words(words, "reset", 0)
+        changed = {name: value for name, value in self._good.items() if self._set[name] != value}
+        if not changed:
+            raise ControlsError("nothing to reset: what is set is what last flew well")
+        for name, value in changed.items():
+            ((_, self._set[name]),) = yield Request(Action.WRITE, name, value)
+        return "reset " + ", ".join(f"{name} {value:.6g}" for name, value in changed.items())
+
+    def _mark(self, words: list[str]) -> Talk:
+        (text,) = _words(words, "mark TEXT", 1)
+        return f"mark {text.strip()}"
+        yield
+
+    def _help(self) -> Talk:
+        for line in HELP.splitlines():
+            self._say(line)
+        return ""
+        yield
+
+    def _watch(self, cockpit: Cockpit, now_us: int) -> None:
+        """Remember values that have flown well for a while."""
+        frame, flying = cockpit.ground.frame, cockpit.link.supervisor_state == State.FLYING
+        goal = cockpit.plan.at(now_us).p_WG
+        near = frame is not None and hypot(*(a - b for a, b in zip(frame.p_WB, goal, strict=True))) <= WELL
+        if not (flying and near):
+            self._well_since_us = None
+        elif self._well_since_us is None:
+            self._well_since_us = now_us
+        elif now_us - self._well_since_us >= WELL_US and self._talk is None:
+            self._good.update(self._set)
+
+
+def _words(words: list[str], usage: str, count: int) -> list[str]:
+    if len(words) != count:
+        raise ControlsError(f"expected {usage}")
+    return words
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise ControlsError(f"{text!r} is no number") from None
+    if not isfinite(value):
+        raise ControlsError(f"{text!r} is no finite number")
+    return value

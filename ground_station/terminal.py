@@ -1,0 +1,101 @@
+"""Lines that are typed while a station flies: with history and completion at a terminal, as they come out of a pipe.
+
+A thread reads, so that the flight never waits. The only file that knows prompt_toolkit.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+from prompt_toolkit import PromptSession
+from prompt_toolkit.completion import WordCompleter
+from prompt_toolkit.patch_stdout import patch_stdout
+
+LINES = 1000  # that nobody has fetched
+READ_SIZE = 4096
+CLOSE_TIMEOUT_S = 1.0
+
+
+class Terminal:
+    """Reads standard input from now on; `words` returns what can be completed to."""
+
+    def __init__(self, words: Callable[[], Sequence[str]]) -> None:
+        self._lines: queue.Queue[str] = queue.Queue(LINES)
+        self._closing = False
+        self._session: PromptSession[str] | None = None
+        try:
+            descriptor = sys.stdin.fileno()
+        except (AttributeError, OSError, ValueError):  # there is none
+            return
+        read = self._read
+        if os.isatty(descriptor):
+            if not _in_foreground(descriptor):  # whoever reads there is stopped
+                return
+            if sys.stdout.isatty():
+                completer = WordCompleter(lambda: list(words()), WORD=True)
+                self._session, read = (
+                    PromptSession(completer=completer, complete_while_typing=False),
+                    self._prompt,
+                )
+        self._thread = threading.Thread(target=read, args=(descriptor,), name="terminal", daemon=True)
+        self._thread.start()
+
+    def lines(self) -> list[str]:
+        """Return what was typed since the last call."""
+        lines: list[str] = []
+        with suppress(queue.Empty):
+            while True:
+                lines.append(self._lines.get_nowait())
+        return lines
+
+    def close(self) -> None:
+        """Give the terminal back as it was."""
+        self._closing = True
+        if self._session is None:
+            return
+        app = self._session.app
+        if app.loop is not None and app.is_running:
+            app.loop.call_soon_threadsafe(self._leave)
+        self._thread.join(CLOSE_TIMEOUT_S)
+
+    def _leave(self) -> None:
+        assert self._session is not None
+        with suppress(Exception):  # a line was just finished: the thread looks whether to go on
+            self._session.app.exit(exception=EOFError)
+
+    def _put(self, line: str) -> None:
+        with suppress(queue.Full):
+            self._lines.put_nowait(line)
+
+    def _read(self, descriptor: int) -> None:
+        """Read a pipe until its end; not through `sys.stdin`, whose lock a thread that waits would keep for ever."""
+        rest = b""
+        while data := os.read(descriptor, READ_SIZE):
+            *lines, rest = (rest + data).split(b"\n")
+            for line in lines:
+                self._put(line.decode(errors="replace"))
+        if rest:
+            self._put(rest.decode(errors="replace"))
+
+    def _prompt(self, descriptor: int) -> None:
+        assert self._session is not None
+        with patch_stdout():  # what is said meanwhile stands above the line that is being typed
+            while not self._closing:
+                try:
+                    self._put(self._session.prompt("> "))
+                except KeyboardInterrupt:  # typed here, meant for the program
+                    signal.raise_signal(signal.SIGINT)
+                except EOFError:
+                    return
+
+
+def _in_foreground(descriptor: int) -> bool:
+    with suppress(AttributeError, OSError):  # no such thing on this system
+        return os.tcgetpgrp(descriptor) == os.getpgrp()
+    return True

@@ -1,0 +1,264 @@
+"""Laws of `ground_station.controls.Controls` on every protocol, each against the firmware in simulated time."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+
+from firmware_py.firmware import Firmware
+from firmware_py.wire import crtp
+from firmware_py.wire.parameter_names import OF_PROFILE
+from firmware_py.wire.parameters import TYPE_EXTENDED, TYPE_READ_ONLY
+from firmware_py.wire.scalars import PARAMETER_SCALARS
+from firmware_py.wire.supervisor import Cause, State
+from ground_station.controls import PATIENCE_US, REPEAT_US, Action, Answer, Controls, Request
+from ground_station.links.crtp_controls import CrtpControls, Entry
+from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
+from hil.config import load_config
+from support.crtp_client import CrtpClient
+from support.mavlink_client import MavlinkClient
+
+TURN_US = 5_000
+GYRO_ZERO_US = 700_000
+
+
+class Bench(Protocol):
+    """A board, and an operator's controls at the other end of a line that may lose what `lossy` says."""
+
+    controls: Controls
+    firmware: Firmware
+    lossy: Callable[[], bool]
+    now_us: int
+    listed: int  # parameters that the board tells of
+
+    def turn(self) -> None:
+        """Let 5 ms pass, as a station's loop does."""
+        ...
+
+    def name(self, name: str) -> str:
+        """What a parameter is called in answers."""
+        ...
+
+
+class CrtpBench(CrtpClient):
+    def __init__(self) -> None:
+        self.lossy = lambda: False
+        super().__init__()
+        self.entries = {
+            name: Entry(
+                number, PARAMETER_SCALARS[kind & 0x0F], not kind & TYPE_READ_ONLY, bool(kind & TYPE_EXTENDED)
+            )
+            for name, (number, kind) in self.toc(2).items()
+        }
+        self.listed = len(self.entries)
+        self.controls = CrtpControls(self._up, lambda: self.entries)
+        self.sent.clear()
+
+    def _up(self, data: bytes) -> None:
+        if not self.lossy():
+            self.firmware.radio_received(data)
+
+    def turn(self) -> None:
+        self.run(self.now_us + TURN_US)
+        for _, data in self.sent:
+            if not self.lossy():
+                self.controls.hear(self.now_us, crtp.decode(data))
+        self.sent.clear()
+
+    def name(self, name: str) -> str:
+        return name
+
+
+class MavlinkBench(MavlinkClient):
+    def __init__(self) -> None:
+        self.lossy = lambda: False
+        self.down = bytearray()
+        super().__init__()
+        self.listed = self.ask("param_request_read", 1, 1, b"", 0)[0].param_count
+        self.down.clear()
+        self.link = MavlinkLink(self._up, MavlinkLinkConfig(921_600, 50.0))
+        self.controls = self.link.controls
+        self.run(20_000)
+
+    def _up(self, now_us: int, data: bytes) -> None:
+        if not self.lossy():
+            self.receive(data)
+
+    def uart_write(self, data: bytes) -> bool:
+        if not self.lossy():
+            self.down += data
+        return super().uart_write(data)
+
+    def turn(self) -> None:
+        self.run(self.now_us + TURN_US)
+        data = bytes(self.down)
+        self.down.clear()
+        self.link.receive(self.now_us, data)
+
+    def name(self, name: str) -> str:
+        return {"extCtrl.y_P": "EXT_Y_P", "supervisor.poseTimeout": "SUP_POSETIMEOUT"}[name]
+
+
+BENCHES: dict[str, Callable[[], Any]] = {"crtp": CrtpBench, "mavlink": MavlinkBench}
+
+
+@pytest.fixture(params=BENCHES)
+def bench(request: pytest.FixtureRequest) -> Bench:
+    made: Bench = BENCHES[request.param]()
+    return made
+
+
+def answer(bench: Bench) -> Answer:
+    """What comes within a while."""
+    for _ in range(30 * PATIENCE_US // TURN_US):
+        bench.turn()
+        if (answer := bench.controls.answer(bench.now_us)) is not None:
+            return answer
+    raise AssertionError("no answer")
+
+
+def ask(bench: Bench, action: Action, name: str = "", value: float = 0.0) -> Answer:
+    bench.controls.ask(bench.now_us, Request(action, name, value))
+    return answer(bench)
+
+
+def on_board(bench: Bench, name: str) -> float:
+    return next(item for item in bench.firmware.parameters if item.name == name).read()
+
+
+def test_what_is_written_is_in_force_and_is_read_back(bench: Bench) -> None:
+    before = on_board(bench, "extCtrl.y_P")
+    name = bench.name("extCtrl.y_P")
+    assert ask(bench, Action.READ, "extCtrl.y_P") == Answer(((name, before),))
+    assert ask(bench, Action.WRITE, "extCtrl.y_P", -1.25) == Answer(((name, -1.25),))
+    assert on_board(bench, "extCtrl.y_P") == -1.25
+    assert ask(bench, Action.READ, "extCtrl.y_P") == Answer(((name, -1.25),))
+    assert ask(bench, Action.WRITE, "extCtrl.y_P", 0.1 - 1).error == ""  # as float32
+
+
+def test_a_value_that_is_not_allowed_changes_nothing_and_is_one_line(bench: Bench) -> None:
+    before = on_board(bench, "extCtrl.y_P")
+    told = ask(bench, Action.WRITE, "extCtrl.y_P", 1e9)
+    assert told.values == ()
+    assert "refused, it stays" in told.error
+    assert f"{before:g}" in told.error
+    assert on_board(bench, "extCtrl.y_P") == before
+    assert ask(bench, Action.WRITE, "supervisor.poseTimeout", 300.5).error
+    assert ask(bench, Action.WRITE, "supervisor.poseTimeout", -1.0).error
+    assert on_board(bench, "supervisor.poseTimeout") == 500
+
+
+def test_an_unknown_name_is_told_with_the_nearest_one(bench: Bench) -> None:
+    near = bench.name("extCtrl.y_P")
+    for action in (Action.READ, Action.WRITE):
+        told = ask(bench, action, near[:-1] + "Q", 1.0)
+        assert told.values == ()
+        assert f"{near[:-1]}Q" in told.error
+        assert "did you mean" in told.error
+
+
+def test_all_that_can_be_set_is_listed_with_the_value_that_is_in_force(bench: Bench) -> None:
+    ask(bench, Action.WRITE, "extCtrl.y_P", -0.75)
+    values = dict(ask(bench, Action.LIST).values)
+    assert len(values) == bench.listed
+    assert values[bench.name("extCtrl.y_P")] == -0.75
+    assert values[bench.name("supervisor.poseTimeout")] == 500
+
+
+def test_a_group_is_listed_whole(bench: Bench) -> None:
+    group = bench.name("extCtrl.y_P")[:3].upper()
+    told = [name for name, _ in ask(bench, Action.LIST, group).values if name.upper().startswith(group)]
+    assert bench.name("extCtrl.y_P") in told
+    everything = [name for name, _ in ask(bench, Action.LIST).values]
+    assert told == [name for name in everything if name.upper().startswith(group)]
+
+
+def test_what_is_saved_is_there_after_the_next_boot(bench: Bench) -> None:
+    ask(bench, Action.WRITE, "extCtrl.y_P", -1.75)
+    assert ask(bench, Action.SAVE) == Answer(())
+    booted = Firmware(load_config(), bench)  # type: ignore[arg-type]
+    assert next(item for item in booted.parameters if item.name == "extCtrl.y_P").read() == -1.75
+
+
+def test_a_stop_stops_and_arming_leaves_it(bench: Bench) -> None:
+    bench.run(GYRO_ZERO_US)  # type: ignore[attr-defined]
+    supervisor = bench.firmware.signals.supervisor
+    assert ask(bench, Action.STOP) == Answer(())
+    bench.turn()
+    bench.turn()
+    assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
+    assert ask(bench, Action.ARM) == Answer(())
+    for _ in range(4):
+        bench.turn()
+    assert supervisor.state is State.WAITING
+
+
+def test_a_stop_of_which_only_the_question_arrives_is_sent_again(bench: Bench) -> None:
+    losses = iter([True])
+    bench.lossy = lambda: next(losses, False)
+    assert ask(bench, Action.STOP) == Answer(())
+    assert bench.firmware.signals.supervisor.stopped
+
+
+def test_what_the_board_cannot_do_is_refused_in_one_line(bench: Bench) -> None:
+    bench.battery_mv = 2_000  # type: ignore[attr-defined]
+    bench.run(8_000_000)  # type: ignore[attr-defined]
+    told = ask(bench, Action.ARM)
+    assert "refuses" in told.error
+    assert "\n" not in told.error
+
+
+def test_a_line_that_loses_much_delays_and_spoils_nothing(bench: Bench) -> None:
+    rng = np.random.default_rng(1)
+    bench.lossy = lambda: bool(rng.random() < 0.15)
+    assert ask(bench, Action.WRITE, "extCtrl.y_P", -1.5).error == ""
+    assert on_board(bench, "extCtrl.y_P") == -1.5
+    values = dict(ask(bench, Action.LIST).values)
+    assert values[bench.name("extCtrl.y_P")] == -1.5
+    assert len(values) == bench.listed
+    assert ask(bench, Action.STOP).error == ""
+
+
+def test_a_board_that_is_not_there_is_an_error_after_two_seconds(bench: Bench) -> None:
+    bench.lossy = lambda: True
+    begin_us = bench.now_us
+    for action in Action:
+        begin_us = bench.now_us
+        assert ask(bench, action, "extCtrl.y_P", 1.0).error == "no answer within 2 s"
+        assert PATIENCE_US <= bench.now_us - begin_us <= PATIENCE_US + REPEAT_US + 2 * TURN_US
+
+
+def test_a_new_request_replaces_the_one_before(bench: Bench) -> None:
+    """A stop does not wait until a long list is there."""
+    bench.controls.ask(bench.now_us, Request(Action.LIST))
+    bench.turn()
+    assert ask(bench, Action.STOP) == Answer(())
+    assert bench.firmware.signals.supervisor.stopped
+    for _ in range(100):
+        bench.turn()
+        assert bench.controls.answer(bench.now_us) is None
+
+
+@pytest.mark.parametrize("key", OF_PROFILE)
+def test_a_profile_s_value_is_the_board_s_times_the_factor(key: str) -> None:
+    """A board that boots with the value, and one that is told it, believe the same."""
+    name, factor = OF_PROFILE[key]
+    section, field = key.split(".")
+    before = getattr(getattr(load_config(), section), field)
+    value = (not before) if isinstance(before, bool) else type(before)(1.25 * before or 0.01)
+    bench = CrtpBench()
+    assert ask(bench, Action.WRITE, name, factor * value).error == ""
+    flashed = CrtpBench()
+    flashed.firmware = Firmware(load_config("floaty", [f"{key}={str(value).lower()}"]), flashed)
+    assert on_board(bench, name) == pytest.approx(on_board(flashed, name), rel=1e-6)
+    assert on_board(bench, name) != on_board(CrtpBench(), name)
+
+
+def test_a_parameter_that_can_only_be_read_is_not_written() -> None:
+    bench = CrtpBench()
+    assert ask(bench, Action.WRITE, "cpu.flash", 1.0).error == "cpu.flash: can only be read"
+    assert dict(ask(bench, Action.READ, "cpu.flash").values) == {"cpu.flash": 1024}
+    bench.entries["cpu.id1"] = replace(bench.entries["cpu.id1"], number=9999)
+    assert "does not tell it" in ask(bench, Action.READ, "cpu.id1").error

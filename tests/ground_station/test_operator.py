@@ -1,0 +1,224 @@
+"""What an operator types: dialogues in simulated time with the firmware at the other end of the line."""
+
+from math import pi, radians
+from types import SimpleNamespace
+
+import pytest
+
+from firmware_py.wire import crtp
+from firmware_py.wire.parameters import TYPE_EXTENDED, TYPE_READ_ONLY
+from firmware_py.wire.scalars import PARAMETER_SCALARS
+from firmware_py.wire.supervisor import State
+from ground_station.controls import ControlsError
+from ground_station.links.crtp_controls import CrtpControls, Entry
+from ground_station.mocap import MocapFrame
+from ground_station.operator import COMMANDS, HELP, LINES, WELL_US, Operator
+from ground_station.trajectory import FlightPlan, Goal, Hold, Offsets, Step
+from support.crtp_client import CrtpClient
+
+HOME = Goal((0.0, 0.0, 1.15), 0.0)
+TURN_US = 5_000
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def find(name):
+    if name != "yaw-step":
+        raise ControlsError(f"experiment {name!r}: unknown")
+    return lambda home, start_us: Offsets(home, start_us, yaw=Step(1.0))
+
+
+class Bench(CrtpClient):
+    """A station's loop around the firmware: 5 ms per turn; `fly` needs no world, the robot is where it is said to be."""
+
+    def __init__(self):
+        super().__init__()
+        entries = {
+            name: Entry(
+                number, PARAMETER_SCALARS[kind & 0x0F], not kind & TYPE_READ_ONLY, bool(kind & TYPE_EXTENDED)
+            )
+            for name, (number, kind) in self.toc(2).items()
+        }
+        self.heard = True
+        self.controls = CrtpControls(self._up, lambda: entries)
+        self.said, self.noted, self.place = [], [], HOME.p_WG
+        self.operator = Operator(find, self.said.append, self.noted.append)
+        self.plan = FlightPlan(HOME, lambda home, start_us: Hold(home))
+        self.state = State.FLYING
+        self.sent.clear()
+
+    def _up(self, data):
+        if self.heard:
+            self.firmware.radio_received(data)
+
+    def turns(self, duration_us):
+        end_us = self.now_us + duration_us
+        while self.now_us < end_us:
+            self.run(self.now_us + TURN_US)
+            for _, data in self.sent:
+                self.controls.hear(self.now_us, crtp.decode(data))
+            self.sent.clear()
+            link = SimpleNamespace(
+                ask=self.controls.ask, answer=self.controls.answer, supervisor_state=self.state
+            )
+            ground = SimpleNamespace(frame=MocapFrame(self.now_us, self.place, LEVEL, True))
+            self.operator.turn(SimpleNamespace(link=link, ground=ground, plan=self.plan), self.now_us)
+
+    def type(self, *lines, wait_us=500_000):
+        """Type lines and return what is answered."""
+        self.said.clear()
+        for line in lines:
+            self.operator.take(line)
+        self.turns(wait_us)
+        return list(self.said)
+
+    def value(self, name):
+        return next(item for item in self.firmware.parameters if item.name == name).read()
+
+    @property
+    def goal(self):
+        return self.plan.at(self.now_us)
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def test_a_goal_is_flown_to_at_once_and_noted(bench):
+    assert bench.type("goal 0.1 -0.2 1.3 90") == ["goal 0.1 -0.2 1.3 m, yaw 90 deg"]
+    assert bench.goal == Goal((0.1, -0.2, 1.3), pi / 2)
+    bench.type("goal 0 0 1")
+    assert bench.goal.p_WG == (0.0, 0.0, 1.0)
+    assert bench.goal.yaw == pytest.approx(radians(90))
+    assert bench.noted == ["goal 0.1 -0.2 1.3 m, yaw 90 deg", "goal 0 0 1 m, yaw 90 deg"]
+
+
+def test_a_trajectory_begins_when_it_is_typed_and_not_again_when_the_station_s_own_would(bench):
+    bench.turns(1_000_000)
+    bench.type("fly yaw-step", wait_us=TURN_US)
+    assert bench.goal.yaw == 1.0
+    bench.plan.start(bench.now_us)
+    assert bench.goal.yaw == 1.0
+    assert bench.noted == ["fly yaw-step"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "goal", "goal 1 2", "goal a b c", "goal nan 0 1", "goal 0 0 1e9", "goal 0 0 1 2 3", "goal 0 5 1.15", "fly",
+        "fly nonsense", "fly a b", "set", "set extCtrl.y_P", "set extCtrl.y_P two", "set extCtrl.y_P inf",
+        "set extCtrl.y_P 1e9", "set nonsense 1", "set cpu.flash 3", "get", "get nonsense", "params nonsense", "save now",
+        "reset", "reset x", "arm 1", "stop it", "mark", "marks", "gaol 0 0 1", "'", "\x00",
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_changes_nothing(bench, line):
+    values = [item.read() for item in bench.firmware.parameters]
+    (told,) = bench.type(line)
+    assert told.count("\n") == 0
+    assert bench.noted == []
+    assert bench.goal == HOME
+    assert [item.read() for item in bench.firmware.parameters] == values
+    assert not bench.firmware.signals.supervisor.stopped
+    assert bench.type("get extCtrl.y_P") != []  # it goes on
+
+
+@pytest.mark.parametrize(
+    ("line", "near"),
+    [
+        ("gaol 0 0 1", "goal"),
+        ("get extCtrl.y_Q", "extCtrl."),
+        ("set controller.gain_q2 1", "controller.gain_q"),
+    ],
+)
+def test_what_was_nearly_right_is_told(bench, line, near):
+    (told,) = bench.type(line)
+    assert f"did you mean {near}" in told
+
+
+def test_parameters_have_the_board_s_names_or_a_profile_s(bench):
+    before = bench.value("extCtrl.y_P")
+    (told,) = bench.type("set controller.gain_y -1.5")
+    assert told == f"set controller.gain_y -1.5, was {-before:g} (extCtrl.y_P 1.5)"
+    assert bench.value("extCtrl.y_P") == 1.5
+    assert bench.type("get controller.gain_y", "get extCtrl.y_P") == [
+        "controller.gain_y -1.5 (extCtrl.y_P 1.5)", "extCtrl.y_P 1.5",
+    ]  # fmt: skip
+    assert bench.type("set extCtrl.y_P 1.25") == ["set extCtrl.y_P 1.25, was 1.5"]
+    assert bench.noted == [told, "set extCtrl.y_P 1.25, was 1.5"]  # reading changes nothing
+
+
+def test_params_lists_a_group_and_completes_from_then_on(bench):
+    told = bench.type("params motorshifts", wait_us=2_000_000)
+    assert [line.split()[0] for line in told] == [f"motorShifts.m{number}" for number in (1, 2, 3, 4)]
+    assert len(bench.type("params", wait_us=2_000_000)) == len(bench.firmware.parameters)
+    assert "extCtrl.y_P" in bench.operator.known
+
+
+def test_reset_goes_back_to_what_last_flew_well(bench):
+    first = bench.value("extCtrl.y_P")
+    bench.type("set extCtrl.y_P 1.5", "set extCtrl.x_P 1.25")
+    bench.turns(WELL_US + 100_000)
+    bench.type("set extCtrl.y_P 0.5")
+    bench.place = (0.5, 0.0, 1.15)
+    bench.turns(WELL_US + 100_000)
+    assert bench.type("reset") == ["reset extCtrl.y_P 1.5"]
+    assert bench.value("extCtrl.y_P") == 1.5 != first
+    assert bench.value("extCtrl.x_P") == 1.25
+    assert bench.noted[-1] == "reset extCtrl.y_P 1.5"
+    assert "nothing to reset" in bench.type("reset")[0]
+
+
+def test_before_anything_flew_well_reset_goes_back_to_what_the_board_had(bench):
+    first = bench.value("extCtrl.y_P")
+    bench.state = State.FAILSAFE
+    bench.type("set extCtrl.y_P 1.5", "set extCtrl.y_P 1.75")
+    bench.turns(WELL_US + 100_000)
+    bench.type("reset")
+    assert bench.value("extCtrl.y_P") == first
+
+
+def test_what_is_saved_survives_a_boot(bench):
+    assert bench.type("set extCtrl.y_P 1.5", "save", wait_us=2_000_000)[-1] == "saved"
+    bench.reboot()
+    assert bench.value("extCtrl.y_P") == 1.5
+    assert bench.noted[-1] == "saved"
+
+
+def test_stop_waits_for_nothing_and_arm_leaves_it(bench):
+    bench.type("params", *["mark x"] * 3, "stop", wait_us=100_000)
+    assert bench.firmware.signals.supervisor.stopped
+    assert bench.noted == ["stop", "stopped"]
+    bench.type("arm", "params", wait_us=100_000)
+    bench.type("stop", wait_us=50_000)  # the list is still on its way
+    assert bench.firmware.signals.supervisor.stopped
+    assert bench.type("arm") == ["armed"]
+    assert not bench.firmware.signals.supervisor.stopped
+
+
+def test_a_stop_that_nobody_acknowledges_is_noted_and_said(bench):
+    bench.heard = False
+    assert bench.type("stop", wait_us=4_000_000) == ["stop: no answer within 2 s"]
+    assert bench.noted == ["stop"]
+
+
+def test_lines_are_done_in_their_order(bench):
+    told = bench.type("set extCtrl.y_P 1.5", "get extCtrl.y_P", "mark now it's on", "set extCtrl.y_P 1.25")
+    assert [line.split(",")[0] for line in told] == [
+        "set extCtrl.y_P 1.5", "extCtrl.y_P 1.5", "mark now it's on", "set extCtrl.y_P 1.25",
+    ]  # fmt: skip
+    assert bench.noted[1] == "mark now it's on"
+
+
+def test_too_many_lines_are_refused_and_said(bench):
+    for number in range(LINES + 5):
+        bench.operator.take(f"mark {number}")
+    assert len(bench.said) == 5
+    bench.turns(LINES * TURN_US)
+    assert bench.noted == [f"mark {number}" for number in range(LINES)]
+
+
+def test_help_has_every_command(bench):
+    assert bench.type("help") == HELP.splitlines()
+    assert set(COMMANDS) == {
+        "goal", "fly", "set", "get", "params", "save", "reset", "arm", "stop", "mark", "help",
+    }  # fmt: skip
