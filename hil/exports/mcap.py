@@ -1,10 +1,11 @@
 """A flight as an MCAP file, for Foxglove and PlotJuggler: poses, frames and texts in Foxglove's types, the rest as numbers.
 
-Foxglove's types (protobuf): `/truth/pose`, `/estimate/pose` and `/goal/pose` (PoseInFrame), `/tf` (the frames world, goal,
-body and estimate for its 3-D panel), `/text` (Log). All other columns of the log go as JSON with a schema that names units
-and frames: `/truth/twist`, `/estimate/twist`, `/flaps`, and one topic for each other prefix of the log (`/link`, `/battery`,
-`/estimator`, …). MCAP's times cannot be negative: they count from the start of the log; the file's metadata `flight` says
-when the release was. The only file that knows foxglove, which comes with the extra `export`.
+Foxglove's types (protobuf): `/truth/pose` (`/cameras/pose` of a real flight), `/estimate/pose` and `/goal/pose`
+(PoseInFrame), `/tf` (the frames world, goal, body and estimate for its 3-D panel), `/text` (Log). All other columns
+of the log go as JSON with a schema that names units and frames: `/truth/twist`, `/estimate/twist`, `/flaps`, and one
+topic for each other prefix of the log (`/link`, `/battery`, `/estimator`, …). MCAP's times cannot be negative: they
+count from the start of the log; the file's metadata `flight` says when the release was. The only file that knows
+foxglove, which comes with the extra `export`.
 """
 
 import math
@@ -17,7 +18,7 @@ import pyarrow as pa
 from firmware_py.extras import install_command
 from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil.errors import LabError
-from hil.laboratory.metrics import column
+from hil.laboratory.metrics import body, column, is_real, known
 from hil.laboratory.recorder import load_events, load_log, release_of
 
 try:
@@ -60,7 +61,7 @@ def topics_of(names: list[str]) -> dict[str, list[str]]:
     topics: dict[str, list[str]] = {}
     for name in names:
         prefix, _, rest = name.partition(".")
-        if name == "t" or (prefix in ("truth", "estimate", "goal") and rest in POSE_COLUMNS):
+        if name == "t" or (prefix in ("truth", "cameras", "estimate", "goal") and rest in POSE_COLUMNS):
             continue
         topic = f"/{prefix}"
         if rest in TWIST_COLUMNS:
@@ -78,15 +79,16 @@ def _metadata(log: pa.Table) -> dict[str, str]:
 
 
 def _write_poses(log: pa.Table, context: foxglove.Context) -> None:
+    eyes = "cameras" if is_real(log) else "truth"
     shown = {
         name: channels.PoseInFrameChannel(f"/{name}/pose", context=context)
-        for name in ("truth", "goal", "estimate")
+        for name in (eyes, "goal", "estimate")
     }
     tf = channels.FrameTransformsChannel("/tf", context=context)
     for us, truth, goal, estimate in _places(log):
         time, log_time = _timestamp(us), NS_PER_US * us
         for name, frame, place in (
-            ("truth", WORLD, truth),
+            (eyes, WORLD, truth),
             ("goal", WORLD, goal),
             ("estimate", GOAL, estimate),
         ):
@@ -106,7 +108,8 @@ def _write_poses(log: pa.Table, context: foxglove.Context) -> None:
 
 def _places(log: pa.Table) -> Iterator[tuple[int, Place, Place, Place]]:
     """Yield time [us], true pose of B in W, goal in W and estimate in G of every row."""
-    truth = column(log, *(f"truth.{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))).tolist()
+    log = known(log)
+    truth = body(log, "x", "y", "z", "qw", "qx", "qy", "qz").tolist()
     goal = column(log, "goal.x", "goal.y", "goal.z", "goal.yaw").tolist()
     estimate = column(log, *(f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw"))).tolist()
     for us, p, g, e in zip(log.column("t").to_pylist(), truth, goal, estimate, strict=True):

@@ -2,9 +2,10 @@
 
 Made from the flight log, whatever link was flown: what the board would say of its estimate (HEARTBEAT, ATTITUDE,
 LOCAL_POSITION_NED, SERVO_OUTPUT_RAW, BATTERY_STATUS, STATUSTEXT), from system 255 the goal when it changes
-(SET_POSITION_TARGET_LOCAL_NED) and the true pose (ATT_POS_MOCAP). Times count from the start of the log, in
-microseconds; STATUSTEXT "released" is the release. The log has the estimate relative to the goal, of which the board
-hears some 30 ms late: for so long after a jump of the goal the estimate here is away by that jump.
+(SET_POSITION_TARGET_LOCAL_NED) and the true pose, in a real flight the cameras' (ATT_POS_MOCAP). Times count from the
+start of the log, in microseconds; STATUSTEXT "released" is the release. The log has the estimate relative to the
+goal, of which the board hears some 30 ms late: for so long after a jump of the goal the estimate here is away by that
+jump.
 """
 
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from firmware_py.extras import install_command
 from firmware_py.geometry import rotate, wrap_angle, yaw_quaternion
 from firmware_py.wire.supervisor import State
 from hil.errors import LabError
-from hil.laboratory.metrics import column
+from hil.laboratory.metrics import body, column, known
 from hil.laboratory.recorder import load_events, load_log
 
 try:
@@ -49,14 +50,10 @@ def write_tlog(folder: Path) -> Path:
 
 
 def _flown(log: pa.Table) -> Iterator[Said]:
+    log = known(log)
     columns = {name: log.column(name).to_pylist() for name in log.column_names}
-    truth, goal = (
-        column(log, *(f"{kind}.{name}" for name in names)).tolist()
-        for kind, names in (
-            ("truth", ("x", "y", "z", "qw", "qx", "qy", "qz")),
-            ("goal", ("x", "y", "z", "yaw")),
-        )
-    )
+    truth = body(log, "x", "y", "z", "qw", "qx", "qy", "qz").tolist()
+    goal = column(log, "goal.x", "goal.y", "goal.z", "goal.yaw").tolist()
     estimate = column(
         log,
         *(
@@ -78,7 +75,7 @@ def _flown(log: pa.Table) -> Iterator[Said]:
             yield us, STATION, mavlink.pose(us, tuple(truth[row][:3]), tuple(truth[row][3:]))
             for message in _estimated(us // 1000, goal[row], estimate[row]):
                 yield us, BOARD, message
-            counts = [columns[f"motor.m{servo}"][row] for servo in (1, 2, 3, 4)]
+            counts = [int(columns[f"motor.m{servo}"][row]) for servo in (1, 2, 3, 4)]
             yield us, BOARD, mavlink.servo_outputs(us, counts)
 
 

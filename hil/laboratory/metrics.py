@@ -154,6 +154,13 @@ def body(table: pa.Table, *names: str) -> NDArray[np.float64]:
     return column(table, *(f"{source}.{name}" for name in names))
 
 
+def known(table: pa.Table) -> pa.Table:
+    """Return the rows that have a pose and an estimate; of a real flight the cameras or the board may not tell them."""
+    if not is_real(table):
+        return table
+    return table.filter(np.isfinite(column(table, "cameras.x") + column(table, "estimate.x")))
+
+
 def position_error(table: pa.Table) -> NDArray[np.float64]:
     """Return the body's position in the goal frame, (N, 3) [m]."""
     offset = body(table, "x", "y", "z") - column(table, "goal.x", "goal.y", "goal.z")

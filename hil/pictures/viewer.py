@@ -21,7 +21,7 @@ from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil.devices.markers import DIAMETER, marker_places
 from hil.errors import LabError
 from hil.laboratory.faults import Span, spans_of
-from hil.laboratory.metrics import BOX, body, column, is_real
+from hil.laboratory.metrics import BOX, body, column, is_real, known
 from hil.laboratory.recorder import load_events, load_log, release_of
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures import curves, scene
@@ -162,8 +162,7 @@ class Stage:
 
     def _move(self, rows: pa.Table) -> None:
         """Place everything that has a pose, and the arrows."""
-        if is_real(rows):  # there are no arrows, and poses only when the board and the cameras tell them
-            rows = rows.filter(np.isfinite(column(rows, "cameras.x") + column(rows, "estimate.x")))
+        rows = known(rows)
         times = column(rows, "t")
         p_WB = body(rows, "x", "y", "z")
         q_WB = body(rows, "qw", "qx", "qy", "qz")
@@ -181,7 +180,7 @@ class Stage:
         self._place(
             "world/goal/estimate", times, p_GE, np.array([from_euler_zyx(*row) for row in angles.tolist()])
         )
-        if is_real(rows):
+        if is_real(rows):  # there are no arrows
             return
 
         parts = ("base", "flap1", "flap2", "flap3", "flap4")

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from pymavlink import mavutil
 
 import hil.pictures.report
 from firmware_py.wire.supervisor import State
@@ -26,9 +28,12 @@ from ground_station.trajectory import FlightPlan, Goal
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.exports.mcap import write_mcap
+from hil.exports.tlog import write_tlog
+from hil.exports.wide_csv import write_csv
 from hil.laboratory.channels import Unwrapped
 from hil.laboratory.lockstep import lockstep_flight
-from hil.laboratory.metrics import free_flight, measure
+from hil.laboratory.metrics import body, free_flight, known, measure
 from hil.laboratory.real_flight import RealFlight
 from hil.laboratory.recorder import Recorder, load_events, load_log
 from hil.laboratory.result import Result, read_result
@@ -193,6 +198,23 @@ def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[P
                 for line in axes.lines
                 if len(line.get_xdata()) == 2
             )
+
+
+def test_a_real_flight_is_exported_as_what_the_cameras_saw(both: tuple[Path, Path], tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(both[0], tmp_path / "run"))
+    with write_mcap(folder).open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    topics = {channel.topic for channel in summary.channels.values()}
+    assert "/cameras/pose" in topics
+    assert "/truth/pose" not in topics
+    log = mavutil.mavlink_connection(str(write_tlog(folder)))
+    poses = []
+    while (message := log.recv_match(type="ATT_POS_MOCAP")) is not None:
+        poses.append((message.x, -message.y, -message.z))
+    seen = body(known(load_log(folder)), "x", "y", "z")[::2]
+    assert np.abs(np.array(poses) - seen).max() < 1e-6
+    assert "cameras.x [m]" in write_csv(folder).read_text().splitlines()[0]
 
 
 class Bench:
