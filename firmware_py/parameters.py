@@ -160,7 +160,7 @@ def _kalman(running: Running) -> Iterator[Parameter]:
     yield Parameter("kalman.resetEstimation", U8, "", lambda: 0, reset, 0, 1)
     yield Parameter("FloatyKalm.resetKalman", U8, "", lambda: 0, reset, 0, 1)
     yield Parameter(
-        "locSrv.absolute", U8, "", lambda: running.pilot.absolute,
+        "extPose.absolute", U8, "", lambda: running.pilot.absolute,
         lambda value: setattr(running.pilot, "absolute", value == 1), 0, 1, persistent=True,
     )  # fmt: skip
     yield deviation("locSrv.extPosStdDev", "m", "measured_position")

@@ -34,7 +34,7 @@ class Flyer(CrtpClient):
             platform=SimpleNamespace(get_protocol_version=lambda: 12),
         )
         self.commander, self.low_level = HighLevelCommander(radio), Commander(radio)
-        self.write(self.params, "locSrv.absolute", absolute)
+        self.write(self.params, "extPose.absolute", absolute)
         self.events.at(self.now_us + 1000, self._pose)
         self.run(max(self.now_us, 700_000) + 300_000)
         self.sent.clear()
@@ -210,7 +210,7 @@ def test_without_a_pose_nobody_knows_where_to_begin(absolute: Flyer) -> None:
     absolute.posing = False
     absolute.eeprom[:] = b"\xff" * len(absolute.eeprom)
     absolute.reboot()
-    absolute.write(absolute.params, "locSrv.absolute", 1)
+    absolute.write(absolute.params, "extPose.absolute", 1)
     absolute.run(800_000)
     assert absolute.order(absolute.commander.takeoff, 1.0, 1.0) == EBUSY
     assert "commander: no pose has come yet" in absolute.console
@@ -298,8 +298,8 @@ def test_set_points_that_cannot_be_flown_are_refused_once_in_words(absolute: Fly
 
 def test_what_poses_are_is_kept_over_a_reboot(absolute: Flyer) -> None:
     assert (
-        absolute.one(PARAM, 3, b"\x03" + struct.pack("<H", absolute.params["locSrv.absolute"][0]))[3:]
+        absolute.one(PARAM, 3, b"\x03" + struct.pack("<H", absolute.params["extPose.absolute"][0]))[3:]
         == b"\0"
     )
     absolute.reboot()
-    assert absolute.read(absolute.params, "locSrv.absolute") == 1
+    assert absolute.read(absolute.params, "extPose.absolute") == 1

@@ -1,6 +1,7 @@
 """What becomes of a flight when the processor has no time: deadlines, queues, watchdog; and the scheduler's trace."""
 
 import json
+import math
 import re
 from collections.abc import Generator
 from pathlib import Path
@@ -40,11 +41,13 @@ def test_overload_names_the_loads_at_which_tasks_are_late_and_the_hover_fails(tm
     result = go(tmp_path, overload, overload.duration_s)
     assert result.passed, [str(verdict) for verdict in result.verdicts]
     cost = load_config().cpu
-    # The estimator's step is late once thief, IMU and step do not fit into a tick, the controller's likewise.
+    # The estimator's step is late once thief, IMU and step do not fit into a tick. The controller's fits beside all but a
+    # thief that takes everything; then it does not run at all, and the watchdog ends the flight.
     fits_estimator = (1000 - cost.sensors_us - cost.estimator_us) / 1000
-    fits_controller = (1000 - cost.controller_us) / 1000
     assert result.metrics["estimator_late_from"] == pytest.approx(fits_estimator, abs=0.06)
-    assert result.metrics["controller_late_from"] == pytest.approx(fits_controller, abs=0.06)
+    assert cost.controller_us < 50
+    assert result.metrics["controller_late_from"] == math.inf
+    assert "STABILIZER has not run" in result.cause
     assert result.metrics["held_up_to"] > result.metrics["estimator_late_from"]
     page = write_report(tmp_path).read_text()
     assert 'alt="Overload"' in page

@@ -32,7 +32,7 @@ class Script:
         )
         self.commander = HighLevelCommander(packets)
         parameters = {parameter.name: parameter for parameter in self.robot.firmware.parameters}
-        parameters["locSrv.absolute"].set(1)
+        parameters["extPose.absolute"].set(1)
         self.wait(2.0)
 
     def _feed(self, frame: MocapFrame, now_us: int) -> None:
