@@ -213,6 +213,7 @@ def test_app_and_laboratory_turn_the_same_samples_into_the_same_bits(app: App) -
     assert abs(state["stateEstimate.pitch"]) > 0.5  # [deg]
 
 
+@pytest.mark.long
 def test_own_logic_flies_in_the_app_as_in_the_laboratory_until_it_fails_in_both(tmp_path: Path) -> None:
     config = own_config(tmp_path, LAW, ESTIMATOR, "gain_iy = 0.5")
     app, laboratory = App(build_app(tmp_path / "app", config), tmp_path / "copy.so"), Laboratory(config)
@@ -262,6 +263,7 @@ def test_own_logic_flies_in_the_app_as_in_the_laboratory_until_it_fails_in_both(
     assert "supervisor: failsafe, controller not finite\n" in app.console()
 
 
+@pytest.mark.long
 def test_an_app_with_own_logic_compiles_as_the_default_does(tmp_path: Path) -> None:
     if shutil.which(ARM) is None:
         pytest.skip(f"no {ARM} here: apt-get install gcc-arm-none-eabi")

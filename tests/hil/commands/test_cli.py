@@ -36,6 +36,7 @@ def test_fly_writes_everything_and_says_where(
     assert json.loads((folder / "result.json").read_text())["passed"] is True
 
 
+@pytest.mark.long
 def test_a_failed_limit_is_exit_code_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,6 +141,7 @@ def start(*arguments: str) -> "subprocess.Popen[str]":
     return process
 
 
+@pytest.mark.long
 def test_ctrl_c_leaves_log_report_and_recording(tmp_path: Path) -> None:
     process = start("fly", "hover", "--realtime", "--duration", "600", "--out", "run")
     process.send_signal(signal.SIGINT)

@@ -29,6 +29,7 @@ def go(
     return fly(Request.of(HOVER, str(profile), overrides, duration_s=duration_s, board=board), folder)
 
 
+@pytest.mark.long
 def test_modules_that_compute_what_the_core_does_make_the_same_flight(tmp_path: Path) -> None:
     profile = make_project(tmp_path, AS_BUILT_IN, ESTIMATOR)
     usual, own = go(tmp_path / "usual", "floaty", 0.5), go(tmp_path / "own", profile, 0.5)

@@ -162,6 +162,7 @@ def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -
     ]
 
 
+@pytest.mark.long
 def test_the_badges_say_which_kind_of_verdict_they_are(result: Result, tmp_path: Path) -> None:
     good = trials(result, True, True)
     row = Row("t", "c", "p", {"rms_x": Claim("0", 0.0)}, "why")

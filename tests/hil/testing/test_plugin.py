@@ -54,6 +54,7 @@ def kept(pytester: pytest.Pytester) -> list[str]:
 # Failures
 
 
+@pytest.mark.long
 def test_a_failure_shows_limit_value_folder_picture_and_the_command_that_flies_it_again(
     strict: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -75,6 +76,7 @@ def test_a_failure_shows_limit_value_folder_picture_and_the_command_that_flies_i
     assert load_run("again").hash == run.hash
 
 
+@pytest.mark.long
 def test_a_flight_that_no_command_names_is_flown_again_by_its_test(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
         import pytest
@@ -90,6 +92,7 @@ def test_a_flight_that_no_command_names_is_flown_again_by_its_test(pytester: pyt
     result.stdout.fnmatch_lines([f"*again*pytest --floaty-seeds=2 '{module}::test_it[[]seed2[]]'"])
 
 
+@pytest.mark.long
 def test_of_many_flights_the_last_is_shown(strict: pytest.Pytester) -> None:
     strict.makepyfile("""
         def test_it(floaty):
@@ -126,6 +129,7 @@ def test_hypothesis_shrinks_a_failing_flight_without_a_word_about_fixtures(pytes
 # What is kept
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("keep", "numbers"), [("failed", ["2"]), ("all", ["1", "2"]), ("none", [])])
 def test_run_folders_are_kept_as_asked(pytester: pytest.Pytester, keep: str, numbers: list[str]) -> None:
     pytester.makepyfile("""
