@@ -4,7 +4,6 @@ A command that comes again, because its acknowledgement was lost, acts again the
 """
 
 from collections.abc import Callable, Sequence
-from enum import IntEnum
 from math import isfinite
 
 from firmware_py.board import Board
@@ -15,28 +14,12 @@ from firmware_py.links.storage import ParameterStorage
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import Message
-from firmware_py.wire.mavlink_numbers import Result
+from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Result
 
 FORCE = 21196  # MAVLink's magic number for disarming in flight
-STORE = 1  # PREFLIGHT_STORAGE: write all
 REBOOT = 1  # PREFLIGHT_REBOOT_SHUTDOWN
 REBOOT_IN_FLIGHT = 20190226  # REBOOT_SHUTDOWN_CONDITIONS_FORCE
 REBOOT_TICKS = 200  # before the reset: what was said leaves, 1 kB even at 57600 baud
-
-
-class Command(IntEnum):
-    """MAV_CMD of what the board can do."""
-
-    DO_FLIGHTTERMINATION = 185
-    PREFLIGHT_STORAGE = 245
-    PREFLIGHT_REBOOT_SHUTDOWN = 246
-    COMPONENT_ARM_DISARM = 400
-    GET_HOME_POSITION = 410
-    INJECT_FAILURE = 420
-    GET_MESSAGE_INTERVAL = 510
-    SET_MESSAGE_INTERVAL = 511
-    REQUEST_MESSAGE = 512
-    REQUEST_AUTOPILOT_CAPABILITIES = 520
 
 
 Outcome = tuple[Result, Sequence[Message]]  # and what is sent after the acknowledgement
@@ -137,7 +120,7 @@ class CommandService:
         return DONE
 
     def _store(self, command: Message) -> Outcome:
-        if command.param1 != STORE:
+        if command.param1 != WRITE_ALL:
             return DENIED
         values = {parameter.name: parameter.value() for parameter in self._parameters if parameter.persistent}
         return DONE if self._storage.store_all(values) else (Result.FAILED, ())

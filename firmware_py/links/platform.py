@@ -12,6 +12,25 @@ from firmware_py.wire.crtp import (
     Packet,
     encode,
 )
+from firmware_py.wire.platform import (
+    ARM,
+    COMMAND_ARM,
+    COMMAND_NOTIFY,
+    COMMAND_RECOVER,
+    GET_BITS,
+    PLATFORM_APP,
+    PLATFORM_COMMAND,
+    PLATFORM_VERSION,
+    RECOVER,
+    REPLY,
+    STOP,
+    STOP_WATCHDOG,
+    SUPERVISOR_COMMAND,
+    SUPERVISOR_INFO,
+    VERSION_DEVICE,
+    VERSION_FIRMWARE,
+    VERSION_PROTOCOL,
+)
 from firmware_py.wire.supervisor import State
 
 PROTOCOL_VERSION = 12
@@ -21,15 +40,6 @@ APP_QUEUE = 10
 
 LINK_ECHO, LINK_SOURCE = 0, 1
 SOURCE_TEXT = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")  # by which clients know the protocol
-
-PLATFORM_COMMAND, PLATFORM_VERSION, PLATFORM_APP = 0, 1, 2
-VERSION_PROTOCOL, VERSION_FIRMWARE, VERSION_DEVICE = 0, 1, 2
-COMMAND_ARM, COMMAND_RECOVER, COMMAND_NOTIFY = 1, 2, 3
-
-SUPERVISOR_INFO, SUPERVISOR_COMMAND = 0, 1
-GET_BITS = 0x0C
-ARM, RECOVER, STOP, STOP_WATCHDOG = 1, 2, 3, 4
-REPLY = 0x80
 
 
 class PlatformService:

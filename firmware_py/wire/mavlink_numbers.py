@@ -1,6 +1,23 @@
-"""Numbers of the MAVLink standard that cross the board's pins, for both sides of them and without pymavlink."""
+"""Numbers of the MAVLink standard that both ends of a line, or both sides of the board's pins, know; without pymavlink."""
 
 from enum import IntEnum
+
+WRITE_ALL = 1  # PREFLIGHT_STORAGE
+
+
+class Command(IntEnum):
+    """MAV_CMD: what the board can do."""
+
+    DO_FLIGHTTERMINATION = 185
+    PREFLIGHT_STORAGE = 245
+    PREFLIGHT_REBOOT_SHUTDOWN = 246
+    COMPONENT_ARM_DISARM = 400
+    GET_HOME_POSITION = 410
+    INJECT_FAILURE = 420
+    GET_MESSAGE_INTERVAL = 510
+    SET_MESSAGE_INTERVAL = 511
+    REQUEST_MESSAGE = 512
+    REQUEST_AUTOPILOT_CAPABILITIES = 520
 
 
 class Result(IntEnum):

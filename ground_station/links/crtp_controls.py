@@ -24,13 +24,19 @@ from firmware_py.wire.parameters import (
     decode_ident,
     encode_ident,
 )
+from firmware_py.wire.platform import (
+    COMMAND_ARM,
+    COMMAND_RECOVER,
+    GET_BITS,
+    LOCKED,
+    PLATFORM_COMMAND,
+    REPLY,
+    SUPERVISOR_INFO,
+)
 from firmware_py.wire.scalars import Scalar
 from ground_station.controls import Action, ControlsError, Dialogue, Exchange, Request, Script, Settings
 
 PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `hear` wants
-PLATFORM_COMMAND, ARM, RECOVER = 0, 1, 2
-SUPERVISOR_INFO, GET_BITS, REPLY = 0, 0x0C, 0x80
-LOCKED = 1 << 6  # of those bits: stopped until it is recovered
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +107,7 @@ class CrtpControls(Dialogue[Packet]):
         return ()
 
     def _arm(self) -> Script[Packet]:
-        for what, command in (("recover", bytes((RECOVER,))), ("arm", bytes((ARM, 1)))):
+        for what, command in (("recover", bytes((COMMAND_RECOVER,))), ("arm", bytes((COMMAND_ARM, 1)))):
             packet = Packet(PORT_PLATFORM, PLATFORM_COMMAND, command)
             reply = yield self._until(packet, lambda got, kind=command[:1]: got.data[:1] == kind)  # type: ignore[misc]
             if not any(reply.data[1:2]):

@@ -8,13 +8,13 @@ from typing import Any
 
 from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Result
 from firmware_py.wire.scalars import Scalar
 from ground_station.controls import Action, ControlsError, Dialogue, Exchange, Request, Script
 from ground_station.links.crtp_controls import unknown
 
 BOARD_COMPONENT = 1  # autopilot
-FLIGHT_TERMINATION, STORAGE, ARM_DISARM = 185, 245, 400  # MAV_CMD
-ACCEPTED, WRITE_ALL, ARM, TERMINATE = 0, 1, 1, 1
+ARM, TERMINATE = 1, 1
 STOPPED = mavlink.mavlink_name("stabilizer.stop")  # a latch, which arming alone does not open
 
 
@@ -32,9 +32,9 @@ class MavlinkControls(Dialogue[Message]):
             Action.LIST: self._list,
             Action.READ: lambda: self._read(request.name),
             Action.WRITE: lambda: self._write(request.name, request.value),
-            Action.SAVE: lambda: self._command(STORAGE, WRITE_ALL),
+            Action.SAVE: lambda: self._command(Command.PREFLIGHT_STORAGE, WRITE_ALL),
             Action.ARM: self._arm,
-            Action.STOP: lambda: self._command(FLIGHT_TERMINATION, TERMINATE),
+            Action.STOP: lambda: self._command(Command.DO_FLIGHTTERMINATION, TERMINATE),
         }
         return scripts[request.action]()
 
@@ -84,15 +84,15 @@ class MavlinkControls(Dialogue[Message]):
         yield from self._list_once()
         if STOPPED in self._names:
             yield from self._write(STOPPED, 0.0)
-        return (yield from self._command(ARM_DISARM, ARM))
+        return (yield from self._command(Command.COMPONENT_ARM_DISARM, ARM))
 
     def _command(self, number: int, *params: float) -> Script[Message]:
         message = mavlink.command(self._board(), BOARD_COMPONENT, number, *params)
         reply = yield self._until(
             message, lambda got: got.get_msgId() == mavlink.MSG_COMMAND_ACK and got.command == number
         )
-        if reply.result != ACCEPTED:
-            raise ControlsError(f"the board refuses command {number}: result {reply.result}")
+        if reply.result != Result.ACCEPTED:
+            raise ControlsError(f"the board refuses command {number:d}: result {reply.result}")
         return ()
 
     def _list_once(self) -> Script[Message]:
