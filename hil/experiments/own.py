@@ -71,11 +71,6 @@ def load_file(path: Path) -> tuple[ModuleType, str]:
     return module, digest
 
 
-def loaded_files() -> tuple[Path, ...]:
-    """Return the files that have been executed: another process must do the same, before it is sent what is in them."""
-    return tuple(_LOADED)
-
-
 def entries() -> dict[str, EntryPoint]:
     """Return the experiments of installed packages, not loaded."""
     return {entry.name: entry for entry in entry_points(group=GROUP)}

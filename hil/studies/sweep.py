@@ -1,17 +1,22 @@
 """Many flights at once: one process per core, results in the order of the jobs, a progress bar meanwhile."""
 
+import io
 import multiprocessing
 import os
+import pickle
 import signal
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from hil.experiments.own import load_file, loaded_files
+from hil.errors import LabError
+from hil.experiments import find_again
+from hil.laboratory.experiment import Experiment, Source
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
 
@@ -37,8 +42,8 @@ def fly_all(jobs: Sequence[Job], notices: Console) -> tuple[list[Result], bool]:
         TimeRemainingColumn(),
     )
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), context, _begin, (loaded_files(),))
-    futures = [pool.submit(_fly, job) for job in jobs]
+    pool = ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), context, _leave_interrupts_to_the_parent)
+    futures = [pool.submit(_fly, _packed(job)) for job in jobs]
     interrupted = False
     try:
         with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
@@ -54,7 +59,29 @@ def fly_all(jobs: Sequence[Job], notices: Console) -> tuple[list[Result], bool]:
     return [future.result() for future in landed], interrupted
 
 
-def _fly(job: Job) -> Result:
+class _Packer(pickle.Pickler):
+    """Packs an experiment of one's own as the place where it stands: it may have functions without a name."""
+
+    def persistent_id(self, value: Any) -> Source | None:
+        return value.source if isinstance(value, Experiment) else None
+
+
+class _Unpacker(pickle.Unpickler):
+    def persistent_load(self, source: Source) -> Experiment:
+        experiment = find_again("", source)
+        if experiment is None:
+            raise LabError(f"experiment {source.reference}: its file has changed while it was flown")
+        return experiment
+
+
+def _packed(job: Job) -> bytes:
+    content = io.BytesIO()
+    _Packer(content).dump(job)
+    return content.getvalue()
+
+
+def _fly(packed: bytes) -> Result:
+    job: Job = _Unpacker(io.BytesIO(packed)).load()
     prepare(job.folder)
     result = fly(job.request, job.folder)
     if job.keep is not None:
@@ -66,8 +93,5 @@ def _fly(job: Job) -> Result:
     return result
 
 
-def _begin(files: tuple[Path, ...]) -> None:
-    """Load what jobs refer to, and leave interrupts to the parent."""
-    for file in files:
-        load_file(file)
+def _leave_interrupts_to_the_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)

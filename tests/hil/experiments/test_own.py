@@ -111,12 +111,23 @@ def test_experiments_of_a_file_fly_in_other_processes_with_the_same_hash(
 ) -> None:
     Path("neighbour.py").write_text("REACH = 0.05\n")
     write(
-        "from neighbour import REACH\ndef way(t): return 0.0, REACH * t, 0.0\nwide = "
-        + PLAIN % ", Along(way)"
+        "from neighbour import REACH\nwide = " + PLAIN % ", Along(lambda t: (0.0, REACH * t, 0.0))",
+        "mine.py",
     )
+    write("other = " + PLAIN % "", "other.py")
+    assert floaty(monkeypatch, "list", "other.py") == 0
+    Path("other.py").unlink()  # what nobody flies is no matter
     assert floaty(monkeypatch, "fly", "mine.py:wide", "--seeds", "2") == 0
     assert floaty(monkeypatch, "fly", "mine.py:wide", "--seed", "2", "--out", "here") == 0
     assert read_result(Path("here")).hash == read_result(Path("runs/mine-2")).hash
+
+
+def test_a_file_that_changes_between_the_flights_of_a_sweep_ends_it_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write("from pathlib import Path\nPath(__file__).write_text('')\nwide = " + PLAIN % "")
+    assert floaty(monkeypatch, "fly", "mine.py:wide", "--seeds", "2") == 2
+    assert "mine.py:wide: its file has changed while it was flown" in capsys.readouterr().err
 
 
 def test_a_file_is_executed_once_for_every_content() -> None:
