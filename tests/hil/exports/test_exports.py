@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -125,11 +126,11 @@ def test_frames_lead_from_the_world_to_the_estimate(folder: Path) -> None:
 
 def test_pymavlink_reads_the_flight_in_the_world_s_frame(folder: Path) -> None:
     log = load_log(folder)
-    link = mavutil.mavlink_connection(str(write_tlog(folder)))
     said: dict[str, list[Any]] = {}
-    while (message := link.recv_match()) is not None:
-        assert message.get_type() != "BAD_DATA"
-        said.setdefault(message.get_type(), []).append(message)
+    with closing(mavutil.mavlink_connection(str(write_tlog(folder)))) as link:
+        while (message := link.recv_match()) is not None:
+            assert message.get_type() != "BAD_DATA"
+            said.setdefault(message.get_type(), []).append(message)
     times = column(log, "t")[::2]
     assert [one._timestamp for one in said["ATTITUDE"]] == pytest.approx(1e-6 * times, abs=1e-6)
     yaw = Rotation.from_quat(column(log, "truth.qx", "truth.qy", "truth.qz", "truth.qw")).as_euler("ZYX")[

@@ -5,7 +5,7 @@ import math
 import resource
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -208,10 +208,10 @@ def test_a_real_flight_is_exported_as_what_the_cameras_saw(both: tuple[Path, Pat
     topics = {channel.topic for channel in summary.channels.values()}
     assert "/cameras/pose" in topics
     assert "/truth/pose" not in topics
-    log = mavutil.mavlink_connection(str(write_tlog(folder)))
     poses = []
-    while (message := log.recv_match(type="ATT_POS_MOCAP")) is not None:
-        poses.append((message.x, -message.y, -message.z))
+    with closing(mavutil.mavlink_connection(str(write_tlog(folder)))) as log:
+        while (message := log.recv_match(type="ATT_POS_MOCAP")) is not None:
+            poses.append((message.x, -message.y, -message.z))
     seen = body(known(load_log(folder)), "x", "y", "z")[::2]
     assert np.abs(np.array(poses) - seen).max() < 1e-6
     assert "cameras.x [m]" in write_csv(folder).read_text().splitlines()[0]
