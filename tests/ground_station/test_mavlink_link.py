@@ -327,6 +327,7 @@ def test_the_budget_of_the_uplink_is_what_the_link_sends():
         assert bench.bytes / 10 == pytest.approx(bench.link.budget.up_load * 92_160, rel=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("baud", [57_600, 921_600])
 def test_the_budget_of_the_downlink_is_what_the_board_sends(baud):
     flight = lockstep_flight(

@@ -182,6 +182,7 @@ def test_the_attitude_is_of_unit_length_from_the_first_pose_on_and_however_long_
 # The gate
 
 
+@pytest.mark.long
 def test_false_refusals_are_rarer_than_one_in_3800() -> None:
     """Three times as many frames of a robot at rest, nominal noise."""
     rng = np.random.default_rng(5)

@@ -294,6 +294,7 @@ def test_paths_begin_at_the_profile_that_names_them(monkeypatch: pytest.MonkeyPa
     assert load_config("profile.toml", ["logic.controller=''"]).logic.controller == ""
 
 
+@pytest.mark.long
 def test_an_edited_module_is_never_mistaken_for_what_it_was(tmp_path: Path) -> None:
     def after_one_tick(factor: str) -> float:
         law = AS_BUILT_IN + f"    control.u[0] = f32({factor})\n"

@@ -110,6 +110,7 @@ def test_a_law_that_fails_puts_the_flaps_to_hover_at_once_until_it_is_asked_to_r
     assert bench.writes[-1][1] != HOVER_COUNTS
 
 
+@pytest.mark.long
 def test_an_estimator_that_fails_is_named(tmp_path: Path) -> None:
     bench = Bench(own_config(tmp_path, LAW, ESTIMATOR))
     bench.run(GYRO_ZERO_US + 300_000)

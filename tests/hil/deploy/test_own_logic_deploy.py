@@ -42,6 +42,7 @@ def test_all_targets_are_equal_with_own_logic(
     assert "130 ticks, numba beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("right", "wrong", "where"),
     [

@@ -52,6 +52,7 @@ def test_air_times_are_those_of_the_reference():
     assert exchange_us(31, 31, 250_000) == pytest.approx(2800, rel=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("size", "bits_per_second", "per_second"),
     [
@@ -133,6 +134,7 @@ def test_a_quiet_link_plans_nothing():
     assert (len(bench.on_board), len(bench.on_ground)) == (10, 40)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loss", [0.05, 0.3, 0.6])
 def test_loss_follows_the_geometric_law(loss):
     bench = RadioWithEnds(uplink_loss=loss, downlink_loss=loss / 2, usb_jitter_us=0)

@@ -148,11 +148,8 @@ def test_no_flap_angle_carries_the_plant_at_eight_metres_per_second() -> None:
 # The flights
 
 
-QUICK = ("yaw-step", "side-wind-3")
-FLIGHTS = [pytest.param(name, marks=() if name in QUICK else pytest.mark.long) for name in PAPER]
-
-
-@pytest.mark.parametrize("name", FLIGHTS)
+@pytest.mark.long
+@pytest.mark.parametrize("name", PAPER)
 def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str) -> None:
     result = flown(tmp_path / "run", name, seed=7)
     assert result.passed, explain(result)

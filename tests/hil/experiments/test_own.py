@@ -122,6 +122,7 @@ def test_experiments_of_a_file_fly_in_other_processes_with_the_same_hash(
     assert read_result(Path("here")).hash == read_result(Path("runs/mine-2")).hash
 
 
+@pytest.mark.long
 def test_a_file_that_changes_between_the_flights_of_a_sweep_ends_it_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

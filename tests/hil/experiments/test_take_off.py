@@ -103,6 +103,7 @@ def test_the_net_ends_where_the_feet_are_above_it() -> None:
     assert plant.state.tobytes() == free.state.tobytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("profile", "seed"),
     [

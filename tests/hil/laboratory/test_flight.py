@@ -52,7 +52,7 @@ def test_hover_with_the_authors_gains_swings_in_y_and_survives(tmp_path: Path) -
         assert np.mean([result.metrics[f"within_6cm_{axis}"] for result in results]) > 0.95
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
 def test_without_the_predictor_the_authors_gains_lose_the_robot(tmp_path: Path, seed: int) -> None:
     result = hover(tmp_path / "run", "predictor.enabled=false", profile="as-flown", seed=seed)
     assert result.outcome == "lost", explain(result)
@@ -91,6 +91,7 @@ HEALTHY = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "faults"), HEALTHY)
 def test_the_tracker_refuses_no_healthy_pose(tmp_path: Path, name: str, faults: tuple[str, ...]) -> None:
     prepare(tmp_path / "run")

@@ -56,6 +56,7 @@ def test_a_robot_is_let_go_when_it_has_flown_in_its_holder_for_a_second_and_hove
     assert np.abs(bench.robot().plant.p_WB - np.array([0.0, 0.0, 1.15])).max() < 0.1
 
 
+@pytest.mark.long
 def test_a_robot_that_is_lost_is_put_back_after_a_second_and_flies_again_among_the_same_faults() -> None:
     bench = Bench(1, 1, (parse("push.x@0.5:0.5=20"), parse("servo.slow.1@0.2=0.9")))
     said = bench.fly(12.0)

@@ -39,6 +39,7 @@ def test_modules_that_compute_what_the_core_does_make_the_same_flight(tmp_path: 
     assert usual.logic == ""
 
 
+@pytest.mark.long
 def test_the_law_in_the_documentation_flies(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "own-logic.md").read_text(encoding="utf-8")
     law = dedent(text.split("## A control law")[1].split("\n`control_law`")[0])
@@ -120,6 +121,7 @@ def test_the_laws_that_ship_hover_within_the_limits_and_alike_on_every_board(
     assert len({result.hash for result in results}) == 1
 
 
+@pytest.mark.long
 def test_the_laws_that_ship_take_off(tmp_path: Path) -> None:
     for profile in ("original", "lqr"):
         result = go(tmp_path / profile, profile, 2.0)

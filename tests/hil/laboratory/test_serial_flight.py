@@ -35,6 +35,7 @@ def explain(result: Result) -> str:
     return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "baud", [57_600, *(pytest.param(baud, marks=pytest.mark.long) for baud in (115_200, 460_800, 921_600))]
 )

@@ -143,6 +143,7 @@ def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_bot
     assert whole["flown"] == pytest.approx(long.result.metrics["flown"]), "nothing is cut of equal flights"
 
 
+@pytest.mark.long
 def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
     a, b = load_run(runs["one"]), load_run(runs["two"])
     figure = overlays._pair((a.log, b.log), ("a", "b"))

@@ -196,6 +196,7 @@ def test_a_mark_repeats_a_test_for_every_seed_board_and_profile(pytester: pytest
     result.stdout.fnmatch_lines(["*::test_it[[]as-flown-c-seed2[]] PASSED*"])
 
 
+@pytest.mark.long
 def test_flights_take_what_the_mark_says_and_options_go_before_it(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
         import pytest
@@ -230,6 +231,7 @@ def test_the_command_line_goes_before_the_mark_and_the_mark_before_the_usual(
     assert choices_of(Marked.of(marked), wanted) == found
 
 
+@pytest.mark.long
 def test_paths_begin_at_the_root_folder_and_the_ini_file_names_the_usual_profile(
     pytester: pytest.Pytester,
 ) -> None:
