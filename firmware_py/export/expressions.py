@@ -6,6 +6,7 @@ calls inside an expression open.
 """
 
 import ast
+import operator
 from dataclasses import dataclass
 
 from firmware_py.export.errors import ExportError, refusal
@@ -63,6 +64,7 @@ class Expressions:
         self.names: dict[str, Kind] = dict(kernel.arguments)
         self.constants: list[Constant] = []  # used
         self.read: set[str] = set()
+        self.loops: dict[str, tuple[int, int]] = {}  # the values of loop variables, where they are known
 
     def refuse(self, node: ast.AST, reason: str) -> ExportError:
         """Return the error for a construct of this kernel."""
@@ -72,7 +74,8 @@ class Expressions:
         """Return an expression that has to be of this type."""
         value = self.value(node)
         if value.kind != kind:
-            raise self.refuse(node, f"{what} is {describe(value.kind)}, not {describe(kind)}")
+            hint = instead(CONSTRUCTS, f"{describe(value.kind)} for {describe(kind)}")
+            raise self.refuse(node, f"{what} is {describe(value.kind)}, not {describe(kind)}{hint}")
         return value
 
     def value(self, node: ast.expr, alone: bool = False) -> Value:
@@ -134,26 +137,56 @@ class Expressions:
         if array.kind.memory:
             return Value(array.text, array.kind)
         if any(isinstance(index, ast.Slice) for index in indices):
-            raise self.refuse(node, "slice")
+            raise self.refuse(node, f"slice{instead(CONSTRUCTS, 'Slice')}")
         rank = array.kind.rank
         if rank == 0 or len(indices) != rank:
             raise self.refuse(node, f"{ast.unparse(node)}: {len(indices)} indices on {describe(array.kind)}")
         text = array.text
         for axis, index in enumerate(indices):
             text += f"[{self.scalar(index, I32, 'an index').text}]"
-            literal = constant_literal(index)
+            least, most = self._reach(index) or (0, 0)
             size = array.kind.shape[axis] if array.kind.shape else 2**31
-            if literal is not None and not 0 <= int(literal[1]) < size:
-                raise self.refuse(index, f"index {literal[1]} is negative or beyond {size - 1}")
+            if not 0 <= least <= most < size:
+                reach = f"{least}..{most}" if least < most else str(least)
+                which = "" if ast.unparse(index) == reach else f", which is {reach}"
+                told = (
+                    f"index {ast.unparse(index)}{which}: {describe(array.kind)} of {size} has 0..{size - 1}"
+                )
+                raise self.refuse(index, told)
         return Value(text, Kind(array.kind.base))
+
+    def _reach(self, node: ast.expr) -> tuple[int, int] | None:
+        """Return the least and the greatest value of an index made of numbers, constants and loop variables, else None."""
+        match node:
+            case ast.Name(id=name) if name in self.loops:
+                return self.loops[name]
+            case ast.Name(id=name) if name not in self.names:
+                known = self.module.names.get(name)
+                value = int(known.text) if isinstance(known, Constant) and known.kind == I32 else None
+                return None if value is None else (value, value)
+            case ast.BinOp(op=ast.Add() | ast.Sub() | ast.Mult()):
+                left, right = self._reach(node.left), self._reach(node.right)
+                if left is None or right is None:
+                    return None
+                operate = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}[
+                    type(node.op)
+                ]
+                ends = [operate(one, other) for one in left for other in right]
+                return min(ends), max(ends)
+        literal = constant_literal(node)
+        return (int(literal[1]), int(literal[1])) if literal and literal[0] == I32 else None
+
+    def loop(self, start: ast.expr | None, end: ast.expr) -> tuple[int, int] | None:
+        """Return the least and the greatest value of a loop variable, None where they are known in flight only."""
+        first, last = self._reach(start) if start else (0, 0), self._reach(end)
+        return (first[0], last[1] - 1) if first and last and first[0] < last[1] else None
 
     def _binary(self, node: ast.BinOp) -> Value:
         left, right = self.value(node.left), self.value(node.right)
         name = type(node.op).__name__
         if left.kind != right.kind or left.kind not in (F32, I32):
-            raise self.refuse(
-                node, f"{name} of {describe(left.kind)} and {describe(right.kind)}{instead(CONSTRUCTS, name)}"
-            )
+            hint = instead(CONSTRUCTS, name) or mixed(left.kind, right.kind)
+            raise self.refuse(node, f"{name} of {describe(left.kind)} and {describe(right.kind)}{hint}")
         operators = FLOAT_OPERATORS if left.kind == F32 else INTEGER_OPERATORS
         if type(node.op) not in operators:
             raise self.refuse(node, f"{name} of {describe(left.kind)}{instead(CONSTRUCTS, name)}")
@@ -170,10 +203,14 @@ class Expressions:
 
     def _comparison(self, node: ast.Compare) -> Value:
         if len(node.ops) != 1 or type(node.ops[0]) not in COMPARISONS:
-            raise self.refuse(node, f"comparison {ast.unparse(node)}")
+            hint = instead(CONSTRUCTS, "Compare") if len(node.ops) > 1 else ""
+            raise self.refuse(node, f"comparison {ast.unparse(node)}{hint}")
         left, right = self.value(node.left), self.value(node.comparators[0])
         if left.kind != right.kind or left.kind not in (F32, I32):
-            raise self.refuse(node, f"comparison of {describe(left.kind)} and {describe(right.kind)}")
+            raise self.refuse(
+                node,
+                f"comparison of {describe(left.kind)} and {describe(right.kind)}{mixed(left.kind, right.kind)}",
+            )
         sign = COMPARISONS[type(node.ops[0])]
         return Value(f"{left.within(COMPARISON + 1)} {sign} {right.within(COMPARISON + 1)}", BOOL, COMPARISON)
 
@@ -185,7 +222,11 @@ class Expressions:
 
     def _call(self, node: ast.Call, alone: bool) -> Value:
         if not isinstance(node.func, ast.Name) or node.keywords:
-            raise self.refuse(node, f"call {ast.unparse(node.func)}(..) is no plain call of a kernel")
+            if isinstance(node.func, ast.Attribute):
+                hint = instead(FUNCTIONS, node.func.attr)
+            else:
+                hint = instead(CONSTRUCTS, "keywords")
+            raise self.refuse(node, f"call {ast.unparse(node.func)}(..) is no plain call of a kernel{hint}")
         name = node.func.id
         if name in CASTS and len(node.args) == 1 and (name == "bool" or name in self.module.builtins):
             return self._cast(node, CASTS[name], alone)
@@ -237,6 +278,11 @@ class Expressions:
         elif kind.base != value.kind.base or kind.rank != value.kind.rank:
             raise self.refuse(node, f"{wanted} of {kernel.node.name} gets {describe(value.kind)}")
         return value.text
+
+
+def mixed(left: Kind, right: Kind) -> str:
+    """Return what to write when a float meets an integer, else nothing."""
+    return instead(CONSTRUCTS, "f32 and i32") if {left, right} == {F32, I32} else ""
 
 
 def describe(kind: Kind) -> str:

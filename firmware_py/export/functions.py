@@ -170,9 +170,13 @@ class FunctionPrinter:
         if not self._fixed(limits[-1]):  # Python looks at the end of a range once
             limit, end = f", {name}_end = {end}", f"{name}_end"
         self._say(node, depth, f"for (int32_t {name} = {start}{limit}; {name} < {end}; {name}++) {{")
+        reach = self._print.loop(limits[0] if len(limits) == 2 else None, limits[-1])
+        if reach:
+            self._print.loops[name] = reach
         self._print.names[name] = I32
         self._block(node.body, depth + 1)
         del self._print.names[name]
+        self._print.loops.pop(name, None)
         self._lines.append(f"{'    ' * depth}}}")
 
     def _fixed(self, node: ast.expr) -> bool:

@@ -39,6 +39,16 @@ CONSTRUCTS: Mapping[str, str] = {
     "ListComp": _LOOP,
     "Pow": "x * x",
     "MatMult": _LOOP,
+    **dict.fromkeys(("GeneratorExp", "Slice", "Starred"), _LOOP),
+    **dict.fromkeys(("Tuple", "Assign"), "one assignment for each value"),
+    **dict.fromkeys(("List", "Dict", "Set"), _FIELD),
+    **dict.fromkeys(("Assert", "Raise", "Try", "Break", "Continue"), "an if"),
+    **dict.fromkeys(("Global", "Nonlocal"), "a field of the memory struct"),
+    "Lambda": "a @kernel of its own",
+    "Compare": "a < b and b < c",
+    "f32 and i32": "f32(..) around the integer",
+    "f32 for bool": "a comparison, as x != ZERO",
+    "keywords": "the arguments in their order, without names",
 }
 
 
