@@ -4,7 +4,6 @@
 Every mistake becomes a `LabError` that names the key, its value and what is allowed.
 """
 
-import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,7 +17,7 @@ from firmware_py.errors import FirmwareError
 from firmware_py.logic.loading import load_logic
 from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
 from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, RadioConfig, SerialConfig
-from hil.errors import LabError
+from hil.errors import LabError, hint
 from hil.world.config import BatteryConfig, PlantConfig, ServoConfig, TunnelConfig
 
 DEFAULT_PROFILE = "floaty"
@@ -123,7 +122,7 @@ def _find_profile(profile: str, children: tuple[Path, ...]) -> Path:
         if (folder / f"{profile}.toml").is_file():
             return (folder / f"{profile}.toml").resolve()
     raise LabError(
-        f"profile {profile!r}: neither the name of a profile{_hint(profile, profile_names())} "
+        f"profile {profile!r}: neither the name of a profile ({hint(profile, profile_names())}) "
         "nor a path that ends in .toml"
     )
 
@@ -176,7 +175,8 @@ def _explain(tree: Mapping[str, Any], detail: ErrorDetails) -> str:
         return f"{name}: missing; a profile without `base` states every constant that is flashed"
     value = detail["input"]
     if detail["type"] == "extra_forbidden":
-        return f"{name} = {value!r}: unknown key{_hint(location[-1], _allowed(location[:-1]))}"
+        allowed = _allowed(location[:-1])
+        return f"{name} = {value!r}: unknown key{f' ({hint(location[-1], allowed)})' if allowed else ''}"
     return f"{name} = {value!r}: {detail['msg'][0].lower()}{detail['msg'][1:]}"
 
 
@@ -189,8 +189,3 @@ def _allowed(location: list[str]) -> list[str]:
         if model is None:
             return []
     return list(model.model_fields)
-
-
-def _hint(word: str, allowed: list[str]) -> str:
-    near = difflib.get_close_matches(word, allowed, 1, 0.5)
-    return f" (did you mean {near[0]}?)" if near else f" (there are {', '.join(allowed)})" if allowed else ""

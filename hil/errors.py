@@ -1,6 +1,8 @@
 """The exceptions of the laboratory; the command line turns them into one line and exit code 2."""
 
+import difflib
 import traceback
+from collections.abc import Iterable
 from pathlib import Path
 
 OURS = [Path(__file__).parent.parent / package for package in ("hil", "ground_station", "firmware_py")]
@@ -9,6 +11,13 @@ PYTHON = Path(traceback.__file__).parent
 
 class LabError(Exception):
     """Something the user asked for cannot be done; the text says what, the value, and what is allowed."""
+
+
+def hint(word: str, known: Iterable[str], otherwise: str = "") -> str:
+    """Return the nearest of the known words as a question; with none near, `otherwise`, or all of them."""
+    names = list(known)
+    near = difflib.get_close_matches(word, names, 1, 0.5)
+    return f"did you mean {near[0]}?" if near else otherwise or f"there are {', '.join(names) or 'none'}"
 
 
 def blame(error: BaseException) -> str:

@@ -1,8 +1,6 @@
 """The experiments: one small file per subject, with trajectory, faults and limits; `EXPERIMENTS` lists them by name."""
 
-import difflib
-
-from hil.errors import LabError
+from hil.errors import LabError, hint
 from hil.experiments.airspeed import AIRSPEEDS
 from hil.experiments.hover import HOVER
 from hil.experiments.overload import OVERLOAD
@@ -50,9 +48,8 @@ def find_experiment(name: str) -> Experiment:
     installed = entries()
     if name in installed:
         return in_package(installed[name])
-    near = difflib.get_close_matches(name, [*EXPERIMENTS, *installed], 1)
-    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join([*EXPERIMENTS, *installed])}"
-    raise LabError(f"experiment {name!r}: unknown; {hint}; one of your own is FILE.py:NAME")
+    near = hint(name, [*EXPERIMENTS, *installed])
+    raise LabError(f"experiment {name!r}: unknown; {near}; one of your own is FILE.py:NAME")
 
 
 def find_again(name: str, source: Source | None) -> Experiment | None:

@@ -4,7 +4,6 @@ A file is executed once for every content that it has. What stands beside it can
 line that names file and line.
 """
 
-import difflib
 import hashlib
 import importlib.util
 import sys
@@ -13,7 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 
-from hil.errors import LabError, blame
+from hil.errors import LabError, blame, hint
 from hil.laboratory.experiment import Experiment, Source
 
 GROUP = "floaty.experiments"
@@ -28,8 +27,7 @@ def in_file(reference: str) -> Experiment:
         return next(iter(found.values()))
     if name in found:
         return found[name]
-    near = difflib.get_close_matches(name, found, 1)
-    there = f"did you mean {near[0]}?" if near else f"there {_are(list(found))}"
+    there = hint(name, found, f"there {_are(list(found))}")
     raise LabError(
         f"experiment {reference}: {f'no experiment {name!r} in it' if name else 'which one?'}; {there}"
     )

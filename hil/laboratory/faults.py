@@ -6,7 +6,6 @@ end), size in the kind's unit: `mocap.dropout@10:0.5`, `push.y@3=2`, `servo.stuc
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import re
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from hil.errors import LabError
+from hil.errors import LabError, hint
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
 from hil.laboratory.recorder import release_of
 
@@ -189,9 +188,8 @@ def why_not(kind: Kind, robot: Robot) -> str:
 
 def _kind(name: str, text: str) -> Kind:
     if name not in KINDS:
-        near = difflib.get_close_matches(name, KINDS, 1)
-        hint = f"did you mean {near[0]}?" if near else "floaty list --faults shows them all"
-        raise LabError(f"fault {text!r}: unknown kind {name!r}; {hint}")
+        near = hint(name, KINDS, "floaty list --faults shows them all")
+        raise LabError(f"fault {text!r}: unknown kind {name!r}; {near}")
     return KINDS[name]
 
 

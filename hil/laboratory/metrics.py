@@ -3,7 +3,6 @@
 In a real flight, whose truth nobody knows, from what the cameras saw; rows without a pose do not count.
 """
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -15,7 +14,7 @@ from pydantic import BeforeValidator, PlainSerializer
 
 from firmware_py.geometry import euler_zyx_of
 from firmware_py.wire.supervisor import State
-from hil.errors import LabError
+from hil.errors import LabError, hint
 
 NEAR = 0.06  # [m] "less than 6 cm over each axis"
 BOX = 0.10  # [m] half of the 20 cm box
@@ -260,6 +259,4 @@ def check_limits(limits: Mapping[str, float], own: Mapping[str, Metric]) -> None
     known = [*own, *METRICS]
     for name in limits:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-            raise LabError(f"limit on {name!r}: no such metric; {hint}")
+            raise LabError(f"limit on {name!r}: no such metric; {hint(name, known)}")

@@ -7,11 +7,10 @@ latency and jitter other seeds were flown as well.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 
 from hil.config import DEFAULT_PROFILE, load_config
-from hil.errors import LabError
+from hil.errors import LabError, hint
 from hil.studies.study import Change, Expected, Study, Variant
 
 AS_FLOWN = "as-flown"
@@ -224,6 +223,4 @@ def find_study(name: str) -> Study:
     """Return a study by name; an unknown one raises `LabError` with the nearest."""
     if name in STUDIES:
         return STUDIES[name]
-    near = difflib.get_close_matches(name, STUDIES, 1)
-    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(STUDIES)}"
-    raise LabError(f"study {name!r}: unknown; {hint}")
+    raise LabError(f"study {name!r}: unknown; {hint(name, STUDIES)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from firmware_py.config import LogicConfig
 from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.errors import ExportError
 from hil.config import DEFAULT_PROFILE
-from hil.errors import LabError
+from hil.errors import LabError, hint
 from hil.laboratory.lockstep import LOCKSTEP, RADIO
 from hil.laboratory.run import BUILD
 
@@ -59,10 +58,7 @@ class Marked:
         """Check the mark's words: `seeds` is a number, which counts from 1 on, or the seeds themselves."""
         for word in words:
             if word not in WORDS:
-                near = difflib.get_close_matches(word, WORDS, 1)
-                raise LabError(
-                    f"{word}: {f'did you mean {near[0]}?' if near else 'expected ' + ', '.join(WORDS)}"
-                )
+                raise LabError(f"{word}: {hint(word, WORDS)}")
         seeds = words.get("seeds", ())
         if isinstance(seeds, int):
             if seeds < 1:

@@ -308,7 +308,7 @@ def test_a_package_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -
     ("words", "told"),
     [
         ({"sedes": 2}, "sedes: did you mean seeds?"),
-        ({"colour": 2}, "colour: expected seeds, boards, profiles, needs"),
+        ({"colour": 2}, "colour: there are seeds, boards, profiles, needs"),
         ({"seeds": 0}, "seeds = 0: expected 1 or more"),
         ({"boards": ["arm"]}, "boards = 'arm': expected python, c, cortex-m4"),
         ({"needs": "wings"}, "needs = 'wings': expected python, c, cortex-m4, mavlink, radio, lockstep"),
