@@ -46,13 +46,22 @@ FindTrajectory = Callable[[str], Callable[[Goal, int], Trajectory]]
 class Operator:
     """`take` lines as they come, `turn` in every turn of the station's loop.
 
-    `find` returns the trajectory of a name, or raises `ControlsError`.
+    `find` returns the trajectory of a name, or raises `ControlsError`. `know`, if there is one, is told every value of a
+    parameter that becomes known, all of them at first.
     """
 
-    def __init__(self, find: FindTrajectory, say: Callable[[str], None], note: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        find: FindTrajectory,
+        say: Callable[[str], None],
+        note: Callable[[str], None],
+        know: Callable[[Settings], None] | None = None,
+    ) -> None:
         self._find = find
         self._say = say
         self._note = note
+        self._know = know
+        self._is_learning = know is not None  # nobody has asked yet for all parameters
         self._lines: deque[str] = deque()
         self._talk: Talk | None = None
         self._line = ""  # that is being done
@@ -81,6 +90,10 @@ class Operator:
                 self._hear(cockpit, now_us, answer)
         elif self._lines:
             self._begin(self._lines.popleft(), cockpit, now_us)
+        elif self._is_learning and cockpit.link.supervisor_state is not None:
+            self._is_learning = False
+            self._line, self._talk = "parameters", self._learn()
+            self._go_on(cockpit, now_us, None)
 
     def _begin(self, line: str, cockpit: Cockpit, now_us: int) -> None:
         line = self._line = line.strip()
@@ -121,6 +134,8 @@ class Operator:
         try:
             if answer.error:
                 raise ControlsError(answer.error)
+            if self._know is not None:
+                self._know(answer.values)
             self._go_on(cockpit, now_us, answer.values)
         except ControlsError as error:
             self._refuse(str(error))
@@ -179,6 +194,10 @@ class Operator:
         ((known, value),) = yield Request(Action.READ, name)
         own = f" ({known} {value:.6g})" if known != typed else ""
         self._say(f"{typed} {value / factor:.6g}{own}")
+        return ""
+
+    def _learn(self) -> Talk:
+        yield Request(Action.LIST)
         return ""
 
     def _list(self, words: list[str]) -> Talk:

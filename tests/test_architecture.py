@@ -40,7 +40,7 @@ FLOORS = (
     ("laboratory",),
     ("experiments",),
     ("pictures", "exports"),
-    ("servers",),
+    ("servers", "live"),
     ("api",),
     ("studies", "deploy", "testing"),
     ("commands",),
@@ -54,12 +54,12 @@ CORE_LIBRARIES = {"numpy", "typing"}
 CONFINED: dict[str, tuple[str, ...]] = {
     "numba": ("firmware_py/compiling.py",),
     "rerun": ("hil/pictures/viewer.py",),
-    "foxglove": ("hil/exports/mcap.py",),
+    "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
     "time": ("hil/clock.py", "hil/laboratory/run.py", "ground_station/clock.py"),
     "datetime": (),
     "asyncio": (),
     "threading": (
-        "hil/pictures/window.py",
+        "hil/live/feed.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
         "ground_station/terminal.py",
     ),
@@ -70,12 +70,12 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "elftools": ("firmware_py/export/arm_image.py",),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
     "subprocess": (
-        "hil/laboratory/result.py", "hil/pictures/window.py", "hil/servers/linked.py",
+        "hil/laboratory/result.py", "hil/live/", "hil/servers/linked.py",
         "ground_station/sources/motioncapture_client.py",
         "firmware_py/export/native.py", "firmware_py/export/arm_image.py", "firmware_py/export/plain.py",
     ),
     "socket": (
-        "hil/clock.py", "hil/pictures/window.py", "hil/servers/dongle_plugin.py", "hil/servers/dongle_server.py",
+        "hil/clock.py", "hil/live/window.py", "hil/servers/dongle_plugin.py", "hil/servers/dongle_server.py",
         "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py",
         "ground_station/sources/optitrack.py", "ground_station/sources/motioncapture_process.py",
     ),
@@ -95,7 +95,9 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "hypothesis": ("hil/testing/strategies.py",),
     "perfetto": ("hil/exports/perfetto.py",),
     "matplotlib": ("hil/pictures/", "hil/studies/"),
-    "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/"),
+    "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/",
+        "hil/live/",
+    ),
 }  # fmt: skip
 # BLAS, LAPACK, the C library's functions and numpy's vector code have other last bits on other processors, so they
 # stay out of all that flies; these files look at what was flown.

@@ -10,12 +10,15 @@ import click
 from hil.commands.options import (
     INTERRUPTED,
     announce_compilation,
+    close_live,
     console,
     fault_option,
     notices,
+    open_live,
     profile_option,
     seed_option,
     set_option,
+    view_option,
     write_pictures,
 )
 from hil.commands.tables import print_result, print_seeds
@@ -24,9 +27,9 @@ from hil.errors import LabError
 if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
     from hil.laboratory.run import Request
-    from hil.pictures.viewer import LiveViewer
 
 SEEDS_MAX = 10_000
+SERVED = ("web", "foxglove")  # pictures that end with the command
 
 
 @click.command()
@@ -41,7 +44,7 @@ SEEDS_MAX = 10_000
 @set_option
 @fault_option
 @click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
-@click.option("--view", "watch", is_flag=True, help="Watch live in the rerun viewer.")
+@view_option
 @click.option("--perfetto", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace.")
 @click.option(
     "--link", metavar="LINK", default="radio", show_default=True,
@@ -64,7 +67,7 @@ def fly(
     overrides: tuple[str, ...],
     fault_texts: tuple[str, ...],
     realtime: bool,
-    watch: bool,
+    target: str | None,
     perfetto: bool,
     link: str,
     board: str,
@@ -77,7 +80,7 @@ def fly(
     from hil.experiments import find_experiment
 
     chosen = find_experiment(experiment)
-    if seeds > 1 and (realtime or watch or perfetto):
+    if seeds > 1 and (realtime or target or perfetto):
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
     if perfetto:
         import hil.exports.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
@@ -95,10 +98,10 @@ def fly(
     if seeds > 1:
         return _fly_many(requests, out or Path("runs"))
     folder = out or Path("runs") / f"{chosen.name}-{seed}"
-    return _fly_one(requests[0], folder, realtime, watch, perfetto)
+    return _fly_one(requests[0], folder, realtime, target, perfetto)
 
 
-def _fly_one(request: Request, folder: Path, realtime: bool, watch: bool, perfetto: bool) -> int:
+def _fly_one(request: Request, folder: Path, realtime: bool, target: str | None, perfetto: bool) -> int:
     """Fly one seed with all its pictures; returns the exit code."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -106,8 +109,8 @@ def _fly_one(request: Request, folder: Path, realtime: bool, watch: bool, perfet
     from hil.laboratory.run import fly, prepare
     from hil.servers.linked import linked_flight
 
+    view = open_live(target)
     prepare(folder)
-    viewer = _live_viewer(folder) if watch else None
     clock = Paced() if realtime else FreeRunning()
     columns = (
         TextColumn("{task.description}"),
@@ -122,31 +125,23 @@ def _fly_one(request: Request, folder: Path, realtime: bool, watch: bool, perfet
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
         make = None if request.in_lockstep else linked_flight
-        result = fly(request, folder, clock, show, viewer.send if viewer else None, perfetto, make)
+        result = fly(request, folder, clock, show, view, perfetto, make)
         progress.update(bar, description="writing recording and report", total=None, now="")
         write_pictures(folder, request.experiment)
         if perfetto:
             from hil.exports.perfetto import write_perfetto
 
             write_perfetto(folder)
-        missed = viewer.close() if viewer else 0
     print_result(result)
-    if missed:
-        console.print(
-            f"the live viewer was too slow for {missed} of the flight's seconds; the recording has them all"
-        )
+    if view is not None and target in SERVED and notices.is_terminal:
+        notices.print("what was flown can be looked at until Ctrl-C")
+        view.stay()
+    close_live(view, result)
     if result.stood_still_ms:
         console.print(f"this machine was too slow: time stood still for {result.stood_still_ms:.0f} ms")
     if result.outcome == "interrupted":
         return INTERRUPTED
     return 0 if result.passed else 1
-
-
-def _live_viewer(folder: Path) -> LiveViewer:
-    """Open the live viewer."""
-    from hil.pictures.viewer import LiveViewer
-
-    return LiveViewer(folder)
 
 
 def _fly_many(requests: list[Request], parent: Path) -> int:

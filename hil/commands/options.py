@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,8 @@ from hil.errors import LabError
 
 if TYPE_CHECKING:
     from hil.laboratory.experiment import Experiment
+    from hil.laboratory.result import Result
+    from hil.live.feed import LiveView
 
 INTERRUPTED = 130
 
@@ -44,6 +47,12 @@ set_option = click.option(
 )
 
 
+view_option = click.option(
+    "--view", "target", is_flag=False, flag_value="window", metavar="[web|connect:HOST:PORT|foxglove]",
+    help="Watch live: in the rerun viewer, in a browser, in a viewer that is open somewhere, in Foxglove.",
+)  # fmt: skip
+
+
 def announce_compilation() -> None:
     """Say that the first run compiles, because it takes a while."""
     from firmware_py.compiling import is_kept
@@ -65,6 +74,29 @@ def stop_signals() -> list[int]:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, _: stops.append(received))
     return stops
+
+
+def open_live(target: str | None) -> LiveView | None:
+    """Open the picture that `--view` asks for."""
+    if target is None:
+        return None
+    from hil.live.feed import open_view
+
+    return open_view(target, say)
+
+
+def close_live(view: LiveView | None, result: Result | None = None) -> None:
+    """Close the picture, and keep and say what it has missed of the flight."""
+    if view is None:
+        return
+    from hil.laboratory.result import write_result
+    from hil.live.feed import missed_text
+
+    missed = view.close()
+    if result is not None:
+        write_result(replace(result, not_shown=missed))
+    if missed:
+        say(missed_text(missed) + ("; the log has them all" if result is not None else ""))
 
 
 def write_pictures(folder: Path, experiment: Experiment) -> None:

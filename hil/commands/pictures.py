@@ -11,9 +11,13 @@ from hil.commands.options import console, run_folder
 @run_folder
 def view(run: Path) -> None:
     """Open RUN, a run folder, in the rerun viewer."""
-    from hil.pictures.viewer import view_run
+    from hil.live.window import show_file
+    from hil.pictures.viewer import RECORDING, write_run_rrd
 
-    view_run(run)
+    path = run / RECORDING
+    if not path.is_file():
+        write_run_rrd(run)
+    show_file(path)
 
 
 @click.command()

@@ -11,12 +11,15 @@ import click
 
 from hil.commands.options import (
     announce_compilation,
+    close_live,
     fault_option,
+    open_live,
     profile_option,
     say,
     seed_option,
     set_option,
     stop_signals,
+    view_option,
 )
 from hil.errors import LabError
 
@@ -70,6 +73,7 @@ BOARDS_MAX = 10
     "--state", type=click.Path(path_type=Path), metavar="DIR",
     help="Keep each board's EEPROM and deck memory in this folder, over restarts of the server.",
 )  # fmt: skip
+@view_option
 @fault_option
 @seed_option
 @profile_option
@@ -88,6 +92,7 @@ def serve(
     up: Up,
     multicast: bool,
     state: Path | None,
+    target: str | None,
     fault_texts: tuple[str, ...],
     seed: int,
     profile: str,
@@ -98,6 +103,8 @@ def serve(
     Without --udp, --radio or --mavlink the first board is on UDP. A robot is held until it flies: corrections come from
     clients or, with --station, from within. Motive calls the bodies floaty, floaty2, .... It tracks them
     by eight markers each, which --set markers.enabled=false takes off: poses have noise of their own then.
+
+    --view shows the first robot, with home as its goal.
 
     While it runs, a line like push.y=2 or mocap.dropout:0.5 lets that fault act at once; help shows what else can be typed.
     """
@@ -124,7 +131,8 @@ def serve(
     faults = [parse(text) for text in fault_texts]
     check(faults, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
     announce_compilation()
-    server = Server(config, boards, seed, say, mavlink=bool(ends), faults=faults, state=state)
+    view = open_live(target)
+    server = Server(config, boards, seed, say, mavlink=bool(ends), faults=faults, state=state, onlooker=view)
     try:
         if radio:
             address = server.ends.serve_radio(radio_port)
@@ -146,6 +154,7 @@ def serve(
         server.run(lambda: bool(stops))
     finally:
         server.ends.close()
+        close_live(view)
     if server.ends.motive is not None and server.ends.motive.malformed:
         say(f"motive could not read {server.ends.motive.malformed} packets")
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING
 import click
 
 from firmware_py.extras import install_command
-from hil.commands.options import INTERRUPTED, profile_option, say, set_option, stop_signals, write_pictures
+from hil.commands.options import (
+    INTERRUPTED,
+    close_live,
+    open_live,
+    profile_option,
+    say,
+    set_option,
+    stop_signals,
+    view_option,
+    write_pictures,
+)
 from hil.commands.tables import print_result
 from hil.errors import LabError
 
@@ -53,6 +63,7 @@ if TYPE_CHECKING:
     "--out", type=click.Path(path_type=Path), metavar="DIR",
     help="Run folder as `floaty fly` writes one: log, telemetry, events, result, report, recording.",
 )  # fmt: skip
+@view_option
 @profile_option
 @set_option
 def station(
@@ -64,6 +75,7 @@ def station(
     log: Path | None,
     record: Path | None,
     out: Path | None,
+    target: str | None,
     profile: str,
     overrides: tuple[str, ...],
 ) -> int:
@@ -91,7 +103,10 @@ def station(
     for option, path in (("--log", log), ("--record", record)):
         if path is not None and not path.parent.is_dir():
             raise LabError(f"{option} {path}: there is no folder {path.parent}")
-    flight = None if out is None else RealFlight(out, experiment, config, profile, overrides, uri, say)
+    view = open_live(target)
+    flight = None
+    if out is not None or view is not None:
+        flight = RealFlight(out, experiment, config, profile, overrides, uri, say, onlooker=view)
 
     def tell(text: str) -> None:
         say(text)
@@ -102,15 +117,18 @@ def station(
         if flight is not None:
             flight.note(OPERATOR, text)
 
-    operator = Operator(_trajectory_of, say, note)
+    operator = Operator(
+        _trajectory_of, say, note, view.know if view is not None and target == "foxglove" else None
+    )
     terminal = Terminal(lambda: (*COMMANDS, *EXPERIMENTS, *operator.known))
 
     def steer(cockpit: Cockpit, now_us: int) -> None:
-        for line in terminal.lines():
+        for line in [*terminal.lines(), *(view.lines() if view is not None else ())]:
             operator.take(line)
         operator.turn(cockpit, now_us)
 
-    session = Session(uri, mocap, experiment.trajectory, start_s, flight.telemetry if flight else log, record)
+    telemetry = flight.telemetry if flight is not None and out is not None else log
+    session = Session(uri, mocap, experiment.trajectory, start_s, telemetry, record)
     stops = stop_signals()
     hands = [steer] if flight is None else [steer, flight.turn]
     failure = ""
@@ -124,6 +142,7 @@ def station(
     if result is not None:
         write_pictures(result.folder, experiment)
         print_result(result)
+    close_live(view, result)
     if failure:
         raise LabError(failure)
     if result is None or result.passed:

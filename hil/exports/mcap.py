@@ -4,12 +4,12 @@ Foxglove's types (protobuf): `/truth/pose` (`/cameras/pose` of a real flight), `
 (PoseInFrame), `/tf` (the frames world, goal, body and estimate for its 3-D panel), `/text` (Log). All other columns
 of the log go as JSON with a schema that names units and frames: `/truth/twist`, `/estimate/twist`, `/flaps`, and one
 topic for each other prefix of the log (`/link`, `/battery`, `/estimator`, …). MCAP's times cannot be negative: they
-count from the start of the log; the file's metadata `flight` says when the release was. The only file that knows
-foxglove, which comes with the extra `export`.
+count from the start of the log; the file's metadata `flight` says when the release was. Foxglove's SDK
+comes with the extra `export`.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,17 +43,27 @@ def write_mcap(folder: Path) -> Path:
     context = foxglove.Context()
     with foxglove.open_mcap(path, allow_overwrite=True, context=context) as writer:
         writer.write_metadata("flight", _metadata(log))
-        _write_poses(log, context)
-        for topic, columns in topics_of(log.column_names).items():
-            _write_numbers(log, topic, columns, context)
-        texts = channels.LogChannel("/text", context=context)
-        for event in events:
-            us = event["t_us"]
-            text = messages.Log(
-                timestamp=_timestamp(us), level=messages.LogLevel.Info, message=event["text"], name=event["source"]
-            )  # fmt: skip
-            texts.log(text, log_time=NS_PER_US * us)
+        log_rows(log, context)
+        log_texts(events, context)
     return path
+
+
+def log_rows(log: pa.Table, context: foxglove.Context) -> None:
+    """Log the poses and numbers of rows; may be called again with the next ones."""
+    _write_poses(log, context)
+    for topic, columns in topics_of(log.column_names).items():
+        _write_numbers(log, topic, columns, context)
+
+
+def log_texts(events: Iterable[Mapping[str, Any]], context: foxglove.Context) -> None:
+    """Log texts: `t_us`, `source`, `text`."""
+    texts = channels.LogChannel("/text", context=context)
+    for event in events:
+        us = event["t_us"]
+        text = messages.Log(
+            timestamp=_timestamp(us), level=messages.LogLevel.Info, message=event["text"], name=event["source"]
+        )  # fmt: skip
+        texts.log(text, log_time=NS_PER_US * us)
 
 
 def topics_of(names: list[str]) -> dict[str, list[str]]:

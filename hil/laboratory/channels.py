@@ -113,7 +113,7 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
     plant, board, firmware = robot.plant, robot.board, robot.firmware
     signals, queue = firmware.signals, firmware.measurements
     kernel = firmware.kernel
-    tasks = kernel.tasks
+    tasks = tuple(kernel.tasks)
     timed = [task for task in tasks if task.name in DEADLINES_US]
 
     def goal() -> tuple[float, ...]:

@@ -26,7 +26,7 @@ from hil.laboratory.channels import station_channels
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import RECORD_PERIOD_US
 from hil.laboratory.metrics import check_limits, free_flight, judge, measure
-from hil.laboratory.recorder import Recorder, load_log
+from hil.laboratory.recorder import Onlooker, Recorder, load_log
 from hil.laboratory.result import REAL, Origin, Outcome, Result, commit, versions, write_result
 from hil.world.config import LimitsConfig
 
@@ -34,12 +34,13 @@ from hil.world.config import LimitsConfig
 class RealFlight:
     """Records one flight of `floaty station` into `folder`, which it makes; `turn` is a hand of the station's program.
 
-    Raises `LabError` when something is there already: real flights are not flown again.
+    Without a folder nothing is kept: there is only who looks on. Raises `LabError` when something is there already: real
+    flights are not flown again.
     """
 
     def __init__(
         self,
-        folder: Path,
+        folder: Path | None,
         experiment: Experiment,
         config: LabConfig,
         profile: str,
@@ -47,8 +48,10 @@ class RealFlight:
         uri: str,
         say: Callable[[str], None],
         clock: Callable[[], int] = clock_us,
+        onlooker: Onlooker | None = None,
     ) -> None:
-        self.folder = folder
+        self._folder = folder
+        self._onlooker = onlooker
         self._experiment = experiment
         self._config = config
         self._limits = config.limits.get(experiment.name, experiment.limits)
@@ -68,12 +71,13 @@ class RealFlight:
         self._lost: str | None = None
         self._state: int | None = None  # the supervisor's
         self._broken = False  # nothing can be written any more
-        _make(folder)
+        if folder is not None:
+            _make(folder)
 
     @property
-    def telemetry(self) -> Path:
+    def telemetry(self) -> Path | None:
         """Where the station's own record belongs."""
-        return self.folder / TELEMETRY
+        return None if self._folder is None else self._folder / TELEMETRY
 
     def note(self, source: str, text: str) -> None:
         """Put a line into the event log."""
@@ -101,7 +105,7 @@ class RealFlight:
         channels = station_channels(
             cockpit, lambda: self._is_free, lambda: cockpit.plan.at(self._now_us), self._start_us
         )
-        self._recorder = Recorder(self.folder, channels, metadata)
+        self._recorder = Recorder(self._folder, channels, metadata, self._onlooker)
         for early in self._early:
             self._note(*early)
 
@@ -113,7 +117,7 @@ class RealFlight:
             write(self._recorder)
         except OSError as error:
             self._broken = True
-            self._say(f"{self.folder}: no more is recorded: {error.strerror or error}")
+            self._say(f"{self._folder}: no more is recorded: {error.strerror or error}")
 
     def _look(self, cockpit: Cockpit, now_us: int) -> None:
         """Notice what the board does, the trajectory's begin and end, and a loss."""
@@ -137,24 +141,29 @@ class RealFlight:
                 self._note(now_us, "lab", f"lost: {self._lost}; what follows is not judged")
 
     def close(self, failure: str = "", interrupted: bool = False) -> Result | None:
-        """Finish the log and write `result.json`; None for a flight that never began, which leaves no folder.
+        """Finish the log and write `result.json`; None for a flight that never began or is not kept: it leaves no folder.
 
         `failure` is why the station gave up. Raises `LabError` when it cannot be written.
         """
+        folder = self._folder
         if self._recorder is None:
-            shutil.rmtree(self.folder)
+            if folder is not None:
+                shutil.rmtree(folder)
             return None
         self.note("lab", failure or ("interrupted by the user" if interrupted else "the station ends"))
         try:
-            result = self._result(self._recorder.close(), failure, interrupted)
+            digest = self._recorder.close()
+            if folder is None:
+                return None
+            result = self._result(folder, digest, failure, interrupted)
             write_result(result)
         except OSError as error:
-            raise LabError(f"--out {self.folder}: cannot be written ({error.strerror or error})") from None
+            raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
         return result
 
-    def _result(self, digest: str, failure: str, interrupted: bool) -> Result:
+    def _result(self, folder: Path, digest: str, failure: str, interrupted: bool) -> Result:
         """Return how it went, from the log."""
-        log = load_log(self.folder)
+        log = load_log(folder)
         own = self._experiment.metrics
         metrics = measure(log, self._lost is not None) | dict.fromkeys(own, nan)
         free = free_flight(log)
@@ -177,11 +186,11 @@ class RealFlight:
             tasks=(),
             queues=(),
             usage=None,
-            ages=ages_of(told(self.folder), log, self._origin.link),
+            ages=ages_of(told(folder), log, self._origin.link),
             hash=digest,
             real_time_factor=nan,
             stood_still_ms=nan,
-            folder=self.folder,
+            folder=folder,
         )
 
 

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +22,7 @@ from hil.errors import LabError
 from hil.laboratory.ages import at_exposure
 
 ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to disk
+ROWS_SHOWN = 20  # together, to who looks on: five times a second
 OPERATOR = "operator"  # source of the events that somebody has brought about at the terminal
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
@@ -45,25 +46,34 @@ class Channel:
     quantities: tuple[Quantity, ...]
 
 
-class Recorder:
-    """Writes one flight into its run folder.
+class Onlooker(Protocol):
+    """Who looks on while a flight is recorded. Neither call waits for anything, or raises."""
 
-    `on_batch` receives every finished batch as a `pyarrow.RecordBatch`, for the live viewer.
-    """
+    def rows(self, batch: pa.RecordBatch) -> None:
+        """Take the next rows; the schema of all of them is that of the log."""
+        ...
+
+    def note(self, t_us: int, source: str, text: str) -> None:
+        """Take a line of text."""
+        ...
+
+
+class Recorder:
+    """Writes one flight into its run folder, and shows it to who looks on; without a folder nothing is kept."""
 
     def __init__(
         self,
-        folder: Path,
+        folder: Path | None,
         channels: tuple[Channel, ...],
         metadata: Mapping[str, str],
-        on_batch: Callable[[pa.RecordBatch], None] | None = None,
+        onlooker: Onlooker | None = None,
     ) -> None:
-        self.folder = folder
         self.release_us: int | None = None  # of the robot, once it is known
         self._sources: list[tuple[Callable[[], Any], NDArray[Any]]] = []
         self._times = np.zeros(ROWS_PER_BATCH, np.int64)
-        self._row = 0
-        self._on_batch = on_batch
+        self._row = self._shown = 0
+        self._folder = folder
+        self._onlooker = onlooker
         fields = [pa.field("t", pa.int64(), metadata={"unit": "us", "frame": ""})]
         for channel in channels:
             columns = [(name, quantity) for quantity in channel.quantities for name in quantity.names]
@@ -74,8 +84,11 @@ class Recorder:
                 fields.append(pa.field(name, pa.from_numpy_dtype(block.dtype), metadata=metadata_of_column))
         self._schema = pa.schema(fields, metadata=dict(metadata))
         self._hash = hashlib.sha256(" ".join(self._schema.names).encode())
-        self._stream = pa.ipc.new_stream(str(folder / STREAM), self._schema)
-        self._events = (folder / EVENTS).open("w", encoding="utf-8")
+        self._stream: Any = None
+        self._events: IO[str] | None = None
+        if folder is not None:
+            self._stream = pa.ipc.new_stream(str(folder / STREAM), self._schema)
+            self._events = (folder / EVENTS).open("w", encoding="utf-8")
 
     def row(self, now_us: int) -> None:
         """Take one sample of every channel."""
@@ -86,11 +99,22 @@ class Recorder:
         self._row = row + 1
         if self._row == ROWS_PER_BATCH or now_us - self._times[0] >= BATCH_US:
             self._write_batch()
+        elif self._row - self._shown == ROWS_SHOWN:
+            self._show()
+
+    def read_from(self, channels: tuple[Channel, ...]) -> None:
+        """Sample these from now on: the same quantities of another object, like a board that has booted again."""
+        self._sources = [
+            (channel.read, block) for channel, (_, block) in zip(channels, self._sources, strict=True)
+        ]
 
     def note(self, now_us: int, source: str, text: str) -> None:
         """Add a line of text to the log, on disk at once."""
-        self._events.write(json.dumps({"t_us": now_us, "source": source, "text": text}) + "\n")
-        self._events.flush()
+        if self._onlooker is not None:
+            self._onlooker.note(now_us, source, text)
+        if self._events is not None:
+            self._events.write(json.dumps({"t_us": now_us, "source": source, "text": text}) + "\n")
+            self._events.flush()
 
     def close(self, correct: Callable[[pa.Table], pa.Table] | None = None) -> str:
         """Finish the files; returns the SHA-256 over times, names and values of all columns as they were recorded.
@@ -99,23 +123,36 @@ class Recorder:
         """
         if self._row:
             self._write_batch()
-        self._stream.close()
-        self._events.close()
-        finish_log(self.folder, self.release_us, correct)
+        if self._events is not None:
+            self._events.close()
+        if self._folder is not None:
+            self._stream.close()
+            finish_log(self._folder, self.release_us, correct)
         return self._hash.hexdigest()
 
     def _write_batch(self) -> None:
-        rows = self._row
-        self._row = 0
-        columns = [self._times[:rows].copy()]
-        for _, block in self._sources:
-            columns.extend(block[:rows].T.copy())
+        self._show()
+        columns = self._columns(0)
+        self._row = self._shown = 0
         for values in columns:
             self._hash.update(values.data)
-        batch = pa.record_batch([pa.array(values) for values in columns], schema=self._schema)
-        self._stream.write_batch(batch)
-        if self._on_batch is not None:
-            self._on_batch(batch)
+        if self._stream is not None:
+            self._stream.write_batch(self._batch(columns))
+
+    def _show(self) -> None:
+        if self._onlooker is not None:
+            self._onlooker.rows(self._batch(self._columns(self._shown)))
+            self._shown = self._row
+
+    def _columns(self, first: int) -> list[NDArray[Any]]:
+        """Return copies of the columns from a row on."""
+        columns = [self._times[first : self._row].copy()]
+        for _, block in self._sources:
+            columns.extend(block[first : self._row].T.copy())
+        return columns
+
+    def _batch(self, columns: list[NDArray[Any]]) -> pa.RecordBatch:
+        return pa.record_batch([pa.array(values) for values in columns], schema=self._schema)
 
 
 def finish_log(

@@ -97,6 +97,7 @@ class Result(Origin):
     real_time_factor: Figure
     stood_still_ms: Figure  # simulated time, while the machine was too slow for a paced flight
     folder: Annotated[Path, Field(exclude=True)] = Path()  # where it lies
+    not_shown: int | None = None  # rows of the log that the live viewer did not take; null without one
 
     @computed_field  # type: ignore[prop-decorator]
     @property

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import pyarrow as pa
-
 from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.cortex_m4 import CortexM4Runner
@@ -31,7 +29,7 @@ from hil.laboratory.faults import Fault, check
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import LOCKSTEP, lockstep_flight
 from hil.laboratory.metrics import check_limits, free_flight, judge, measure
-from hil.laboratory.recorder import Recorder, load_log
+from hil.laboratory.recorder import Onlooker, Recorder, load_log
 from hil.laboratory.result import RESULT, Origin, Outcome, QueueReport, Result, commit, versions, write_result
 
 LOADED_US = 250_000  # every part of the core has been called by then
@@ -111,7 +109,7 @@ def fly(
     folder: Path,
     clock: Clock | None = None,
     progress: Callable[[int, Flight], None] | None = None,
-    on_batch: Callable[[pa.RecordBatch], None] | None = None,
+    onlooker: Onlooker | None = None,
     trace_all: bool = False,
     flight_of: MakeFlight | None = None,
 ) -> Result:
@@ -124,7 +122,7 @@ def fly(
     flight = (flight_of or lockstep)(request, folder / TELEMETRY, clock, trace_all)
     origin = request.origin()
     metadata = {**origin.metadata(), "config": request.config.model_dump_json()}
-    recorder = Recorder(folder, flight.channels(), metadata, on_batch)
+    recorder = Recorder(folder, flight.channels(), metadata, onlooker)
     flight.recorder = recorder
     outcome: Outcome = "error"
     cause = None

@@ -4,7 +4,7 @@ Lengths in cm, angles in degrees, times in ms. Colours are those of Okabe and It
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,7 +14,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from ground_station.latency import STAGES
-from hil.laboratory.faults import Span
 from hil.laboratory.metrics import attitude_error, column, is_real, position_error
 from hil.laboratory.recorder import OPERATOR
 
@@ -116,7 +115,9 @@ FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _flaps)
 FLAPS_COMMAND = Curves(
     _four("command "), FLAP_COLOURS, "deg", _degrees(*_four("control.flap_")), needs="control.flap_1"
 )
-INPUTS = Curves(_four("u"), FLAP_COLOURS, "deg", _degrees(*_four("control.u")))
+INPUTS = Curves(
+    ("u1 roll", "u2 pitch", "u3 yaw", "u4 height"), FLAP_COLOURS, "deg", _degrees(*_four("control.u"))
+)
 AGE = Curves(
     ("age of the pose",), (BLUE,), "ms", lambda rows: 1e-3 * column(rows, "estimator.pose_age_us")[:, None]
 )
@@ -150,7 +151,6 @@ SUPERVISOR = States(
     ("calibrating", "waiting", "flying", "failsafe", "unknown"),
     (ORANGE, SKY, GREEN, RED, GREY),
 )  # firmware_py.wire.supervisor.State, and that of a board that has not told it
-FAULT_STATES, FAULT_COLOURS = ("-", "acts"), (GREY, RED)
 RELEASE = States("flight.free", ("held", "free"), (GREY, BLUE))
 
 
@@ -201,23 +201,9 @@ def line_load(rows: pa.Table) -> NDArray[np.float64]:
 
 def changes(rows: pa.Table, states: States) -> tuple[NDArray[np.float64], list[str]]:
     """Return when [us] which state began; the first row begins one."""
-    return _changes(rows, column(rows, states.column).astype(np.int64), states.names)
-
-
-def fault_changes(rows: pa.Table, spans: Iterable[Span]) -> tuple[NDArray[np.float64], list[str]]:
-    """Return when [us] any of some faults began or ceased to act; the first row begins one."""
-    times = column(rows, "t")
-    acts = np.zeros(len(times), np.int64)
-    for span in spans:
-        acts[(times >= span.begin_us) & (times < span.end_us)] = 1
-    return _changes(rows, acts, FAULT_STATES)
-
-
-def _changes(
-    rows: pa.Table, codes: NDArray[np.int64], names: Sequence[str]
-) -> tuple[NDArray[np.float64], list[str]]:
+    codes = column(rows, states.column).astype(np.int64)
     begins = np.flatnonzero(np.diff(codes, prepend=-1)) if len(codes) else np.empty(0, np.int64)
-    return column(rows, "t")[begins], [names[code] for code in codes[begins]]
+    return column(rows, "t")[begins], [states.names[code] for code in codes[begins]]
 
 
 def with_marks(log: pa.Table, events: Iterable[Mapping[str, Any]]) -> pa.Table:

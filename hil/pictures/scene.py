@@ -86,6 +86,16 @@ def stand_lines(plant: PlantConfig) -> list[Points]:
     return [feet, *np.stack((corners[:4], feet[:4]), axis=1)]
 
 
+def net_lines(radius: float, height: float) -> list[Points]:
+    """Return the net in W: lines along x and y, 10 cm apart, within a circle."""
+    places = np.arange(-0.1 * (radius // 0.1), radius, 0.1)
+    halves = np.sqrt(radius**2 - places**2)
+    along_x = [
+        np.array([(-half, y, height), (half, y, height)]) for y, half in zip(places, halves, strict=True)
+    ]
+    return along_x + [line[:, (1, 0, 2)] for line in along_x]
+
+
 def box_lines(half: float) -> list[Points]:
     """Return the edges of a cube around the origin as five closed or straight lines."""
     low, high = (
@@ -110,6 +120,11 @@ def rotated(q_AB: Points, v_B: Points) -> Points:
     w, u = q_AB[:, :1], q_AB[:, 1:]
     t = 2.0 * np.cross(u, v_B)
     return np.asarray(v_B + w * t + np.cross(u, t))
+
+
+def tops(plant: PlantConfig, p_WB: Points, q_WB: Points) -> Points:
+    """Return where the tether is fixed, the middle of the base plate, (N, 3) in W."""
+    return p_WB + rotated(q_WB, np.array([0.0, 0.0, plant.axis_height]))
 
 
 def drag_origins(plant: PlantConfig, p_WB: Points, q_WB: Points, flaps: Points) -> Points:

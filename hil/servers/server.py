@@ -7,16 +7,25 @@ from functools import partial
 from pathlib import Path
 
 from firmware_py.rtos import WatchdogError
+from ground_station.trajectory import Goal, Hold
 from hil.clock import Paced, Readers
 from hil.config import LabConfig
 from hil.devices.dongle import VirtualDongle
 from hil.devices.markers import NO_POINTS, marker_places
 from hil.devices.nrf51 import Power
 from hil.errors import LabError
+from hil.laboratory.channels import (
+    battery_channel,
+    flight_channels,
+    logic_channels,
+    marker_channel,
+    radio_channel,
+)
 from hil.laboratory.failures import Failures
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
+from hil.laboratory.recorder import Channel, Onlooker, Recorder
 from hil.laboratory.robot import Robot, Streams, with_system
 from hil.servers.dongle_server import DongleServer
 from hil.servers.holder import Holder
@@ -93,11 +102,45 @@ def name_of(number: int) -> str:
     return "floaty" if number == 1 else f"floaty{number}"
 
 
+class Shown:
+    """Shows a served robot to who looks on, with home as its goal: nobody here knows those of the clients."""
+
+    def __init__(self, served: ServedRobot, onlooker: Onlooker) -> None:
+        self._served = served
+        served.robot.thief.share = (
+            0.0  # a task that a fault may add later: the columns are those of all tasks
+        )
+        self._firmware = served.robot.firmware
+        config = served.robot.config
+        metadata = {"experiment": "served", "link": "served:", "config": config.model_dump_json()}
+        self._recorder = Recorder(None, self._channels(), metadata, onlooker)
+
+    def row(self, now_us: int) -> None:
+        """Take a sample of it."""
+        if self._served.robot.firmware is not self._firmware:  # it has booted
+            self._firmware = self._served.robot.firmware
+            self._recorder.read_from(self._channels())
+        self._recorder.row(now_us)
+
+    def _channels(self) -> tuple[Channel, ...]:
+        robot = self._served.robot
+        if robot.uart is not None:
+            from hil.laboratory.serial_line import serial_channel  # needs pymavlink
+
+            line = serial_channel(robot.uart, robot.firmware, None)
+        else:
+            line = radio_channel(self._served.udp_radio)
+        home = Hold(Goal(robot.config.flight.home, 0.0))
+        markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
+        own = logic_channels(robot.firmware)
+        return (*flight_channels(robot, home), line, battery_channel(robot.battery), *markers, *own)
+
+
 class Server:
     """`count` robots that are let go when they fly, and put back when they are lost; `run` them after opening ends.
 
-    `faults` act from the first release of each robot on. `say` gets lines for the user. EEPROM and deck memories are kept
-    in the folder `state`.
+    `faults` act from the first release of each robot on. `say` gets lines for the user, `onlooker` sees the
+    first robot. EEPROM and deck memories are kept in the folder `state`.
     """
 
     def __init__(
@@ -109,6 +152,7 @@ class Server:
         mavlink: bool = False,
         faults: Sequence[Fault] = (),
         state: Path | None = None,
+        onlooker: Onlooker | None = None,
     ) -> None:
         self.clock = Paced()
         self.lab = Laboratory(self.clock)
@@ -117,7 +161,8 @@ class Server:
         self._say = say
         self._faults = faults
         self._state = state
-        self._holders: list[Holder] = []
+        self._onlooker = onlooker
+        self._shown: Shown | None = None
         for number in range(1, count + 1):
             own = with_system(config, config.mavlink.system + number - 1) if mavlink else config
             self._add(number, own, Streams.of_seed(seed + number - 1), mavlink)
@@ -125,6 +170,8 @@ class Server:
     def _add(self, number: int, config: LabConfig, streams: Streams, mavlink: bool) -> None:
         def say(source: str, text: str) -> None:
             self._say(f"board {number}: {text}")
+            if number == 1 and self._onlooker is not None:
+                self._onlooker.note(self.lab.now_us, source, text)
 
         robot = Robot(config, self.lab.events, streams, say, radio=True, mavlink=mavlink)
         served = ServedRobot(number, robot, streams.radio, self._say, self._state)
@@ -146,6 +193,8 @@ class Server:
 
         holder = Holder(robot, let_go)
         robot.watch(0)
+        if number == 1 and self._onlooker is not None:
+            self._shown = Shown(served, self._onlooker)
         self.lab.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, partial(self._look, served, holder))
 
     def run(self, stopping: Callable[[], bool]) -> None:
@@ -164,6 +213,8 @@ class Server:
         robot, nrf51 = served.robot, served.nrf51
         lost = robot.look(now_us)
         served.keep()
+        if self._shown is not None and served.number == 1:
+            self._shown.row(now_us)
         if nrf51.power in (Power.OFF, Power.BOOTLOADER) and now_us - nrf51.heard_us > BUTTON_US:
             robot.say("lab", "power button pressed")
             nrf51.press_button(now_us)

@@ -3,10 +3,8 @@
 import importlib
 import os
 import signal
-import socket
 import subprocess
 import sys
-import threading
 from collections import Counter
 from contextlib import suppress
 from itertools import pairwise
@@ -32,7 +30,9 @@ from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import SCHEMA
-from hil.pictures import curves, scene, viewer, window
+from hil.live import window
+from hil.live.feed import open_view
+from hil.pictures import curves, scene, viewer
 from hil.world import layout as at
 from hil.world.body import place_plates
 from hil.world.config import PlantConfig
@@ -53,8 +53,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def chunks(path: Path, entity: str) -> list[pa.RecordBatch]:
     """The batches of an entity that move with time, in its order."""
     found = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity]
-    moving = [batch for batch in found if viewer.TIMELINE in batch.schema.names]
-    return sorted(moving, key=lambda batch: batch.column(viewer.TIMELINE)[0].value)
+    moving = [batch for batch in found if viewer.FROM_RELEASE in batch.schema.names]
+    return sorted(moving, key=lambda batch: batch.column(viewer.FROM_RELEASE)[0].value)
 
 
 def values(path: Path, entity: str, component: str) -> NDArray[np.float64]:
@@ -66,7 +66,7 @@ def moments(path: Path, entity: str) -> list[int]:
     return [
         moment.value + 1000 * RELEASE_US
         for batch in chunks(path, entity)
-        for moment in batch.column(viewer.TIMELINE)
+        for moment in batch.column(viewer.FROM_RELEASE)
     ]
 
 
@@ -75,7 +75,7 @@ def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:
     assert log.num_rows == 150
     fast = ["robot", "robot/plates/flap_1", "robot/plates/flap_4", "goal", "goal/estimate", "drag", "flow"]
     plots = [name for name, plot in viewer.PLOTS.items() if plot.needs in log.column_names]
-    assert "link/radio" in plots
+    assert "link/loss/radio" in plots
     for entity in (*(f"/world/{name}" for name in fast), *(f"/plot/{name}" for name in plots)):
         assert moments(path, entity) == [1000 * t for t in log.column("t").to_pylist()], entity
     assert moments(path, "/world/trail") == [1000 * t for t in log.column("t").to_pylist()[1:]]
@@ -111,7 +111,11 @@ def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) 
     assert colours.tolist() == expected
     times_us = [250, 10_250, 1_210_250, 1_310_250]
     assert moments(path, "/world/robot/markers") == [1000 * t for t in times_us]
-    still = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.is_static]
+    still = [
+        chunk.to_record_batch()
+        for chunk in RrdReader(path).stream()
+        if chunk.is_static and chunk.entity_path == "/world/robot/markers"
+    ]
     (places,) = [batch for batch in still if "Points3D:positions" in batch.schema.names]
     np.testing.assert_allclose(
         places.column("Points3D:positions").to_pylist()[0], marker_places(PlantConfig()), atol=1e-7
@@ -133,36 +137,32 @@ def rows_by_entity(path: Path) -> Counter[str]:
     return rows
 
 
-def free_port() -> int:
-    with socket.create_server((window.LOOPBACK, 0)) as free:
-        return int(free.getsockname()[1])
-
-
-def live_sink(path: Path) -> "subprocess.Popen[bytes]":
+def live_sink(path: Path, port: int) -> "subprocess.Popen[bytes]":
     """A rerun server that writes what it receives, the headless stand-in for the window."""
-    command = [*window.COMMAND, "--port", str(window.PORT), "--save", str(path)]
+    command = [*window.COMMAND, "--port", str(port), "--save", str(path)]
     return subprocess.Popen(
         command, env={**os.environ, "CI": "1", "RUST_LOG": "error"}, start_new_session=True
     )
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the sink is interrupted
-def test_a_live_flight_sends_what_the_file_holds(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_live_flight_sends_what_the_file_holds(folder: Path, tmp_path: Path) -> None:
     whole, path = rows_by_entity(viewer.write_run_rrd(folder)), tmp_path / "live.rrd"
     assert "/state/task/KALMAN" in whole
-    # The schedule is there only after the flight.
-    expected = Counter({name: rows for name, rows in whole.items() if not name.startswith("/state/task/")})
-    monkeypatch.setattr(window, "PORT", free_port())
-    sink = live_sink(path)
+    # The schedule and the station's record are there only after the flight.
+    later = ("/state/task/", "/plot/age/stages")
+    expected = Counter({name: rows for name, rows in whole.items() if not name.startswith(later)})
+    port = window.free_port(0)
+    sink = live_sink(path, port)
     try:
-        while sink.poll() is None and not window._is_open():
+        while sink.poll() is None and not window.is_open(window.LOOPBACK, port):
             pass
-        live = viewer.LiveViewer(folder)
+        view = open_view(f"connect:{window.LOOPBACK}:{port}", [].append)
+        for event in load_events(folder):
+            view.note(event["t_us"], event["source"], event["text"])
         for batch in load_log(folder).combine_chunks().to_batches(max_chunksize=40):
-            live.send(batch)
-        assert live.close() == 0
+            view.rows(batch)
+        assert view.close(60) == 0
         seen: Counter[str] = Counter()
         for _ in range(300):
             with suppress(RuntimeError):  # read in the middle of a write
@@ -182,43 +182,11 @@ def test_an_empty_log_has_a_recording(folder: Path, tmp_path: Path) -> None:
     assert rows_by_entity(tmp_path / "empty.rrd")["/world/robot/plates/flap_1"] == 1  # its mesh
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
-def test_without_a_display_the_error_says_so(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window, "PORT", free_port())
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(LabError, match="needs a display"):
-        viewer.LiveViewer(folder)
-    with pytest.raises(LabError, match="needs a display"):
-        viewer.view_run(folder)
-    assert (folder / viewer.RECORDING).is_file()
-
-
 def test_without_rerun_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "hil.pictures.viewer")
     with pytest.raises(LabError, match=r"pip install .*rerun-sdk"):
         importlib.import_module("hil.pictures.viewer")
-
-
-def test_a_full_feed_drops_the_oldest_and_never_waits() -> None:
-    busy, go_on, seen = threading.Event(), threading.Event(), list[int]()
-
-    def sink(item: int) -> None:
-        busy.set()
-        go_on.wait()
-        seen.append(item)
-
-    feed = window.LiveFeed(sink, capacity=3)
-    feed.offer(0)
-    busy.wait()
-    for item in range(1, 9):
-        feed.offer(item)
-    assert feed.dropped == 5
-    assert not feed.close(timeout_s=0.05)
-    go_on.set()
-    assert feed.close(timeout_s=10)
-    assert seen == [0, 6, 7, 8]
 
 
 @given(angles, st.integers(0, 3))

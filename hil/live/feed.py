@@ -1,0 +1,220 @@
+"""Rows and texts of a flight on their way to a picture that is made of them while it flies.
+
+The picture has a process of its own (`hil.live.picture`), at a lower priority. What goes there waits in a bounded queue
+for the thread that writes it into a pipe: an Arrow stream, whose batches carry texts and the board's parameters as metadata.
+Back come lines: how many rows were taken, and what somebody has typed there. So a picture that is slow, stands still, is
+closed or never comes up holds nobody: what it does not take is dropped and counted.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, TypeVar
+
+import pyarrow as pa
+
+from hil.errors import LabError
+
+START_TIMEOUT_S = 30.0  # for the picture to come up, after which nobody waits for it
+CATCH_UP_S = 10.0  # for it to show the rest, at the end
+QUEUE_PIECES = 300  # as the recorder shows them: a minute of flight
+TOGETHER = 100  # pieces that are written as one, when that many wait
+LINES = 1000  # that were typed there and nobody has fetched; texts before the first row
+EVENTS, PARAMETERS = b"events", b"parameters"  # metadata of a batch
+READY, FAILED, TAKEN, TYPED = "ready", "failed", "taken", "typed"  # first words of the lines that come back
+
+T = TypeVar("T")
+Piece = tuple[pa.RecordBatch, list[dict[str, Any]]]
+
+
+class Feed:
+    """Hands pieces to a sink in a thread of its own; when the sink is slow, the oldest waiting ones are dropped."""
+
+    def __init__(self, sink: Callable[[list[Piece]], None], capacity: int = QUEUE_PIECES) -> None:
+        self._sink = sink
+        self._waiting: deque[Piece] = deque(maxlen=capacity)
+        self._changed = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="live feed", daemon=True)
+        self._thread.start()
+
+    def offer(self, piece: Piece) -> None:
+        """Queue a piece; returns at once."""
+        with self._changed:
+            self._waiting.append(piece)
+            self._changed.notify()
+
+    def close(self, timeout_s: float) -> bool:
+        """Let the sink finish what is waiting; False when it did not within the time."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._closed)
+                if not self._waiting:
+                    return
+                pieces = _all(self._waiting, TOGETHER)
+            try:
+                self._sink(pieces)
+            except OSError:  # the picture has gone
+                return
+
+
+class LiveView:
+    """`hil.laboratory.recorder.Onlooker` of a picture in another process; `command` starts that.
+
+    `say` gets lines for the user. Raises `LabError` when the picture says that it cannot come up; one that says nothing is
+    not waited for.
+    """
+
+    def __init__(
+        self, command: Sequence[str], say: Callable[[str], None], start_timeout_s: float = START_TIMEOUT_S
+    ) -> None:
+        self.offered = self.taken = 0  # rows
+        self._texts: deque[dict[str, Any]] = deque(maxlen=LINES)
+        self._typed: deque[str] = deque(maxlen=LINES)
+        self._parameters: deque[tuple[str, float]] = deque()  # that the picture does not know yet
+        self._schema: pa.Schema | None = None
+        self._stream: Any = None
+        self._failure = ""
+        self._is_late = False
+        self._up = threading.Event()  # it has said whether it comes up, or it has ended
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
+        )  # fmt: skip
+        self._answers = threading.Thread(
+            target=self._listen, args=(say,), name="live feed answers", daemon=True
+        )
+        self._answers.start()
+        if not self._up.wait(start_timeout_s):
+            self._is_late = True
+            say(f"the viewer has not come up within {start_timeout_s:g} s; nobody waits for it any longer")
+        elif self._failure:
+            self._end()
+            raise LabError(self._failure)
+        self._feed = Feed(self._write)
+
+    # Recorder's onlooker
+
+    def rows(self, batch: pa.RecordBatch) -> None:
+        """Queue the next rows, with the texts before them."""
+        self.offered += batch.num_rows
+        self._schema = batch.schema
+        self._feed.offer((batch, _all(self._texts)))
+
+    def note(self, t_us: int, source: str, text: str) -> None:
+        """Keep a text for the next rows."""
+        self._texts.append({"t_us": t_us, "source": source, "text": text})
+
+    # Parameters of the board, which some pictures show and let people change
+
+    def know(self, values: Sequence[tuple[str, float]]) -> None:
+        """Tell values of the board's parameters with the next rows."""
+        self._parameters.extend(values)
+
+    def lines(self) -> list[str]:
+        """Return what was typed at the picture since the last call."""
+        return _all(self._typed)
+
+    # The end
+
+    def stay(self) -> None:
+        """Wait until the picture ends by itself, or Ctrl-C."""
+        self._flush()
+        with suppress(KeyboardInterrupt):
+            self._process.wait()
+
+    def close(self, catch_up_s: float = CATCH_UP_S) -> int:
+        """Let the picture catch up for a while and end; returns how many rows it has not taken."""
+        self._flush()
+        if self._is_late and not self.taken:
+            catch_up_s = 0.0
+        if self._feed.close(catch_up_s):
+            with suppress(OSError):
+                if self._stream is not None:
+                    self._stream.close()
+            self._close_pipe()
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(catch_up_s)
+        self._end()
+        return self.offered - self.taken
+
+    def _flush(self) -> None:
+        """Send the texts for which no rows follow."""
+        if self._texts and self._schema is not None:
+            self.rows(pa.RecordBatch.from_pylist([], schema=self._schema))
+
+    def _end(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._answers.join()
+        self._close_pipe()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+    def _close_pipe(self) -> None:
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+
+    # Threads
+
+    def _write(self, pieces: list[Piece]) -> None:
+        """Write pieces into the pipe, in the feed's thread. `OSError`: nobody reads there any more."""
+        batches = [batch for batch, _ in pieces]
+        if self._stream is None:
+            self._stream = pa.ipc.new_stream(self._process.stdin, batches[0].schema)
+        events = [event for _, texts in pieces for event in texts]
+        known = dict(_all(self._parameters))
+        metadata = {EVENTS: json.dumps(events).encode(), PARAMETERS: json.dumps(known).encode()}
+        (batch, *_) = pa.Table.from_batches(batches).combine_chunks().to_batches() or batches
+        self._stream.write_batch(batch, custom_metadata=metadata)
+        assert self._process.stdin is not None
+        self._process.stdin.flush()
+
+    def _listen(self, say: Callable[[str], None]) -> None:
+        """Take the lines of the picture until it ends."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            word, _, text = line.decode(errors="replace").strip().partition(" ")
+            if word == READY:
+                if text:
+                    say(f"view   {text}")
+                self._up.set()
+            elif word == FAILED:
+                self._failure = text
+                if self._up.is_set():
+                    say(f"the viewer has ended: {text}")
+            elif word == TAKEN:
+                self.taken = int(text)
+            elif word == TYPED:
+                self._typed.append(text)
+        if not self._up.is_set():
+            self._failure = self._failure or "the viewer's process ended without a word"
+            self._up.set()
+
+
+def _all(waiting: deque[T], most: int = LINES) -> list[T]:
+    """Take what waits; another thread may add to it meanwhile."""
+    return [waiting.popleft() for _ in range(min(len(waiting), most))]
+
+
+def open_view(target: str, say: Callable[[str], None]) -> LiveView:
+    """Return the picture that `--view` means by a target. Raises `LabError` when there is no such one, or it cannot open."""
+    return LiveView([sys.executable, "-m", "hil.live.picture", target], say)
+
+
+def missed_text(rows: int) -> str:
+    """Return how the user is told of rows that a picture has missed."""
+    return f"the live viewer did not take {rows} rows of the flight"

@@ -1,0 +1,99 @@
+"""The process that shows a flight while it happens: `python -m hil.live.picture TARGET`, fed by `hil.live.feed`.
+
+A TARGET is `window` (rerun's viewer), `web` (the same in a browser), `connect:HOST:PORT` (one that is open somewhere) or
+`foxglove` (a WebSocket server for Foxglove). Rows come in at standard input, lines go out at standard output.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import IO, Any, Protocol
+
+import pyarrow as pa
+
+from hil.errors import LabError
+from hil.live.feed import EVENTS, FAILED, PARAMETERS, READY, TAKEN, TYPED
+
+NICE = 5  # behind everything that flies
+Say = Callable[[str, str], None]  # (first word, text)
+
+
+class Screen(Protocol):
+    """Where a flight is shown."""
+
+    address: str  # for the user, who must be told where to look; empty if not
+
+    def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
+        """Show the next rows, and texts up to them."""
+        ...
+
+    def know(self, values: Mapping[str, float]) -> None:
+        """Show values of the board's parameters."""
+        ...
+
+    def close(self) -> None:
+        """End."""
+        ...
+
+
+def open_screen(target: str, typed: Callable[[str], None]) -> Screen:
+    """Return the screen of a target; `typed` takes lines for the station's operator. Raises `LabError`."""
+    if target == "foxglove":
+        from hil.live.foxglove_server import FoxgloveScreen
+
+        return FoxgloveScreen(typed)
+    from hil.live.rerun_screen import RerunScreen
+
+    return RerunScreen(target)
+
+
+def run(target: str, rows: IO[bytes], say: Say) -> None:
+    """Show what comes until it ends."""
+    screen = open_screen(target, lambda line: say(TYPED, line))
+    say(READY, screen.address)
+    taken = 0
+    try:
+        reader = pa.ipc.open_stream(rows)
+        while True:
+            batch, metadata = reader.read_next_batch_with_custom_metadata()
+            if known := json.loads(metadata[PARAMETERS]):
+                screen.know(known)
+            screen.show(pa.Table.from_batches([batch]), json.loads(metadata[EVENTS]))
+            taken += batch.num_rows
+            say(TAKEN, str(taken))
+    except (StopIteration, pa.ArrowInvalid):  # the flight is over, or its process was killed
+        pass
+    finally:
+        screen.close()
+
+
+def main() -> int:
+    """Run as a process; returns the exit code."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the flight
+    with suppress(OSError):
+        os.nice(NICE)
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever libraries print
+
+    def say(word: str, text: str) -> None:
+        with suppress(OSError):
+            print(word, text, file=answers)
+
+    try:
+        run(sys.argv[1], sys.stdin.buffer, say)
+    except LabError as error:
+        say(FAILED, str(error))
+        return 1
+    except Exception as error:  # whatever it is, the flight goes on and is told
+        say(FAILED, f"{type(error).__name__}: {error}")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

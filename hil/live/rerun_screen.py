@@ -1,0 +1,54 @@
+"""A flight in rerun's viewer while it happens: in its window, in a browser, or in a viewer that is open somewhere."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import pyarrow as pa
+
+from hil.errors import LabError
+from hil.live.window import address_of, end, is_open, open_window, serve_web
+from hil.pictures.viewer import LivePicture
+
+
+class RerunScreen:
+    """`hil.live.picture.Screen` of the targets `window`, `web` and `connect:HOST:PORT`."""
+
+    def __init__(self, target: str) -> None:
+        """Open it. Raises `LabError` when there is no such target, or no viewer comes up."""
+        self.address = ""
+        self._server: subprocess.Popen[bytes] | None = None
+        if target == "window":
+            taker = open_window()
+        elif target == "web":
+            self.address, taker, self._server = serve_web()
+        else:
+            taker = _there(target)
+        self._picture = LivePicture(taker)
+
+    def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
+        """Show the next rows, and texts up to them."""
+        self._picture.show(rows, events)
+
+    def know(self, values: Mapping[str, float]) -> None:
+        """Nothing: rerun has no parameters; their changes are texts."""
+
+    def close(self) -> None:
+        """Let the viewer have the rest; the browser keeps what it has, the window stays."""
+        self._picture.close()
+        if self._server is not None:
+            end(self._server)
+
+
+def _there(target: str) -> str:
+    """Return the address of a viewer that is open at HOST:PORT."""
+    found = re.fullmatch(r"connect:(.+):(\d{1,5})", target)
+    if found is None or not 0 < int(found[2]) < 65536:
+        raise LabError(f"--view {target}: expected nothing, web, connect:HOST:PORT or foxglove")
+    host, port = found[1], int(found[2])
+    if not is_open(host, port):
+        raise LabError(f"--view {target}: no viewer listens there (rerun --port {port} opens one)")
+    return address_of(host, port)

@@ -1,0 +1,93 @@
+"""What a person watches while a robot flies, for the viewer: rates of the link, the way of the poses by stage, marks.
+
+Rates are per second, over the second before. Marks are instants at which something was refused.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from hil.laboratory.metrics import column
+from hil.pictures.curves import BLUE, GREEN, ORANGE, PINK, RED, SKY, Curves
+
+SECOND_US = 1_000_000
+ROWS_OF_A_SECOND = 100
+
+
+def _stages(rows: pa.Table) -> NDArray[np.float64]:
+    """Return the ages of the newest pose behind each stage [ms], (N, 5); NaN where that is not told."""
+    camera, processing, mocap, station, link = column(
+        rows, "age.camera", "age.processing", "age.mocap", "age.station", "age.link"
+    ).T
+    behind = (camera, camera + processing, mocap, mocap + station, mocap + station + link)
+    return np.asarray(1e-3 * np.stack(behind, axis=1))
+
+
+AGE_STAGES = Curves(
+    ("camera", "+ processing", "+ network", "+ station", "+ link: on board"), (BLUE, SKY, GREEN, ORANGE, PINK), "ms",
+    _stages, needs="age.link",
+)  # fmt: skip
+BATTERY = Curves(
+    ("a cell",), (GREEN,), "V", lambda rows: column(rows, "battery.voltage")[:, None], needs="battery.voltage"
+)  # fmt: skip
+AIR = Curves(
+    ("link quality [%]", "RSSI [-dBm]"), (BLUE, ORANGE), "", lambda rows: column(rows, "link.quality", "link.rssi"),
+    needs="link.rssi",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Counters of which the viewer shows how fast they count."""
+
+    names: tuple[str, ...]
+    colours: tuple[str, ...]
+    columns: tuple[str, ...]
+
+
+RATES: Mapping[str, Rates] = {
+    "link/rate/radio": Rates(
+        ("packets up", "packets down"), (BLUE, GREEN), ("link.up_delivered", "link.down_delivered")
+    ),
+    "link/rate/station": Rates(
+        ("poses sent", "frames seen", "telemetry blocks"), (BLUE, GREEN, PINK),
+        ("link.sent", "station.frames", "station.samples"),
+    ),
+}  # fmt: skip
+REFUSALS: Mapping[str, tuple[str, ...]] = {  # what a mark is called: counters, those of them that the log has
+    "pose refused on board": (
+        "estimator.refused",
+        "estimator.too_old",
+        "estimator.invalid",
+        "estimator.rejected",
+    ),
+    "pose refused by the tracker": ("tracker.refused",),
+    "pose too late for the link": ("link.late",),
+}
+MARK_COLOURS = {
+    "pose refused on board": RED,
+    "pose refused by the tracker": ORANGE,
+    "pose too late for the link": SKY,
+    "fault": PINK,
+    "operator": BLUE,
+}
+
+
+def rates(rows: pa.Table, names: tuple[str, ...], at: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return how fast counters count [1/s] at rows `at`, over the second before or what there is of it; (len(at), names)."""
+    times, counts = column(rows, "t"), column(rows, *names).reshape(-1, len(names))
+    since = np.searchsorted(times, times[at] - SECOND_US)
+    passed = 1e-6 * (times[at] - times[since])[:, None]
+    return np.asarray((counts[at] - counts[since]) / np.where(passed > 0, passed, np.nan))
+
+
+def refused(rows: pa.Table, names: tuple[str, ...]) -> NDArray[np.int64]:
+    """Return at which rows but the first any of some counters is larger than in the row before."""
+    known = [name for name in names if name in rows.column_names]
+    if not known:
+        return np.empty(0, np.int64)
+    counts = column(rows, *known).reshape(-1, len(known)).sum(axis=1)
+    return np.asarray(1 + np.flatnonzero(np.diff(counts) > 0))

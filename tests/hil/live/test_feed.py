@@ -1,0 +1,169 @@
+"""The live feed: whatever its picture does, the flight is the same, and what was missed is counted."""
+
+import threading
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from hil.config import load_config
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.recorder import Channel, Quantity, Recorder, load_log
+from hil.laboratory.run import Request, fly, prepare
+from hil.live import feed
+from hil.live.feed import Feed, LiveView
+from support import pictures
+from support.pictures import picture
+
+SCHEMA = pa.schema([("t", pa.int64())])
+
+
+def rows(first: int, count: int) -> pa.RecordBatch:
+    return pa.record_batch([pa.array(range(first, first + count), pa.int64())], schema=SCHEMA)
+
+
+def flight_hash(folder: Path, view: LiveView | None) -> str:
+    prepare(folder)
+    return fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 0.5), folder, onlooker=view).hash
+
+
+@pytest.fixture(scope="module")
+def unseen(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The hash of a flight of 150 rows that nobody watches."""
+    return flight_hash(tmp_path_factory.mktemp("unseen") / "run", None)
+
+
+@pytest.mark.parametrize(
+    ("program", "taken"),
+    [
+        (pictures.STALLS, range(1)),
+        (pictures.IS_CLOSED, range(20, 150)),
+        (pictures.NEVER_COMES_UP, range(1)),
+        (pictures.TAKES_ALL, range(150, 151)),
+    ],
+)
+def test_a_flight_is_the_same_whatever_its_picture_does(
+    program: str, taken: range, unseen: str, tmp_path: Path
+) -> None:
+    is_silent = program == pictures.NEVER_COMES_UP
+    view = LiveView(picture(program), [].append, start_timeout_s=0.01 if is_silent else 30)
+    assert flight_hash(tmp_path / "run", view) == unseen
+    missed = view.close(0.0 if program == pictures.STALLS else 30)
+    assert load_log(tmp_path / "run").num_rows == view.offered == 150
+    assert view.offered - missed in taken
+
+
+def test_what_does_not_fit_into_the_queue_is_dropped_and_counted() -> None:
+    view = LiveView(picture(pictures.STALLS), [].append)
+    for piece in range(2000):
+        view.rows(rows(1000 * piece, 1000))  # 8 kB: more than a pipe holds
+    assert len(view._feed._waiting) == feed.QUEUE_PIECES
+    assert view.close(0.0) == 2_000_000
+
+
+def test_a_picture_that_says_nothing_is_not_waited_for() -> None:
+    said: list[str] = []
+    view = LiveView(picture(pictures.NEVER_COMES_UP), said.append, start_timeout_s=0.01)
+    assert said == ["the viewer has not come up within 0.01 s; nobody waits for it any longer"]
+    view.rows(rows(0, 20))
+    assert view.close() == 20
+
+
+@pytest.mark.parametrize(
+    ("program", "why"), [(pictures.FAILS, "no such screen"), (pictures.DIES, "ended without a word")]
+)
+def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight(program: str, why: str) -> None:
+    with pytest.raises(LabError, match=why):
+        LiveView(picture(program), [].append)
+
+
+def test_a_picture_says_where_it_is_and_what_was_typed_there() -> None:
+    said: list[str] = []
+    view = LiveView(picture(pictures.TAKES_ALL), said.append)
+    view.note(5, "lab", "the first text")
+    view.rows(rows(0, 20))
+    view.note(25, "lab", "the last text")
+    assert view.close() == 0
+    assert said == ["view   here"]
+    assert view.lines() == ["set a.b 2.0"]
+    assert view.lines() == []
+
+
+def test_texts_and_parameters_travel_with_the_rows() -> None:
+    """The picture's program is the test's own: it says back what it got."""
+    program = """
+import pyarrow as pa, sys
+print('ready', flush=True)
+reader = pa.ipc.open_stream(sys.stdin.buffer)
+try:
+    while True:
+        batch, metadata = reader.read_next_batch_with_custom_metadata()
+        print('typed', batch.num_rows, metadata[b'events'].decode(), metadata[b'parameters'].decode(), flush=True)
+except StopIteration:
+    pass
+"""
+    view = LiveView(picture(program), [].append)
+    view.know([("a.b", 1.0), ("a.b", 2.0)])
+    view.note(7, "lab", "released")
+    view.rows(rows(0, 20))
+    view.note(30, "lab", "over")
+    view.close()
+    first, last = (
+        '{"t_us": 7, "source": "lab", "text": "released"}',
+        '{"t_us": 30, "source": "lab", "text": "over"}',
+    )
+    assert " ".join(view.lines()) in (
+        f'20 [{first}] {{"a.b": 2.0}} 0 [{last}] {{}}',
+        f'20 [{first}, {last}] {{"a.b": 2.0}}',  # both waited
+    )
+
+
+def test_a_full_feed_drops_the_oldest_and_never_waits() -> None:
+    busy, go_on, seen = threading.Event(), threading.Event(), list[int]()
+
+    def sink(pieces: list[feed.Piece]) -> None:
+        busy.set()
+        go_on.wait()
+        seen.extend(batch.column(0)[0].as_py() for batch, _ in pieces)
+
+    queue = Feed(sink, capacity=3)
+    queue.offer((rows(0, 1), []))
+    busy.wait()
+    for item in range(1, 9):
+        queue.offer((rows(item, 1), []))
+    assert not queue.close(timeout_s=0.05)
+    go_on.set()
+    assert queue.close(timeout_s=10)
+    assert seen == [0, 6, 7, 8]
+
+
+class Seen:
+    """An onlooker."""
+
+    def __init__(self) -> None:
+        self.times: list[int] = []
+        self.sizes: list[int] = []
+        self.texts: list[tuple[int, str, str]] = []
+
+    def rows(self, batch: pa.RecordBatch) -> None:
+        self.times += batch.column("t").to_pylist()
+        self.sizes.append(batch.num_rows)
+
+    def note(self, t_us: int, source: str, text: str) -> None:
+        self.texts.append((t_us, source, text))
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_who_looks_on_sees_every_row_once_five_times_a_second(kept: bool, tmp_path: Path) -> None:
+    seen, value = Seen(), [0.0]
+    channel = Channel("float64", lambda: value, (Quantity(("x",), "m"),))
+    recorder = Recorder(tmp_path if kept else None, (channel,), {}, seen)
+    for row in range(250):
+        recorder.row(10_000 * row)
+    recorder.note(2_500_000, "lab", "over")
+    recorder.close()
+    assert seen.times == [10_000 * row for row in range(250)]
+    assert max(seen.sizes) == 20
+    assert seen.texts == [(2_500_000, "lab", "over")]
+    assert bool(list(tmp_path.iterdir())) is kept

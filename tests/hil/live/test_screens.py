@@ -1,0 +1,45 @@
+"""What `--view` can mean, each as the process that it is; a viewer that is not there is one line before the flight."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil.errors import LabError
+from hil.live import window
+from hil.live.feed import open_view
+from hil.live.rerun_screen import RerunScreen
+from hil.live.window import DISPLAYS, LOOPBACK, free_port, open_window, show_file
+
+
+@pytest.mark.parametrize("target", ["wbe", "connect:here", "connect:127.0.0.1:0", "connect:127.0.0.1:99999"])
+def test_an_unknown_target_says_what_is_allowed(target: str) -> None:
+    with pytest.raises(
+        LabError, match=f"--view {target}: expected nothing, web, connect:HOST:PORT or foxglove"
+    ):
+        RerunScreen(target)
+
+
+def test_a_viewer_that_is_not_there_is_said_before_the_flight() -> None:
+    port = free_port(0)
+    with pytest.raises(LabError, match=f"connect:127.0.0.1:{port}: no viewer listens there"):
+        open_view(f"connect:127.0.0.1:{port}", [].append)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")
+def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(window, "PORT", free_port(0))
+    for name in DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    for show in (open_window, lambda: show_file(tmp_path / "flight.rrd")):
+        with pytest.raises(
+            LabError, match=r"^the viewer needs a display, and this computer has none; --view web"
+        ):
+            show()
+
+
+def test_a_port_that_is_taken_gives_way_to_one_that_is_free() -> None:
+    wanted = free_port(0)
+    assert free_port(wanted) == wanted
+    with window.socket.create_server((LOOPBACK, wanted)):
+        assert free_port(wanted) != wanted
