@@ -70,7 +70,7 @@ class CrazyradioLink(LiveLink):
         self._lost = ""  # what cflib says of it
         self._blocks: dict[int, Block] = {}
         self._telemetry_us = 0  # the last packet of a log block
-        self._quality = self._rate = 0.0  # cflib's [%, 100: no retries; exchanges/s], 0 over UDP
+        self._rate = 0.0  # of exchanges [1/s], 0 over UDP
         self._controls = CrtpControls(lambda data: self._do(partial(self._transmit, data)), self._parameters)
         quiet_cflib()
 
@@ -101,6 +101,7 @@ class CrazyradioLink(LiveLink):
         for port in PORTS:
             crazyflie.add_port_callback(port, self._on_service_packet)
         crazyflie.link_statistics.link_quality_updated.add_callback(self._on_quality)
+        crazyflie.link_statistics.uplink_rssi_updated.add_callback(self._on_rssi)
         crazyflie.link_statistics.uplink_rate_updated.add_callback(self._on_rate)
         self._create_blocks(crazyflie)
         return True
@@ -256,14 +257,17 @@ class CrazyradioLink(LiveLink):
             self.latency = LinkLatency(self._medium, median_low(self._round_trips_us) // 2, measured=True)
 
     def _on_quality(self, quality: float) -> None:
-        self._quality = float(quality)
+        self.quality = float(quality)
+
+    def _on_rssi(self, rssi: float) -> None:
+        self.rssi = float(rssi)
 
     def _on_rate(self, rate: float) -> None:
         self._rate = float(rate)
 
     def summary(self) -> str:
         """Return one line on how the link does."""
-        radio = f"  quality {self._quality:.0f} %  {self._rate:.0f} exchanges/s" if self._rate else ""
+        radio = f"  quality {self.quality:.0f} %  {self._rate:.0f} exchanges/s" if self._rate else ""
         return f"corrections {self.sent} sent, {self.late} late{radio}"
 
 

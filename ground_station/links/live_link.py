@@ -10,6 +10,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from math import nan
 
 from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import Sample
@@ -68,6 +69,9 @@ class LiveLink(ABC):
             0  # poses that a newer one replaced, or that were too old or unfit when they were to be sent
         )
         self.heard_us = 0  # when the board was last heard; 0: not yet
+        self.quality = self.rssi = (
+            nan  # of a radio: 100 % without retries; how weak its signal is there [-dBm]
+        )
         self._notices: list[str] = []
         self._received: queue.Queue[tuple[int, bytes]] = queue.Queue(PIECES)
         self._mailbox: tuple[MocapFrame, Goal] | None = None

@@ -233,6 +233,9 @@ def station_channels(
             link.latency.us,
         )  # fmt: skip
 
+    def air() -> tuple[float, ...]:
+        return (link.quality, link.rssi)
+
     tracker = () if ground.tracker is None else (tracker_channel(ground.tracker),)
     return (
         Channel("int8", states, (quantity("flight", "free"), quantity("supervisor", "state"))),
@@ -274,6 +277,7 @@ def station_channels(
                 quantity("link", "latency", "us"),
             ),
         ),
+        Channel("float32", air, (quantity("link", "quality", "%"), quantity("link", "rssi", "-dBm"))),
         Channel("float64", ground.budget.last, (quantity("age", " ".join(STAGES), "us"),)),
         *tracker,
     )

@@ -222,3 +222,14 @@ def test_help_has_every_command(bench):
     assert set(COMMANDS) == {
         "goal", "fly", "set", "get", "params", "save", "reset", "arm", "stop", "mark", "help",
     }  # fmt: skip
+
+
+def test_who_wants_to_know_parameters_is_told_all_of_them_and_every_change_unasked(bench):
+    known = {}
+    bench.operator = Operator(find, bench.said.append, bench.noted.append, known.update)
+    assert bench.type(wait_us=8_000_000) == []
+    assert known["extCtrl.y_P"] == pytest.approx(bench.value("extCtrl.y_P"))
+    assert len(known) > 100
+    bench.type("set controller.gain_y -2.5")
+    assert known["extCtrl.y_P"] == 2.5
+    assert len(bench.noted) == 1

@@ -65,6 +65,7 @@ class Link:
 
     def __init__(self, ground: GroundStation) -> None:
         self.latency, self.late, self._ground = LinkLatency("air", 1_400, measured=True), 0, ground
+        self.quality = self.rssi = math.nan
 
     @property
     def sent(self) -> int:
@@ -228,7 +229,7 @@ class Bench:
         link = LoopbackLink(lambda now_us, data: None, 1_400)
         self.ground = GroundStation(link, self.plan, None, StationConfig())
         self._link = SimpleNamespace(
-            latency=link.latency, late=0, sent=0, supervisor_state=State.FLYING
+            latency=link.latency, late=0, sent=0, quality=99.0, rssi=40.0, supervisor_state=State.FLYING
         )  # fmt: skip
         self.cockpit = Cockpit(self._link, self.ground, self.plan)  # type: ignore[arg-type]
 

@@ -32,7 +32,7 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import SCHEMA
 from hil.live import window
 from hil.live.feed import open_view
-from hil.pictures import curves, scene, viewer
+from hil.pictures import curves, monitor, scene, viewer
 from hil.world import layout as at
 from hil.world.body import place_plates
 from hil.world.config import PlantConfig
@@ -280,3 +280,117 @@ def test_the_load_of_the_line_is_its_busy_time_in_percent() -> None:
 
 def test_states_have_the_supervisors_names() -> None:
     assert curves.SUPERVISOR.names == (*(state.name.lower() for state in State), "unknown")
+
+
+def staged(path: Path, table: pa.Table, events: list[dict] | None = None) -> Path:
+    viewer.write_rrd(table, events or [], SCHEMA.empty_table(), path)
+    return path
+
+
+def real_log(rows: int = 30) -> pa.Table:
+    """The log of a real flight whose cameras and board are silent for the first ten rows."""
+    silent = np.arange(rows) < 10
+    names = [f"cameras.{name}" for name in ("x", "y", "z", "qx", "qy", "qz")]
+    names += [f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")]
+    names += [f"telemetry.flap_{number}" for number in (1, 2, 3, 4)]
+    names += [f"control.u{number}" for number in (1, 2, 3, 4)] + ["estimator.pose_age_us"]
+    names += [f"age.{stage}" for stage in ("camera", "processing", "network", "mocap", "station", "link")]
+    columns = {name: np.where(silent, np.nan, 0.1) for name in names}
+    columns |= {"cameras.qw": np.where(silent, np.nan, 1.0)}
+    columns |= {f"goal.{name}": np.zeros(rows) for name in ("x", "y", "z", "yaw")}
+    columns |= {
+        "t": 10_000 * np.arange(rows),
+        "flight.free": np.zeros(rows),
+        "supervisor.state": np.full(rows, 2),
+    }
+    columns |= {
+        "link.sent": np.arange(rows) // 2,
+        "station.frames": np.arange(rows),
+        "station.samples": np.arange(rows),
+    }
+    columns |= {
+        "link.late": np.arange(rows) // 25,
+        "station.unusable": np.zeros(rows),
+        "station.malformed": np.zeros(rows),
+    }
+    columns |= {"estimator.rejected": np.where(silent, np.nan, np.arange(rows) // 20)}
+    return pa.table(columns).replace_schema_metadata({"link": "udp://127.0.0.1:19850", "experiment": "hover"})
+
+
+def test_a_real_flight_has_the_same_scene_and_what_nobody_knows_is_not_drawn(tmp_path: Path) -> None:
+    path = staged(tmp_path / "real.rrd", real_log())
+    assert viewer.timeline_of(real_log().schema.metadata) == (viewer.FROM_START, 0)
+    counted = rows_by_entity(path)
+    for name in ("robot", "robot/plates/flap_1", "goal/estimate"):
+        assert counted[f"/world/{name}"] - (name != "robot" and "flap" in name) == 20, name
+    assert counted["/world/goal"] == 30
+    assert counted["/world/trail"] == 19 + 1  # and its colour
+    assert not {"/world/drag", "/world/tether"} & {entity for entity, rows in counted.items() if rows > 1}
+    assert counted["/plot/position/marks/pose_refused_on_board"] == 1 + 1
+    assert counted["/plot/position/marks/pose_too_late_for_the_link"] == 1 + 1
+
+
+def test_rates_are_those_of_the_second_before() -> None:
+    rows = pa.table({"t": 10_000 * np.arange(300), "n": np.arange(300) // 2, "m": 3 * np.arange(300)})
+    rates = monitor.rates(rows, ("n", "m"), np.array([0, 10, 100, 250]))
+    assert np.isnan(rates[0]).all()
+    np.testing.assert_allclose(rates[1:], [[50.0, 300.0]] * 3)
+
+
+def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
+    ages = pa.table(
+        {
+            "camera": [20e3],
+            "processing": [18e3],
+            "network": [1e3],
+            "mocap": [39e3],
+            "station": [100.0],
+            "link": [2e3],
+        }
+    )
+    table = ages.rename_columns([f"age.{name}" for name in ages.column_names])
+    np.testing.assert_allclose(monitor.AGE_STAGES.read(table), [[20.0, 38.0, 39.0, 39.1, 41.1]])
+    counted = rows_by_entity(viewer.write_run_rrd(folder))
+    assert counted["/plot/age/stages"] > 60  # by the station's own record, and their names
+
+
+def test_faults_share_a_lane_and_a_push_is_an_arrow_that_can_be_seen(folder: Path, tmp_path: Path) -> None:
+    texts = [
+        "fault push.y@0.1=2 begins",
+        "fault imu.noise@0.1:1=2 begins",
+        "fault push.y@0.1=2 ends",
+        "fault own.kind@1 begins",
+    ]
+    events = [
+        {"t_us": 1_100_000 + 100_000 * row, "source": "lab", "text": text} for row, text in enumerate(texts)
+    ]
+    path = staged(tmp_path / "faults.rrd", load_log(folder), events)
+    lane = values(path, "/state/faults", "StateChange:state")[:, 0].tolist()
+    assert lane == ["push.y", "push.y + imu.noise", "imu.noise", "imu.noise + own.kind"]
+    assert len(moments(path, "/plot/position/marks/fault")) == 3
+    (arrow,) = [
+        batch for batch in chunks(path, "/world/held/push_y") if "Arrows3D:vectors" in batch.schema.names
+    ]
+    assert arrow.column("Arrows3D:vectors").to_pylist()[0] == [
+        [0.0, pytest.approx(2 * viewer.METRES_PER_NEWTON), 0.0]
+    ]
+    begun, gone = moments(path, "/world/held/push_y")
+    assert gone - begun == 1000 * viewer.PUSH_SHOWN_US
+
+
+def test_a_view_stands_in_the_blueprint_when_the_log_has_its_curves(folder: Path) -> None:
+    simulated = load_log(folder).schema
+    known = {path for _, path in viewer.VIEWS if _has(path, simulated)}
+    assert {"position", "processor", "battery", "link/rate", "queue"} <= known
+    assert "link/air" not in known
+    real = {path for _, path in viewer.VIEWS if _has(path, real_log().schema)}
+    assert {"position", "flaps", "age", "link/rate", "link/loss"} <= real
+    assert not {"processor", "battery", "queue"} & real
+
+
+def _has(path: str, schema: pa.Schema) -> bool:
+    return any(
+        viewer._is_known(name, schema)
+        for name in (*viewer.PLOTS, *viewer.RATES, "processor")
+        if name == path or name.startswith(f"{path}/")
+    )
