@@ -108,6 +108,7 @@ class Firmware:
 
     def _start_services(self, config: FirmwareConfig) -> None:
         """Create the services of the links."""
+        self._supervisor.connected = self._client_is_there
         board, core, link, supervisor = self._board, self._core, self.link, self._supervisor
         settings = _radio_settings(board)
         if all(byte == 0xFF for byte in board.deck_memory):
@@ -231,6 +232,9 @@ class Firmware:
         """Return what the IMU measures now: rates [rad/s, B] and acceleration [g, B]."""
         counts = self._board.read_imu()
         return rates(counts, self._core.data.fields.gyro_bias.tolist()), acceleration(counts)
+
+    def _client_is_there(self) -> bool:
+        return self.link.connected or (self.mavlink is not None and self.mavlink.connected)
 
     def _zero_found(self) -> None:
         bias = self._zero.bias

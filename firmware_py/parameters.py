@@ -168,18 +168,26 @@ def _kalman(running: Running) -> Iterator[Parameter]:
 
 
 def _supervision(running: Running, stream: TelemetryStream) -> Iterator[Parameter]:
-    """Failsafe and telemetry."""
+    """Failsafe and telemetry. The stop of the Crazyflie firmware holds until a reboot, Floaty's own can be left."""
     supervisor, kernel = running.supervisor, running.stack.kernel
+
+    def lock(value: float) -> None:
+        if value:
+            supervisor.emergency_stop()
 
     def stop(value: float) -> None:
         if value:
-            supervisor.emergency_stop()
+            supervisor.stop()
         else:
             supervisor.recover(kernel.now_us)
 
     low_us, high_us = configured_limits(SupervisorConfig, "pose_timeout_us")
     low_mv, high_mv = configured_limits(SupervisorConfig, "low_battery_mv")
-    yield Parameter("stabilizer.stop", U8, "", lambda: supervisor.stopped, stop, 0, 1)
+    yield Parameter("stabilizer.stop", U8, "", lambda: supervisor.locked, lock, 0, 1)
+    yield Parameter("floaty.stop", U8, "", lambda: supervisor.stopped and not supervisor.locked, stop, 0, 1)
+    yield Parameter(
+        "floaty.armed", U8, "", lambda: supervisor.armed, lambda value: supervisor.arm(value == 1), 0, 1
+    )
     yield Parameter(
         "supervisor.poseTimeout", U16, "ms", lambda: supervisor.pose_timeout_us // 1000,
         lambda value: setattr(supervisor, "pose_timeout_us", int(value) * 1000),

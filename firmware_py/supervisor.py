@@ -6,9 +6,9 @@ and cause are log variables (`supervisor.state`, `supervisor.cause`). The way ba
     silence         no accepted pose for 500 ms (parameter): the next accepted pose ends it
     out of bounds   the estimator was held at its bounds for 200 ms: ends after 500 ms inside them
     disarmed        by request: ends with the request to arm
-    not finite      own logic put out NaN or infinity, the controller or the estimator: as after an emergency stop
+    not finite      own logic put out NaN or infinity, the controller or the estimator: ends with a recovery request
     emergency stop  by request, or because a started emergency stop watchdog was not fed for 1 s: ends only with a
-                    recovery request (or a reboot)
+                    reboot; one by the parameter floaty.stop ends with a recovery request, too
     low battery     below the limit for 5 s: ends only with a recovery request when the voltage is back above it
 
 Before the first pose, and with absolute poses while the high-level commander has nothing to do, it waits. The board arms
@@ -35,7 +35,7 @@ class Manual(IntEnum):
     """Who moves the flaps: the original's parameter `extCtrl.manual`."""
 
     OFF = 0  # the controller, when the state allows it
-    ANGLES = 1  # angles from outside, whether poses come or not
+    ANGLES = 1  # angles from outside, with or without poses, while a client is there to take them back
     HOVER = 2  # hover angles
 
 
@@ -68,9 +68,10 @@ class Supervisor:
         self.low_battery_mv = config.low_battery_mv
         self.battery_mv = 0
         self.goals: GoalSource | None = None  # None: there is always something to fly to
+        self.connected: Callable[[], bool] = lambda: True  # whether a client is there
         self._estimator = estimator
         self._announce = announce
-        self._stopped = False
+        self._stopped = self._locked = False
         self._not_finite = Cause.NONE
         self._controller_faults = self._estimator_faults = 0
         self._battery_empty = False
@@ -81,8 +82,18 @@ class Supervisor:
 
     @property
     def stopped(self) -> bool:
-        """Whether the emergency stop is latched."""
+        """Whether the robot was stopped, for a while or until a reboot."""
         return self._stopped
+
+    @property
+    def locked(self) -> bool:
+        """Whether an emergency stop holds until the board reboots."""
+        return self._locked
+
+    @property
+    def battery_empty(self) -> bool:
+        """Whether the battery was found empty."""
+        return self._battery_empty
 
     @property
     def can_be_armed(self) -> bool:
@@ -98,7 +109,7 @@ class Supervisor:
         """Return the controller's mode at this instant and announce a change of state; called every 10 ms."""
         self._watch_bounds(now_us)
         if self._watchdog_us is not None and now_us >= self._watchdog_us:
-            self._stopped = True
+            self.emergency_stop()
         if self.goals is not None and not self.can_fly:
             self.goals.abort()
         state, cause = self._state(now_us)
@@ -115,10 +126,14 @@ class Supervisor:
         if self.cause > Cause.OUT_OF_BOUNDS or self.manual is Manual.HOVER:
             return MODE_HOVER
         if self.manual is Manual.ANGLES:
-            return MODE_MANUAL
+            return MODE_MANUAL if self.connected() else MODE_HOVER
         return MODE_FLY if self.state is State.FLYING else MODE_HOVER
 
     def emergency_stop(self) -> None:
+        """Stop until the board reboots."""
+        self._stopped = self._locked = True
+
+    def stop(self) -> None:
         """Stop until `recover`."""
         self._stopped = True
 
@@ -134,10 +149,12 @@ class Supervisor:
         return True
 
     def recover(self, now_us: int) -> bool:
-        """Leave what lasts: stop, logic that failed, and with a good voltage the low battery; False when one remains."""
-        self._stopped = False
+        """Leave what lasts: stop, logic that failed, and with a good voltage the low battery.
+
+        False while the battery is low. The emergency stop is none of what can be left.
+        """
+        self._stopped = self._locked
         self._not_finite = Cause.NONE
-        self._watchdog_us = None
         if self.battery_mv >= self.low_battery_mv:
             self._battery_empty = False
             self._battery_good_us = now_us

@@ -27,8 +27,8 @@ class Action(Enum):
     READ = "read"
     WRITE = "write"
     SAVE = "save"  # the persistent parameters, for the next boot
-    ARM = "arm"  # and leave an emergency stop
-    STOP = "stop"  # at once: flaps at hover until the board is armed
+    ARM = "arm"  # and leave what can be left without a reboot
+    STOP = "stop"  # at once: flaps at hover until the board reboots
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ get NAME             what a parameter is
 params [GROUP]       all of them, or those whose names begin so
 save                 keep the parameters for the board's next boot
 reset                set those that were changed to the values that last flew well
-arm                  leave the emergency stop, and arm
-stop                 emergency stop: flaps at hover, until armed
+arm                  leave what a recovery can end, and arm
+stop                 emergency stop: flaps at hover, until the board reboots
 mark TEXT            note something in the record
 help                 this"""
 COMMANDS = tuple(line.split()[0] for line in HELP.splitlines())

@@ -19,6 +19,7 @@ from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Result
 FORCE = 21196  # MAVLink's magic number for disarming in flight
 REBOOT = 1  # PREFLIGHT_REBOOT_SHUTDOWN
 REBOOT_IN_FLIGHT = 20190226  # REBOOT_SHUTDOWN_CONDITIONS_FORCE
+STOP = "floaty.stop"  # a parameter
 REBOOT_TICKS = 200  # before the reset: what was said leaves, 1 kB even at 57600 baud
 
 
@@ -85,7 +86,12 @@ class CommandService:
             self._supervisor.emergency_stop()
         if self._supervisor.arm(command.param1 == 1):
             return DONE
-        obstacle = "emergency stop; reboot first" if self._supervisor.stopped else "battery low"
+        if self._supervisor.locked:
+            obstacle = "emergency stop; reboot first"
+        elif self._supervisor.battery_empty:
+            obstacle = "battery low"
+        else:
+            obstacle = f"stopped; set {mavlink.mavlink_name(STOP)} 0"
         return self._not_now(f"not armed: {obstacle}")
 
     def _not_now(self, why: str) -> Outcome:

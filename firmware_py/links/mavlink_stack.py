@@ -22,6 +22,7 @@ TRANSMIT_QUEUE = 32
 UNASKED_LIMIT = 24  # messages in the queue beyond which nothing is sent unasked
 SILENCE_TICKS = 50  # after which MAV-RX lets the receiver look through half a frame again
 
+SILENCE_US = 3_000_000  # three heartbeats of a ground station
 INFO, WARNING = 6, 4  # MAV_SEVERITY
 
 
@@ -34,6 +35,7 @@ class MavlinkStack:
         self.component = config.component
         self.refused = 0  # messages that no service could use
         self.unserved = 0  # messages that nobody here reads, or that are for others
+        self._heard_us = 0  # when a message came last
         self._unsent = 0  # messages that nobody asked for and the line had no time for, or that fit no frame
         self._cost_us = cost.mavlink_us
         self._board = board
@@ -74,6 +76,11 @@ class MavlinkStack:
     def overruns(self) -> int:
         """Bytes that the UART lost because nobody fetched them in time."""
         return self._board.uart_overruns
+
+    @property
+    def connected(self) -> bool:
+        """Whether somebody has been heard lately."""
+        return self.kernel.now_us - self._heard_us < SILENCE_US
 
     def uart_ready(self) -> None:
         """Interrupt: the UART has bytes."""
@@ -116,6 +123,7 @@ class MavlinkStack:
     def _dispatch(self, message: Message) -> None:
         if (message.get_srcSystem(), message.get_srcComponent()) == (self.system, self.component):
             return  # an echo of our own
+        self._heard_us = self.kernel.now_us
         handler = self._handlers.get(message.get_msgId())
         if handler is None or not self._is_ours(message):
             self.unserved += 1

@@ -134,7 +134,7 @@ def supervisor_bits(supervisor: Supervisor) -> int:
         supervisor.can_fly,
         supervisor.state is State.FLYING,
         False,
-        supervisor.stopped,
+        supervisor.locked,
     )
     return sum(1 << bit for bit, flag in enumerate(flags) if flag)
 

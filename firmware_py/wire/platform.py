@@ -8,4 +8,4 @@ SUPERVISOR_INFO, SUPERVISOR_COMMAND = 0, 1
 GET_BITS = 0x0C
 ARM, RECOVER, STOP, STOP_WATCHDOG = 1, 2, 3, 4
 REPLY = 0x80
-LOCKED = 1 << 6  # of the supervisor's bits: stopped until it is recovered
+LOCKED = 1 << 6  # of the supervisor's bits: stopped until a reboot

@@ -107,7 +107,12 @@ class CrtpControls(Dialogue[Packet]):
         return ()
 
     def _arm(self) -> Script[Packet]:
-        for what, command in (("recover", bytes((COMMAND_RECOVER,))), ("arm", bytes((COMMAND_ARM, 1)))):
+        """By Floaty's own parameters, where there are any: the Crazyflie firmware's arming does not concern the flaps."""
+        for name, value in (("floaty.stop", 0.0), ("floaty.armed", 1.0)):
+            if name in self._table():
+                yield from self._write(name, value)
+        locked = "arm; after an emergency stop it has to reboot first"
+        for what, command in (("recover", bytes((COMMAND_RECOVER,))), (locked, bytes((COMMAND_ARM, 1)))):
             packet = Packet(PORT_PLATFORM, PLATFORM_COMMAND, command)
             reply = yield self._until(packet, lambda got, kind=command[:1]: got.data[:1] == kind)  # type: ignore[misc]
             if not any(reply.data[1:2]):

@@ -15,7 +15,7 @@ from ground_station.links.crtp_controls import unknown
 
 BOARD_COMPONENT = 1  # autopilot
 ARM, TERMINATE = 1, 1
-STOPPED = mavlink.mavlink_name("stabilizer.stop")  # a latch, which arming alone does not open
+STOPPED = mavlink.mavlink_name("floaty.stop")  # a latch, which arming alone does not open
 
 
 class MavlinkControls(Dialogue[Message]):

@@ -182,13 +182,23 @@ def test_what_is_saved_is_there_after_the_next_boot(bench: Bench) -> None:
     assert next(item for item in booted.parameters if item.name == "extCtrl.y_P").read() == -1.75
 
 
-def test_a_stop_stops_and_arming_leaves_it(bench: Bench) -> None:
+def test_a_stop_lasts_until_a_reboot(bench: Bench) -> None:
     bench.run(GYRO_ZERO_US)  # type: ignore[attr-defined]
     supervisor = bench.firmware.signals.supervisor
     assert ask(bench, Action.STOP) == Answer(())
     bench.turn()
     bench.turn()
     assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
+    assert "refuses" in ask(bench, Action.ARM).error
+    bench.turn()
+    assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
+
+
+def test_arming_leaves_what_can_be_left(bench: Bench) -> None:
+    bench.run(GYRO_ZERO_US)  # type: ignore[attr-defined]
+    supervisor = bench.firmware.signals.supervisor
+    supervisor.arm(False)
+    supervisor.stop()
     assert ask(bench, Action.ARM) == Answer(())
     for _ in range(4):
         bench.turn()

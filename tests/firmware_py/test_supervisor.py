@@ -15,6 +15,7 @@ from firmware_py.wire.supervisor import Cause, State
 from hil.config import load_config
 from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, CrtpClient
 from support.firmware_bench import HOVER_COUNTS, LEVEL
+from support.mavlink_client import MavlinkClient
 
 OFF_CENTRE = (0.0, 0.04, 0.02)
 
@@ -50,21 +51,99 @@ def stop_on_the_supervisors_port(client: CrtpClient) -> None:
 
 
 def stop_by_parameter(client: CrtpClient) -> None:
-    client.send(PARAM, 3, b"\0stabilizer\0stop\0\x08\1")
+    write(client, "stabilizer.stop", 1)
 
 
-@pytest.mark.parametrize("stop", [stop, stop_on_the_supervisors_port, stop_by_parameter])
-def test_emergency_stop_acts_within_eleven_milliseconds_and_ends_only_by_recovery(
-    flying: CrtpClient, stop
-) -> None:
+def stop_by_floatys_own_parameter(client: CrtpClient) -> None:
+    write(client, "floaty.stop", 1)
+
+
+def write(client: CrtpClient, name: str, value: int) -> None:
+    """Write a parameter of one byte by its name."""
+    group, own = name.encode().split(b".")
+    client.send(PARAM, 3, b"\0" + group + b"\0" + own + b"\0\x08" + bytes((value,)))
+
+
+def let_watchdog_bite(client: CrtpClient) -> None:
+    client.send(LOC, 1, b"\4")
+    client.run(client.now_us + 1_000_000)
+
+
+STOPS = (stop, stop_on_the_supervisors_port, stop_by_parameter, let_watchdog_bite)
+
+
+@pytest.mark.parametrize("stop", [*STOPS, stop_by_floatys_own_parameter])
+def test_emergency_stop_acts_within_eleven_milliseconds(flying: CrtpClient, stop) -> None:
     stop(flying)
     assert after(flying, 11_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
     assert flying.writes[-1][1] == HOVER_COUNTS
     assert flying.console == ["supervisor: failsafe, emergency stop"]
     assert after(flying, 3_000_000)[1] is Cause.EMERGENCY_STOP
     assert flying.one(SUPERVISOR, 1, b"\1\1") == b"\x81\0\1"  # arming is refused
-    assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\1\1"
-    assert after(flying, 11_000) == (State.FLYING, Cause.NONE)
+
+
+@pytest.mark.parametrize("stop", STOPS)
+def test_an_emergency_stop_of_the_crazyflie_lasts_until_a_reboot(flying: CrtpClient, stop) -> None:
+    stop(flying)
+    flying.run(flying.now_us + 11_000)
+    flying.one(SUPERVISOR, 1, b"\2")
+    write(flying, "floaty.stop", 0)
+    write(flying, "stabilizer.stop", 0)
+    flying.one(SUPERVISOR, 1, b"\1\1")
+    assert after(flying, 1_000_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
+    assert flying.one(SUPERVISOR, 0, b"\x0c")[1] & 1 << 6  # locked
+    flying.reboot()
+    flying.poses(flying.now_us + 605_000, flying.now_us + 2_000_000)
+    assert after(flying, 1_000_000) == (State.FLYING, Cause.NONE)
+
+
+@pytest.mark.parametrize(
+    "leave", [lambda c: write(c, "floaty.stop", 0), lambda c: c.one(SUPERVISOR, 1, b"\2")]
+)
+def test_floatys_own_stop_can_be_left(flying: CrtpClient, leave) -> None:
+    stop_by_floatys_own_parameter(flying)
+    flying.run(flying.now_us + 11_000)
+    assert not flying.one(SUPERVISOR, 0, b"\x0c")[1] & 1 << 6  # not locked
+    leave(flying)
+    assert after(flying, 20_000) == (State.FLYING, Cause.NONE)
+
+
+def test_floatys_own_parameter_arms_and_disarms(flying: CrtpClient) -> None:
+    write(flying, "floaty.armed", 0)
+    assert after(flying, 20_000) == (State.FAILSAFE, Cause.DISARMED)
+    write(flying, "floaty.armed", 1)
+    assert after(flying, 20_000) == (State.FLYING, Cause.NONE)
+
+
+@pytest.mark.parametrize(
+    ("make", "silence_us", "ask", "sign_of_life"),
+    [
+        (
+            CrtpClient, 1_000_000,
+            lambda client: write(client, "extCtrl.manual", Manual.ANGLES),
+            lambda client: client.firmware.radio_polled(),  # an empty packet of the radio
+        ),
+        (
+            MavlinkClient, 3_000_000,
+            lambda client: client.send("param_set", 1, 1, b"EXT_MANUAL", Manual.ANGLES, 9),
+            lambda client: client.send("heartbeat", 6, 8, 0, 0, 0),
+        ),
+    ],
+    ids=["crtp", "mavlink"],
+)  # fmt: skip
+def test_angles_from_outside_last_as_long_as_a_client_is_there(make, silence_us, ask, sign_of_life) -> None:
+    client = make()
+    client.run(700_000)
+    client.polling = False
+    ask(client)
+    client.run(700_000 + silence_us - 10_000)
+    angles = client.writes[-1][1]
+    assert angles != HOVER_COUNTS
+    client.run(700_000 + silence_us + 12_000)
+    assert client.writes[-1][1] == HOVER_COUNTS
+    sign_of_life(client)
+    client.run(client.now_us + 20_000)
+    assert client.writes[-1][1] == angles
 
 
 def test_emergency_stop_beats_flaps_from_outside(flying: CrtpClient) -> None:
@@ -171,8 +250,6 @@ def test_watchdog_bites_one_second_after_its_last_meal_and_not_before_the_first(
     assert after(flying, 16_000) == (State.FAILSAFE, Cause.EMERGENCY_STOP)
     flying.send(port, 1, data)
     assert after(flying, 100_000)[1] is Cause.EMERGENCY_STOP
-    flying.one(SUPERVISOR, 1, b"\2")
-    assert after(flying, 3_000_000)[0] is State.FLYING  # recovery ends the watchdog, too
 
 
 def test_disarmed_board_does_not_fly_until_it_is_armed(flying: CrtpClient) -> None:

@@ -184,13 +184,15 @@ def test_what_is_saved_survives_a_boot(bench):
     assert bench.noted[-1] == "saved"
 
 
-def test_stop_waits_for_nothing_and_arm_leaves_it(bench):
+def test_stop_waits_for_nothing_and_lasts_until_a_reboot(bench):
     bench.type("params", *["mark x"] * 3, "stop", wait_us=100_000)
     assert bench.firmware.signals.supervisor.stopped
     assert bench.noted == ["stop", "stopped"]
     bench.type("arm", "params", wait_us=100_000)
     bench.type("stop", wait_us=50_000)  # the list is still on its way
     assert bench.firmware.signals.supervisor.stopped
+    assert "it has to reboot first" in bench.type("arm")[-1]
+    bench.reboot()
     assert bench.type("arm") == ["armed"]
     assert not bench.firmware.signals.supervisor.stopped
 

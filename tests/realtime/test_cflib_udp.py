@@ -131,10 +131,9 @@ def test_position_alone_arrives(session: Session) -> None:
     assert list(values.values()) == [0.5, 0.25, -0.125]
 
 
-def test_emergency_stop_and_recovery(session: Session) -> None:
-    session.cf.supervisor.send_emergency_stop()
+def test_stop_and_recovery(session: Session) -> None:
+    session.cf.param.set_value("floaty.stop", 1)
     assert session.rows(5, 10, "supervisor.cause")[-1][1]["supervisor.cause"] == 3
-    assert session.cf.supervisor.is_locked
     session.cf.supervisor.send_crash_recovery_request()
     assert session.rows(5, 10, "supervisor.cause")[-1][1]["supervisor.cause"] != 3
     assert session.cf.supervisor.is_armed

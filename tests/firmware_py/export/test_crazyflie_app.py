@@ -151,7 +151,7 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
         events[step].append(
             lambda app, lab, stop=stop: (
                 app.set("floaty.stop", stop),
-                lab.parameters["stabilizer.stop"].set(stop),
+                lab.parameters["floaty.stop"].set(stop),
             )
         )  # type: ignore[list-item]
     for name, value in (
@@ -716,8 +716,7 @@ def test_the_firmware_sees_a_flight_only_while_its_commander_leads_one(app: App)
 
 
 RENAMED = {
-    "floaty.stop": "stabilizer.stop", "floaty.armed": None, "floaty.reset": "FloatyKalm.resetKalman",
-    "FloatyKalm.maxPos": "kalman.maxPos", "FloatyKalm.maxVel": "kalman.maxVel",
+    "floaty.reset": "FloatyKalm.resetKalman", "FloatyKalm.maxPos": "kalman.maxPos", "FloatyKalm.maxVel": "kalman.maxVel",
 }  # fmt: skip
 
 
@@ -725,10 +724,7 @@ def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App
     laboratory = Laboratory()
     app.boot()
     for name, index in app.params.items():
-        twin = laboratory.parameters.get(RENAMED.get(name, name) or "")
-        if twin is None:
-            assert name == "floaty.armed"
-            continue
+        twin = laboratory.parameters[RENAMED.get(name, name)]
         assert app.c.stub_param_type(index) == twin.scalar.parameter_number, name
         assert app.get(name) == twin.read(), name
         if name != "floaty.reset":
@@ -826,7 +822,7 @@ def test_supervisor_decides_as_the_laboratorys(
         elif name == "calibrated":
             python.calibrated, here.calibrated = True, 1
         elif name == "stop":
-            python.emergency_stop()
+            python.stop()
             here.stopped = 1
         elif name == "arm":
             assert c.floaty_supervisor_arm(this, bool(value)) == python.arm(bool(value))

@@ -628,6 +628,14 @@ def test_a_forced_stop_is_latched(client: MavlinkClient, params: tuple[float, ..
     assert why.severity == dialect.MAV_SEVERITY_WARNING
 
 
+def test_a_stop_that_can_be_left_says_how(client: MavlinkClient) -> None:
+    client.ask("param_set", 1, 1, b"FLOATY_STOP", 1, 9)
+    ack, why = client.command(400, 1)
+    assert (ack.result, why.text) == (TEMPORARILY_REJECTED, "not armed: stopped; set FLOATY_STOP 0")
+    client.ask("param_set", 1, 1, b"FLOATY_STOP", 0, 9)
+    assert client.command(400, 1)[0].result == 0
+
+
 def test_with_an_empty_battery_arming_is_refused_with_that_reason(client: MavlinkClient) -> None:
     client.battery_mv = 3000
     client.run(6_020_000)

@@ -74,9 +74,10 @@ def spoilt(rng: np.random.Generator, frame: bytes) -> bytes:
 
 def recover(client: MavlinkClient) -> None:
     """Undo what the fuzz did to the supervisor and its parameters, as a ground station would."""
+    client.firmware.signals.supervisor._locked = False  # without a reboot: this board shall fly on
     for name, value in (
-        (b"STAB_STOP", 1.0),
-        (b"STAB_STOP", 0.0),
+        (b"FLOATY_STOP", 1.0),
+        (b"FLOATY_STOP", 0.0),
         (b"EXT_MANUAL", 0.0),
         (b"SUP_LOWBATTERY", 3200.0),
     ):

@@ -104,7 +104,7 @@ def test_a_law_that_fails_puts_the_flaps_to_hover_at_once_until_it_is_asked_to_r
     bench.run(bench.now_us + 500_000)
     assert bench.supervisor.state is State.FAILSAFE
     assert all(counts == HOVER_COUNTS for _, counts in bench.writes[-50:])
-    bench.parameter("stabilizer.stop").set(0)
+    bench.parameter("floaty.stop").set(0)
     bench.run(bench.now_us + 100_000)
     assert bench.supervisor.state is State.FLYING
     assert bench.writes[-1][1] != HOVER_COUNTS

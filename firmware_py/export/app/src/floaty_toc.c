@@ -97,20 +97,24 @@ void floaty_toc_report(void) {
 
 static uint8_t stop_wanted, armed_wanted = 1, reset_wanted;
 
-static void stop_written(void) {
-  if (stop_wanted) {
-    floaty_requests.stop = true;
-  } else {
-    floaty_requests.recover = true;
+/* Hands a switch on as one of two requests; what is neither 0 nor 1 is put back. */
+static void switch_written(uint8_t *wanted, uint8_t *before, volatile bool *on, volatile bool *off) {
+  if (*wanted > 1) {
+    *wanted = *before;
+    return;
   }
+  *before = *wanted;
+  *(*wanted ? on : off) = true;
+}
+
+static void stop_written(void) {
+  static uint8_t before;
+  switch_written(&stop_wanted, &before, &floaty_requests.stop, &floaty_requests.recover);
 }
 
 static void armed_written(void) {
-  if (armed_wanted) {
-    floaty_requests.arm = true;
-  } else {
-    floaty_requests.disarm = true;
-  }
+  static uint8_t before = 1;
+  switch_written(&armed_wanted, &before, &floaty_requests.arm, &floaty_requests.disarm);
 }
 
 static void reset_written(void) {
