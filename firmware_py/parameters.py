@@ -211,9 +211,12 @@ def _own_logic(running: Running) -> Iterator[Parameter]:
         )  # fmt: skip
 
 
-# cfclient's flight and lighthouse tabs read these without asking whether there are any: without them its callbacks end in
-# KeyError. Of other decks that are not there the table says nothing.
-ABSENT_DECKS = ("bcDWM1000", "bcFlow", "bcFlow2", "bcLighthouse4", "bcLoco", "bcZRanger", "bcZRanger2")
+# cfclient's flight and lighthouse tabs and Bitcraze's QA suite read these without asking whether there are any: without them
+# they end in KeyError. Of other decks that are not there the table says nothing.
+ABSENT_DECKS = (
+    "bcAI", "bcDWM1000", "bcFlow", "bcFlow2", "bcLighthouse4", "bcLoco", "bcMultiranger", "bcUSD", "bcZRanger",
+    "bcZRanger2",
+)  # fmt: skip
 
 
 def _identity() -> Iterator[Parameter]:

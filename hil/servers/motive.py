@@ -1,8 +1,10 @@
-"""A virtual Motive: a NatNet server on the loopback interface that streams what the virtual cameras see.
+"""A virtual Motive: a NatNet server for programs of this computer that streams what the virtual cameras see.
 
 It answers connect, model definitions, echo, keep-alive and the bitstream request on its command port, and sends every
 frame either to the multicast group or to each client: to the data port of its computer and, once it keeps alive, to
-where it speaks from, because clients differ in where they listen. Nothing here blocks: the board server calls it.
+where it speaks from, because clients differ in where they listen. Clients differ as well in the interface on which they
+join the group, so its frames go out on the loopback interface and on the one that the routes name, never beyond this
+computer. Nothing here blocks: the board server calls it.
 What it cannot read is counted. Its clock counts from its own start, as that of another computer would.
 """
 
@@ -88,6 +90,32 @@ def in_axes(up: Up, p_WB: Vector, q_WB: Quaternion) -> tuple[Vector, Quaternion]
     return turn(*p_WB), (w, *turn(a, b, c))
 
 
+def _send(sender: socket.socket, data: bytes, to: Address) -> None:
+    with suppress(OSError):  # a full buffer, nobody there: UDP loses packets then
+        sender.sendto(data, to)
+
+
+def _interfaces(port: int) -> set[str]:
+    """Return the addresses of the interfaces on which clients of this computer join the group."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker,
+        suppress(OSError),
+    ):  # no route: loopback alone
+        asker.connect((MULTICAST_GROUP, port))  # sends nothing
+        routed: str = asker.getsockname()[0]
+        return {HOST, routed}
+    return {HOST}
+
+
+def _group_sender(interface: str) -> socket.socket:
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sender.setblocking(False)
+    sender.bind((interface, 0))
+    sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(interface))
+    sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)  # for this computer alone
+    return sender
+
+
 class VirtualMotive:
     """Tracks `bodies` (names by id), each with the same `markers`, (N, 3) [m] in B."""
 
@@ -123,15 +151,16 @@ class VirtualMotive:
         except OSError as error:
             self._socket.close()
             raise LabError(f"natnet port {settings.port}: {error.strerror or error}") from None
-        self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(HOST))
         self.port: int = self._socket.getsockname()[1]
         self.data_port = self.port + 1
+        self._groups = [_group_sender(interface) for interface in _interfaces(self.data_port)]
         readers[self._socket] = self._read
 
     def close(self) -> None:
         """Stop serving."""
         del self._readers[self._socket]
-        self._socket.close()
+        for each in (self._socket, *self._groups):
+            each.close()
 
     def take(self, body: int, frame: MocapFrame, now_us: int, sighting: Sighting | None = None) -> None:
         """Take what was seen of a body, of another clock, on which it is `now_us`; the last body completes a frame."""
@@ -162,25 +191,24 @@ class VirtualMotive:
             sent,
             parameters=0,
         )
+        if self._multicast:
+            data = encode_frame(whole, self._version)
+            for group in self._groups:
+                _send(group, data, (MULTICAST_GROUP, self.data_port))
+            return
         targets = self._targets()
         encoded = {version: encode_frame(whole, version) for version in set(targets.values())}
         for target, version in targets.items():
-            self._send(encoded[version], target)
+            _send(self._socket, encoded[version], target)
 
     def _ticks(self) -> int:
         """What Motive's clock shows."""
         return (clock_us() - self._start_us) * _TICKS_PER_US
 
     def _targets(self) -> dict[Address, Version]:
-        """Where frames go, and in which version."""
-        if self._multicast:
-            return {(MULTICAST_GROUP, self.data_port): self._version}
+        """Where frames go without multicast, and in which version."""
         ports = {(host, self.data_port): client.version for (host, _), client in self._clients.items()}
         return ports | {at: client.version for at, client in self._clients.items() if client.keeps_alive}
-
-    def _send(self, data: bytes, to: Address) -> None:
-        with suppress(OSError):  # a full buffer, nobody there: UDP loses packets then
-            self._socket.sendto(data, to)
 
     def _read(self, now_us: int) -> None:
         """Take one datagram and answer it."""
@@ -192,19 +220,19 @@ class VirtualMotive:
         payload = data[HEADER_SIZE:]
         if kind == MessageId.CONNECT:  # clients differ in what follows
             self._admit(client, _Client(self._version, keeps_alive=False))
-            self._send(self._info(), client)
+            _send(self._socket, self._info(), client)
         elif kind == MessageId.KEEPALIVE:
             if client in self._clients:
                 self._admit(client, _Client(self._version_of(client), keeps_alive=True))
         elif kind == MessageId.REQUEST_MODELDEF:
-            self._send(encode_models(self._models, self._version_of(client)), client)
+            _send(self._socket, encode_models(self._models, self._version_of(client)), client)
         elif kind == MessageId.DISCONNECT:
             self._clients.pop(client, None)
         elif kind == MessageId.ECHO_REQUEST and len(payload) == _ECHO_REQUEST_SIZE:
             asked = int.from_bytes(payload, "little")
-            self._send(packet(MessageId.ECHO_RESPONSE, _ECHO.pack(asked, self._ticks())), client)
+            _send(self._socket, packet(MessageId.ECHO_RESPONSE, _ECHO.pack(asked, self._ticks())), client)
         elif kind == MessageId.REQUEST and size <= len(payload) <= MAX_COMMAND:
-            self._send(self._obey(payload.partition(b"\0")[0], client), client)
+            _send(self._socket, self._obey(payload.partition(b"\0")[0], client), client)
         else:
             self.malformed += 1
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.config import Axes, CaptureConfig
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.natnet import (
+    MULTICAST_GROUP,
     BodyDescription,
     BodyPose,
     Echo,
@@ -32,6 +33,7 @@ from ground_station.sources.natnet import (
 )
 from ground_station.sources.natnet_stream import NatnetStream
 from hil.errors import LabError
+from hil.servers.dongle_server import HOST
 from hil.servers.motive import MAX_CLIENTS, Streaming, Up, VirtualMotive, in_axes
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
 from support.motive_bench import (
@@ -329,6 +331,26 @@ def test_no_bytes_stop_the_server(lab: MotiveBench, client: NatNetSocket) -> Non
 def test_a_taken_port_is_said_in_one_line(lab: MotiveBench) -> None:
     with pytest.raises(LabError, match=rf"^natnet port {lab.motive.port}: Address already in use$"):
         VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
+
+
+@pytest.mark.parametrize("interface", [HOST, "0.0.0.0"], ids=["loopback", "any"])
+def test_a_program_that_joins_the_group_on_either_interface_hears_each_frame_once(interface: str) -> None:
+    """On any: the kernel takes the interface of the route, as for Bitcraze's scripts with libmotioncapture."""
+    lab = MotiveBench(multicast=True)
+    member = socket.inet_aton(MULTICAST_GROUP) + socket.inet_aton(interface)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.bind(("", lab.motive.data_port))
+        try:
+            client.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        except OSError as error:
+            pytest.skip(f"no route for {MULTICAST_GROUP}: {error}")
+        client.settimeout(0.5)
+        for _ in range(3):
+            lab.expose()
+        heard = [decode(client.recv(65536), (4, 1)).number for _ in range(3)]
+        assert heard == [1, 2, 3]
+        assert not select.select([client], (), (), 0)[0]
+    lab.motive.close()
 
 
 @pytest.mark.parametrize(
