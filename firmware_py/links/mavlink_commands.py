@@ -57,6 +57,7 @@ class CommandService:
             Command.GET_MESSAGE_INTERVAL: self._tell_interval,
             Command.SET_MESSAGE_INTERVAL: self._set_interval,
             Command.REQUEST_MESSAGE: lambda command: self._once(_whole(command.param1)),
+            Command.REQUEST_PROTOCOL_VERSION: lambda command: self._once(mavlink.MSG_PROTOCOL_VERSION),
             Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda command: self._once(mavlink.MSG_AUTOPILOT_VERSION),
         }
         stack.handle(mavlink.MSG_COMMAND_LONG, self._obey)

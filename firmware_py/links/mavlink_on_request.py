@@ -36,6 +36,7 @@ class RequestedMessages:
                 (mavlink.MSG_AUTOPILOT_VERSION, self._version),
                 (mavlink.MSG_HOME_POSITION, self._home_position),
                 (mavlink.MSG_EXTENDED_SYS_STATE, self._extended_state),
+                (mavlink.MSG_PROTOCOL_VERSION, lambda tick: (mavlink.protocol_version(),)),
                 (mavlink.MSG_ODOMETRY, self._odometry),
             )
         )

@@ -28,7 +28,7 @@ from firmware_py.wire.mavlink_services import (  # offered here, too
     message_interval as message_interval, named_value as named_value, no_log_data as no_log_data, no_logs as no_logs,
     no_mission as no_mission, parameter as parameter, parameter_list as parameter_list,
     parameter_read as parameter_read, parameter_set as parameter_set,
-    parameter_error as parameter_error, ping_answer as ping_answer,
+    parameter_error as parameter_error, ping_answer as ping_answer, protocol_version as protocol_version,
     refused_mission as refused_mission, station_heartbeat as station_heartbeat, status_text as status_text,
     timesync as timesync,
 )  # fmt: skip
@@ -69,6 +69,7 @@ MSG_HOME_POSITION = 242
 MSG_EXTENDED_SYS_STATE = 245
 MSG_NAMED_VALUE_FLOAT = 251
 MSG_STATUSTEXT = 253
+MSG_PROTOCOL_VERSION = 300
 MSG_ODOMETRY = 331
 MSG_DEBUG_FLOAT_ARRAY = 350
 

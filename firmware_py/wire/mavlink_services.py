@@ -6,6 +6,7 @@ Nothing here has an axis; what flies is in `mavlink`, which offers these functio
 import pymavlink.dialects.v20.common as dialect
 
 from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.mavlink_layouts import ProtocolVersion
 
 NAME_SIZE = 16  # of a parameter
 
@@ -160,6 +161,11 @@ def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) 
     return dialect.MAVLink_autopilot_version_message(
         _CAPABILITIES, packed, 0, 0, 0, own, none, none, 0, 0, uid
     )
+
+
+def protocol_version() -> Message:
+    """MAVLink 2, and versions that are read: 1 as well; which revisions of the standard these are, nobody here knows."""
+    return ProtocolVersion(200, 100, 200, [0] * 8, [0] * 8)
 
 
 def message_interval(number: int, interval_us: int) -> Message:

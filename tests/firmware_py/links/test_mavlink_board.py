@@ -1,6 +1,7 @@
 """The board's MAVLink services, asked by pymavlink's own codec."""
 
 import math
+import struct
 from itertools import pairwise
 from typing import Any
 
@@ -18,7 +19,7 @@ from hil.devices.config import SerialConfig
 from hil.devices.uart import VirtualSerial
 from hil.events import EventQueue
 from support.firmware_bench import LEVEL, FirmwareBench
-from support.mavlink_client import GYRO_ZERO_US, MavlinkClient, codec, count
+from support.mavlink_client import GYRO_ZERO_US, STREAMS, MavlinkClient, codec, count
 
 DENIED, UNSUPPORTED, TEMPORARILY_REJECTED = 2, 3, 1
 IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
@@ -733,6 +734,17 @@ def test_the_version_is_told(client: MavlinkClient, params: tuple[float, ...]) -
     version = answers["AUTOPILOT_VERSION"]
     assert version.flight_sw_version.to_bytes(4, "big")[:2] == bytes((26, 11))
     assert version.uid == 0x00F10A71
+
+
+@pytest.mark.parametrize("params", [(519, 1), (512, 300)])
+def test_the_versions_of_the_protocol_are_told(client: MavlinkClient, params: tuple[float, ...]) -> None:
+    """In bytes, because pymavlink does not have the message."""
+    ack, answer = (message for message in client.command(*params) if message.get_type() not in STREAMS)  # type: ignore[arg-type]
+    assert (ack.command, ack.result) == (params[0], 0)
+    frame = bytes(answer.get_msgbuf())
+    assert int.from_bytes(frame[7:10], "little") == 300
+    assert struct.unpack("<HHH16s", frame[10:-2].ljust(22, b"\0")) == (200, 100, 200, bytes(16))
+    assert dialect.x25crc(frame[1:-2] + bytes((217,))).crc == int.from_bytes(frame[-2:], "little")
 
 
 # The rest

@@ -38,10 +38,10 @@ def test_a_connection_as_qgroundcontrol_makes_it_meets_no_silence(client: Mavlin
         return ack.result, [answer.get_type() for answer in rest]
 
     assert request(148) == (ACCEPTED, ["AUTOPILOT_VERSION"])
-    assert request(PROTOCOL_VERSION) == (DENIED, [])  # QGroundControl goes by the capabilities then
+    assert request(PROTOCOL_VERSION) == (ACCEPTED, ["UNKNOWN_300"])  # to pymavlink
     for number in (COMPONENT_METADATA, COMPONENT_INFORMATION, AVAILABLE_MODES):
         assert request(number) == (DENIED, [])
-    assert client.command(519)[0].result == UNSUPPORTED  # the older request for PROTOCOL_VERSION
+    assert client.command(519)[0].result == ACCEPTED  # the older request for PROTOCOL_VERSION
     (nak,) = answers(
         client, "FILE_TRANSFER_PROTOCOL", "file_transfer_protocol", 0, 1, 1, [1, 0, 0, 4] + [0] * 247
     )
