@@ -127,7 +127,7 @@ class Firmware:
             localisation=LocalisationService(
                 link, self.measurements, supervisor, pilot, settings.address & 0xFF
             ),
-            platform=PlatformService(link, supervisor),
+            platform=PlatformService(link, supervisor, pilot),
             tester=tester,
             storage=storage,
             gyro_zero=self._zero,

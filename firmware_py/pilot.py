@@ -6,11 +6,12 @@ which the pose was true. While the planner is idle, corrections are errors alrea
 poses there is nothing to fly to: the goal stays under the robot, and the supervisor keeps the flaps at hover.
 """
 
-from firmware_py.geometry import in_goal_frame, to_euler_zyx
-from firmware_py.planner import Motion, Phase, Planner
+from firmware_py.geometry import Vector, in_goal_frame, to_euler_zyx
+from firmware_py.planner import Motion, Path, Phase, Planner, stay
 from firmware_py.wire.crtp import PoseMessage
 
 ORIGIN = Motion((0.0, 0.0, 0.0), 0.0)
+SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHUTDOWN
 
 
 class Pilot:
@@ -21,6 +22,7 @@ class Pilot:
         self.absolute = False
         self.goal: Motion | None = None
         self.here: Motion | None = None  # the last absolute pose
+        self._setpoint_us: int | None = None  # when the last set-point came, while they lead
         self._default_age_us = default_age_us
 
     def flies(self, now_us: int) -> bool:
@@ -28,9 +30,33 @@ class Pilot:
         idle = self.planner.phase(now_us) is Phase.IDLE
         return not (self.absolute and idle and self.here is not None)
 
+    @property
+    def led(self) -> bool:
+        """Whether set-points lead."""
+        return self._setpoint_us is not None
+
+    def forsaken(self, now_us: int) -> bool:
+        """Whether set-points lead and no more of them come."""
+        return self._setpoint_us is not None and now_us - self._setpoint_us >= SETPOINT_SILENCE_US
+
+    def follow(self, path: Path, now_us: int, lands: bool = False) -> None:
+        """Take up a path of the high-level commander, which needs nobody any more."""
+        self.planner.follow(path, now_us, lands)
+        self._setpoint_us = None
+
+    def hold(self, position: Vector, yaw: float, now_us: int) -> None:
+        """Fly to a set-point; the next one has to come soon."""
+        self.planner.follow(stay(position, yaw), now_us)
+        self._setpoint_us = now_us
+
+    def release(self) -> None:
+        """Notice that nobody promises further set-points; what the last one said stays in force."""
+        self._setpoint_us = None
+
     def abort(self) -> None:
-        """Give up the path: the robot may not fly."""
+        """Give up what was to be flown."""
         self.planner.stop()
+        self._setpoint_us = None
 
     def begin(self, now_us: int) -> Motion | None:
         """Where a new path begins: where the present one is, else where the robot is; None when nobody knows."""

@@ -124,6 +124,10 @@ class Planner:
             self._phase = Phase.IDLE
         return self._phase
 
+    def finished(self, now_us: int) -> bool:
+        """Whether nothing of the path is left."""
+        return self.phase(now_us) is Phase.IDLE or self._time(now_us) >= self._path.duration
+
     def at(self, t_us: int) -> Motion:
         """Where to be at an instant; only while it is not idle."""
         return self._path.at(self._time(t_us))
@@ -139,6 +143,12 @@ class Planner:
 
     def _time(self, t_us: int) -> float:
         return (t_us - self._begin_us) * 1e-6
+
+
+def stay(position: Vector, yaw: float) -> Path:
+    """At a position, without an end."""
+    x, y, z = position
+    return Path((Piece(0.0, ((x,), (y,), (z,), (yaw,))),))
 
 
 def straight_up(begin: Motion, height: float, yaw: float, duration: float) -> Path:

@@ -7,8 +7,9 @@ and cause are log variables (`supervisor.state`, `supervisor.cause`). The way ba
     out of bounds   the estimator was held at its bounds for 200 ms: ends after 500 ms inside them
     disarmed        by request: ends with the request to arm
     not finite      own logic put out NaN or infinity, the controller or the estimator: ends with a recovery request
-    emergency stop  by request, or because a started emergency stop watchdog was not fed for 1 s: ends only with a
-                    reboot; one by the parameter floaty.stop ends with a recovery request, too
+    emergency stop  by request, because a started emergency stop watchdog was not fed for 1 s, or because a stream of
+                    set-points fell silent for 2 s: ends only with a reboot. A stop by the parameter floaty.stop ends
+                    with a recovery request, too
     low battery     below the limit for 5 s: ends only with a recovery request when the voltage is back above it
 
 Before the first pose, and with absolute poses while the high-level commander has nothing to do, it waits. The board arms
@@ -44,6 +45,10 @@ class GoalSource(Protocol):
 
     def flies(self, now_us: int) -> bool:
         """Whether there is something to fly to."""
+        ...
+
+    def forsaken(self, now_us: int) -> bool:
+        """Whether somebody who led step by step has fallen silent."""
         ...
 
     def abort(self) -> None:
@@ -110,8 +115,11 @@ class Supervisor:
         self._watch_bounds(now_us)
         if self._watchdog_us is not None and now_us >= self._watchdog_us:
             self.emergency_stop()
-        if self.goals is not None and not self.can_fly:
-            self.goals.abort()
+        if self.goals is not None:
+            if self.goals.forsaken(now_us):
+                self.emergency_stop()
+            if not self.can_fly:
+                self.goals.abort()
         state, cause = self._state(now_us)
         if state is not self.state or cause is not self.cause:
             self.state, self.cause = state, cause

@@ -17,7 +17,6 @@ from firmware_py.drivers.imu import acceleration, rates
 from firmware_py.geometry import from_euler_zyx, rotate, wrap_angle, yaw_quaternion
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
-from firmware_py.links.platform import supervisor_bits
 from firmware_py.links.stream import ReadBlock
 from firmware_py.logic.plugs import GROUP
 from firmware_py.running import Running
@@ -54,7 +53,7 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         LogVariable("motors_ctrp.min_angle", F32, "rad", lambda: control.flap.min()),
         LogVariable("motors_ctrp.max_angle", F32, "rad", lambda: control.flap.max()),
         LogVariable("Error.int_z_err", F32, "m s", partial(getattr, control, "integral_z")),
-        LogVariable("supervisor.info", U16, "", partial(supervisor_bits, supervisor)),
+        LogVariable("supervisor.info", U16, "", running.platform.bits),
         LogVariable("supervisor.state", U8, "", partial(getattr, supervisor, "state")),
         LogVariable("supervisor.cause", U8, "", partial(getattr, supervisor, "cause")),
         LogVariable("sys.canfly", U8, "", partial(getattr, supervisor, "can_fly")),

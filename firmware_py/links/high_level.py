@@ -1,4 +1,6 @@
-"""The high-level commander on port 8, its trajectory memory, and the set-points of ports 3 and 7, which are not flown.
+"""The high-level commander on port 8, its trajectory memory, and the set-points of ports 3 and 7.
+
+With absolute poses set-points are flown that say where to be, each a step of the goal; the others are refused.
 
 Commands are few and planned at once, in the receiving task. Each is answered with the head of itself and a status in the
 fourth byte, as the stock firmware answers.
@@ -12,7 +14,7 @@ from firmware_py.links.trajectories import decode_trajectory
 from firmware_py.pilot import Pilot
 from firmware_py.planner import Motion, Phase, go_to, straight_up
 from firmware_py.supervisor import Supervisor
-from firmware_py.wire import WireError, high_level
+from firmware_py.wire import WireError, high_level, setpoints
 from firmware_py.wire.crtp import PORT_COMMANDER, PORT_GENERIC_SETPOINT, Packet
 from firmware_py.wire.high_level import (
     Command,
@@ -25,12 +27,6 @@ from firmware_py.wire.high_level import (
 )
 
 OK, REFUSED, ENOEXEC, EBUSY = 0, 1, 8, 16
-SETPOINT_CHANNEL = 0  # of port 7; 1 carries notices
-SETPOINT_STOP = 0
-SETPOINT_NAMES = {
-    1: "velocity", 2: "height and attitude", 4: "PPM", 5: "hover", 6: "full state", 7: "position", 8: "velocity",
-    9: "height and attitude", 10: "hover", 11: "manual",
-}  # fmt: skip
 LINE_PERIOD_US = 1_000_000  # set-points that come on without a pause of this length are refused once
 
 
@@ -91,7 +87,7 @@ class HighLevelService:
         if groups and not groups & self.defaults.groups:
             return OK  # for others
         if command is Command.STOP:
-            self._pilot.planner.stop()
+            self._pilot.abort()
             return OK
         begin = self._pilot.begin(self._stack.kernel.now_us)
         if begin is None:
@@ -134,19 +130,19 @@ class HighLevelService:
         return Vertical(wish.groups, height, wish.yaw, wish.current_yaw, abs(height - z) / velocity)
 
     def _climb(self, wish: Vertical, begin: Motion, lands: bool) -> int:
-        planner, now_us = self._pilot.planner, self._stack.kernel.now_us
-        phase = planner.phase(now_us)
+        now_us = self._stack.kernel.now_us
+        phase = self._pilot.planner.phase(now_us)
         if phase is Phase.LANDING if lands else phase is not Phase.IDLE:
             return REFUSED
         yaw = begin.yaw if wish.current_yaw else wish.yaw
-        planner.follow(straight_up(begin, wish.height, yaw, wish.duration), now_us, lands)
+        self._pilot.follow(straight_up(begin, wish.height, yaw, wish.duration), now_us, lands)
         return OK
 
     def _go_to(self, wish: GoTo, begin: Motion) -> int:
         path = go_to(
             begin, (wish.x, wish.y, wish.z), wish.yaw, wish.duration, bool(wish.relative), bool(wish.linear)
         )
-        self._pilot.planner.follow(path, self._stack.kernel.now_us)
+        self._pilot.follow(path, self._stack.kernel.now_us)
         return OK
 
     def _start(self, wish: Start, begin: Motion) -> int:
@@ -159,7 +155,7 @@ class HighLevelService:
         path = replace(path, timescale=wish.timescale, reverse=bool(wish.reverse))
         if wish.relative:
             path = path.begun_at(begin.position, begin.yaw if wish.relative_yaw else None)
-        self._pilot.planner.follow(path, self._stack.kernel.now_us)
+        self._pilot.follow(path, self._stack.kernel.now_us)
         return OK
 
     def _see_attitude(self, packet: Packet) -> Task:
@@ -169,17 +165,31 @@ class HighLevelService:
         yield from self._stack.kernel.yield_if_pending()
 
     def _see_setpoint(self, packet: Packet) -> Task:
-        """Port 7: a stop is obeyed; that a client sends no more set-points changes nothing."""
-        if packet.channel == SETPOINT_CHANNEL and packet.data:
-            if packet.data[0] == SETPOINT_STOP:
-                self._pilot.planner.stop()
-            else:
-                self._refuse(SETPOINT_NAMES.get(packet.data[0], f"type {packet.data[0]}"))
+        """Port 7: set-points, and the notice that no more of them come."""
+        kind = packet.data[0] if packet.data else None
+        if packet.channel == setpoints.CHANNEL_NOTICE:
+            self._pilot.release()
+        elif packet.channel == setpoints.CHANNEL_SETPOINT and kind == setpoints.STOP:
+            self._pilot.abort()
+        elif packet.channel == setpoints.CHANNEL_SETPOINT and kind is not None:
+            self._follow(kind, packet.data)
         yield from self._stack.kernel.yield_if_pending()
+
+    def _follow(self, kind: int, data: bytes) -> None:
+        """Fly to a set-point, if it says where to be and poses where that is."""
+        if kind in (setpoints.POSITION, setpoints.FULL_STATE) and self._pilot.absolute:
+            place = setpoints.decode_place(data)
+            if self._supervisor.can_fly:
+                self._pilot.hold(*place, self._stack.kernel.now_us)
+        else:
+            self._refuse(setpoints.NAMES.get(kind, f"type {kind}"))
 
     def _refuse(self, kind: str) -> None:
         """Say once that set-points of this kind are not flown."""
         now_us = self._stack.kernel.now_us
         if now_us - self._setpoint_us.get(kind, -LINE_PERIOD_US) >= LINE_PERIOD_US:
-            self._say(f"commander: {kind} set-points are not flown, the high-level commander's are")
+            instead = (
+                "positions are" if self._pilot.absolute else "poses are corrections, see extPose.absolute"
+            )
+            self._say(f"commander: {kind} set-points are not flown, {instead}")
         self._setpoint_us[kind] = now_us

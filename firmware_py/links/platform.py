@@ -1,6 +1,8 @@
 """Who the board is, and what it may do: link, platform and supervisor services, and the application channel."""
 
 from firmware_py.links.crtp_stack import CrtpStack, Task
+from firmware_py.pilot import Pilot
+from firmware_py.planner import Phase
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import WireError
@@ -45,9 +47,10 @@ SOURCE_TEXT = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")  # by which clients k
 class PlatformService:
     """Answers on the ports of link, platform and supervisor. The application echoes what comes on its channel."""
 
-    def __init__(self, stack: CrtpStack, supervisor: Supervisor) -> None:
+    def __init__(self, stack: CrtpStack, supervisor: Supervisor, pilot: Pilot) -> None:
         self._stack = stack
         self._supervisor = supervisor
+        self._pilot = pilot
         kernel = stack.kernel
         self._app: Queue[bytes] = kernel.create_queue(APP_QUEUE, "app")
         self._requests = stack.open_port(PORT_PLATFORM)
@@ -60,6 +63,10 @@ class PlatformService:
     def app_overflows(self) -> int:
         """Packets that the application lost because it was too slow."""
         return self._app.dropped
+
+    def bits(self) -> int:
+        """Return the Crazyflie's bit field of what the board and its commander do."""
+        return supervisor_bits(self._supervisor) | commander_bits(self._pilot, self._stack.kernel.now_us)
 
     def answer_platform(self, packet: Packet) -> tuple[bytes, ...]:
         """Return the reply to a platform command (answered with itself) or to a question for a version."""
@@ -79,8 +86,13 @@ class PlatformService:
         """Return the state, or the outcome of a command; the emergency stops are not answered."""
         supervisor, data = self._supervisor, packet.data
         command = data[0] if data else 0
-        if packet.channel == SUPERVISOR_INFO and command == GET_BITS:
-            return (bytes((REPLY | command,)) + supervisor_bits(supervisor).to_bytes(2, "little"),)
+        if (
+            packet.channel == SUPERVISOR_INFO and 0 < command <= GET_BITS
+        ):  # all bits, or the one with this number
+            answer = self.bits().to_bytes(2, "little")
+            if command < GET_BITS:
+                answer = bytes((self.bits() >> command - 1 & 1,))
+            return (bytes((REPLY | command,)) + answer,)
         if packet.channel == SUPERVISOR_COMMAND:
             if command in (ARM, RECOVER):
                 return (bytes((REPLY | command,)) + self._command(data),)
@@ -137,6 +149,14 @@ def supervisor_bits(supervisor: Supervisor) -> int:
         supervisor.locked,
     )
     return sum(1 << bit for bit, flag in enumerate(flags) if flag)
+
+
+def commander_bits(pilot: Pilot, now_us: int) -> int:
+    """Return the rest of it: the high-level commander flies, has come to its path's end, is overruled by set-points."""
+    flies = pilot.planner.phase(now_us) is not Phase.IDLE
+    overruled = flies and pilot.led
+    flags = flies and not overruled, pilot.planner.finished(now_us), overruled
+    return sum(1 << bit for bit, flag in enumerate(flags, 8) if flag)
 
 
 def _version(command: int) -> bytes:

@@ -337,7 +337,7 @@ def test_state_and_cause_are_log_variables(flying: CrtpClient) -> None:
     stop(flying)
     flying.run(flying.now_us + 20_000)
     names = ("supervisor.state", "supervisor.cause", "sys.canfly", "sys.isFlying", "supervisor.info")
-    assert flying.log(table, *names) == [3, 3, 0, 0, 0b1000110]
+    assert flying.log(table, *names) == [3, 3, 0, 0, 0b10_0100_0110]
 
 
 def test_flaps_never_rest_whatever_the_supervisor_says(flying: CrtpClient) -> None:

@@ -8,6 +8,7 @@ import pytest
 from cflib.crazyflie.commander import Commander
 from cflib.crazyflie.high_level_commander import HighLevelCommander
 from cflib.crazyflie.mem.trajectory_memory import CompressedSegment, CompressedStart, Poly4D
+from cflib.crazyflie.supervisor import BIT_HL_CONTROL_ACTIVE, BIT_HL_CONTROL_DISABLED, BIT_HL_TRAJ_FINISHED
 from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
@@ -281,19 +282,108 @@ def test_set_points_that_cannot_be_flown_are_refused_once_in_words(absolute: Fly
 
     low = absolute.low_level
     for _ in range(20):
-        absolute.post(low.send_position_setpoint, 0.0, 0.0, 1.0, 0.0)
+        absolute.post(low.send_velocity_world_setpoint, 0.0, 0.0, 1.0, 0.0)
         absolute.post(low.send_setpoint, 0.0, 0.0, 0.0, 20000)
     assert refusals() == [
-        f"commander: {kind} set-points are not flown, the high-level commander's are"
-        for kind in ("position", "attitude")
+        f"commander: {kind} set-points are not flown, positions are" for kind in ("velocity", "attitude")
     ]
     absolute.wait(1.5)
     absolute.post(low.send_hover_setpoint, 0.0, 0.0, 0.0, 1.0)
-    absolute.post(low.send_position_setpoint, 0.0, 0.0, 1.0, 0.0)
+    absolute.post(low.send_velocity_world_setpoint, 0.0, 0.0, 1.0, 0.0)
     assert len(refusals()) == 4
     absolute.post(low.send_setpoint, 0.0, 0.0, 0.0, 0)  # cflib's farewell
     absolute.post(low.send_notify_setpoint_stop)
     assert len(refusals()) == 4
+
+
+def test_among_corrections_a_position_is_no_place_to_fly_to(relative: Flyer) -> None:
+    relative.post(relative.low_level.send_position_setpoint, 0.0, 0.0, 0.1, 0.0)
+    assert relative.console[-1] == (
+        "commander: position set-points are not flown, poses are corrections, see extPose.absolute"
+    )
+    assert relative.goal() == [0.0, 0.0, 0.0]
+
+
+def send_full_state(flyer: Flyer, x: float, y: float, z: float, yaw_deg: float) -> None:
+    q = Rotation.from_euler("z", yaw_deg, degrees=True).as_quat().tolist()
+    nothing = (0.0, 0.0, 0.0)
+    flyer.post(flyer.low_level.send_full_state_setpoint, (x, y, z), nothing, nothing, q, 0.0, 0.0, 0.0)
+
+
+def send_position(flyer: Flyer, x: float, y: float, z: float, yaw_deg: float) -> None:
+    flyer.post(flyer.low_level.send_position_setpoint, x, y, z, yaw_deg)
+
+
+@pytest.mark.parametrize("send", [send_position, send_full_state])
+def test_set_points_that_say_where_to_be_are_flown_as_steps_of_the_goal(absolute: Flyer, send) -> None:
+    x, y, z = HERE
+    for _ in range(20):
+        send(absolute, x + 0.05, y, z - 0.02, 30.0)
+        absolute.wait(0.02)
+    assert absolute.state == "FLYING"
+    assert absolute.goal() == pytest.approx([x + 0.05, y, z - 0.02], abs=1e-6)
+    assert absolute.estimate() == pytest.approx(
+        Rotation.from_euler("z", -30, degrees=True).apply((-0.05, 0.0, 0.02)), abs=0.005
+    )
+    assert not [line for line in absolute.console if "set-points" in line]
+
+
+def test_a_stream_of_set_points_that_falls_silent_for_two_seconds_locks_the_board(absolute: Flyer) -> None:
+    for _ in range(5):
+        send_position(absolute, *HERE, 0.0)
+        absolute.wait(0.1)
+    absolute.wait(1.88)
+    assert absolute.state == "FLYING"
+    absolute.wait(0.03)
+    assert absolute.firmware.signals.supervisor.locked
+
+
+@pytest.mark.parametrize("end", ["notice", "high level", "stop"])
+def test_a_stream_of_set_points_may_end_in_words(absolute: Flyer, end: str) -> None:
+    send_position(absolute, *HERE, 0.0)
+    absolute.wait(0.1)
+    if end == "notice":
+        absolute.post(absolute.low_level.send_notify_setpoint_stop)
+    elif end == "stop":
+        absolute.post(absolute.low_level.send_stop_setpoint)
+    else:
+        assert absolute.order(absolute.commander.go_to, *HERE, 0.0, 1.0) == 0
+    absolute.wait(3.0)
+    assert absolute.state == ("WAITING" if end == "stop" else "FLYING")
+
+
+ACTIVE, FINISHED, OVERRULED = "hl_control_active", "hl_traj_finished", "hl_control_disabled"
+
+
+def told_of_the_commander(flyer: Flyer) -> set[str]:
+    """As cflib's supervisor reads the bits, all at once and one by one."""
+    flyer.wait(0.02)
+    bits = int.from_bytes(flyer.one(SUPERVISOR, 0, b"\x0c")[1:], "little")
+    assert [flyer.one(SUPERVISOR, 0, bytes((n,))) for n in range(1, 12)] == [
+        bytes((0x80 | n, bits >> n - 1 & 1)) for n in range(1, 12)
+    ]
+    assert flyer.log(flyer.logs, "supervisor.info") == [bits]
+    names = {
+        BIT_HL_CONTROL_ACTIVE: ACTIVE,
+        BIT_HL_TRAJ_FINISHED: FINISHED,
+        BIT_HL_CONTROL_DISABLED: OVERRULED,
+    }
+    return {name for bit, name in names.items() if bits >> bit & 1}
+
+
+def test_the_supervisor_says_what_the_commander_does(absolute: Flyer) -> None:
+    assert told_of_the_commander(absolute) == {FINISHED}
+    absolute.order(absolute.commander.takeoff, 1.5, 1.0)
+    assert told_of_the_commander(absolute) == {ACTIVE}
+    absolute.wait(1.0)
+    assert told_of_the_commander(absolute) == {ACTIVE, FINISHED}
+    send_position(absolute, *HERE, 0.0)
+    assert told_of_the_commander(absolute) == {FINISHED, OVERRULED}
+    absolute.post(absolute.low_level.send_notify_setpoint_stop)
+    absolute.order(absolute.commander.land, 1.0, 0.2)
+    assert told_of_the_commander(absolute) == {ACTIVE}
+    absolute.wait(0.3)
+    assert told_of_the_commander(absolute) == {FINISHED}
 
 
 def test_what_poses_are_is_kept_over_a_reboot(absolute: Flyer) -> None:
