@@ -22,7 +22,14 @@ from cflib.crazyflie.param import ParamTocElement
 from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
 
 from firmware_py.wire import WireError
-from firmware_py.wire.crtp import CHANNEL_LOG_DATA, PORT_LOG, decode, decode_log_data, encode_ext_pose
+from firmware_py.wire.crtp import (
+    CHANNEL_LOG_DATA,
+    PORT_CONSOLE,
+    PORT_LOG,
+    decode,
+    decode_log_data,
+    encode_ext_pose,
+)
 from firmware_py.wire.scalars import PARAMETER_SCALARS
 from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, Block, Sample
 from ground_station.clock import clock_us
@@ -42,6 +49,7 @@ from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
 CFLIB_CLOSES_S = 3.0  # it may stay behind when the dongle was pulled
+CONSOLE_BYTES = 1000  # of a line without an end that are kept
 ECHO_PERIOD_US = 100_000  # between packets that the board sends back
 ECHO_APART_US = 3_000  # from the last correction, in whose way they would be
 ECHOES = 30  # of which the median counts
@@ -68,6 +76,7 @@ class CrazyradioLink(LiveLink):
         self._crazyflie: Crazyflie | None = None
         self._connected = threading.Event()
         self._lost = ""  # what cflib says of it
+        self._console = b""  # what the board has printed of a line
         self._blocks: dict[int, Block] = {}
         self._telemetry_us = 0  # the last packet of a log block
         self._rate = 0.0  # of exchanges [1/s], 0 over UDP
@@ -98,7 +107,7 @@ class CrazyradioLink(LiveLink):
         if crazyflie is None or not self._connected.wait(POLL_S):
             return False
         crazyflie.add_port_callback(CRTPPort.LINKCTRL, self._on_echo)
-        for port in PORTS:
+        for port in (*PORTS, PORT_CONSOLE):
             crazyflie.add_port_callback(port, self._on_service_packet)
         crazyflie.link_statistics.link_quality_updated.add_callback(self._on_quality)
         crazyflie.link_statistics.uplink_rssi_updated.add_callback(self._on_rssi)
@@ -217,6 +226,9 @@ class CrazyradioLink(LiveLink):
         packet = decode(data)
         if packet.port in PORTS:
             self._controls.hear(now_us, packet)
+        if packet.port == PORT_CONSOLE:
+            *lines, self._console = (self._console + packet.data)[-CONSOLE_BYTES:].split(b"\n")
+            self._notices += [f"board: {line.decode(errors='replace')}" for line in lines if line]
         if packet.port != PORT_LOG or packet.channel != CHANNEL_LOG_DATA:
             return ()
         number, timestamp_ms, values = decode_log_data(packet.data)

@@ -5,9 +5,11 @@ import threading
 import pytest
 
 from firmware_py.wire import WireError
+from firmware_py.wire.crtp import PORT_CONSOLE, Packet, encode
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
 from ground_station.latency import LinkLatency
+from ground_station.links.crazyradio import CrazyradioLink
 from ground_station.links.live_link import MAX_AGE_US, PIECES, LiveLink
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
@@ -165,3 +167,11 @@ def test_what_nobody_fetches_is_bounded():
     assert len(board.received()) == PIECES
     assert board.received() == []
     board.close()
+
+
+def test_what_a_board_prints_is_a_notice_for_each_line():
+    link = CrazyradioLink("udp://127.0.0.1:19850", 0)
+    for piece in (b"imu: gyro ", b"zero found\nsuper", b"visor: flying\n\n"):
+        assert link.receive(0, encode(Packet(PORT_CONSOLE, 0, piece))) == ()
+    assert link.notices() == ["board: imu: gyro zero found", "board: supervisor: flying"]
+    assert link.notices() == []
