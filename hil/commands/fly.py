@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from hil.laboratory.run import Request
 
 SEEDS_MAX = 10_000
-SERVED = ("web", "foxglove")  # pictures that end with the command
 
 
 @click.command()
@@ -133,7 +132,7 @@ def _fly_one(request: Request, folder: Path, realtime: bool, target: str | None,
 
             write_perfetto(folder)
     print_result(result)
-    if view is not None and target in SERVED and notices.is_terminal:
+    if view is not None and view.address and notices.is_terminal:
         notices.print("what was flown can be looked at until Ctrl-C")
         view.stay()
     close_live(view, result)

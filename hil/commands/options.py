@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -77,12 +78,12 @@ def stop_signals() -> list[int]:
 
 
 def open_live(target: str | None) -> LiveView | None:
-    """Open the picture that `--view` asks for."""
+    """Open the picture that `--view` asks for; it ends with the command, however that ends."""
     if target is None:
         return None
     from hil.live.feed import open_view
 
-    return open_view(target, say)
+    return click.get_current_context().with_resource(closing(open_view(target, say)))
 
 
 def close_live(view: LiveView | None, result: Result | None = None) -> None:

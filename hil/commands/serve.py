@@ -154,7 +154,7 @@ def serve(
         server.run(lambda: bool(stops))
     finally:
         server.ends.close()
-        close_live(view)
+    close_live(view)
     if server.ends.motive is not None and server.ends.motive.malformed:
         say(f"motive could not read {server.ends.motive.malformed} packets")
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")

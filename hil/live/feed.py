@@ -82,6 +82,7 @@ class LiveView:
         self, command: Sequence[str], say: Callable[[str], None], start_timeout_s: float = START_TIMEOUT_S
     ) -> None:
         self.offered = self.taken = 0  # rows
+        self.address = ""  # of a picture that is served until it ends
         self._texts: deque[dict[str, Any]] = deque(maxlen=LINES)
         self._typed: deque[str] = deque(maxlen=LINES)
         self._parameters: deque[tuple[str, float]] = deque()  # that the picture does not know yet
@@ -136,7 +137,7 @@ class LiveView:
             self._process.wait()
 
     def close(self, catch_up_s: float = CATCH_UP_S) -> int:
-        """Let the picture catch up for a while and end; returns how many rows it has not taken."""
+        """Let the picture catch up for a while and end; returns how many rows it has not taken. May be called again."""
         self._flush()
         if self._is_late and not self.taken:
             catch_up_s = 0.0
@@ -144,6 +145,7 @@ class LiveView:
             with suppress(OSError):
                 if self._stream is not None:
                     self._stream.close()
+            self._stream = None
             self._close_pipe()
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(catch_up_s)
@@ -189,6 +191,7 @@ class LiveView:
         for line in self._process.stdout:
             word, _, text = line.decode(errors="replace").strip().partition(" ")
             if word == READY:
+                self.address = text
                 if text:
                     say(f"view   {text}")
                 self._up.set()

@@ -11,6 +11,7 @@ import pytest
 
 from hil.errors import LabError
 from hil.laboratory.recorder import load_log
+from hil.live.window import DISPLAYS
 from support.command import floaty
 
 FLOATY = (sys.executable, "-m", "hil.commands")
@@ -172,5 +173,15 @@ def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
     assert "view" in capsys.readouterr().err
     assert not Path("run/flight.rrd").exists()
     assert Path("run/report.html").exists()
-    monkeypatch.delitem(sys.modules, "hil.pictures.viewer", raising=False)
-    assert floaty(monkeypatch, "fly", "hover", "--view", "--out", "run2") == 2
+
+
+@pytest.mark.parametrize("view", [["--view", "--realtime"], ["--view", "wbe"]])
+def test_a_viewer_that_cannot_open_is_one_line_and_leaves_no_folder(
+    view: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    assert floaty(monkeypatch, "fly", "hover", *view, "--out", "run") == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("floaty: ")]
+    assert "--view web" in line or "--view wbe: expected" in line
+    assert not Path("run").exists()

@@ -167,3 +167,11 @@ def test_who_looks_on_sees_every_row_once_five_times_a_second(kept: bool, tmp_pa
     assert max(seen.sizes) == 20
     assert seen.texts == [(2_500_000, "lab", "over")]
     assert bool(list(tmp_path.iterdir())) is kept
+
+
+def test_a_picture_stays_until_it_ends_by_itself() -> None:
+    view = LiveView(picture(pictures.IS_CLOSED), [].append)
+    view.rows(rows(0, 20))
+    view.stay()
+    assert view.close() == 0
+    assert view.close() == 0
