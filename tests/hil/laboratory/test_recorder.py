@@ -4,7 +4,6 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from hil.errors import LabError
@@ -70,15 +69,6 @@ def test_hash_depends_on_values_and_names_only(tmp_path: Path) -> None:
         recorder.row(0)
         digests.append(recorder.close())
     assert digests[0] == digests[1] != digests[2]
-
-
-def test_every_batch_reaches_the_listener(tmp_path: Path) -> None:
-    batches: list[pa.RecordBatch] = []
-    recorder = Recorder(tmp_path, (Channel("int32", lambda: 1, (Quantity(("n",), ""),)),), {}, batches.append)
-    for row in range(250):
-        recorder.row(row)
-    recorder.close()
-    assert [batch.num_rows for batch in batches] == [100, 100, 50]
 
 
 def test_a_folder_without_a_log_is_an_error(tmp_path: Path) -> None:

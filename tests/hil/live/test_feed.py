@@ -1,5 +1,7 @@
 """The live feed: whatever its picture does, the flight is the same, and what was missed is counted."""
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -175,3 +177,27 @@ def test_a_picture_stays_until_it_ends_by_itself() -> None:
     view.stay()
     assert view.close() == 0
     assert view.close() == 0
+
+
+def test_nothing_is_imported_while_a_flight_is_recorded_and_shown() -> None:
+    """An import takes up to seconds on a busy machine; pyarrow imports pandas when it first sees an array of numpy's."""
+    program = f"""
+import sys, tempfile
+from pathlib import Path
+from hil.laboratory.recorder import Channel, Quantity, Recorder
+from hil.live.feed import LiveView
+view = LiveView([sys.executable, '-c', {pictures.TAKES_ALL!r}], print)
+with tempfile.TemporaryDirectory() as folder:
+    recorder = Recorder(Path(folder), (Channel('float64', lambda: 0.0, (Quantity(('x',), 'm'),)),), {{}}, view)
+    before = set(sys.modules)
+    for row in range(250):
+        recorder.note(row, 'lab', 'text')
+        recorder.row(10_000 * row)
+    while not view.taken:
+        pass
+    print(sorted(set(sys.modules) - before))
+    recorder.close()
+view.close()
+"""
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert shown.stdout.splitlines() == ["view   here", "[]"]
