@@ -55,6 +55,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "numba": ("firmware_py/compiling.py",),
     "rerun": ("hil/pictures/viewer.py",),
     "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
+    "youplot": ("hil/pictures/pages.py",),
     "time": ("hil/clock.py", "hil/laboratory/run.py", "ground_station/clock.py"),
     "datetime": (),
     "asyncio": (),

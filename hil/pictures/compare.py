@@ -6,7 +6,7 @@ one share no rows: there it is how far they are apart, by the time since the rel
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,16 @@ from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real,
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import Result, read_result
 from hil.pictures import curves
-from hil.pictures.overlays import pair, since_release
-from hil.pictures.pages import data_uri, write_page
+from hil.pictures.curves import since_release
+from hil.pictures.drawing import png
+from hil.pictures.pages import Shown, write_page, zoomable
+from hil.pictures.panels import Marks, Panel, Plot, Series
+from hil.pictures.trials import DARK
 
 ROW_S = 0.01
 AROUND_US = 1_000_000  # shown before and after what is judged of a real flight
 PICTURE, PAGE = "compare.png", "compare.html"
+PAIR = (DARK, curves.ORANGE)
 SETTINGS = (
     "experiment",
     "profile",
@@ -133,15 +137,39 @@ def compare(a: Run, b: Run) -> Comparison:
 
 def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Path:
     """Write `compare.png` and `compare.html` into a folder; returns the page. Raises `LabError`."""
-    png = pair((_judged(a.log), _judged(b.log)), (str(a.result.folder), str(b.result.folder)))
+    logs, names = (_judged(a.log), _judged(b.log)), (str(a.result.folder), str(b.result.folder))
+    plot = pair(logs, names)
+    figure = Shown(
+        "both",
+        "Both flights",
+        f"Position and attitude against the goal and the flap angles over time. Blue: {names[0]}; orange: {names[1]}. "
+        "Times count from the release of each.",
+        plot=plot,
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / PICTURE).write_bytes(png)
+        (folder / PICTURE).write_bytes(png(lambda: plot))
         return write_page(
-            folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, picture=data_uri(png)
-        )
+            folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, figure=figure,
+            zoomable=zoomable([figure], Marks()),
+        )  # fmt: skip
     except OSError as error:
         raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
+
+
+def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Plot:
+    """Return position, attitude and flap angles of two flights over time."""
+    times = [since_release(log) for log in logs]
+    panels = []
+    for curve in (curves.POSITION, curves.ATTITUDE, curves.FLAPS):
+        read = [curve.read(log) for log in logs]
+        for index, title in enumerate(curve.names):
+            both = tuple(
+                Series(name, colour, at, values[:, index])
+                for name, colour, at, values in zip(names, PAIR, times, read, strict=True)
+            )
+            panels.append(Panel(f"{title} [{curve.unit}]", both, height=0.95))
+    return Plot(tuple(panels))
 
 
 def _judged(log: pa.Table) -> pa.Table:

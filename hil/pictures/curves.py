@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ground_station.latency import STAGES
 from hil.laboratory.metrics import attitude_error, column, is_real, position_error
-from hil.laboratory.recorder import OPERATOR
+from hil.laboratory.recorder import OPERATOR, release_of
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
     "#e69f00", "#56b4e9", "#009e73", "#b8a900", "#0072b2", "#d55e00", "#cc79a7", "#888888",
@@ -60,6 +60,11 @@ class States:
     column: str
     names: tuple[str, ...]
     colours: tuple[str, ...]
+
+
+def since_release(log: pa.Table) -> NDArray[np.float64]:
+    """Return the time of every row [s], zero at the release."""
+    return np.asarray(1e-6 * (column(log, "t") - release_of(log.schema.metadata)))
 
 
 def task_colour(name: str) -> str:

@@ -1,4 +1,8 @@
-"""How every figure is drawn: its size, its style, and the way to PNG. matplotlib is loaded here."""
+"""How every figure becomes a PNG: its size, its style, and panels as matplotlib draws them. matplotlib is loaded here.
+
+Grey: the robot was still held; red: a fault was in force; pink: failsafe; yellow strip at the bottom: a flap at its limit;
+dotted blue: an operator did something; black: the flight was lost.
+"""
 
 import io
 from collections.abc import Callable, Sequence
@@ -9,12 +13,15 @@ import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hil.laboratory.recorder import release_of
-from hil.pictures.curves import BLUE, marks_of
+from hil.pictures.curves import BLUE, GREY, PINK, RED, YELLOW
+from hil.pictures.panels import INK, Marks, Panel, Plot, marks_of_flight
 
 MARK_LENGTH = 28  # letters
 WIDTH, DPI = 9.2, 115  # [in], 1/in
-MARK_COLOUR = BLUE
+SPELL_COLOURS = {"held": GREY, "fault": RED, "failsafe": PINK, "flap limit": YELLOW}
+INSTANT_COLOURS = {"operator": BLUE, "lost": INK}
+SHADE = 0.18  # opacity
+STRIP = 0.04  # of the axes' height: flaps at their limits
 STYLE: Any = {
     "axes.grid": True,
     "axes.spines.right": False,
@@ -28,25 +35,93 @@ STYLE: Any = {
 }
 
 
-def png(draw: Callable[..., Figure], *flights: pa.Table) -> bytes:
-    """Return the figure that `draw` makes of flight logs, or of a schedule."""
+def drawn(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> Plot | bytes:
+    """Return what `draw` makes of flight logs, or of a schedule: panels, or the PNG of a figure."""
     with matplotlib.rc_context(STYLE):
-        file = io.BytesIO()
-        draw(*flights).savefig(file, format="png", dpi=DPI)
+        made = draw(*flights)
+        return made if isinstance(made, Plot) else _png(made)
+
+
+def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
+    """Return it as PNG in any case; panels are marked as the first flight was."""
+    made = drawn(draw, *flights)
+    if isinstance(made, bytes):
+        return made
+    with matplotlib.rc_context(STYLE):
+        return _png(figure_of(made, marks_of_flight(flights[0]) if flights else Marks()))
+
+
+def _png(figure: Figure) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=DPI)
     return file.getvalue()
 
 
-def draw_marks(axes: Sequence[Axes], log: pa.Table) -> None:
-    """Draw a line for each mark, which the first of the axes names; the time axis is zero at the release."""
-    release_us = release_of(log.schema.metadata)
-    for t_us, text in marks_of(log):
-        at_s = 1e-6 * (t_us - release_us)
+def figure_of(plot: Plot, marks: Marks) -> Figure:
+    """Return the figure of panels."""
+    figure, axes = stack([panel.height for panel in plot.panels])
+    for one, panel in zip(axes, plot.panels, strict=True):
+        one.margins(x=0)
+        _draw(one, panel)
+        one.set_ylabel(panel.label)
+        one.set_ylim(panel.least, panel.most)
+        # two states of a lane may have one name: one entry per name
+        named = dict(zip(*reversed(one.get_legend_handles_labels()), strict=True))
+        if named:
+            one.legend(named.values(), named.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.1))
+    if plot.window_s is not None:
+        axes[-1].set_xlim(plot.window_s)
+    draw_marks(axes, marks)
+    figure.align_ylabels(axes)
+    return figure
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    if panel.stacked and panel.series:
+        axes.stackplot(
+            panel.series[0].times, [one.values for one in panel.series],
+            labels=[one.name for one in panel.series], colors=[one.colour for one in panel.series],
+        )  # fmt: skip
+    else:
+        for one in panel.series:
+            style = "--" if one.dashed else "-"
+            axes.plot(
+                one.times, one.values, style, color=one.colour, linewidth=one.width, label=one.name or None
+            )
+    for limit in panel.limits:
+        axes.axhline(limit, color=INK, linestyle="--", linewidth=0.8)
+    names = list(dict.fromkeys(bar.lane for bar in panel.bars))
+    for bar in panel.bars:
+        axes.barh(
+            names.index(bar.lane), bar.end_s - bar.begin_s, 0.8, bar.begin_s, color=bar.colour, label=bar.name
+        )
+    if names:
+        axes.set_yticks(range(len(names)), names)
+        axes.grid(visible=False)
+
+
+def draw_marks(axes: Sequence[Axes], marks: Marks) -> None:
+    """Shade and mark what happened; the first axes name it. The time axis is zero at the release."""
+    for spell in marks.spells:
+        high = STRIP if spell.kind == "flap limit" else 1.0
+        alpha = 0.9 if spell.kind == "flap limit" else SHADE
         for one in axes:
-            one.axvline(at_s, color=MARK_COLOUR, linestyle=":", linewidth=0.9)
+            one.axvspan(
+                spell.begin_s, spell.end_s, 0.0, high, color=SPELL_COLOURS[spell.kind], alpha=alpha, linewidth=0
+            )  # fmt: skip
+    faults = [(spell.begin_s, spell.text, RED) for spell in marks.spells if spell.kind == "fault"]
+    for instant in marks.instants:
+        colour = INSTANT_COLOURS[instant.kind]
+        for one in axes:
+            one.axvline(
+                instant.t_s, color=colour, linestyle=":" if instant.kind == "operator" else "-", linewidth=0.9
+            )
+        faults.append((instant.t_s, instant.text, colour))
+    for begins, text, colour in faults:
         short = text if len(text) <= MARK_LENGTH else f"{text[: MARK_LENGTH - 1]}…"
         axes[0].text(
-            at_s, 0.02, short, transform=axes[0].get_xaxis_transform(), color=MARK_COLOUR, fontsize=6.5,
-            rotation=90, ha="right", va="bottom", clip_on=True,
+            begins, 0.98, short, transform=axes[0].get_xaxis_transform(), color=colour, fontsize=6.5,
+            rotation=90, ha="left", va="top", clip_on=True,
         )  # fmt: skip
 
 

@@ -1,73 +1,32 @@
-"""The figures of a flight as PNG, after the paper's figure Hover_figure; also of a flight that was lost or never began.
+"""The figures of a flight, after the paper's figure Hover_figure; also of a flight that was lost or never began.
 
-Axes carry cm, degrees, ms and seconds from the release. Grey: the robot was still held; red: a fault was in force; dotted
-blue: an operator did something.
+Axes carry cm, degrees, ms and seconds from the release. Over time they are panels, which a page can zoom; what has no time
+axis, or 20 ms of one, is drawn by matplotlib.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ground_station.latency import STAGES, stages_told
-from hil.laboratory.faults import spans_of
-from hil.laboratory.metrics import BOX, column, free_flight
+from hil.laboratory.metrics import BOX, free_flight
 from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, scene
-from hil.pictures.curves import Curves
-from hil.pictures.drawing import WIDTH, draw_marks, stack
-from hil.pictures.overlays import since_release
+from hil.pictures.curves import since_release
+from hil.pictures.drawing import WIDTH
+from hil.pictures.panels import INK, Panel, Plot, Series, lanes, panel
 from hil.pictures.picture import Picture
 
 TENTH, SECOND = 10, 100  # rows
 BUSY_PERCENT = 0.02  # of the processor, that makes a task worth a colour
 SCHEDULE_US = 20_000  # of the scheduler's picture
 BOX_CM = 100 * BOX
-
-
-def _lines(
-    axes: Axes, times: NDArray[np.float64], plot: Curves, values: NDArray[np.float64], label: str
-) -> None:
-    for index, (name, colour) in enumerate(zip(plot.names, plot.colours, strict=True)):
-        axes.plot(times, values[:, index], color=colour, label=name)
-    axes.set_ylabel(f"{label} [{plot.unit}]")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-
-
-def _limits(axes: Axes, limit: float) -> None:
-    for value in (-limit, limit):
-        axes.axhline(value, color="black", linestyle="--", linewidth=0.8)
-
-
-def shade(axes: Sequence[Axes], rows: pa.Table) -> None:
-    """Shade when the robot was held and when a fault was in force, and mark what an operator did; the first axes name it."""
-    times = since_release(rows)
-    held = times[column(rows, "flight.free") < 0.5]
-    for one in axes:
-        one.margins(x=0)
-        if len(held) > 1:
-            one.axvspan(held[0], held[-1], color=curves.GREY, alpha=0.2, linewidth=0)
-    names: dict[float, list[str]] = {}  # by begin
-    release_us = release_of(rows.schema.metadata)
-    for span in spans_of(rows.schema.metadata):
-        begin, end = (1e-6 * (us - release_us) for us in (span.begin_us, span.end_us))
-        end = min(end, times[-1] if len(times) else begin)
-        if begin >= end:
-            continue
-        for one in axes:
-            one.axvspan(begin, end, color=curves.RED, alpha=0.15, linewidth=0.5)
-        names.setdefault(begin, []).append(span.fault.kind)
-    for begin, kinds in names.items():
-        axes[0].text(
-            begin, 0.98, ", ".join(kinds), transform=axes[0].get_xaxis_transform(), color=curves.RED, fontsize=6.5,
-            rotation=90, ha="left", va="top", clip_on=True,
-        )  # fmt: skip
-    draw_marks(axes, rows)
 
 
 def track(rows: pa.Table) -> Figure:
@@ -102,162 +61,132 @@ def track(rows: pa.Table) -> Figure:
     return figure
 
 
-def errors(rows: pa.Table) -> Figure:
-    """Draw position and attitude errors over time with the paper's limits."""
-    figure, axes = stack((2.1, 2.1))
-    times = since_release(rows)
-    _lines(axes[0], times, curves.POSITION, curves.POSITION.read(rows), "position error")
-    _limits(axes[0], curves.NEAR_CM)
-    _lines(axes[1], times, curves.ATTITUDE, curves.ATTITUDE.read(rows), "attitude error")
-    _limits(axes[1], curves.ATTITUDE_DEG)
-    shade(axes, rows)
-    return figure
+def errors(rows: pa.Table) -> Plot:
+    """Position and attitude errors over time with the paper's limits."""
+    near, level = (
+        (-curves.NEAR_CM, curves.NEAR_CM),
+        (-curves.ATTITUDE_DEG, curves.ATTITUDE_DEG),
+    )
+    return Plot(
+        (
+            panel(curves.POSITION, rows, "position error", height=2.1, limits=near),
+            panel(curves.ATTITUDE, rows, "attitude error", height=2.1, limits=level),
+        )
+    )
 
 
-def flaps(rows: pa.Table) -> Figure:
-    """Draw what the flaps were told and what they did; of a real board, what it believes that they did."""
-    figure = Figure(figsize=(WIDTH, 3.8), layout="constrained")
-    grid = figure.subplots(2, 2, sharex=True)
+def flaps(rows: pa.Table) -> Plot:
+    """What the flaps were told and what they did; of a real board, what it believes that they did."""
     times, angles = since_release(rows), curves.FLAPS.read(rows)
     commanded = curves.FLAPS_COMMAND.needs in rows.column_names
     commands = curves.FLAPS_COMMAND.read(rows) if commanded else None
-    for index, axes in enumerate((grid[0, 1], grid[0, 0], grid[1, 0], grid[1, 1])):
-        if commands is not None:
-            axes.plot(times, commands[:, index], color="black", linewidth=0.6, alpha=0.55, label="command")
-        label = "true" if commanded else "by telemetry"
-        axes.plot(times, angles[:, index], color=curves.FLAPS.colours[index], label=label)
-        axes.set_title(curves.FLAPS.names[index], loc="left", fontsize=9)
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("angle [deg]")
-    for axes in grid[1]:
-        axes.set_xlabel("time from the release [s]")
-    shade(list(grid.flat), rows)
-    return figure
+    panels = []
+    for index, (name, colour) in enumerate(zip(curves.FLAPS.names, curves.FLAPS.colours, strict=True)):
+        angle = Series("true" if commanded else "by telemetry", colour, times, angles[:, index], width=1.2)
+        command = () if commands is None else (Series("command", INK, times, commands[:, index], width=0.6),)
+        panels.append(Panel(f"{name} [deg]", (*command, angle), height=1.3))
+    return Plot(tuple(panels))
 
 
-def age(rows: pa.Table) -> Figure:
-    """Draw how old poses are when the estimator takes them, and for how long there were none, where that is told."""
-    told = curves.SINCE_FUSION.needs in rows.column_names
-    figure, axes = stack((1.5, 1.2) if told else (1.5,))
-    for plot in (curves.AGE, curves.HORIZON):
-        if plot.needs in rows.column_names:
-            _lines(axes[0], since_release(rows), plot, plot.read(rows), "on board")
-    if told:
-        _lines(axes[1], since_release(rows), curves.SINCE_FUSION, curves.SINCE_FUSION.read(rows), "without")
-    shade(axes, rows)
-    return figure
+def age(rows: pa.Table) -> Plot:
+    """How old poses are when the estimator takes them, and for how long there were none, where that is told."""
+    plots = [plot for plot in (curves.AGE, curves.HORIZON) if plot.needs in rows.column_names]
+    series = [line for plot in plots for line in panel(plot, rows, "").series]
+    panels = [Panel("on board [ms]", tuple(series))]
+    if curves.SINCE_FUSION.needs in rows.column_names:
+        panels.append(panel(curves.SINCE_FUSION, rows, "without", height=1.2))
+    return Plot(tuple(panels))
 
 
-def way(told: pa.Table) -> Figure:
-    """Draw where the poses of `ages.told_in_time_of` spent their time, stage on stage."""
-    figure, (axes,) = stack((1.8,))
+def way(told: pa.Table) -> Plot:
+    """Where the poses of `ages.told_in_time_of` spent their time, stage on stage."""
     columns = {name: told.column(name).to_numpy() for name in STAGES}
-    names = stages_told(columns)
-    colours = [curves.STAGE_COLOURS[name] for name in names]
-    axes.stackplot(since_release(told), *[columns[name] for name in names], labels=names, colors=colours)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), reverse=True)
-    axes.margins(x=0.0)
-    axes.set_ylabel("age [ms]")
-    return figure
+    times = since_release(told)
+    stages = [Series(name, curves.STAGE_COLOURS[name], times, columns[name]) for name in stages_told(columns)]
+    return Plot((Panel("age [ms]", tuple(stages), height=1.8, stacked=True, least=0.0),))
 
 
-def radio(rows: pa.Table) -> Figure:
-    """Draw the time in the air and the packets that were lost."""
-    figure, axes = stack((1.5, 1.5))
-    _up_and_down(axes[0], rows, SECOND, curves.latency, "mean latency [ms]")
-    _lines(axes[1], since_release(rows), curves.PACKETS, curves.PACKETS.read(rows), "so far")
-    shade(axes, rows)
-    return figure
-
-
-def serial_line(rows: pa.Table) -> Figure:
-    """Draw the load of the line, the time on it and what was lost or spoilt."""
-    figure, axes = stack((1.5, 1.5, 1.5))
-    _up_and_down(axes[0], rows, TENTH, curves.line_load, "load of the line [%]")
-    axes[0].set_ylim(0.0, 105.0)
-    _up_and_down(axes[1], rows, SECOND, curves.latency, "mean latency [ms]")
-    _lines(
-        axes[2], since_release(rows), curves.SERIAL_FAULTS, curves.SERIAL_FAULTS.read(rows), "bytes or frames"
+def radio(rows: pa.Table) -> Plot:
+    """The time in the air and the packets that were lost."""
+    return Plot(
+        (
+            _up_and_down(rows, SECOND, curves.latency, "mean latency [ms]"),
+            panel(curves.PACKETS, rows, "so far"),
+        )
     )
-    shade(axes, rows)
-    return figure
+
+
+def serial_line(rows: pa.Table) -> Plot:
+    """The load of the line, the time on it and what was lost or spoilt."""
+    load = _up_and_down(rows, TENTH, curves.line_load, "load of the line [%]")
+    return Plot(
+        (
+            replace(load, least=0.0, most=105.0),
+            _up_and_down(rows, SECOND, curves.latency, "mean latency [ms]"),
+            panel(curves.SERIAL_FAULTS, rows, "bytes or frames"),
+        )
+    )
 
 
 def _up_and_down(
-    axes: Axes, rows: pa.Table, step: int, read: Callable[[pa.Table], NDArray[np.float64]], label: str
-) -> None:
-    """Draw what `read` makes of every `step`-th row, for both directions of the link."""
+    rows: pa.Table, step: int, read: Callable[[pa.Table], NDArray[np.float64]], label: str
+) -> Panel:
+    """What `read` makes of every `step`-th row, for both directions of the link."""
     thinned = rows.take(np.arange(0, rows.num_rows, step))
-    for index, name in enumerate(("up", "down")):
-        axes.plot(
-            since_release(thinned)[1:], read(thinned)[:, index], color=curves.FLAP_COLOURS[index], label=name
-        )
-    axes.set_ylabel(label)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    times, values = since_release(thinned)[1:], read(thinned)
+    return Panel(
+        label,
+        tuple(
+            Series(name, curves.FLAP_COLOURS[index], times, values[:, index])
+            for index, name in enumerate(("up", "down"))
+        ),
+    )
 
 
-def station(rows: pa.Table) -> Figure:
-    """Draw what a real link and its ground station could not use, and the states."""
-    figure, axes = stack((1.5, 0.8))
-    _lines(axes[0], since_release(rows), curves.STATION, curves.STATION.read(rows), "not used")
-    _states(axes[1], rows)
-    shade(axes, rows)
-    return figure
+def station(rows: pa.Table) -> Plot:
+    """What a real link and its ground station could not use, and the states."""
+    return Plot((panel(curves.STATION, rows, "not used"), _states(rows)))
 
 
-def board(rows: pa.Table) -> Figure:
-    """Draw the load of the processor by task, the measurement queue and the states."""
-    figure, axes = stack((1.8, 1.4, 0.8))
+def board(rows: pa.Table) -> Plot:
+    """The load of the processor by task, the measurement queue and the states."""
     load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
-    shares = load.read(tenths).T
+    times, shares = since_release(tenths)[1:], load.read(tenths).T
     busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT] or [0]
-    axes[0].stackplot(
-        since_release(tenths)[1:], shares[busy],
-        labels=[load.names[index] for index in busy], colors=[load.colours[index] for index in busy],
-    )  # fmt: skip
-    axes[0].set_ylim(bottom=0.0)
-    axes[0].set_ylabel("processor [%]")
-    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.1), labelspacing=0.25)
-    _lines(axes[1], since_release(rows), curves.QUEUE, curves.QUEUE.read(rows), "queue")
-    _states(axes[2], rows)
-    shade(axes, rows)
-    return figure
+    tasks = tuple(Series(load.names[index], load.colours[index], times, shares[index]) for index in busy)
+    return Plot(
+        (
+            Panel("processor [%]", tasks, height=1.8, stacked=True, least=0.0),
+            panel(curves.QUEUE, rows, "queue", height=1.4),
+            _states(rows),
+        )
+    )
 
 
-def _states(axes: Axes, rows: pa.Table) -> None:
-    """Draw the states of supervisor and robot as bars."""
-    lanes = (curves.SUPERVISOR, curves.RELEASE)
-    end = since_release(rows)[-1:]
-    for height, states in enumerate(lanes):
+def _states(rows: pa.Table) -> Panel:
+    """The states of supervisor and robot as bars."""
+    release_us, end_s = release_of(rows.schema.metadata), since_release(rows)[-1:]
+    told = []
+    for lane, states in (("robot", curves.RELEASE), ("supervisor", curves.SUPERVISOR)):
         begins, names = curves.changes(rows, states)
-        edges = np.append(1e-6 * (begins - release_of(rows.schema.metadata)), end)
-        for start, stop, name in zip(edges[:-1], edges[1:], names, strict=True):
-            colour = states.colours[states.names.index(name)]
-            axes.barh(height, stop - start, 0.8, start, color=colour, label=name)
-    axes.set_yticks(range(len(lanes)), ("supervisor", "robot"))
-    axes.grid(visible=False)
-    named = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # one entry per name
-    axes.legend(named.values(), named.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.2))
+        colours = dict(zip(states.names, states.colours, strict=True))
+        told.append((lane, 1e-6 * (begins - release_us), names, colours))
+    return Panel("states", height=0.8, bars=lanes(told, float(end_s[0]) if len(end_s) else 0.0))
 
 
-def estimate(rows: pa.Table) -> Figure:
-    """Draw what the estimator believed, less what was, in the goal frame."""
-    figure, axes = stack((1.8, 1.8))
-    _lines(axes[0], since_release(rows), curves.POSITION_MISS, curves.POSITION_MISS.read(rows), "position")
-    _lines(axes[1], since_release(rows), curves.ATTITUDE_MISS, curves.ATTITUDE_MISS.read(rows), "attitude")
-    shade(axes, rows)
-    return figure
+def estimate(rows: pa.Table) -> Plot:
+    """What the estimator believed, less what was, in the goal frame."""
+    return Plot(
+        (
+            panel(curves.POSITION_MISS, rows, "position", height=1.8),
+            panel(curves.ATTITUDE_MISS, rows, "attitude", height=1.8),
+        )
+    )
 
 
-def own_logic(rows: pa.Table) -> Figure:
-    """Draw what logic of the user's own logs, one axis for each unit."""
-    plots = curves.own_logic(rows)
-    figure, axes = stack((1.5,) * len(plots))
-    for one, plot in zip(axes, plots, strict=True):
-        _lines(one, since_release(rows), plot, plot.read(rows), "own logic")
-    shade(axes, rows)
-    return figure
+def own_logic(rows: pa.Table) -> Plot:
+    """What logic of the user's own logs, one axis for each unit."""
+    return Plot(tuple(panel(plot, rows, "own logic") for plot in curves.own_logic(rows)))
 
 
 def schedule(table: pa.Table) -> Figure:
@@ -297,8 +226,8 @@ PICTURES = (
     ),
     Picture(
         "Flaps",
-        "True angle of each flap and the angle that the controller asked for, placed as seen from above; of a real board, "
-        "the angle that its estimator has.",
+        "True angle of each flap and the angle that the controller asked for; of a real board, the angle that its "
+        "estimator has.",
         flaps,
     ),
     Picture(

@@ -9,10 +9,8 @@ from hil.errors import LabError, blame
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.metrics import free_flight
 from hil.pictures import trials
-from hil.pictures.overload import OVERLOAD
 from hil.pictures.picture import Picture
 from hil.pictures.power import COMPARISON, DISCHARGE
-from hil.pictures.take_off import TAKE_OFF_LANDING
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,8 +24,8 @@ GALLERY: dict[str, Picture] = {
     "side-wind": trials.SIDE_WIND,
     "disturbances": trials.DISTURBED,
     "airspeed": trials.AIRSPEED,
-    "overload": OVERLOAD,
-    "take-off": TAKE_OFF_LANDING,
+    "overload": trials.OVERLOAD,
+    "take-off": trials.TAKE_OFF_LANDING,
     "specific-power": COMPARISON,
     "discharge": DISCHARGE,
 }

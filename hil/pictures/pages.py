@@ -1,15 +1,44 @@
-"""Pages: HTML files that need nothing else, from the templates beside this file."""
+"""Pages: HTML files that need nothing else, from the templates beside this file; their figures, zoomable or as PNG.
+
+What can be zoomed are panels as data for `templates/figures.js`, drawn by uPlot (MIT licence; in the Python package
+youplot), whose script stands once in a file. A panel's curves are thinned to the lowest and highest values of some 1500
+stretches, which is more than a screen shows at once.
+"""
 
 import base64
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from numpy.typing import NDArray
+from youplot.vendor import uplot_css, uplot_js
 
+from hil.pictures.panels import Marks, Panel, Plot, Series, Signal
+from hil.pictures.picture import Picture
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+STRETCHES = 1500  # of a thinned line
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
     autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
 )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A figure of a page: a plot that can be zoomed, or a picture as a data URI."""
+
+    name: str  # in the page's addresses
+    title: str
+    caption: str
+    source: str = ""
+    plot: Plot | None = None
+    alone: bool = False  # a plot with a window of time of its own
 
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
@@ -21,3 +50,92 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
 def data_uri(png: bytes) -> str:
     """Return a picture as the text that embeds it in a page."""
     return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def draw(picture: Picture, *flights: "pa.Table") -> Shown:
+    """Return a picture of flights as a page shows it."""
+    from hil.pictures.drawing import drawn
+
+    name = picture.title.lower().replace(" ", "-")
+    shown = drawn(picture.draw, *flights)
+    if isinstance(shown, Plot):
+        return Shown(name, picture.title, picture.caption, plot=shown)
+    return Shown(name, picture.title, picture.caption, data_uri(shown))
+
+
+def zoomable(shown: Iterable[Shown], marks: Marks) -> dict[str, Any]:
+    """Return what `figures.html.j2` embeds: uPlot, and the plots among the figures."""
+    plots = {one.name: (one.plot, one.alone) for one in shown if one.plot is not None}
+    return {**library(), "content": _content(plots, marks)}
+
+
+def library() -> dict[str, str]:
+    """Return uPlot's script and style, for a page to embed once."""
+    return {"script": uplot_js(), "style": uplot_css()}
+
+
+def _content(plots: Mapping[str, tuple[Plot, bool]], marks: Marks) -> dict[str, Any]:
+    """Return plots and marks as JSON can carry them; a plot's name is the id of its place in the page.
+
+    With each plot: whether it keeps a window of time of its own, and is not moved with the others.
+    """
+    return {
+        "marks": asdict(marks),
+        "figures": [
+            {
+                "place": name,
+                "alone": alone,
+                "window": plot.window_s if alone else None,
+                "panels": [_panel(panel) for panel in plot.panels],
+            }
+            for name, (plot, alone) in plots.items()
+        ],
+    }
+
+
+def _panel(panel: Panel) -> dict[str, Any]:
+    tables: list[tuple[Signal, list[Series]]] = []
+    # lines with the same instants, in the order in which they are drawn
+    for line in panel.series:
+        if tables and tables[-1][0] is line.times:
+            tables[-1][1].append(line)
+        else:
+            tables.append((line.times, [line]))
+    return {
+        "label": panel.label,
+        "height": panel.height,
+        "limits": panel.limits,
+        "least": panel.least,
+        "most": panel.most,
+        "stacked": panel.stacked,
+        "bars": [asdict(bar) for bar in panel.bars],
+        "series": [
+            {"name": line.name, "colour": line.colour, "width": line.width, "dashed": line.dashed}
+            for line in panel.series
+        ],
+        "tables": [_table(times, [line.values for line in lines]) for times, lines in tables],
+    }
+
+
+def _table(times: Signal, curves: list[Signal]) -> list[str]:
+    """Return the instants and the values as little-endian float32 in base64."""
+    rows = thinned(curves, STRETCHES)
+    return [base64.b64encode(column[rows].astype("<f4").tobytes()).decode() for column in (times, *curves)]
+
+
+def thinned(curves: list[Signal], stretches: int) -> NDArray[np.intp]:
+    """Return the rows that keep the lowest and highest value of every curve in every stretch, and the first NaN of each."""
+    count = len(curves[0])
+    if count <= 2 * len(curves) * stretches:
+        return np.arange(count)
+    edges = np.linspace(0, count, stretches + 1).astype(int)[:-1]
+    kept = [edges, np.array([count - 1])]
+    stretch_of = np.repeat(np.arange(stretches), np.diff(edges, append=count))
+    for curve in curves:
+        gaps = np.isnan(curve)
+        for order in (curve, -curve):
+            # of each stretch the first row in the order of its values
+            ranked = np.lexsort((np.where(gaps, np.inf, order), stretch_of))
+            kept.append(ranked[edges])
+        kept.append(np.flatnonzero(np.diff(gaps, prepend=False)))
+    return np.unique(np.concatenate(kept))

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
 
+    from hil.pictures.panels import Plot
+
 
 @dataclass(frozen=True, slots=True)
 class Picture:
@@ -17,11 +19,11 @@ class Picture:
 
     title: str
     caption: str
-    draw: Callable[..., Figure]  # of the log of a flight, of several, or of a schedule
+    draw: Callable[..., Plot | Figure]  # of the log of a flight, of several, or of a schedule
     needs: str = "t"  # a column without which there is nothing to draw
 
     def png(self, *flights: pa.Table) -> bytes:
-        """Return the figure."""
+        """Return the figure, marked as the first flight was."""
         from hil.pictures.drawing import png
 
         return png(self.draw, *flights)

@@ -1,20 +1,22 @@
 """Figures of power: the comparison of vehicles (paper, figure robustness a and b) and the discharge of the battery."""
 
 import json
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hil.experiments.measures import seconds
 from hil.experiments.power import power
 from hil.experiments.specific_power import CONVENTIONAL_W_PER_KG, VEHICLES
 from hil.laboratory.metrics import column, free_flight
 from hil.pictures import curves
-from hil.pictures.drawing import WIDTH, stack
+from hil.pictures.drawing import WIDTH
 from hil.pictures.figures import SECOND
+from hil.pictures.panels import Panel, Plot, Series
 from hil.pictures.picture import Picture
+from hil.pictures.trials import DARK, LIGHT
 
 KIND_COLOURS = {"quadcopter": curves.SKY, "drone": curves.BLUE, "helicopter": curves.GREEN}
 
@@ -69,28 +71,26 @@ def _beside_others(power: float, mass: float) -> Figure:
     return figure
 
 
-def discharge(*flights: pa.Table) -> Figure:
-    """Draw voltage, power and charge; the first flight dark, further ones light."""
-    figure, axes = stack((1.6, 1.6, 1.2))
+def discharge(*flights: pa.Table) -> Plot:
+    """Voltage, power and charge; the first flight dark, further ones light."""
+    voltages, powers, charges = [], [], []
     for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
-        look: Any = {"color": curves.BLUE, "alpha": 0.35 if index else 1.0}
-        times, power = column(flight, "t") * 1e-6, column(flight, "battery.power")
-        axes[0].plot(times, column(flight, "battery.voltage"), **look)
-        axes[1].plot(*_seconds_mean(times, power), **look)
-        axes[2].plot(times, 100 * column(flight, "battery.charge"), **look)
-    axes[1].axhline(float(power.mean()), color="black", linewidth=0.8, label=f"mean {power.mean():.2f} W")
-    axes[1].legend(loc="lower right")
+        times, power = seconds(flight), column(flight, "battery.power")
+        name, colour = ("" if index > 1 else "trials", LIGHT) if index else ("flight", DARK)
+        voltages.append(Series(name, colour, times, column(flight, "battery.voltage")))
+        powers.append(Series(name, colour, *_seconds_mean(times, power)))
+        charges.append(Series(name, colour, times, 100 * column(flight, "battery.charge")))
+    whole = np.array([0.0, times.max(initial=0.0)])
+    mean = Series(f"mean {power.mean():.2f} W", curves.GREY, whole, np.full(2, power.mean()))
     config = json.loads((flights[0].schema.metadata or {}).get(b"config", b"{}"))
-    if config:
-        axes[0].axhline(
-            1e-3 * config["supervisor"]["low_battery_mv"], color="black", linestyle="--", linewidth=0.8
+    low = (1e-3 * config["supervisor"]["low_battery_mv"],) if config else ()
+    return Plot(
+        (
+            Panel("cell [V]", tuple(voltages), height=1.6, limits=low),
+            Panel("power [W]", (*powers, mean), height=1.6, least=0.0),
+            Panel("charge [%]", tuple(charges), height=1.2),
         )
-    axes[0].set_ylabel("cell [V]")
-    axes[1].set_ylabel("power [W]")
-    axes[1].set_ylim(bottom=0.0)
-    axes[2].set_ylabel("charge [%]")
-    axes[2].margins(x=0)
-    return figure
+    )
 
 
 def _seconds_mean(

@@ -9,8 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import pyarrow as pa
-
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
 from hil.experiments import find_again
 from hil.laboratory.ages import told_in_time_of
@@ -21,11 +19,12 @@ from hil.laboratory.metrics import METRICS, SHOWN
 from hil.laboratory.recorder import load_events, load_log, release_of
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
+from hil.pictures.close_ups import close_ups
 from hil.pictures.curves import own_logic, with_marks
 from hil.pictures.figures import OWN_LOGIC, PICTURES, SCHEDULE, WAY
 from hil.pictures.gallery import pictures_of
-from hil.pictures.pages import data_uri, write_page
-from hil.pictures.picture import Picture
+from hil.pictures.pages import draw, write_page, zoomable
+from hil.pictures.panels import marks_of_flight
 from hil.pictures.story import story_of
 
 REPORT = "report.html"
@@ -55,15 +54,6 @@ class FaultRow:
     meaning: str
 
 
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """A figure with its picture as a data URI."""
-
-    title: str
-    caption: str
-    source: str
-
-
 def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log.
 
@@ -73,15 +63,16 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     log = with_marks(load_log(folder), events)
     experiment = experiment or find_again(result.experiment, result.source)
     own = pictures_of(experiment) if experiment else ()
-    schedule = load_schedule(folder).replace_schema_metadata(log.schema.metadata)
-    shown = [_show(picture, log) for picture in (*own, *PICTURES) if picture.needs in log.column_names]
-    if own_logic(log):
-        shown.append(_show(OWN_LOGIC, log))
-    shown += [
-        _show(picture, table)
-        for picture, table in ((WAY, told_in_time_of(log, folder)), (SCHEDULE, schedule))
-        if table.num_rows
-    ]
+    told, schedule = told_in_time_of(log, folder), load_schedule(folder)
+    of_log = [*own, *PICTURES, *([OWN_LOGIC] if own_logic(log) else [])]
+    figures = [draw(picture, log) for picture in of_log if picture.needs in log.column_names]
+    if told.num_rows:
+        figures.append(draw(WAY, told))
+    if schedule.num_rows:
+        figures.append(draw(SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata)))
+    lost = result.cause or "lost" if result.outcome == "lost" else None
+    marks = marks_of_flight(log, lost)
+    close = close_ups(log, marks)
     config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
     return write_page(
         folder / REPORT,
@@ -93,7 +84,10 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         events=events,
         release_us=release_of(log.schema.metadata),
         story=story_of(log, result),
-        pictures=shown,
+        marked=[*dict.fromkeys([one.kind for one in marks.spells] + [one.kind for one in marks.instants])],
+        pictures=figures,
+        close_ups=close,
+        zoomable=zoomable([*figures, *(one.figure for one in close)], marks),
         latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,
         config=json.dumps(config, indent=2),
@@ -127,7 +121,3 @@ def fault_rows(faults: Iterable[Fault]) -> list[FaultRow]:
         end = f"{end_s:.3f}" if end_s < math.inf else "with the flight"
         rows.append(FaultRow(fault.kind, f"{fault.start_s:.3f}", end, size, kind.meaning))
     return rows
-
-
-def _show(picture: Picture, rows: pa.Table) -> Shown:
-    return Shown(picture.title, picture.caption, data_uri(picture.png(rows)))

@@ -1,6 +1,5 @@
 """The story of a flight, which its report begins with: what happened when, in seconds from the release."""
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -13,8 +12,7 @@ from hil.laboratory.faults import spans_of
 from hil.laboratory.metrics import BOX, NEAR, attitude_error, column, free_flight, position_error
 from hil.laboratory.recorder import release_of
 from hil.laboratory.result import Result
-
-ROUNDING = 1e-6  # [rad] float32 of a command at its limit
+from hil.pictures.panels import saturated
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +39,7 @@ def story_of(log: pa.Table, result: Result) -> list[Moment]:
     if passed:
         row, name = min(passed)
         moments.append(Moment(seconds[row], f"first limit passed: {name}"))
-    for flap, at_limit in _saturated(free):
+    for flap, at_limit in saturated(free):
         moments.append(Moment(seconds[_first(at_limit)], f"flap {flap} saturates for the first time"))
     failsafe = column(free, "supervisor.state") == State.FAILSAFE
     for row in np.flatnonzero(np.diff(failsafe, prepend=False)).tolist():
@@ -70,19 +68,3 @@ def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.
             wrong = values > (verdict.bound if bound is None else bound)
             if wrong.any():
                 yield verdict.metric, wrong
-
-
-def _saturated(flight: pa.Table) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Yield the flaps whose commands reach an end of their range, and the rows in which they do."""
-    limits = json.loads((flight.schema.metadata or {}).get(b"config", b"{}")).get("allocation")
-    if (
-        limits is None or "control.flap_1" not in flight.column_names
-    ):  # a real board does not tell its commands
-        return
-    for flap, sign in ((1, 1), (2, -1), (3, 1), (4, -1)):
-        opening = sign * column(flight, f"control.flap_{flap}")
-        at_limit = (opening <= limits["opening_min"] + ROUNDING) | (
-            opening >= limits["opening_max"] - ROUNDING
-        )
-        if at_limit.any():
-            yield flap, at_limit

@@ -1,29 +1,37 @@
 """The experiments' own pictures, after the paper's figures: every trial light, a representative one, the first, dark.
 
-Time counts from the release; grey: a fault acts. matplotlib is loaded when the first picture is drawn.
+Time counts from the release.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.experiments import measures
-from hil.laboratory.fault_kinds import KINDS
-from hil.laboratory.faults import spans_of
+from hil.experiments.overload import ROWS_PER_SECOND, thief_load
+from hil.experiments.take_off import (
+    CONTROLLER_ON,
+    FANS_OFF,
+    FLIGHT,
+    FLIGHT_FROM,
+    LANDING,
+    LANDING_FROM,
+    SPIN_UP,
+    STANDING_Z,
+    TAKE_OFF,
+)
 from hil.laboratory.metrics import BOX, column, free_flight, position_error
-from hil.laboratory.recorder import release_of
-from hil.pictures.curves import AXIS_COLOURS, GREY
+from hil.pictures.curves import AXIS_COLOURS, BLUE, GREEN, GREY, ORANGE, SKY, task_colour
+from hil.pictures.panels import INK, Panel, Plot, Series, Signal, lanes
 from hil.pictures.picture import Picture
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 LIGHT, DARK, WANTED = (
@@ -32,7 +40,6 @@ LIGHT, DARK, WANTED = (
     "#d04030",
 )  # the paper's figure experiments_fig: trials, one of them, target
 HEIGHT = 2.6  # [in] of one axis
-Signal = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,82 +79,112 @@ X, Y, Z = (Quantity(f"{axis} [cm]", partial(centimetres, axis)) for axis in "xyz
 OPENING = Quantity("mean opening [deg]", openings)
 
 
-def follow(quantities: tuple[Quantity, ...], window_s: tuple[float, float], *flights: pa.Table) -> Figure:
-    """Draw quantities and their goals, one axis each, of one flight or of several trials, inside a window of time."""
-    from hil.pictures.drawing import stack
-
-    figure, axes = stack([HEIGHT] * len(quantities))
-    free = [free_flight(flight) for flight in flights]
-    for one, quantity in zip(axes, quantities, strict=True):
-        for index, flight in reversed(list(enumerate(free))):
-            times, (value, goal) = measures.seconds(flight), quantity.read(flight)
-            if index:
-                one.plot(times, value, color=LIGHT, label="trials" if index == 1 else None)
-            else:
-                one.plot(times, value, color=DARK, linewidth=1.6, label="flight")
-                one.plot(
-                    times, goal, color=WANTED, linestyle="--", linewidth=1.1, drawstyle="steps-post", label="target"
-                )  # fmt: skip
-        one.set_ylabel(quantity.label)
-        _shade_faults(one, flights[0])
-        _mark(one, flights[0])
-        one.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    longest = max(float(measures.seconds(flight).max(initial=0.0)) for flight in free)
-    axes[-1].set_xlim(window_s[0], max(min(window_s[1], longest), window_s[0] + 0.1))
-    return figure
-
-
-def disturbed(*flights: pa.Table) -> Figure:
-    """Draw the position error of one flight with its disturbances and the 20 cm box; trials light."""
-    from hil.pictures.drawing import stack
-
-    figure, axes = stack([1.7] * 3)
-    for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
-        times, error = measures.seconds(flight), 100 * position_error(flight)
-        for axis, one in enumerate(axes):
-            colour, width = (LIGHT, 0.9) if index else (AXIS_COLOURS[axis], 1.4)
-            one.plot(times, error[:, axis], color=colour, linewidth=width)
-    for one, name in zip(axes, "xyz", strict=True):
-        one.set_ylabel(f"{name} error [cm]")
-        one.margins(x=0)
-        for limit in (-100 * BOX, 100 * BOX):
-            one.axhline(limit, color="black", linestyle="--", linewidth=0.8)
-        _shade_faults(one, flights[0])
-    for begin_s, text in _names(flights[0]).items():
-        place: Any = axes[0].get_xaxis_transform()
-        axes[0].text(begin_s, 1.02, text, transform=place, fontsize=7.5, ha="left", va="bottom")
-    return figure
-
-
-def _spans(flight: pa.Table) -> list[tuple[float, float, str]]:
-    """Return begin and end [s after the release] and text of the faults of a flight, clipped to its end."""
-    rows = free_flight(flight)
-    if rows.num_rows == 0:
-        return []
-    release_us, end_us = release_of(flight.schema.metadata), column(rows, "t")[-1]
-    return [
-        (
-            1e-6 * (span.begin_us - release_us), 1e-6 * (min(span.end_us, end_us) - release_us),
-            f"{span.fault.kind.partition('.')[2]} {span.fault.size:+g} {KINDS[span.fault.kind].unit}".rstrip(),
+def follow(quantities: tuple[Quantity, ...], window_s: tuple[float, float], *flights: pa.Table) -> Plot:
+    """Quantities and their goals, one panel each, of one flight or of several trials, inside a window of time."""
+    panels = []
+    for quantity in quantities:
+        read = [(measures.seconds(flight), *quantity.read(flight)) for flight in map(free_flight, flights)]
+        (times, value, goal), *others = read
+        panels.append(
+            Panel(
+                quantity.label,
+                (
+                    *_light((times, value) for times, value, _ in others),
+                    Series("flight", DARK, times, value, width=1.6),
+                    Series("target", WANTED, times, goal, width=1.1, dashed=True),
+                ),
+                HEIGHT,
+            )
         )
-        for span in spans_of(flight.schema.metadata)
-        if span.begin_us < end_us
-    ]  # fmt: skip
+    longest = max(float(line.times.max(initial=0.0)) for line in panels[0].series)
+    return Plot(tuple(panels), (window_s[0], max(min(window_s[1], longest), window_s[0] + 0.1)))
 
 
-def _shade_faults(axes: Axes, flight: pa.Table) -> None:
-    for begin_s, end_s, _ in _spans(flight):
-        axes.axvspan(begin_s, end_s, color=GREY, alpha=0.15, linewidth=0)
+def disturbed(*flights: pa.Table) -> Plot:
+    """The position error of one flight with the 20 cm box; trials light."""
+    read = [(measures.seconds(flight), 100 * position_error(flight)) for flight in map(free_flight, flights)]
+    (times, error), *others = read
+    box_cm = 100 * BOX
+    return Plot(
+        tuple(
+            Panel(
+                f"{name} error [cm]",
+                (
+                    *_light((times, error[:, axis]) for times, error in others),
+                    Series("flight", AXIS_COLOURS[axis], times, error[:, axis], width=1.4),
+                ),
+                height=1.7,
+                limits=(-box_cm, box_cm),
+            )
+            for axis, name in enumerate("xyz")
+        )
+    )
 
 
-def _mark(axes: Axes, flight: pa.Table) -> None:
-    from hil.pictures.drawing import draw_marks
+def _light(trials: Iterable[tuple[Signal, Signal]]) -> list[Series]:
+    """Return the lines of the other trials; the first one names them."""
+    return [
+        Series("trials" if index == 0 else "", LIGHT, times, value)
+        for index, (times, value) in reversed(list(enumerate(trials)))
+    ]
 
-    draw_marks([axes], flight)
+
+def take_off(*flights: pa.Table) -> Plot:
+    """Height, vertical speed and the air at the robot over time; the first flight dark, further ones light."""
+    heights, climbs, flows = [], [], []
+    for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
+        times, colour = measures.seconds(flight), LIGHT if index else DARK
+        name = "" if index > 1 else "trials" if index else "flight"
+        height = 100 * (column(flight, "truth.z") - STANDING_Z)
+        heights.append(Series(name, colour, times, height))
+        climbs.append(Series(name, colour, times, 100 * column(flight, "truth.vz")))
+        flows.append(Series(name, colour, times, column(flight, "flow.z")))
+    goal = 100 * (column(flight, "goal.z") - STANDING_Z)
+    heights.append(Series("goal", INK, times, goal, width=0.8, dashed=True))
+    fans = [(SPIN_UP, f"take-off {TAKE_OFF:.0%}"), (FLIGHT_FROM, f"flight {FLIGHT:.0%}")]
+    fans += [(LANDING_FROM, f"landing {LANDING:.0%}"), (FANS_OFF, "off")]
+    begins, end_s = np.array([begin for begin, _ in fans]), float(times.max(initial=FANS_OFF))
+    names = [name for _, name in fans]
+    colours = dict(zip(names, (SKY, BLUE, ORANGE, GREY), strict=True))
+    controller = (np.array([CONTROLLER_ON, FANS_OFF]), ["on", "off"], {"on": GREEN, "off": GREY})
+    stages = lanes((("controller", *controller), ("fans", begins, names, colours)), end_s)
+    return Plot(
+        (
+            Panel("height over the net [cm]", tuple(heights), height=2.2),
+            Panel("climb [cm/s]", tuple(climbs)),
+            Panel("air, upwards [m/s]", tuple(flows)),
+            Panel("stages", height=0.8, bars=stages),
+        )
+    )
 
 
-def _names(flight: pa.Table) -> dict[float, str]:
-    return {begin_s: text for begin_s, _, text in _spans(flight)}
+def overload(rows: pa.Table, *trials: pa.Table) -> Figure:
+    """Draw late tasks and position error over the thief's share, of the first flight."""
+    from hil.pictures.drawing import stack
+
+    flight = free_flight(rows)
+    load = 5 * np.round(20 * thief_load(flight)).astype(int)  # the steps of the experiment
+    shares = np.unique(load)
+    figure, axes = stack((2.1, 2.1))
+    late = [name for name in flight.column_names if name.startswith("late.")]
+    for name in late:
+        misses = np.diff(column(flight, name), prepend=0.0)
+        per_second = [misses[load == share].mean() * ROWS_PER_SECOND for share in shares]
+        task = name.removeprefix("late.")
+        axes[0].plot(shares, per_second, "o-", color=task_colour(task), label=task)
+    axes[0].set_ylabel("missed deadlines [1/s]")
+    axes[0].set_yscale("symlog", linthresh=1.0)
+    axes[0].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    error = 100 * np.abs(position_error(flight))
+    for axis, name, colour in zip(range(3), "xyz", AXIS_COLOURS, strict=True):
+        worst = [error[load == share, axis].max() for share in shares]
+        axes[1].plot(shares, worst, "o-", color=colour, label=name)
+    axes[1].axhline(100 * BOX, color="black", linestyle="--", linewidth=0.8)
+    axes[1].set_ylabel("largest error [cm]")
+    axes[1].set_yscale("log")
+    axes[1].set_xlabel("share of every tick that the thief takes [%]")
+    axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
 
 
 YAW_STEP = Picture(
@@ -172,13 +209,13 @@ Y_SQUARE = Picture(
 )
 SIDE_WIND = Picture(
     "Side wind",
-    "Position, W, while a fan beside the tunnel blows (grey, darker with every step of its speed), as in the paper's "
+    "Position, W, while a fan beside the tunnel blows (red, darker with every step of its speed), as in the paper's "
     "figure of robustness, e; the height that leaning costs.",
     partial(follow, (X, Y, Z), (0.0, 60.0)),
 )
 DISTURBED = Picture(
     "Disturbances",
-    "Position error with each disturbance (grey) and its size. Dashed: the 20 cm box.",
+    "Position error with each disturbance (red) and its size. Dashed: the 20 cm box.",
     disturbed,
 )
 AIRSPEED = Picture(
@@ -186,4 +223,17 @@ AIRSPEED = Picture(
     "Height, and the mean opening of the flaps (target: what the controller asks for), over 0.1 s.",
     partial(follow, (Z, OPENING), (0.0, 60.0)),
     needs="control.flap_1",
+)
+TAKE_OFF_LANDING = Picture(
+    "Take-off and landing",
+    "Height over the net, vertical speed and the air at the robot.",
+    take_off,
+    needs="flow.z",
+)
+OVERLOAD = Picture(
+    "Overload",
+    "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
+    "Dashed: the 20 cm box. A task that starves completes nothing, late or not.",
+    overload,
+    needs="cpu.THIEF",
 )

@@ -25,6 +25,7 @@ from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.gallery import pictures_of
+from hil.pictures.panels import Plot
 from hil.pictures.picture import Picture
 from hil.world.body import SIGNS
 from hil.world.config import TunnelConfig
@@ -235,9 +236,9 @@ def test_listing_experiments_draws_nothing() -> None:
 def test_trials_are_drawn_behind_the_first_flight(tmp_path: Path) -> None:
     logs = [load_log(flown(tmp_path / str(seed), "yaw-step", seed=seed).folder) for seed in (1, 2, 3)]
     picture: Picture = pictures_of(EXPERIMENTS["yaw-step"])[0]
-    figure = picture.draw(*logs)
-    lines = figure.axes[0].get_lines()
-    assert len(lines) == 4  # two trials, the flight, its target
-    first = lines[2].get_ydata()
-    assert np.asarray(first)[-1] == pytest.approx(110.0, abs=3.0)
-    assert lines[2].get_linewidth() > lines[0].get_linewidth()
+    plot = picture.draw(*logs)
+    assert isinstance(plot, Plot)
+    lines = plot.panels[0].series
+    assert [line.name for line in lines] == ["", "trials", "flight", "target"]
+    assert lines[2].values[-1] == pytest.approx(110.0, abs=3.0)
+    assert lines[2].width > lines[0].width

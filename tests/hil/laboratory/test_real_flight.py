@@ -41,7 +41,9 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.pictures import figures
 from hil.pictures.compare import _judged, compare, load_run
 from hil.pictures.curves import with_marks
+from hil.pictures.drawing import figure_of
 from hil.pictures.figures import PICTURES
+from hil.pictures.panels import marks_of_flight
 from hil.pictures.report import write_report
 from hil.pictures.trials import YAW_STEP
 from support.command import floaty
@@ -175,7 +177,8 @@ def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Pa
     assert "seed" not in {row[0] for row in page.tables["run"]}
     drawn = [picture.title for picture in PICTURES if picture.needs in load_log(folder).column_names]
     assert drawn == ["Track", "Errors", "Flaps", "Age", "Station", "Estimate"]
-    assert len(page.pictures) == 1 + len(drawn) + 1  # its own, and the way of the poses
+    shown = [name for name, plot in page.plots.items() if not plot["alone"]]
+    assert len(page.pictures) + len(shown) == 1 + len(drawn) + 1  # its own, and the way of the poses
 
 
 def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[Path, Path]) -> None:
@@ -189,7 +192,7 @@ def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[P
     ]
     log = with_marks(load_log(both[0]), events)
     for draw in (figures.errors, figures.flaps, YAW_STEP.draw):
-        drawn = draw(log).axes
+        drawn = figure_of(draw(log), marks_of_flight(log)).axes
         named = [text.get_text() for axes in drawn for text in axes.texts]
         assert any(text.startswith("set controller.gain_y -2") for text in named)
         assert not any("poses" in text for text in named)

@@ -20,9 +20,9 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import measure
 from hil.laboratory.recorder import load_log
 from hil.laboratory.run import Request, fly, prepare
-from hil.pictures import overlays
-from hil.pictures.compare import Run, compare, load_run, write_comparison
+from hil.pictures.compare import Run, compare, load_run, pair, write_comparison
 from support.command import floaty
+from support.html_page import Page
 
 
 def flown(folder: Path, seed: int, *overrides: str) -> Path:
@@ -146,8 +146,9 @@ def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_bot
 @pytest.mark.long
 def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
     a, b = load_run(runs["one"]), load_run(runs["two"])
-    figure = overlays._pair((a.log, b.log), ("a", "b"))
-    hues = [colorsys.rgb_to_hsv(*to_rgb(line.get_color()))[0] * 360 for line in figure.axes[0].lines]
+    figure = pair((a.log, b.log), ("a", "b"))
+    hues = [colorsys.rgb_to_hsv(*to_rgb(line.colour))[0] * 360 for line in figure.panels[0].series]
+    assert [line.name for line in figure.panels[0].series] == ["a", "b"]
     assert 180 < hues[0] < 260, "blue"
     assert 20 < hues[1] < 50, "orange"
     page = write_comparison(tmp_path, a, b, compare(a, b)).read_text(encoding="utf-8")
@@ -167,7 +168,7 @@ def test_the_command_tells_the_difference_by_its_exit_code(
     assert (tmp_path / "new" / "compare.png").read_bytes().startswith(b"\x89PNG")
     page = (tmp_path / "new" / "compare.html").read_text(encoding="utf-8")
     assert "first differ in row" in page
-    assert "data:image/png;base64," in page
+    assert len(Page(page).plots["both"]["panels"]) == 10
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "no parquet", "no flight", "no json"])

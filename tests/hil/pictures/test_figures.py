@@ -1,5 +1,6 @@
 """Figures and curves: what they show of a log, in seconds from the release and in colours that can be told apart."""
 
+import functools
 import json
 from itertools import combinations
 
@@ -103,11 +104,17 @@ def test_curves_and_states_stand_at_seconds_from_the_release() -> None:
     }
     states = {"supervisor.state": [2, 2, 3, 3], "flight.free": [0, 1, 1, 1]}
     board = figures.board(log([0, 0, 0, 0], **counts, **states))
-    (queue,) = [axes for axes in board.axes if "queue" in axes.get_ylabel()]
-    assert queue.lines[0].get_xdata() == pytest.approx([0.0, 0.01, 0.02, 0.03])
-    assert queue.get_ylabel() == "queue [measurements]", "poses, gyro and accelerometer samples"
-    begins = {bar.get_x() for bar in board.axes[-1].patches if bar.get_height() == 0.8}
-    assert sorted(begins) == pytest.approx([0.0, 0.01, 0.02])
+    _, queue, lanes = board.panels
+    assert queue.series[0].times == pytest.approx([0.0, 0.01, 0.02, 0.03])
+    assert queue.label == "queue [measurements]", "poses, gyro and accelerometer samples"
+    shown = [(bar.lane, bar.name, bar.begin_s, bar.end_s) for bar in lanes.bars]
+    second = functools.partial(pytest.approx, abs=1e-9)
+    assert shown == [
+        ("robot", "held", second(0.0), second(0.01)),
+        ("robot", "free", second(0.01), second(0.03)),
+        ("supervisor", "flying", second(0.0), second(0.02)),
+        ("supervisor", "failsafe", second(0.02), second(0.03)),
+    ]
 
 
 def overloaded(shares: list[float], error: list[float], late: list[int]) -> pa.Table:

@@ -1,0 +1,166 @@
+"""What a figure over time consists of, and what is marked in it; as values, drawn by `drawing` and, zoomable, in `pages`.
+
+Times are seconds from the release.
+"""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from firmware_py.wire.supervisor import State
+from hil.laboratory.faults import spans_of
+from hil.laboratory.metrics import column, free_flight
+from hil.laboratory.recorder import release_of
+from hil.pictures.curves import GREY, Curves, marks_of, since_release
+
+Signal = NDArray[np.float64]  # (N,)
+ROUNDING = 1e-6  # [rad] float32 of a command at its limit
+TOGETHER_S = 0.1  # a flap that leaves its limit for less is drawn as if it had stayed
+INK = "black"  # of the page: in dark mode it is white
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One line. NaN: a gap."""
+
+    name: str
+    colour: str
+    times: Signal  # [s]
+    values: Signal  # in the unit of the panel's label
+    width: float = 0.9  # [pt]
+    dashed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """A state that lasted, on a lane of its own."""
+
+    lane: str
+    name: str
+    colour: str
+    begin_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One pair of axes: lines, or bars on lanes."""
+
+    label: str  # with the unit
+    series: tuple[Series, ...] = ()
+    height: float = 1.5  # [in]
+    limits: tuple[float, ...] = ()  # horizontal, dashed
+    least: float | None = None  # of the vertical axis
+    most: float | None = None
+    stacked: bool = False
+    bars: tuple[Bar, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Panels one above the other that share their time axis."""
+
+    panels: tuple[Panel, ...]
+    window_s: tuple[float, float] | None = None  # shown, of a flight that is longer; None: all
+
+
+@dataclass(frozen=True, slots=True)
+class Spell:
+    """A stretch of a flight that every figure shades."""
+
+    kind: str  # held, fault, failsafe, flap limit
+    begin_s: float
+    end_s: float
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """A moment of a flight that every figure marks."""
+
+    kind: str  # operator, lost
+    t_s: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """What every figure of a flight marks."""
+
+    spells: tuple[Spell, ...] = ()
+    instants: tuple[Instant, ...] = ()
+
+
+def panel(curves: Curves, rows: pa.Table, label: str, **look: float | tuple[float, ...]) -> Panel:
+    """Return a panel of curves over the rows of a log."""
+    times, values = since_release(rows), curves.read(rows)
+    lines = tuple(
+        Series(name, colour, times, values[:, index])
+        for index, (name, colour) in enumerate(zip(curves.names, curves.colours, strict=True))
+    )
+    return Panel(f"{label} [{curves.unit}]", lines, **look)  # type: ignore[arg-type]
+
+
+def marks_of_flight(log: pa.Table, lost: str | None = None) -> Marks:
+    """Return what is marked in every figure of a flight; `lost`: why it was lost, where it was."""
+    times = since_release(log)
+    if len(times) == 0:
+        return Marks()
+    held = times[column(log, "flight.free") < 0.5]
+    spells = [Spell("held", held[0], held[-1])] if len(held) > 1 else []
+    release_us = release_of(log.schema.metadata)
+    for span in spans_of(log.schema.metadata):
+        begin_s, end_s = (1e-6 * (us - release_us) for us in (span.begin_us, span.end_us))
+        if begin_s < times[-1]:
+            spells.append(Spell("fault", begin_s, min(end_s, float(times[-1])), str(span.fault)))
+    spells += _spells("failsafe", times, column(log, "supervisor.state") == State.FAILSAFE)
+    for flap, at_limit in saturated(log):
+        spells += _spells("flap limit", times, at_limit & (times > 0.0), f"flap {flap}")
+    instants = [Instant("operator", 1e-6 * (us - release_us), text) for us, text in marks_of(log)]
+    free = free_flight(log)
+    if lost is not None and free.num_rows:
+        instants.append(Instant("lost", float(since_release(free)[-1]), lost))
+    return Marks(tuple(spells), tuple(instants))
+
+
+def _spells(kind: str, times: Signal, acts: NDArray[np.bool_], text: str = "") -> Iterator[Spell]:
+    edges = np.flatnonzero(np.diff(acts, prepend=False, append=False)).reshape(-1, 2).tolist()
+    joined: list[list[float]] = []
+    for begin, end in edges:
+        begin_s, end_s = float(times[begin]), float(times[min(end, len(times) - 1)])
+        if joined and begin_s - joined[-1][1] < TOGETHER_S:
+            joined[-1][1] = end_s
+        else:
+            joined.append([begin_s, end_s])
+    return (Spell(kind, begin_s, end_s, text) for begin_s, end_s in joined)
+
+
+def saturated(flight: pa.Table) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+    """Yield the flaps whose commands reach an end of their range, and the rows in which they do."""
+    limits = json.loads((flight.schema.metadata or {}).get(b"config", b"{}")).get("allocation")
+    # a real board does not tell its commands
+    if limits is None or "control.flap_1" not in flight.column_names:
+        return
+    for flap, sign in ((1, 1), (2, -1), (3, 1), (4, -1)):
+        opening = sign * column(flight, f"control.flap_{flap}")
+        at_limit = (opening <= limits["opening_min"] + ROUNDING) | (
+            opening >= limits["opening_max"] - ROUNDING
+        )
+        if at_limit.any():
+            yield flap, at_limit
+
+
+def lanes(states: Iterable[tuple[str, Signal, list[str], dict[str, str]]], end_s: float) -> tuple[Bar, ...]:
+    """Return the bars of lanes: name, when [s] which state began, the colours of the states."""
+    bars = []
+    for lane, begins, names, colours in states:
+        edges = [*begins.tolist(), end_s]
+        bars += [
+            Bar(lane, name, colours.get(name, GREY), begin, end)
+            for name, begin, end in zip(names, edges[:-1], edges[1:], strict=True)
+        ]
+    return tuple(bars)

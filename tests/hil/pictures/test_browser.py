@@ -1,0 +1,88 @@
+"""The report in a real browser: every panel is drawn, all edges are aligned, zoom and cursor are shared; no network."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil.config import load_config
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.faults import parse
+from hil.laboratory.run import Request, fly, prepare
+from hil.pictures.report import write_report
+from support.html_page import Page
+
+BROWSER = shutil.which("chromium")
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine"),
+]
+SELDOM = ("close-up-1", "radio")  # a window of its own; a value in a second
+ACT = """
+<script>
+addEventListener("load", async () => {
+  document.documentElement.style.width = "WIDTHpx";
+  dispatchEvent(new Event("resize"));
+  const pause = () => new Promise((done) => setTimeout(done, 300));
+  await pause();
+  document.querySelector("#story a[data-begin='0.5']").click();
+  await pause();
+  const [over] = document.querySelectorAll("#errors .u-over"), box = over.getBoundingClientRect();
+  const middle = { clientX: box.left + box.width / 2, clientY: box.top + 20, bubbles: true };
+  over.dispatchEvent(new MouseEvent("mouseenter", middle));
+  over.dispatchEvent(new MouseEvent("mousemove", middle));
+  await pause();
+  const shown = [...document.querySelectorAll(".plot")].flatMap((place) =>
+    [...place.querySelectorAll(".uplot")].map((chart) => {
+      const edge = chart.querySelector(".u-over").getBoundingClientRect();
+      const time = chart.querySelector(".u-legend .u-series .u-value");
+      return { place: place.id, left: edge.left, right: edge.right, time: time ? time.textContent : null };
+    }));
+  document.body.dataset.shown = JSON.stringify({ shown, width: document.body.scrollWidth });
+});
+</script>
+</body>"""
+
+
+def seen(page: Path, width: int, profile: Path) -> dict[str, Any]:
+    """What the browser shows of a page after a click on the story's moment at 1 s and the cursor in the middle of a plot."""
+    page.write_text(
+        page.read_text(encoding="utf-8").replace("</body>", ACT.replace("WIDTH", str(width))),
+        encoding="utf-8",
+    )
+    assert BROWSER is not None
+    ran = subprocess.run(
+        [
+            BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom",
+            f"--user-data-dir={profile}", "--window-size=1200,900", "--virtual-time-budget=4000", f"file://{page}",
+        ],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert "CONSOLE" not in ran.stderr
+    told = re.search(r'data-shown="([^"]*)"', ran.stdout)
+    assert told is not None
+    content: dict[str, Any] = json.loads(told[1].replace("&quot;", '"'))
+    return content
+
+
+@pytest.mark.parametrize("width", [420, 1180])
+def test_every_panel_is_drawn_with_aligned_edges_and_one_zoom_and_cursor(tmp_path: Path, width: int) -> None:
+    folder = tmp_path / "run"
+    prepare(folder)
+    faults = (parse("push.y@1=1"),)
+    fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 3.0, faults=faults), folder)
+    page = Page(write_report(folder).read_text(encoding="utf-8"))
+    told = seen(folder / "report.html", width, tmp_path / "profile")
+    panels = [name for name, plot in page.plots.items() for _ in plot["panels"]]
+    assert [one["place"] for one in told["shown"]] == panels
+    assert len({(one["left"], one["right"]) for one in told["shown"]}) == 1
+    assert told["shown"][0]["right"] > width - 70
+    assert told["width"] <= width, "nothing stands over the edge of the page"
+    moved = [one["time"] for one in told["shown"] if one["place"] not in SELDOM and one["time"]]
+    assert len(moved) > 10
+    # the story's link shows 0.5 s before the moment to 1.5 s after it
+    assert [float(time) for time in moved] == pytest.approx([1.5] * len(moved), abs=0.1)
