@@ -15,6 +15,11 @@ def wait(duration_s: float) -> None:
     time.sleep(duration_s)
 
 
+def epoch_us() -> int:
+    """The time since 1970 when `clock_us` was 0 [us]."""
+    return time.time_ns() // 1000 - clock_us()
+
+
 def signing_start() -> int:
     """The time stamp of MAVLink's signatures when `clock_us` was 0 [10 us since 2015-01-01]; may be negative."""
-    return (time.time_ns() // 1000 - _YEAR_2015_US - clock_us()) // 10
+    return (epoch_us() - _YEAR_2015_US) // 10

@@ -6,17 +6,18 @@ It knows nothing of the laboratory: what a profile says of it arrives as `Ground
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from firmware_py.wire import WireError
 from firmware_py.wire.supervisor import State
-from ground_station.clock import clock_us, wait
+from ground_station.clock import clock_us, epoch_us, wait
 from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
 from ground_station.controls import Answer, Request
 from ground_station.errors import MocapError
 from ground_station.frame_rate import FrameRate
+from ground_station.links.frame_log import FrameLog
 from ground_station.links.live_link import LiveLink
 from ground_station.links.schemes import LinkSettings, find_link
 from ground_station.live import LiveStation
@@ -54,6 +55,7 @@ class Session:
     start_s: float = 0.0
     log: Path | None = None  # telemetry
     record: Path | None = None  # frames of motion capture
+    tlog: Path | None = None  # frames of MAVLink
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +82,20 @@ def fly(
     Raises `LinkError` or `MocapError` when there is no board or there are no poses, `OSError` for a file that cannot be
     written, `ImportError` for a package that is missing.
     """
-    link = find_link(session.uri, settings.link)
-    tracker = tracker_of(settings.tracker, settings.frame_period_us)
-    played = source = _open_source(session.mocap, settings.capture)
-    telemetry = None
-    try:
-        telemetry = TelemetryLog(session.log) if session.log else None
+    with ExitStack() as opened:
+        note_frame = None
+        if session.tlog is not None:
+            frames = FrameLog(session.tlog, epoch_us())
+            opened.callback(frames.close)
+            note_frame = frames.note
+        link = find_link(session.uri, replace(settings.link, note_frame=note_frame))
+        tracker = tracker_of(settings.tracker, settings.frame_period_us)
+        played = source = _open_source(session.mocap, settings.capture)
+        opened.callback(lambda: source.close())
+        telemetry = None
+        if session.log is not None:
+            telemetry = TelemetryLog(session.log)
+            opened.callback(telemetry.close)
         source = RecordingSource(source, session.record) if session.record else source
         plan = FlightPlan(Goal(settings.home, 0.0), session.trajectory)
         ground = GroundStation(link, plan, telemetry, settings.station, tracker)
@@ -102,10 +112,6 @@ def fly(
 
         rate = FrameRate(settings.frame_period_us, settings.station.corrections_hz)
         LiveStation(link, ground, source, rate, say, over, turn).run()
-    finally:
-        source.close()
-        if telemetry is not None:
-            telemetry.close()
 
 
 def ask(link: LiveLink, request: Request) -> Answer:

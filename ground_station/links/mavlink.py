@@ -67,6 +67,7 @@ class MavlinkLink:
         self.budget = link_budget(config.baud, config.pose_hz, signing is not None)
         self.texts: deque[str] = deque(maxlen=TEXTS)  # the board's, and what it refused
         self.supervisor_state: int | None = None  # as last received
+        self.note_frame: Callable[[int, bytes], object] | None = None  # gets what passes, both ways
         self.board: int | None = None  # its system id, None before the first heartbeat
         self.answered = False  # it has acknowledged a command
         self.heard_us = 0  # when its last frame came
@@ -132,7 +133,10 @@ class MavlinkLink:
         return EVERYBODY if self.board is None else self.board
 
     def _send(self, now_us: int, message: Message) -> None:
-        self._carry(now_us, self._sender.encode(now_us, message))
+        frame = self._sender.encode(now_us, message)
+        self._carry(now_us, frame)
+        if self.note_frame is not None:
+            self.note_frame(now_us, frame)
 
     def _look_after(self, now_us: int) -> None:
         """Ask for the time, say that we are here, and ask for telemetry that is too slow."""
@@ -156,6 +160,8 @@ class MavlinkLink:
         self._read_us = now_us if read_us is None else read_us
         samples: list[Sample] = []
         for message in self._receiver.feed(now_us, data):
+            if self.note_frame is not None:
+                self.note_frame(now_us, bytes(message.get_msgbuf()))
             handler = self._handlers.get(message.get_msgId())
             if handler is None or not self._is_of_board(message):
                 continue

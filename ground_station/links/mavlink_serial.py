@@ -101,13 +101,19 @@ class _Port:
 
 
 class MavlinkSerialLink(LiveLink):
-    """One board; `config.baud` is for URIs without one."""
+    """One board; `config.baud` is for URIs without one, `note_frame` gets what passes the line, both ways."""
 
-    def __init__(self, uri: str, config: MavlinkLinkConfig) -> None:
+    def __init__(
+        self,
+        uri: str,
+        config: MavlinkLinkConfig,
+        note_frame: Callable[[int, bytes], object] | None = None,
+    ) -> None:
         self._device, baud = parse_uri(uri, config.baud)
         self._config = replace(config, baud=baud, signing_start=signing_start())
         self._port: _Port | None = None
         self._link_lock = threading.Lock()  # the sender's thread uses the link, too
+        self._note_frame = note_frame
         self._link = MavlinkLink(self._carry, self._config)
         self._asked = False  # for telemetry
         super().__init__(uri, self._link.latency)
@@ -119,6 +125,7 @@ class MavlinkSerialLink(LiveLink):
             raise LinkError(f"{self.uri}: {reason(error)}") from None
         with self._link_lock:
             self._link = MavlinkLink(self._carry, self._config)
+            self._link.note_frame = self._note_frame
         self._asked = False
 
     def _connect(self) -> bool:

@@ -17,6 +17,9 @@ class LinkSettings:
     latency_us: int  # to the board, until it is measured
     baud: int  # where the URI names none
     signing_key: bytes  # 32 bytes; empty: nothing is signed
+    note_frame: Callable[[int, bytes], object] | None = (
+        None  # gets the frames of MAVLink that pass, both ways
+    )
 
 
 def _crazyradio(uri: str, settings: LinkSettings) -> LiveLink:
@@ -32,7 +35,7 @@ def _mavlink(uri: str, settings: LinkSettings) -> LiveLink:
     config = MavlinkLinkConfig(
         settings.baud, settings.corrections_hz, settings.signing_key, latency_us=settings.latency_us
     )
-    return MavlinkSerialLink(uri, config)
+    return MavlinkSerialLink(uri, config, settings.note_frame)
 
 
 # Scheme: the back end, and the extra that installs what it needs

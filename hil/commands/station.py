@@ -60,6 +60,10 @@ if TYPE_CHECKING:
     help="Every frame of motion capture as CSV, for --mocap replay:FILE.",
 )  # fmt: skip
 @click.option(
+    "--tlog", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Every frame of MAVLink that passes the link, as a telemetry log; for --link mavlink:….",
+)  # fmt: skip
+@click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR",
     help="Run folder as `floaty fly` writes one: log, telemetry, events, result, report, recording.",
 )  # fmt: skip
@@ -74,6 +78,7 @@ def station(
     duration: float | None,
     log: Path | None,
     record: Path | None,
+    tlog: Path | None,
     out: Path | None,
     target: str | None,
     profile: str,
@@ -100,9 +105,11 @@ def station(
     experiment = find_experiment(trajectory)
     if out is not None and log is not None:
         raise LabError(f"--log {log}: --out {out} has a telemetry.csv of its own")
-    for option, path in (("--log", log), ("--record", record)):
+    for option, path in (("--log", log), ("--record", record), ("--tlog", tlog)):
         if path is not None and not path.parent.is_dir():
             raise LabError(f"{option} {path}: there is no folder {path.parent}")
+    if tlog is not None and not uri.startswith("mavlink:"):
+        raise LabError(f"--tlog {tlog}: --link {uri}: only mavlink:DEVICE[,BAUD] has frames of MAVLink")
     view = open_live(target)
     flight = None
     if out is not None or view is not None:
@@ -128,7 +135,7 @@ def station(
         operator.turn(cockpit, now_us)
 
     telemetry = flight.telemetry if flight is not None and out is not None else log
-    session = Session(uri, mocap, experiment.trajectory, start_s, telemetry, record)
+    session = Session(uri, mocap, experiment.trajectory, start_s, telemetry, record, tlog)
     stops = stop_signals()
     hands = [steer] if flight is None else [steer, flight.turn]
     failure = ""

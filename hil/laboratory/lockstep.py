@@ -7,6 +7,7 @@ from pathlib import Path
 
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from firmware_py.extras import install_command
+from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
@@ -40,7 +41,10 @@ class ModelledLine:
         self.tracker = tracker_of(config.tracker, config.mocap.period_us)
         self.radio = VirtualRadio(config.radio, flight.events, flight.streams.radio, robot.air)
         robot.send_packet = self.radio.downlink
-        self._link, self._channel = self._serial(flight) if link == MAVLINK else self._radio(config)
+        self._frames: FrameLog | None = None
+        self._link, self._channel = (
+            self._serial(flight, telemetry_path) if link == MAVLINK else self._radio(config)
+        )
         self._telemetry = TelemetryLog(telemetry_path) if telemetry_path else None
         self.station = GroundStation(
             self._link, self.trajectory, self._telemetry, config.station, self.tracker
@@ -57,7 +61,7 @@ class ModelledLine:
     def _radio(self, config: LabConfig) -> tuple[Link, Channel]:
         return LoopbackLink(self.radio.uplink, config.station.link_latency_us), radio_channel(self.radio)
 
-    def _serial(self, flight: Flight) -> tuple[Link, Channel]:
+    def _serial(self, flight: Flight, telemetry_path: Path | None) -> tuple[Link, Channel]:
         """Return the station's end of the serial line, whose packages are an extra."""
         try:
             from hil.laboratory.serial_line import link_of, serial_channel
@@ -68,6 +72,9 @@ class ModelledLine:
         uart = self._robot.uart
         assert uart is not None
         link = link_of(flight.config, uart)
+        if telemetry_path is not None:
+            self._frames = FrameLog(telemetry_path.with_name(FRAME_LOG))
+            link.note_frame = self._frames.note
         flight.events.at(0, lambda now_us: flight.note("lab", link.budget.text))
         return link, serial_channel(uart, self._robot.firmware, link)
 
@@ -83,9 +90,10 @@ class ModelledLine:
         """Nothing: the station ends with its time line."""
 
     def close(self) -> None:
-        """Close the telemetry log."""
-        if self._telemetry is not None:
-            self._telemetry.close()
+        """Close what the station wrote."""
+        for written in (self._telemetry, self._frames):
+            if written is not None:
+                written.close()
 
 
 def lockstep_flight(

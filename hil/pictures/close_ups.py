@@ -34,7 +34,7 @@ def close_ups(log: pa.Table, marks: Marks) -> list[CloseUp]:
         rows = log.filter((times >= begin_s) & (times <= end_s))
         if rows.num_rows > 1:
             plot = _plot(rows, (begin_s, end_s))
-            figure = Shown(f"close-up-{len(shown) + 1}", title, "", plot=plot, alone=True)
+            figure = Shown(f"close-up-{len(shown) + 1}", title, "", plot=plot, alone=True, marks=marks)
             shown.append(CloseUp(figure, at_s, begin_s, end_s))
     return shown
 

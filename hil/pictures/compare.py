@@ -23,7 +23,7 @@ from hil.pictures import curves
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import png
 from hil.pictures.pages import Shown, write_page, zoomable
-from hil.pictures.panels import Marks, Panel, Plot, Series
+from hil.pictures.panels import Panel, Plot, Series
 from hil.pictures.trials import DARK
 
 ROW_S = 0.01
@@ -151,7 +151,7 @@ def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Pa
         (folder / PICTURE).write_bytes(png(lambda: plot))
         return write_page(
             folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, figure=figure,
-            zoomable=zoomable([figure], Marks()),
+            zoomable=zoomable([figure]),
         )  # fmt: skip
     except OSError as error:
         raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None

@@ -6,7 +6,7 @@ stretches, which is more than a screen shows at once.
 """
 
 import base64
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 STRETCHES = 1500  # of a thinned line
+NOTHING = Marks()
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
     autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
@@ -39,6 +40,7 @@ class Shown:
     source: str = ""
     plot: Plot | None = None
     alone: bool = False  # a plot with a window of time of its own
+    marks: Marks = NOTHING
 
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
@@ -52,45 +54,43 @@ def data_uri(png: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
-def draw(picture: Picture, *flights: "pa.Table") -> Shown:
+def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> Shown:
     """Return a picture of flights as a page shows it."""
     from hil.pictures.drawing import drawn
 
     name = picture.title.lower().replace(" ", "-")
     shown = drawn(picture.draw, *flights)
     if isinstance(shown, Plot):
-        return Shown(name, picture.title, picture.caption, plot=shown)
+        return Shown(name, picture.title, picture.caption, plot=shown, marks=marks)
     return Shown(name, picture.title, picture.caption, data_uri(shown))
 
 
-def zoomable(shown: Iterable[Shown], marks: Marks) -> dict[str, Any]:
-    """Return what `figures.html.j2` embeds: uPlot, and the plots among the figures."""
-    plots = {one.name: (one.plot, one.alone) for one in shown if one.plot is not None}
-    return {**library(), "content": _content(plots, marks)}
+def zoomable(shown: Iterable[Shown]) -> dict[str, Any]:
+    """Return what `figures.html.j2` embeds: uPlot, and the plots among the figures as JSON can carry them."""
+    plots = [(one, one.plot) for one in shown if one.plot is not None]
+    marks = list({id(one.marks): one.marks for one, _ in plots}.values())
+    places = [id(one) for one in marks]
+    return {
+        **library(),
+        "content": {
+            "marks": [asdict(one) for one in marks],
+            "figures": [
+                {
+                    "place": one.name,
+                    "alone": one.alone,
+                    "window": plot.window_s if one.alone else None,
+                    "marks": places.index(id(one.marks)),
+                    "panels": [_panel(panel) for panel in plot.panels],
+                }
+                for one, plot in plots
+            ],
+        },
+    }
 
 
 def library() -> dict[str, str]:
     """Return uPlot's script and style, for a page to embed once."""
     return {"script": uplot_js(), "style": uplot_css()}
-
-
-def _content(plots: Mapping[str, tuple[Plot, bool]], marks: Marks) -> dict[str, Any]:
-    """Return plots and marks as JSON can carry them; a plot's name is the id of its place in the page.
-
-    With each plot: whether it keeps a window of time of its own, and is not moved with the others.
-    """
-    return {
-        "marks": asdict(marks),
-        "figures": [
-            {
-                "place": name,
-                "alone": alone,
-                "window": plot.window_s if alone else None,
-                "panels": [_panel(panel) for panel in plot.panels],
-            }
-            for name, (plot, alone) in plots.items()
-        ],
-    }
 
 
 def _panel(panel: Panel) -> dict[str, Any]:

@@ -94,6 +94,13 @@ class Marks:
     spells: tuple[Spell, ...] = ()
     instants: tuple[Instant, ...] = ()
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What there is, without repetition."""
+        return tuple(
+            dict.fromkeys([*(one.kind for one in self.spells), *(one.kind for one in self.instants)])
+        )
+
 
 def panel(curves: Curves, rows: pa.Table, label: str, **look: float | tuple[float, ...]) -> Panel:
     """Return a panel of curves over the rows of a log."""

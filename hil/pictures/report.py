@@ -65,13 +65,12 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     own = pictures_of(experiment) if experiment else ()
     told, schedule = told_in_time_of(log, folder), load_schedule(folder)
     of_log = [*own, *PICTURES, *([OWN_LOGIC] if own_logic(log) else [])]
-    figures = [draw(picture, log) for picture in of_log if picture.needs in log.column_names]
+    marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
+    figures = [draw(picture, marks, log) for picture in of_log if picture.needs in log.column_names]
     if told.num_rows:
-        figures.append(draw(WAY, told))
+        figures.append(draw(WAY, marks, told))
     if schedule.num_rows:
-        figures.append(draw(SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata)))
-    lost = result.cause or "lost" if result.outcome == "lost" else None
-    marks = marks_of_flight(log, lost)
+        figures.append(draw(SCHEDULE, marks, schedule.replace_schema_metadata(log.schema.metadata)))
     close = close_ups(log, marks)
     config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
     return write_page(
@@ -84,10 +83,10 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         events=events,
         release_us=release_of(log.schema.metadata),
         story=story_of(log, result),
-        marked=[*dict.fromkeys([one.kind for one in marks.spells] + [one.kind for one in marks.instants])],
+        marked=marks.kinds,
         pictures=figures,
         close_ups=close,
-        zoomable=zoomable([*figures, *(one.figure for one in close)], marks),
+        zoomable=zoomable([*figures, *(one.figure for one in close)]),
         latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,
         config=json.dumps(config, indent=2),

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from ground_station.links.frame_log import FRAME_LOG
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock, Paced
 from hil.errors import LabError
@@ -74,7 +75,7 @@ class StationProcess:
             sys.executable, "-m", "hil.commands", "station", "--link", station_uri,
             "--mocap", f"optitrack:127.0.0.1:{motive.port},body={name_of(1)},y-up",
             "--trajectory", flight.experiment.reference, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
-            *arguments, *ALIGNED,
+            *(("--tlog", str(telemetry.with_name(FRAME_LOG))) if uri.startswith(SERIAL) else ()), *arguments, *ALIGNED,
         ]  # fmt: skip
         self._output = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - closed with the line
         self._station: subprocess.Popen[bytes] | None = None

@@ -1,12 +1,13 @@
-"""The report of the paper: `report.html` for people, `result.json` for programs.
+"""The report of the paper: `report.html` with its pages for people, `result.json` for programs.
 
-Figures as in the paper: every trial light, the one with the median error dark.
+`report.html` has the table and the contents, `EXPERIMENT.html` the figures of one experiment as in the paper (every trial
+light, the one with the median error dark), `drag-model.html` and `studies.html` the rest.
 """
 
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from math import degrees
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from hil.laboratory.recorder import load_log
 from hil.laboratory.result import RESULT, commit, versions
 from hil.pictures.figures import PICTURES
 from hil.pictures.gallery import pictures_of
-from hil.pictures.pages import data_uri, write_page
+from hil.pictures.pages import Shown, data_uri, draw, write_page, zoomable
+from hil.pictures.panels import marks_of_flight
 from hil.studies import drag_model, drag_model_report
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
@@ -29,18 +31,9 @@ from hil.studies.study_figures import picture
 from hil.studies.study_run import StudyResult
 
 REPORT = "report.html"
+DRAG_MODEL, STUDIES = "drag-model", "studies"  # names of pages beside those of the experiments
 OPERATIONAL_DEG = 50  # flap angles of flight, in the steps of the test
 OF_EVERY_FLIGHT = PICTURES[:2]  # for an experiment without pictures of its own
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """A picture of one experiment on one profile."""
-
-    profile: str
-    title: str
-    caption: str
-    source: str
 
 
 def write_paper(out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = ()) -> Path:
@@ -55,16 +48,34 @@ def write_paper(out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = ())
             png = picture(result)
             (out / f"study-{result.study.name}.png").write_bytes(png)
             studies.append((result, data_uri(png)))
-    rows = [(name, row, trials, _figures(trials)) for name, row, trials in paper.rows]
     bench = _mounted(out / "drag-model", list(mounted)) if mounted else []
+    pages = [
+        *((name, row.title) for name, row, _ in paper.rows),
+        *([(DRAG_MODEL, "Drag model")] if bench else []),
+        *([(STUDIES, "Robustness beyond the paper")] if studies else []),
+    ]
+    common = {"pages": pages, "metrics": METRICS, "spread": Spread.of, "profile": PROFILES[0]}
+    for name, row, trials in paper.rows:
+        figures = _figures(trials)
+        shown = [one for _, pictures in figures for one in pictures]
+        kinds = dict.fromkeys(kind for one in shown for kind in one.marks.kinds)
+        write_page(
+            out / f"{name}.html", "paper_experiment.html.j2", name=name, row=row, both=trials, figures=figures,
+            kinds=kinds, zoomable=zoomable(shown), **common,
+        )  # fmt: skip
+    if bench:
+        write_page(
+            out / f"{DRAG_MODEL}.html", "paper_drag_model.html.j2", name=DRAG_MODEL, bench=bench, **common
+        )
+    if studies:
+        write_page(out / f"{STUDIES}.html", "paper_studies.html.j2", name=STUDIES, studies=studies, **common)
     return write_page(
-        out / REPORT, "paper.html.j2", bench=bench, missing=[row for row, _, _ in paper.misses],
-        paper=paper, profile=PROFILES[0], rows=rows, studies=studies, metrics=METRICS, spread=Spread.of, commit=commit(),
-        versions=versions(),
+        out / REPORT, "paper.html.j2", paper=paper, rows=paper.rows, missing=[row for row, _, _ in paper.misses],
+        studies=studies, bench=bench, commit=commit(), versions=versions(), **common,
     )  # fmt: skip
 
 
-def _mounted(folder: Path, rows: list[drag_model.Row]) -> list[Figure]:
+def _mounted(folder: Path, rows: list[drag_model.Row]) -> list[Shown]:
     """Write the test of the drag model into a folder; returns its figures."""
     folder.mkdir(exist_ok=True)
     drag_model.write_csv(rows, folder / "drag_model.csv")
@@ -80,12 +91,13 @@ def _mounted(folder: Path, rows: list[drag_model.Row]) -> list[Figure]:
                 f"{sweep.title}. From 0 to {OPERATIONAL_DEG} degrees model and measurement differ by at most "
                 f"{force:.2f} N and {torque:.3f} N m."
             )
-            figures.append(Figure(text, f"Drag model, {text}", caption, data_uri(png)))
+            name = f"{robot}-{sweep.name}"
+            figures.append(Shown(name, f"Drag model, {text}", caption, data_uri(png)))
     return figures
 
 
-def _figures(both: Sequence[Trials]) -> list[Figure]:
-    """Return the pictures of a row, those of the default profile first."""
+def _figures(both: Sequence[Trials]) -> list[tuple[str, list[Shown]]]:
+    """Return the profiles with the pictures of a row, the default profile first."""
     figures = []
     for trials in both:
         ordered = trials.representative_first()
@@ -93,12 +105,10 @@ def _figures(both: Sequence[Trials]) -> list[Figure]:
             continue
         logs = [load_log(result.folder) for result in ordered]
         own = pictures_of(EXPERIMENTS[ordered[0].experiment])
-        figures += [
-            Figure(
-                trials.profile, one.title, one.caption, data_uri(one.png(*(logs if own else logs[:1])))
-            )
-            for one in own or OF_EVERY_FLIGHT
-        ]  # fmt: skip
+        marks = marks_of_flight(logs[0], ordered[0].cause if ordered[0].outcome == "lost" else None)
+        drawn = [draw(one, marks, *(logs if own else logs[:1])) for one in own or OF_EVERY_FLIGHT]
+        shown = [replace(one, name=f"{trials.profile}-{one.name}", alone=True) for one in drawn]
+        figures.append((trials.profile, shown))
     return figures
 
 

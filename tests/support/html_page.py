@@ -20,7 +20,7 @@ class Page(HTMLParser):
         self.pictures: list[bytes] = []
         self.links: list[str] = []
         self.plots: dict[str, dict[str, Any]] = {}  # by the id of their place
-        self.marks: dict[str, list[dict[str, Any]]] = {}
+        self.marks: list[dict[str, list[dict[str, Any]]]] = []
         self.places: list[str] = []
         self._open: list[str] = []
         self._table: list[list[str]] = []

@@ -29,13 +29,13 @@
     return [sums[0], ...sums.slice(1).reverse()];
   }
 
-  function shade(u) {
+  function shade(u, marks) {
     const { ctx, bbox } = u;
     ctx.save();
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
-    for (const spell of told.marks.spells) {
+    for (const spell of marks.spells) {
       const begin = u.valToPos(spell.begin_s, "x", true), end = u.valToPos(spell.end_s, "x", true);
       const high = spell.kind === "flap limit" ? STRIP_PX * devicePixelRatio : bbox.height;
       ctx.fillStyle = SHADES[spell.kind];
@@ -44,7 +44,7 @@
     ctx.restore();
   }
 
-  function mark(u, panel, first) {
+  function mark(u, marks, panel, first) {
     const { ctx, bbox } = u, scale = devicePixelRatio;
     ctx.save();
     ctx.beginPath();
@@ -65,7 +65,7 @@
       const y = u.valToPos(limit, "y", true);
       line(bbox.left, y, bbox.left + bbox.width, y, "#000000", [5, 4]);
     }
-    for (const instant of told.marks.instants) {
+    for (const instant of marks.instants) {
       const x = u.valToPos(instant.t_s, "x", true);
       line(x, bbox.top, x, bbox.top + bbox.height, MARKS[instant.kind], instant.kind === "operator" ? [2, 3] : []);
     }
@@ -88,9 +88,9 @@
 
     function name(u) {
       const rows = []; // where the last text of each row ends
-      const texts = told.marks.spells.filter((spell) => spell.kind === "fault")
+      const texts = marks.spells.filter((spell) => spell.kind === "fault")
         .map((spell) => [spell.begin_s, spell.text, "#a04000"])
-        .concat(told.marks.instants.map((instant) => [instant.t_s, instant.text, MARKS[instant.kind]]))
+        .concat(marks.instants.map((instant) => [instant.t_s, instant.text, MARKS[instant.kind]]))
         .sort((a, b) => a[0] - b[0]);
       ctx.font = TEXT.replace(/^\d+/, (px) => px * scale);
       for (const [t_s, text, colour] of texts) {
@@ -113,6 +113,7 @@
   function optionsOf(figure, panel, data, first, last, key, whole) {
     const lines = panel.stacked ? [...panel.series].reverse() : panel.series;
     const lanes = [...new Set(panel.bars.map((bar) => bar.lane))];
+    const marks = told.marks[figure.marks];
     return {
       width: 300,
       height: Math.round(panel.height * INCH_PX) + (last ? 52 : 0),
@@ -155,8 +156,8 @@
         })),
       ],
       hooks: {
-        drawAxes: [shade],
-        draw: [(u) => mark(u, panel, first)],
+        drawAxes: [(u) => shade(u, marks)],
+        draw: [(u) => mark(u, marks, panel, first)],
         setScale: [(u, scale) => { if (scale === "x") move(u, u.scales.x.min, u.scales.x.max); }],
       },
     };

@@ -60,6 +60,10 @@ def test_a_failed_limit_is_exit_code_one(
         (["fly", "hover", "--out", "/proc/floaty/run"], "--out /proc/floaty/run: cannot be written"),
         (["fly", "hover", "--seeds", "2", "--view"], "--seeds 2"),
         (
+            ["station", "--link", "udp://127.0.0.1:1", "--tlog", "t.tlog"],
+            "--tlog t.tlog: --link udp://127.0.0.1:1: only mavlink:",
+        ),
+        (
             ["station", "--link", "udp://127.0.0.1:1", "--out", "a", "--log", "b"],
             "--log b: --out a has a telemetry.csv",
         ),

@@ -2,10 +2,12 @@
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink import mavutil
 
 from hil.config import load_config
 from hil.errors import LabError
@@ -123,6 +125,32 @@ def test_the_report_shows_the_line(tmp_path: Path) -> None:
     assert "Radio" not in shown
 
 
+def test_the_telemetry_log_has_every_byte_that_passed_the_line_in_frames_with_their_times(
+    tmp_path: Path,
+) -> None:
+    """pymavlink reads the file, the plant's UART has counted the bytes."""
+    result = fly_over_mavlink(tmp_path / "run", duration_s=2.0)
+    log = load_log(result.folder)
+    file = mavutil.mavlink_connection(str(result.folder / "link.tlog"))
+    frames = []
+    while (message := file.recv_match()) is not None:
+        frames.append((round(1e6 * message._timestamp), message))
+    file.close()
+    assert [t_us for t_us, _ in frames] == sorted(t_us for t_us, _ in frames)
+    size = {
+        system: sum(len(message.get_msgbuf()) for _, message in frames if message.get_srcSystem() == system)
+        for system in (255, 1)
+    }
+    on_the_line = 4 * 280  # frames at the end of the flight
+    assert size[255] == pytest.approx(column(log, "serial.up_bytes")[-1], abs=on_the_line)
+    assert size[1] == pytest.approx(column(log, "serial.down_bytes")[-1], abs=on_the_line)
+    assert (result.folder / "link.tlog").stat().st_size == sum(size.values()) + 8 * len(frames)
+    poses = [(t_us, m) for t_us, m in frames if m.get_type() == "ATT_POS_MOCAP"]
+    assert len(poses) > 140
+    age_us = [t_us - message.time_usec for t_us, message in poses]
+    assert np.median(age_us) == pytest.approx(38_000, abs=300), "camera and processing, before it is sent"
+
+
 @pytest.mark.realtime
 def test_the_station_flies_a_board_behind_a_pty_in_real_time(tmp_path: Path) -> None:
     line = tmp_path / "uart"
@@ -135,6 +163,11 @@ def test_the_station_flies_a_board_behind_a_pty_in_real_time(tmp_path: Path) -> 
     log = load_log(tmp_path / "run")
     assert column(log, "serial.up_bytes")[-1] > 100 * 48  # poses
     assert not line.is_symlink()
+    file = mavutil.mavlink_connection(str(tmp_path / "run" / "link.tlog"))
+    first = file.recv_match(type="ATT_POS_MOCAP")
+    file.close()
+    assert first is not None
+    assert abs(first._timestamp - time.time()) < 120, "since 1970"
 
 
 def test_a_line_that_is_there_already_is_left_alone(tmp_path: Path) -> None:

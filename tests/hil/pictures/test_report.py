@@ -247,7 +247,9 @@ def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_sh
     pq.write_table(pa.table(columns, schema=log.schema.with_metadata(metadata)), folder / "log.parquet")
     write_result(dataclasses.replace(result, outcome="lost", cause="fell", faults=("push.y@0.3=2",)))
     page = Page(write_report(folder).read_text(encoding="utf-8"))
-    times = [(one["kind"], one["text"], one["begin_s"], one["end_s"]) for one in page.marks["spells"]]
+    (marks,) = page.marks
+    assert {plot["marks"] for plot in page.plots.values()} == {0}
+    times = [(one["kind"], one["text"], one["begin_s"], one["end_s"]) for one in marks["spells"]]
     exact = functools.partial(pytest.approx, abs=2e-3)
     assert times == [
         ("held", "", exact(-1.0), exact(-0.01)),
@@ -257,7 +259,7 @@ def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_sh
         ("failsafe", "", exact(0.6), exact(0.7)),
         ("flap limit", "flap 2", exact(0.55), exact(0.6)),
     ]
-    assert page.marks["instants"] == [{"kind": "lost", "t_s": exact(1.99), "text": "fell"}]
+    assert marks["instants"] == [{"kind": "lost", "t_s": exact(1.99), "text": "fell"}]
     windows = {name: plot["window"] for name, plot in page.plots.items() if plot["alone"]}
     assert windows == {
         "close-up-1": [exact(-0.2), exact(1.4)],

@@ -115,10 +115,14 @@ def test_the_report_tells_the_papers_value_and_ours(flown: Path) -> None:
         )
         assert cell.endswith(" deg")
     assert rows["limits held"][1:] == ["2 of 2", "2 of 2"]
-    assert len(page.pictures) >= 2 * len(PROFILES)
-    assert all(picture.startswith(b"\x89PNG") for picture in page.pictures)
-    assert page.scripts == 0
-    assert [link for link in page.links if not link.startswith("#")] == []
+    assert page.links == ["hover.html"] * 2, "in the contents and in the table"
+    figures = Page((flown / "hover.html").read_text(encoding="utf-8"))
+    for profile in PROFILES:
+        assert f"{profile}-errors" in figures.plots
+    assert len(figures.pictures) == len(PROFILES), "the track"
+    assert all(plot["alone"] for plot in figures.plots.values())
+    assert {plot["marks"] for plot in figures.plots.values()} == {0, 1}, "each profile's flight has its own"
+    assert figures.links == ["report.html"]
 
 
 def trials(result: Result, *passed: bool) -> Trials:
@@ -187,6 +191,12 @@ def test_the_badges_say_which_kind_of_verdict_they_are(result: Result, tmp_path:
     ):
         page = write_paper(tmp_path, paper).read_text(encoding="utf-8")
         assert re.findall(r'class="verdict \w+">([^<]+)<', page) == badges
+        assert (
+            Page(page).links[: 1 + len(paper.studies)] == ["t.html", "studies.html"][: 1 + len(paper.studies)]
+        )
+    studies = Page((tmp_path / "studies.html").read_text(encoding="utf-8"))
+    assert len(studies.pictures) == 1
+    assert studies.links == ["report.html", "t.html"]
 
 
 def test_the_representative_trial_has_the_median_error(result: Result) -> None:

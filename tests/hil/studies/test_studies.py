@@ -166,6 +166,7 @@ def test_a_study_can_be_flown_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "report.html",
         "result.json",
+        "studies.html",
         "study-loss.png",
     }
     (told,) = json.loads((tmp_path / "out" / "result.json").read_text())["studies"]
