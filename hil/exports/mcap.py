@@ -2,10 +2,10 @@
 
 Foxglove's types (protobuf): `/truth/pose` (`/cameras/pose` of a real flight), `/estimate/pose` and `/goal/pose`
 (PoseInFrame), `/tf` (the frames world, goal, body and estimate for its 3-D panel), `/text` (Log). All other columns
-of the log go as JSON with a schema that names units and frames: `/truth/twist`, `/estimate/twist`, `/flaps`, and one
-topic for each other prefix of the log (`/link`, `/battery`, `/estimator`, …). MCAP's times cannot be negative: they
-count from the start of the log; the file's metadata `flight` says when the release was. Foxglove's SDK
-comes with the extra `export`.
+of the log go as JSON with a schema that names units and frames: `/truth/twist`, `/estimate/twist`, `/flaps`,
+`/estimate/flaps` (deviations from the hover angle), and one topic for each other prefix of the log (`/link`,
+`/battery`, `/estimator`, …). MCAP's times cannot be negative: they count from the start of the log; the file's
+metadata `flight` says when the release was. Foxglove's SDK comes with the extra `export`.
 """
 
 import math
@@ -77,7 +77,7 @@ def topics_of(names: list[str]) -> dict[str, list[str]]:
         if rest in TWIST_COLUMNS:
             topic = f"/{prefix}/twist"
         elif rest.startswith("flap_"):
-            topic = "/flaps"
+            topic = "/estimate/flaps" if prefix == "estimate" else "/flaps"
         topics.setdefault(topic, []).append(name)
     return topics
 
@@ -145,9 +145,12 @@ def _write_numbers(log: pa.Table, topic: str, names: list[str], context: foxglov
 def _property(field: pa.Field) -> Mapping[str, Any]:
     known = field.metadata or {}
     unit, frame = (known.get(key, b"").decode() for key in (b"unit", b"frame"))
+    about = [unit or "no unit", f"frame {frame}" if frame else ""]
+    if field.name.startswith("estimate.flap_"):
+        about.append("from the hover angle")
     return {
-        "type": ["number", "null"],
-        "description": ", ".join(filter(None, (unit, frame and f"frame {frame}"))),
+        "type": "integer" if pa.types.is_integer(field.type) else ["number", "null"],
+        "description": ", ".join(filter(None, about)),
     }
 
 

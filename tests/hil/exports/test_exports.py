@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
@@ -94,6 +95,7 @@ def test_foxglove_reads_every_row_with_its_type_and_its_time(folder: Path) -> No
 def test_numbers_of_an_mcap_file_cover_the_log_and_name_unit_and_frame(folder: Path) -> None:
     log, path = load_log(folder), write_mcap(folder)
     described: dict[str, str] = {}
+    types: dict[str, Any] = {}
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
         assert summary is not None
@@ -101,6 +103,11 @@ def test_numbers_of_an_mcap_file_cover_the_log_and_name_unit_and_frame(folder: P
             if schema.encoding == "jsonschema":
                 properties = json.loads(schema.data)["properties"]
                 described |= {name: one["description"] for name, one in properties.items()}
+                types |= {name: one["type"] for name, one in properties.items()}
+    whole = {field.name.replace(".", "_") for field in log.schema if pa.types.is_integer(field.type)}
+    assert {name for name, kind in types.items() if kind == "integer"} == whole - {"t"}
+    assert described["estimate_flap_1"] == "rad, frame B, from the hover angle"
+    assert described["battery_charge"] == "no unit"
     assert described["truth_vx"] == "m/s, frame W"
     assert described["battery_voltage"] == "V"
     in_poses = {name.replace(".", "_") for name in log.column_names} - described.keys()
