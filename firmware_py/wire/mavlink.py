@@ -131,6 +131,7 @@ _SENSORS = (
     | dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
     | dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
 )
+_HEALTHY = _SENSORS | dialect.MAV_SYS_STATUS_GEOFENCE  # there is none, and MAVProxy would call it breached
 _ESTIMATES = (
     dialect.ESTIMATOR_ATTITUDE
     | dialect.ESTIMATOR_VELOCITY_HORIZ
@@ -262,7 +263,7 @@ def read_target(message: Message) -> Target:
 def sys_status(battery_mV: int, drop_rate: float, errors: int, load: float) -> Message:
     """The supply, the share of received frames that were lost, receive errors, and the processor's load, 0..1."""
     return dialect.MAVLink_sys_status_message(
-        _SENSORS, _SENSORS, _SENSORS, round(1000 * min(1.0, max(0.0, load))), u16(battery_mV), -1, -1,
+        _SENSORS, _SENSORS, _HEALTHY, round(1000 * min(1.0, max(0.0, load))), u16(battery_mV), -1, -1,
         round(10_000 * min(1.0, max(0.0, drop_rate))), u16(errors), 0, 0, 0, 0,
     )  # fmt: skip
 

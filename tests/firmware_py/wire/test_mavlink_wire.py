@@ -292,7 +292,9 @@ def test_status_has_the_standards_units() -> None:
     assert (message.voltage_battery, message.drop_rate_comm, message.load) == (3900, 500, 250)
     assert message.errors_comm == 65_535
     present = message.onboard_control_sensors_present
-    assert present == message.onboard_control_sensors_enabled == message.onboard_control_sensors_health
+    assert present == message.onboard_control_sensors_enabled
+    assert message.onboard_control_sensors_health == present | dialect.MAV_SYS_STATUS_GEOFENCE
+    assert not present & dialect.MAV_SYS_STATUS_GEOFENCE
     assert present & dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
     assert not present & dialect.MAV_SYS_STATUS_GEOFENCE
 
