@@ -1,7 +1,8 @@
 """One flight against another: where their logs first differ, their metrics side by side, what was configured otherwise.
 
-Logs are compared bit for bit, row by row, in the columns that both have; a NaN equals a NaN. A real flight and a simulated
-one share no rows: there it is how far they are apart, by the time since the release, that says what the model does not know.
+Logs are compared bit for bit, row by row, in the columns that both have; a NaN equals a NaN. Flights that are not released
+at the same instant of their logs, real ones and those over a real link, share no rows: there it is how far they are apart,
+by the time since the release, that says what the model does not know.
 """
 
 import json
@@ -17,7 +18,7 @@ import pyarrow as pa
 from hil.errors import LabError
 from hil.experiments import find_again
 from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure
-from hil.laboratory.recorder import load_log
+from hil.laboratory.recorder import load_log, release_of
 from hil.laboratory.result import Result, read_result
 from hil.pictures import curves
 from hil.pictures.curves import since_release
@@ -98,7 +99,9 @@ class Comparison:
     ]  # columns of the other one that the first, the second lacks
     span: str  # of the metrics
     metrics: tuple[MetricPair, ...]
-    apart: tuple[Apart, ...]  # with a real flight among them, if they have time in common
+    apart: tuple[
+        Apart, ...
+    ]  # with a real flight among them, or one over a real link, if they have time in common
     one_is_real: bool  # and the other is not
     settings: tuple[tuple[str, str, str], ...]  # name, first, second: those that differ
 
@@ -183,7 +186,8 @@ def _judged(log: pa.Table) -> pa.Table:
 
 def _apart(a: pa.Table, b: pa.Table) -> Iterator[Apart]:
     free = [free_flight(log) for log in (a, b)]
-    if not (is_real(a) or is_real(b)) or min(log.num_rows for log in free) < 2:
+    lined_up = release_of(a.schema.metadata) == release_of(b.schema.metadata)
+    if (lined_up and not (is_real(a) or is_real(b))) or min(log.num_rows for log in free) < 2:
         return
     times, others = (since_release(log) for log in free)
     common = times <= others[-1]

@@ -17,7 +17,9 @@
   function dataOf(panel) {
     const tables = panel.tables.map((table) => table.map(numbers));
     if (!tables.length) return [[]];
-    const data = tables.length === 1 ? tables[0] : uPlot.join(tables);
+    // 2: a gap of one line is a gap also where another line has instants of its own
+    const gaps = tables.map((table) => table.map(() => 2));
+    const data = tables.length === 1 ? tables[0] : uPlot.join(tables, gaps);
     if (!panel.stacked) return data;
     const sums = [data[0]];
     let sum = data[0].map(() => 0);

@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgb
 
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.laboratory.metrics import measure
+from hil.laboratory.metrics import free_flight, measure, position_error
 from hil.laboratory.recorder import load_log
 from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.compare import Run, compare, load_run, pair, write_comparison
@@ -144,6 +144,22 @@ def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_bot
 
 
 @pytest.mark.long
+def test_flights_that_are_released_at_other_instants_are_compared_by_the_time_since_then(
+    runs: dict[str, Path],
+) -> None:
+    a, b = load_run(runs["one"]), load_run(runs["two"])
+    assert compare(a, b).apart == (), "row by row"
+    t = b.log.column_names.index("t")
+    release_us = load_config().flight.release_us + 2_000_000
+    metadata = {**b.log.schema.metadata, b"release_us": str(release_us).encode()}
+    later = b.log.set_column(t, b.log.schema.field(t), pa.array(b.log.column("t").to_numpy() + 2_000_000))
+    told = {one.name: one for one in compare(a, Run(later.replace_schema_metadata(metadata), b.result)).apart}
+    free = [free_flight(run.log) for run in (a, b)]
+    miss = np.subtract(*(100 * position_error(log)[:, 1] for log in reversed(free)))
+    assert (told["y"].unit, told["y"].largest) == ("cm", pytest.approx(np.abs(miss).max(), rel=1e-6))
+    assert told["y"].rms == pytest.approx(np.sqrt((miss**2).mean()), rel=1e-6)
+
+
 def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
     a, b = load_run(runs["one"]), load_run(runs["two"])
     figure = pair((a.log, b.log), ("a", "b"))

@@ -63,7 +63,7 @@ def test_a_task_has_one_colour_in_every_figure_whatever_tasks_are_there() -> Non
     for order in (names, names[::-1], names[:1]):
         load = curves.processor(order)
         assert load.colours == tuple(map(curves.task_colour, load.names))
-    events = [(0, "IN", "KALMAN"), (100, "IN", "STABILIZER"), (300, "IN", "KALMAN"), (400, "END", "-")]
+    events = [(0, "IN", "KALMAN"), (100, "IN", "SENSORS"), (300, "IN", "KALMAN"), (400, "END", "-")]
     schedule = pa.table(
         {
             "us": [RELEASE_US + us for us, _, _ in events],
@@ -76,7 +76,7 @@ def test_a_task_has_one_colour_in_every_figure_whatever_tasks_are_there() -> Non
     (axes,) = figures.schedule(schedule).axes
     drawn = [tuple(bars.get_facecolor()[0][:3]) for bars in axes.collections]
     shown = [label.get_text() for label in axes.get_yticklabels()]
-    assert sorted(shown) == ["KALMAN", "STABILIZER"]
+    assert sorted(shown) == ["KALMAN", "SENSORS"]
     assert drawn == [to_rgb(curves.task_colour(name)) for name in shown]
 
 
@@ -86,6 +86,10 @@ def test_the_time_since_the_last_fused_pose_shows_a_dropout_and_nothing_before_t
     assert np.isnan(since[:2]).all()
     assert since[2:6].tolist() == [0.0, 10.0, 0.0, 10.0]
     assert since[-2:].tolist() == [600.0, 0.0]
+    shown = rows.append_column("estimator.pose_age_us", pa.array([39_400] * rows.num_rows))
+    ages, without = figures.age(shown).panels
+    assert ages.series[0].values.tolist() == [39.4] * rows.num_rows, "also with the predictor off"
+    assert without.series[0].values[-2] == 600.0
 
 
 @pytest.mark.parametrize("cut", [1, 3, 5, 30])
