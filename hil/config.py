@@ -18,7 +18,9 @@ from firmware_py.logic.loading import load_logic
 from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
 from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, RadioConfig, SerialConfig
 from hil.errors import LabError, hint
-from hil.world.config import BatteryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.body import check_hover
+from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.geometry import check
 
 DEFAULT_PROFILE = "floaty"
 _FOLDERS = (Path(__file__).parent.parent / "profiles", Path(__file__).parent / "profiles")
@@ -46,6 +48,7 @@ class FlightConfig(BaseModel):
 class LabConfig(FirmwareConfig):
     """What is flashed, and the world around it."""
 
+    geometry: GeometryConfig = Field(default_factory=GeometryConfig)
     plant: PlantConfig = Field(default_factory=PlantConfig)
     actuators: ServoConfig = Field(default_factory=ServoConfig)
     battery: BatteryConfig = Field(default_factory=BatteryConfig)
@@ -78,6 +81,8 @@ def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -
     try:
         config = LabConfig.model_validate(tree)
         load_logic(config.logic)
+        check(config.geometry)
+        check_hover(config.geometry, config.plant)
     except ValidationError as error:
         raise LabError("; ".join(_explain(tree, detail) for detail in error.errors()[:3])) from None
     except FirmwareError as error:

@@ -96,7 +96,7 @@ def core_us() -> tuple[float, float]:
 def plant_us() -> float:
     """Microseconds of one millisecond of the plant."""
     config = load_config()
-    plant = Plant(config.plant, config.tunnel, config.actuators, np.random.default_rng(1))
+    plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, np.random.default_rng(1))
     plant.hold()
     now_us = 0
 

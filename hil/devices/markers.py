@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from firmware_py.elementary import cos, sin
 from firmware_py.geometry import Quaternion, Vector
 from hil.devices.config import MARKERS, MarkersConfig
-from hil.world.config import PlantConfig
+from hil.world.config import GeometryConfig, GroundConfig
 from hil.world.fixed_order import product
+from hil.world.geometry import weigh
 
 COUNT = MARKERS
 DIAMETER = 0.014  # [m]; chosen, a common size
@@ -54,10 +55,10 @@ class Sighting:
         return self.ghosts if self.pose else np.vstack((self.points[self.seen], self.ghosts))
 
 
-def marker_places(plant: PlantConfig) -> Points:
+def marker_places(geometry: GeometryConfig, ground: GroundConfig) -> Points:
     """Return the markers' places in B, (8, 3) [m]."""
-    corner, base, axis = plant.footprint / 2, plant.base_side, plant.axis_height
-    spread, below = plant.ground.foot_spread, plant.ground.foot_below
+    corner, base, axis = geometry.footprint / 2, geometry.base_side, weigh(geometry).axis_height
+    spread, below = ground.foot_spread, ground.foot_below
     return np.array(
         [
             (1.00 * corner, -1.00 * corner, axis),  # on the axes of flaps 1 to 4
@@ -79,7 +80,7 @@ class Cameras:
     centre of mass. A marker is placed when enough cameras have it in sight.
     """
 
-    def __init__(self, config: MarkersConfig, plant: PlantConfig) -> None:
+    def __init__(self, config: MarkersConfig, geometry: GeometryConfig, ground: GroundConfig) -> None:
         azimuths = [2.0 * math.pi * camera / config.cameras for camera in range(config.cameras)]
         self._p_WC = np.array(
             [
@@ -88,11 +89,11 @@ class Cameras:
             ]
         )
         self._needed = config.min_cameras
-        self._plate_height = plant.axis_height
-        self._plate_half = plant.footprint / 2
-        self._places = marker_places(plant)
+        self._plate_height = weigh(geometry).axis_height
+        self._plate_half = geometry.footprint / 2
+        self._places = marker_places(geometry, ground)
         self._squares = (self._places**2).sum(axis=1)[:, None]
-        self._over_plate = self._places[:, 2:] - plant.axis_height
+        self._over_plate = self._places[:, 2:] - self._plate_height
 
     def see(self, p_WB: Points, R_WB: Points) -> Mask:
         """Return which markers enough cameras see, (8,), at a pose: (3,) [m] and (3, 3)."""

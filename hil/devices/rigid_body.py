@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from firmware_py.geometry import Quaternion, Vector, rotation_matrix
 from hil.devices.config import MarkersConfig
 from hil.devices.markers import COUNT, NO_POINTS, Cameras, Mask, Points, Sighting, marker_places
-from hil.world.config import PlantConfig
+from hil.world.config import GeometryConfig, GroundConfig
 from hil.world.fixed_order import eigen, product
 from hil.world.noise import normal
 
@@ -94,10 +94,16 @@ class VirtualMarkers:
     factor on the noise; `ghosts` per frame.
     """
 
-    def __init__(self, config: MarkersConfig, plant: PlantConfig, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        config: MarkersConfig,
+        geometry: GeometryConfig,
+        ground: GroundConfig,
+        rng: np.random.Generator,
+    ) -> None:
         self._config = config
-        self._cameras = Cameras(config, plant)
-        self._places = marker_places(plant)
+        self._cameras = Cameras(config, geometry, ground)
+        self._places = marker_places(geometry, ground)
         self._body = RigidBody(self._places)
         self._rng = rng
         self._rng_labels, self._rng_ghosts = rng.spawn(2)
@@ -159,9 +165,9 @@ class VirtualMarkers:
 
 
 def make_markers(
-    config: MarkersConfig, plant: PlantConfig, rng: np.random.Generator
+    config: MarkersConfig, geometry: GeometryConfig, ground: GroundConfig, rng: np.random.Generator
 ) -> VirtualMarkers | None:
     """Return the markers on a robot; None when they are not enabled."""
     if not config.enabled:
         return None
-    return VirtualMarkers(config, plant, rng)
+    return VirtualMarkers(config, geometry, ground, rng)

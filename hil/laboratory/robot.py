@@ -77,11 +77,15 @@ class Robot:
         self.say = say
         self.free = False
         self.powered = True
-        self.plant = Plant(config.plant, config.tunnel, config.actuators, streams.gusts, self.start_W)
+        self.plant = Plant(
+            config.geometry, config.plant, config.tunnel, config.actuators, streams.gusts, self.start_W
+        )
         self.battery: Battery = Battery(config.battery)
         self.imu = VirtualImu(config.imu, streams.imu)
         self.mocap = VirtualMocap(
-            config.mocap, streams.mocap, make_markers(config.markers, config.plant, streams.markers)
+            config.mocap,
+            streams.mocap,
+            make_markers(config.markers, config.geometry, config.plant.ground, streams.markers),
         )
         self.air = Air.of(config.radio) if radio else None
         self.uart = VirtualSerial(config.serial, events, streams.serial) if mavlink else None

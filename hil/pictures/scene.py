@@ -1,8 +1,8 @@
 """The shape of what is drawn: the robot's plates as triangles, and where the drag acts.
 
-Lengths in m, angles in rad. Geometry G0 as in `hil.world.body`: a flap is drawn in its own frame F, which has its origin on
-the body's z axis at the height of the flap axes and is parallel to B when the flap angle is 0; the flap turns about the
-outward radial `FLAP_AXES[flap]` by its signed angle. Nothing here knows the viewer.
+Lengths in m, angles in rad. A flap is drawn in its own frame F, which has its origin on the body's z axis where the flap
+axes meet and is parallel to B when the flap angle is 0; the flap turns about its axis, outwards, by its signed angle.
+Nothing here knows the viewer.
 """
 
 from dataclasses import dataclass
@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.world.body import AXIS, MIRRORS
-from hil.world.config import PlantConfig
+from hil.world.body import MIRRORS
+from hil.world.config import GeometryConfig, GroundConfig
+from hil.world.geometry import axis_of, surfaces, triangles, weigh
 
 Points = NDArray[np.float64]
-
-FLAP_AXES: Points = AXIS * MIRRORS  # (4, 3) unit vectors in B; azimuths -45, 45, 135, -135 deg
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,25 +39,21 @@ def _quads(*corners: list[tuple[float, float, float]]) -> Mesh:
     return Mesh(np.array(corners).reshape(-1, 3), triangles)
 
 
-def base_mesh(plant: PlantConfig) -> Mesh:
+def flap_axes(geometry: GeometryConfig) -> Points:
+    """Return the flaps' axes, (4, 3) unit vectors in B."""
+    return np.asarray(axis_of(geometry) * MIRRORS)
+
+
+def base_mesh(geometry: GeometryConfig) -> Mesh:
     """Return the base plate in F."""
-    c = plant.base_side / 2
+    c = geometry.base_side / 2
     return _quads([(-c, -c, 0.0), (c, -c, 0.0), (c, c, 0.0), (-c, c, 0.0)])
 
 
-def flap_mesh(plant: PlantConfig, flap: int) -> Mesh:
-    """Return flap 0..3 in F: vertices 0-7 are the flat part, 8-11 the kinked strip."""
-    side, corner, fold = plant.footprint / 2, plant.base_side / 2, plant.footprint / 2 - plant.strip_width
-    edge, rise = (
-        fold + plant.strip_width * np.cos(plant.kink_angle),
-        plant.strip_width * np.sin(plant.kink_angle),
-    )
-    mesh = _quads(
-        [(corner, 0.0, 0.0), (side, 0.0, 0.0), (side, fold, 0.0), (corner, fold, 0.0)],
-        [(0.0, corner, 0.0), (corner, corner, 0.0), (corner, fold, 0.0), (0.0, fold, 0.0)],
-        [(0.0, fold, 0.0), (side, fold, 0.0), (side, edge, rise), (0.0, edge, rise)],
-    )
-    return Mesh(mesh.vertices * MIRRORS[flap], mesh.triangles)
+def flap_mesh(geometry: GeometryConfig, flap: int) -> Mesh:
+    """Return flap 0..3 in F: first the triangles of the flat parts, then those of the kinked strip."""
+    corners = np.concatenate([triangles(surface.corners) for surface in surfaces(geometry)]) * MIRRORS[flap]
+    return Mesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
 def mesh_centre(mesh: Mesh) -> Points:
@@ -69,20 +64,20 @@ def mesh_centre(mesh: Mesh) -> Points:
     return centre
 
 
-def outline(plant: PlantConfig) -> list[Points]:
+def outline(geometry: GeometryConfig) -> list[Points]:
     """Return the lines of the robot's ghost in B: the footprint, the base plate and the rod to the centre of mass."""
     turn = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
-    halves = plant.footprint / 2, plant.base_side / 2
-    squares = [np.column_stack((turn * half, np.full(5, plant.axis_height))) for half in halves]
-    return [*squares, np.array([(0.0, 0.0, 0.0), (0.0, 0.0, plant.axis_height)])]
+    halves, height = (geometry.footprint / 2, geometry.base_side / 2), weigh(geometry).axis_height
+    squares = [np.column_stack((turn * half, np.full(5, height))) for half in halves]
+    return [*squares, np.array([(0.0, 0.0, 0.0), (0.0, 0.0, height)])]
 
 
-def stand_lines(plant: PlantConfig) -> list[Points]:
+def stand_lines(geometry: GeometryConfig, ground: GroundConfig) -> list[Points]:
     """Return the stand in B: from each corner of the base plate to a foot, and around the feet."""
-    corner, foot = plant.base_side / 2, plant.ground.foot_spread
+    corner, foot, height = geometry.base_side / 2, ground.foot_spread, weigh(geometry).axis_height
     turn = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
-    feet = np.array([(foot * x, foot * y, -plant.ground.foot_below) for x, y in turn])
-    corners = np.array([(corner * x, corner * y, plant.axis_height) for x, y in turn])
+    feet = np.array([(foot * x, foot * y, -ground.foot_below) for x, y in turn])
+    corners = np.array([(corner * x, corner * y, height) for x, y in turn])
     return [feet, *np.stack((corners[:4], feet[:4]), axis=1)]
 
 
@@ -122,16 +117,16 @@ def rotated(q_AB: Points, v_B: Points) -> Points:
     return np.asarray(v_B + w * t + np.cross(u, t))
 
 
-def tops(plant: PlantConfig, p_WB: Points, q_WB: Points) -> Points:
+def tops(geometry: GeometryConfig, p_WB: Points, q_WB: Points) -> Points:
     """Return where the tether is fixed, the middle of the base plate, (N, 3) in W."""
-    return p_WB + rotated(q_WB, np.array([0.0, 0.0, plant.axis_height]))
+    return p_WB + rotated(q_WB, np.array([0.0, 0.0, weigh(geometry).axis_height]))
 
 
-def drag_origins(plant: PlantConfig, p_WB: Points, q_WB: Points, flaps: Points) -> Points:
+def drag_origins(geometry: GeometryConfig, p_WB: Points, q_WB: Points, flaps: Points) -> Points:
     """Return where the drag of the base plate and of the four flaps acts, (N, 5, 3) in W, for flap angles (N, 4)."""
-    top = np.array([0.0, 0.0, plant.axis_height])
+    top, axes = np.array([0.0, 0.0, weigh(geometry).axis_height]), flap_axes(geometry)
     points = [np.broadcast_to(top, p_WB.shape)]
     for flap in range(4):
-        centre = mesh_centre(flap_mesh(plant, flap))
-        points.append(top + rotated(turn_quaternion(FLAP_AXES[flap], flaps[:, flap]), centre))
+        centre = mesh_centre(flap_mesh(geometry, flap))
+        points.append(top + rotated(turn_quaternion(axes[flap], flaps[:, flap]), centre))
     return np.stack([p_WB + rotated(q_WB, point) for point in points], axis=1)

@@ -30,7 +30,8 @@ from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures import curves, monitor, scene
 from hil.pictures.curves import Curves, States
 from hil.pictures.monitor import MARK_COLOURS, RATES, REFUSALS, Rates
-from hil.world.config import PlantConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
+from hil.world.geometry import weigh
 
 try:
     import rerun as rr
@@ -127,8 +128,13 @@ class Stage:
         metadata = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
         config = json.loads(metadata.get("config", "{}"))
         self._recording = recording
-        self._plant = PlantConfig.model_validate(config.get("plant", {}))
+        self._geometry = GeometryConfig.model_validate(config.get("geometry", {}))
+        plant = {
+            key: value for key, value in config.get("plant", {}).items() if key in PlantConfig.model_fields
+        }
+        self._plant = PlantConfig.model_validate(plant)  # logs from before [geometry] had the shape in it
         self._tunnel = TunnelConfig.model_validate(config.get("tunnel", {}))
+        self._flap_axes = scene.flap_axes(self._geometry)
         self._plots = {path: plot for path, plot in PLOTS.items() if plot.needs in schema.names}
         self._rates = {path: rate for path, rate in RATES.items() if set(rate.columns) <= set(schema.names)}
         self._processor = curves.processor(schema.names)
@@ -149,7 +155,7 @@ class Stage:
         if MARKERS_SEEN in schema.names:
             self._recording.log(
                 "world/robot/markers",
-                rr.Points3D(marker_places(self._plant), radii=DIAMETER / 2),
+                rr.Points3D(marker_places(self._geometry, self._plant.ground), radii=DIAMETER / 2),
                 static=True,
             )
         self._name_curves()
@@ -204,7 +210,7 @@ class Stage:
         self._slow = chosen.slice(chosen.num_rows - 1)
         if "truth.x" not in past.column_names:
             return
-        top = scene.tops(self._plant, body(chosen, "x", "y", "z"), body(chosen, "qw", "qx", "qy", "qz"))
+        top = scene.tops(self._geometry, body(chosen, "x", "y", "z"), body(chosen, "qw", "qx", "qy", "qz"))
         anchor = (0.0, 0.0, self._tunnel.hover_height + self._plant.tether.anchor_height)
         lines = np.stack((np.broadcast_to(anchor, top.shape), top), axis=1).astype(np.float32)
         self._send("world/tether", times, rr.LineStrips3D.columns(strips=lines))
@@ -304,7 +310,7 @@ class Stage:
         upright = np.broadcast_to((1.0, 0.0, 0.0, 0.0), q_WB.shape)
         self._place("world/held", times, p_WB, upright)
         for flap in range(4):
-            turn = scene.turn_quaternion(scene.FLAP_AXES[flap], flaps[:, flap])
+            turn = scene.turn_quaternion(self._flap_axes[flap], flaps[:, flap])
             self._place(f"world/robot/plates/flap_{flap + 1}", times, np.zeros_like(p_WB), turn)
         goal = column(rows, "goal.x", "goal.y", "goal.z")
         self._place(
@@ -320,7 +326,7 @@ class Stage:
         parts = ("base", "flap1", "flap2", "flap3", "flap4")
         forces = column(rows, *(f"force.{part}_{axis}" for part in parts for axis in "xyz"))
         drag = METRES_PER_NEWTON * forces.reshape(-1, 3)
-        origins = scene.drag_origins(self._plant, p_WB, q_WB, flaps).reshape(-1, 3)
+        origins = scene.drag_origins(self._geometry, p_WB, q_WB, flaps).reshape(-1, 3)
         arrows = rr.Arrows3D.columns(vectors=drag, origins=origins)
         self._send("world/drag", times, arrows.partition(np.full(len(times), len(parts))))
         flow = column(rows, "flow.x", "flow.y", "flow.z")
@@ -334,7 +340,7 @@ class Stage:
         bits = column(rows, MARKERS_SEEN).astype(np.int64)
         changed = np.flatnonzero(np.diff(bits, prepend=-1))
         changed = changed[changed >= fresh]
-        places = marker_places(self._plant)
+        places = marker_places(self._geometry, self._plant.ground)
         seen = bits[changed, None] >> np.arange(len(places)) & 1
         colours = np.where(seen, SEEN, HIDDEN).astype(np.uint32)
         points = rr.Points3D.columns(colors=colours.ravel())
@@ -386,18 +392,21 @@ class Stage:
         )
 
     def _build_robot(self) -> None:
-        log, plant = self._recording.log, self._plant
+        log, geometry = self._recording.log, self._geometry
+        height = weigh(geometry).axis_height
         body = rr.Boxes3D(half_sizes=[(0.022, 0.016, 0.012)], colors=0x404850FF, fill_mode="solid")
         log("world/robot/body", body, static=True)
-        rod = [[(0, 0, 0), (0, 0, plant.axis_height)]]
+        rod = [[(0, 0, 0), (0, 0, height)]]
         log("world/robot/rod", rr.LineStrips3D(rod, colors=0x707880FF, radii=0.003), static=True)
-        stand = rr.LineStrips3D(scene.stand_lines(plant), colors=0x707880FF, radii=0.0015)
+        stand = rr.LineStrips3D(
+            scene.stand_lines(geometry, self._plant.ground), colors=0x707880FF, radii=0.0015
+        )
         log("world/robot/stand", stand, static=True)
         log("world/robot/axes", rr.TransformAxes3D(AXIS), static=True)
-        log("world/robot/plates", rr.Transform3D(translation=(0, 0, plant.axis_height)), static=True)
-        meshes = [("base", scene.base_mesh(plant), "#c8ccd0")]
+        log("world/robot/plates", rr.Transform3D(translation=(0, 0, height)), static=True)
+        meshes = [("base", scene.base_mesh(geometry), "#c8ccd0")]
         for flap, colour in enumerate(curves.FLAP_COLOURS):
-            meshes.append((f"flap_{flap + 1}", scene.flap_mesh(plant, flap), colour))
+            meshes.append((f"flap_{flap + 1}", scene.flap_mesh(geometry, flap), colour))
         for name, mesh, colour in meshes:
             surface = rr.Mesh3D(
                 vertex_positions=mesh.vertices, triangle_indices=mesh.triangles, vertex_normals=mesh.normals(),
@@ -409,7 +418,7 @@ class Stage:
                     [scene.mesh_centre(mesh)], radii=0.002, colors=_rgba(colour), labels=name[-1]
                 )
                 log(f"world/robot/plates/{name}/number", number, static=True)
-        ghost = rr.LineStrips3D(scene.outline(plant), colors=0xFFFFFF90, radii=0.0012)
+        ghost = rr.LineStrips3D(scene.outline(geometry), colors=0xFFFFFF90, radii=0.0012)
         log("world/goal/estimate/ghost", ghost, static=True)
         log("world/drag", rr.Arrows3D.from_fields(colors=[0xF0E442FF], radii=[0.0035]), static=True)
         log("world/flow", rr.Arrows3D.from_fields(colors=[0x56B4E9FF], radii=[0.005]), static=True)

@@ -74,7 +74,11 @@ class Ends:
     def serve_motive(self, settings: Streaming) -> VirtualMotive:
         """Let Motive see every robot, under its number."""
         names = {robot.number: name_of(robot.number) for robot in self.robots}
-        markers = marker_places(self._config.plant) if self._config.markers.enabled else NO_POINTS
+        markers = (
+            marker_places(self._config.geometry, self._config.plant.ground)
+            if self._config.markers.enabled
+            else NO_POINTS
+        )
         self.motive = VirtualMotive(settings, names, self._readers, markers)
         for served in self.robots:
             served.robot.seen_by(partial(self.motive.take, served.number))

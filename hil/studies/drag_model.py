@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from firmware_py.elementary import cos, sin
 from hil.config import LabConfig
 from hil.laboratory.robot import Streams
-from hil.world.body import AXIS, MIRRORS, SIGNS, flap_plates
-from hil.world.config import PlantConfig
+from hil.world.body import MIRRORS, SIGNS, flap_plates
+from hil.world.config import GeometryConfig, PlantConfig
+from hil.world.geometry import axis_of, weigh
 from hil.world.layout import STEP_US
 from hil.world.motion import GRAVITY
 from hil.world.noise import normal
@@ -87,46 +88,47 @@ class Row:
 class SimplifiedModel:
     """The paper's plates in a uniform flow. The drag coefficient is the one with which the robot hovers."""
 
-    def __init__(self, config: PlantConfig) -> None:
-        self._config = config
-        self._parts = flap_plates(config)
+    def __init__(self, geometry: GeometryConfig, config: PlantConfig) -> None:
+        weight = weigh(geometry)
+        self._airspeed = config.airspeed
+        self._base_area = geometry.base_side * geometry.base_side
+        self._axes = np.array([0.0, 0.0, weight.axis_height])
+        self._axis = axis_of(geometry)
+        self._parts = flap_plates(geometry)
         self._pressure = 1.0  # [kg/m3] rho C_D / 2
         lift = self.wrench(SIGNS * config.hover_angle)[2]
-        self._pressure = config.mass * GRAVITY / lift
+        self._pressure = weight.mass * GRAVITY / lift
 
     def wrench(self, flaps: NDArray[np.float64]) -> Wrench:
         """Return force and torque in B, (6,), for flap angles (4,) [rad]."""
-        up = np.array([0.0, 0.0, 1.0])
-        lift = np.array([0.0, 0.0, self._config.axis_height])
-        total = self._push(self._config.base_side * self._config.base_side, up, lift)
+        total = self._push(self._base_area, np.array([0.0, 0.0, 1.0]), self._axes)
         for mirror, sign, angle in zip(MIRRORS, SIGNS, flaps, strict=True):
             for part in self._parts:
-                n, r = (mirror * _turned(v, -sign * angle) for v in (part.normal, part.centre))
-                total += self._push(part.area, n, r + lift)
+                n, r = (mirror * _turned(v, self._axis, -sign * angle) for v in (part.normal, part.centre))
+                total += self._push(part.area, n, r + self._axes)
         return total
 
     def _push(self, area: float, normal: NDArray[np.float64], centre: NDArray[np.float64]) -> Wrench:
         """Return what the flow does to one plate (eq. flaps_drag_force_simplified, drag_torque_equation)."""
-        across = self._config.airspeed * normal[2]
+        across = self._airspeed * normal[2]
         force = self._pressure * area * across * abs(across) * normal
         return np.concatenate([force, np.cross(centre, force)])
 
 
-def _turned(vector: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """Return a vector turned about the axis of flap 2."""
-    along = AXIS * math.fsum(AXIS * vector)
-    return np.asarray(along + (vector - along) * cos(angle) + np.cross(AXIS, vector) * sin(angle))
+def _turned(vector: NDArray[np.float64], axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    """Return a vector of flap 2 turned about its axis."""
+    along = axis * math.fsum(axis * vector)
+    return np.asarray(along + (vector - along) * cos(angle) + np.cross(axis, vector) * sin(angle))
 
 
 def measure(config: LabConfig, seed: int) -> Iterator[Row]:
     """Yield the ROWS rows, robot by robot and sweep by sweep."""
     streams = Streams.of_seed(seed)
-    for robot, kink in zip(ROBOTS, (0.0, config.plant.kink_angle), strict=True):
-        body = config.plant.model_copy(
-            update={"variant": "plate", "constant_factors": {}, "kink_angle": kink}
-        )
-        model = SimplifiedModel(body)
-        plant = Plant(body, config.tunnel, config.actuators, streams.gusts)
+    body = config.plant.model_copy(update={"variant": "plate", "constant_factors": {}})
+    for robot, kink in zip(ROBOTS, (0.0, config.geometry.kink_angle), strict=True):
+        geometry = config.geometry.model_copy(update={"kink_angle": kink})
+        model = SimplifiedModel(geometry, body)
+        plant = Plant(geometry, body, config.tunnel, config.actuators, streams.gusts)
         plant.hold()
         for servo in range(4):
             plant.set_servo_fault(servo, speed=0.0)  # the flaps stay where they are put

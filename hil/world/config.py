@@ -11,6 +11,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0)]
+Extent = Annotated[float, Field(ge=0, le=2)]
+Three = tuple[float, float, float]
 Four = tuple[float, float, float, float]
 Factor = Annotated[float, Field(ge=0.25, le=4)]
 Variant = Literal["plate", "methods", "table", "methods_open", "table_open"]
@@ -76,11 +78,80 @@ class LimitsConfig(BaseModel):
     )
 
 
-class PlantConfig(BaseModel):
-    """The body in the flow: geometry G0 of section 3, corrected to a set of identified constants (section 4).
+class MassConfig(BaseModel):
+    """A box of even density; `place` is that of its centre from the point above B where the flap axes meet."""
 
-    The drag coefficient is not a free constant: it is trimmed so that `mass` hovers at `airspeed` and `hover_angle`
-    (C_D = 1.353 at 1.225 kg/m3). Model errors are the factors, true over design: they act after the trim.
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    mass: float = Field(gt=0, le=5, description="[kg]")
+    place: Three = Field((0.0, 0.0, 0.0), description="x, y, z in B from where the flap axes meet [m]")
+    size: tuple[Extent, Extent, Extent] = Field((0.0, 0.0, 0.0), description="along x, y, z of B [m]")
+    mirrored: bool = Field(False, description="four of them, at (+-x, +-y)")
+
+
+class GeometryConfig(BaseModel):
+    """The robot's shape and masses: G0 of section 3. What is said of a flap holds for flap 2, in the quadrant (+,+) of B, at
+    flap angle 0; the other three are its mirror images.
+
+    Mass and centre of mass follow from `flap_mass` and `masses`, the moments of inertia too where none are given.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    footprint: float = Field(
+        0.23, gt=0.02, le=2, description="side of the square of four quadrants [m]; paper"
+    )
+    base_side: float = Field(
+        0.08, gt=0, le=1, description="side of the base plate [m]; original firmware, baseArea"
+    )
+    outline: Annotated[tuple[tuple[float, float], ...], Field(max_length=12)] = Field(
+        (),
+        description="corners of the unfolded flap in turn, a convex trapezoid or the like [m]; "
+        "without: its quadrant of the footprint less the base plate; section 3",
+    )
+    strip_width: float = Field(
+        0.0198,
+        gt=0,
+        le=0.5,
+        description="width of the kinked strip at the flap's outer edge [m]; section 3, tuned",
+    )
+    kink_angle: float = Field(
+        math.radians(42.5), ge=0, le=math.pi / 2, description="upward bend of the strip [rad]; paper"
+    )
+    kink_side: Literal["x", "y"] = Field(
+        "y", description="edge with the strip: the one outwards in y or in x"
+    )
+    axis_azimuth: float = Field(
+        math.radians(45),
+        ge=0,
+        le=math.pi / 2,
+        description="of the flap's axis from x [rad]; original firmware",
+    )
+    dihedral: float = Field(
+        0.0, ge=-1.2, le=1.2, description="by which axis and flap rise outwards [rad]; section 2: horizontal"
+    )
+    flow_point: float = Field(
+        0.0627, gt=0, le=0.5, description="|x| = |y| where a flap's flow is taken [m]; section 3"
+    )
+    flap_mass: float = Field(
+        0.025, gt=0, le=2, description="of each flap, even over its surface [kg]; paper, Setup specifications"
+    )
+    masses: tuple[MassConfig, ...] = Field(
+        (MassConfig(mass=0.240, place=(0.0, 0.0, -0.0991666667), size=(0.0636, 0.0636, 0.0809)),),
+        description="all the rest; paper: 0.340 kg, centre of mass 7 cm below the flaps; size: mass budget of section 3",
+    )
+    inertia: tuple[Positive, Positive, Positive] | Literal["masses"] = Field(
+        (1.30e-3, 1.30e-3, 1.47e-3),
+        description="about x, y, z of B [kg m2]; section 3, tuned to the paper's roll and yaw; 'masses': what follows from "
+        "them (1.40e-3, 1.40e-3, 1.15e-3)",
+    )
+
+
+class PlantConfig(BaseModel):
+    """The geometry's plates in the flow, corrected to a set of identified constants (section 4).
+
+    The drag coefficient is not a free constant: it is trimmed so that the robot hovers at `airspeed` and `hover_angle`
+    (of G0 C_D = 1.353 at 1.225 kg/m3). Model errors are the factors, true over design: they act after the trim.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -89,33 +160,11 @@ class PlantConfig(BaseModel):
         "methods",
         description="plate: isolated plates; else their linearisation is corrected to the paper's Table; section 1",
     )
-    mass: float = Field(0.340, gt=0.05, le=2, description="design mass [kg]; paper, Setup specifications")
-    inertia: tuple[Positive, Positive, Positive] = Field(
-        (1.30e-3, 1.30e-3, 1.47e-3), description="design inertia about x, y, z of B [kg m2]; section 3"
-    )
     airspeed: float = Field(
         10.0, gt=1, le=30, description="design airspeed of the hover [m/s]; paper, Setup specifications"
     )
     hover_angle: float = Field(
         math.radians(25), gt=0, le=1.2, description="flap angle of the design hover [rad]; paper: 25 deg"
-    )
-    footprint: float = Field(
-        0.23, gt=0.05, le=1, description="side of the square of four quadrants [m]; paper"
-    )
-    base_side: float = Field(
-        0.08, gt=0, le=0.5, description="side of the base plate [m]; original firmware, baseArea"
-    )
-    strip_width: float = Field(
-        0.0198, gt=0, le=0.1, description="width of the kinked strip along the y edges [m]; section 3"
-    )
-    kink_angle: float = Field(
-        math.radians(42.5), ge=0, le=1.5, description="upward bend of the strip [rad]; paper"
-    )
-    axis_height: float = Field(
-        0.07, ge=0, le=0.3, description="flap axes above the centre of mass [m]; paper"
-    )
-    flow_point: float = Field(
-        0.0627, gt=0, le=0.5, description="|x| = |y| where a flap's flow is taken [m]; section 3"
     )
     mass_factor: Factor = Field(1.0, description="true mass over design mass")
     inertia_factor: Factor = Field(1.0, description="true inertia over design inertia")
@@ -128,9 +177,7 @@ class PlantConfig(BaseModel):
     limits: LimitsConfig = Field(default_factory=LimitsConfig)
 
     @model_validator(mode="after")
-    def _plates_fit(self) -> PlantConfig:
-        if self.base_side >= self.footprint or self.strip_width >= (self.footprint - self.base_side) / 2:
-            raise ValueError("base_side and strip_width leave no flat part of the flaps inside the footprint")
+    def _factors_act(self) -> PlantConfig:
         if self.variant == "plate" and self.constant_factors:
             raise ValueError("constant_factors act on corrected variants only, not on 'plate'")
         return self

@@ -17,6 +17,7 @@ from hil.world import layout as at
 from hil.world.body import MIX
 from hil.world.config import PlantConfig
 from hil.world.fixed_order import fit_polynomial
+from hil.world.geometry import Weight
 from hil.world.motion import GRAVITY, evaluate
 from hil.world.plates import LIFT_U4_MAX, State
 
@@ -124,15 +125,14 @@ def target_constants(config: PlantConfig, plate: Constants) -> Constants:
     return dataclasses.replace(target, **{name: factors[name] * getattr(target, name) for name in factors})
 
 
-def trim_and_correct(s: State, config: PlantConfig) -> None:
+def trim_and_correct(s: State, config: PlantConfig, weight: Weight) -> None:
     """Write the trimmed drag, then the correction of the configured variant; needs the plates and the true mass in `s`."""
     design = calm(s, config.airspeed)
-    design[at.MASS], design[at.DRAG_FACTOR], design[at.CORRECTED] = config.mass, 1.0, 0.0
-    design[at.INERTIA : at.INERTIA + 3] = config.inertia
-    weight = config.mass * GRAVITY
+    design[at.MASS], design[at.DRAG_FACTOR], design[at.CORRECTED] = weight.mass, 1.0, 0.0
+    design[at.INERTIA : at.INERTIA + 3] = weight.inertia
     design[at.PRESSURE] = 1.0
     evaluate(design)
-    s[at.PRESSURE] = design[at.PRESSURE] = weight / design[at.DRAG + 2]
+    s[at.PRESSURE] = design[at.PRESSURE] = weight.mass * GRAVITY / design[at.DRAG + 2]
     s[at.AIRSPEED] = config.airspeed
     s[at.CORRECTED] = float(config.variant != "plate")
     if config.variant == "plate":
@@ -142,7 +142,7 @@ def trim_and_correct(s: State, config: PlantConfig) -> None:
     s[at.LIFT_FIT : at.LIFT_FIT + LIFT_ORDER + 1] = fit_polynomial(LIFT_SAMPLES, np.array(lift), LIFT_ORDER)
     L = linearise(design, config.airspeed)
     T = target_constants(config, L)
-    m, (ix, iy, iz) = config.mass, config.inertia
+    m, (ix, iy, iz) = weight.mass, weight.inertia
     s[at.X_INPUT], s[at.X_TILT] = T.x_u2 / L.x_u2, m * (T.x_pitch - L.x_pitch)
     s[at.Y_INPUT], s[at.Y_TILT] = T.y_u1 / L.y_u1, m * (T.y_roll - L.y_roll)
     s[at.Z_INPUT] = T.z_u4 / GRAVITY

@@ -16,8 +16,9 @@ from firmware_py.elementary import cos
 from hil.errors import LabError
 from hil.world import layout as at
 from hil.world.body import SIGNS, place_plates
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.correction import Constants, calm, linearise, trim_and_correct
+from hil.world.geometry import weigh
 from hil.world.motion import advance, evaluate
 from hil.world.noise import normal
 from hil.world.servos import commanded_angles, next_period_us
@@ -50,6 +51,7 @@ class Plant:
 
     def __init__(
         self,
+        geometry: GeometryConfig,
         config: PlantConfig,
         tunnel: TunnelConfig,
         servos: ServoConfig,
@@ -60,12 +62,13 @@ class Plant:
         """Start at rest with the flaps at the hover angle, at the hover point unless `p_WB` [m] says otherwise."""
         self._s = s = np.zeros(at.SIZE)
         self.tunnel = Tunnel(tunnel, s)
-        place_plates(s, config)
-        s[at.MASS] = config.mass * config.mass_factor
-        s[at.INERTIA : at.INERTIA + 3] = np.array(config.inertia) * config.inertia_factor
+        weight = weigh(geometry)
+        place_plates(s, geometry, config.hover_angle)
+        s[at.MASS] = weight.mass * config.mass_factor
+        s[at.INERTIA : at.INERTIA + 3] = np.array(weight.inertia) * config.inertia_factor
         s[at.DRAG_FACTOR] = config.drag_factor
         self._airspeed = config.airspeed
-        trim_and_correct(s, config)
+        trim_and_correct(s, config, weight)
 
         tether, ground, limits = config.tether, config.ground, config.limits
         s[at.TETHER_ANCHOR + 2] = tunnel.hover_height + tether.anchor_height

@@ -14,12 +14,12 @@ from ground_station.mocap import MocapFrame
 from hil.devices.markers import NO_POINTS, Sighting, marker_places
 from hil.servers.dongle_server import Readers
 from hil.servers.motive import Streaming, Up, VirtualMotive
-from hil.world.config import PlantConfig
+from hil.world.config import GeometryConfig, GroundConfig
 
 FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
 PERIOD_S = 0.005
 LATENCY_US = 38_000
-PLACES = marker_places(PlantConfig())
+PLACES = marker_places(GeometryConfig(), GroundConfig())
 NO_POSE = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))  # Motive looks at the frame's
 
 

@@ -21,13 +21,14 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.world.body import AXIS, MIRRORS
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 
 ON = MarkersConfig(enabled=True)
 EXACT = MarkersConfig(enabled=True, noise=0.0)
-PLANT = PlantConfig()
-PLACES = marker_places(PLANT)
+GEOMETRY, GROUND = GeometryConfig(), PlantConfig().ground
+AXIS_HEIGHT = 0.07  # [m] paper
+PLACES = marker_places(GEOMETRY, GROUND)
 HOME = np.array([0.0, 0.0, 1.15])
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 ALL = np.ones(COUNT, bool)
@@ -41,7 +42,7 @@ turns = st.tuples(number, number, number, number).filter(lambda q: sum(x * x for
 
 
 def markers(config: MarkersConfig = ON, seed: int = 1) -> VirtualMarkers:
-    return VirtualMarkers(config, PLANT, np.random.default_rng(seed))
+    return VirtualMarkers(config, GEOMETRY, GROUND, np.random.default_rng(seed))
 
 
 def look(config: MarkersConfig, turn: Rotation | None = None, p_WB: Array = HOME, seed: int = 1) -> Sighting:
@@ -61,7 +62,7 @@ def kabsch(points: Array, body: Array) -> tuple[Array, Array]:
 
 def test_four_markers_sit_where_no_flap_moves_them() -> None:
     for flap in range(4):
-        on_axis = PLACES[flap] - (0, 0, PLANT.axis_height)
+        on_axis = PLACES[flap] - (0, 0, AXIS_HEIGHT)
         assert np.cross(on_axis, AXIS * MIRRORS[flap]) == pytest.approx(np.zeros(3), abs=1e-12)
         assert on_axis @ (AXIS * MIRRORS[flap]) > 0.1
     assert len(PLACES) == COUNT
@@ -245,11 +246,11 @@ def ray_hits(marker: Array, camera: Array) -> set[bool]:
     """Whether the robot is in between, by walking along the ray; with a body a little smaller and a little larger."""
     steps = np.linspace(1e-6, 1, 4000)[:, None]
     way = marker + steps * (camera - marker)
-    height = way[:, 2] - PLANT.axis_height
+    height = way[:, 2] - AXIS_HEIGHT
     through = np.flatnonzero(np.sign(height[:-1]) * np.sign(height[1:]) < 0)
     hits = set()
     for more in (-0.002, 0.002):
-        plate = (np.abs(way[through, :2]) < PLANT.footprint / 2 + more).all(axis=1).any()
+        plate = (np.abs(way[through, :2]) < GEOMETRY.footprint / 2 + more).all(axis=1).any()
         trunk = (np.linalg.norm(way, axis=1) < TRUNK_RADIUS + more).any()
         hits.add(bool(plate or trunk))
     return hits
@@ -283,7 +284,7 @@ def test_a_marker_is_seen_when_enough_rays_are_free(
         hits = ray_hits(PLACES[row], turn.inv().apply(camera - p))
         assume(len(hits) == 1)  # not by a hair
         free.append(not hits.pop())
-    seen = Cameras(config, PLANT).see(np.array(p), turn.as_matrix())
+    seen = Cameras(config, GEOMETRY, GROUND).see(np.array(p), turn.as_matrix())
     assert seen[row] == (sum(free) >= config.min_cameras)
 
 
@@ -326,7 +327,9 @@ def test_ghosts_lie_near_the_body_have_no_label_and_do_not_change_its_pose() -> 
 
 
 def frames(count: int, seed: int = 1, **knobs: float) -> list[tuple[MocapFrame, Sighting | None]]:
-    plant = Plant(PLANT, TunnelConfig(turbulence="none"), ServoConfig(), np.random.default_rng(1))
+    plant = Plant(
+        GEOMETRY, PlantConfig(), TunnelConfig(turbulence="none"), ServoConfig(), np.random.default_rng(1)
+    )
     plant.hold()
     mocap = VirtualMocap(MocapConfig(), np.random.default_rng(seed), markers(seed=seed))
     for name, value in knobs.items():

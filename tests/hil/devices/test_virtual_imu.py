@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from hil.devices.config import ImuConfig
 from hil.devices.imu import VirtualImu
 from hil.errors import LabError
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 
 GYRO_LSB = math.radians(2000 / 32768)  # [rad/s] data sheet
@@ -21,7 +21,13 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
 def make_plant() -> Plant:
-    plant = Plant(PlantConfig(), TunnelConfig(turbulence="none"), ServoConfig(), np.random.default_rng(1))
+    plant = Plant(
+        GeometryConfig(),
+        PlantConfig(),
+        TunnelConfig(turbulence="none"),
+        ServoConfig(),
+        np.random.default_rng(1),
+    )
     plant.hold()
     return plant
 

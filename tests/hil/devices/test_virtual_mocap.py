@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.mocap import MocapFrame
 from hil.devices.cameras import VirtualMocap
 from hil.devices.config import MocapConfig
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 
 TURN = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
@@ -17,7 +17,13 @@ PLACE = (0.1, 0.2, 0.3)
 
 
 def make_plant() -> Plant:
-    plant = Plant(PlantConfig(), TunnelConfig(turbulence="none"), ServoConfig(), np.random.default_rng(1))
+    plant = Plant(
+        GeometryConfig(),
+        PlantConfig(),
+        TunnelConfig(turbulence="none"),
+        ServoConfig(),
+        np.random.default_rng(1),
+    )
     plant.place(PLACE, TURN.as_quat(scalar_first=True))
     plant.hold()
     return plant

@@ -127,10 +127,11 @@ def test_a_robot_is_recovered_when_it_is_back_in_the_box_before_the_next_disturb
 
 def lift(speed: float, opening: float, variant: str) -> float:
     """Lift over weight on the mounted robot with every flap open alike."""
-    config = load_config("floaty", [f"plant.variant={variant}"]).plant
-    plant = Plant(config, TunnelConfig(), load_config().actuators, np.random.default_rng(1))
+    lab = load_config("floaty", [f"plant.variant={variant}"])
+    config = lab.plant
+    plant = Plant(lab.geometry, config, TunnelConfig(), lab.actuators, np.random.default_rng(1))
     force, _ = plant.mounted_wrench((SIGNS * opening).tolist())
-    return float(force[2]) * (speed / config.airspeed) ** 2 / (config.mass * 9.81)
+    return float(force[2]) * (speed / config.airspeed) ** 2 / (0.340 * 9.81)
 
 
 @pytest.mark.parametrize("speed", [9.5, 9.75, 10.0, 10.25, 10.4])

@@ -13,7 +13,7 @@ from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -27,7 +27,8 @@ def standing(**changes: float) -> Plant:
     config = PlantConfig.model_validate(
         {"tether": {"length": 5.0}, "limits": {"below": 1.2}, "ground": changes}
     )
-    plant = Plant(config, TunnelConfig(turbulence="none"), ServoConfig(), np.random.default_rng(1))
+    calm = TunnelConfig(turbulence="none")
+    plant = Plant(GeometryConfig(), config, calm, ServoConfig(), np.random.default_rng(1))
     plant.tunnel.set_fan_factor(0.0)
     return plant
 

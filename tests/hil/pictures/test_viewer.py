@@ -35,7 +35,8 @@ from hil.live.feed import open_view
 from hil.pictures import curves, monitor, scene, viewer
 from hil.world import layout as at
 from hil.world.body import place_plates
-from hil.world.config import PlantConfig
+from hil.world.config import GeometryConfig, GroundConfig
+from hil.world.geometry import surfaces, weigh
 
 RELEASE_US = load_config().flight.release_us
 angles = st.floats(-1.5, 1.5)
@@ -118,7 +119,9 @@ def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) 
     ]
     (places,) = [batch for batch in still if "Points3D:positions" in batch.schema.names]
     np.testing.assert_allclose(
-        places.column("Points3D:positions").to_pylist()[0], marker_places(PlantConfig()), atol=1e-7
+        places.column("Points3D:positions").to_pylist()[0],
+        marker_places(GeometryConfig(), GroundConfig()),
+        atol=1e-7,
     )
     split = tmp_path / "split.rrd"
     recording = viewer.rr.RecordingStream("test")
@@ -189,20 +192,30 @@ def test_without_rerun_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch
         importlib.import_module("hil.pictures.viewer")
 
 
+SHAPES: tuple[dict[str, object], ...] = (
+    {},
+    {"kink_side": "x", "axis_azimuth": 0.9, "base_side": 0.05},
+    {"dihedral": 0.2, "kink_angle": 1.2},
+    {"outline": [(0.05, 0.0), (0.115, 0.02), (0.1, 0.11), (0.02, 0.09)], "strip_width": 0.03},
+)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
 @given(angles, st.integers(0, 3))
-def test_a_drawn_flap_lies_where_the_plant_has_it(angle: float, flap: int) -> None:
-    plant, s = PlantConfig(), np.zeros(at.SIZE)
-    place_plates(s, plant)
-    mesh = scene.flap_mesh(plant, flap)
+def test_a_drawn_flap_lies_where_the_plant_has_it(shape: dict[str, object], angle: float, flap: int) -> None:
+    geometry, s = GeometryConfig.model_validate(shape), np.zeros(at.SIZE)
+    place_plates(s, geometry, 0.4)
+    mesh = scene.flap_mesh(geometry, flap)
     turn = Rotation.from_quat(
-        scene.turn_quaternion(scene.FLAP_AXES[flap], np.array([angle]))[0], scalar_first=True
+        scene.turn_quaternion(scene.flap_axes(geometry)[flap], np.array([angle]))[0], scalar_first=True
     )
-    vertices = np.add(turn.apply(mesh.vertices), (0, 0, plant.axis_height))
+    vertices = np.add(turn.apply(mesh.vertices), (0, 0, weigh(geometry).axis_height))
+    strip = len(surfaces(geometry)[-1].corners) - 2  # triangles, the last ones
     phi = -angle if flap % 2 == 0 else angle  # the plant's flaps 1 and 3 are mirror images
     series = np.array([1.0, np.cos(phi), np.sin(phi)])
     for plate, triangles in (
-        (2 * flap, _part(mesh, flat=True)),
-        (2 * flap + 1, _part(mesh, flat=False)),
+        (2 * flap, mesh.triangles[:-strip]),
+        (2 * flap + 1, mesh.triangles[-strip:]),
     ):
         part = scene.Mesh(vertices, triangles)
         n, r = (series @ s[base + 9 * plate :][:9].reshape(3, 3) for base in (at.NORMAL, at.CENTRE))
@@ -212,20 +225,15 @@ def test_a_drawn_flap_lies_where_the_plant_has_it(angle: float, flap: int) -> No
         np.testing.assert_allclose(normal, n, atol=1e-12)
 
 
-def _part(mesh: scene.Mesh, flat: bool) -> NDArray[np.int64]:
-    raised = mesh.vertices[mesh.triangles][:, :, 2].max(axis=1) > 0
-    return mesh.triangles[raised != flat]
-
-
 def _area(mesh: scene.Mesh) -> float:
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
 def test_the_lowest_marker_sits_on_the_drawn_stand() -> None:
-    plant = PlantConfig()
-    lowest = min(marker_places(plant), key=lambda place: place[2])
-    foot = scene.stand_lines(plant)[0]
+    geometry, ground = GeometryConfig(), GroundConfig()
+    lowest = min(marker_places(geometry, ground), key=lambda place: place[2])
+    foot = scene.stand_lines(geometry, ground)[0]
     along = [
         np.linalg.norm(lowest - a) + np.linalg.norm(lowest - b) - np.linalg.norm(b - a)
         for a, b in pairwise(foot)
@@ -234,24 +242,24 @@ def test_the_lowest_marker_sits_on_the_drawn_stand() -> None:
 
 
 def test_the_drawn_areas_are_the_papers() -> None:
-    plant = PlantConfig()
-    parts = [scene.base_mesh(plant), *(scene.flap_mesh(plant, flap) for flap in range(4))]
+    geometry = GeometryConfig()
+    parts = [scene.base_mesh(geometry), *(scene.flap_mesh(geometry, flap) for flap in range(4))]
     areas = [_area(part) for part in parts]
     assert areas == pytest.approx([0.0064, 0.0116, 0.0116, 0.0116, 0.0116], abs=5e-5)
     assert sum(areas) == pytest.approx(0.23**2)
 
 
 def test_drag_acts_on_the_turned_flaps(folder: Path) -> None:
-    log, plant = load_log(folder), PlantConfig()
+    log, geometry = load_log(folder), GeometryConfig()
     p_WB = column(log, "truth.x", "truth.y", "truth.z")
     q_WB = column(log, "truth.qw", "truth.qx", "truth.qy", "truth.qz")
     flaps = column(log, *(f"truth.flap_{number}" for number in (1, 2, 3, 4)))
-    origins = scene.drag_origins(plant, p_WB, q_WB, flaps)
+    origins = scene.drag_origins(geometry, p_WB, q_WB, flaps)
     body = Rotation.from_quat(q_WB, scalar_first=True)
     np.testing.assert_allclose(origins[:, 0], p_WB + body.apply([0, 0, 0.07]), atol=1e-12)
     for flap in range(4):
-        turn = body * Rotation.from_rotvec(flaps[:, flap, None] * scene.FLAP_AXES[flap])
-        centre = scene.mesh_centre(scene.flap_mesh(plant, flap))
+        turn = body * Rotation.from_rotvec(flaps[:, flap, None] * scene.flap_axes(geometry)[flap])
+        centre = scene.mesh_centre(scene.flap_mesh(geometry, flap))
         np.testing.assert_allclose(origins[:, flap + 1], origins[:, 0] + turn.apply(centre), atol=1e-12)
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from hil.commands import app
 from hil.config import load_config
 from hil.studies.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, SimplifiedModel, measure
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 
 AZIMUTHS = np.radians((-45.0, 45.0, 135.0, -135.0))  # of the flap axes, outwards
@@ -25,8 +25,8 @@ RHO, AIRSPEED, WEIGHT = 1.225, 10.0, 0.34 * 9.81
 FLAPS = st.lists(st.floats(-1.2, 1.2), min_size=4, max_size=4).map(np.array)
 
 
-def config(kink: float) -> PlantConfig:
-    return PlantConfig(variant="plate", kink_angle=kink)
+def robot(kink: float) -> tuple[GeometryConfig, PlantConfig]:
+    return GeometryConfig(kink_angle=kink), PlantConfig(variant="plate")
 
 
 def by_the_paper(flaps: NDArray[np.float64], kink: float, drag_coefficient: float) -> NDArray[np.float64]:
@@ -64,8 +64,8 @@ def test_model_and_plant_are_the_papers_equations(kink: float, flaps: NDArray[np
     hover = np.radians((25.0, -25.0, 25.0, -25.0))
     drag_coefficient = WEIGHT / by_the_paper(hover, kink, 1.0)[2]
     expected = by_the_paper(flaps, kink, drag_coefficient)
-    assert np.allclose(SimplifiedModel(config(kink)).wrench(flaps), expected, rtol=1e-9, atol=1e-9)
-    plant = Plant(config(kink), TunnelConfig(), ServoConfig(), np.random.default_rng(1))
+    assert np.allclose(SimplifiedModel(*robot(kink)).wrench(flaps), expected, rtol=1e-9, atol=1e-9)
+    plant = Plant(*robot(kink), TunnelConfig(), ServoConfig(), np.random.default_rng(1))
     assert np.allclose(np.concatenate(plant.mounted_wrench(flaps)), expected, rtol=1e-9, atol=1e-9)
 
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from hil.errors import LabError
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 from support.paths import VECTORS
 
@@ -36,7 +36,13 @@ PLATE = {
 
 
 def make(tunnel: TunnelConfig = CALM, seed: int = 1, **config: object) -> Plant:
-    return Plant(PlantConfig.model_validate(config), tunnel, ServoConfig(), np.random.default_rng(seed))
+    return Plant(
+        GeometryConfig(),
+        PlantConfig.model_validate(config),
+        tunnel,
+        ServoConfig(),
+        np.random.default_rng(seed),
+    )
 
 
 def truth(plant: Plant) -> bytes:
@@ -158,7 +164,7 @@ def test_motion_follows_newton_and_euler(variant: str) -> None:
     reference = solve_ivp(slope, (0, 0.3), start, method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
 
     plant = Plant(
-        PlantConfig.model_validate({"variant": variant}), CALM,
+        GeometryConfig(), PlantConfig.model_validate({"variant": variant}), CALM,
         ServoConfig.model_validate({"speed": (0, 0, 0, 0)}), np.random.default_rng(1),
     )  # fmt: skip
     plant.place(start[:3], start[6:10], start[3:6], start[10:], flaps)
@@ -316,9 +322,8 @@ def test_factors_are_true_over_design() -> None:
     [
         {"variant": "plate", "constant_factors": {"roll_u1": 1.1}},
         {"constant_factors": {"roll": 1.1}},
-        {"base_side": 0.3},
-        {"mass": math.nan},
-        {"masss": 0.3},
+        {"airspeed": math.nan},
+        {"airspeeed": 10.0},
     ],
 )
 def test_impossible_designs_are_refused(config: dict[str, object]) -> None:

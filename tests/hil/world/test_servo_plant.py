@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 from hil.world.servos import commanded_angles, next_period_us
 from support.paths import VECTORS
@@ -22,7 +22,9 @@ TAU, RATE = 0.05, 10.5
 
 def make(**servos: object) -> Plant:
     config = ServoConfig.model_validate({"dead_band": 0.0} | servos)
-    plant = Plant(PlantConfig(), TunnelConfig(turbulence="none"), config, np.random.default_rng(1))
+    plant = Plant(
+        GeometryConfig(), PlantConfig(), TunnelConfig(turbulence="none"), config, np.random.default_rng(1)
+    )
     plant.hold()
     return plant
 

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from hil.errors import LabError
 from hil.world import layout as at
-from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -16,7 +16,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 def make(**tunnel: object) -> Plant:
     config = TunnelConfig.model_validate({"turbulence": "none", "hover_height": 1.0} | tunnel)
-    return Plant(PlantConfig(), config, ServoConfig(), np.random.default_rng(5))
+    return Plant(GeometryConfig(), PlantConfig(), config, ServoConfig(), np.random.default_rng(5))
 
 
 def flow(plant: Plant, x: float, y: float, z: float) -> list[float]:
