@@ -41,7 +41,7 @@ FLOORS = (
     ("experiments",),
     ("pictures", "exports"),
     ("servers", "live"),
-    ("api",),
+    ("api", "design"),
     ("studies", "deploy", "testing"),
     ("commands",),
 )
@@ -91,19 +91,20 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "filterpy": (),
     "motioncapture": ("ground_station/sources/motioncapture_process.py",),
-    "scipy": (),
+    "scipy": ("hil/design/",),
     "pytest": ("hil/testing/",),
     "hypothesis": ("hil/testing/strategies.py",),
     "perfetto": ("hil/exports/perfetto.py",),
-    "matplotlib": ("hil/pictures/", "hil/studies/"),
+    "matplotlib": ("hil/pictures/", "hil/studies/", "hil/design/"),
     "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/",
         "hil/live/",
     ),
 }  # fmt: skip
 # BLAS, LAPACK, the C library's functions and numpy's vector code have other last bits on other processors, so they
-# stay out of all that flies; these files look at what was flown.
+# stay out of all that flies; these files look at what was flown, or are done before.
 AFTER_THE_FLIGHT = (
     "hil/laboratory/metrics.py", "hil/pictures/", "hil/experiments/measures.py", "hil/experiments/take_off.py",
+    "hil/design/",
 )  # fmt: skip
 BY_PROCESSOR = """
     math.sin math.cos math.tan math.asin math.acos math.atan math.atan2 math.exp math.expm1 math.log math.log1p math.log2

@@ -9,6 +9,7 @@ import click
 
 from hil.commands.compare import compare
 from hil.commands.deploy import deploy
+from hil.commands.design import design
 from hil.commands.drag_model import drag_model
 from hil.commands.export import export
 from hil.commands.fly import fly
@@ -30,7 +31,8 @@ def app() -> None:
 
 
 for command in (
-    fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, drag_model, deploy,
+    fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, drag_model, design,
+    deploy,
 ):  # fmt: skip
     app.add_command(command)
 

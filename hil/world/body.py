@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,7 @@ class Plate:
     centre: NDArray[np.float64]  # (3,) [m] of pressure
 
 
+@lru_cache(256)
 def flap_plates(geometry: GeometryConfig) -> tuple[Plate, Plate]:
     """Return the flat part and the kinked strip of flap 2."""
     flat, strip = _outlined(geometry) if geometry.outline else _quadrant(geometry)

@@ -161,7 +161,7 @@ class PlantConfig(BaseModel):
         description="plate: isolated plates; else their linearisation is corrected to the paper's Table; section 1",
     )
     airspeed: float = Field(
-        10.0, gt=1, le=30, description="design airspeed of the hover [m/s]; paper, Setup specifications"
+        10.0, gt=1, le=60, description="design airspeed of the hover [m/s]; paper, Setup specifications"
     )
     hover_angle: float = Field(
         math.radians(25), gt=0, le=1.2, description="flap angle of the design hover [rad]; paper: 25 deg"
@@ -216,7 +216,7 @@ class TunnelConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     speed: float = Field(
-        10.0, gt=0, le=30, description="mean flow at the hover point [m/s]; paper, Setup specifications"
+        10.0, gt=0, le=60, description="mean flow at the hover point [m/s]; paper, Setup specifications"
     )
     profile_radius: float = Field(
         0.45, gt=0.05, le=5, description="w(r) = speed / (1 + (r / profile_radius)^6) [m]; assumed"

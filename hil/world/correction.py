@@ -77,7 +77,7 @@ def calm(s: State, speed: float) -> State:
     return c
 
 
-def _accelerations(c: State, cause: str, amount: float) -> State:
+def accelerations(c: State, cause: str, amount: float) -> State:
     """Return ACC (W) and ALPHA (B), (6,), of a calm plant with one cause changed by `amount`."""
     s = c.copy()
     if cause[0] == "u":
@@ -98,8 +98,8 @@ def linearise(s: State, speed: float) -> Constants:
 
     def slope(cause: str) -> State:
         h = DIFFERENCE
-        near = _accelerations(c, cause, h) - _accelerations(c, cause, -h)
-        far = _accelerations(c, cause, 2 * h) - _accelerations(c, cause, -2 * h)
+        near = accelerations(c, cause, h) - accelerations(c, cause, -h)
+        far = accelerations(c, cause, 2 * h) - accelerations(c, cause, -2 * h)
         return (8 * near - far) / (12 * h)
 
     u1, u2, u3, u4 = (slope(cause).tolist() for cause in ("u1", "u2", "u3", "u4"))
@@ -138,7 +138,7 @@ def trim_and_correct(s: State, config: PlantConfig, weight: Weight) -> None:
     if config.variant == "plate":
         return
 
-    lift = [_accelerations(design, "u4", u4)[2] / GRAVITY + 1.0 for u4 in LIFT_SAMPLES.tolist()]
+    lift = [accelerations(design, "u4", u4)[2] / GRAVITY + 1.0 for u4 in LIFT_SAMPLES.tolist()]
     s[at.LIFT_FIT : at.LIFT_FIT + LIFT_ORDER + 1] = fit_polynomial(LIFT_SAMPLES, np.array(lift), LIFT_ORDER)
     L = linearise(design, config.airspeed)
     T = target_constants(config, L)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -114,6 +115,7 @@ def area_and_centre(corners: Points) -> tuple[float, Points]:
     return area, np.array([math.fsum((areas * parts.mean(axis=1)[:, i]).tolist()) / area for i in range(3)])
 
 
+@lru_cache(256)
 def weigh(geometry: GeometryConfig) -> Weight:
     """Return mass, centre of mass and inertia, in steps of 1e-9 kg and m and 1e-12 kg m2. Raises `LabError`."""
     mass, moment, second = 0.0, np.zeros(3), np.zeros((3, 3))  # the two moments about the origin of F

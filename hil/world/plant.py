@@ -21,6 +21,7 @@ from hil.world.correction import Constants, calm, linearise, trim_and_correct
 from hil.world.geometry import weigh
 from hil.world.motion import advance, evaluate
 from hil.world.noise import normal
+from hil.world.plates import State
 from hil.world.servos import commanded_angles, next_period_us
 from hil.world.tunnel import Tunnel
 
@@ -35,6 +36,18 @@ LOSS_TEXTS = {
     at.TETHER_TAUT: "tether taut, {:.2f} m below the hover point",
     at.TUMBLED: "tumbled: tilt {:.2f} rad",
 }
+
+
+def assemble(geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig) -> tuple[State, Tunnel]:
+    """Return the plant's array with the robot, trimmed and corrected, and the knobs of the tunnel around it."""
+    s = np.zeros(at.SIZE)
+    air, weight = Tunnel(tunnel, s), weigh(geometry)
+    place_plates(s, geometry, config.hover_angle)
+    s[at.MASS] = weight.mass * config.mass_factor
+    s[at.INERTIA : at.INERTIA + 3] = np.array(weight.inertia) * config.inertia_factor
+    s[at.DRAG_FACTOR] = config.drag_factor
+    trim_and_correct(s, config, weight)
+    return s, air
 
 
 class Plant:
@@ -60,15 +73,8 @@ class Plant:
         q_WB: Vector = (1.0, 0.0, 0.0, 0.0),
     ) -> None:
         """Start at rest with the flaps at the hover angle, at the hover point unless `p_WB` [m] says otherwise."""
-        self._s = s = np.zeros(at.SIZE)
-        self.tunnel = Tunnel(tunnel, s)
-        weight = weigh(geometry)
-        place_plates(s, geometry, config.hover_angle)
-        s[at.MASS] = weight.mass * config.mass_factor
-        s[at.INERTIA : at.INERTIA + 3] = np.array(weight.inertia) * config.inertia_factor
-        s[at.DRAG_FACTOR] = config.drag_factor
-        self._airspeed = config.airspeed
-        trim_and_correct(s, config, weight)
+        s, self.tunnel = assemble(geometry, config, tunnel)
+        self._s, self._airspeed = s, config.airspeed
 
         tether, ground, limits = config.tether, config.ground, config.limits
         s[at.TETHER_ANCHOR + 2] = tunnel.hover_height + tether.anchor_height

@@ -13,7 +13,7 @@ def geometries(count: int) -> list[GeometryConfig]:
 
 def _geometry(index: int, rng: np.random.Generator) -> GeometryConfig:
     side = rng.uniform(0.05, 0.25)
-    base, mass = rng.uniform(0.15, 0.5) * side, rng.uniform(0.02, 0.6)
+    base, mass = rng.uniform(0.15, 0.5) * side, rng.uniform(8.0, 40.0) * side * side
     trapezoid = ((base, 0.0), (side, 0.2 * side), (side, side), (rng.uniform(1.0, 2.0) * base, 0.9 * side))
     trunk = {"mass": mass, "place": (0, 0, -rng.uniform(0.1, 0.7) * side), "size": (side, side, base)}
     return GeometryConfig.model_validate({

@@ -20,8 +20,9 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
-from hil.world.body import AXIS, MIRRORS
+from hil.world.body import MIRRORS
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.geometry import axis_of
 from hil.world.plant import Plant
 
 ON = MarkersConfig(enabled=True)
@@ -63,8 +64,8 @@ def kabsch(points: Array, body: Array) -> tuple[Array, Array]:
 def test_four_markers_sit_where_no_flap_moves_them() -> None:
     for flap in range(4):
         on_axis = PLACES[flap] - (0, 0, AXIS_HEIGHT)
-        assert np.cross(on_axis, AXIS * MIRRORS[flap]) == pytest.approx(np.zeros(3), abs=1e-12)
-        assert on_axis @ (AXIS * MIRRORS[flap]) > 0.1
+        assert np.cross(on_axis, axis_of(GEOMETRY) * MIRRORS[flap]) == pytest.approx(np.zeros(3), abs=1e-12)
+        assert on_axis @ (axis_of(GEOMETRY) * MIRRORS[flap]) > 0.1
     assert len(PLACES) == COUNT
 
 

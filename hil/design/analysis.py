@@ -1,0 +1,131 @@
+"""Everything that `floaty design` finds out of one robot, and the files that it becomes: pictures, table, page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hil.design import figures
+from hil.design.authority import QUANTITIES, attainable, pressure_at, single, wrenches
+from hil.design.claims import Claim, claims, robot_lines
+from hil.design.sweeps import Point, authorities, hover_angles, scaling, stability
+from hil.pictures.drawing import png
+from hil.pictures.pages import data_uri, write_page
+from hil.world import layout as at
+from hil.world.body import SIGNS
+from hil.world.config import PlantConfig, TunnelConfig
+from hil.world.correction import calm
+from hil.world.motion import evaluate
+from hil.world.plant import assemble
+
+CHECKED = 200  # openings at which plant and plate equations are compared
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture of the design."""
+
+    name: str
+    title: str
+    caption: str
+    content: bytes  # PNG
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """What was found out."""
+
+    point: Point
+    robot: list[tuple[str, str]]
+    inputs: list[tuple[str, str, str]]  # input, alone, about the hover
+    claims: list[Claim]
+    pictures: list[Picture]
+
+
+def model_error(point: Point) -> float:
+    """Return the largest difference between the flown plant and the Supplement's plates, [N] or [N m], over openings."""
+    plant = PlantConfig(variant="plate", airspeed=point.speed, hover_angle=point.opening)
+    s, _ = assemble(point.geometry, plant, TunnelConfig(turbulence="none"))
+    c = calm(s, point.speed)
+    places = np.stack(
+        [np.linspace(point.low, point.high, CHECKED) * f % point.high for f in (1.0, 1.7, 2.3, 3.1)], axis=1
+    )
+    expected = wrenches(point.geometry, places, pressure_at(point.geometry, point.opening))
+    worst = 0.0
+    for openings, wanted in zip(places, expected, strict=True):
+        c[at.FLAPS : at.FLAPS + 4] = SIGNS * openings
+        evaluate(c)
+        worst = max(worst, float(np.abs(c[at.DRAG : at.DRAG + 6] - wanted).max()))
+    return worst
+
+
+def analyse(point: Point) -> Analysis:
+    """Return trim, linear dynamics, authority, sweeps and the paper's claims of a robot, with their pictures."""
+    stable, angles, laws = stability(point), hover_angles(point), scaling(point)
+    reached = attainable(point.geometry, point.opening, point.low, point.high)
+    alone, about = single(point.geometry, point.opening, point.low, point.high), authorities(point)
+    units = dict(zip(QUANTITIES, ("rad/s²", "rad/s²", "rad/s²", "weights"), strict=True))
+    inputs = [
+        (
+            f"u{index + 1}: {name}",
+            f"{alone[name][0]:.3g} to {alone[name][1]:.3g} {units[name]}",
+            f"± {about[name]:.3g} {'m/s²' if name == 'lift' else units[name]}",
+        )
+        for index, name in enumerate(QUANTITIES)
+    ]
+
+    def picture(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> Picture:
+        return Picture(name, title, caption, png(draw))
+
+    pictures = [
+        picture(
+            "shape", "The robot at its hover",
+            "Centre of mass: black dot. The paper's Fig. control_concept d, e: V along y (pitch); along x (roll) Λ with "
+            "flat flaps, _Λ_ with the kink.",
+            lambda: figures.shape(point),
+        ),
+        picture(
+            "stability", "Kink and centre of mass (Fig. robustness f)",
+            "Left: f_αα, black line where it is zero, star: this robot, dot: flat flaps with the centre of mass in their "
+            "plane. Middle and right: over the kink at this robot's centre of mass. Dashed: its kink. The inertia is kept.",
+            lambda: figures.stability(point, stable),
+        ),
+        picture(
+            "hover_angle", "Hover angle (Fig. robustness g)",
+            "Left: input constants, each by its largest. Right: three readings of authority over all axes, with the best "
+            "angle. Green: the paper's 20 to 25°; dashed: this robot.",
+            lambda: figures.hover(point, angles),
+        ),
+        picture(
+            "attainable", "Attainable set",
+            "All combinations of openings inside the flaps' range; orange: those that carry just the weight. Cross: hover.",
+            lambda: figures.reach(point, reached),
+        ),
+        picture(
+            "scaling", "Size and mass (eqs. airflow_proportionality, Reynold_numbers)",
+            "Similar robots at the same hover angle; the legend has the fitted exponent.",
+            lambda: figures.scale(laws),
+        ),
+    ]  # fmt: skip
+    found = claims(point, stable, angles, laws, model_error(point))
+    return Analysis(point, robot_lines(point), inputs, found, pictures)
+
+
+def write(analysis: Analysis, folder: Path) -> Path:
+    """Write `design.html`, `design.json` and the pictures; returns the page."""
+    for one in analysis.pictures:
+        (folder / f"{one.name}.png").write_bytes(one.content)
+    content = {
+        "geometry": analysis.point.geometry.model_dump(),
+        "constants": asdict(analysis.point.linear.constants),
+        "robot": dict(analysis.robot),
+        "claims": [asdict(claim) for claim in analysis.claims],
+    }
+    (folder / "design.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    shown = [(one, data_uri(one.content)) for one in analysis.pictures]
+    return write_page(folder / "design.html", "design.html.j2", analysis=analysis, shown=shown)

@@ -1,0 +1,196 @@
+"""Pictures of a design: the robot itself, its stability, its hover angle, its reach, and its laws of scale."""
+
+from __future__ import annotations
+
+from math import degrees
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
+from numpy.typing import NDArray
+
+from hil.design.authority import QUANTITIES, Attainable, hull
+from hil.design.sweeps import FACTORS, HEIGHTS, KINKS, OPENINGS, HoverAngles, Law, Point, Stability
+from hil.pictures import scene
+from hil.pictures.curves import (
+    AXIS_COLOURS,
+    BLUE,
+    FLAP_COLOURS,
+    GREEN,
+    GREY,
+    ORANGE,
+    PINK,
+    RED,
+    SERIES_COLOURS,
+)
+from hil.pictures.drawing import WIDTH
+from hil.world.body import SIGNS
+from hil.world.geometry import weigh
+
+COLOURS = dict(zip(QUANTITIES, (*AXIS_COLOURS, ORANGE), strict=True))
+PAPER_BAND_DEG = (20.0, 25.0)
+Points = NDArray[np.float64]
+
+
+def shape(point: Point) -> Figure:
+    """Draw the robot at its hover: from above, along x and along y."""
+    figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
+    height = weigh(point.geometry).axis_height
+    base = scene.base_mesh(point.geometry)
+    parts = [(base.vertices[base.triangles] + (0.0, 0.0, height), GREY)]
+    for flap, axis in enumerate(scene.flap_axes(point.geometry)):
+        mesh = scene.flap_mesh(point.geometry, flap)
+        q = scene.turn_quaternion(axis, np.array([SIGNS[flap] * point.opening]))
+        turned = scene.rotated(q, mesh.vertices) + np.array([0.0, 0.0, height])
+        parts.append((turned[mesh.triangles], FLAP_COLOURS[flap]))
+    views = (("from above", 1, 0), ("along x: roll", 1, 2), ("along y: pitch", 0, 2))
+    for axes, (title, across, up) in zip(figure.subplots(1, 3), views, strict=True):
+        for triangles, colour in parts:
+            for triangle in triangles:
+                plan = 100 * triangle[:, [across, up]]
+                axes.add_patch(Polygon(plan, facecolor=colour, alpha=0.35, edgecolor=colour, linewidth=0.4))
+        if up == 2:
+            axes.plot([0, 0], [0, 100 * height], color=GREY)
+            axes.plot(0, 0, "o", color="black", markersize=4)
+        half = 60 * point.geometry.footprint
+        axes.set_xlim((half, -half) if across == 1 else (-half, half))  # y is to the left of x
+        axes.set_ylim((-half, half) if up == 0 else (-0.35 * half, 1.3 * half))
+        axes.set_aspect("equal")
+        axes.set_title(title)
+        axes.set_xlabel(("y" if across else "x") + " [cm]")
+        axes.set_ylabel(("z" if up else "x") + " [cm]")
+    return figure
+
+
+def stability(point: Point, sweep: Stability) -> Figure:
+    """Draw f_αα over kink and centre of mass, and beside it f_αα and the roll poles over the kink."""
+    figure = Figure(figsize=(WIDTH, 3.3), layout="constrained")
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1.25, 1, 1))
+    kinks, own = np.degrees(KINKS), degrees(point.geometry.kink_angle)
+    size = float(np.abs(sweep.stiffness).max())
+    surface = left.contourf(
+        kinks, 100 * HEIGHTS, sweep.stiffness, np.linspace(-size, size, 21), cmap="RdBu_r"
+    )
+    left.contour(kinks, 100 * HEIGHTS, sweep.stiffness, [0.0], colors="black", linewidths=1.5)
+    left.plot(own, 100 * weigh(point.geometry).axis_height, "*", color="black", markersize=10)
+    left.plot(0.0, 0.0, "o", color="black", clip_on=False)
+    left.set_xlabel("kink [deg]")
+    left.set_ylabel("centre of mass below the flaps [cm]")
+    figure.colorbar(surface, ax=left, label="f_αα [1/s²]: red falls over")
+    middle.plot(kinks, sweep.along, color=BLUE)
+    middle.axhline(0.0, color=GREY)
+    middle.axvline(own, color="#ff5733", linestyle="--")
+    if np.isfinite(sweep.crossing):
+        middle.plot(degrees(sweep.crossing), 0.0, "o", color=RED)
+        middle.annotate(
+            f"{degrees(sweep.crossing):.1f}°",
+            (degrees(sweep.crossing), 0.0),
+            (4, 6),
+            textcoords="offset points",
+        )
+    middle.set_xlabel("kink [deg]")
+    middle.set_ylabel("f_αα [1/s²]")
+    for index in range(3):
+        right.plot(kinks, sweep.poles[:, index].real, ".", color=BLUE, label="real" if index == 0 else None)
+        right.plot(
+            kinks, sweep.poles[:, index].imag, ".", color=ORANGE, label="imaginary" if index == 0 else None
+        )
+    right.axhline(0.0, color=GREY)
+    right.axvline(own, color="#ff5733", linestyle="--")
+    right.set_xlabel("kink [deg]")
+    right.set_ylabel("roll poles [1/s]")
+    right.legend()
+    return figure
+
+
+def hover(point: Point, sweep: HoverAngles) -> Figure:
+    """Draw the input constants over the hover angle, each by its largest, and what "over all axes" makes of them."""
+    figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
+    left, right = figure.subplots(1, 2, sharex=True)
+    angles = np.degrees(OPENINGS)
+    for name in QUANTITIES:
+        values = sweep.constants[name]
+        left.plot(angles, values / np.abs(values).max(), color=COLOURS[name], label=name)
+    left.axhline(0.0, color=GREY)
+    left.set_ylabel("input constant / its largest")
+    left.legend()
+    for index, (name, curve) in enumerate(sweep.criteria.items()):
+        best = degrees(sweep.best(name)[0])
+        right.plot(angles, curve, color=SERIES_COLOURS[index], label=f"{name}: {best:.1f}°")
+        right.plot(best, 1.0, "o", color=SERIES_COLOURS[index])
+    right.set_ylabel("share of the best")
+    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    for axes in (left, right):
+        axes.axvspan(*PAPER_BAND_DEG, color=GREEN, alpha=0.12)
+        axes.axvline(degrees(point.opening), color="#2ecc71", linestyle="--")
+        axes.set_xlabel("hover angle [deg]")
+    return figure
+
+
+def reach(point: Point, found: Attainable) -> Figure:
+    """Draw the attainable set, quantity against quantity; the inner one carries just the weight."""
+    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+    pairs = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
+    for axes, (a, b) in zip(figure.subplots(2, 3).flat, pairs, strict=True):
+        for points, colour, label in (
+            (found.all, BLUE, "any lift"), (found.level, ORANGE, "lift = weight ± 2 %"),
+        ):  # fmt: skip
+            if b == 3 and colour == ORANGE:
+                continue
+            _outline(axes, points[:, [a, b]], colour, label)
+        axes.plot(0.0, 1.0 if b == 3 else 0.0, "+", color="black")
+        for setter, index in ((axes.set_xlabel, a), (axes.set_ylabel, b)):
+            setter("lift [weights]" if index == 3 else f"{QUANTITIES[index]} [rad/s²]")
+    figure.axes[0].legend(loc="upper left")
+    figure.suptitle(
+        f"hover at {degrees(point.opening):.0f}°, flaps {degrees(point.low):.0f} to {degrees(point.high):.0f}°",
+        fontsize=9,
+    )
+    return figure
+
+
+def _outline(axes: Axes, points: Points, colour: str, label: str) -> None:
+    if len(points) > 2:
+        axes.fill(*hull(points).T, facecolor=colour, alpha=0.25, edgecolor=colour, label=label)
+
+
+def scale(laws: tuple[Law, ...]) -> Figure:
+    """Draw every law on logarithmic axes, relative to the robot itself."""
+    figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
+    causes = ("l", "m", "m / l²")
+    for axes, cause in zip(figure.subplots(1, 3), causes, strict=True):
+        for index, law in enumerate(one for one in laws if one.cause == cause):
+            order = np.argsort(law.x)
+            own = len(FACTORS) // 2
+            axes.loglog(
+                law.x[order] / law.x[own], law.y[order] / law.y[own], marker="o", markersize=3, color=SERIES_COLOURS[index],
+                linestyle=("-", "--", ":")[index % 3],
+                label=f"{law.quantity}: {round(law.exponent, 6) + 0.0:+.3f} (paper {law.paper:+g})",
+            )  # fmt: skip
+        axes.set_xlabel(f"{cause}, relative")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(FixedLocator([0.25, 0.5, 1.0, 2.0, 4.0]))
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_locator(NullLocator())
+        axes.set_ylim(0.2, 8.0)
+        axes.legend(fontsize=6.5, loc="upper center")
+    figure.axes[0].set_ylabel("relative")
+    return figure
+
+
+def pareto(
+    names: tuple[str, str], found: Points, front: Points, marks: dict[str, tuple[float, float]]
+) -> Figure:
+    """Draw what an optimisation tried (N, 2), the front of what nothing beats (M, 2), and robots by name."""
+    figure = Figure(figsize=(0.7 * WIDTH, 3.6), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(*found.T, ".", color=GREY, markersize=2, alpha=0.5, label="tried")
+    axes.plot(*front.T, "-", color=BLUE, label="nothing beats both")
+    for (name, place), colour in zip(marks.items(), (RED, GREEN, PINK), strict=False):
+        axes.plot(*place, "*", color=colour, markersize=11, label=name)
+    axes.set_xlabel(names[0])
+    axes.set_ylabel(names[1])
+    axes.legend()
+    return figure

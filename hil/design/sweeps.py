@@ -1,0 +1,202 @@
+"""Sweeps over the shape: where roll is stable, which hover angle leaves most authority, what size and mass change."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.design.authority import QUANTITIES, authority, reach
+from hil.design.linear import Linear, linear, stiffness
+from hil.design.trim import balanced, changed, scaled, speed_at
+from hil.world.body import AIR_DENSITY
+from hil.world.config import GeometryConfig
+from hil.world.geometry import weigh
+
+KINKS = np.radians(np.arange(0.0, 90.1, 3.75))
+HEIGHTS = np.arange(0.0, 0.1201, 0.015)  # [m] of the flap axes above the centre of mass
+OPENINGS = np.radians(np.arange(10.0, 45.1, 0.5))
+FACTORS = np.array([0.5, 0.7, 1.0, 1.4, 2.0])  # on length or mass
+VISCOSITY = 1.81e-5  # [Pa s] of air at 15 deg C, dynamic
+NEAR_BEST = 0.95  # of the best: the range of hover angles that is as good
+Curve = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A robot at its hover."""
+
+    geometry: GeometryConfig
+    coefficient: float  # of drag
+    opening: float  # [rad]
+    low: float  # [rad] least and greatest opening
+    high: float
+
+    @property
+    def speed(self) -> float:
+        """The updraft [m/s]."""
+        return speed_at(self.geometry, self.coefficient, self.opening)
+
+    @property
+    def linear(self) -> Linear:
+        """Its dynamics."""
+        return linear(self.geometry, self.speed, self.opening)
+
+
+@dataclass(frozen=True, slots=True)
+class Stability:
+    """f_αα [1/s2] over kink and height, and the roll poles over the kink at the robot's own height; the inertia is kept."""
+
+    stiffness: Curve  # (HEIGHTS, KINKS)
+    along: Curve  # (KINKS,) at the robot's own height
+    poles: NDArray[np.complex128]  # (KINKS, 3)
+    crossing: float  # [rad] kink at which f_αα is 0 at that height, NaN: nowhere
+
+
+def stability(point: Point) -> Stability:
+    """Return the sweep over kink and centre of mass, at the same hover angle."""
+    rows = [balanced(point.geometry, height, keep_inertia=True) for height in HEIGHTS.tolist()]
+    surface = [[_stiffness(point, row, kink) for kink in KINKS.tolist()] for row in rows]
+    along = np.array([_stiffness(point, point.geometry, kink) for kink in KINKS.tolist()])
+    kinked = [changed(point.geometry, kink_angle=kink) for kink in KINKS.tolist()]
+    poles = [_at(point, one).linear.poles("roll") for one in kinked]
+    falling = np.flatnonzero((along[:-1] > 0.0) & (along[1:] <= 0.0))
+    crossing = np.nan
+    if len(falling):
+        crossing = _zero(
+            lambda kink: _stiffness(point, point.geometry, kink), KINKS[falling[0]], KINKS[falling[0] + 1]
+        )
+    return Stability(np.array(surface), along, np.array(poles), crossing)
+
+
+def _at(point: Point, geometry: GeometryConfig) -> Point:
+    return Point(geometry, point.coefficient, point.opening, point.low, point.high)
+
+
+def _stiffness(point: Point, geometry: GeometryConfig, kink: float) -> float:
+    bent = changed(geometry, kink_angle=kink)
+    return stiffness(bent, speed_at(bent, point.coefficient, point.opening), point.opening)
+
+
+def _zero(of: Callable[[float], float], above: float, below: float) -> float:
+    for _ in range(40):
+        middle = (above + below) / 2
+        above, below = (middle, below) if of(middle) > 0.0 else (above, middle)
+    return above
+
+
+@dataclass(frozen=True, slots=True)
+class HoverAngles:
+    """Input constants over the hover angle, and what three readings of "authority over all axes" make of them."""
+
+    constants: Mapping[str, Curve]  # by QUANTITIES, (OPENINGS,), signed
+    criteria: Mapping[str, Curve]  # each as a share of its best
+
+    def best(self, criterion: str) -> tuple[float, float, float]:
+        """Return the best hover angle and the range within 5 % of it [rad]."""
+        curve = self.criteria[criterion]
+        near = OPENINGS[curve >= NEAR_BEST * curve.max()]
+        return float(OPENINGS[curve.argmax()]), float(near[0]), float(near[-1])
+
+
+def hover_angles(point: Point) -> HoverAngles:
+    """Return the sweep over the hover angle; the updraft follows."""
+    found = [
+        Point(point.geometry, point.coefficient, o, point.low, point.high).linear.constants
+        for o in OPENINGS.tolist()
+    ]
+    names = dict(zip(QUANTITIES, ("roll_u1", "pitch_u2", "yaw_u3", "z_u4"), strict=True))
+    constants = {key: np.array([getattr(f, name) for f in found]) for key, name in names.items()}
+    sizes = {key: np.maximum(values, 0.0) for key, values in constants.items()}
+    shares = np.array([sizes[key] / sizes[key].max() for key in QUANTITIES])
+    reaches = np.array([reach(opening, point.low, point.high) for opening in OPENINGS.tolist()])
+    criteria = {
+        "√(yaw · lift)": np.sqrt(sizes["yaw"] * sizes["lift"]),
+        "mean of four × flaps' reach": np.prod(shares, axis=0) ** 0.25 * reaches,
+        "least of four, each by its largest": shares.min(axis=0),
+    }
+    return HoverAngles(constants, {name: curve / curve.max() for name, curve in criteria.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """A power law: fitted on a sweep, and the paper's."""
+
+    quantity: str
+    cause: str
+    x: Curve
+    y: Curve
+    exponent: float
+    paper: float
+
+
+def scaling(point: Point) -> tuple[Law, ...]:
+    """Return what size and mass do at the same hover angle."""
+    sizes = [_at(point, scaled(point.geometry, factor, 1.0)) for factor in FACTORS.tolist()]
+    masses = [_at(point, scaled(point.geometry, 1.0, factor)) for factor in FACTORS.tolist()]
+
+    def law(
+        quantity: str, cause: str, points: list[Point], of: Callable[[Point], float], paper: float
+    ) -> Law:
+        x = np.array([_CAUSES[cause](one) for one in points])
+        y = np.array([abs(of(one)) for one in points])
+        return Law(quantity, cause, x, y, float(np.polyfit(np.log(x), np.log(y), 1)[0]), paper)
+
+    return (
+        law("roll acceleration per input", "l", sizes, lambda p: p.linear.constants.roll_u1, -1.0),
+        law("pitch acceleration per input", "l", sizes, lambda p: p.linear.constants.pitch_u2, -1.0),
+        law("yaw acceleration per input", "l", sizes, lambda p: p.linear.constants.yaw_u3, -1.0),
+        law("lift acceleration per input", "l", sizes, lambda p: p.linear.constants.z_u4, 0.0),
+        law(
+            "lift acceleration / l per input",
+            "l",
+            sizes,
+            lambda p: p.linear.constants.z_u4 / _length(p),
+            -1.0,
+        ),
+        law("roll acceleration per input", "m", masses, lambda p: p.linear.constants.roll_u1, 0.0),
+        law("airspeed", "m / l²", [*sizes, *masses], lambda p: p.speed, 0.5),
+        law("Reynolds number", "l", sizes, reynolds, 0.0),
+        law("Reynolds number", "m", masses, reynolds, 0.5),
+    )
+
+
+def reynolds(point: Point) -> float:
+    """Return the Reynolds number over the side of the footprint."""
+    return AIR_DENSITY * point.speed * _length(point) / VISCOSITY
+
+
+def _length(point: Point) -> float:
+    return point.geometry.footprint
+
+
+_CAUSES: Mapping[str, Callable[[Point], float]] = {
+    "l": _length,
+    "m": lambda point: weigh(point.geometry).mass,
+    "m / l²": lambda point: weigh(point.geometry).mass / _length(point) ** 2,
+}
+
+
+def updrafts(point: Point, reserve: float) -> tuple[float, float]:
+    """Return the least and greatest updraft [m/s] that the flaps hold with `reserve` [rad] left to both limits."""
+    return (
+        speed_at(point.geometry, point.coefficient, point.low + reserve),
+        speed_at(point.geometry, point.coefficient, point.high - reserve),
+    )
+
+
+FLAT = {"kink_angle": 0.0}
+RESERVE = radians(8.0)  # of the opening, for attitude: 95 % of the hover's time (hil/experiments/airspeed.py)
+
+
+def flat_high(point: Point) -> Point:
+    """Return the paper's first idea: flat flaps, the centre of mass in their plane; the inertia is kept."""
+    return _at(point, balanced(changed(point.geometry, **FLAT), 0.0, keep_inertia=True))
+
+
+def authorities(point: Point) -> dict[str, float]:
+    """Return the authority of each input about the hover."""
+    return authority(point.linear, point.opening, point.low, point.high)

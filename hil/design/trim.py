@@ -1,0 +1,104 @@
+"""Hover angle and airspeed of a robot whose drag coefficient is known, and robots of another size, mass or balance.
+
+The coefficient is that of the plates and stays when shape, mass or speed change: it is the profile's, which its design
+airspeed and hover angle fix. Openings are flap angles, positive for every flap.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hil.config import LabConfig
+from hil.errors import LabError
+from hil.world.body import drag_coefficient
+from hil.world.config import GeometryConfig
+from hil.world.geometry import weigh
+
+OPENINGS = np.radians(np.arange(-20.0, 75.5, 0.5))  # searched for a trim
+BISECTIONS = 50
+
+
+def coefficient_of(config: LabConfig) -> float:
+    """Return the drag coefficient with which a profile's robot hovers at its design point."""
+    return drag_coefficient(config.geometry, config.plant.airspeed, config.plant.hover_angle)
+
+
+def speed_at(geometry: GeometryConfig, coefficient: float, opening: float) -> float:
+    """Return the updraft [m/s] that carries the robot at an opening [rad] of all flaps."""
+    return math.sqrt(drag_coefficient(geometry, 1.0, opening) / coefficient)
+
+
+def opening_at(geometry: GeometryConfig, coefficient: float, speed: float) -> float:
+    """Return the opening [rad] of the hover at a speed [m/s]: where opening the flaps further makes the robot sink.
+
+    Raises `LabError` when there is none.
+    """
+    speeds = np.array([speed_at(geometry, coefficient, opening) for opening in OPENINGS.tolist()])
+    below = np.flatnonzero((speeds[:-1] <= speed) & (speeds[1:] > speed))
+    if not len(below):
+        raise LabError(
+            f"no hover at {speed:g} m/s: with openings of {math.degrees(OPENINGS[0]):.0f} to "
+            f"{math.degrees(OPENINGS[-1]):.0f} deg the flaps carry {weigh(geometry).mass:.3g} kg at "
+            f"{speeds.min():.2f} to {speeds.max():.2f} m/s"
+        )
+    low, high = OPENINGS[below[-1]], OPENINGS[below[-1] + 1]
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if speed_at(geometry, coefficient, middle) <= speed else (low, middle)
+    return float(low)
+
+
+def changed(geometry: GeometryConfig, **changes: Any) -> GeometryConfig:
+    """Return a geometry with some values replaced, checked like a profile's."""
+    return GeometryConfig.model_validate(geometry.model_dump() | changes)
+
+
+def scaled(geometry: GeometryConfig, length: float, mass: float) -> GeometryConfig:
+    """Return the similar robot: all lengths times `length`, all masses times `mass`."""
+    masses = [
+        one.model_dump()
+        | {
+            "mass": mass * one.mass,
+            "place": tuple(length * x for x in one.place),
+            "size": tuple(length * x for x in one.size),
+        }
+        for one in geometry.masses
+    ]
+    inertia = geometry.inertia
+    if inertia != "masses":
+        inertia = (*(mass * length * length * moment for moment in inertia),)  # type: ignore[assignment]
+    lengths = {
+        name: length * getattr(geometry, name)
+        for name in ("footprint", "base_side", "strip_width", "flow_point")
+    }
+    outline = tuple((length * x, length * y) for x, y in geometry.outline)
+    return changed(
+        geometry,
+        **lengths,
+        outline=outline,
+        flap_mass=mass * geometry.flap_mass,
+        masses=masses,
+        inertia=inertia,
+    )
+
+
+def balanced(geometry: GeometryConfig, height: float, keep_inertia: bool = False) -> GeometryConfig:
+    """Return the robot whose centre of mass is `height` [m] below the flap axes, because `masses` hang higher or lower.
+
+    A fitted inertia grows like that of the masses, unless it is kept.
+    """
+    before = weigh(geometry)
+    hung = sum(one.mass * (4 if one.mirrored else 1) for one in geometry.masses)
+    down = (height - before.axis_height) * before.mass / hung
+    masses = [
+        one.model_dump() | {"place": (one.place[0], one.place[1], one.place[2] - down)}
+        for one in geometry.masses
+    ]
+    moved = changed(geometry, masses=masses)
+    if keep_inertia or geometry.inertia == "masses":
+        return moved
+    old, new = (weigh(changed(one, inertia="masses")).inertia for one in (geometry, moved))
+    return changed(moved, inertia=tuple(i * b / a for i, a, b in zip(before.inertia, old, new, strict=True)))

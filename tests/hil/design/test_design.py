@@ -1,0 +1,239 @@
+"""The design against the flown plant, the specification's printed figures, and the laws that every geometry obeys."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from hil.commands import app
+from hil.config import load_config
+from hil.design import sweeps
+from hil.design.authority import attainable, hull, pressure_at, single, wrenches
+from hil.design.claims import PLUS_MINUS, claims
+from hil.design.linear import Linear, linear
+from hil.design.sweeps import Point
+from hil.design.trim import balanced, changed, coefficient_of, opening_at, scaled, speed_at
+from hil.errors import LabError
+from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.geometry import weigh
+from hil.world.plant import Plant
+from support.geometries import geometries
+
+G0, COEFFICIENT = load_config().geometry, coefficient_of(load_config())
+HOVER = math.radians(25.0)
+PAPER = Point(G0, COEFFICIENT, HOVER, 0.0, 0.9)
+UNIFORM = TunnelConfig(turbulence="none", profile_radius=5.0, height_slope=0.0)
+HOME = (0.0, 0.0, UNIFORM.hover_height)
+# Paper, eq. (input_signals): flap angles per u1..u4
+MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)
+SIGNS = np.array([1.0, -1.0, 1.0, -1.0])
+# physics.md section 3, column "plate G0"
+PRINTED = {
+    "roll_u1": 188.6, "roll_roll": -15.97, "roll_rate": -1.64, "y_u1": -3.55, "y_roll": -7.64, "pitch_u2": 78.7,
+    "pitch_pitch": -119, "pitch_rate": -3.2, "x_u2": -3.87, "x_pitch": 8.09, "yaw_u3": 110.0, "yaw_rate": -0.46,
+    "z_u4": 8.88, "z_vz": -1.962,
+}  # fmt: skip
+INSIDE = {"roll_u1", "roll_roll", "yaw_u3", "z_vz"}  # of the Table's uncertainty, the same column
+
+
+def flown(geometry: GeometryConfig, speed: float, opening: float) -> Plant:
+    config = PlantConfig(variant="plate", airspeed=speed, hover_angle=opening)
+    tunnel = UNIFORM.model_copy(update={"speed": speed})
+    return Plant(geometry, config, tunnel, ServoConfig(), np.random.default_rng(1))
+
+
+def by_differences(plant: Plant, opening: float) -> NDArray[np.float64]:
+    """Central differences of the flown plant's accelerations, (6, 13), by velocity, turn, rate and input."""
+    step = 1e-5
+    columns = []
+    for cause in range(13):
+        ends = []
+        for sign in (1.0, -1.0):
+            x = np.zeros(13)
+            x[cause] = sign * step
+            turn = Rotation.from_rotvec(x[3:6]).as_quat(scalar_first=True)
+            plant.place(HOME, turn, x[:3], x[6:9], SIGNS * opening + MIX @ x[9:])
+            ends.append(np.concatenate([plant.acceleration_W, plant.alpha_B]))
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("geometry", geometries(20))
+def test_linearisation_is_the_central_difference_of_the_flown_plant(geometry: GeometryConfig) -> None:
+    speed = speed_at(geometry, 1.3, HOVER)
+    plant, model = flown(geometry, speed, HOVER), linear(geometry, speed, HOVER)
+    seen = by_differences(plant, HOVER)
+    ours = np.vstack([np.hstack([model.A[rows], model.B[rows]]) for rows in (slice(0, 3), slice(6, 9))])
+    assert ours == pytest.approx(seen, rel=1e-5, abs=1e-6 * np.abs(seen).max())
+    assert model.A[3:6, 6:] == pytest.approx(np.eye(3))
+    for name, value in ((name, getattr(plant.linearise(), name)) for name in PRINTED):
+        assert getattr(model.constants, name) == pytest.approx(value, rel=1e-9, abs=1e-9), name
+
+
+def test_g0_has_the_constants_and_poles_that_the_specification_prints() -> None:
+    model = PAPER.linear
+    for name, value in PRINTED.items():
+        assert getattr(model.constants, name) == pytest.approx(value, rel=0.012), name
+    roll = model.poles("roll")
+    assert roll[0] == pytest.approx(complex(-0.42, 3.91), abs=0.005)
+    assert roll[1] == pytest.approx(roll[0].conjugate())
+    assert roll[2] == pytest.approx(-1.01, abs=0.005)
+
+
+def test_the_first_robot_falls_over_as_the_specification_prints() -> None:
+    high = sweeps.flat_high(PAPER)
+    assert high.linear.constants.roll_roll == pytest.approx(89.5, abs=0.05)
+    light = changed(high.geometry, inertia=(1.16e-3, 1.16e-3, 1.47e-3))
+    assert linear(light, high.speed, HOVER).constants.roll_roll == pytest.approx(100.3, abs=0.05)
+    low = linear(changed(G0, kink_angle=0.0), 10.0, HOVER)
+    assert low.constants.roll_roll == pytest.approx(56.5, abs=0.05)
+    assert low.growth("roll") == pytest.approx(7.5, abs=0.05)
+
+
+@pytest.mark.parametrize("geometry", geometries(20))
+def test_size_and_mass_scale_every_geometry_exactly(geometry: GeometryConfig) -> None:
+    length, mass = 0.6, 1.7
+    other = scaled(geometry, length, mass)
+    before, after = speed_at(geometry, 1.3, HOVER), speed_at(other, 1.3, HOVER)
+    assert after / before == pytest.approx(math.sqrt(mass) / length, rel=1e-6)
+    f, g = linear(geometry, before, HOVER).constants, linear(other, after, HOVER).constants
+    for name in ("roll_u1", "pitch_u2", "yaw_u3", "roll_roll", "pitch_pitch"):
+        assert getattr(g, name) == pytest.approx(getattr(f, name) / length, rel=1e-5, abs=1e-6), name
+    for name in ("z_u4", "y_u1", "x_u2", "y_roll"):
+        assert getattr(g, name) == pytest.approx(getattr(f, name), rel=1e-5, abs=1e-6), name
+
+
+@pytest.mark.parametrize("geometry", geometries(20))
+def test_plates_in_one_array_are_the_flown_ones(geometry: GeometryConfig) -> None:
+    plant = flown(geometry, speed_at(geometry, 1.3, HOVER), HOVER)
+    openings = np.random.default_rng(2).uniform(-0.4, 1.2, (5, 4))
+    found = wrenches(geometry, openings, pressure_at(geometry, HOVER))
+    for opening, wrench in zip(openings, found, strict=True):
+        seen = np.concatenate(plant.mounted_wrench((SIGNS * opening).tolist()))
+        assert wrench == pytest.approx(seen, rel=1e-9, abs=1e-12)
+
+
+def test_hover_angle_and_speed_are_each_others_inverse() -> None:
+    assert speed_at(G0, COEFFICIENT, HOVER) == pytest.approx(10.0, rel=1e-12)
+    for speed in (9.3, 10.0, 11.7, 13.0):
+        assert speed_at(G0, COEFFICIENT, opening_at(G0, COEFFICIENT, speed)) == pytest.approx(speed, rel=1e-9)
+
+
+def test_an_updraft_that_carries_nobody_is_refused_in_one_line() -> None:
+    with pytest.raises(LabError, match=r"no hover at 8 m/s: .* carry 0\.34 kg at 9\.19 to") as caught:
+        opening_at(G0, COEFFICIENT, 8.0)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_centre_of_mass_moves_and_the_fitted_inertia_follows_the_masses() -> None:
+    lower = balanced(G0, 0.09)
+    assert weigh(lower).mass == weigh(G0).mass
+    assert weigh(lower).axis_height == pytest.approx(0.09, abs=1e-9)
+    old, new = (weigh(changed(one, inertia="masses")).inertia for one in (G0, lower))
+    assert new[0] > old[0]
+    assert new[2] == pytest.approx(old[2])
+    grown = [b / a for a, b in zip(weigh(G0).inertia, weigh(lower).inertia, strict=True)]
+    assert grown == pytest.approx([b / a for a, b in zip(old, new, strict=True)])
+    assert weigh(balanced(G0, 0.09, keep_inertia=True)).inertia == weigh(G0).inertia
+    assert weigh(balanced(G0, 0.07)).inertia == pytest.approx(weigh(G0).inertia)
+
+
+def test_the_hull_is_scipy_s() -> None:
+    points = np.random.default_rng(3).normal(size=(300, 2))
+    assert len(hull(points)) == len(ConvexHull(points).vertices) + 1
+    assert {tuple(p) for p in hull(points)} == {tuple(p) for p in points[ConvexHull(points).vertices]}
+
+
+def test_inputs_alone_end_at_the_flaps_limits() -> None:
+    plant = flown(G0, 10.0, HOVER)
+
+    def at(*openings: float) -> NDArray[np.float64]:
+        force, torque = plant.mounted_wrench((SIGNS * openings).tolist())
+        return np.array([*(torque / weigh(G0).inertia), force[2] / (0.34 * 9.81)])
+
+    alone = single(G0, HOVER, 0.0, 0.9)
+    assert alone["lift"][0] == pytest.approx(at(*4 * (0.9,))[3])
+    assert alone["lift"][1] == pytest.approx(
+        at(*4 * (math.radians(3.6),))[3], rel=1e-3
+    )  # bent strips lie level then
+    closed, opened = 0.0, 2 * HOVER
+    # the supplement's Delta: u1 opens flap 1 and 4, u3 closes 1 and 3
+    assert alone["roll"][1] == pytest.approx(at(opened, closed, closed, opened)[0])
+    assert alone["pitch"][1] == pytest.approx(abs(at(opened, opened, closed, closed)[1]))
+    assert alone["yaw"][1] == pytest.approx(at(closed, opened, closed, opened)[2])
+
+
+def test_the_attainable_set_contains_what_single_inputs_do_and_is_mirror_symmetric() -> None:
+    found = attainable(G0, HOVER, 0.0, 0.9)
+    alone = single(G0, HOVER, 0.0, 0.9)
+    for index, (least, most) in enumerate(alone.values()):
+        assert found.all[:, index].min() <= least + 1e-9
+        assert found.all[:, index].max() >= 0.95 * most  # on a grid
+    assert np.abs(found.level[:, 3] - 1.0).max() < 0.02
+    for index in range(3):
+        assert found.all[:, index].max() == pytest.approx(-found.all[:, index].min())
+
+
+def test_roll_becomes_stable_where_the_specification_says_and_best_hover_angles_too() -> None:
+    stable = sweeps.stability(PAPER)
+    assert math.degrees(stable.crossing) == pytest.approx(33.7, abs=0.05)
+    assert stable.along[0] == pytest.approx(56.5, abs=0.05)
+    angles = sweeps.hover_angles(PAPER)
+    best = [math.degrees(angles.best(name)[0]) for name in angles.criteria]
+    assert best[:2] == pytest.approx([25.0, 26.0], abs=0.75)  # section 3, "theta_H 20-25 deg optimal"
+    assert np.interp(math.radians(17.5), sweeps.OPENINGS, angles.constants["pitch"]) == pytest.approx(
+        0, abs=6
+    )
+    verdicts = {
+        claim.title: claim.verdict for claim in claims(PAPER, stable, angles, sweeps.scaling(PAPER), 0.0)
+    }
+    inside = {name for name in PLUS_MINUS if verdicts[name.replace("_", " per ")] == "agrees"}
+    assert inside == INSIDE
+    assert verdicts["lateral forces cancel under u1 and u2"] == "differs"
+    assert verdicts["airspeed over m / l²"] == "agrees"
+
+
+def test_the_slowest_pole_is_never_hidden() -> None:
+    spun = Linear(np.diag([0.0, -1.0, 0, 2.0, 0, 0, -3.0, 0, 0]), np.zeros((9, 4)))
+    assert spun.growth("roll") == 2.0
+
+
+def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(sys, "argv", ["floaty", "design", *arguments])
+    with pytest.raises(SystemExit) as end:
+        app.main()
+    return int(end.value.code or 0)
+
+
+def test_command_writes_pictures_a_page_and_all_claims(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(["--out", str(tmp_path), "--angle", "22"], monkeypatch) == 0
+    content = json.loads((tmp_path / "design.json").read_text())
+    assert len(content["claims"]) > 35
+    assert content["robot"]["hover"].startswith("22.0° at 9.78 m/s")
+    page = (tmp_path / "design.html").read_text(encoding="utf-8")
+    for name in ("shape", "stability", "hover_angle", "attainable", "scaling"):
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert f'id="{name}"' in page
+    assert "33.7° on" not in page, "the crossing is that of 22°"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--speed", "8"], "no hover at 8 m/s"),
+        (["--speed", "10", "--angle", "25"], "one follows from the other"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    arguments: list[str], text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments, monkeypatch) == 2
+    assert text in capsys.readouterr().err
