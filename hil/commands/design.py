@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
-from hil.commands.options import announce_compilation, console, profile_option, set_option
+from hil.commands.options import announce_compilation, console, profile_option, seed_option, set_option
 from hil.errors import LabError
 
 if TYPE_CHECKING:
@@ -15,6 +15,13 @@ if TYPE_CHECKING:
     from hil.design.sweeps import Point
 
 SPEED_MAX = 60.0  # [m/s] that a profile may have
+write_option = click.option(
+    "--write",
+    "write_to",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A profile that flies this robot, with gains.",
+)  # fmt: skip
 out_option = click.option(
     "--out", type=click.Path(path_type=Path), default=Path("runs/design"), show_default=True, metavar="DIR"
 )
@@ -26,6 +33,13 @@ out_option = click.option(
 @set_option
 @click.option("--speed", type=click.FloatRange(1, 40), help="Updraft [m/s]: the hover angle follows.")
 @click.option("--angle", type=click.FloatRange(0, 70), help="Hover angle [deg]: the updraft follows.")
+@click.option(
+    "--length", type=click.FloatRange(0.1, 10), default=1.0, help="The similar robot: lengths times this."
+)
+@click.option(
+    "--mass", type=click.FloatRange(0.01, 100), default=1.0, help="The similar robot: masses times this."
+)
+@write_option
 @out_option
 def design(
     context: click.Context,
@@ -33,6 +47,9 @@ def design(
     overrides: tuple[str, ...],
     speed: float | None,
     angle: float | None,
+    length: float,
+    mass: float,
+    write_to: Path | None,
     out: Path,
 ) -> None:
     """Trim, constants, poles, authority and sweeps of a profile's robot, beside the paper's claims of its design."""
@@ -41,28 +58,125 @@ def design(
     from hil.design.analysis import analyse, write
 
     announce_compilation()
-    found = analyse(point_of(profile, overrides, speed, angle))
+    point = point_of(profile, overrides, speed, angle, length, mass)
+    if write_to is not None:
+        write_profile(
+            point,
+            write_to,
+            f"The robot of {profile}, lengths times {length:g}, masses times {mass:g}.",
+            length,
+        )
+    found = analyse(point)
     page = write(found, folder_for(out))
     show(found)
     console.print(f"report  {page}", soft_wrap=True)
 
 
-def point_of(profile: str, overrides: tuple[str, ...], speed: float | None, angle: float | None) -> "Point":
-    """Return a profile's robot at its design hover, or at the hover of another speed or angle."""
+@design.command()
+@profile_option
+@set_option
+@seed_option
+@click.option(
+    "--figure",
+    type=click.Choice(["least-authority", "speed-range"]),
+    default="least-authority",
+    show_default=True,
+)
+@click.option(
+    "--generations", type=click.IntRange(1, 500), default=25, show_default=True, help="Of the search."
+)
+@click.option(
+    "--updrafts",
+    type=click.FloatRange(1, 60),
+    nargs=2,
+    default=(8.0, 11.0),
+    show_default=True,
+    help="Which robot could hold these speeds, and what would it cost?",
+)
+@write_option
+@out_option
+def optimise(
+    profile: str,
+    overrides: tuple[str, ...],
+    seed: int,
+    figure: str,
+    generations: int,
+    updrafts: tuple[float, float],
+    write_to: Path | None,
+    out: Path,
+) -> None:
+    """Find the kink, centre of mass, base plate and strip with the largest figure, at the profile's span, mass and speed."""
+    from hil.design import figures
+    from hil.design import optimise as search
+    from hil.design.claims import robot_lines
+    from hil.pictures.drawing import png
+
+    announce_compilation()
+    if updrafts[0] >= updrafts[1]:
+        raise LabError(f"--updrafts {updrafts[0]:g} {updrafts[1]:g}: expected the least first")
+    found = search.optimise(point_of(profile, overrides, None, None), figure, seed, generations)
+    best, front = found.best, search.front(found.tried, figure)
+    if write_to is not None:
+        write_profile(
+            best.point,
+            write_to,
+            f"What floaty design optimise --figure {figure} --seed {seed} made of {profile}.",
+        )
+    named = {profile: found.reference, "best": best}
+    marks = {name: tuple(search.places((one,), figure)[0].tolist()) for name, one in named.items()}
+    axes = (
+        "stability: -f_αα [1/s²]",
+        figure + (" / that of the profile's robot" if figure == "least-authority" else ""),
+    )
+    picture = folder_for(out) / f"pareto-{figure}.png"
+    picture.write_bytes(png(lambda: figures.pareto(axes, search.places(found.tried, figure), front, marks)))
+    for name, value in robot_lines(best.point):
+        console.print(f"{name:38} {value}", soft_wrap=True)
+    console.print(
+        f"{figure}: {marks['best'][1]:.3f}; {profile}: {marks[profile][1]:.3f}; {len(found.tried)} robots flew"
+    )
+    for line in search.exercise(found, *updrafts):
+        console.print(line, soft_wrap=True)
+    console.print(f"picture  {picture}", soft_wrap=True)
+
+
+def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -> None:
+    """Write a profile that flies the robot."""
+    from hil.design.gains import gains_of
+    from hil.design.profile import profile_text
+
+    text = profile_text(point, gains_of(point.linear), about, length)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LabError(f"--write {path}: cannot be written ({error.strerror or error})") from None
+    console.print(f"profile {path}", soft_wrap=True)
+
+
+def point_of(
+    profile: str,
+    overrides: tuple[str, ...],
+    speed: float | None,
+    angle: float | None,
+    length: float = 1.0,
+    mass: float = 1.0,
+) -> "Point":
+    """Return a profile's robot, or a similar one, at its design hover or at the hover of another speed or angle."""
     from hil.config import load_config
     from hil.design.sweeps import Point
-    from hil.design.trim import coefficient_of, opening_at
+    from hil.design.trim import coefficient_of, opening_at, scaled
 
     config = load_config(profile, overrides)
     coefficient, opening = coefficient_of(config), config.plant.hover_angle
+    geometry = scaled(config.geometry, length, mass)
     if speed is not None and angle is not None:
         raise LabError(f"--speed {speed:g} --angle {angle:g}: one follows from the other; give one of them")
     if speed is not None:
-        opening = opening_at(config.geometry, coefficient, speed)
+        opening = opening_at(geometry, coefficient, speed)
     if angle is not None:
         opening = math.radians(angle)
     limits = config.allocation
-    point = Point(config.geometry, coefficient, opening, limits.opening_min, limits.opening_max)
+    point = Point(geometry, coefficient, opening, limits.opening_min, limits.opening_max)
     if not 1.0 < point.speed <= SPEED_MAX:
         raise LabError(
             f"hover at {math.degrees(opening):.0f} deg takes {point.speed:.3g} m/s: outside 1..{SPEED_MAX:g}"

@@ -47,6 +47,16 @@ class Linear:
         found = np.linalg.eigvals(self.A[np.ix_(chosen, chosen)])
         return sorted(map(complex, found), key=lambda pole: (-abs(pole.imag), -pole.real, -pole.imag))
 
+    def steady(self, axis: str) -> float:
+        """Return the sideways acceleration per input [m/s2] once the attitude has followed, in its usual direction.
+
+        Negative: the robot steers the other way round than the paper's; NaN for yaw and height.
+        """
+        f = self.constants
+        if axis == "pitch":
+            return f.x_u2 - f.x_pitch * f.pitch_u2 / f.pitch_pitch
+        return -(f.y_u1 - f.y_roll * f.roll_u1 / f.roll_roll) if axis == "roll" else math.nan
+
     def growth(self, axis: str) -> float:
         """Return the largest real part of an axis' poles [1/s]: positive when it falls over by itself."""
         return max(pole.real for pole in self.poles(axis))

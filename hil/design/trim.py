@@ -17,7 +17,7 @@ from hil.world.body import drag_coefficient
 from hil.world.config import GeometryConfig
 from hil.world.geometry import weigh
 
-OPENINGS = np.radians(np.arange(-20.0, 75.5, 0.5))  # searched for a trim
+OPENINGS = np.radians(np.arange(-20.0, 75.5, 2.5))  # searched for a trim
 BISECTIONS = 50
 
 

@@ -164,7 +164,7 @@ class PlantConfig(BaseModel):
         10.0, gt=1, le=60, description="design airspeed of the hover [m/s]; paper, Setup specifications"
     )
     hover_angle: float = Field(
-        math.radians(25), gt=0, le=1.2, description="flap angle of the design hover [rad]; paper: 25 deg"
+        math.radians(25), gt=-0.5, le=1.2, description="flap angle of the design hover [rad]; paper: 25 deg"
     )
     mass_factor: Factor = Field(1.0, description="true mass over design mass")
     inertia_factor: Factor = Field(1.0, description="true inertia over design inertia")

@@ -1,0 +1,50 @@
+"""A design as a profile that flies: its geometry, its design point, its own model on board, and gains for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from math import degrees
+from typing import Any
+
+from hil.design.sweeps import Point
+from hil.world.config import GeometryConfig
+
+
+def profile_text(point: Point, gains: Mapping[str, float], about: str, length: float = 1.0) -> str:
+    """Return a TOML profile on top of `floaty`; the tunnel is wider for a robot `length` times as long, never narrower."""
+    found = point.linear
+    model = asdict(found.constants)
+    sections: dict[str, Mapping[str, Any]] = {
+        "geometry": _stated(point.geometry),
+        "plant": {"variant": "plate", "airspeed": point.speed, "hover_angle": point.opening},
+        "tunnel": {"speed": point.speed} | ({"profile_radius": 0.45 * length} if length > 1.0 else {}),
+        "model": {name: float(f"{value:.5g}") for name, value in model.items()},
+        "controller": gains,
+        "allocation": {"hover_angle": float(f"{point.opening:.6g}"), "opening_min": point.low, "opening_max": point.high},
+    }  # fmt: skip
+    lines = [
+        *(f"# {line}" for line in about.splitlines()),
+        f"# Written by floaty design; hover at {degrees(point.opening):.2f} deg and {point.speed:.2f} m/s, C_D = "
+        f"{point.coefficient:.4f}. Plate model on board; gains by hil/design/gains.py.",
+        'base = "floaty"',
+    ]
+    for name, values in sections.items():
+        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _stated(geometry: GeometryConfig) -> dict[str, Any]:
+    """Return what a geometry has other than G0."""
+    own, usual = geometry.model_dump(), GeometryConfig().model_dump()
+    return {key: value for key, value in own.items() if value != usual[key]}
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else repr(value)
