@@ -1,6 +1,7 @@
 """`floaty design`: the robot of a profile as a design."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -163,20 +164,18 @@ def point_of(
 ) -> "Point":
     """Return a profile's robot, or a similar one, at its design hover or at the hover of another speed or angle."""
     from hil.config import load_config
-    from hil.design.sweeps import Point
-    from hil.design.trim import coefficient_of, opening_at, scaled
+    from hil.design.analysis import point_of as own_point_of
+    from hil.design.trim import opening_at, scaled
 
-    config = load_config(profile, overrides)
-    coefficient, opening = coefficient_of(config), config.plant.hover_angle
-    geometry = scaled(config.geometry, length, mass)
+    point = own_point_of(load_config(profile, overrides))
+    geometry, opening = scaled(point.geometry, length, mass), point.opening
     if speed is not None and angle is not None:
         raise LabError(f"--speed {speed:g} --angle {angle:g}: one follows from the other; give one of them")
     if speed is not None:
-        opening = opening_at(geometry, coefficient, speed)
+        opening = opening_at(geometry, point.coefficient, speed)
     if angle is not None:
         opening = math.radians(angle)
-    limits = config.allocation
-    point = Point(geometry, coefficient, opening, limits.opening_min, limits.opening_max)
+    point = replace(point, geometry=geometry, opening=opening)
     if not 1.0 < point.speed <= SPEED_MAX:
         raise LabError(
             f"hover at {math.degrees(opening):.0f} deg takes {point.speed:.3g} m/s: outside 1..{SPEED_MAX:g}"
@@ -204,8 +203,15 @@ def show(found: "Analysis") -> None:
         table.add_row(*row)
     wide = Console(highlight=False, width=max(console.width, 150))
     wide.print(table)
+    show_claims(found)
+
+
+def show_claims(found: "Analysis") -> None:
+    """Print the paper's claims."""
+    from rich.table import Table
+
     table = Table("claim", "paper", "computed", "", title="the paper's design")
     for claim in found.claims:
         colour = "green" if claim.verdict == "agrees" else "red"
         table.add_row(claim.title, claim.paper, claim.ours, f"[{colour}]{claim.verdict}[/{colour}]")
-    wide.print(table)
+    Console(highlight=False, width=max(console.width, 150)).print(table)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import click
 from rich.console import Console
 
+from hil.commands.design import show_claims
 from hil.commands.options import INTERRUPTED, announce_compilation, console, notices
 from hil.errors import LabError
 
@@ -65,6 +66,7 @@ def study(name: str, seeds: int, out: Path | None) -> int:
 
 def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted: bool = False) -> int:
     from hil.config import load_config
+    from hil.design.analysis import analyse, point_of
     from hil.studies import drag_model
     from hil.studies.paper import fly_paper
     from hil.studies.paper_report import write_paper
@@ -74,11 +76,14 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
         out.mkdir(parents=True, exist_ok=True)
         flown = fly_paper(rows, studies, seeds, out, notices)
         bench = list(drag_model.measure(load_config(), 1)) if mounted and not flown.interrupted else []
-        report = write_paper(out, flown, bench)
+        shape = analyse(point_of(load_config())) if bench else None
+        report = write_paper(out, flown, bench, shape)
     except OSError as error:
         raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
     _print_rows(flown)
     _print_studies(flown)
+    if shape is not None:
+        show_claims(shape)
     console.print(f"  {report}", soft_wrap=True)
     if flown.interrupted:
         notices.print("interrupted: the report has the flights that were complete")

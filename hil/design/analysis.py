@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from hil.config import LabConfig
 from hil.design import figures
 from hil.design.authority import QUANTITIES, attainable, pressure_at, single, wrenches
 from hil.design.claims import Claim, claims, robot_lines
 from hil.design.sweeps import Point, authorities, hover_angles, scaling, stability
+from hil.design.trim import coefficient_of
 from hil.pictures.drawing import png
 from hil.pictures.pages import data_uri, write_page
 from hil.world import layout as at
@@ -45,6 +47,18 @@ class Analysis:
     inputs: list[tuple[str, str, str]]  # input, alone, about the hover
     claims: list[Claim]
     pictures: list[Picture]
+
+
+def point_of(config: LabConfig) -> Point:
+    """Return a profile's robot at its design hover."""
+    limits = config.allocation
+    return Point(
+        config.geometry,
+        coefficient_of(config),
+        config.plant.hover_angle,
+        limits.opening_min,
+        limits.opening_max,
+    )
 
 
 def model_error(point: Point) -> float:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 from hil.config import DEFAULT_PROFILE, load_config
 from hil.errors import LabError, hint
+from hil.studies.designs import PUSHES, UPDRAFTS
 from hil.studies.study import Change, Expected, Study, Variant
 
 AS_FLOWN = "as-flown"
@@ -31,6 +32,7 @@ MID = (
     "controller.gain_yaw=0.4",
     "controller.gain_r=0.07",
 )
+DESIGN_STUDIES = (UPDRAFTS, PUSHES)
 INPUTS = ("roll_u1", "y_u1", "pitch_u2", "x_u2", "yaw_u3", "z_u4")
 
 
@@ -216,7 +218,7 @@ _ALL = (
         remark="Below 3.2 V for 5 s the supervisor ends the flight: the flaps stay at hover, and the robot drifts off.",
     ),
 )  # fmt: skip
-STUDIES = {study.name: study for study in _ALL}
+STUDIES = {study.name: study for study in (*_ALL, *DESIGN_STUDIES)}
 
 
 def find_study(name: str) -> Study:

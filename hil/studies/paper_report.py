@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from hil.config import load_config
+from hil.design.analysis import Analysis
+from hil.design.analysis import write as write_design
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
@@ -31,17 +33,28 @@ from hil.studies.study_figures import picture
 from hil.studies.study_run import StudyResult
 
 REPORT = "report.html"
-DRAG_MODEL, STUDIES = "drag-model", "studies"  # names of pages beside those of the experiments
+DRAG_MODEL, STUDIES, DESIGN = (
+    "drag-model",
+    "studies",
+    "design/design",
+)  # names of pages beside those of the experiments
 OPERATIONAL_DEG = 50  # flap angles of flight, in the steps of the test
 OF_EVERY_FLIGHT = PICTURES[:2]  # for an experiment without pictures of its own
 
 
-def write_paper(out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = ()) -> Path:
+def write_paper(
+    out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = (), shape: Analysis | None = None
+) -> Path:
     """Write `result.json`, `report.html` and the pictures of the studies; returns the report.
 
-    `mounted` is the test of the drag model: with it, its files are written into `drag-model` as well.
+    `mounted` is the test of the drag model: with it, its files are written into `drag-model` as well. `shape` is the
+    analysis of the design: with it, its page and pictures are written into `design`.
     """
-    (out / RESULT).write_text(json.dumps(_content(paper), indent=1) + "\n", encoding="utf-8")
+    content = _content(paper) | ({"design": [asdict(claim) for claim in shape.claims]} if shape else {})
+    (out / RESULT).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    if shape:
+        (out / "design").mkdir(exist_ok=True)
+        write_design(shape, out / "design")
     studies = []
     for result in paper.studies:
         if result.curves:
@@ -52,6 +65,7 @@ def write_paper(out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = ())
     pages = [
         *((name, row.title) for name, row, _ in paper.rows),
         *([(DRAG_MODEL, "Drag model")] if bench else []),
+        *([(DESIGN, "Design")] if shape else []),
         *([(STUDIES, "Robustness beyond the paper")] if studies else []),
     ]
     common = {"pages": pages, "metrics": METRICS, "spread": Spread.of, "profile": PROFILES[0]}
@@ -71,7 +85,7 @@ def write_paper(out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = ())
         write_page(out / f"{STUDIES}.html", "paper_studies.html.j2", name=STUDIES, studies=studies, **common)
     return write_page(
         out / REPORT, "paper.html.j2", paper=paper, rows=paper.rows, missing=[row for row, _, _ in paper.misses],
-        studies=studies, bench=bench, commit=commit(), versions=versions(), **common,
+        studies=studies, bench=bench, shape=shape, commit=commit(), versions=versions(), **common,
     )  # fmt: skip
 
 

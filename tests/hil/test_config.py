@@ -12,7 +12,15 @@ from hil.errors import LabError
 
 
 def test_shipped_profiles_load() -> None:
-    assert profile_names() == ["as-flown", "floaty", "lqr", "original"]
+    assert profile_names() == [
+        "as-flown",
+        "design-best",
+        "design-flat",
+        "design-paper",
+        "floaty",
+        "lqr",
+        "original",
+    ]
     for name in profile_names():
         load_config(name)
 

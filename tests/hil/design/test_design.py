@@ -211,6 +211,7 @@ def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     return int(end.value.code or 0)
 
 
+@pytest.mark.long
 def test_command_writes_pictures_a_page_and_all_claims(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

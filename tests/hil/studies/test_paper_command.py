@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from hil.config import load_config
+from hil.design.analysis import analyse, point_of
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS, Verdict
 from hil.laboratory.result import Result
@@ -267,3 +269,18 @@ def test_ctrl_c_keeps_what_was_flown_and_writes_the_report(tmp_path: Path) -> No
     flights = told["rows"][0]["profiles"]["floaty"]["flights"]
     assert 1 <= len(flights) < seeds
     assert "interrupted" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.long
+def test_every_claim_of_the_design_is_in_the_report_with_its_reason(tmp_path: Path) -> None:
+    shape = analyse(point_of(load_config()))
+    assert {claim.verdict for claim in shape.claims} == {"agrees", "differs"}
+    assert [claim.title for claim in shape.claims if claim.verdict == "differs" and not claim.why] == []
+    page = write_paper(tmp_path, Paper((), (), False), (), shape).read_text(encoding="utf-8")
+    for claim in shape.claims:
+        assert page.count(claim.ours.replace("'", "&#39;")) >= 1, claim.title
+    assert 'href="design/design.html"' in page
+    pictures = (tmp_path / "design" / "design.html").read_text(encoding="utf-8")
+    assert pictures.count('src="data:image/png') == len(shape.pictures)
+    assert content(tmp_path)["design"] == [dataclasses.asdict(claim) for claim in shape.claims]
+    assert (tmp_path / "design" / "stability.png").exists()

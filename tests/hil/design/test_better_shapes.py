@@ -1,0 +1,239 @@
+"""Gains, profiles and optimised shapes: what is promised holds, and what is written flies."""
+
+import math
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from hil.commands import app
+from hil.config import load_config
+from hil.design import optimise as search
+from hil.design.gains import LOOPS, gains_of
+from hil.design.linear import Linear
+from hil.design.profile import profile_text
+from hil.design.sweeps import Point, authorities, flat_high
+from hil.design.trim import coefficient_of, scaled
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.metrics import column
+from hil.laboratory.recorder import load_log
+from hil.laboratory.run import Request, fly, prepare
+from hil.world.body import SIGNS
+from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
+from hil.world.geometry import weigh
+from hil.world.plant import Plant
+
+CONFIG = load_config()
+PAPER = Point(CONFIG.geometry, coefficient_of(CONFIG), math.radians(28.0), 0.0, 0.9)
+DESIGNS = ("design-flat", "design-paper", "design-best")
+MIX = np.array(
+    [[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float
+)  # paper, eq. (input_signals)
+
+
+def point_of(profile: str) -> Point:
+    config = load_config(profile)
+    return Point(config.geometry, coefficient_of(config), config.plant.hover_angle, 0.0, 0.9)
+
+
+def closed_loop(model: Linear, gains: dict[str, float], index: int) -> NDArray[np.complex128]:
+    """Poles of one axis in continuous time, behind the flaps' lag of 50 ms; ours are found in discrete time."""
+    names, states, _ = LOOPS[index]
+    n = len(states)
+    A = np.zeros((n + 1, n + 1))
+    for row, state in enumerate(states):
+        if state is None:
+            A[row, row + 1] = 1.0
+            continue
+        A[row, :n] = [0.0 if other is None else model.A[state, other] for other in states]
+        A[row, n] = model.B[state, index]
+    A[n, :n] = [-20.0 * gains[name] for name in names]
+    A[n, n] = -20.0
+    return np.linalg.eigvals(A)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("robot", [PAPER, flat_high(PAPER)], ids=["paper", "flat"])
+def test_gains_hold_every_axis_of_a_stable_and_of_an_unstable_robot(robot: Point) -> None:
+    model = robot.linear
+    gains = gains_of(model)
+    for index in range(4):
+        assert closed_loop(model, gains, index).real.max() < -0.1, LOOPS[index][0]
+
+
+def test_an_axis_that_no_input_reaches_is_refused_in_one_line() -> None:
+    model = PAPER.linear
+    dead = model.B.copy()
+    dead[:, 1] = 0.0
+    with pytest.raises(LabError, match=r"no gains: x cannot be held") as caught:
+        gains_of(Linear(model.A, dead))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", DESIGNS)
+def test_a_written_profile_is_the_robot_that_was_written(name: str, tmp_path: Path) -> None:
+    point = point_of(name)
+    (tmp_path / "again.toml").write_text(profile_text(point, gains_of(point.linear), "again\nand again"))
+    again, shipped = load_config(str(tmp_path / "again.toml")), load_config(name)
+    assert again.geometry == shipped.geometry
+    assert again.plant.airspeed == pytest.approx(shipped.plant.airspeed)
+    assert coefficient_of(again) == pytest.approx(coefficient_of(CONFIG), rel=1e-9), "the same plates"
+    assert again.model.model_dump() == pytest.approx(shipped.model.model_dump(), rel=1e-3)
+    assert again.controller.model_dump() == pytest.approx(shipped.controller.model_dump(), rel=0.02, abs=1e-3)
+
+
+def test_the_flat_robot_falls_over_in_the_time_that_its_pole_says() -> None:
+    point = point_of("design-flat")
+    tunnel = TunnelConfig(turbulence="none", profile_radius=5.0, height_slope=0.0, speed=point.speed)
+    plant = Plant(
+        point.geometry, PlantConfig(variant="plate", airspeed=point.speed, hover_angle=point.opening), tunnel,
+        ServoConfig(), np.random.default_rng(1),
+    )  # fmt: skip
+    values, vectors = np.linalg.eig(point.linear.A[np.ix_((1, 3, 6), (1, 3, 6))])
+    mode = (vectors[:, values.real.argmax()] / vectors[1, values.real.argmax()]).real * 0.002  # [rad] of roll
+    q = (math.cos(mode[1] / 2), math.sin(mode[1] / 2), 0.0, 0.0)
+    plant.place((0.0, 0.0, tunnel.hover_height), q, (0.0, mode[0], 0.0), (mode[2], 0.0, 0.0))
+    growth = point.linear.growth("roll")
+    seconds = round(math.log(20.0) / growth, 3)
+    plant.advance(round(1e6 * seconds))
+    assert growth == pytest.approx(8.97, abs=0.01)
+    assert 2 * math.atan2(plant.q_WB[1], plant.q_WB[0]) == pytest.approx(
+        0.002 * math.exp(growth * seconds), rel=0.03
+    )
+
+
+@cache
+def small_search(figure: str) -> search.Optimum:
+    return search.optimise(PAPER, figure, 1, generations=1)
+
+
+@pytest.mark.long
+def test_the_optimum_keeps_span_mass_speed_and_is_stable_and_steers_around_its_hover() -> None:
+    found = small_search("least-authority")
+    best = found.best.point
+    assert best.geometry.footprint == PAPER.geometry.footprint
+    assert weigh(best.geometry).mass == pytest.approx(weigh(PAPER.geometry).mass)
+    assert best.speed == pytest.approx(PAPER.speed, rel=1e-9)
+    for opening in (best.opening - search.RESERVE, best.opening, best.opening + search.RESERVE):
+        model = Point(best.geometry, best.coefficient, opening, best.low, best.high).linear
+        assert max(model.growth("roll"), model.growth("pitch")) < 0.0
+        assert min(model.steady("roll"), model.steady("pitch")) > 0.0
+    share = authorities(PAPER)
+    assert found.best.authority == pytest.approx(min(v / share[k] for k, v in authorities(best).items()))
+    assert found.best.authority == max(one.authority for one in found.tried)
+
+
+@pytest.mark.long
+def test_the_front_is_what_nothing_beats_in_both() -> None:
+    found = small_search("least-authority")
+    places, front = (
+        search.places(found.tried, "least-authority"),
+        search.front(found.tried, "least-authority"),
+    )
+    for stable, figure in places:
+        assert ((front[:, 0] >= stable) & (front[:, 1] >= figure)).any()
+    for stable, figure in front:
+        assert not ((places[:, 0] > stable) & (places[:, 1] > figure)).any()
+
+
+def test_lighter_or_wider_robots_hold_slower_air_in_the_same_proportion() -> None:
+    low, high = search.held(PAPER)
+    lines = search.exercise(
+        search.Optimum(*2 * (search.Tried(PAPER, -16.0, 1.0, high / low),), ()), low / 1.25, high / 1.25
+    )
+    mass, span = 0.34 / 1.25**2, 23.0 * 1.25
+    assert f"with {1e3 * mass:.0f} g instead of 340 g" in lines[1]
+    assert f"{span:.1f} cm instead of 23.0 cm" in lines[1]
+    for other in (scaled(PAPER.geometry, 1.0, 1.25**-2), scaled(PAPER.geometry, 1.25, 1.0)):
+        slower = search.held(Point(other, PAPER.coefficient, PAPER.opening, 0.0, 0.9))
+        assert slower == pytest.approx((low / 1.25, high / 1.25), rel=1e-6)
+
+
+def test_the_steady_side_step_is_that_of_the_simulated_linear_model() -> None:
+    model = PAPER.linear
+    chosen = [0, 4, 7]
+    A, b = model.A[np.ix_(chosen, chosen)].copy(), model.B[chosen, 1]
+    A[1:, 0] = 0.0  # the drift in x is held, the attitude follows
+    A[:, 0] = 0.0
+    flow = np.block([[A, b[:, None]], [np.zeros((1, 4))]])
+    early, late = (expm(flow * t)[0, 3] for t in (10.0, 11.0))
+    assert late - early == pytest.approx(model.steady("pitch"), rel=1e-3)
+
+
+def measured_agility(profile: Path, folder: Path) -> float:
+    """Yaw acceleration per u3 [1/s2], by least squares over a yaw step as it was flown."""
+    prepare(folder)
+    fly(
+        Request.of(
+            EXPERIMENTS["yaw-step"], str(profile), ("tunnel.turbulence=none",), seed=1, duration_s=4.0
+        ),
+        folder,
+    )
+    log = load_log(folder)
+    t, rate = 1e-6 * column(log, "t"), column(log, "truth.r")
+    flaps = column(log, *(f"truth.flap_{number}" for number in (1, 2, 3, 4)))
+    u3 = (flaps - SIGNS * PAPER.opening) @ MIX[:, 2] / 4
+    rows = np.abs(u3) > 0.003
+    slope = np.gradient(rate, t)
+    found, *_ = np.linalg.lstsq(np.column_stack((u3[rows], rate[rows])), slope[rows], rcond=None)
+    return float(found[0])
+
+
+@pytest.mark.long
+def test_agility_measured_in_flight_goes_with_one_over_the_size(tmp_path: Path) -> None:
+    agility = {}
+    for length in (0.5, 1.0, 2.0):
+        point = Point(scaled(PAPER.geometry, length, length**3), PAPER.coefficient, PAPER.opening, 0.0, 0.9)
+        profile = tmp_path / f"{length:g}.toml"
+        profile.write_text(profile_text(point, gains_of(point.linear), "similar", length))
+        agility[length] = measured_agility(profile, tmp_path / f"{length:g}")
+    for length, found in agility.items():
+        assert found * length == pytest.approx(agility[1.0], rel=0.1), agility
+
+
+def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(sys, "argv", ["floaty", "design", *arguments])
+    with pytest.raises(SystemExit) as end:
+        app.main()
+    return int(end.value.code or 0)
+
+
+@pytest.mark.long
+def test_command_writes_the_pareto_picture_and_a_profile_that_flies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile = tmp_path / "best.toml"
+    arguments = ["optimise", "--profile", "design-paper", "--generations", "3", "--out", str(tmp_path)]
+    assert run([*arguments, "--write", str(profile)], monkeypatch) == 0
+    assert (tmp_path / "pareto-least-authority.png").read_bytes().startswith(b"\x89PNG")
+    assert "1.375 are needed" in capsys.readouterr().out
+    prepare(tmp_path / "flight")
+    result = fly(Request.of(EXPERIMENTS["hover"], str(profile), seed=1, duration_s=4.0), tmp_path / "flight")
+    assert result.metrics["lost"] == 0.0
+    assert run([*arguments, "--updrafts", "11", "8"], monkeypatch) == 2
+    assert "expected the least first" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.long
+def test_the_three_designs_hover(name: str, tmp_path: Path) -> None:
+    prepare(tmp_path / "flight")
+    result = fly(Request.of(EXPERIMENTS["hover"], name, seed=2, duration_s=8.0), tmp_path / "flight")
+    assert result.outcome == "completed"
+    assert result.metrics["in_box"] > 0.97
+
+
+def test_without_scipy_one_line_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("hil.design.gains", "hil.design.optimise"):
+        monkeypatch.delitem(sys.modules, module)
+    for module in ("scipy.linalg", "scipy.optimize"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for module in ("gains", "optimise"):
+        with pytest.raises(LabError, match=r"pip install .*scipy"):
+            __import__(f"hil.design.{module}")
