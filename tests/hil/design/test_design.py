@@ -96,7 +96,7 @@ def test_the_first_robot_falls_over_as_the_specification_prints() -> None:
     assert low.growth("roll") == pytest.approx(7.5, abs=0.05)
 
 
-@pytest.mark.parametrize("geometry", geometries(20))
+@pytest.mark.parametrize("geometry", [G0, *geometries(20)])
 def test_size_and_mass_scale_every_geometry_exactly(geometry: GeometryConfig) -> None:
     length, mass = 0.6, 1.7
     other = scaled(geometry, length, mass)
