@@ -14,6 +14,8 @@ from firmware_py.drivers.imu import GYRO_SCALE
 Gain = Annotated[float, Field(ge=-20, le=20)]
 Coupling = Annotated[float, Field(ge=-5000, le=5000)]
 Variance = Annotated[float, Field(gt=0, le=100)]
+Excitation = Annotated[float, Field(ge=0, le=0.3)]
+Frequency = Annotated[float, Field(ge=0.1, le=10)]
 Trim = Annotated[float, Field(ge=-12000, le=12000)]
 
 
@@ -106,6 +108,25 @@ class AllocationConfig(Section):
     hover_angle: float = Field(ge=0, le=1.2, description="opening at hover, theta_H [rad]")
     opening_min: float = Field(ge=-1, le=1.5, description="least opening [rad]")
     opening_max: float = Field(ge=-1, le=1.5, description="greatest opening [rad]")
+
+
+class ExcitationConfig(Section):
+    """What is added to the inputs for identification, once `excite.signal` on board switches it on."""
+
+    signal: Literal["multisine", "chirp"] = Field(
+        description="multisine: all inputs at once, each with lines of its own; chirp: one input"
+    )
+    u1: Excitation = Field(description="rms of what is added to u1 [rad]; 0: nothing")
+    u2: Excitation = Field(description="rms of what is added to u2 [rad]; 0: nothing")
+    u3: Excitation = Field(description="rms of what is added to u3 [rad]; 0: nothing")
+    u4: Excitation = Field(description="rms of what is added to u4 [rad]; 0: nothing")
+    low: Frequency = Field(description="lower end of the band [Hz]")
+    high: Frequency = Field(description="upper end of the band [Hz]")
+
+    @property
+    def rms(self) -> tuple[float, float, float, float]:
+        """Of u1 to u4 [rad]."""
+        return (self.u1, self.u2, self.u3, self.u4)
 
 
 class ServoConfig(Section):
@@ -202,6 +223,7 @@ class FirmwareConfig(Section):
     predictor: PredictorConfig
     controller: ControllerConfig
     allocation: AllocationConfig
+    excitation: ExcitationConfig
     servo: ServoConfig
     supervisor: SupervisorConfig
     cpu: CpuConfig
@@ -220,6 +242,8 @@ def parameters_of(config: FirmwareConfig) -> Block[Parameters]:
     values["age_measured"] = int(predictor.age == "measured")
     values["horizon"] = predictor.horizon
     values["default_age_us"] = predictor.default_age_us
+    excitation = config.excitation
+    values |= {"excite_rms": excitation.rms, "excite_low": excitation.low, "excite_high": excitation.high}
     for name, value in values.items():
         block.memory[name] = value
     return block

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
+from firmware_py.core.structs import EXCITE_OFF
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory, costs_of
 from firmware_py.drivers.imu import GyroZero, acceleration, rates
 from firmware_py.geometry import Vector
@@ -139,7 +140,8 @@ class Firmware:
         )
         self.variables = log_variables(running)
         read = telemetry_reader(self.variables)
-        own = parameters(running, TelemetryStream(link, read))
+        fields = running.core.parameters.fields
+        own = parameters(running, TelemetryStream(link, read, lambda: fields.excite_kind != EXCITE_OFF))
         self.parameters = (*own, *stock_parameters(running))
         LogService(link, self.variables)
         ParameterService(link, self.parameters, storage)

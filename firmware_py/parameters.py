@@ -15,6 +15,7 @@ from firmware_py.config import (
     AllocationConfig,
     ControllerConfig,
     EstimatorConfig,
+    ExcitationConfig,
     ModelConfig,
     PredictorConfig,
     SupervisorConfig,
@@ -27,7 +28,7 @@ from firmware_py.logic.plugs import GROUP
 from firmware_py.running import Running
 from firmware_py.supervisor import Manual
 from firmware_py.variables import F32, I8, I16, SCALARS, U8, U16, U32
-from firmware_py.wire.parameter_names import GAINS
+from firmware_py.wire.parameter_names import GAINS, SIGNALS
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import STREAM
 
@@ -60,6 +61,7 @@ def parameters(running: Running, stream: TelemetryStream) -> tuple[Parameter, ..
             lambda value: setattr(core, "predict", int(value)), 0, 1, persistent=True,
         ),
         _field("delayComp.horizon", "10 ms", core, "horizon", PredictorConfig, U8),
+        *_excitation(core),
         *_kalman(running),
         *_supervision(running, stream),
         *_own_logic(running),
@@ -137,6 +139,25 @@ def _manual(running: Running) -> Iterator[Parameter]:
         yield element(f"extCtrl.{name}", F32, "rad", manual.angles, index, -pi / 2, pi / 2)
         yield element(f"motorPowerSet.{name}", U16, "words", manual.words, index, 0, 0xFFFF)
         yield element(f"motorShifts.{name}", I16, "words", trim, index, -TRIM_LIMIT, TRIM_LIMIT)
+
+
+def _excitation(core: Parameters) -> Iterator[Parameter]:
+    """What is added to the inputs for identification; a board that boots excites nothing."""
+    yield Parameter(
+        "excite.signal", U8, "", lambda: int(core.excite_kind),
+        lambda value: setattr(core, "excite_kind", int(value)), 0, len(SIGNALS) - 1,
+    )  # fmt: skip
+    for index in range(4):
+        yield Parameter(
+            f"excite.u{index + 1}", F32, "rad", partial(core.excite_rms.item, index),
+            partial(core.excite_rms.__setitem__, index), *configured_limits(ExcitationConfig, f"u{index + 1}"),
+        )  # fmt: skip
+    for end in ("low", "high"):
+        field = f"excite_{end}"
+        yield Parameter(
+            f"excite.{end}", F32, "Hz", partial(getattr, core, field), partial(setattr, core, field),
+            *configured_limits(ExcitationConfig, end),
+        )  # fmt: skip
 
 
 def _kalman(running: Running) -> Iterator[Parameter]:

@@ -23,7 +23,7 @@ from firmware_py.running import Running
 from firmware_py.stock_names import stock_variables
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import State
-from firmware_py.wire.telemetry import BLOCKS, LEGACY_DEGREES
+from firmware_py.wire.telemetry import ALL_BLOCKS, LEGACY_DEGREES
 
 if TYPE_CHECKING:
     pass
@@ -50,6 +50,7 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         *_each("controller", "u1 u2 u3 u4", F32, "rad", control.u),
         *_each("controller", "m1 m2 m3 m4", F32, "rad", control.command),  # deviation from the hover angle
         *_each("motors_ctrp", "m1 m2 m3 m4", F32, "rad", control.flap),
+        *_each("excite", "u1 u2 u3 u4", F32, "rad", control.excitation),
         LogVariable("motors_ctrp.min_angle", F32, "rad", lambda: control.flap.min()),
         LogVariable("motors_ctrp.max_angle", F32, "rad", lambda: control.flap.max()),
         LogVariable("Error.int_z_err", F32, "m s", partial(getattr, control, "integral_z")),
@@ -207,5 +208,5 @@ def _received(estimator: Estimator) -> int:
 def telemetry_reader(variables: Sequence[LogVariable]) -> ReadBlock:
     """Return the function that reads a telemetry block from the log table."""
     read = {variable.name: variable.read for variable in variables}
-    blocks = {block.id: [read[variable.name] for variable in block.variables] for block in BLOCKS}
+    blocks = {block.id: [read[variable.name] for variable in block.variables] for block in ALL_BLOCKS}
     return lambda block: [read() for read in blocks[block.id]]

@@ -4,6 +4,7 @@ Errors are taken in the heading frame. Sign conventions are the paper's: u1 > 0 
 pitch with the sign of the profile's pitch constant, u3 > 0 turns left, u4 > 0 lifts.
 """
 
+from firmware_py.core.excitation import excite
 from firmware_py.core.maths import HALF, ZERO, clamp, cos, sin, wrap
 from firmware_py.core.structs import (
     ATTITUDE,
@@ -17,7 +18,7 @@ from firmware_py.core.structs import (
     Input,
     Parameters,
 )
-from firmware_py.core.subset import Integer, f32, kernel
+from firmware_py.core.subset import Integer, f32, i32, kernel
 
 DT = f32(0.01)
 FLAP_LIMIT = f32(1.5707963)  # [rad] of a flap angle that comes from outside
@@ -112,10 +113,12 @@ def allocate(parameters: Parameters, control: Control) -> None:
 
 @kernel
 def release(control: Control) -> None:
-    """Leave the loop open: no compound inputs, no integral."""
+    """Leave the loop open: no compound inputs, no integral, no excitation."""
     control.integral_z = ZERO
+    control.excite_tick = i32(0)
     for i in range(4):
         control.u[i] = ZERO
+        control.excitation[i] = ZERO
 
 
 @kernel
@@ -123,6 +126,7 @@ def control_flaps(parameters: Parameters, data: Input, estimator: Estimator, con
     """Write the commanded flap angles for the mode: closed loop, hover angles, or angles from outside."""
     if data.mode == MODE_FLY:
         feedback(parameters, estimator, control)
+        excite(parameters, control)
         allocate(parameters, control)
     else:
         release(control)

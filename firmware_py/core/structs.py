@@ -23,6 +23,10 @@ MODE_HOVER = 0  # flaps at the hover angles
 MODE_FLY = 1  # closed loop
 MODE_MANUAL = 2  # flap angles come from outside
 
+EXCITE_OFF = 0
+EXCITE_MULTISINE = 1
+EXCITE_CHIRP = 2
+
 POSE_ON_TIME = 0
 POSE_TOO_OLD = 1
 POSE_INVALID = 2
@@ -102,6 +106,11 @@ class Parameters(Struct):
     gyro_scale: f32  # [rad/s per count]
     # set-point in G, normally zero: the correction that arrives is already relative to the goal
     target: Annotated[F32s, 4]  # x, y, z [m], yaw [rad]
+    # excitation, for identification
+    excite_kind: i32  # EXCITE_OFF, EXCITE_MULTISINE or EXCITE_CHIRP
+    excite_rms: Annotated[F32s, 4]  # [rad] of u1..u4
+    excite_low: f32  # [Hz] the band
+    excite_high: f32
 
 
 class Input(Struct):
@@ -163,3 +172,5 @@ class Control(Struct):
     command: Annotated[F32s, 4]  # [rad] the same as deviations from hover
     word: Annotated[I32s, 4]
     count: Annotated[I32s, 4]
+    excitation: Annotated[F32s, 4]  # [rad] its part of u
+    excite_tick: i32  # of its period

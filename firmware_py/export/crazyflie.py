@@ -12,6 +12,7 @@ from firmware_py.config import (
     AllocationConfig,
     ControllerConfig,
     EstimatorConfig,
+    ExcitationConfig,
     FirmwareConfig,
     ModelConfig,
     PredictorConfig,
@@ -26,7 +27,7 @@ from firmware_py.export.reading import float_literal
 from firmware_py.logic.loading import load_logic, translation_of
 from firmware_py.logic.plugs import GROUP
 from firmware_py.parameters import FLAPS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits
-from firmware_py.wire.parameter_names import GAINS
+from firmware_py.wire.parameter_names import GAINS, SIGNALS
 
 TEMPLATES = Path(__file__).parent / "app"
 MARKER = Path("src") / "floaty_app.c"  # a folder with this file is an app and may be written over
@@ -123,6 +124,23 @@ def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
             "delayComp.activate", "U8", "floaty_parameters.predict", "I32", core.predict.item(), 0, 1
         ),
         field("delayComp.horizon", "horizon", PredictorConfig, "U8", "I32"),
+        AppParameter(
+            "excite.signal", "U8", "floaty_parameters.excite_kind", "I32", 0, 0, len(SIGNALS) - 1, persistent=False
+        ),
+        *(
+            AppParameter(
+                f"excite.u{i + 1}", "F32", f"floaty_parameters.excite_rms[{i}]", "F32", core.excite_rms.item(i),
+                *configured_limits(ExcitationConfig, f"u{i + 1}"), persistent=False,
+            )
+            for i in range(4)
+        ),
+        *(
+            AppParameter(
+                f"excite.{end}", "F32", f"floaty_parameters.excite_{end}", "F32",
+                getattr(config.excitation, end), *configured_limits(ExcitationConfig, end), persistent=False,
+            )
+            for end in ("low", "high")
+        ),
         field("FloatyKalm.maxPos", "bound_position", EstimatorConfig),
         field("FloatyKalm.maxVel", "bound_velocity", EstimatorConfig),
         AppParameter("extPose.absolute", "U8", "floaty_absolute", "U8", 0, 0, 1),

@@ -70,7 +70,7 @@ class FlightMessages:
         return (mavlink.local_position(tick, *self._world.motion()),)
 
     def _flight_array(self, tick: int) -> Messages:
-        values = [value for block in telemetry.BLOCKS for value in block.si_of(self._read_block(block))]
+        values = [value for block in telemetry.ALL_BLOCKS for value in block.si_of(self._read_block(block))]
         return (mavlink.flight_array(tick * 1000, values),)
 
     def _servo_outputs(self, tick: int) -> Messages:

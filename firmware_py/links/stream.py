@@ -1,5 +1,7 @@
 """The telemetry of a flight: four fixed log blocks at 50 Hz, all with the same time stamp, while they are wanted.
 
+A fifth tells the excitation while there is one.
+
 It ends with its partner, as log blocks do.
 """
 
@@ -12,12 +14,15 @@ ReadBlock = Callable[[telemetry.Block], Sequence[float]]
 
 
 class TelemetryStream:
-    """`read_block` returns what the log variables of a telemetry block show now."""
+    """`read_block` returns what the log variables of a telemetry block show now, `is_exciting` whether there is an
+    excitation.
+    """
 
-    def __init__(self, stack: CrtpStack, read_block: ReadBlock) -> None:
+    def __init__(self, stack: CrtpStack, read_block: ReadBlock, is_exciting: Callable[[], bool]) -> None:
         self._on = False
         self._stack = stack
         self._read_block = read_block
+        self._is_exciting = is_exciting
         self._switched = stack.kernel.create_binary_semaphore("telemetry")
         stack.kernel.create_task("TELEMETRY", 1, self._task)
 
@@ -45,7 +50,8 @@ class TelemetryStream:
                 yield from self._stack.hang_up()
                 continue
             stamp_ms = kernel.tick_count
-            yield from kernel.work(cost.log_us * len(telemetry.BLOCKS))
-            for block in telemetry.BLOCKS:
+            blocks = telemetry.ALL_BLOCKS if self._is_exciting() else telemetry.BLOCKS
+            yield from kernel.work(cost.log_us * len(blocks))
+            for block in blocks:
                 packet = telemetry.encode_block(block, stamp_ms, self._read_block(block))
                 yield from self._stack.offer(packet)

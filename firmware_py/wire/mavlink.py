@@ -19,7 +19,7 @@ from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_place, check_pose
 from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.mavlink_services import u16, u32
-from firmware_py.wire.telemetry import BLOCKS, TIMESTAMP_MASK, Sample
+from firmware_py.wire.telemetry import ALL_BLOCKS, BLOCKS, TIMESTAMP_MASK, Sample
 
 # isort: off
 from firmware_py.wire.mavlink_services import (  # offered here, too
@@ -93,7 +93,7 @@ MISSION_MESSAGES = (
 )  # what is asked or told of missions, but for the list and its end
 
 FLIGHT_ARRAY = "floaty"
-FLIGHT_ARRAY_SIZE = sum(len(block.variables) for block in BLOCKS)
+FLIGHT_ARRAY_SIZE = sum(len(block.variables) for block in BLOCKS)  # without excitation
 COUNTS_PER_US = 21  # of the servo timer
 
 _U16_MAX = 0xFFFF
@@ -341,7 +341,10 @@ def imu(t_us: int, rates: Vector, acceleration: Vector) -> Message:
 
 
 def flight_array(t_us: int, values: Sequence[float]) -> Message:
-    """The samples of `telemetry.BLOCKS` in their order, relative to the goal as the board knows them, in SI."""
+    """The samples of `telemetry.ALL_BLOCKS` in their order, relative to the goal as the board knows them, in SI.
+
+    The excitation comes last: zeros at the end are not sent.
+    """
     data = (*values, *(0.0,) * (58 - len(values)))
     return dialect.MAVLink_debug_float_array_message(max(0, t_us), FLIGHT_ARRAY.encode(), 0, data)
 
@@ -354,7 +357,9 @@ def read_flight_array(message: Message) -> tuple[Sample, ...]:
     if message.name != FLIGHT_ARRAY:
         raise WireError(f"array {message.name!r}: not {FLIGHT_ARRAY!r}")
     values, timestamp_ms = iter(message.data), message.time_usec // 1000 & TIMESTAMP_MASK
-    return tuple(Sample(block, timestamp_ms, tuple(islice(values, len(block.variables)))) for block in BLOCKS)
+    return tuple(
+        Sample(block, timestamp_ms, tuple(islice(values, len(block.variables)))) for block in ALL_BLOCKS
+    )
 
 
 def _from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:

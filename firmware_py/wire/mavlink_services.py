@@ -24,6 +24,7 @@ PREFIXES = {  # of parameters, by group
     "supervisor": "SUP",
     "telemetry": "TLM",
     "logic": "OWN",
+    "excite": "EXC",
     "memTst": "MEM",
     "deck": "DK",
     "imu_sensors": "IMU",

@@ -16,6 +16,7 @@ OF_PROFILE: dict[str, tuple[str, float]] = {  # section.key: name on the board, 
     **{f"controller.{key}": (f"extCtrl.{name}", factor) for name, (key, factor) in GAINS.items()},
     "allocation.hover_angle": ("RandConsts.flapHoverAng", 1),
     "model.flap_rate": ("RandConsts.flapTimeConst", 1),
+    **{f"excitation.{key}": (f"excite.{key}", 1) for key in ("u1", "u2", "u3", "u4", "low", "high")},
     "predictor.enabled": ("delayComp.activate", 1),
     "predictor.horizon": ("delayComp.horizon", 1),
     "estimator.bound_position": ("kalman.maxPos", 1),
@@ -23,6 +24,9 @@ OF_PROFILE: dict[str, tuple[str, float]] = {  # section.key: name on the board, 
     "supervisor.pose_timeout_us": ("supervisor.poseTimeout", 1e-3),
     "supervisor.low_battery_mv": ("supervisor.lowBattery", 1),
 }
+
+
+SIGNALS = ("off", "multisine", "chirp")  # by their numbers in excite.signal
 
 
 def on_board(name: str) -> tuple[str, float]:

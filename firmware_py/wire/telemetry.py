@@ -127,7 +127,11 @@ BLOCKS = (
     ),
 )
 
-_BLOCK_OF_ID = {block.id: block for block in BLOCKS}
+# Only while something is excited: other flights have nothing of it on their line.
+EXCITATION = Block(FIRST_ID + 4, _variables("excite", "u1 u2 u3 u4", Scalar.F32, "rad"))
+ALL_BLOCKS = (*BLOCKS, EXCITATION)
+
+_BLOCK_OF_ID = {block.id: block for block in ALL_BLOCKS}
 
 
 def encode_block(block: Block, timestamp_ms: int, values: Sequence[float]) -> bytes:

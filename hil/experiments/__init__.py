@@ -3,6 +3,7 @@
 from hil.errors import LabError, hint
 from hil.experiments.airspeed import AIRSPEEDS
 from hil.experiments.hover import HOVER
+from hil.experiments.identification import IDENTIFICATION
 from hil.experiments.overload import OVERLOAD
 from hil.experiments.own import entries, in_file, in_package
 from hil.experiments.position import HEIGHT_SINE, Y_SQUARE
@@ -30,6 +31,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         ENDURANCE,
         TAKE_OFF_LANDING,
         OVERLOAD,
+        *IDENTIFICATION,
     )
 }
 

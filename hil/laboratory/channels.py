@@ -85,6 +85,12 @@ def _all(reads: Sequence[Callable[[], float]]) -> Callable[[], list[float]]:
     return lambda: [read() for read in reads]
 
 
+def excitation_channel(firmware: Firmware) -> Channel:
+    """Return what is added to the inputs for identification."""
+    reads = [variable.read for variable in firmware.variables if variable.name.startswith("excite.")]
+    return Channel("float32", _all(reads), (quantity("excite", "u1 u2 u3 u4", "rad"),))
+
+
 def fault_channel(active: Sequence[Fault]) -> Channel:
     """Return how many faults are in force."""
     return Channel("int8", lambda: len(active), (quantity("fault", "active"),))

@@ -19,6 +19,7 @@ from hil.config import LabConfig
 from hil.events import EventQueue
 from hil.laboratory.channels import (
     battery_channel,
+    excitation_channel,
     fault_channel,
     flight_channels,
     logic_channels,
@@ -187,8 +188,10 @@ class Flight:
         markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
         faults = (fault_channel(self.switchboard.active),) if self.faults else ()
         line, tracker = self.line.channels()
+        excited = (excitation_channel(robot.firmware),) if any(self.config.excitation.rms) else ()
         own = logic_channels(robot.firmware)
-        return (*channels, *line, battery_channel(robot.battery), *tracker, *markers, *faults, *own)
+        battery = battery_channel(robot.battery)
+        return (*channels, *line, battery, *tracker, *markers, *faults, *excited, *own)
 
     def run(self, progress: Progress | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C; the log is left open for the caller to close."""

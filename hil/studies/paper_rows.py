@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import radians
 
+from hil.experiments.identification import IDENTIFICATION
+
 
 @dataclass(frozen=True, slots=True)
 class Claim:
@@ -151,4 +153,5 @@ ROWS: Mapping[str, Row] = {
     ),
 }  # fmt: skip
 
-OUTSIDE = ("overload", "endurance")  # not the paper's; 33 min of simulated flight, which `power` computes
+# Not the paper's; 33 min of simulated flight, which `power` computes; flights for `floaty identify`.
+OUTSIDE = ("overload", "endurance", *(experiment.name for experiment in IDENTIFICATION))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import WireError
-from firmware_py.wire.telemetry import BLOCKS
+from firmware_py.wire.telemetry import ALL_BLOCKS
 from ground_station.config import StationConfig
 from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
@@ -178,9 +178,9 @@ def test_telemetry_is_what_the_board_knows_whatever_goal_was_sent(goal):
     bench = LinkWithCodec()
     bench.pose(0, goal)
     samples = bench.hear(0, *telemetry((1 << 24) + 1234))
-    assert [sample.block for sample in samples] == list(BLOCKS)
+    assert [sample.block for sample in samples] == list(ALL_BLOCKS)
     assert {sample.timestamp_ms for sample in samples} == {1234}
-    assert [value for sample in samples for value in sample.values] == list(range(1, 29))
+    assert [value for sample in samples for value in sample.values] == [*range(1, 29), *4 * (0,)]
     assert bench.link.supervisor_state == 25
 
 
@@ -191,7 +191,7 @@ def test_the_station_logs_what_comes_in_pieces_of_any_size():
     stream = b"".join(message.pack(bench.codec) for t_ms in (20, 40) for message in telemetry(t_ms))
     for byte in stream:
         station.on_packet(50_000, bytes((byte,)))
-    assert station.counters.samples == 8
+    assert station.counters.samples == 2 * len(ALL_BLOCKS)
     assert station.counters.malformed == 0
 
 

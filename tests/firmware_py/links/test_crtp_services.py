@@ -242,6 +242,20 @@ def test_stream_is_a_parameter_that_can_be_switched_off_and_on(client: CrtpClien
         assert len(client.packets(LOG, 2)) == count * len(telemetry.BLOCKS)
 
 
+def test_the_stream_tells_the_excitation_sample_by_sample_while_there_is_one(
+    client: CrtpClient, params
+) -> None:
+    client.stream(client.now_us)
+    for signal, count in ((0, 0), (1, 25), (0, 0)):
+        client.write(params, "excite.signal", signal)
+        client.run(client.now_us // 20_000 * 20_000 + 30_000)
+        client.sent.clear()
+        client.run(client.now_us + 500_000)
+        rows = client.packets(LOG, 2)
+        assert sum(row[0] == telemetry.EXCITATION.id for row in rows) == count
+        assert sum(row[0] == telemetry.BLOCKS[0].id for row in rows) == 25
+
+
 @pytest.mark.parametrize("kind", ["blocks", "stream"])
 def test_rows_end_a_second_after_the_partner_fell_silent_and_the_next_one_gets_none_of_them(
     client: CrtpClient, logs, kind: str

@@ -318,8 +318,10 @@ def test_flight_array_carries_the_telemetry_blocks() -> None:
     message = over_the_wire(mavlink.flight_array(12_000, values))
     assert (message.name, message.time_usec, message.data[28:]) == ("floaty", 12_000, [0.0] * 30)
     samples = mavlink.read_flight_array(message)
-    assert [(sample.block, sample.timestamp_ms) for sample in samples] == [(b, 12) for b in telemetry.BLOCKS]
-    assert tuple(value for sample in samples for value in sample.values) == values
+    assert [(sample.block, sample.timestamp_ms) for sample in samples] == [
+        (b, 12) for b in telemetry.ALL_BLOCKS
+    ]
+    assert tuple(value for sample in samples for value in sample.values) == (*values, *4 * (0.0,))
     with pytest.raises(WireError, match="other"):
         mavlink.read_flight_array(
             over_the_wire(dialect.MAVLink_debug_float_array_message(0, b"other", 0, [0.0] * 58))

@@ -177,6 +177,13 @@ LOG_ADD(LOG_FLOAT, m3, &floaty_control.flap[2])
 LOG_ADD(LOG_FLOAT, m4, &floaty_control.flap[3])
 LOG_GROUP_STOP(motors_ctrp)
 
+LOG_GROUP_START(excite)
+LOG_ADD(LOG_FLOAT, u1, &floaty_control.excitation[0])
+LOG_ADD(LOG_FLOAT, u2, &floaty_control.excitation[1])
+LOG_ADD(LOG_FLOAT, u3, &floaty_control.excitation[2])
+LOG_ADD(LOG_FLOAT, u4, &floaty_control.excitation[3])
+LOG_GROUP_STOP(excite)
+
 LOG_GROUP_START(Error)
 LOG_ADD(LOG_FLOAT, int_z_err, &floaty_control.integral_z)
 LOG_GROUP_STOP(Error)

@@ -1,0 +1,59 @@
+"""The excitation: a known signal on top of the inputs, for identification; off unless a parameter switches it on.
+
+It repeats every 20 s. The multisine's lines are the odd multiples of 0.05 Hz from the lower to the upper frequency. They go
+round the four inputs: u1 has the first, u2 the second, and so on, so that no two inputs share a line and all can be excited
+at once. What squares and products of inputs do lies on even multiples, where nothing is looked for. The phases are
+Schroeder's, which keep the peaks low. The chirp sweeps the band and is for one input at a time.
+"""
+
+from firmware_py.core.maths import HALF, PI, TWO_PI, ZERO, cos, sin
+from firmware_py.core.structs import EXCITE_CHIRP, EXCITE_OFF, Control, Parameters
+from firmware_py.core.subset import Integer, f32, i32, kernel, sqrt
+
+PERIOD = 2000  # ticks
+ODD_LINES_PER_HZ = f32(10.0)
+INPUTS = 4
+TICK = f32(0.01)
+SWEEP = f32(0.025)  # half a frequency's rise over the period [1/s]
+ROOT_2 = f32(1.41421356)
+
+
+@kernel
+def multisine(first: Integer, last: Integer, tick: Integer) -> f32:
+    """Return the sum of every fourth odd line from `first` to `last`, of rms 1; line n is the multiple 2 n + 1."""
+    if last < first:
+        return ZERO
+    lines = (last - first) // INPUTS + 1
+    total = ZERO
+    for index in range(lines):
+        turn = ((2 * (first + INPUTS * index) + 1) * tick) % PERIOD
+        schroeder = (index * (index + 1)) % (2 * lines)
+        total = total + cos(TWO_PI * f32(turn) / f32(PERIOD) - PI * f32(schroeder) / f32(lines))
+    return f32(total * sqrt(f32(2.0) / f32(lines)))
+
+
+@kernel
+def chirp(low: f32, high: f32, tick: Integer) -> f32:
+    """Return the sweep from `low` to `high` [Hz], of rms 1."""
+    t = TICK * f32(tick)
+    turns = t * (low + SWEEP * (high - low) * t)
+    return ROOT_2 * sin(TWO_PI * (turns - f32(i32(turns))))
+
+
+@kernel
+def excite(parameters: Parameters, control: Control) -> None:
+    """Add the excitation of this tick to the inputs u; call it once per tick."""
+    tick = control.excite_tick
+    first = i32(parameters.excite_low * ODD_LINES_PER_HZ + HALF)
+    last = i32(parameters.excite_high * ODD_LINES_PER_HZ + HALF) - 1
+    for i in range(INPUTS):
+        control.excitation[i] = ZERO
+        if parameters.excite_kind != EXCITE_OFF and parameters.excite_rms[i] > ZERO:
+            wave = multisine(first + i, last, tick)
+            if parameters.excite_kind == EXCITE_CHIRP:
+                wave = chirp(parameters.excite_low, parameters.excite_high, tick)
+            control.excitation[i] = parameters.excite_rms[i] * wave
+            control.u[i] = control.u[i] + control.excitation[i]
+    control.excite_tick = i32((tick + 1) % PERIOD)
+    if parameters.excite_kind == EXCITE_OFF:
+        control.excite_tick = i32(0)

@@ -1,0 +1,75 @@
+"""Identification: flights whose logs `floaty identify` makes constants of.
+
+The excitation is a parameter of the board, which the operator switches on over the link once the robot hovers. How strong
+it is and which band it has are settings, like `--set excitation.u1=0.08 --set excitation.high=6`. The amplitudes here keep
+the default robot inside its 20 cm box. The paper's way needs two flights with different gains and no excitation at all;
+its gains on roll are those of its Methods, -0.2 and -0.15.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING
+
+from firmware_py.wire.parameter_names import SIGNALS
+from firmware_py.wire.parameters import SetByName, encode_set_by_name
+from firmware_py.wire.scalars import Scalar
+from hil.laboratory.experiment import Experiment
+
+if TYPE_CHECKING:
+    from hil.laboratory.flight import Flight
+
+BEGIN_US = 2_000_000  # the robot has come to rest after its release
+PERIODS = 8  # of 20 s, after 2 s in which the answer settles
+DURATION_S = 2.0 + 2.0 + 20.0 * PERIODS + 1.0
+LIMITS = {"lost": 0.0}
+ALONE = {"u1": 0.05, "u2": 0.08, "u3": 0.06, "u4": 0.10}  # [rad] rms; more is not linear any more
+TOGETHER = {"u1": 0.04, "u2": 0.06, "u3": 0.05, "u4": 0.08}
+
+
+def excite(flight: Flight) -> None:
+    """Plan that the operator switches the excitation on."""
+    flight.events.at(flight.release_us + BEGIN_US, partial(_switch_on, flight))
+
+
+def _switch_on(flight: Flight, now_us: int) -> None:
+    signal = flight.config.excitation.signal
+    request = SetByName("excite.signal", Scalar.U8, SIGNALS.index(signal))
+    flight.line.command(now_us, encode_set_by_name(request))
+    flight.note("lab", f"excitation on: {signal}")
+
+
+def excited(name: str, summary: str, amplitudes: Mapping[str, float], *settings: str) -> Experiment:
+    """Return a hover with an excitation of some inputs."""
+    return Experiment(
+        name=name,
+        summary=summary,
+        duration_s=DURATION_S,
+        limits=LIMITS,
+        settings=(*(f"excitation.{one}={rms}" for one, rms in amplitudes.items()), *settings),
+        script=excite,
+    )
+
+
+def preliminary(number: int, gain_roll: float, gain_pitch: float) -> Experiment:
+    """Return the paper's flight with one of its two preliminary controllers."""
+    return Experiment(
+        name=f"two-controllers-{number}",
+        summary=f"hover with attitude gains {gain_roll:g} and {gain_pitch:g}, undisturbed but by the flow (paper's Methods)",
+        duration_s=42.0,
+        limits=LIMITS,
+        settings=(f"controller.gain_roll={gain_roll}", f"controller.gain_pitch={gain_pitch}"),
+    )
+
+
+IDENTIFICATION = (
+    excited("identify", "multisines on u1 to u4 at once, without a common line: for all constants", TOGETHER),
+    *(excited(f"identify-{one}", f"a multisine on {one} alone", {one: rms}) for one, rms in ALONE.items()),
+    excited(
+        "identify-chirp", "a chirp on u1; another one: --set excitation.u1=0 --set excitation.u3=0.1", {"u1": 0.08},
+        "excitation.signal=chirp",
+    ),
+    preliminary(1, 0.2, 0.15),
+    preliminary(2, 0.15, 0.1),
+)  # fmt: skip
