@@ -34,7 +34,7 @@ bench: .venv/test.stamp
 	@touch $@
 
 .venv/fly.stamp: .venv/pip.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable '.[radio,mavlink,view]'
+	$(BIN)/python -m pip install --quiet --editable '.[radio,mavlink,view,identify]'
 	@touch $@
 
 .venv/test.stamp: .venv/fly.stamp

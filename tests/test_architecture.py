@@ -42,7 +42,7 @@ FLOORS = (
     ("pictures", "exports"),
     ("servers", "live"),
     ("api", "design"),
-    ("studies", "deploy", "testing"),
+    ("studies", "deploy", "testing", "identify"),
     ("commands",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -91,11 +91,11 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "filterpy": (),
     "motioncapture": ("ground_station/sources/motioncapture_process.py",),
-    "scipy": ("hil/design/",),
+    "scipy": ("hil/design/", "hil/identify/"),
     "pytest": ("hil/testing/",),
     "hypothesis": ("hil/testing/strategies.py",),
     "perfetto": ("hil/exports/perfetto.py",),
-    "matplotlib": ("hil/pictures/", "hil/studies/", "hil/design/"),
+    "matplotlib": ("hil/pictures/", "hil/studies/", "hil/design/", "hil/identify/"),
     "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/",
         "hil/live/",
     ),
@@ -104,7 +104,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
 # stay out of all that flies; these files look at what was flown, or are done before.
 AFTER_THE_FLIGHT = (
     "hil/laboratory/metrics.py", "hil/pictures/", "hil/experiments/measures.py", "hil/experiments/take_off.py",
-    "hil/design/",
+    "hil/design/", "hil/identify/",
 )  # fmt: skip
 BY_PROCESSOR = """
     math.sin math.cos math.tan math.asin math.acos math.atan math.atan2 math.exp math.expm1 math.log math.log1p math.log2

@@ -10,13 +10,13 @@ import click
 from hil.commands.compare import compare
 from hil.commands.deploy import deploy
 from hil.commands.design import design
-from hil.commands.drag_model import drag_model
 from hil.commands.export import export
 from hil.commands.fly import fly
+from hil.commands.identify import identify
 from hil.commands.listing import list_experiments
 from hil.commands.new import new
 from hil.commands.options import INTERRUPTED
-from hil.commands.paper import paper, study
+from hil.commands.paper import drag_model, paper, study
 from hil.commands.param import param
 from hil.commands.pictures import report, view
 from hil.commands.serve import serve
@@ -31,7 +31,8 @@ def app() -> None:
 
 
 for command in (
-    fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, drag_model, design,
+    fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, identify,
+    drag_model, design,
     deploy,
 ):  # fmt: skip
     app.add_command(command)

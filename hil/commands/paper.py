@@ -1,5 +1,6 @@
-"""`floaty paper | study`: many flights and what they come to."""
+"""`floaty paper | study | drag-model`: many flights and what they come to, and the mounted robot on the balance."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -7,7 +8,15 @@ import click
 from rich.console import Console
 
 from hil.commands.design import show_claims
-from hil.commands.options import INTERRUPTED, announce_compilation, console, notices
+from hil.commands.options import (
+    INTERRUPTED,
+    announce_compilation,
+    console,
+    notices,
+    profile_option,
+    seed_option,
+    set_option,
+)  # fmt: skip
 from hil.errors import LabError
 
 if TYPE_CHECKING:
@@ -131,3 +140,34 @@ def _print_studies(flown: "Paper") -> None:
         ]
         verdict = "as expected" if result.holds else "; ".join(surprises) or "not complete"
         console.print(f"study {result.study.name}: {verdict}", soft_wrap=True)
+
+
+@click.command("drag-model")
+@seed_option
+@profile_option
+@set_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("runs/drag-model"),
+    show_default=True,
+    metavar="DIR",
+)
+def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -> None:
+    """Measure forces and torques on the mounted robot over flap angles, against the paper's simplified model."""
+    from rich.progress import track
+
+    from hil.config import load_config
+    from hil.studies import drag_model, drag_model_report
+
+    config = load_config(profile, overrides)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
+    announce_compilation()
+    measured = drag_model.measure(config, seed)
+    rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))
+    drag_model.write_csv(rows, out / "drag_model.csv")
+    page = drag_model_report.write(rows, math.degrees(config.plant.hover_angle), out)
+    console.print(f"report  {page}")

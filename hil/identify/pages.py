@@ -1,0 +1,139 @@
+"""The page and the pictures of an identification.
+
+For each excited axis: measured and fitted frequency response with the coherence, the errors over the scatter with their
+autocorrelation from line to line, and the answer over one period, measured and simulated from the input, on a flight that
+was not fitted where there is one. For the paper's method the one picture that explains what it finds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hil.errors import LabError
+from hil.identify.axes import response
+from hil.identify.identify import Identification
+from hil.identify.joint import Excited, excited_axes, whitened
+from hil.identify.record import Record
+from hil.identify.spectra import PERIOD_S
+from hil.identify.two_controllers import closed_loop
+from hil.pictures import curves
+from hil.pictures.drawing import WIDTH, png
+from hil.pictures.pages import data_uri, write_page
+
+OUTPUTS = {"roll": "roll rate", "pitch": "pitch rate", "yaw": "yaw rate", "z": "height"}
+UNITS = {"roll": "rad/s", "pitch": "rad/s", "yaw": "rad/s", "z": "m"}
+
+
+def write_pages(out: Path, found: Identification, held_out: Record | None) -> Path:
+    """Write the pictures and `identify.html`; return its path. Raises `LabError` for a useless held out flight."""
+    new = [] if held_out is None else excited_axes([held_out])
+    if held_out is not None and not any(one.axis is fitted.axis for one in new for fitted in found.excited):
+        raise LabError(f"--validate {held_out.name}: no input is excited in it that the fit knows")
+    figures = []
+    for axis in dict.fromkeys(one.axis for one in found.excited):
+        fitted = [one for one in found.excited if one.axis is axis]
+        shown = [one for one in new if one.axis is axis]
+        picture = png(lambda fitted=fitted, shown=shown: _axis(found, fitted, shown))
+        (out / f"identify_{axis.name}.png").write_bytes(picture)
+        figures.append({"title": f"{axis.name}, from u{axis.input + 1}", "image": data_uri(picture)})
+    if found.free:
+        picture = png(lambda: _identity(found.free))
+        (out / "identify_paper.png").write_bytes(picture)
+        figures.append(
+            {"title": "why the paper's equations tell nothing of the robot", "image": data_uri(picture)}
+        )
+    rows = [
+        {
+            "name": one.name, "unit": one.unit, "verdict": f"{one.verdict}: {one.why}",
+            "cells": [
+                _pair(one.paper), _pair((one.truth, np.nan)), _pair(one.two_controllers), _pair(one.instrumental),
+                _pair(one.joint),
+            ],
+        }
+        for one in found.constants
+    ]  # fmt: skip
+    names = ", ".join(record.name for record in (*found.records, *found.free))
+    return write_page(out / "identify.html", "identify.html.j2", rows=rows, figures=figures, names=names)
+
+
+def _pair(pair: tuple[float, float]) -> str:
+    if pair[0] != pair[0]:
+        return ""
+    return f"{pair[0]:.4g}" + (f" ± {pair[1]:.2g}" if pair[1] == pair[1] else "")
+
+
+def _axis(found: Identification, fitted: list[Excited], held_out: list[Excited]) -> Figure:
+    """Draw one axis."""
+    axis = fitted[0].axis
+    values = found.estimate.values
+    figure = Figure(figsize=(WIDTH, 5.6), layout="constrained")
+    (gain, phase), (errors, answer) = figure.subplots(2, 2)
+    grid = np.geomspace(fitted[0].spectra.w[0], fitted[0].spectra.w[-1], 200)
+    model = response(axis, values, grid)[:, 0]
+    gain.loglog(grid / 2 / np.pi, np.abs(model), color=curves.BLUE, label="joint fit")
+    phase.semilogx(grid / 2 / np.pi, np.degrees(np.unwrap(np.angle(model))), color=curves.BLUE)
+    together = gain.twinx()
+    together.set(ylim=(0, 1.05), ylabel="coherence with the excitation")
+    for one in fitted:
+        Z, hertz = one.spectra.Z, one.spectra.w / 2 / np.pi
+        measured = Z[:, 1] / Z[:, 0]
+        expected = response(axis, values, one.spectra.w)[:, 0]
+        turned = np.angle(measured / expected) + np.interp(one.spectra.w, grid, np.unwrap(np.angle(model)))
+        gain.loglog(hertz, np.abs(measured), "+", color=curves.RED, label="measured")
+        phase.semilogx(hertz, np.degrees(turned), "+", color=curves.RED)
+        together.semilogx(hertz, one.spectra.coherence[:, 1], ":", color=curves.GREY)
+        late = found.estimate.late[one.record] if one.record < len(found.estimate.late) else 0.0
+        left = whitened(one, values, late).reshape(2, len(hertz), -1)[:, :, 0]
+        errors.plot(hertz, left[0], ".", color=curves.RED)
+        errors.plot(hertz, left[1], ".", color=curves.SKY)
+        correlation = np.mean([np.corrcoef(part[:-1], part[1:])[0, 1] for part in left])
+        errors.set_title(f"error over scatter, real and imaginary; from line to line {correlation:+.2f}")
+    gain.set(ylabel=f"{OUTPUTS[axis.name]} per u{axis.input + 1} [{UNITS[axis.name]}/rad]")
+    gain.legend(loc="lower left")
+    phase.set(xlabel="frequency [Hz]", ylabel="phase [deg]")
+    errors.axhspan(-2, 2, color=curves.GREY, alpha=0.2)
+    errors.set(xlabel="frequency [Hz]")
+    seen = (held_out or fitted)[0]
+    t = np.linspace(0.0, PERIOD_S, 1001)
+    Z = seen.spectra.Z * seen.spectra.excitation[:, None]
+    predicted = response(axis, values, seen.spectra.w)[:, 0] * Z[:, 0]
+    wave = np.exp(1j * np.outer(t, seen.spectra.w))
+    answer.plot(t, (wave @ Z[:, 1]).real, color=curves.RED, label="measured")
+    answer.plot(t, (wave @ predicted).real, color=curves.BLUE, label="simulated from the input")
+    answer.set(
+        xlim=(0, 5), xlabel="time in the period [s]", ylabel=f"{OUTPUTS[axis.name]} [{UNITS[axis.name]}]"
+    )
+    answer.set_title(
+        "a flight that was not fitted" if held_out else "the fitted flight; --validate RUN: another"
+    )
+    answer.legend(loc="upper right")
+    return figure
+
+
+def _identity(records: tuple[Record, ...]) -> Figure:
+    """Draw, bin by bin, what eq. (roll_dynamics_sys_of_equations) is fitted to."""
+    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
+    panels = figure.subplots(1, min(2, len(records)), squeeze=False)[0]
+    for axes, record in zip(panels, records, strict=False):
+        loop = closed_loop(record, "roll")
+        axes.plot(
+            loop.w**2,
+            (loop.acceleration / loop.angle).real,
+            ".",
+            color=curves.RED,
+            markersize=2,
+            label="every bin",
+        )
+        axes.plot(np.sort(loop.w**2), -np.sort(loop.w**2), color="black", label="−ω², whatever flies")
+        axes.axhline(
+            loop.starred[1],
+            color=curves.BLUE,
+            label=f"c* = {loop.starred[1]:.1f} ± {1.96 * loop.errors[1]:.1f}",
+        )
+        axes.set(xlabel="ω² [1/s²]", ylabel="jωȦ / A, real part [1/s²]", ylim=(-1000, 100))
+        axes.set_title(f"{record.name}: b* = {loop.starred[0]:.2f}")
+        axes.legend(loc="lower left")
+    return figure

@@ -1,0 +1,92 @@
+"""A profile of what was identified, on top of another: model, servo lag, trim, with the uncertainty as comments.
+
+What was not identified keeps the value that it has there, and the others are fitted once more with it: so the profile's
+model answers as the robot did even where single constants cannot be told apart.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hil.config import load_config
+from hil.errors import LabError
+from hil.identify.axes import AXES, DELAY, LAG
+from hil.identify.identify import NUISANCES, UNKNOWN, Identification
+from hil.identify.joint import Estimate, joint
+
+TRIM_LEAST = 0.005  # [rad] mean input that is worth a trim
+WORDS_PER_RADIAN = 31290
+# Flap angles per input: eq. (input_signals).
+MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)
+
+
+def refit(found: Identification, profile: str) -> Estimate:
+    """Return the joint fit with the constants that nobody knows at the profile's values."""
+    model = load_config(profile).model
+    fixed = {
+        constant.name: getattr(model, constant.name)
+        for constant in found.constants
+        if constant.verdict == UNKNOWN and constant.name not in (*NUISANCES, LAG, DELAY)
+    }
+    excited_constants = {name for one in found.excited for name in one.axis.constants}
+    start = {
+        constant.name: constant.best for constant in found.constants if constant.name in excited_constants
+    }
+    return joint(
+        found.excited,
+        1.0 / model.flap_rate,
+        start,
+        {k: v for k, v in fixed.items() if k in excited_constants},
+    )
+
+
+def write_profile(path: Path, profile: str, found: Identification) -> None:
+    """Write the profile. Raises `LabError` when nothing was identified, or it cannot be written."""
+    if not any(constant.verdict != UNKNOWN and constant.name != DELAY for constant in found.constants):
+        raise LabError(f"--profile-out {path}: nothing was identified that a profile could hold")
+    fitted = refit(found, profile)
+    base = Path(profile).resolve().as_posix() if profile.endswith(".toml") else profile
+    lines = [
+        f"# Identified by `floaty identify` from {', '.join(record.name for record in found.records)}.",
+        f'base = "{base}"',
+        "",
+    ]
+    lines.append("[model]                   # value, half width of the 95 % interval, verdict")
+    for axis in AXES:
+        for name in axis.constants:
+            constant = found.constant(name)
+            if name in NUISANCES or name not in fitted.values:
+                continue
+            text = f"{name} = {fitted.values[name]:.6g}"
+            lines.append(f"{text:26}# ± {constant.joint[1]:.2g}, {constant.verdict}")
+    kept = [
+        c.name for c in found.constants if c.verdict == UNKNOWN and c.name not in (*NUISANCES, LAG, DELAY)
+    ]
+    if kept:
+        lines.append(f"# as in {profile}, not identifiable from these flights: {', '.join(kept)}")
+    lag = found.constant(LAG)
+    told = f"lag {1e3 * lag.joint[0]:.1f} ± {1e3 * lag.joint[1]:.1f} ms, {lag.verdict}"
+    lines.append(f"{f'flap_rate = {1 / fitted.values[LAG]:.4g}':26}# {told}")
+    lines.append(
+        f"# input to gyro {1e3 * fitted.values[DELAY]:.1f} ms, of which the firmware's own timing makes 13"
+    )
+    lines += ["", *_trim(found)]
+    try:
+        path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    except OSError as error:
+        raise LabError(f"--profile-out {path}: cannot be written ({error.strerror or error})") from None
+    load_config(str(path))  # what cannot fly is an error here, not at the next flight
+
+
+def _trim(found: Identification) -> list[str]:
+    """Return the section [servo] that makes the mean inputs zero, empty where they are."""
+    mean = np.mean([record.u.mean(axis=0) for record in found.records], axis=0)
+    if np.all(np.abs(mean) < TRIM_LEAST):
+        return []
+    servo = found.records[0].config.servo
+    turned = WORDS_PER_RADIAN * np.array(servo.direction) * (MIX @ mean)
+    trim = [round(old + more) for old, more in zip(servo.trim, turned.tolist(), strict=True)]
+    shown = ", ".join(f"{1e3 * value:.0f}" for value in mean)
+    return ["[servo]", f"trim = {trim}   # the flights needed u1..u4 of {shown} mrad on the mean"]

@@ -1,0 +1,149 @@
+"""What a flight's log says for identification: inputs, excitation, gyro rates and poses, each with its instants.
+
+The log is the ground station's `telemetry.csv`, alone or in a run folder, of a simulated or a real flight. Times are those
+of the board's clock; a pose's instant comes from the ground's clock, which runs `clock_s` ahead. What remains between the
+two, the telemetry's way down, is a few milliseconds and is found from the data (`hil.identify.spectra`).
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from firmware_py.wire.supervisor import State
+from ground_station.telemetry_log import POSE_COLUMNS, TELEMETRY, TIME_COLUMN
+from hil.config import LabConfig, load_config
+from hil.errors import LabError
+from hil.laboratory.recorder import PARQUET, load_log
+from hil.laboratory.result import read_result
+
+Array = NDArray[np.float64]
+BOARD_COLUMN = "board.t [ms]"
+INPUTS = tuple(f"controller.u{i} [rad]" for i in range(1, 5))
+EXCITATIONS = tuple(f"excite.u{i} [rad]" for i in range(1, 5))
+RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch", "yaw"))
+WRAP_MS = 1 << 24  # of the board's time stamps
+# Opening of each flap per input, eq. (input_signals) times the flap's sense; u4 closes.
+SHARES = np.array([[1, -1, -1, 1], [1, 1, -1, -1], [-1, 1, -1, 1], [-1, -1, -1, -1]], float)
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One flight under control. Rows of `t` (N,) and of `pose_t` (M,) are not the same instants."""
+
+    name: str
+    t: Array  # (N,) [s] board's clock
+    u: Array  # (N, 4) [rad] what the flaps were commanded, after their limits
+    excitation: Array  # (N, 4) [rad] NaN-free; zero where none was reported
+    rates: Array  # (N, 3) [rad/s] gyro, B
+    pose_t: Array  # (M,) [s] board's clock, when the cameras exposed
+    pose: Array  # (M, 6) x y z [m], roll pitch yaw [rad], W
+    saturated: float  # share of the rows in which a flap stood at its limit
+    lost_rows: float  # share of the rows that are missing
+    config: LabConfig  # what flew: gains and limits
+    simulated: bool  # its plant is known
+
+    @property
+    def period_s(self) -> float:
+        """Between two rows, the usual one."""
+        return float(np.median(np.diff(self.t)))
+
+
+def load_record(path: Path, profile: str) -> Record:
+    """Return the record of a run folder, or of a `telemetry.csv`, which was flown with `profile`. Raises `LabError`."""
+    folder, file = (path, path / TELEMETRY) if path.is_dir() else (path.parent, path)
+    if not file.is_file():
+        raise LabError(f"{path}: no {TELEMETRY} there; identify takes run folders and telemetry.csv")
+    config, simulated = _flown_with(folder) if path.is_dir() else (load_config(profile), False)
+    columns = _read(file)
+    state = columns["supervisor.state []"]
+    flown = (state == State.FLYING) & np.all(
+        np.isfinite([columns[name] for name in (*INPUTS, *RATES)]), axis=0
+    )
+    if folder_release := _release_s(folder, simulated):
+        flown &= columns[BOARD_COLUMN] * 1e-3 > folder_release
+    if np.count_nonzero(flown) < 100:
+        raise LabError(
+            f"{path}: {np.count_nonzero(flown)} rows of flight under control; identification needs 100 at least"
+        )
+    board_s = 1e-3 * np.unwrap(columns[BOARD_COLUMN], period=WRAP_MS)
+    ahead_s = float(np.median(columns[TIME_COLUMN] - board_s))
+    t = board_s[flown]
+    order = np.concatenate([[True], np.diff(t) > 0])
+    if not np.all(order):
+        raise LabError(f"{path}: the board's time runs backwards; one flight, in its order, is expected")
+    u = np.stack([columns[name][flown] for name in INPUTS], axis=1)
+    limited, saturated = _limited(u, config)
+    steps = np.diff(t)
+    usual = float(np.median(steps))
+    pose_t, pose = _poses(columns, flown, ahead_s)
+    excitation = np.nan_to_num(np.stack([columns[name][flown] for name in EXCITATIONS], axis=1))
+    rates = np.stack([columns[name][flown] for name in RATES], axis=1)
+    return Record(
+        str(path), t, limited, excitation, rates, pose_t, pose, saturated,
+        1.0 - len(t) / (1.0 + (t[-1] - t[0]) / usual), config, simulated,
+    )  # fmt: skip
+
+
+def _read(file: Path) -> dict[str, Array]:
+    """Return the columns by their titles; excitation that is not there is zero."""
+    with file.open(encoding="utf-8", newline="") as lines:
+        rows = list(csv.reader(lines))
+    titles = rows[0] if rows else []
+    whole = [
+        row for row in rows[1:] if len(row) == len(titles)
+    ]  # a flight that was cut off ends in half a row
+    try:
+        table = np.array(whole, float).reshape(len(whole), len(titles))
+    except ValueError as error:
+        raise LabError(f"{file}: {error}") from None
+    columns = dict(zip(titles, table.T, strict=True))
+    for name in EXCITATIONS:
+        columns.setdefault(name, np.zeros(len(whole)))
+    for name in (BOARD_COLUMN, TIME_COLUMN, *POSE_COLUMNS, *INPUTS, *RATES, "supervisor.state []"):
+        if name not in columns:
+            raise LabError(f"{file}: no column {name!r}")
+    return columns
+
+
+def _flown_with(folder: Path) -> tuple[LabConfig, bool]:
+    """Return the configuration of a run folder, and whether its world was simulated."""
+    text = (load_log(folder).schema.metadata or {})[b"config"]
+    try:
+        return LabConfig.model_validate_json(text), read_result(folder).seed is not None
+    except ValidationError as error:
+        key = ".".join(map(str, error.errors()[0]["loc"]))
+        raise LabError(
+            f"{folder}: flown by another version, whose configuration this one does not read ({key}); give its {TELEMETRY} "
+            "and --profile"
+        ) from None
+
+
+def _release_s(folder: Path, simulated: bool) -> float:
+    """Return when the robot was let go, on the board's clock; 0 where that is not known."""
+    if not simulated or not (folder / PARQUET).exists():
+        return 0.0
+    return 1e-6 * float((load_log(folder).schema.metadata or {}).get(b"release_us", b"0"))
+
+
+def _limited(u: Array, config: LabConfig) -> tuple[Array, float]:
+    """Return the inputs that the limited flaps make, and how often a flap was limited: what `allocate` does on board."""
+    allocation = config.allocation
+    opening = allocation.hover_angle + u @ SHARES
+    inside = np.clip(opening, allocation.opening_min, allocation.opening_max)
+    saturated = float(np.mean(np.any(np.abs(inside - opening) > 1e-4, axis=1)))
+    return (inside - allocation.hover_angle) @ SHARES.T / 4.0, saturated
+
+
+def _poses(columns: dict[str, Array], flown: NDArray[np.bool_], ahead_s: float) -> tuple[Array, Array]:
+    """Return every pose once, with yaw unwrapped."""
+    t, *parts = (columns[name][flown] for name in POSE_COLUMNS)
+    new = np.isfinite(t) & np.concatenate([[True], np.diff(t) > 0])
+    pose = np.stack(parts, axis=1)[new]
+    pose[:, 5] = np.unwrap(pose[:, 5])
+    return t[new] - ahead_s, pose

@@ -1,0 +1,191 @@
+"""Identification of planted robots: linear ones that scipy simulates, in coloured gusts, as telemetry.csv."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter, ss2tf
+
+from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
+from hil.config import load_config
+from hil.errors import LabError
+from hil.identify.identify import IDENTIFIED, UNKNOWN, Identification, identify
+from hil.identify.profile_out import write_profile
+from hil.identify.record import BOARD_COLUMN, EXCITATIONS, INPUTS, RATES, load_record
+from hil.identify.two_controllers import closed_loop, input_constant
+
+PITCH = {
+    "pitch_u2": -900.0, "pitch_rate": -22.0, "pitch_pitch": -1300.0, "pitch_vx": -130.0, "x_u2": -0.9, "x_pitch": 2.7,
+    "x_vx": -0.7, "lag": 0.045,
+}  # fmt: skip
+Array = NDArray[np.float64]
+MS = 1e-3
+BEGIN_MS, PERIOD_MS = 3000, 20_000
+ACTUATION_MS = 4
+Change = Callable[[dict[str, Array]], dict[str, Array]]
+
+
+def simulated(inputs: Array, matrix: Array, column: Array) -> Array:
+    """The states (N, 5), flap, pitch, rate, x, vx, of inputs at 1 kHz."""
+    A, B, *_ = cont2discrete((matrix, column, np.eye(5), np.zeros((5, 1))), MS)
+    numerators, denominator = ss2tf(A, B, np.eye(5), np.zeros((5, 1)))
+    return np.stack([lfilter(row, denominator, inputs) for row in numerators], axis=1)
+
+
+def flight(
+    seed: int, seconds: float = 126.0, rms: float = 0.05, disturbance: float = 1.0
+) -> dict[str, Array]:
+    """The columns of telemetry.csv of a robot that a multisine on u2 excites and gusts of 30 ms disturb."""
+    rng = np.random.default_rng(seed)
+    k = PITCH
+    matrix = np.array([
+        [-1 / k["lag"], 0, 0, 0, 0],
+        [0, 0, 1, 0, 0],
+        [k["pitch_u2"], k["pitch_pitch"], k["pitch_rate"], 0, k["pitch_vx"]],
+        [0, 0, 0, 0, 1],
+        [k["x_u2"], k["x_pitch"], -0.04, 0, k["x_vx"]],
+    ])  # fmt: skip
+    tick = np.arange(round(seconds * 100))
+    phase = 2 * np.pi * rng.random(19)
+    lines = np.array([5 + 8 * index for index in range(19)]) / 20
+    t = 0.01 * tick
+    r = np.where(tick >= BEGIN_MS // 10, np.cos(2 * np.pi * np.outer(t, lines) + phase).sum(axis=1), 0.0)
+    r *= rms * np.sqrt(2 / len(lines))
+    held = np.repeat(r, 10)
+    late = np.concatenate([np.zeros(ACTUATION_MS), held[:-ACTUATION_MS]])
+    states = simulated(late, matrix, np.array([[1 / k["lag"]], [0], [0], [0], [0]]))
+    gust = lfilter([1 - np.exp(-1 / 30)], [1, -np.exp(-1 / 30)], rng.normal(0, 60 * disturbance, len(held)))
+    states = states + simulated(gust, matrix, np.array([[0.0], [0], [1], [0], [0]]))
+    rate = lfilter(np.ones(10) / 10, [1.0], states[:, 2])
+    rows = np.arange(20, len(held), 20)
+    zero = np.zeros(len(rows))
+    columns = {BOARD_COLUMN: rows.astype(float), TIME_COLUMN: MS * rows + 0.0016}
+    pose = [MS * (rows - 40), states[rows - 40, 3], zero, zero + 1.15, zero, states[rows - 40, 1], zero]
+    noise = [0.0, 5e-4, 5e-4, 5e-4, 4e-3, 4e-3, 4e-3]
+    columns |= {
+        name: value + rng.normal(0, spread, len(rows))
+        for name, value, spread in zip(POSE_COLUMNS, pose, noise, strict=True)
+    }
+    columns |= dict.fromkeys((*INPUTS, *EXCITATIONS, *RATES), zero)
+    columns |= {
+        INPUTS[1]: r[rows // 10],
+        EXCITATIONS[1]: r[rows // 10],
+        RATES[1]: rate[rows] + rng.normal(0, 0.02, len(rows)),
+    }
+    return columns | {"supervisor.state []": zero + 2}
+
+
+def written(folder: Path, columns: dict[str, Array], *changes: Change) -> Path:
+    for change in changes:
+        columns = change(columns)
+    path = folder / "telemetry.csv"
+    header = ",".join(columns)
+    np.savetxt(
+        path,
+        np.stack(list(columns.values()), axis=1),
+        "%.9g",
+        ",",
+        header=header,
+        comments="",
+        encoding="utf-8",
+    )
+    return path
+
+
+def identified(folder: Path, columns: dict[str, Array], *changes: Change) -> Identification:
+    return identify([load_record(written(folder, columns, *changes), "floaty")])
+
+
+def keep(chosen: Callable[[int], NDArray[np.bool_]]) -> Change:
+    return lambda columns: {name: values[chosen(len(values))] for name, values in columns.items()}
+
+
+def assert_true(found: Identification) -> None:
+    for name in ("pitch_u2", "pitch_rate", "pitch_pitch", "lag"):
+        constant = found.constant(name)
+        value, half = constant.joint
+        assert constant.verdict == IDENTIFIED, (name, constant.why)
+        assert abs(value - PITCH[name]) <= 1.5 * half, name
+        assert value == pytest.approx(PITCH[name], rel=0.10), name
+
+
+def test_a_planted_robot_is_found_in_coloured_gusts(tmp_path: Path) -> None:
+    assert_true(identified(tmp_path, flight(1)))
+
+
+def test_a_fifth_of_the_rows_may_be_lost(tmp_path: Path) -> None:
+    assert_true(identified(tmp_path, flight(2), keep(lambda n: np.random.default_rng(3).random(n) > 0.2)))
+
+
+def test_another_sample_rate_does_no_harm(tmp_path: Path) -> None:
+    assert_true(identified(tmp_path, flight(4), keep(lambda n: np.arange(n) % 2 == 0)))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "change", "reason"),
+    [
+        (40.0, keep(lambda n: np.ones(n, bool)), "periods of 20 s after it settled; at least 4"),
+        (126.0, lambda columns: columns | {EXCITATIONS[1]: 0 * columns[EXCITATIONS[1]]}, "no excitation"),
+        (126.0, keep(lambda n: np.random.default_rng(3).random(n) > 0.5), "rows are missing"),
+        (126.0, lambda columns: columns | {BOARD_COLUMN: 0.5 * columns[BOARD_COLUMN]}, "does not repeat every 20 s|periods"),
+        (126.0, lambda columns: columns | {BOARD_COLUMN: 1.02 * columns[BOARD_COLUMN]}, "does not repeat every 20 s"),
+        (126.0, keep(lambda n: np.arange(n) % 8 == 0), "samples in a period|too far apart"),
+    ],
+    ids=["too short", "no excitation", "half the rows lost", "clock twice too slow", "clock 2 % fast", "6 rows a second"],
+)  # fmt: skip
+def test_a_log_that_cannot_tell_is_refused_with_the_reason(
+    tmp_path: Path, seconds: float, change: Change, reason: str
+) -> None:
+    with pytest.raises(LabError, match=reason):
+        identified(tmp_path, flight(5, seconds), change)
+
+
+def test_saturated_flaps_make_no_constant_believable(tmp_path: Path) -> None:
+    found = identified(tmp_path, flight(6, rms=0.4))
+    assert {constant.verdict for constant in found.constants if constant.joint[0] == constant.joint[0]} <= {
+        UNKNOWN,
+        "weak",
+    }
+    assert "limits" in found.constant("pitch_u2").why
+    assert found.constant("pitch_u2").verdict == UNKNOWN
+
+
+def test_what_is_not_excited_is_not_identifiable(tmp_path: Path) -> None:
+    found = identified(tmp_path, flight(7))
+    assert {found.constant(name).why for name in ("roll_u1", "yaw_rate", "z_u4")} == {
+        "its axis is not excited"
+    }
+
+
+def test_the_intervals_hold_the_truth_of_most_constants(tmp_path: Path) -> None:
+    hits = []
+    for seed in range(10, 16):
+        found = identified(tmp_path, flight(seed))
+        for name in PITCH:
+            value, half = found.constant(name).joint
+            hits.append(abs(value - PITCH[name]) <= half)
+    assert np.mean(hits) >= 0.85
+
+
+def test_a_profile_of_what_was_identified_loads_and_keeps_what_was_not(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    write_profile(path, "floaty", identified(tmp_path, flight(1)))
+    model = load_config(str(path)).model
+    assert model.pitch_u2 == pytest.approx(-900, rel=0.1)
+    assert model.flap_rate == pytest.approx(1 / 0.045, rel=0.1)
+    assert model.roll_u1 == load_config().model.roll_u1
+    assert "± " in path.read_text()
+
+
+def test_the_papers_arithmetic_gives_230_and_minus_14_where_its_text_prints_minus_16() -> None:
+    a, c = input_constant((-60.0, -48.5), (-0.2, -0.15))
+    assert (a, c) == (pytest.approx(230.0), pytest.approx(-14.0))
+
+
+def test_the_papers_equations_find_no_damping_whatever_the_robot_has(tmp_path: Path) -> None:
+    record = load_record(written(tmp_path, flight(8, 60.0)), "floaty")
+    loop = closed_loop(record, "pitch")
+    assert abs(loop.starred[0]) < 0.1 * abs(PITCH["pitch_rate"])
+    assert np.median((loop.acceleration / loop.angle).real / -(loop.w**2)) == pytest.approx(1.0, abs=0.15)
