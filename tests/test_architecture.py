@@ -42,7 +42,7 @@ FLOORS = (
     ("pictures", "exports"),
     ("servers", "live"),
     ("api", "design"),
-    ("studies", "deploy", "testing", "identify"),
+    ("studies", "campaigns", "deploy", "testing", "identify"),
     ("commands",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -56,17 +56,17 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "rerun": ("hil/pictures/viewer.py",),
     "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
     "youplot": ("hil/pictures/pages.py",),
-    "time": ("hil/clock.py", "hil/laboratory/run.py", "ground_station/clock.py"),
+    "time": ("hil/clock.py", "hil/laboratory/run.py", "hil/campaigns/flying.py", "ground_station/clock.py"),
     "datetime": (),
     "asyncio": (),
     "threading": (
-        "hil/live/feed.py",
+        "hil/live/feed.py", "hil/campaigns/cluster.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
         "ground_station/terminal.py",
     ),
     "prompt_toolkit": ("ground_station/terminal.py",),
     "multiprocessing": ("hil/studies/sweep.py",),
-    "concurrent": ("hil/studies/sweep.py",),
+    "concurrent": ("hil/studies/sweep.py", "hil/campaigns/cluster.py"),
     "unicorn": ("firmware_py/export/cortex_m4.py",),
     "elftools": ("firmware_py/export/arm_image.py",),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
@@ -82,7 +82,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "random": (),
     "secrets": (),
-    "numpy.random.default_rng": ("hil/laboratory/robot.py",),
+    "numpy.random.default_rng": ("hil/laboratory/robot.py", "hil/campaigns/sampling.py"),
     "numpy.random.seed": (),
     "cflib": ("ground_station/links/crazyradio.py", "ground_station/flashing.py"),
     "serial": ("ground_station/links/mavlink_serial.py",),
@@ -91,20 +91,23 @@ CONFINED: dict[str, tuple[str, ...]] = {
     ),
     "filterpy": (),
     "motioncapture": ("ground_station/sources/motioncapture_process.py",),
-    "scipy": ("hil/design/", "hil/identify/"),
+    "scipy": ("hil/design/", "hil/identify/", "hil/campaigns/"),
+    "SALib": ("hil/campaigns/",),
+    "dask": ("hil/campaigns/cluster.py",),
+    "distributed": ("hil/campaigns/cluster.py",),
     "pytest": ("hil/testing/",),
     "hypothesis": ("hil/testing/strategies.py",),
     "perfetto": ("hil/exports/perfetto.py",),
-    "matplotlib": ("hil/pictures/", "hil/studies/", "hil/design/", "hil/identify/"),
+    "matplotlib": ("hil/pictures/", "hil/studies/", "hil/design/", "hil/identify/", "hil/campaigns/report.py"),
     "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/",
-        "hil/live/",
+        "hil/live/", "hil/campaigns/",
     ),
 }  # fmt: skip
 # BLAS, LAPACK, the C library's functions and numpy's vector code have other last bits on other processors, so they
 # stay out of all that flies; these files look at what was flown, or are done before.
 AFTER_THE_FLIGHT = (
     "hil/laboratory/metrics.py", "hil/pictures/", "hil/experiments/measures.py", "hil/experiments/take_off.py",
-    "hil/design/", "hil/identify/",
+    "hil/design/", "hil/identify/", "hil/campaigns/findings.py",
 )  # fmt: skip
 BY_PROCESSOR = """
     math.sin math.cos math.tan math.asin math.acos math.atan math.atan2 math.exp math.expm1 math.log math.log1p math.log2
@@ -231,6 +234,8 @@ def test_file_keeps_to_its_room(path: Path) -> None:
         ("hil/laboratory/flight.py", "from hil.experiments import EXPERIMENTS"),
         ("hil/pictures/report.py", "import hil.servers.server"),
         ("hil/deploy/check.py", "from hil.studies.paper import fly_paper"),
+        ("hil/campaigns/run.py", "from distributed import Client"),
+        ("hil/campaigns/run.py", "from hil.studies.sweep import fly_all"),
         ("hil/clock.py", "from hil.config import LabConfig"),
         ("hil/laboratory/run.py", "import click"),
         ("hil/devices/imu.py", "from firmware_py.drivers.imu import body_of"),

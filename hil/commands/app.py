@@ -7,6 +7,7 @@ import sys
 
 import click
 
+from hil.commands.campaign import campaign
 from hil.commands.compare import compare
 from hil.commands.deploy import deploy
 from hil.commands.design import design
@@ -33,7 +34,7 @@ def app() -> None:
 for command in (
     fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, identify,
     drag_model, design,
-    deploy,
+    campaign, deploy,
 ):  # fmt: skip
     app.add_command(command)
 

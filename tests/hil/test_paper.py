@@ -10,26 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from firmware_py.config import ControllerConfig, ModelConfig
+from hil.campaigns.config import PAPER_TABLE
 from hil.config import load_config
 
-# Paper, Supplementary Table of dynamics constants: f_{affected, influencing}, value +- uncertainty
-TABLE = """
-roll_u1      230   66
-roll_roll    -16   10
-roll_rate    -40   12
-y_u1        -4.8  0.1
-y_roll      -6.5  0.1
-pitch_u2    1100  170
-pitch_pitch -1560  25
-pitch_rate   -29    5
-x_u2        -0.8  0.1
-x_pitch      2.5  0.1
-yaw_u3       110  1.8
-yaw_rate    -7.7  0.1
-z_u4         2.3  0.3
-z_vz          -2  0.1
-"""
-ROWS = {name: (float(value), float(error)) for name, value, error in map(str.split, TABLE.split("\n")[1:-1])}
+ROWS = PAPER_TABLE  # value, uncertainty
 METHODS_PITCH_U2 = -1066.0  # paper, Methods, "Data-driven estimation of dynamics constants"
 G, AIRSPEED = 9.81, 10.0  # [m/s2], [m/s] paper, Experimental platform
 FLAP_LAG = 0.05  # [s] the author's firmware, flapTimeConst = 20 1/s

@@ -1,0 +1,133 @@
+"""Flights on Dask's workers: processes of this computer, or those of a scheduler that is there already.
+
+A worker that dies is replaced and its flights are flown again. Which flight has killed it is not known when several wait
+there; so those are flown once more at the end, each alone, and only the one that kills its worker then becomes a row.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import logging
+import os
+import threading
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import CancelledError
+
+import dask
+from distributed import Client, Future, KilledWorker, LocalCluster, wait
+
+from hil.campaigns.flying import Campaign, Row, failed, fly_flight
+from hil.campaigns.sampling import draw
+from hil.errors import LabError
+
+LOOK_S = 0.2  # how soon Ctrl-C is seen
+PER_WORKER = 2  # flights there, one of which waits: none stands idle while a row travels
+CONNECT_S = 30.0
+FlyOne = Callable[[Campaign, int], Row]
+
+_ALONE = threading.Lock()  # one flight per process at a time: its time limit is the process'
+
+
+def fly_alone(campaign: Campaign, index: int, fly_one: FlyOne) -> Row:
+    """Fly in a worker; one that hangs where nothing can be asked of it ends the process."""
+    with _ALONE, open(os.devnull, "w") as nowhere:
+        faulthandler.dump_traceback_later(2.0 * campaign.spec.limits.wall_s, exit=True, file=nowhere)
+        try:
+            return fly_one(campaign, index)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+
+class Workers:
+    """Dask's workers, until `close`. `address` is that of a scheduler; empty: `count` processes of this computer.
+
+    Raises `LabError` when the scheduler is not there or has no workers.
+    """
+
+    def __init__(self, count: int, address: str = "") -> None:
+        self._cluster: LocalCluster | None = None
+        self._address = address
+        dask.config.set({"distributed.scheduler.allowed-failures": 0})  # of our own scheduler
+        for name in ("distributed", "distributed.nanny", "distributed.scheduler", "distributed.worker"):
+            logging.getLogger(name).setLevel(
+                logging.CRITICAL
+            )  # what concerns the user becomes a row or an error
+        try:
+            if address:
+                self.client = Client(address, timeout=CONNECT_S)
+                self.client.wait_for_workers(1, timeout=CONNECT_S)
+            else:
+                self._cluster = LocalCluster(
+                    n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+                    memory_limit=0, silence_logs=logging.CRITICAL,
+                )  # fmt: skip
+                self.client = Client(self._cluster)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise LabError(f"--cluster {address or 'local'}: no workers ({error})") from None
+
+    def close(self) -> None:
+        """End the workers that were begun here, and what they fly."""
+        self.client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+    def fly(
+        self,
+        campaign: Campaign,
+        stopped: Callable[[], bool],
+        indices: Iterator[int],
+        fly_one: FlyOne = fly_flight,
+    ) -> Generator[Row]:
+        """Yield the rows of flights as they come, until `stopped`. Raises `LabError` for a full disk or a lost cluster."""
+        suspects: list[int] = []
+        room = PER_WORKER * sum(self.client.nthreads().values())
+        yield from self._fly(campaign, stopped, indices, fly_one, room, suspects)
+        yield from self._fly(campaign, stopped, iter(suspects.copy()), fly_one, 1, None)
+
+    def _fly(
+        self, campaign: Campaign, stopped: Callable[[], bool], indices: Iterator[int], fly_one: FlyOne,
+        room: int, suspects: list[int] | None,
+    ) -> Generator[Row]:  # fmt: skip
+        """Fly with `room` flights under way; those of dead workers become suspects, and without such a list rows."""
+        flying: dict[Future, int] = {}
+        try:
+            while not stopped():
+                while len(flying) < max(1, room) and (index := next(indices, None)) is not None:
+                    flying[self.client.submit(fly_alone, campaign, index, fly_one, pure=False)] = index
+                if not flying:
+                    return
+                try:
+                    wait(list(flying), timeout=LOOK_S, return_when="FIRST_COMPLETED")
+                except TimeoutError:
+                    continue
+                except CancelledError:
+                    pass  # one of them is; which one is seen below
+                ended = [future for future in flying if future.status != "pending"]
+                for future in ended:
+                    index = flying.pop(future)
+                    row = self._row_of(future, campaign, index, suspects)
+                    if row is not None:
+                        yield row
+        finally:
+            self.client.cancel(list(flying), force=True)
+
+    def _row_of(
+        self, future: Future, campaign: Campaign, index: int, suspects: list[int] | None
+    ) -> Row | None:
+        try:
+            row: Row = future.result()
+            return row
+        except LabError:
+            raise
+        except (KilledWorker, CancelledError):  # the latter: it had ended, and its row died with the worker
+            if self.client.status != "running":
+                where = self._address or "local"
+                raise LabError(f"--cluster {where}: lost; --resume goes on with what is there") from None
+        except Exception as error:
+            return failed(draw(campaign.spec, index), f"{type(error).__name__}: {error}")
+        if suspects is not None:
+            suspects.append(index)
+            return None
+        return failed(
+            draw(campaign.spec, index), "the process that flew it died, also when it flew nothing else"
+        )

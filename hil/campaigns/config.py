@@ -1,0 +1,223 @@
+"""What a campaign's TOML file may say: experiments, what varies and how, when to stop, how long a flight may take.
+
+Every mistake is a `LabError` of one line that names the key, its value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import ErrorDetails
+
+from hil.config import DEFAULT_PROFILE
+from hil.errors import LabError, hint
+from hil.world.config import ConstantName
+
+Value = bool | int | float | str
+Sampling = Literal["random", "sobol", "latin", "saltelli", "morris"]
+DESIGNS = ("saltelli", "morris")  # all their points together give the indices; they cannot stop early
+STOP = re.compile(r"failure rate known to (?:±|\+-)\s*(\d+(?:\.\d+)?)\s*%")
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+# Paper, Supplementary Table of dynamics constants: f_{affected, influencing}, value and uncertainty.
+PAPER_TABLE: dict[str, tuple[float, float]] = {
+    "roll_u1": (230.0, 66.0),
+    "roll_roll": (-16.0, 10.0),
+    "roll_rate": (-40.0, 12.0),
+    "y_u1": (-4.8, 0.1),
+    "y_roll": (-6.5, 0.1),
+    "pitch_u2": (1100.0, 170.0),
+    "pitch_pitch": (-1560.0, 25.0),
+    "pitch_rate": (-29.0, 5.0),
+    "x_u2": (-0.8, 0.1),
+    "x_pitch": (2.5, 0.1),
+    "yaw_u3": (110.0, 1.8),
+    "yaw_rate": (-7.7, 0.1),
+    "z_u4": (2.3, 0.3),
+    "z_vz": (-2.0, 0.1),
+}
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="strings")
+
+
+class Distribution(_Part):
+    """How one number varies: exactly one of the four."""
+
+    uniform: tuple[Finite, Finite] | None = Field(None, description="[low, high]")
+    log_uniform: tuple[Finite, Finite] | None = Field(None, description="[low, high], above 0")
+    normal: tuple[Finite, Finite] | tuple[Finite, Finite, Finite, Finite] | None = Field(
+        None, description="[mean, deviation], or [mean, deviation, low, high] cut there"
+    )
+    choice: tuple[Value, ...] | None = Field(None, description="each as likely as the others", min_length=1)
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Distribution:
+        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected one of {', '.join(type(self).model_fields)}")
+        for bounds in (self.uniform, self.log_uniform, self.normal and self.normal[2:]):
+            if bounds and not bounds[0] < bounds[1]:
+                raise ValueError("expected low < high")
+        if self.log_uniform and self.log_uniform[0] <= 0.0:
+            raise ValueError("log_uniform: expected bounds above 0")
+        if self.normal and self.normal[1] <= 0.0:
+            raise ValueError("normal: expected a deviation above 0")
+        return self
+
+
+Number = float | Distribution
+
+
+class SampledFault(_Part):
+    """A fault of every flight, or of a share of them."""
+
+    kind: str = Field(description="as `floaty list --faults` has it")
+    probability: float = Field(1.0, gt=0, le=1, description="that it happens in a flight")
+    start_s: Number = Field(description="after the release [s]")
+    duration_s: Number | None = Field(None, description="[s]; default: the kind's")
+    size: Number | None = Field(None, description="in the kind's unit; default: the kind's")
+
+
+class TableConfig(_Part):
+    """Constants of the paper's Table, each within its ±; they act as `plant.constant_factors`."""
+
+    constants: Literal["all"] | tuple[ConstantName, ...] = Field("all", description="by name")
+    distribution: Literal["uniform", "normal"] = Field(
+        "uniform", description="over value ± uncertainty, or with the uncertainty as its deviation"
+    )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The constants, in the Table's order; z_vz is none that the plant lets vary."""
+        known = get_args(ConstantName)
+        chosen = known if self.constants == "all" else self.constants
+        return tuple(name for name in PAPER_TABLE if name in chosen)
+
+
+class FlightLimits(_Part):
+    """When a flight is given up; it becomes a row with that as its error."""
+
+    wall_s: float = Field(120.0, gt=0, le=86_400, description="real time; the process is ended at twice that")
+    simulated_s: float = Field(3_600.0, gt=0, le=100_000, description="simulated time, from the boot on")
+
+
+class Spec(_Part):
+    """A campaign. Flight number i is a function of this and i alone."""
+
+    experiments: tuple[str, ...] = Field(min_length=1, description="names, or FILE.py:NAME")
+    profiles: tuple[str, ...] = Field((DEFAULT_PROFILE,), min_length=1)
+    settings: tuple[str, ...] = Field((), description="section.key=value, of every flight")
+    duration_s: float | None = Field(None, gt=0, description="free flight [s]; default: the experiment's")
+    link: Literal["radio", "mavlink"] = "radio"
+    flights: int = Field(ge=1, le=10_000_000)
+    seeds: int = Field(1, ge=1, description="flights per point, profile and experiment")
+    seed: int = Field(1, ge=0, le=2**61, description="of the sampling, and of the first flight")
+    sampling: Sampling = "random"
+    stop: str = Field("", description='"failure rate known to ±1 %": with 95 % confidence')
+    parameters: dict[str, Distribution] = Field({}, description="by section.key of the profile")
+    table: TableConfig | None = None
+    faults: tuple[SampledFault, ...] = ()
+    limits: FlightLimits = FlightLimits()
+
+    @field_validator("stop")
+    @classmethod
+    def _says_when(cls, stop: str) -> str:
+        match = STOP.fullmatch(stop)
+        if stop and (match is None or not 0.0 < float(match[1]) < 50.0):
+            raise ValueError('expected "failure rate known to ±1 %", above 0 and below 50')
+        return stop
+
+    @model_validator(mode="after")
+    def _fits(self) -> Spec:
+        if self.stop and self.sampling in DESIGNS:
+            raise ValueError(f"stop: sampling {self.sampling} needs all its flights")
+        if both := self.parameters.keys() & {name for name, _ in table_dimensions(self.table)}:
+            raise ValueError(f"{min(both)}: stands in [parameters] and in [table]")
+        return self
+
+    @property
+    def half_width(self) -> float | None:
+        """How well the failure rate shall be known; None: all flights are flown."""
+        match = STOP.fullmatch(self.stop)
+        return float(match[1]) / 100.0 if match else None
+
+    @property
+    def cells(self) -> int:
+        """Flights per point of the sampling."""
+        return len(self.experiments) * len(self.profiles) * self.seeds
+
+    @property
+    def points(self) -> int:
+        """Points of the sampling; the last one may lack some of its flights."""
+        return math.ceil(self.flights / self.cells)
+
+
+def table_dimensions(table: TableConfig | None) -> list[tuple[str, Distribution]]:
+    """Return what of the profile varies as the Table allows, as factors on the tabulated values."""
+    found = []
+    for name in table.names if table else ():
+        value, error = PAPER_TABLE[name]
+        spread = error / abs(value)
+        varies = (
+            Distribution(uniform=(1.0 - spread, 1.0 + spread))
+            if table and table.distribution == "uniform"
+            else Distribution(normal=(1.0, spread, 0.0, 4.0))  # what the plant takes
+        )
+        found.append((f"plant.constant_factors.{name}", varies))
+    return found
+
+
+def read_spec(path: Path) -> Spec:
+    """Return the campaign of a file; files that it names begin at its folder. Raises `LabError` of one line."""
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LabError(f"campaign {path}: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise LabError(f"campaign {path}: not TOML: {error}") from None
+    try:
+        spec = Spec.model_validate(tree)
+    except ValidationError as error:
+        raise LabError(f"campaign {path}: {_explain(error.errors()[0])}") from None
+    folder = path.parent.resolve()
+    return spec.model_copy(
+        update={
+            "experiments": tuple(str(folder / one) if ".py" in one else one for one in spec.experiments),
+            "profiles": tuple(str(folder / one) if one.endswith(".toml") else one for one in spec.profiles),
+        }
+    )
+
+
+def _explain(detail: ErrorDetails) -> str:
+    """Return what is wrong: the key, its value, what is allowed."""
+    names = [str(part) for part in detail["loc"] if part not in ("float", "Distribution", "Literal['all']")]
+    where, value = ".".join(names), detail["input"]
+    if detail["type"] == "missing":
+        return f"{where}: missing"
+    if detail["type"] == "extra_forbidden":
+        return f"{where} = {value!r}: unknown key; {hint(names[-1], _keys_of(names[:-1]))}"
+    message = detail["msg"].removeprefix("Value error, ")
+    message = message[0].lower() + message[1:]
+    return f"{where} = {value!r}: {message}" if where else message
+
+
+def _keys_of(names: list[str]) -> list[str]:
+    parts: dict[str, type[BaseModel]] = {
+        "parameters": Distribution, "table": TableConfig, "limits": FlightLimits, "faults": SampledFault,
+    }  # fmt: skip
+    part = parts.get(names[0], Spec) if names else Spec
+    if part is SampledFault and len(names) > 2:
+        part = Distribution
+    return list(part.model_fields)
+
+
+def spec_text(spec: Spec) -> dict[str, Any]:
+    """Return a campaign as what a JSON file holds."""
+    return spec.model_dump(mode="json", exclude_none=True)

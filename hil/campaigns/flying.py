@@ -1,0 +1,119 @@
+"""One flight of a campaign: from its number to its row; what a worker process executes.
+
+A flight that cannot be flown, raises or takes too long is a row with its error. A disk that is full is none: it raises.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hil.campaigns.config import Spec, Value
+from hil.campaigns.sampling import Draw, draw, request_of
+from hil.errors import LabError, blame
+from hil.experiments import find_experiment
+from hil.laboratory.experiment import Source
+from hil.laboratory.flight import Flight
+from hil.laboratory.result import Result
+from hil.laboratory.run import LOADED_US, Request, fly, prepare
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """What every worker gets: the spec, and which files its experiments are."""
+
+    spec: Spec
+    sources: tuple[Source | None, ...]  # of its experiments
+
+    @classmethod
+    def of(cls, spec: Spec) -> Campaign:
+        """Return a campaign of experiments as they are now. Raises `LabError` for an unknown one."""
+        return cls(spec, tuple(find_experiment(name).source for name in spec.experiments))
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """How a flight went; equal for the same flight on every worker."""
+
+    index: int
+    experiment: str
+    profile: str
+    seed: int
+    settings: tuple[str, ...]
+    faults: tuple[str, ...]
+    parameters: Mapping[str, Value]
+    outcome: str  # completed, lost or error
+    error: str  # why it was lost, or what went wrong
+    passed: bool
+    hash: str  # empty: it did not come to an end
+    metrics: Mapping[str, float]  # none: it was not flown
+    holds: Mapping[str, bool]  # by limit
+
+
+class TooLongError(Exception):
+    """A flight goes beyond the campaign's limits."""
+
+
+def fly_flight(campaign: Campaign, index: int) -> Row:
+    """Fly flight `index`. Raises `LabError` when there is no room on the disk, or an experiment's file has changed."""
+    drawn = draw(campaign.spec, index)
+    which = campaign.spec.experiments.index(drawn.experiment)
+    try:
+        request = request_of(campaign.spec, drawn)
+    except LabError as error:
+        return failed(drawn, str(error))
+    if request.experiment.source != campaign.sources[which]:
+        raise LabError(f"experiment {drawn.experiment}: its file is not what it was when the campaign began")
+    try:
+        result = fly_within(request, campaign.spec)
+    except OSError as error:
+        if error.errno in FULL:
+            raise LabError(f"flight {index}: {tempfile.gettempdir()}: {error.strerror}") from None
+        return failed(drawn, blame(error))
+    except Exception as error:
+        return failed(drawn, f"{type(error).__name__}: {blame(error)}")
+    if result.outcome == "error" and any(os.strerror(number) in (result.cause or "") for number in FULL):
+        raise LabError(f"flight {index}: {tempfile.gettempdir()}: {result.cause}")
+    return row_of(drawn, result)
+
+
+def fly_within(request: Request, spec: Spec) -> Result:
+    """Fly within the campaign's limits, and leave no file. Real time counts from when all parts are loaded or compiled."""
+    begun: list[float] = []
+
+    def watch(now_us: int, flight: Flight) -> None:
+        if now_us >= LOADED_US and not begun:
+            begun.append(time.monotonic())
+        if now_us > spec.limits.simulated_s * 1e6:
+            raise TooLongError(f"limits.simulated_s = {spec.limits.simulated_s:g}: the flight had not ended")
+        if begun and time.monotonic() - begun[0] > spec.limits.wall_s:
+            raise TooLongError(f"limits.wall_s = {spec.limits.wall_s:g}: the flight had not ended")
+
+    with tempfile.TemporaryDirectory(prefix="floaty-") as parent:
+        folder = Path(parent) / "run"
+        prepare(folder)
+        return fly(request, folder, progress=watch)
+
+
+def row_of(drawn: Draw, result: Result) -> Row:
+    """Return the row of a flight that was flown."""
+    return Row(
+        drawn.index, drawn.experiment, drawn.profile, drawn.seed, drawn.settings, drawn.faults, drawn.parameters,
+        result.outcome, result.cause or "", result.passed, result.hash if result.outcome != "error" else "",
+        dict(result.metrics), {verdict.metric: verdict.holds for verdict in result.verdicts},
+    )  # fmt: skip
+
+
+def failed(drawn: Draw, error: str) -> Row:
+    """Return the row of a flight that did not come to an end of its own."""
+    return Row(
+        drawn.index, drawn.experiment, drawn.profile, drawn.seed, drawn.settings, drawn.faults, drawn.parameters,
+        "error", error, False, "", {}, {},
+    )  # fmt: skip

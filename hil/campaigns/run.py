@@ -1,0 +1,100 @@
+"""Flying a campaign: which flights are left, when enough is known, and what stands so far.
+
+Who flies is handed in: `hil.campaigns.cluster` on Dask's workers. Rows come in any order; what is decided is decided on
+the flights in the order of their numbers, so it is the same for every number of workers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
+
+from scipy.stats import binomtest
+
+from hil.campaigns.config import Spec
+from hil.campaigns.dataset import Dataset, read_flights
+from hil.campaigns.flying import Row
+
+CONFIDENCE = 0.95
+STOP_FROM = 30  # flights; of fewer an interval says little
+
+Flyer = Callable[
+    [Iterator[int]], Generator[Row]
+]  # rows of these flights, in any order; ends early when interrupted
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What is known so far."""
+
+    flown: int
+    failed: int
+    planned: int
+    complete: bool  # all flights are there that the campaign needs
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Where the failure rate lies with CONFIDENCE."""
+        return interval(self.failed, self.flown)
+
+
+def interval(failed: int, flown: int) -> tuple[float, float]:
+    """Return Wilson's interval for a rate."""
+    if flown == 0:
+        return 0.0, 1.0
+    low, high = binomtest(failed, flown).proportion_ci(CONFIDENCE, "wilson")
+    return float(low), float(high)
+
+
+class Progress:
+    """Counts rows; `end` is the number of flights that the campaign needs, once it is known."""
+
+    def __init__(self, spec: Spec) -> None:
+        self._spec = spec
+        self._waiting: dict[int, bool] = {}  # flights whose predecessors are not all there
+        self._flown = self._failed = self._known = self._failed_of_known = 0
+        self.end: int | None = None
+
+    def add(self, index: int, passed: bool) -> None:
+        """Count a row."""
+        self._flown += 1
+        self._failed += not passed
+        self._waiting[index] = passed
+        while self.end is None and self._known in self._waiting:
+            self._failed_of_known += not self._waiting.pop(self._known)
+            self._known += 1
+            if self._known == self._spec.flights or self._knows_enough():
+                self.end = self._known
+
+    def _knows_enough(self) -> bool:
+        if self._spec.half_width is None or self._known < STOP_FROM:
+            return False
+        low, high = interval(self._failed_of_known, self._known)
+        return (high - low) / 2.0 <= self._spec.half_width
+
+    @property
+    def standing(self) -> Standing:
+        """What is known now."""
+        if self.end is None:
+            return Standing(self._flown, self._failed, self._spec.flights, complete=False)
+        return Standing(self.end, self._failed_of_known, self.end, complete=True)
+
+
+def conduct(spec: Spec, dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) -> Standing:
+    """Fly what is not yet in the dataset, until all is there, enough is known or the flyer ends."""
+    progress = Progress(spec)
+    for row in read_flights(dataset.folder, dataset.schema, ["index", "passed"]).to_pylist():
+        progress.add(row["index"], row["passed"])
+    show(progress.standing)
+    there = frozenset(dataset.indices)
+    left = (index for index in range(spec.flights) if index not in there)
+    rows = flyer(left)
+    try:
+        while progress.end is None and (row := next(rows, None)) is not None:
+            dataset.add(row)
+            progress.add(row.index, row.passed)
+            show(progress.standing)
+    finally:
+        rows.close()
+        dataset.close(progress.end)
+    return progress.standing

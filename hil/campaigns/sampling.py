@@ -1,0 +1,226 @@
+"""Flight number i as a pure function of (spec, i): its experiment, profile, seed, settings and faults.
+
+A campaign is a cube: one axis for every number that varies, 0..1. A sampling gives points of the cube, each axis has a
+distribution that makes a value of its coordinate. Values have nine digits, so that no processor's logarithm matters.
+
+    random            points do not depend on one another; any number of flights
+    sobol             fills the cube evenly at any number of flights, best at a power of two
+    latin             every axis evenly, at the number of flights that the spec says
+    saltelli, morris  the designs that Sobol's and Morris' indices need (SALib): N (D + 2) and N (D + 1) points of D axes
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+from scipy.stats import qmc
+
+from hil.campaigns.config import DESIGNS, Distribution, SampledFault, Spec, Value, table_dimensions
+from hil.errors import LabError
+from hil.experiments import find_experiment
+from hil.laboratory.faults import Fault, parse
+from hil.laboratory.run import Request
+
+DIGITS = 9
+LEVELS = 4  # of Morris' grid, as in his paper
+_FAULT_PARTS = ("start_s", "duration_s", "size")
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """What flight `index` is."""
+
+    index: int
+    point: int  # which of the sampling's
+    experiment: str
+    profile: str
+    seed: int
+    settings: tuple[str, ...]  # those of the spec and those that were sampled
+    faults: tuple[str, ...]
+    parameters: Mapping[str, Value]  # that were sampled, of the profile
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """One axis of the cube; a fault that may be absent has one without a distribution."""
+
+    name: str
+    varies: Distribution | None
+
+
+@lru_cache(maxsize=8)
+def axes_of(text: str) -> tuple[Axis, ...]:
+    """Return the axes of a campaign, by its JSON text."""
+    spec = Spec.model_validate_json(text)
+    axes = [Axis(name, varies) for name, varies in _parameters(spec)]
+    for number, fault in enumerate(spec.faults, 1):
+        name = f"fault {number} {fault.kind}"
+        if fault.probability < 1.0:
+            axes.append(Axis(f"{name} happens", None))
+        for part in _FAULT_PARTS:
+            if isinstance(varies := getattr(fault, part), Distribution):
+                axes.append(Axis(f"{name} {part}", varies))
+    return tuple(axes)
+
+
+def axes(spec: Spec) -> tuple[Axis, ...]:
+    """Return the axes of a campaign."""
+    return axes_of(spec.model_dump_json())
+
+
+def _parameters(spec: Spec) -> list[tuple[str, Distribution]]:
+    return [*spec.parameters.items(), *table_dimensions(spec.table)]
+
+
+def points_of(spec: Spec, first: int = 0, count: int | None = None) -> NDArray[np.float64]:
+    """Return points of the cube from `first` on, (count, D), each coordinate in 0..1; by default all."""
+    count = spec.points - first if count is None else count
+    width = len(axes(spec))
+    if width == 0:
+        return np.zeros((count, 0))
+    if spec.sampling == "random":
+        rows = [_own_stream(spec.seed, point, width) for point in range(first, first + count)]
+        return np.array(rows).reshape(count, width)
+    if spec.sampling == "sobol":
+        return _sobol(width, spec.seed, first, count)
+    return _design(spec.sampling, width, spec.points, spec.seed)[first : first + count]
+
+
+def _own_stream(seed: int, point: int, width: int) -> NDArray[np.float64]:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(point,))).random(width)
+
+
+def _sobol(width: int, seed: int, first: int, count: int) -> NDArray[np.float64]:
+    sequence = qmc.Sobol(width, scramble=True, rng=np.random.default_rng(seed))
+    if first:  # scipy cannot go on by none
+        sequence.fast_forward(first)
+    return np.concatenate([sequence.random(1) for _ in range(count)])  # at once it wants a power of two
+
+
+@lru_cache(maxsize=8)
+def _design(sampling: str, width: int, points: int, seed: int) -> NDArray[np.float64]:
+    if sampling == "latin":
+        return np.asarray(qmc.LatinHypercube(width, rng=np.random.default_rng(seed)).random(points))
+    from SALib.sample import morris, sobol
+
+    cube = problem(width)
+    if sampling == "saltelli":
+        base = points // (width + 2)
+        return np.asarray(sobol.sample(cube, base, calc_second_order=False, seed=seed))
+    return np.asarray(morris.sample(cube, points // (width + 1), LEVELS, seed=seed))
+
+
+def problem(width: int) -> dict[str, Any]:
+    """Return what SALib calls a problem: the cube."""
+    return {"num_vars": width, "names": [f"x{n}" for n in range(width)], "bounds": [[0.0, 1.0]] * width}
+
+
+def check_design(spec: Spec) -> None:
+    """Raise `LabError` when a design does not fit the number of flights."""
+    if spec.sampling not in DESIGNS:
+        return
+    width = len(axes(spec))
+    if width < 2:
+        raise LabError(
+            f"sampling = {spec.sampling!r}: needs two numbers that vary at least; there are {width}"
+        )
+    step = (width + (2 if spec.sampling == "saltelli" else 1)) * spec.cells
+    base, rest = divmod(spec.flights, step)
+    power = spec.sampling != "saltelli" or base & (base - 1) == 0
+    if rest or base < 2 or not power:
+        below = max(1, base).bit_length() - 1
+        near = [2**below, 2 ** (below + 1)] if spec.sampling == "saltelli" else [base, base + 1]
+        allowed = " or ".join(str(step * max(2, one)) for one in dict.fromkeys(max(2, one) for one in near))
+        raise LabError(
+            f"flights = {spec.flights}: sampling {spec.sampling} with {width} numbers that vary needs {allowed}"
+        )
+
+
+def draw(spec: Spec, index: int) -> Draw:
+    """Return flight `index` of a campaign."""
+    point, cell = divmod(index, spec.cells)
+    return draw_at(spec, points_of(spec, point, 1)[0], index, point, cell)
+
+
+def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cell: int) -> Draw:
+    """Return the flight at a point of the cube."""
+    repetition, which = divmod(cell, len(spec.experiments) * len(spec.profiles))
+    experiment, profile = divmod(which, len(spec.profiles))
+    share = dict(zip((axis.name for axis in axes(spec)), shares.tolist(), strict=True))
+    parameters = {name: value_at(varies, share[name]) for name, varies in _parameters(spec)}
+    settings = (*spec.settings, *(f"{name}={_toml(value)}" for name, value in parameters.items()))
+    faults = (_fault_at(number, fault, share) for number, fault in enumerate(spec.faults, 1))
+    return Draw(
+        index, point, spec.experiments[experiment], spec.profiles[profile],
+        spec.seed + point * spec.seeds + repetition, settings, tuple(filter(None, faults)), parameters,
+    )  # fmt: skip
+
+
+def _fault_at(number: int, fault: SampledFault, share: Mapping[str, float]) -> str:
+    name = f"fault {number} {fault.kind}"
+    if share.get(f"{name} happens", 0.0) >= fault.probability:
+        return ""
+    values = [_number_at(getattr(fault, part), f"{name} {part}", share) for part in _FAULT_PARTS]
+    start, duration, size = (None if value is None else repr(value) for value in values)
+    return f"{fault.kind}@{start}{f':{duration}' if duration else ''}{f'={size}' if size else ''}"
+
+
+def _number_at(number: float | Distribution | None, name: str, share: Mapping[str, float]) -> Value | None:
+    return value_at(number, share[name]) if isinstance(number, Distribution) else number
+
+
+def value_at(varies: Distribution, share: float) -> Value:
+    """Return the value below which a share of the distribution lies."""
+    if varies.choice is not None:
+        return varies.choice[min(int(share * len(varies.choice)), len(varies.choice) - 1)]
+    if varies.uniform is not None:
+        low, high = varies.uniform
+        value = low + share * (high - low)
+    elif varies.log_uniform is not None:
+        low, high = varies.log_uniform
+        value = low * (high / low) ** share
+    else:
+        assert varies.normal is not None
+        mean, deviation, *cut = varies.normal
+        below, above = (float(ndtr((bound - mean) / deviation)) for bound in cut) if cut else (0.0, 1.0)
+        tail = 1e-12  # a design has points at the very ends of its axes
+        value = mean + deviation * float(ndtri(min(max(below + share * (above - below), tail), 1.0 - tail)))
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _toml(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return json.dumps(value) if isinstance(value, str) else repr(value)
+
+
+def request_of(spec: Spec, drawn: Draw, faults: tuple[Fault, ...] | None = None) -> Request:
+    """Return what is flown; `faults` instead of those drawn. Raises `LabError` for what cannot be flown."""
+    return Request.of(
+        find_experiment(drawn.experiment), drawn.profile, drawn.settings, drawn.seed, spec.duration_s, spec.link,
+        tuple(map(parse, drawn.faults)) if faults is None else faults,
+    )  # fmt: skip
+
+
+def check_spec(spec: Spec) -> None:
+    """Raise `LabError` for what is found wrong before anything is flown: unknown names, values that nothing takes.
+
+    Looked at are every experiment and profile, both ends of every axis, and all values of a choice.
+    """
+    check_design(spec)
+    width = len(axes(spec))
+    for cell in range(len(spec.experiments) * len(spec.profiles)):
+        request_of(spec, draw_at(spec, np.full(width, 0.001), 0, 0, cell))
+    for column, axis in enumerate(axes(spec)):
+        count = len(axis.varies.choice) if axis.varies and axis.varies.choice else 1
+        for share in (0.001, *((part + 0.5) / count for part in range(count)), 0.999):
+            shares = np.full(width, 0.001)  # every fault happens
+            shares[column] = share
+            request_of(spec, draw_at(spec, shares, 0, 0, 0))

@@ -1,0 +1,296 @@
+"""A campaign of planted flights: the same dataset for any order, nothing lost or repeated, and what is found in it."""
+
+import gc
+import itertools
+import json
+import os
+import random
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from scipy.stats import binomtest
+
+from hil.campaigns.config import Spec
+from hil.campaigns.dataset import ARRIVING, FLIGHTS, Dataset, read_flights, schema_of
+from hil.campaigns.findings import find
+from hil.campaigns.flying import Campaign, Row, fly_flight
+from hil.campaigns.report import write_report
+from hil.campaigns.run import Flyer, Progress, Standing, conduct, interval
+from hil.errors import LabError
+from support.campaigns import BAD_PUSH, planted, spec_of
+from support.html_page import Page
+
+
+def nothing(standing: Standing) -> None:
+    """Show nothing."""
+
+
+def flown_into(folder: Path, spec: Spec, flyer: Flyer, resume: bool = False) -> Standing:
+    dataset = Dataset(folder, Campaign.of(spec), resume)
+    return conduct(spec, dataset, flyer, nothing)
+
+
+def workers(spec: Spec, count: int, asked: list[int] | None = None) -> Flyer:
+    """`count` workers, whose flights come in an order of their own."""
+    campaign, rng = Campaign.of(spec), random.Random(count)
+
+    def fly(indices: Iterator[int]) -> Iterator[Row]:
+        under_way: list[int] = []
+        while under_way := under_way + list(itertools.islice(indices, count - len(under_way))):
+            index = under_way.pop(rng.randrange(len(under_way)))
+            if asked is not None:
+                asked.append(index)
+            yield planted(campaign, index)
+
+    return fly  # type: ignore[return-value]
+
+
+def bytes_of(folder: Path) -> bytes:
+    (file,) = (folder / FLIGHTS).iterdir()
+    return file.read_bytes()
+
+
+@pytest.mark.parametrize("stop", ["", "failure rate known to ±10 %"])
+def test_the_dataset_is_the_same_for_any_number_of_workers(tmp_path: Path, stop: str) -> None:
+    spec = spec_of(flights=200, stop=stop)
+    standings = [flown_into(tmp_path / str(n), spec, workers(spec, n)) for n in (1, 2, 17)]
+    assert len({bytes_of(tmp_path / str(n)) for n in (1, 2, 17)}) == 1
+    assert len(set(standings)) == 1
+    assert standings[0].complete
+    assert (standings[0].flown < 200) == bool(stop)
+
+
+def test_a_row_says_all_of_its_flight_and_columns_have_units(tmp_path: Path) -> None:
+    spec = spec_of()
+    flown_into(tmp_path / "out", spec, workers(spec, 1))
+    table = pq.read_table(tmp_path / "out" / FLIGHTS)
+    row = table.to_pylist()[7]
+    expected = planted(Campaign.of(spec), 7)
+    assert (row["index"], row["seed"], row["hash"]) == (7, 8, expected.hash)
+    assert row["parameter.actuators.tau"] == expected.parameters["actuators.tau"]
+    assert tuple(row["faults"]) == expected.faults
+    assert row["metric.max_y"] == expected.metrics["max_y"]
+    assert row["holds.in_box"] is expected.holds["in_box"]
+    assert table.schema.field("metric.max_y").metadata == {b"unit": b"m"}
+
+
+def test_a_campaign_that_was_interrupted_flies_the_rest_and_nothing_twice(tmp_path: Path) -> None:
+    spec = spec_of()
+    asked: list[int] = []
+    whole = workers(spec, 3, asked)
+    first = flown_into(tmp_path / "out", spec, limited(whole, 11))
+    assert (first.flown, first.complete) == (11, False)
+    then = flown_into(tmp_path / "out", spec, whole, resume=True)
+    assert then.complete
+    assert sorted(asked) == list(range(40))
+    flown_into(tmp_path / "straight", spec, workers(spec, 1))
+    assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "straight")
+
+
+def limited(flyer: Flyer, count: int) -> Flyer:
+    """Workers that are interrupted after `count` flights."""
+
+    def fly(indices: Iterator[int]) -> Iterator[Row]:
+        yield from itertools.islice(flyer(indices), count)
+
+    return fly  # type: ignore[return-value]
+
+
+def flown_and_killed(folder: Path, when: str) -> None:
+    """Fly eleven flights in files of four, and die."""
+    rows = Dataset(folder, Campaign.of(spec_of()), resume=False)
+    unlink = Path.unlink
+
+    def die_once_packed(path: Path, missing_ok: bool = False) -> None:
+        if when == "packing" and path.name == ARRIVING and len(rows.indices) == 8:
+            os.kill(os.getpid(), signal.SIGKILL)
+        unlink(path, missing_ok)
+
+    Path.unlink = die_once_packed  # type: ignore[method-assign, assignment]
+    for index in range(11):
+        rows.add(planted(Campaign.of(spec_of()), index))
+    with (folder / ARRIVING).open("a") as file:
+        file.write('{"index": 11, "exper')
+        file.flush()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.parametrize(("when", "kept"), [("writing", 11), ("packing", 8)])
+def test_kill_9_loses_no_row_that_was_there_and_repeats_none(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, when: str, kept: int
+) -> None:
+    """Killed in the middle of a line, and between a new file and the end of the lines that became it."""
+    monkeypatch.setattr("hil.campaigns.dataset.ROWS_PER_FILE", 4)
+    child = os.fork()
+    if child == 0:
+        try:
+            flown_and_killed(tmp_path / "out", when)
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    assert (tmp_path / "out" / ARRIVING).is_file()
+    spec = spec_of()
+    asked: list[int] = []
+    assert flown_into(tmp_path / "out", spec, workers(spec, 2, asked), resume=True).complete
+    assert sorted(asked) == list(range(kept, 40))
+    flown_into(tmp_path / "straight", spec, workers(spec, 1))
+    assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "straight")
+
+
+@contextmanager
+def small_files(limit: int) -> Iterator[None]:
+    """No file may become larger, as on a disk that is full."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+
+
+@pytest.mark.parametrize("limit", [30_000, 4_000])
+def test_a_full_disk_is_one_line_and_what_is_there_is_kept(tmp_path: Path, limit: int) -> None:
+    """4 kB do not even take the file that the first lines become."""
+    spec = spec_of(flights=100)
+    asked: list[int] = []
+    with small_files(limit), pytest.raises(LabError, match="cannot be written") as refused:
+        flown_into(tmp_path / "out", spec, workers(spec, 1, asked))
+    assert "\n" not in str(refused.value)
+    there = len(asked) - 1
+    assert 1 <= there < 99
+    assert flown_into(tmp_path / "out", spec, workers(spec, 1, asked), resume=True).complete
+    assert asked == [*range(there + 1), *range(there, 100)], (
+        "only the flight that found no room is flown again"
+    )
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_no_room_for_a_flight_s_own_files_ends_the_campaign_and_is_no_row() -> None:
+    campaign = Campaign.of(spec_of(flights=1))
+    with small_files(10_000), pytest.raises(LabError, match=r"flight 0: .*File too large"):
+        fly_flight(campaign, 0)
+    gc.collect()  # the telemetry log that found no room
+
+
+def test_a_folder_is_not_mistaken_for_another_campaign(tmp_path: Path) -> None:
+    spec = spec_of()
+    flown_into(tmp_path / "out", spec, limited(workers(spec, 1), 3))
+    with pytest.raises(LabError, match="holds a campaign; --resume goes on with it"):
+        flown_into(tmp_path / "out", spec, workers(spec, 1))
+    with pytest.raises(LabError, match=r"--resume: spec\.seed was 1 and is 9: choose another --out"):
+        flown_into(tmp_path / "out", spec_of(seed=9), workers(spec, 1), resume=True)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").touch()
+    with pytest.raises(LabError, match="not empty and holds no campaign"):
+        flown_into(tmp_path / "other", spec, workers(spec, 1))
+    with pytest.raises(LabError, match="cannot be written"):
+        flown_into(Path("/proc/floaty"), spec, workers(spec, 1))
+
+
+def test_flying_stops_at_the_first_flight_by_which_the_rate_is_known_well_enough(tmp_path: Path) -> None:
+    spec = spec_of(flights=2000, stop="failure rate known to ±6 %")
+    standing = flown_into(tmp_path / "out", spec, workers(spec, 3))
+    table = pq.read_table(tmp_path / "out" / FLIGHTS)
+    failed = [not one for one in table["passed"].to_pylist()]
+    assert table["index"].to_pylist() == list(range(standing.flown))
+
+    def half(n: int) -> float:
+        low, high = binomtest(sum(failed[:n]), n).proportion_ci(0.95, "wilson")
+        return float(high - low) / 2.0
+
+    assert half(standing.flown) <= 0.06 < half(standing.flown - 1)
+    assert standing.failed == sum(failed)
+
+
+def test_the_interval_is_wilson_s() -> None:
+    assert interval(0, 0) == (0.0, 1.0)
+    low, high = interval(1, 10)
+    assert (low, high) == pytest.approx((0.01787621, 0.40415005), abs=1e-6)  # statsmodels, proportion_confint
+
+
+def test_what_comes_beyond_the_end_does_not_count() -> None:
+    progress = Progress(spec_of(flights=1000, stop="failure rate known to ±5 %"))
+    for index in reversed(range(200)):  # all hold: 38 are enough
+        progress.add(index, True)
+    assert progress.end is not None
+    assert progress.standing == Standing(progress.end, 0, progress.end, complete=True)
+    assert 30 <= progress.end < 60
+
+
+def test_what_was_planted_is_found(tmp_path: Path) -> None:
+    spec = spec_of(flights=256, sampling="sobol", table={"constants": ["roll_u1"]})
+    campaign = Campaign.of(spec)
+    flown_into(tmp_path, spec, workers(spec, 2))
+    found = find(spec, read_flights(tmp_path, schema_of(campaign)))
+    expected = [not planted(campaign, n).passed for n in range(256)]
+    assert (found.rate.failed, found.rate.flown) == (sum(expected), 256)
+    mapped, *others = found.influences
+    assert mapped.method == "logistic map"
+    strongest = {name for name, _ in mapped.ranked[:2]}
+    assert strongest == {"fault 1 push.y size", "fault 1 push.y happens"}
+    assert dict(mapped.ranked)["fault 1 push.y size"] > 2.0
+    assert dict(mapped.ranked)["fault 1 push.y happens"] < -2.0, "the fault happens at the low end"
+    pawn = next(one for one in others if one.figure == "failing")
+    assert pawn.method == "PAWN"
+    assert pawn.chance is not None
+    for name, value in pawn.by_axis.items():
+        assert (value > pawn.chance) == ("push.y" in name), name
+    assert all(float(one.command.split("push.y@0.1=")[1]) >= BAD_PUSH for one in found.worst)
+    assert all(one.command.startswith("floaty fly hover --seed ") for one in found.worst)
+
+
+@pytest.mark.long
+def test_the_report_has_rates_influences_commands_and_pictures(tmp_path: Path) -> None:
+    spec = spec_of(flights=128, sampling="sobol")
+    campaign = Campaign.of(spec)
+    flown_into(tmp_path, spec, workers(spec, 2))
+    path, found = write_report(tmp_path, campaign, complete=True)
+    page = Page(path.read_text(encoding="utf-8"))
+    assert [len(page.tables[name]) for name in ("limits", "worst")] == [1 + len(found.limits), 1 + 10]
+    assert len(page.tables["influences"]) == 1 + len(found.influences) > 2
+    assert [picture[:4] for picture in page.pictures] == [b"\x89PNG"] * 2
+    told = json.loads((tmp_path / "result.json").read_text())
+    assert (told["failed"], told["flown"]) == (found.rate.failed, 128)
+
+
+@pytest.mark.long
+def test_a_report_of_nothing_and_of_nothing_that_failed_can_be_written(tmp_path: Path) -> None:
+    spec = spec_of(faults=[])
+    Dataset(tmp_path, Campaign.of(spec), resume=False).close()
+    assert "not complete" in write_report(tmp_path, Campaign.of(spec), complete=False)[0].read_text()
+    flown_into(tmp_path, spec, workers(spec, 1), resume=True)
+    text = write_report(tmp_path, Campaign.of(spec), complete=True)[0].read_text()
+    assert "No flight failed a limit." in text
+
+
+@pytest.mark.parametrize(
+    ("sampling", "flights", "method"), [("saltelli", 640, "total Sobol index"), ("morris", 80, "Morris' mu*")]
+)
+def test_a_design_has_the_indices_that_it_is_for(
+    tmp_path: Path, sampling: str, flights: int, method: str
+) -> None:
+    spec = spec_of(sampling=sampling, flights=flights)
+    flown_into(tmp_path, spec, workers(spec, 2))
+    found = find(spec, read_flights(tmp_path, schema_of(Campaign.of(spec))))
+    (failing,) = (one for one in found.influences if one.figure == "failing" and one.method == method)
+    assert failing.by_axis["actuators.tau"] == pytest.approx(0.0, abs=1e-9)
+    assert failing.by_axis["fault 1 push.y size"] > 0.1
+
+
+def test_flights_without_an_end_are_failures_and_told_apart(tmp_path: Path) -> None:
+    spec = spec_of(flights=3, settings=["limits.hover.unsee=1"])
+    campaign = Campaign.of(spec)
+    rows = Dataset(tmp_path, campaign, False)
+    for index in range(3):
+        rows.add(fly_flight(campaign, index))
+    rows.close(3)
+    found = find(spec_of(flights=3), read_flights(tmp_path, rows.schema))
+    assert (found.rate.failed, found.worst) == (3, ())
+    assert found.errors == ("3×, first flight 0: limit on 'unsee': no such metric; did you mean unseen?",)

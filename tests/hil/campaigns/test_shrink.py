@@ -1,0 +1,150 @@
+"""A failing flight is reduced to the least that still fails: planted robots say what that is."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from hil.campaigns.sampling import draw
+from hil.campaigns.shrink import Reflight, Trial, harmless, shrink
+from hil.errors import LabError
+from hil.laboratory.fault_kinds import KINDS
+from hil.laboratory.faults import Fault, parse
+from support.campaigns import spec_of
+from support.command import floaty
+
+FAULTS = (
+    "mocap.dropout@1:2=1",
+    "push.y@1:3=12",
+    "servo.slow.1@0=0.1",
+    "imu.saturation@0=5",
+    "wind.side_y@0=-6",
+)
+DURATION_S = 10.0
+
+
+def trial(*faults: str, settings: tuple[str, ...] = ("a.b=1", "c.d=2")) -> Trial:
+    return Trial(settings, tuple(map(parse, faults)))
+
+
+def size_of(one: Trial, kind: str, otherwise: float) -> float:
+    return next((fault.size for fault in one.faults if fault.kind == kind), otherwise)
+
+
+def span_of(one: Trial, kind: str) -> float:
+    return next((fault.duration_s for fault in one.faults if fault.kind == kind), 0.0)
+
+
+def test_only_the_fault_that_matters_is_left_with_the_smallest_size_and_time_that_fail() -> None:
+    least = shrink(
+        trial(*FAULTS),
+        DURATION_S,
+        lambda one: size_of(one, "push.y", 0.0) >= 7.0 and span_of(one, "push.y") >= 0.5,
+    )
+    (push,) = least.faults
+    assert (push.kind, push.start_s) == ("push.y", 1.0)
+    assert 7.0 <= push.size <= 7.0 + 12.0 / 64
+    assert 0.5 <= push.duration_s <= 0.5 + 3.0 / 64
+    assert least.settings == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "fails", "low", "high"),
+    [
+        ("servo.slow.1", lambda size: size <= 0.4, 0.4 - 0.9 / 64, 0.4),
+        ("imu.saturation", lambda size: size <= 50.0, 50.0 - 1995 / 64, 50.0),
+        ("wind.side_y", lambda size: size <= -2.0, -2.0 - 6.0 / 64, -2.0),
+        ("mocap.dropout", lambda size: size >= 0.3, 0.3, 0.3 + 1.0 / 64),
+    ],
+)
+def test_sizes_shrink_towards_what_is_harmless_for_their_kind(
+    kind: str, fails: Callable[[float], bool], low: float, high: float
+) -> None:
+    least = shrink(trial(*FAULTS), DURATION_S, lambda one: fails(size_of(one, kind, harmless(kind) or 0.0)))
+    (fault,) = least.faults
+    assert fault.kind == kind
+    assert low <= fault.size <= high
+
+
+def test_two_faults_that_fail_together_stay_both() -> None:
+    def fails(one: Trial) -> bool:
+        return {"push.y", "mocap.dropout"} <= {fault.kind for fault in one.faults}
+
+    assert {fault.kind for fault in shrink(trial(*FAULTS), DURATION_S, fails).faults} == {
+        "push.y",
+        "mocap.dropout",
+    }
+
+
+def test_a_parameter_without_which_it_holds_stays() -> None:
+    least = shrink(trial(*FAULTS), DURATION_S, lambda one: "c.d=2" in one.settings)
+    assert least == Trial(("c.d=2",), ())
+
+
+def test_a_fault_to_the_end_that_needs_all_its_time_stays_as_it_is_written() -> None:
+    fault = Fault("servo.stuck.1", 2.0, math.inf, 0.0)
+    least = shrink(Trial((), (fault,)), DURATION_S, lambda one: one.faults == (fault,))
+    assert least.faults == (fault,)
+
+
+def test_a_flight_that_holds_cannot_be_shrunk() -> None:
+    with pytest.raises(LabError, match="does not fail"):
+        shrink(trial(*FAULTS), DURATION_S, lambda one: False)
+
+
+def test_what_is_harmless_can_be_written() -> None:
+    for name, kind in KINDS.items():
+        size = harmless(name)
+        if kind.sized:
+            assert size is not None
+            assert str(Fault(name, 0.0, 1.0, size))
+        else:
+            assert size is None
+
+
+@pytest.mark.long
+def test_the_command_shrinks_a_flight_that_is_lost_and_says_how_to_fly_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: pytest.TempPathFactory
+) -> None:
+    monkeypatch.chdir(str(tmp_path))
+    text = """
+experiments = ["hover"]
+duration_s = 1.0
+flights = 1
+[parameters]
+"actuators.tau" = { uniform = [0.045, 0.055] }
+[[faults]]
+kind = "push.x"
+start_s = 0.1
+size = { uniform = [15, 20] }
+[[faults]]
+kind = "imu.noise"
+start_s = 0.0
+size = 2.0
+"""
+    with open("spec.toml", "w") as file:
+        file.write(text)
+    assert floaty(monkeypatch, "campaign", "spec.toml", "--shrink", "0") == 0
+    said = capsys.readouterr()
+    command = said.out.splitlines()[-1].split()
+    assert command[:3] == ["floaty", "fly", "hover"]
+    assert "--set" not in command
+    assert command.count("--fault") == 1
+    fault = parse(command[command.index("--fault") + 1])
+    assert fault.kind == "push.x"
+    assert fault.size * fault.duration_s < 1.0
+    assert "holds: " in said.err
+    assert floaty(monkeypatch, *command[1:]) == 1, "it fails"
+
+
+def test_what_is_shrunk_is_the_flight_that_was_drawn() -> None:
+    spec = spec_of(flights=8, sampling="sobol")
+    drawn = next(one for one in (draw(spec, index) for index in range(8)) if one.faults)
+    reflight = Reflight(spec, drawn, print)
+    assert reflight.whole == Trial(drawn.settings, tuple(map(parse, drawn.faults)))
+    request = reflight.request(reflight.whole)
+    assert (request.seed, request.overrides, request.faults) == (
+        drawn.seed,
+        drawn.settings,
+        reflight.whole.faults,
+    )

@@ -1,0 +1,125 @@
+"""What a campaign's file may say: the example loads, every mistake is one line with what, value and what is allowed."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil.campaigns.config import read_spec
+from hil.campaigns.sampling import check_spec, draw, request_of
+from support.command import floaty
+
+ROOT = Path(__file__).parents[3]
+EXAMPLE = ROOT / "docs" / "table.toml"
+HOVER = 'experiments = ["hover"]\nflights = 64\n'
+
+
+def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> None:
+    spec = read_spec(EXAMPLE)
+    check_spec(spec)
+    assert (spec.flights, spec.experiments) == (1000, ("hover",))
+    factors = request_of(spec, draw(spec, 999)).config.plant.constant_factors
+    assert len(factors) == 13
+    assert spec.table is not None
+    assert spec.table.constants == "all"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("flights = 3", "experiments: missing"),
+        ("flights = [", "not TOML"),
+        ('experiments = ["hover"]\nflights = 0', "flights = 0: input should be greater than or equal to 1"),
+        (HOVER + "fligths = 3", "fligths = 3: unknown key; did you mean flights?"),
+        (HOVER + 'sampling = "halton"', "sampling = 'halton': input should be 'random', 'sobol'"),
+        (HOVER + 'stop = "soon"', "stop = 'soon': expected \"failure rate known to ±1 %\""),
+        (HOVER + 'stop = "failure rate known to ±0 %"', "above 0 and below 50"),
+        (HOVER + "seed = -1", "seed = -1"),
+        (HOVER + '[parameters]\n"actuators.tau" = { unifrom = [1, 2] }', "did you mean uniform?"),
+        (HOVER + '[parameters]\n"actuators.tau" = { uniform = [2, 1] }', "expected low < high"),
+        (
+            HOVER + '[parameters]\n"actuators.tau" = {}',
+            "expected one of uniform, log_uniform, normal, choice",
+        ),
+        (HOVER + '[parameters]\n"actuators.tau" = { log_uniform = [0, 1] }', "expected bounds above 0"),
+        (HOVER + '[parameters]\n"actuators.tau" = { normal = [0.05, 0] }', "expected a deviation above 0"),
+        (HOVER + '[parameters]\n"actuators.tau" = { choice = [] }', "parameters.actuators.tau.choice"),
+        (HOVER + '[parameters]\n"actuators.tau" = { uniform = [0.04, 0.9] }', "actuators.tau = 0.8"),
+        (HOVER + '[parameters]\n"actuators.tua" = { uniform = [0.04, 0.06] }', "did you mean tau?"),
+        (
+            HOVER + '[parameters]\n"plant.variant" = { choice = ["methods", "bent"] }',
+            "plant.variant = 'bent'",
+        ),
+        (HOVER + '[table]\nconstants = ["roll_u9"]', "table.constants"),
+        (
+            HOVER + '[table]\n[parameters]\n"plant.constant_factors.roll_u1" = { uniform = [1, 2] }',
+            "in [table]",
+        ),
+        (HOVER + '[[faults]]\nkind = "push.w"\nstart_s = 1', "fault 'push.w@1.0': unknown kind 'push.w'"),
+        (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 1\nsize = 99', "size 99: expected -20..20 N"),
+        (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 99', "the flight ends 30 s after the release"),
+        (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 1\nprobability = 2', "faults.0.probability = 2"),
+        (HOVER + "[limits]\nwall_s = 0", "limits.wall_s = 0: input should be greater than 0"),
+        (HOVER + 'sampling = "saltelli"', "needs two numbers that vary at least; there are 0"),
+        (HOVER + 'sampling = "saltelli"\n[table]', "with 13 numbers that vary needs 60 or 120"),
+        (HOVER + 'sampling = "morris"\n[table]', "with 13 numbers that vary needs 56 or 70"),
+        (
+            HOVER + 'sampling = "morris"\nstop = "failure rate known to ±1 %"\n[table]',
+            "needs all its flights",
+        ),
+        (HOVER.replace("hover", "hovver"), "experiment 'hovver': unknown; did you mean hover?"),
+        (HOVER + 'profiles = ["flaoty"]', "did you mean floaty?"),
+    ],
+)
+def test_a_bad_spec_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    text: str,
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("bad.toml").write_text(text, encoding="utf-8")
+    assert floaty(monkeypatch, "campaign", "bad.toml") == 2
+    told = capsys.readouterr().err
+    assert message in told
+    assert told.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [tmp_path / "bad.toml"], "nothing was begun"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.toml"], "campaign nowhere.toml: No such file"),
+        (["table.toml", "--shrink", "1000"], "--shrink 1000: the campaign has flights 0..999"),
+        (
+            ["table.toml", "--workers", "2", "--cluster", "tcp://a:1"],
+            "--workers 2: not together with --cluster",
+        ),
+    ],
+)
+def test_a_bad_option_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    monkeypatch.chdir(EXAMPLE.parent)
+    assert floaty(monkeypatch, "campaign", *arguments) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text('experiments = ["mine.py:PUSHED", "hover"]\nprofiles = ["lab.toml"]\nflights = 1\n')
+    spec = read_spec(path)
+    assert spec.experiments == (f"{tmp_path}/mine.py:PUSHED", "hover")
+    assert spec.profiles == (f"{tmp_path}/lab.toml",)
+
+
+def test_a_missing_extra_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, "hil.campaigns.cluster", raising=False)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert floaty(monkeypatch, "campaign", EXAMPLE) == 2
+    told = capsys.readouterr().err
+    assert "floaty campaign needs distributed: " in told
+    assert "pip install 'dask[distributed]" in told
