@@ -45,7 +45,7 @@ class Workers:
     """
 
     def __init__(self, count: int, address: str = "") -> None:
-        self._cluster: LocalCluster | None = None
+        self.cluster: LocalCluster | None = None
         self._address = address
         dask.config.set({"distributed.scheduler.allowed-failures": 0})  # of our own scheduler
         for name in ("distributed", "distributed.nanny", "distributed.scheduler", "distributed.worker"):
@@ -57,19 +57,19 @@ class Workers:
                 self.client = Client(address, timeout=CONNECT_S)
                 self.client.wait_for_workers(1, timeout=CONNECT_S)
             else:
-                self._cluster = LocalCluster(
+                self.cluster = LocalCluster(
                     n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address="127.0.0.1:0",
                     memory_limit=0, silence_logs=logging.CRITICAL,
                 )  # fmt: skip
-                self.client = Client(self._cluster)
+                self.client = Client(self.cluster)
         except (OSError, TimeoutError, ValueError) as error:
             raise LabError(f"--cluster {address or 'local'}: no workers ({error})") from None
 
     def close(self) -> None:
         """End the workers that were begun here, and what they fly."""
         self.client.close()
-        if self._cluster is not None:
-            self._cluster.close()
+        if self.cluster is not None:
+            self.cluster.close()
 
     def fly(
         self,

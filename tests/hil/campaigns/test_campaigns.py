@@ -294,3 +294,10 @@ def test_flights_without_an_end_are_failures_and_told_apart(tmp_path: Path) -> N
     found = find(spec_of(flights=3), read_flights(tmp_path, rows.schema))
     assert (found.rate.failed, found.worst) == (3, ())
     assert found.errors == ("3×, first flight 0: limit on 'unsee': no such metric; did you mean unseen?",)
+
+
+@pytest.mark.parametrize(("limit", "value"), [("simulated_s", 1.2), ("wall_s", 1e-6)])
+def test_a_flight_beyond_a_limit_of_time_is_a_row_that_says_which(limit: str, value: float) -> None:
+    row = fly_flight(Campaign.of(spec_of(limits={limit: value})), 0)
+    assert (row.outcome, row.passed, row.hash) == ("error", False, "")
+    assert row.error == f"TooLongError: limits.{limit} = {value:g}: the flight had not ended"
