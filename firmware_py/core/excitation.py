@@ -6,7 +6,7 @@ at once. What squares and products of inputs do lies on even multiples, where no
 Schroeder's, which keep the peaks low. The chirp sweeps the band and is for one input at a time.
 """
 
-from firmware_py.core.maths import HALF, PI, TWO_PI, ZERO, cos, sin
+from firmware_py.core.maths import HALF, PI, TWO_PI, ZERO, clamp, cos, sin
 from firmware_py.core.structs import EXCITE_CHIRP, EXCITE_OFF, Control, Parameters
 from firmware_py.core.subset import Integer, f32, i32, kernel, sqrt
 
@@ -15,6 +15,7 @@ ODD_LINES_PER_HZ = f32(10.0)
 INPUTS = 4
 TICK = f32(0.01)
 SWEEP = f32(0.025)  # half a frequency's rise over the period [1/s]
+NYQUIST = f32(50.0)  # [Hz]; whatever the parameters say, a tick's work is bounded
 ROOT_2 = f32(1.41421356)
 
 
@@ -41,17 +42,27 @@ def chirp(low: f32, high: f32, tick: Integer) -> f32:
 
 
 @kernel
+def line_above(frequency: f32) -> i32:
+    """Return the first line at or above a frequency [Hz]."""
+    return i32(frequency * ODD_LINES_PER_HZ + HALF)
+
+
+@kernel
 def excite(parameters: Parameters, control: Control) -> None:
     """Add the excitation of this tick to the inputs u; call it once per tick."""
     tick = control.excite_tick
-    first = i32(parameters.excite_low * ODD_LINES_PER_HZ + HALF)
-    last = i32(parameters.excite_high * ODD_LINES_PER_HZ + HALF) - 1
+    if tick < 0 or tick >= PERIOD:
+        tick = i32(0)
+    low = clamp(parameters.excite_low, ZERO, NYQUIST)
+    high = clamp(parameters.excite_high, ZERO, NYQUIST)
+    first = line_above(low)
+    last = i32(line_above(high) - 1)
     for i in range(INPUTS):
         control.excitation[i] = ZERO
         if parameters.excite_kind != EXCITE_OFF and parameters.excite_rms[i] > ZERO:
             wave = multisine(first + i, last, tick)
             if parameters.excite_kind == EXCITE_CHIRP:
-                wave = chirp(parameters.excite_low, parameters.excite_high, tick)
+                wave = chirp(low, high, tick)
             control.excitation[i] = parameters.excite_rms[i] * wave
             control.u[i] = control.u[i] + control.excitation[i]
     control.excite_tick = i32((tick + 1) % PERIOD)

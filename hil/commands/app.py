@@ -11,7 +11,6 @@ from hil.commands.campaign import campaign
 from hil.commands.compare import compare
 from hil.commands.deploy import deploy
 from hil.commands.design import design
-from hil.commands.export import export
 from hil.commands.fly import fly
 from hil.commands.identify import identify
 from hil.commands.listing import list_experiments
@@ -19,7 +18,7 @@ from hil.commands.new import new
 from hil.commands.options import INTERRUPTED
 from hil.commands.paper import drag_model, paper, study
 from hil.commands.param import param
-from hil.commands.pictures import report, view
+from hil.commands.pictures import export, report, view
 from hil.commands.serve import serve
 from hil.commands.station import station
 from hil.errors import LabError

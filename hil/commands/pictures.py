@@ -1,10 +1,11 @@
-"""`floaty view | report`: what a run looks like."""
+"""`floaty view | report | export`: what a run looks like, here and in the programs of others."""
 
 from pathlib import Path
 
 import click
 
 from hil.commands.options import console, run_folder
+from hil.errors import LabError
 
 
 @click.command()
@@ -27,3 +28,28 @@ def report(run: Path) -> None:
     from hil.pictures.report import write_report
 
     console.print(f"report  {write_report(run)}")
+
+
+@click.command()
+@run_folder
+@click.option("--csv", "as_csv", is_flag=True, help="flight.csv: one wide table, units in the header.")
+@click.option("--mcap", "as_mcap", is_flag=True, help="flight.mcap: for Foxglove and PlotJuggler.")
+@click.option(
+    "--tlog", "as_tlog", is_flag=True, help="flight.tlog: MAVLink, for ground stations and pymavlink."
+)
+def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool) -> None:
+    """Write the log of RUN, a run folder, in other formats, beside it."""
+    if not (as_csv or as_mcap or as_tlog):
+        raise LabError(f"export {run}: into what? --csv, --mcap, --tlog")
+    if as_csv:
+        from hil.exports.wide_csv import write_csv
+
+        console.print(f"  {write_csv(run)}", soft_wrap=True)
+    if as_mcap:
+        from hil.exports.mcap import write_mcap
+
+        console.print(f"  {write_mcap(run)}", soft_wrap=True)
+    if as_tlog:
+        from hil.exports.tlog import write_tlog
+
+        console.print(f"  {write_tlog(run)}", soft_wrap=True)
