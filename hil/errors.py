@@ -38,4 +38,6 @@ def _is_known(file: Path) -> bool:
     """Whether a file is ours or Python's own."""
     if file.name.startswith("<") or any(file.is_relative_to(folder) for folder in OURS):
         return True
-    return file.is_relative_to(PYTHON) and "site-packages" not in file.parts
+    if file.is_relative_to(PYTHON) and "site-packages" not in file.parts:
+        return True
+    return file.parent.name == "importlib_metadata"  # takes over from Python's own wherever it is installed

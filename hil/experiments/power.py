@@ -15,7 +15,8 @@ from firmware_py.wire.supervisor import Cause, State
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.metrics import column
 from hil.world.battery import endurance
-from hil.world.config import BatteryConfig
+from hil.world.config import BatteryConfig, GeometryConfig
+from hil.world.geometry import weigh
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -42,8 +43,9 @@ def _watch(flight: Flight, now_us: int) -> None:
 def power(flight: pa.Table) -> dict[str, float]:
     """Return the mean power [W] and that per mass [W/kg]."""
     mean = float(column(flight, "battery.power").mean())
-    plant = _configuration(flight)["plant"]
-    return {"power": mean, "specific_power": mean / (plant["mass"] * plant["mass_factor"])}
+    config = _configuration(flight)
+    mass = weigh(GeometryConfig.model_validate(config["geometry"])).mass * config["plant"]["mass_factor"]
+    return {"power": mean, "specific_power": mean / mass}
 
 
 def estimate(flight: pa.Table) -> Mapping[str, float]:

@@ -35,8 +35,8 @@ def test_every_parameter_of_the_core_comes_from_the_profile() -> None:
     marked = load_config()
     block = parameters_of(marked)
     unset = {name for name in Parameters.dtype.names or () if not np.any(block.memory[name])}
-    # `target` is the set-point, zero by design; the gains of pitch are zero in the tuned set
-    assert unset == {"target", "gain_pitch", "gain_q", "opening_min"}
+    # `target` is the set-point, zero by design; the gains of pitch are zero in the tuned set; nothing is excited
+    assert unset == {"target", "gain_pitch", "gain_q", "opening_min", "excite_kind", "excite_rms"}
 
 
 @pytest.mark.parametrize(

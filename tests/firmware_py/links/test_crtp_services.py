@@ -795,9 +795,9 @@ def test_poses_come_in_while_nothing_goes_out(client: CrtpClient) -> None:
 
 def test_supervisor_port_answers_state_and_commands(client: CrtpClient) -> None:
     client.run(610_000)
-    assert client.one(SUPERVISOR, 0, b"\x0c") == b"\x8c" + (0b1110).to_bytes(2, "little")
+    assert client.one(SUPERVISOR, 0, b"\x0c") == b"\x8c" + (0b10_0000_1110).to_bytes(2, "little")
     assert client.one(SUPERVISOR, 1, b"\1\0") == b"\x81\1\0"
-    assert client.one(SUPERVISOR, 0, b"\x0c") == b"\x8c" + (0b0101).to_bytes(2, "little")
+    assert client.one(SUPERVISOR, 0, b"\x0c") == b"\x8c" + (0b10_0000_0101).to_bytes(2, "little")
     assert client.one(SUPERVISOR, 1, b"\1\1") == b"\x81\1\1"
     assert client.one(PLATFORM, 0, b"\1\0") == b"\1\1\0"  # protocols before 12
     assert client.one(SUPERVISOR, 1, b"\2") == b"\x82\1\1"

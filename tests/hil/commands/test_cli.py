@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -97,7 +98,9 @@ def test_list_names_experiments_and_profiles(
     assert floaty(monkeypatch, "list") == 0
     shown = capsys.readouterr().out
     assert shown.startswith("hover  ")
-    assert "profiles: as-flown, floaty (default)" in shown
+    assert {"as-flown", "design-best", "floaty (default)", "lqr"} <= set(
+        re.split(r",\s+", shown.partition("profiles: ")[2].partition("\n\n")[0])
+    )
 
 
 @pytest.mark.long

@@ -159,6 +159,7 @@ def test_what_is_not_excited_is_not_identifiable(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.long
 def test_the_intervals_hold_the_truth_of_most_constants(tmp_path: Path) -> None:
     hits = []
     for seed in range(10, 16):

@@ -82,9 +82,7 @@ def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
     flying = column(log, "supervisor.state") == State.FLYING
     assert column(log, "logic.errors1")[flying] == pytest.approx(-column(log, "estimate.x")[flying], abs=1e-6)
     assert np.abs(column(log, "logic.integral")).max() > 0.0
-    assert (
-        write_report(failed.folder).read_text().count("Own logic") == 2
-    )  # of the figure: its title and its text
+    assert "Own logic" in write_report(failed.folder).read_text()
 
 
 @pytest.mark.parametrize("board", ["c", pytest.param("cortex-m4", marks=pytest.mark.long)])

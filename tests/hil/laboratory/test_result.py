@@ -22,7 +22,7 @@ from support.command import floaty
 KEYS = """
     experiment profile overrides seed duration_s link board faults source logic outcome cause metrics
     own_metrics verdicts passed tasks queues usage ages hash versions commit real_time_factor
-    stood_still_ms
+    stood_still_ms not_shown
 """.split()  # noqa: SIM905  of result.json, which programs of users read
 
 
