@@ -199,6 +199,8 @@ def record_plausible(seed: int, ticks: int) -> Recording:
                 rng.integers(1, 13),
                 rng.integers(120_000),
             )
+            parameters.fields.excite_kind = rng.integers(3)
+            parameters.fields.excite_rms[:] = rng.normal(0.05, 0.05, 4)
         for _ in range(rng.choice(3, p=[0.4, 0.5, 0.1])):
             spread = 1.0 if rng.random() < 0.2 else 0.1
             turn = rng.normal(0, spread, 3)

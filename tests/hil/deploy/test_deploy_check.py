@@ -139,7 +139,7 @@ def test_all_targets_are_equal_in_a_short_flight_with_faults(
     shown = capsys.readouterr().out
     assert [line.split()[0] for line in shown.splitlines() if line.endswith("equal")] == list(TARGETS)
     assert "180 ticks, numba beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
-    assert re.search(r"flash \d+ B, RAM 4820 B, stack \d+ B\n", shown)
+    assert re.search(r"flash \d+ B, RAM 4868 B, stack \d+ B\n", shown)
     mean, worst = map(int, re.search(r"per tick: mean (\d+), worst (\d+)", shown).groups())
     assert 10_000 < mean <= worst < 200_000
 
