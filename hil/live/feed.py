@@ -23,6 +23,7 @@ from hil.errors import LabError
 
 START_TIMEOUT_S = 30.0  # for the picture to come up, after which nobody waits for it
 CATCH_UP_S = 10.0  # for it to show the rest, at the end
+PIPE_BREAKS_S = 1.0  # for a thread that writes to notice that nobody reads any more
 QUEUE_PIECES = 300  # as the recorder shows them: a minute of flight
 TOGETHER = 100  # pieces that are written as one, when that many wait
 LINES = 1000  # that were typed there and nobody has fetched; texts before the first row
@@ -98,13 +99,13 @@ class LiveView:
             target=self._listen, args=(say,), name="live feed answers", daemon=True
         )
         self._answers.start()
+        self._feed = Feed(self._write)
         if not self._up.wait(start_timeout_s):
             self._is_late = True
             say(f"the viewer has not come up within {start_timeout_s:g} s; nobody waits for it any longer")
         elif self._failure:
             self._end()
             raise LabError(self._failure)
-        self._feed = Feed(self._write)
 
     # Recorder's onlooker
 
@@ -161,7 +162,8 @@ class LiveView:
         self._process.kill()
         self._process.wait()
         self._answers.join()
-        self._close_pipe()
+        if self._feed.close(PIPE_BREAKS_S):  # else somebody whom the picture has started holds the pipe's other end
+            self._close_pipe()
         assert self._process.stdout is not None
         self._process.stdout.close()
 

@@ -62,6 +62,7 @@ def test_what_does_not_fit_into_the_queue_is_dropped_and_counted() -> None:
         view.rows(rows(1000 * piece, 1000))  # 8 kB: more than a pipe holds
     assert len(view._feed._waiting) == feed.QUEUE_PIECES
     assert view.close(0.0) == 2_000_000
+    assert not view._feed._thread.is_alive()  # it was in the middle of a piece
 
 
 def test_a_picture_that_says_nothing_is_not_waited_for() -> None:
