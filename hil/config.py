@@ -99,14 +99,19 @@ def _locate_logic(tree: dict[str, Any], folder: Path) -> None:
                 section[key] = str((folder / section[key]).resolve())
 
 
+def read_toml(kind: str, path: Path) -> dict[str, Any]:
+    """Return what a file of a kind ("profile", ..) says. Raises `LabError` when it cannot be read, or is not TOML."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LabError(f"{kind} {path}: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise LabError(f"{kind} {path}: not TOML: {error}") from None
+
+
 def _read_profile(profile: str, children: tuple[Path, ...]) -> dict[str, Any]:
     path = _find_profile(profile, children)
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise LabError(f"profile {profile}: {error.strerror or error}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise LabError(f"profile {path}: not TOML: {error}") from None
+    tree = read_toml("profile", path)
     _locate_logic(tree, path.parent)
     base = tree.pop("base", None)
     if base is None:

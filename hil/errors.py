@@ -2,7 +2,8 @@
 
 import difflib
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 OURS = [Path(__file__).parent.parent / package for package in ("hil", "ground_station", "firmware_py")]
@@ -11,6 +12,15 @@ PYTHON = Path(traceback.__file__).parent
 
 class LabError(Exception):
     """Something the user asked for cannot be done; the text says what, the value, and what is allowed."""
+
+
+@contextmanager
+def writing(option: str, path: Path | None) -> Iterator[None]:
+    """Turn an `OSError` of what is written where an option says into the `LabError` that says so."""
+    try:
+        yield
+    except OSError as error:
+        raise LabError(f"{option} {path}: cannot be written ({error.strerror or error})") from None
 
 
 def hint(word: str, known: Iterable[str], otherwise: str = "") -> str:

@@ -14,9 +14,9 @@ from rich.console import Console
 from hil.experiments import find_experiment
 from hil.identify.identify import Constant, identify
 from hil.identify.record import load_record
-from hil.identify.two_controllers import TABLE
 from hil.laboratory.run import Request
 from hil.studies.sweep import Job, fly_all
+from hil.world.paper_table import PAPER_TABLE
 
 EXPERIMENTS = tuple(f"identify-u{number}" for number in range(1, 5))
 KEPT = ("log.parquet", "telemetry.csv", "events.jsonl", "result.json")
@@ -37,7 +37,7 @@ def drawn(seed: int) -> tuple[str, ...]:
     rng = np.random.default_rng(seed)
     factors = [
         f"{name}={rng.uniform(1 - half / abs(value), 1 + half / abs(value)):.4f}"
-        for name, (value, half) in TABLE.items()
+        for name, (value, half) in PAPER_TABLE.items()
         if name not in UNTOUCHED
     ]
     return (

@@ -13,10 +13,9 @@ from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.core.model import derivative
 from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, STATES, VELOCITY
 from hil.config import load_config
+from hil.world.body import MIX
 
 STEP_S = 0.01
-# Flap angles [rad] of one unit of u1..u4: eq. (input_signals).
-MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)
 ACCEPTED = {  # by state
     POSITION: 0.05, POSITION + 1: 0.05, POSITION + 2: 0.03,  # [m]
     VELOCITY: 0.2, VELOCITY + 1: 0.2, VELOCITY + 2: 0.2,  # [m/s]

@@ -7,40 +7,22 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
-from hil.config import DEFAULT_PROFILE
+from hil.config import DEFAULT_PROFILE, read_toml
 from hil.errors import LabError, hint
 from hil.world.config import ConstantName
+from hil.world.paper_table import PAPER_TABLE
 
 Value = bool | int | float | str
 Sampling = Literal["random", "sobol", "latin", "saltelli", "morris"]
 DESIGNS = ("saltelli", "morris")  # all their points together give the indices; they cannot stop early
 STOP = re.compile(r"failure rate known to (?:±|\+-)\s*(\d+(?:\.\d+)?)\s*%")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-# Paper, Supplementary Table of dynamics constants: f_{affected, influencing}, value and uncertainty.
-PAPER_TABLE: dict[str, tuple[float, float]] = {
-    "roll_u1": (230.0, 66.0),
-    "roll_roll": (-16.0, 10.0),
-    "roll_rate": (-40.0, 12.0),
-    "y_u1": (-4.8, 0.1),
-    "y_roll": (-6.5, 0.1),
-    "pitch_u2": (1100.0, 170.0),
-    "pitch_pitch": (-1560.0, 25.0),
-    "pitch_rate": (-29.0, 5.0),
-    "x_u2": (-0.8, 0.1),
-    "x_pitch": (2.5, 0.1),
-    "yaw_u3": (110.0, 1.8),
-    "yaw_rate": (-7.7, 0.1),
-    "z_u4": (2.3, 0.3),
-    "z_vz": (-2.0, 0.1),
-}
 
 
 class _Part(BaseModel):
@@ -176,12 +158,7 @@ def table_dimensions(table: TableConfig | None) -> list[tuple[str, Distribution]
 
 def read_spec(path: Path) -> Spec:
     """Return the campaign of a file; files that it names begin at its folder. Raises `LabError` of one line."""
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise LabError(f"campaign {path}: {error.strerror or error}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise LabError(f"campaign {path}: not TOML: {error}") from None
+    tree = read_toml("campaign", path)
     try:
         spec = Spec.model_validate(tree)
     except ValidationError as error:

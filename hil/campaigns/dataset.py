@@ -23,7 +23,7 @@ from firmware_py.logic.loading import digest_of
 from hil.campaigns.config import Distribution, spec_text, table_dimensions
 from hil.campaigns.flying import Campaign, Row
 from hil.config import load_config
-from hil.errors import LabError
+from hil.errors import LabError, writing
 from hil.experiments import find_experiment
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.result import commit, versions
@@ -46,13 +46,11 @@ class Dataset:
 
     def add(self, row: Row) -> None:
         """Keep a row."""
-        try:
+        with writing("--out", self.folder):
             if self._arriving is None:
                 self._arriving = (self.folder / ARRIVING).open("a", encoding="utf-8")
             self._arriving.write(json.dumps(asdict(row)) + "\n")
             self._arriving.flush()
-        except OSError as error:
-            raise self._refused(error) from None
         self.indices.add(row.index)
         self._lines += 1
         if self._lines >= ROWS_PER_FILE:
@@ -72,7 +70,7 @@ class Dataset:
 
     def _begin(self, now: dict[str, Any], resume: bool) -> None:
         path = self.folder / ABOUT
-        try:
+        with writing("--out", self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             if not path.is_file():
                 if any(self.folder.iterdir()):
@@ -82,9 +80,9 @@ class Dataset:
                 partial.write_text(json.dumps(now, indent=2) + "\n", encoding="utf-8")
                 partial.replace(path)
                 return
-            before = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise self._refused(error) from None
+            text = path.read_text(encoding="utf-8")
+        try:
+            before = json.loads(text)
         except json.JSONDecodeError as error:
             raise LabError(f"{path}: not JSON: {error}") from None
         if not resume:
@@ -98,10 +96,8 @@ class Dataset:
     def _pack(self) -> None:
         """Make a file of what has arrived."""
         if self._arriving is not None:
-            try:
+            with writing("--out", self.folder):
                 self._arriving.close()
-            except OSError as error:
-                raise self._refused(error) from None
             self._arriving, self._lines = None, 0
         path = self.folder / ARRIVING
         rows = list(_lines_of(path))
@@ -114,18 +110,16 @@ class Dataset:
 
     def _write(self, table: pa.Table, name: str) -> None:
         partial = self.folder / f"{name}.partial"
-        try:
-            pq.write_table(table, partial, compression="zstd")
-            partial.replace(self.folder / FLIGHTS / name)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            raise self._refused(error) from None
+        with writing("--out", self.folder):
+            try:
+                pq.write_table(table, partial, compression="zstd")
+                partial.replace(self.folder / FLIGHTS / name)
+            except OSError:
+                partial.unlink(missing_ok=True)
+                raise
 
     def _files(self) -> list[Path]:
         return sorted((self.folder / FLIGHTS).glob("*.parquet"))
-
-    def _refused(self, error: OSError) -> LabError:
-        return LabError(f"--out {self.folder}: cannot be written ({error.strerror or error})")
 
 
 def read_flights(folder: Path, schema: pa.Schema, columns: list[str] | None = None) -> pa.Table:

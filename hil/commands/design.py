@@ -9,7 +9,7 @@ import click
 from rich.console import Console
 
 from hil.commands.options import announce_compilation, console, profile_option, seed_option, set_option
-from hil.errors import LabError
+from hil.errors import LabError, writing
 
 if TYPE_CHECKING:
     from hil.design.analysis import Analysis
@@ -147,10 +147,8 @@ def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -
     from hil.design.profile import profile_text
 
     text = profile_text(point, gains_of(point.linear), about, length)
-    try:
+    with writing("--write", path):
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise LabError(f"--write {path}: cannot be written ({error.strerror or error})") from None
     console.print(f"profile {path}", soft_wrap=True)
 
 
@@ -185,10 +183,8 @@ def point_of(
 
 def folder_for(out: Path) -> Path:
     """Make the folder."""
-    try:
+    with writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
     return out
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hil.commands.options import console, profile_option
-from hil.errors import LabError
+from hil.errors import LabError, writing
 
 if TYPE_CHECKING:
     from hil.identify.identify import Constant, Identification
@@ -55,11 +55,9 @@ def identify(
     _print(found)
     if found.excited or found.free:
         held_out = None if validate is None else load_record(validate, profile)
-        try:
+        with writing("--out", out):
             out.mkdir(parents=True, exist_ok=True)
             console.print(f"  {write_pages(out, found, held_out)}", soft_wrap=True)
-        except OSError as error:
-            raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
     if profile_out is not None:
         write_profile(profile_out, profile, found)
         console.print(f"  {profile_out}   (floaty fly hover --profile {profile_out})", soft_wrap=True)

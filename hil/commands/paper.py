@@ -17,7 +17,7 @@ from hil.commands.options import (
     seed_option,
     set_option,
 )  # fmt: skip
-from hil.errors import LabError
+from hil.errors import writing
 
 if TYPE_CHECKING:
     from hil.studies.paper import Paper
@@ -81,14 +81,12 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
     from hil.studies.paper_report import write_paper
 
     announce_compilation()
-    try:
+    with writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
         flown = fly_paper(rows, studies, seeds, out, notices)
         bench = list(drag_model.measure(load_config(), 1)) if mounted and not flown.interrupted else []
         shape = analyse(point_of(load_config())) if bench else None
         report = write_paper(out, flown, bench, shape)
-    except OSError as error:
-        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
     _print_rows(flown)
     _print_studies(flown)
     if shape is not None:
@@ -161,10 +159,8 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
     from hil.studies import drag_model, drag_model_report
 
     config = load_config(profile, overrides)
-    try:
+    with writing("--out", out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LabError(f"--out {out}: cannot be written ({error.strerror or error})") from None
     announce_compilation()
     measured = drag_model.measure(config, seed)
     rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))

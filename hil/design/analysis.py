@@ -14,16 +14,14 @@ from hil.config import LabConfig
 from hil.design import figures
 from hil.design.authority import QUANTITIES, attainable, pressure_at, single, wrenches
 from hil.design.claims import Claim, claims, robot_lines
+from hil.design.linear import calm_plates
 from hil.design.sweeps import Point, authorities, hover_angles, scaling, stability
 from hil.design.trim import coefficient_of
 from hil.pictures.drawing import png
 from hil.pictures.pages import data_uri, write_page
 from hil.world import layout as at
 from hil.world.body import SIGNS
-from hil.world.config import PlantConfig, TunnelConfig
-from hil.world.correction import calm
 from hil.world.motion import evaluate
-from hil.world.plant import assemble
 
 CHECKED = 200  # openings at which plant and plate equations are compared
 
@@ -63,9 +61,7 @@ def point_of(config: LabConfig) -> Point:
 
 def model_error(point: Point) -> float:
     """Return the largest difference between the flown plant and the Supplement's plates, [N] or [N m], over openings."""
-    plant = PlantConfig(variant="plate", airspeed=point.speed, hover_angle=point.opening)
-    s, _ = assemble(point.geometry, plant, TunnelConfig(turbulence="none"))
-    c = calm(s, point.speed)
+    c = calm_plates(point.geometry, point.speed, point.opening)
     places = np.stack(
         [np.linspace(point.low, point.high, CHECKED) * f % point.high for f in (1.0, 1.7, 2.3, 3.1)], axis=1
     )

@@ -26,8 +26,8 @@ from hil.design.sweeps import (
     updrafts,
 )
 from hil.design.trim import balanced, changed
-from hil.world.correction import TABLE
 from hil.world.geometry import weigh
+from hil.world.paper_table import PAPER_TABLE
 
 AGREES, DIFFERS, NOTHING = "agrees", "differs", "no value"
 ROUGHLY = 0.15  # what "approximately" still covers
@@ -35,12 +35,7 @@ ROUGHLY = 0.15  # what "approximately" still covers
 DESIGN, SCALING = "Design optimization, Fig. robustness f, g", "Scaling analysis"
 FORCES, CONSTANTS = "Force and torque analysis", "Table of dynamics constants"
 
-# Paper, Table of dynamics constants: the uncertainty of each; physics.md section 3 has the reason of each difference
-PLUS_MINUS = {
-    "roll_u1": 66.0, "roll_roll": 10.0, "roll_rate": 12.0, "y_u1": 0.1, "y_roll": 0.1, "pitch_u2": 170.0,
-    "pitch_pitch": 25.0, "pitch_rate": 5.0, "x_u2": 0.1, "x_pitch": 0.1, "yaw_u3": 1.8, "yaw_rate": 0.1, "z_u4": 0.3,
-    "z_vz": 0.1,
-}  # fmt: skip
+# Why a constant of the Table differs: physics.md section 3
 RATES = (
     "Plates damp by 1 to 3 1/s; the Table's value is that of a loop closed by the firmware's own rate gain."
 )
@@ -223,8 +218,8 @@ def _forces(point: Point, model_error: float) -> Iterator[Claim]:
         _holds(abs(f.y_u1) < 0.01 and abs(f.x_u2) < 0.01),
         "Nor by the Supplement's own sign tables, which leave 4 F'; the Table has -4.8 and -0.8.",
     )  # fmt: skip
-    for name, error in PLUS_MINUS.items():
-        paper, ours = getattr(TABLE, name), getattr(f, name)
+    for name, (paper, error) in PAPER_TABLE.items():
+        ours = getattr(f, name)
         inside = abs(ours - paper) <= error
         yield Claim(
             name.replace("_", " per "), CONSTANTS, f"{paper:g} ± {error:g}", f"{ours:.4g}", _holds(inside),

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
-from hil.world.correction import Constants, accelerations, calm
+from hil.world.correction import DIFFERENCE, Constants, accelerations, calm, slope
 from hil.world.plant import assemble
+from hil.world.plates import State
 
 CAUSES = ("vx", "vy", "vz", "qx", "qy", "qz", "ox", "oy", "oz", "u1", "u2", "u3", "u4")
 STATES = 9
 AXES = {"roll": (1, 3, 6), "pitch": (0, 4, 7), "yaw": (8,), "height": (2,)}  # states of each, by input u1..u4
-STEP = 1e-3  # [m/s, rad, rad/s] of the five-point difference
 Matrix = NDArray[np.float64]
 
 
@@ -62,18 +62,17 @@ class Linear:
         return max(pole.real for pole in self.poles(axis))
 
 
-def linear(geometry: GeometryConfig, speed: float, opening: float) -> Linear:
-    """Return the dynamics of the plates at a hover that carries the weight, at a speed [m/s] and opening [rad]."""
+def calm_plates(geometry: GeometryConfig, speed: float, opening: float) -> State:
+    """Return the plate model, level and at rest at a hover, at a speed [m/s] and opening [rad]."""
     plant = PlantConfig(variant="plate", airspeed=speed, hover_angle=opening)
     s, _ = assemble(geometry, plant, TunnelConfig(turbulence="none"))
-    c = calm(s, speed)
+    return calm(s, speed)
 
-    def slope(cause: str) -> Matrix:
-        near = accelerations(c, cause, STEP) - accelerations(c, cause, -STEP)
-        far = accelerations(c, cause, 2 * STEP) - accelerations(c, cause, -2 * STEP)
-        return (8 * near - far) / (12 * STEP)
 
-    slopes = np.array([slope(cause) for cause in CAUSES]).T  # (6, 13)
+def linear(geometry: GeometryConfig, speed: float, opening: float) -> Linear:
+    """Return the dynamics of the plates at a hover that carries the weight, at a speed [m/s] and opening [rad]."""
+    c = calm_plates(geometry, speed, opening)
+    slopes = np.array([slope(c, cause) for cause in CAUSES]).T  # (6, 13)
     A, B = np.zeros((STATES, STATES)), np.zeros((STATES, 4))
     A[:3], A[6:] = slopes[:3, :STATES], slopes[3:, :STATES]
     A[3:6, 6:] = np.eye(3)
@@ -83,13 +82,6 @@ def linear(geometry: GeometryConfig, speed: float, opening: float) -> Linear:
 
 def stiffness(geometry: GeometryConfig, speed: float, opening: float) -> float:
     """Return f_αα alone: roll acceleration per roll angle [1/s2]."""
-    plant = PlantConfig(variant="plate", airspeed=speed, hover_angle=opening)
-    s, _ = assemble(geometry, plant, TunnelConfig(turbulence="none"))
-    c = calm(s, speed)
-    change = accelerations(c, "qx", STEP) - accelerations(c, "qx", -STEP)
-    return float(change[3]) / (2 * STEP)
-
-
-def time_to_fall(growth: float, start: float, end: float) -> float:
-    """Return how long [s] a mode takes to grow from one size to another."""
-    return math.log(end / start) / growth if growth > 0.0 else math.inf
+    c = calm_plates(geometry, speed, opening)
+    change = accelerations(c, "qx", DIFFERENCE) - accelerations(c, "qx", -DIFFERENCE)
+    return float(change[3]) / (2 * DIFFERENCE)

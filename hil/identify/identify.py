@@ -15,8 +15,9 @@ from hil.errors import LabError
 from hil.identify.axes import AXES, DELAY, LAG, UNITS
 from hil.identify.joint import Estimate, Excited, excited_axes, instrumental, joint
 from hil.identify.record import Record
-from hil.identify.two_controllers import TABLE, two_controllers
+from hil.identify.two_controllers import two_controllers
 from hil.laboratory.robot import Streams
+from hil.world.paper_table import PAPER_TABLE
 from hil.world.plant import Plant
 
 IDENTIFIED, WEAK, UNKNOWN = "identified", "weak", "not identifiable"
@@ -97,7 +98,7 @@ def identify(records: Sequence[Record]) -> Identification:
         verdict, why = _verdict(name, joint_pair, fitted, rich)
         constants.append(
             Constant(
-                name, UNITS[name], TABLE.get(name, (nan, nan)), truth.get(name, nan), printed_pair, instruments,
+                name, UNITS[name], PAPER_TABLE.get(name, (nan, nan)), truth.get(name, nan), printed_pair, instruments,
                 joint_pair, verdict, why,
             )
         )  # fmt: skip

@@ -11,15 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from hil.config import load_config
-from hil.errors import LabError
+from hil.errors import LabError, writing
 from hil.identify.axes import AXES, DELAY, LAG
 from hil.identify.identify import NUISANCES, UNKNOWN, Identification
 from hil.identify.joint import Estimate, joint
+from hil.world.body import MIX
+from hil.world.servos import WORDS_PER_RADIAN
 
 TRIM_LEAST = 0.005  # [rad] mean input that is worth a trim
-WORDS_PER_RADIAN = 31290
-# Flap angles per input: eq. (input_signals).
-MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)
 
 
 def refit(found: Identification, profile: str) -> Estimate:
@@ -73,10 +72,8 @@ def write_profile(path: Path, profile: str, found: Identification) -> None:
         f"# input to gyro {1e3 * fitted.values[DELAY]:.1f} ms, of which the firmware's own timing makes 13"
     )
     lines += ["", *_trim(found)]
-    try:
+    with writing("--profile-out", path):
         path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
-    except OSError as error:
-        raise LabError(f"--profile-out {path}: cannot be written ({error.strerror or error})") from None
     load_config(str(path))  # what cannot fly is an error here, not at the next flight
 
 

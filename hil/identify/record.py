@@ -19,8 +19,9 @@ from firmware_py.wire.supervisor import State
 from ground_station.telemetry_log import POSE_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.config import LabConfig, load_config
 from hil.errors import LabError
-from hil.laboratory.recorder import PARQUET, load_log
+from hil.laboratory.recorder import load_log, release_of
 from hil.laboratory.result import read_result
+from hil.world.body import MIX, SIGNS
 
 Array = NDArray[np.float64]
 BOARD_COLUMN = "board.t [ms]"
@@ -28,8 +29,7 @@ INPUTS = tuple(f"controller.u{i} [rad]" for i in range(1, 5))
 EXCITATIONS = tuple(f"excite.u{i} [rad]" for i in range(1, 5))
 RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch", "yaw"))
 WRAP_MS = 1 << 24  # of the board's time stamps
-# Opening of each flap per input, eq. (input_signals) times the flap's sense; u4 closes.
-SHARES = np.array([[1, -1, -1, 1], [1, 1, -1, -1], [-1, 1, -1, 1], [-1, -1, -1, -1]], float)
+SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 closes
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,14 +59,15 @@ def load_record(path: Path, profile: str) -> Record:
     folder, file = (path, path / TELEMETRY) if path.is_dir() else (path.parent, path)
     if not file.is_file():
         raise LabError(f"{path}: no {TELEMETRY} there; identify takes run folders and telemetry.csv")
-    config, simulated = _flown_with(folder) if path.is_dir() else (load_config(profile), False)
+    config, simulated, release_s = (
+        _flown_with(folder) if path.is_dir() else (load_config(profile), False, 0.0)
+    )
     columns = _read(file)
     state = columns["supervisor.state []"]
     flown = (state == State.FLYING) & np.all(
         np.isfinite([columns[name] for name in (*INPUTS, *RATES)]), axis=0
     )
-    if folder_release := _release_s(folder, simulated):
-        flown &= columns[BOARD_COLUMN] * 1e-3 > folder_release
+    flown &= columns[BOARD_COLUMN] * 1e-3 > release_s
     if np.count_nonzero(flown) < 100:
         raise LabError(
             f"{path}: {np.count_nonzero(flown)} rows of flight under control; identification needs 100 at least"
@@ -111,24 +112,22 @@ def _read(file: Path) -> dict[str, Array]:
     return columns
 
 
-def _flown_with(folder: Path) -> tuple[LabConfig, bool]:
-    """Return the configuration of a run folder, and whether its world was simulated."""
-    text = (load_log(folder).schema.metadata or {})[b"config"]
+def _flown_with(folder: Path) -> tuple[LabConfig, bool, float]:
+    """Return a run folder's configuration, whether its world was simulated, and when it was released [s], board's clock.
+
+    0: not known.
+    """
+    metadata = load_log(folder).schema.metadata or {}
+    simulated = read_result(folder).seed is not None
     try:
-        return LabConfig.model_validate_json(text), read_result(folder).seed is not None
+        config = LabConfig.model_validate_json(metadata[b"config"])
+        return config, simulated, 1e-6 * release_of(metadata) if simulated else 0.0
     except ValidationError as error:
         key = ".".join(map(str, error.errors()[0]["loc"]))
         raise LabError(
             f"{folder}: flown by another version, whose configuration this one does not read ({key}); give its {TELEMETRY} "
             "and --profile"
         ) from None
-
-
-def _release_s(folder: Path, simulated: bool) -> float:
-    """Return when the robot was let go, on the board's clock; 0 where that is not known."""
-    if not simulated or not (folder / PARQUET).exists():
-        return 0.0
-    return 1e-6 * float((load_log(folder).schema.metadata or {}).get(b"release_us", b"0"))
 
 
 def _limited(u: Array, config: LabConfig) -> tuple[Array, float]:

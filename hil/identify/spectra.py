@@ -30,15 +30,8 @@ NEIGHBOURS = 4  # lines to either side that tell the disturbance of a line
 LEAST_SAMPLES = 1.5  # per unknown of the fit
 PURE = 0.05  # share of the excitation that may differ from period to period
 POWERS = {
-    8: 1,
-    9: 1,
-    10: 1,
-    11: 2,
-    12: 2,
-    13: 2,
-    14: 2,
-    15: 2,
-    16: 2,
+    **dict.fromkeys(range(8, 11), 1),
+    **dict.fromkeys(range(11, 17), 2),
 }  # of w, from a signal to an acceleration
 
 

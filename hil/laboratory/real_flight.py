@@ -20,7 +20,7 @@ from ground_station.mocap import MocapFrame
 from ground_station.program import Cockpit
 from ground_station.telemetry_log import TELEMETRY
 from hil.config import LabConfig
-from hil.errors import LabError
+from hil.errors import LabError, writing
 from hil.laboratory.ages import ages_of, told
 from hil.laboratory.channels import station_channels
 from hil.laboratory.experiment import Experiment
@@ -151,14 +151,12 @@ class RealFlight:
                 shutil.rmtree(folder)
             return None
         self.note("lab", failure or ("interrupted by the user" if interrupted else "the station ends"))
-        try:
+        with writing("--out", folder):
             digest = self._recorder.close()
             if folder is None:
                 return None
             result = self._result(folder, digest, failure, interrupted)
             write_result(result)
-        except OSError as error:
-            raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
         return result
 
     def _result(self, folder: Path, digest: str, failure: str, interrupted: bool) -> Result:
@@ -195,14 +193,12 @@ class RealFlight:
 
 
 def _make(folder: Path) -> None:
-    try:
+    with writing("--out", folder):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise LabError(
                 f"--out {folder}: there is something already, and a real flight is not flown again"
             )
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
 
 
 def why_lost(frame: MocapFrame, limits: LimitsConfig, home: tuple[float, float, float]) -> str | None:

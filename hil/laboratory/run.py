@@ -22,7 +22,7 @@ from firmware_py.rtos import WatchdogError
 from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
-from hil.errors import LabError
+from hil.errors import LabError, writing
 from hil.laboratory.ages import ages_of, told, with_goals_sent
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.faults import Fault, check
@@ -213,7 +213,7 @@ def lockstep(request: Request, telemetry: Path, clock: Clock | None, trace_all: 
 
 def prepare(folder: Path) -> None:
     """Make an empty run folder; one that holds something else than a run is left alone. Raises `LabError`."""
-    try:
+    with writing("--out", folder):
         if folder.exists():
             if any(folder.iterdir()) and not any(
                 (folder / name).exists() for name in (RESULT, "events.jsonl")
@@ -223,5 +223,3 @@ def prepare(folder: Path) -> None:
                 )
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
-    except OSError as error:
-        raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from hil.errors import LabError
+from hil.errors import LabError, writing
 from hil.experiments import find_again
 from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure
 from hil.laboratory.recorder import load_log, release_of
@@ -149,15 +149,13 @@ def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Pa
         "Times count from the release of each.",
         plot=plot,
     )
-    try:
+    with writing("--out", folder):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / PICTURE).write_bytes(png(lambda: plot))
         return write_page(
             folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, figure=figure,
             zoomable=zoomable([figure]),
         )  # fmt: skip
-    except OSError as error:
-        raise LabError(f"--out {folder}: cannot be written ({error.strerror or error})") from None
 
 
 def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Plot:

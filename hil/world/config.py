@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from hil.world.servos import WORDS_PER_RADIAN
+
 Positive = Annotated[float, Field(gt=0)]
 Extent = Annotated[float, Field(ge=0, le=2)]
 Three = tuple[float, float, float]
@@ -189,7 +191,12 @@ class ServoConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     zero_offset: Four = Field(
-        (-3600 / 31290, -5000 / 31290, -9000 / 31290, 6200 / 31290),
+        (
+            -3600 / WORDS_PER_RADIAN,
+            -5000 / WORDS_PER_RADIAN,
+            -9000 / WORDS_PER_RADIAN,
+            6200 / WORDS_PER_RADIAN,
+        ),
         description="pulse of a level flap, from the middle pulse of 1.5 ms [rad]; original firmware, motorShifts",
     )
     tau: float = Field(

@@ -19,6 +19,7 @@ from hil.world.config import PlantConfig
 from hil.world.fixed_order import fit_polynomial
 from hil.world.geometry import Weight
 from hil.world.motion import GRAVITY, evaluate
+from hil.world.paper_table import PAPER_TABLE
 from hil.world.plates import LIFT_U4_MAX, State
 
 
@@ -47,15 +48,9 @@ class Constants:
     pitch_vx: float = math.nan
 
 
-# Paper, Table "Empirical estimation of dynamics constants"
-TABLE = Constants(
-    roll_u1=230.0, roll_roll=-16.0, roll_rate=-40.0, y_u1=-4.8, y_roll=-6.5,
-    pitch_u2=1100.0, pitch_pitch=-1560.0, pitch_rate=-29.0, x_u2=-0.8, x_pitch=2.5,
-    yaw_u3=110.0, yaw_rate=-7.7, z_u4=2.3, z_vz=-2.0,
-)  # fmt: skip
-PITCH_INPUT_METHODS = (
-    -1066.0
-)  # [1/s2] paper, Methods: contradicts the Table's +1100; section 5 decides for it
+TABLE = Constants(**{name: value for name, (value, _) in PAPER_TABLE.items()})
+# [1/s2] paper, Methods: contradicts the Table's +1100; section 5 decides for it
+PITCH_INPUT_METHODS = -1066.0
 
 LIFT_SAMPLES = np.linspace(-LIFT_U4_MAX, LIFT_U4_MAX, 45)  # [rad] u4 at which l is fitted, every 0.025
 LIFT_ORDER = 6
@@ -92,19 +87,20 @@ def accelerations(c: State, cause: str, amount: float) -> State:
     return np.concatenate([s[at.ACC : at.ACC + 3], s[at.ALPHA : at.ALPHA + 3]])
 
 
+def slope(c: State, cause: str) -> State:
+    """Return how ACC (W) and ALPHA (B), (6,), of a calm plant change with a cause, per its unit."""
+    h = DIFFERENCE
+    near = accelerations(c, cause, h) - accelerations(c, cause, -h)
+    far = accelerations(c, cause, 2 * h) - accelerations(c, cause, -2 * h)
+    return (8 * near - far) / (12 * h)
+
+
 def linearise(s: State, speed: float) -> Constants:
     """Return the constants of the plant in `s` about the level hover in a uniform flow of `speed` [m/s]."""
     c = calm(s, speed)
-
-    def slope(cause: str) -> State:
-        h = DIFFERENCE
-        near = accelerations(c, cause, h) - accelerations(c, cause, -h)
-        far = accelerations(c, cause, 2 * h) - accelerations(c, cause, -2 * h)
-        return (8 * near - far) / (12 * h)
-
-    u1, u2, u3, u4 = (slope(cause).tolist() for cause in ("u1", "u2", "u3", "u4"))
-    roll, pitch, vx, vy, vz = (slope(cause).tolist() for cause in ("qx", "qy", "vx", "vy", "vz"))
-    p, q, r = (slope(cause).tolist() for cause in ("ox", "oy", "oz"))
+    u1, u2, u3, u4 = (slope(c, cause).tolist() for cause in ("u1", "u2", "u3", "u4"))
+    roll, pitch, vx, vy, vz = (slope(c, cause).tolist() for cause in ("qx", "qy", "vx", "vy", "vz"))
+    p, q, r = (slope(c, cause).tolist() for cause in ("ox", "oy", "oz"))
     return Constants(
         roll_u1=u1[3], roll_roll=roll[3], roll_rate=p[3], y_u1=u1[1], y_roll=roll[1],
         pitch_u2=u2[4], pitch_pitch=pitch[4], pitch_rate=q[4], x_u2=u2[0], x_pitch=pitch[0],

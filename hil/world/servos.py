@@ -12,9 +12,8 @@ from collections.abc import Sequence
 TIMER_MHZ = 21
 PERIOD_COUNTS = 52501
 MIDDLE_COUNTS = 31500.0  # 1.5 ms
-RAD_PER_COUNT = 65535 / (
-    31290 * 21000
-)  # 477.455 us/rad: 31290 servo words per radian, 65535 words per millisecond
+WORDS_PER_RADIAN = 31290
+RAD_PER_COUNT = 65535 / (WORDS_PER_RADIAN * 21000)  # 477.455 us/rad: 65535 words per millisecond
 PULSE_MIN, PULSE_MAX = 10_500, 52_500  # counts, 0.5..2.5 ms: anything else is no pulse to a servo
 
 

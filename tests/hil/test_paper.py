@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from firmware_py.config import ControllerConfig, ModelConfig
-from hil.campaigns.config import PAPER_TABLE
 from hil.config import load_config
+from hil.world.paper_table import PAPER_TABLE
 
 ROWS = PAPER_TABLE  # value, uncertainty
 METHODS_PITCH_U2 = -1066.0  # paper, Methods, "Data-driven estimation of dynamics constants"

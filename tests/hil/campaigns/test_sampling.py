@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hil.campaigns.config import PAPER_TABLE, Distribution, Spec
+from hil.campaigns.config import Distribution, Spec
 from hil.campaigns.sampling import axes, check_design, draw, points_of, value_at
 from hil.config import load_config
 from hil.errors import LabError
+from hil.world.paper_table import PAPER_TABLE
 from support.campaigns import spec_of
 
 SAMPLINGS = {

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from hil.commands import app
 from hil.config import load_config
 from hil.design import optimise as search
 from hil.design.gains import LOOPS, gains_of
@@ -27,6 +26,7 @@ from hil.world.body import SIGNS
 from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import weigh
 from hil.world.plant import Plant
+from support.command import floaty
 
 CONFIG = load_config()
 PAPER = Point(CONFIG.geometry, coefficient_of(CONFIG), math.radians(28.0), 0.0, 0.9)
@@ -197,26 +197,19 @@ def test_agility_measured_in_flight_goes_with_one_over_the_size(tmp_path: Path) 
         assert found * length == pytest.approx(agility[1.0], rel=0.1), agility
 
 
-def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(sys, "argv", ["floaty", "design", *arguments])
-    with pytest.raises(SystemExit) as end:
-        app.main()
-    return int(end.value.code or 0)
-
-
 @pytest.mark.long
 def test_command_writes_the_pareto_picture_and_a_profile_that_flies(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     profile = tmp_path / "best.toml"
     arguments = ["optimise", "--profile", "design-paper", "--generations", "3", "--out", str(tmp_path)]
-    assert run([*arguments, "--write", str(profile)], monkeypatch) == 0
+    assert floaty(monkeypatch, "design", *arguments, "--write", str(profile)) == 0
     assert (tmp_path / "pareto-least-authority.png").read_bytes().startswith(b"\x89PNG")
     assert "1.375 are needed" in capsys.readouterr().out
     prepare(tmp_path / "flight")
     result = fly(Request.of(EXPERIMENTS["hover"], str(profile), seed=1, duration_s=4.0), tmp_path / "flight")
     assert result.metrics["lost"] == 0.0
-    assert run([*arguments, "--updrafts", "11", "8"], monkeypatch) == 2
+    assert floaty(monkeypatch, "design", *arguments, "--updrafts", "11", "8") == 2
     assert "expected the least first" in capsys.readouterr().err
 
 

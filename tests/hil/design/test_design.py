@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,18 +10,19 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hil.commands import app
 from hil.config import load_config
 from hil.design import sweeps
 from hil.design.authority import attainable, hull, pressure_at, single, wrenches
-from hil.design.claims import PLUS_MINUS, claims
+from hil.design.claims import claims
 from hil.design.linear import Linear, linear
 from hil.design.sweeps import Point
 from hil.design.trim import balanced, changed, coefficient_of, opening_at, scaled, speed_at
 from hil.errors import LabError
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import weigh
+from hil.world.paper_table import PAPER_TABLE
 from hil.world.plant import Plant
+from support.command import floaty
 from support.geometries import geometries
 
 G0, COEFFICIENT = load_config().geometry, coefficient_of(load_config())
@@ -193,7 +193,7 @@ def test_roll_becomes_stable_where_the_specification_says_and_best_hover_angles_
     verdicts = {
         claim.title: claim.verdict for claim in claims(PAPER, stable, angles, sweeps.scaling(PAPER), 0.0)
     }
-    inside = {name for name in PLUS_MINUS if verdicts[name.replace("_", " per ")] == "agrees"}
+    inside = {name for name in PAPER_TABLE if verdicts[name.replace("_", " per ")] == "agrees"}
     assert inside == INSIDE
     assert verdicts["lateral forces cancel under u1 and u2"] == "differs"
     assert verdicts["airspeed over m / l²"] == "agrees"
@@ -204,18 +204,11 @@ def test_the_slowest_pole_is_never_hidden() -> None:
     assert spun.growth("roll") == 2.0
 
 
-def run(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(sys, "argv", ["floaty", "design", *arguments])
-    with pytest.raises(SystemExit) as end:
-        app.main()
-    return int(end.value.code or 0)
-
-
 @pytest.mark.long
 def test_command_writes_pictures_a_page_and_all_claims(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert run(["--out", str(tmp_path), "--angle", "22"], monkeypatch) == 0
+    assert floaty(monkeypatch, "design", "--out", tmp_path, "--angle", "22") == 0
     content = json.loads((tmp_path / "design.json").read_text())
     assert len(content["claims"]) > 35
     assert content["robot"]["hover"].startswith("22.0° at 9.78 m/s")
@@ -236,5 +229,5 @@ def test_command_writes_pictures_a_page_and_all_claims(
 def test_what_cannot_be_is_one_line(
     arguments: list[str], text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(arguments, monkeypatch) == 2
+    assert floaty(monkeypatch, "design", *arguments) == 2
     assert text in capsys.readouterr().err
