@@ -13,7 +13,6 @@ from math import comb
 
 from firmware_py.geometry import Vector, rotate, wrap_angle, yaw_quaternion
 
-DEGREE = 7
 AXES = 4  # x, y, z, yaw
 Coefficients = tuple[float, ...]  # ascending powers of the time in a piece
 

@@ -60,9 +60,10 @@ def excite(parameters: Parameters, control: Control) -> None:
     for i in range(INPUTS):
         control.excitation[i] = ZERO
         if parameters.excite_kind != EXCITE_OFF and parameters.excite_rms[i] > ZERO:
-            wave = multisine(first + i, last, tick)
             if parameters.excite_kind == EXCITE_CHIRP:
                 wave = chirp(low, high, tick)
+            else:
+                wave = multisine(first + i, last, tick)
             control.excitation[i] = parameters.excite_rms[i] * wave
             control.u[i] = control.u[i] + control.excitation[i]
     control.excite_tick = i32((tick + 1) % PERIOD)

@@ -3,7 +3,6 @@
 import ast
 from collections.abc import Mapping
 
-FOREIGN = ("numpy", "math")
 _MATHS = "from firmware_py.core.maths"
 _NONE = "there is none: put it together from + - * / and sqrt, as firmware_py/core/maths.py does"
 _LOOP = "a loop over range(..)"

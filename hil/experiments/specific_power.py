@@ -12,7 +12,6 @@ from typing import Literal
 
 WATTS_PER_SHP = 745.7  # the paper's
 PISTON, TURBINE = (0.75, 0.90), (0.60, 0.75)
-PAPER_W_PER_KG = 10.0  # Floaty's in the paper
 CONVENTIONAL_W_PER_KG = (100.0, 250.0)  # paper: "typically in the range of", shaded grey in its figure
 
 
