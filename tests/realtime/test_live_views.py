@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -16,29 +15,10 @@ import pytest
 from hil.laboratory.recorder import load_events, load_log
 from hil.live.window import COMMAND, LOOPBACK, free_port, is_open
 from support.foxglove_client import FoxgloveClient
-from support.serving import Served, serve
+from support.serving import Served, serve, started
 from support.serving import free_port as free_udp_port
 
-FLOATY = (sys.executable, "-m", "hil.commands")
 PATIENCE_S = 60.0
-
-
-@contextmanager
-def started(*arguments: str | Path) -> Iterator[Served]:
-    """A command as a process of its own."""
-    process = subprocess.Popen(
-        [*FLOATY, *map(str, arguments)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
-    try:
-        yield Served(process)
-    finally:
-        process.kill()
-        process.wait()
-        process.stdin.close()
-        process.stdout.close()
 
 
 @contextmanager

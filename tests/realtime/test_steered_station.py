@@ -5,7 +5,6 @@ import os
 import pty
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,9 +13,8 @@ from pathlib import Path
 import pytest
 
 from hil.laboratory.recorder import load_events, load_log
-from support.serving import Served, serve
+from support.serving import FLOATY, Served, serve, started
 
-FLOATY = (sys.executable, "-m", "hil.commands")
 PATIENCE_S = 30.0
 ENDS: dict[str, tuple[str, ...]] = {
     "radio": ("--radio", "--radio-port", "0"),
@@ -37,17 +35,9 @@ def link_of(lab: Served, end: str) -> tuple[str, dict[str, str]]:
 def station(lab: Served, end: str, *arguments: str | Path) -> Iterator[Served]:
     """The ground station as a process of its own, whose terminal is a pipe."""
     uri, environment = link_of(lab, end)
-    command = [*FLOATY, "station", "--link", uri, "--mocap", lab.motive, *map(str, arguments)]
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment
-    )
-    try:
-        yield Served(process)
-    finally:
-        process.kill()
-        process.wait()
-        process.stdin.close()
-        process.stdout.close()
+    arguments = ("station", "--link", uri, "--mocap", lab.motive, *arguments)
+    with started(*arguments, environment=environment) as typed:
+        yield typed
 
 
 def wait_for_event(folder: Path, text: str) -> None:

@@ -11,9 +11,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from support.paths import VECTORS
 
+FLOATY = (sys.executable, "-m", "hil.commands")
 CAMERAS = f"replay:{VECTORS / 'hover_frame.csv'}"  # one frame, for those who need no more
 
 START_TIMEOUT_S = 60.0
@@ -109,21 +111,31 @@ def free_port() -> int:
 
 
 @contextmanager
-def serve(*arguments: str, motive: bool = False) -> Iterator[Served]:
-    """A server, with or without Motive, on a free port."""
-    cameras = ("--natnet-port", "0") if motive else ("--no-motive",)
-    command = [sys.executable, "-m", "hil.commands", "serve", *cameras, *arguments]
+def started(*arguments: str | Path, environment: dict[str, str] | None = None) -> Iterator[Served]:
+    """A command as a process of its own, whose terminal is a pipe."""
     process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        [*FLOATY, *map(str, arguments)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=environment,
     )
-    served = Served(process)
-    SERVED.append(served)
+    running = Served(process)
     try:
-        served.wait_for("^serving", START_TIMEOUT_S)
-        yield served
+        yield running
     finally:
-        served.listen()
+        running.listen()
         process.kill()
         process.wait()
         process.stdin.close()
         process.stdout.close()
+
+
+@contextmanager
+def serve(*arguments: str, motive: bool = False) -> Iterator[Served]:
+    """A server, with or without Motive, on a free port."""
+    cameras = ("--natnet-port", "0") if motive else ("--no-motive",)
+    with started("serve", *cameras, *arguments) as served:
+        SERVED.append(served)
+        served.wait_for("^serving", START_TIMEOUT_S)
+        yield served

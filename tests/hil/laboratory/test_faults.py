@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hil.commands.app import main
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, Experiment
@@ -33,6 +31,7 @@ from hil.pictures.report import write_report
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig
 from hil.world.plant import Plant
 from hil.world.tunnel import TunnelConfig
+from support.command import floaty
 
 HOVER = EXPERIMENTS["hover"]
 Settings = tuple[str, ...]
@@ -119,11 +118,8 @@ def test_a_wrong_fault_is_one_line_and_exit_code_two(
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["floaty", "fly", "hover", "--fault", text])
-    with pytest.raises(SystemExit) as left:
-        main()
+    assert floaty(monkeypatch, "fly", "hover", "--fault", text) == 2
     shown = capsys.readouterr().err
-    assert left.value.code == 2
     assert message in shown
     assert shown.count("\n") == 1
     assert os.listdir() == []
@@ -591,9 +587,7 @@ def test_a_flight_without_faults_has_no_table_of_them(tmp_path: Path) -> None:
 def test_the_list_tells_every_kind(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["floaty", "list", "--faults"])
-    with pytest.raises(SystemExit):
-        main()
+    assert floaty(monkeypatch, "list", "--faults") == 0
     shown = capsys.readouterr().out
     first = [line.split()[0] for line in shown.splitlines() if line and not line.startswith(" ")]
     assert first == ["kind", *KINDS]
