@@ -162,10 +162,8 @@ class LiveView:
         self._process.kill()
         self._process.wait()
         self._answers.join()
-        if self._feed.close(
-            PIPE_BREAKS_S
-        ):  # else somebody whom the picture has started holds the pipe's other end
-            self._close_pipe()
+        if self._feed.close(PIPE_BREAKS_S):
+            self._close_pipe()  # else somebody whom the picture has started holds its other end
         assert self._process.stdout is not None
         self._process.stdout.close()
 
