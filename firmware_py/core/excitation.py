@@ -60,6 +60,7 @@ def excite(parameters: Parameters, control: Control) -> None:
     for i in range(INPUTS):
         control.excitation[i] = ZERO
         if parameters.excite_kind != EXCITE_OFF and parameters.excite_rms[i] > ZERO:
+            wave = ZERO
             if parameters.excite_kind == EXCITE_CHIRP:
                 wave = chirp(low, high, tick)
             else:

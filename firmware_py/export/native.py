@@ -13,7 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +42,11 @@ def compilers() -> Iterator[Compiler]:
     """Yield the C compilers of this machine, ziglang first."""
     if importlib.util.find_spec("ziglang"):
         python = (sys.executable, "-m", "ziglang")
-        yield Compiler("zig", (*python, "cc"), _output((*python, "version"), {}))
+        yield Compiler("zig", (*python, "cc"), _version(*python, "version"))
     for name in SYSTEM_COMPILERS:
         path = shutil.which(name)
         if path:
-            yield Compiler(name, (path,), _output((path, "--version"), {}))
+            yield Compiler(name, (path,), _version(path, "--version"))
 
 
 def find_compiler(name: str = "") -> Compiler:
@@ -92,6 +92,11 @@ def build(
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return library
+
+
+@cache
+def _version(*command: str) -> str:
+    return _output(command, {})
 
 
 def _output(command: tuple[str, ...], environment: dict[str, str]) -> str:
