@@ -9,7 +9,9 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 
-@pytest.mark.parametrize("command", ["ruff check", "ruff format --check", "mypy"])
+@pytest.mark.parametrize(
+    "command", ["ruff check", "ruff format --check", pytest.param("mypy", marks=pytest.mark.long)]
+)
 def test_the_sources_are_clean(command: str) -> None:
     ran = subprocess.run(
         [sys.executable, "-m", *command.split()],

@@ -11,7 +11,7 @@ from pathlib import Path
 from firmware_py.config import LogicConfig
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
 from firmware_py.export.arm_image import Image, build_image, build_meter, read_image
-from firmware_py.export.cortex_m4 import CortexM4Runner, Load
+from firmware_py.export.cortex_m4 import CortexM4Runner, Load, find_emulator
 from firmware_py.export.errors import ExportError
 from firmware_py.export.native import NativeRunner, build
 from firmware_py.export.plain import PlainRunner
@@ -93,6 +93,7 @@ class Toolbox:
                     library = build(c, BUILD, OPTIMISATION[name])
                     self._native[name] = partial(NativeRunner, library=library)
                 elif name == CORTEX_M4:
+                    find_emulator()
                     self._image = read_image(elf, False) if elf else build_image(c.source, c.header, BUILD)
                     self._meter = build_meter(BUILD)
                     flash = None if elf else len(self._image.code)

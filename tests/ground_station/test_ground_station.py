@@ -99,6 +99,7 @@ def test_slower_cameras_lose_no_frame(camera_hz):
 
 
 @given(st.lists(st.integers(-2000, 2000), min_size=100, max_size=100))
+@pytest.mark.long
 def test_jitter_of_a_camera_at_the_corrections_rate_loses_no_frame(jitter_us):
     bench = StationWithPackets()
     for number, late_us in enumerate(jitter_us):

@@ -192,6 +192,7 @@ def test_false_refusals_are_rarer_than_one_in_3800() -> None:
     assert tracker.counters.refused == 0
 
 
+@pytest.mark.long
 def test_distances_are_distributed_as_chi2_when_the_robot_moves_as_assumed() -> None:
     one = PoseFilter(0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration)
     rng, p, v = np.random.default_rng(5), np.zeros(3), np.zeros(3)
@@ -444,6 +445,7 @@ tame = st.builds(
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(wild | tame, max_size=40))
+@pytest.mark.long
 def test_anything_may_come_and_the_tracker_recovers(frames: list[MocapFrame]) -> None:
     tracker = Tracker(CONFIG, PERIOD_US)
     for seen in frames:

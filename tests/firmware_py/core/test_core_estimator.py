@@ -224,8 +224,10 @@ LOOSE = {"position": 5e-5, "velocity": 1.5e-3, "attitude": 1e-3, "rate": 2e-4, "
 
 @pytest.mark.parametrize(
     ("level", "limits", "covariance"),
-    [(series(), TIGHT, 3e-4), (exact(), LOOSE, 6e-3)],
-    ids=["series", "expm"],
+    [
+        pytest.param(series(), TIGHT, 3e-4, id="series"),
+        pytest.param(exact(), LOOSE, 6e-3, id="expm", marks=pytest.mark.long),
+    ],
 )
 def test_state_prediction_and_covariance_are_filterpys_in_every_tick_of_a_flight(
     flight: list[Record], level: tuple[Vector, Vector], limits: dict[str, float], covariance: float
@@ -282,6 +284,7 @@ def assert_sane(core: Core) -> None:
 
 @settings(deadline=None, max_examples=150)
 @given(st.lists(any_tick, min_size=1, max_size=40), st.booleans(), st.booleans())
+@pytest.mark.long
 def test_state_and_covariance_stay_sane_whatever_comes_in(ticks, predict, measured) -> None:
     core = Core(predict=predict, age_measured=measured)
     for poses, gyro_sum, samples, command in ticks:
@@ -648,6 +651,7 @@ FLOATS = [name for name, kind in Parameters.dtype.fields.items() if kind[0].kind
 
 @settings(deadline=None, max_examples=150)
 @given(st.sampled_from(FLOATS), any_number)
+@pytest.mark.long
 def test_senseless_parameter_moves_no_servo_out_of_range_and_does_no_lasting_harm(
     name: str, value: float
 ) -> None:

@@ -127,7 +127,8 @@ def memory(blocks: CoreBlocks) -> list[bytes]:
     return [block.bytes() for block in (blocks.parameters, blocks.data, blocks.estimator, blocks.control)]
 
 
-@pytest.mark.parametrize("kind", [pytest.param("image", marks=pytest.mark.long), "optimised"])
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["image", "optimised"])
 def test_machine_code_gives_the_bits_of_python(kind: str, request: pytest.FixtureRequest) -> None:
     blocks, _ = started(request.getfixturevalue(kind))
     python = CoreBlocks(parameters_of(CONFIG), PythonRunner)

@@ -51,7 +51,10 @@ def plausible() -> Recording:
     return record_plausible(2027, 1_000)
 
 
-@pytest.mark.parametrize("optimisation", ["-O0", "-O2", "-O3"])
+@pytest.mark.parametrize(
+    "optimisation",
+    [pytest.param("-O0", marks=pytest.mark.long), "-O2", pytest.param("-O3", marks=pytest.mark.long)],
+)
 @pytest.mark.parametrize("compiler", COMPILERS, ids=IDS)
 def test_c_gives_the_bits_of_python_in_every_call_of_a_flight_and_on_arbitrary_bits(
     compiler: Compiler, optimisation: str, flight: Recording, plausible: Recording, wild: Recording
@@ -65,6 +68,7 @@ def test_c_gives_the_bits_of_python_in_every_call_of_a_flight_and_on_arbitrary_b
 
 @gcc_only
 @pytest.mark.skipif("fma" not in Path("/proc/cpuinfo").read_text(), reason="this processor cannot fuse")
+@pytest.mark.long
 def test_the_file_itself_forbids_fused_multiplications(flight: Recording) -> None:
     fusing = ("-std=gnu11", "-mfma", "-ffp-contract=fast")
     assert first_difference(flight, build(C, BUILD, "-O2", GCC, fusing)) is None

@@ -2,7 +2,6 @@
 
 import ctypes
 import inspect
-import os
 import re
 from collections.abc import Iterator
 from importlib import import_module
@@ -19,7 +18,6 @@ from firmware_py.export.native import build, compilers
 from support import core_streams
 from support.core_streams import BUILD, one_nan, wild_words
 
-LONG = bool(os.environ.get("FLOATY_LONG"))
 STRUCTS = (Parameters, Input, Estimator, Control)
 
 SHAPES = {"x": 16, "dx": 16, "first": 16, "other": 16, "command": (32, 4), "P": (16, 16), "M": (16, 16), "q": 4,
@@ -103,6 +101,7 @@ def copied(argument: Any) -> Any:
 
 @pytest.mark.skipif(not list(compilers()), reason="no C compiler")
 @pytest.mark.parametrize("c_name", PRIVATE)
+@pytest.mark.long
 def test_every_kernel_gives_the_same_bits_in_c(c_name: str) -> None:
     module, _, name = c_name.partition("_")
     kernel: Any = getattr(import_module(f"firmware_py.core.{module}"), name)

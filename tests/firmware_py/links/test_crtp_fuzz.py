@@ -101,6 +101,7 @@ def board() -> CrtpClient:
 
 @given(st.lists(st.binary(max_size=40), max_size=5))
 @settings(max_examples=300, deadline=None)
+@pytest.mark.long
 def test_any_bytes_leave_the_board_alive(board: CrtpClient, burst: list[bytes]) -> None:
     for data in burst:
         board.firmware.radio_received(data)

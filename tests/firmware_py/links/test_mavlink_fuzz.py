@@ -136,6 +136,7 @@ def board() -> MavlinkClient:
 
 @given(st.lists(st.binary(max_size=300), max_size=4), st.booleans())
 @settings(max_examples=300, deadline=None)
+@pytest.mark.long
 def test_any_bytes_leave_the_board_alive(board: MavlinkClient, bursts: list[bytes], magic: bool) -> None:
     for data in bursts:
         board.receive(b"\xfd" + data if magic else data)

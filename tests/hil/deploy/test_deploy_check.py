@@ -277,6 +277,7 @@ CRAZYFLIE_FLAGS = (
 @pytest.mark.parametrize(
     ("right", "wrong", "code"), [("", "", 0), ("word * COUNT_1MS", "word + COUNT_1MS", 1)]
 )
+@pytest.mark.long
 def test_the_core_inside_a_linked_firmware_is_checked(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

@@ -71,6 +71,7 @@ def test_one_changed_operator_in_the_c_of_own_logic_is_exit_one_and_named(
     assert re.search(rf"c-O2 .* DIFFERS first in tick \d+, after control: {re.escape(where)}", shown)
 
 
+@pytest.mark.long
 def test_a_parameter_that_is_set_in_flight_reaches_every_target(project: Path) -> None:
     config, made = load_config("profile.toml"), []
 
@@ -111,6 +112,7 @@ def logic_of(profile: str, *overrides: str) -> Logic:
     return logic
 
 
+@pytest.mark.long
 def test_the_original_law_is_the_original_firmwares_with_both_integrators_and_without_priorities() -> None:
     """All 300 recorded steps, each from reset: no state is left out, whether flaps saturate or not."""
     rows = json.loads((VECTORS / "original_controller.json").read_text())["rows"]

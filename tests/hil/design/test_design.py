@@ -180,6 +180,7 @@ def test_the_attainable_set_contains_what_single_inputs_do_and_is_mirror_symmetr
         assert found.all[:, index].max() == pytest.approx(-found.all[:, index].min())
 
 
+@pytest.mark.long
 def test_roll_becomes_stable_where_the_specification_says_and_best_hover_angles_too() -> None:
     stable = sweeps.stability(PAPER)
     assert math.degrees(stable.crossing) == pytest.approx(33.7, abs=0.05)

@@ -115,10 +115,12 @@ def test_a_planted_robot_is_found_in_coloured_gusts(tmp_path: Path) -> None:
     assert_true(identified(tmp_path, flight(1)))
 
 
+@pytest.mark.long
 def test_a_fifth_of_the_rows_may_be_lost(tmp_path: Path) -> None:
     assert_true(identified(tmp_path, flight(2), keep(lambda n: np.random.default_rng(3).random(n) > 0.2)))
 
 
+@pytest.mark.long
 def test_another_sample_rate_does_no_harm(tmp_path: Path) -> None:
     assert_true(identified(tmp_path, flight(4), keep(lambda n: np.arange(n) % 2 == 0)))
 
@@ -142,6 +144,7 @@ def test_a_log_that_cannot_tell_is_refused_with_the_reason(
         identified(tmp_path, flight(5, seconds), change)
 
 
+@pytest.mark.long
 def test_saturated_flaps_make_no_constant_believable(tmp_path: Path) -> None:
     found = identified(tmp_path, flight(6, rms=0.4))
     assert {constant.verdict for constant in found.constants if constant.joint[0] == constant.joint[0]} <= {
@@ -152,6 +155,7 @@ def test_saturated_flaps_make_no_constant_believable(tmp_path: Path) -> None:
     assert found.constant("pitch_u2").verdict == UNKNOWN
 
 
+@pytest.mark.long
 def test_what_is_not_excited_is_not_identifiable(tmp_path: Path) -> None:
     found = identified(tmp_path, flight(7))
     assert {found.constant(name).why for name in ("roll_u1", "yaw_rate", "z_u4")} == {
@@ -170,6 +174,7 @@ def test_the_intervals_hold_the_truth_of_most_constants(tmp_path: Path) -> None:
     assert np.mean(hits) >= 0.85
 
 
+@pytest.mark.long
 def test_a_profile_of_what_was_identified_loads_and_keeps_what_was_not(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     write_profile(path, "floaty", identified(tmp_path, flight(1)))

@@ -40,6 +40,7 @@ def test_a_flight_on_another_board_is_recorded_alike_to_the_last_bit(
     assert json.loads((tmp_path / "result.json").read_text())["board"] == board
 
 
+@pytest.mark.long
 def test_the_costs_of_the_profile_are_what_the_machine_code_takes(tmp_path: Path, python: Result) -> None:
     result = go(tmp_path, "cortex-m4")
     assert python.usage is None
@@ -55,6 +56,7 @@ def test_the_costs_of_the_profile_are_what_the_machine_code_takes(tmp_path: Path
     )
 
 
+@pytest.mark.long
 def test_measured_costs_are_the_processor_time_of_the_tasks(tmp_path: Path) -> None:
     result = go(tmp_path, "cortex-m4", "cpu.measured=true", "cpu.estimator_us=0", "cpu.controller_us=0")
     assert result.passed

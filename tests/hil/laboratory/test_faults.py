@@ -535,7 +535,8 @@ def test_the_hover_has_the_stated_outcome(tmp_path: Path, text: str, seed: int) 
     assert outcome == STATED[text], f"{result.cause} {failed}"
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
 def test_swapped_markers_lose_the_robot_where_neither_the_fit_nor_the_tracker_refuses_them(
     tmp_path: Path, seed: int
 ) -> None:

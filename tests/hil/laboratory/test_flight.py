@@ -53,6 +53,7 @@ def test_hover_with_the_authors_gains_swings_in_y_and_survives(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
+@pytest.mark.long
 def test_without_the_predictor_the_authors_gains_lose_the_robot(tmp_path: Path, seed: int) -> None:
     result = hover(tmp_path / "run", "predictor.enabled=false", profile="as-flown", seed=seed)
     assert result.outcome == "lost", explain(result)

@@ -79,6 +79,7 @@ def test_same_seed_same_hash_over_the_serial_line(tmp_path: Path) -> None:
     assert (first.folder / "telemetry.csv").read_bytes() == (again.folder / "telemetry.csv").read_bytes()
 
 
+@pytest.mark.long
 def test_wrong_bits_cost_frames_and_nothing_else(tmp_path: Path) -> None:
     noisy = ("serial.uplink_bit_error_rate=1e-4", "serial.downlink_bit_error_rate=1e-4")
     result = fly_over_mavlink(tmp_path / "run", *noisy)
@@ -170,6 +171,7 @@ def test_the_station_flies_a_board_behind_a_pty_in_real_time(tmp_path: Path) -> 
     assert abs(first._timestamp - time.time()) < 120, "since 1970"
 
 
+@pytest.mark.long
 def test_a_line_that_is_there_already_is_left_alone(tmp_path: Path) -> None:
     line = tmp_path / "uart"
     line.write_text("not a line")

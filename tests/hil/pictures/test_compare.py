@@ -76,6 +76,7 @@ def test_the_first_difference_is_the_first_by_row_then_by_column(runs: dict[str,
 
 @settings(deadline=None, max_examples=40)
 @given(data=st.data())
+@pytest.mark.long
 def test_any_changed_cell_is_found(runs: dict[str, Path], data: st.DataObject) -> None:
     run = load_run(runs["one"])
     column = data.draw(st.sampled_from([name for name in run.log.column_names if name.startswith("truth.")]))

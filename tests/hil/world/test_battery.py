@@ -120,6 +120,7 @@ def test_the_log_holds_the_power_of_the_flaps_that_moved(tmp_path: Path) -> None
     assert spent == pytest.approx(current.sum() * 0.01, rel=1e-3)
 
 
+@pytest.mark.long
 def test_a_nearly_empty_battery_ends_in_the_failsafe(tmp_path: Path) -> None:
     result = flown(tmp_path / "run", "endurance", "battery.charge=0.03", duration_s=60.0)
     texts = [event["text"] for event in load_events(tmp_path / "run")]

@@ -67,6 +67,7 @@ def test_blocking_one_side_unloads_the_flaps_there() -> None:
         ("T1", [0.40, 0.40, 0.20, 0.06, 0.06, 0.03] + [0.50] * 4 + [0.15] * 4),
     ],
 )
+@pytest.mark.long
 def test_gusts_have_the_levels_and_time_constants_of_the_specification(level: str, rms: list[float]) -> None:
     tau = np.array([0.015] * 3 + [0.4] * 3 + [0.010] * 4 + [0.15] * 4)
     plant = make(turbulence=level)
