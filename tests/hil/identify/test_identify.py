@@ -111,6 +111,7 @@ def assert_true(found: Identification) -> None:
         assert value == pytest.approx(PITCH[name], rel=0.10), name
 
 
+@pytest.mark.long
 def test_a_planted_robot_is_found_in_coloured_gusts(tmp_path: Path) -> None:
     assert_true(identified(tmp_path, flight(1)))
 
