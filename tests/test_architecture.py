@@ -42,7 +42,8 @@ FLOORS = (
     ("pictures", "exports"),
     ("servers", "live"),
     ("api", "design"),
-    ("studies", "campaigns", "deploy", "testing", "identify"),
+    ("identify",),
+    ("studies", "campaigns", "deploy", "testing"),
     ("commands",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -116,7 +117,10 @@ BY_PROCESSOR = """
     numpy.matmul numpy.einsum numpy.convolve numpy.polyfit numpy.polynomial
 """.split()  # noqa: SIM905
 CONFINED |= dict.fromkeys(BY_PROCESSOR, AFTER_THE_FLIGHT)
-CONFINED["click"] = CONFINED["rich"] = ("hil/commands/", "hil/studies/sweep.py", "hil/studies/paper.py")
+CONFINED["click"] = CONFINED["rich"] = (
+    "hil/commands/", "hil/studies/sweep.py", "hil/studies/paper.py", "hil/studies/tuning.py",
+    "hil/studies/paper_identification.py",
+)  # fmt: skip
 CONFINED |= dict.fromkeys(
     ("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",)
 )  # of a whole flight

@@ -12,7 +12,7 @@ from hil.commands.compare import compare
 from hil.commands.deploy import deploy
 from hil.commands.design import design
 from hil.commands.fly import fly
-from hil.commands.identify import identify
+from hil.commands.identify import identify, tune
 from hil.commands.listing import list_experiments
 from hil.commands.new import new
 from hil.commands.options import INTERRUPTED
@@ -31,7 +31,7 @@ def app() -> None:
 
 
 for command in (
-    fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, identify,
+    fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, identify, tune,
     drag_model, design,
     campaign, deploy,
 ):  # fmt: skip

@@ -1,16 +1,19 @@
-"""`floaty identify`: the model's constants from flights, by three methods, with intervals and verdicts."""
+"""`floaty identify` and `floaty tune`: from flights to the model's constants, and from those to gains."""
 
-import math
+from collections.abc import Iterable
+from math import degrees, inf, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from hil.commands.options import console, profile_option
+from hil.commands.options import announce_compilation, console, notices, profile_option, seed_option
 from hil.errors import LabError, writing
 
 if TYPE_CHECKING:
+    from hil.design.loop import Margins
     from hil.identify.identify import Constant, Identification
+    from hil.studies.tuning import Round
 
 folder_type = click.Path(path_type=Path)
 
@@ -52,7 +55,7 @@ def identify(
     if profile_out is not None and profile_out.suffix != ".toml":
         raise LabError(f"--profile-out {profile_out}: a profile's name ends in .toml")
     found = identify_records([load_record(run, profile) for run in runs])
-    _print(found)
+    _print_constants(found)
     if found.excited or found.free:
         held_out = None if validate is None else load_record(validate, profile)
         with writing("--out", out):
@@ -64,7 +67,7 @@ def identify(
     return 0 if any(constant.verdict == IDENTIFIED for constant in found.constants) else 1
 
 
-def _print(found: "Identification") -> None:
+def _print_constants(found: "Identification") -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -98,8 +101,138 @@ def _verdict(one: "Constant") -> str:
 
 
 def _number(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.4g}"
+    return "" if isnan(value) else f"{value:.4g}"
 
 
 def _pair(pair: tuple[float, float]) -> str:
-    return "" if math.isnan(pair[0]) else f"{pair[0]:.4g} ± {pair[1]:.2g}"
+    return "" if isnan(pair[0]) else f"{pair[0]:.4g} ± {pair[1]:.2g}"
+
+
+@click.command()
+@profile_option
+@click.option(
+    "--repeat", type=click.IntRange(1, 10), metavar="N",
+    help="Fly the excitations, identify and tune until nothing improves, N times at most.",
+)  # fmt: skip
+@click.option(
+    "--robots", type=click.IntRange(0, 1000), default=100, show_default=True, metavar="N",
+    help="Drawn from the intervals of the model; all must be stable.",
+)  # fmt: skip
+@seed_option
+@click.option("--board", metavar="BOARD", default="python", show_default=True, help="As for `floaty fly`.")
+@click.option(
+    "--out", type=folder_type, metavar="FILE.toml", help="A profile with the gains; of rounds, the best one."
+)
+@click.option(
+    "--runs", type=folder_type, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
+)  # fmt: skip
+def tune(
+    profile: str, repeat: int | None, robots: int, seed: int, board: str, out: Path | None, runs: Path
+) -> int:
+    """Make gains of the paper's control law for the profile's model, and fly them in lockstep with the profile's plant.
+
+    Exit code 0: the new gains hover no worse than the old ones; 1: they do; 2: bad input, no gains, or a lost robot.
+    """
+    from hil.identify import need_scipy
+
+    need_scipy()
+    from hil.config import load_config
+    from hil.studies.tuning import Flights, fly_round, rms, rounds, write_tuned
+
+    if out is not None and out.suffix != ".toml":
+        raise LabError(f"--out {out}: a profile's name ends in .toml")
+    announce_compilation()
+    flights = Flights(seed, board, runs, notices)
+    flown: Iterable[Round] = (
+        [fly_round(profile, flights, robots)] if repeat is None else rounds(profile, flights, robots, repeat)
+    )
+    best: Round | None = None
+    try:
+        for number, one in enumerate(flown, 1):
+            if repeat is not None:
+                console.print(f"round {number}")
+            _print_round(one)
+            if best is None or one.rms < best.rms:
+                best = one
+    except LabError as error:
+        if best is None:
+            raise
+        notices.print(f"{error}; the best round before it counts", soft_wrap=True)
+    assert best is not None
+    if best.rms == inf:
+        raise LabError(f"the new gains lose the robot: {best.flown[0].cause}")
+    if out is not None:
+        write_tuned(out, profile, load_config(str(best.profile)), "Model and gains by floaty tune.")
+        console.print(f"  {out}   (floaty fly hover --profile {out})", soft_wrap=True)
+    return 0 if best.rms <= rms(best.tuned.before) else 1
+
+
+def _print_round(one: "Round") -> None:
+    """Print a round: gains, margins, predicted and flown motion."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from hil.studies.tuning import rms
+
+    tuned = one.tuned
+    wide = Console(highlight=False, width=max(console.width, 150))
+    gains = Table(
+        "axis",
+        "gains, old",
+        "gains, new",
+        title="u = gain (target - estimate) - gains (velocity, angle, rate)",
+    )
+    edge = Table(
+        "axis", "", "gain up", "gain down", "phase", "delay", "late poses", "peak of 1/(1+L)",
+        title="margins, broken between command and servo",
+    )  # fmt: skip
+    moved = Table(
+        "axis", "old, predicted", "old, flown", "new, predicted", "new, flown", "worst robots, flown",
+        title="rms of the hover",
+    )  # fmt: skip
+    for axis in tuned.axes:
+        old, new = (", ".join(f"{gain:.4g}" for gain in own) for own in (axis.old, axis.new))
+        gains.add_row(axis.axis.name, f"{', '.join(axis.axis.gains)} = {old}", new)
+        edge.add_row(axis.axis.name, "old", *_margins(axis.old_margins), end_section=False)
+        edge.add_row("", "new", *_margins(axis.margins, axis.late))
+        edge.add_row(
+            "",
+            f"least of {1 + len(tuned.robots.drawn)}",
+            *_margins(axis.least, axis.least_late),
+            end_section=True,
+        )
+        scale, unit = (100.0, "cm") if axis.metric else (degrees(1.0), "deg")
+        flown = [
+            "lost"
+            if result.outcome != "completed"
+            else f"{scale * result.metrics[axis.metric]:.2f} {unit}"
+            if axis.metric
+            else ""
+            for result in (tuned.before, *one.flown)
+        ]
+        before = "not stable" if axis.old_motion is None else f"{scale * axis.old_motion.main:.2f} {unit}"
+        after = f"{scale * axis.motion.main:.2f} {unit}"
+        moved.add_row(axis.axis.name, before, flown[0], after, flown[1], ", ".join(flown[2:]))
+    for table in (gains, edge, moved):
+        wide.print(table)
+    console.print(
+        f"robots: {len(tuned.robots.drawn)} drawn, {tuned.robots.about}; poses are {1e3 * tuned.age_s:.1f} ms old, one in a "
+        f"hundred {1e3 * tuned.jitter_s:.1f} ms older; the least delay margin is {1e3 * tuned.least_delay_s:.1f} ms",
+        soft_wrap=True,
+    )
+    console.print(
+        f"rms distance from the goal: {_distance(rms(tuned.before))}, with the new gains {_distance(one.rms)}"
+    )
+
+
+def _margins(found: "Margins", late: float | None = None) -> list[str]:
+    if not found.stable:
+        return ["not stable", "", "", "", "", ""]
+    return [
+        f"{found.gain:.2f}", f"{found.least_gain:.2f}", f"{degrees(found.phase):.0f} deg", f"{1e3 * found.delay:.0f} ms",
+        "" if late is None else f"{1e3 * late:.0f} ms", f"{found.peak:.2f}",
+    ]  # fmt: skip
+
+
+def _distance(metres: float) -> str:
+    return "lost" if metres == inf else f"{100 * metres:.2f} cm"

@@ -1,7 +1,8 @@
-"""A profile of what was identified, on top of another: model, servo lag, trim, with the uncertainty as comments.
+"""A profile of what was identified, on top of another: model, servo lag, trim, with the uncertainty as comments, and as a
+file beside it for `floaty tune`.
 
-What was not identified keeps the value that it has there, and the others are fitted once more with it: so the profile's
-model answers as the robot did even where single constants cannot be told apart.
+What was not identified keeps the value that it has there unless the flights contradict it, and the others are fitted once
+more with it: so the profile's model answers as the robot did even where single constants cannot be told apart.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from firmware_py.config import ModelConfig
 from hil.config import load_config
 from hil.errors import LabError, writing
 from hil.identify.axes import AXES, DELAY, LAG
 from hil.identify.identify import NUISANCES, UNKNOWN, Identification
 from hil.identify.joint import Estimate, joint
+from hil.identify.robots import write_known
 from hil.world.body import MIX
 from hil.world.servos import WORDS_PER_RADIAN
 
@@ -24,11 +27,7 @@ TRIM_LEAST = 0.005  # [rad] mean input that is worth a trim
 def refit(found: Identification, profile: str) -> Estimate:
     """Return the joint fit with the constants that nobody knows at the profile's values."""
     model = load_config(profile).model
-    fixed = {
-        constant.name: getattr(model, constant.name)
-        for constant in found.constants
-        if constant.verdict == UNKNOWN and constant.name not in (*NUISANCES, LAG, DELAY)
-    }
+    fixed = {name: getattr(model, name) for name in kept(found, model)}
     excited_constants = {name for one in found.excited for name in one.axis.constants}
     start = {
         constant.name: constant.best for constant in found.constants if constant.name in excited_constants
@@ -39,6 +38,17 @@ def refit(found: Identification, profile: str) -> Estimate:
         start,
         {k: v for k, v in fixed.items() if k in excited_constants},
     )
+
+
+def kept(found: Identification, model: ModelConfig) -> list[str]:
+    """Return the constants that are not identifiable from these flights, and may as well be what a model has."""
+    return [
+        one.name
+        for one in found.constants
+        if one.verdict == UNKNOWN
+        and one.name not in (*NUISANCES, LAG, DELAY)
+        and not abs(getattr(model, one.name) - one.best) > one.joint[1]
+    ]
 
 
 def write_profile(path: Path, profile: str, found: Identification) -> None:
@@ -60,11 +70,8 @@ def write_profile(path: Path, profile: str, found: Identification) -> None:
                 continue
             text = f"{name} = {fitted.values[name]:.6g}"
             lines.append(f"{text:26}# ± {constant.joint[1]:.2g}, {constant.verdict}")
-    kept = [
-        c.name for c in found.constants if c.verdict == UNKNOWN and c.name not in (*NUISANCES, LAG, DELAY)
-    ]
-    if kept:
-        lines.append(f"# as in {profile}, not identifiable from these flights: {', '.join(kept)}")
+    if names := kept(found, load_config(profile).model):
+        lines.append(f"# as in {profile}, not identifiable from these flights: {', '.join(names)}")
     lag = found.constant(LAG)
     told = f"lag {1e3 * lag.joint[0]:.1f} ± {1e3 * lag.joint[1]:.1f} ms, {lag.verdict}"
     lines.append(f"{f'flap_rate = {1 / fitted.values[LAG]:.4g}':26}# {told}")
@@ -74,7 +81,9 @@ def write_profile(path: Path, profile: str, found: Identification) -> None:
     lines += ["", *_trim(found)]
     with writing("--profile-out", path):
         path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
-    load_config(str(path))  # what cannot fly is an error here, not at the next flight
+    config = load_config(str(path))  # what cannot fly is an error here, not at the next flight
+    with writing("--profile-out", path):
+        write_known(path, config, found, fitted.values[DELAY])
 
 
 def _trim(found: Identification) -> list[str]:

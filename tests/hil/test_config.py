@@ -14,6 +14,7 @@ from hil.errors import LabError
 def test_shipped_profiles_load() -> None:
     assert profile_names() == [
         "as-flown",
+        "cad",
         "design-best",
         "design-flat",
         "design-paper",

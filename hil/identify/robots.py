@@ -1,0 +1,132 @@
+"""How well a profile's model is known: `floaty identify` writes it beside the profile, `floaty tune` draws robots from it.
+
+`mine.json` belongs to `mine.toml`: the model that was identified with it, and the covariance of its constants, lag and delay
+as the reported intervals have it. A profile without one counts every constant as known to `UNKNOWN_SHARE`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from scipy.stats import qmc
+
+from hil.config import LabConfig
+from hil.design.loop import DELAY, TICK_DELAYS_S, robot_of
+from hil.errors import LabError
+from hil.identify.axes import DELAY as INPUT_TO_GYRO
+from hil.identify.axes import LAG
+from hil.identify.identify import NUISANCES, Identification
+from hil.identify.record import Array
+
+UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, of a constant of which nothing is said
+SIGMAS = 1.96
+FLAP_RATE = "flap_rate"
+
+
+class Known(BaseModel):
+    """The file beside a profile."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    values: dict[str, float]  # of the profile's [model]
+    half_widths: dict[str, float]  # of the 95 % intervals, in the order of the covariance
+    covariance: list[list[float]]
+    delay: float  # [s] input to gyro
+
+
+def beside(profile: str) -> Path:
+    """Return where the file of a profile stands."""
+    return Path(profile).with_suffix(".json")
+
+
+def write_known(path: Path, config: LabConfig, found: Identification, delay_s: float) -> None:
+    """Write what an identification knows beside the profile `path` that it wrote, which reads as `config`."""
+    estimate = found.estimate
+    assert estimate.covariance is not None
+    names = list(estimate.values)
+    kept = [index for index, name in enumerate(names) if name not in NUISANCES]
+    half = np.array([estimate.errors[name] for name in names])[kept]
+    own = estimate.covariance[np.ix_(kept, kept)]
+    grown = half / SIGMAS / np.sqrt(np.diag(own))  # curvature makes the intervals wider than the scatter does
+    known = Known(
+        values=config.model.model_dump(),
+        half_widths={names[index]: float(width) for index, width in zip(kept, half, strict=True)},
+        covariance=(own * np.outer(grown, grown)).tolist(),
+        delay=delay_s,
+    )
+    beside(str(path)).write_text(known.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+@dataclass(frozen=True, slots=True)
+class Robots:
+    """The robot that a profile describes, and those that it may be as well."""
+
+    nominal: dict[str, float]
+    drawn: tuple[dict[str, float], ...]
+    about: str
+
+
+def robots_of(profile: str, config: LabConfig, count: int) -> Robots:
+    """Return a profile's robot and `count` drawn from its intervals. Raises `LabError` for a file that is none."""
+    file = beside(profile)
+    known = _read(file) if profile.endswith(".toml") and file.is_file() else None
+    if known is not None and known.values != config.model.model_dump():
+        raise LabError(
+            f"{file}: it belongs to another [model] than that of {profile}; identify again, or delete it"
+        )
+    nominal = robot_of(config)
+    if known is None:
+        names = [name for name in nominal if name != DELAY]
+        spread = np.diag([(UNKNOWN_SHARE * nominal[name] / SIGMAS) ** 2 for name in names])
+        return Robots(
+            nominal, _draw(nominal, names, spread, count), f"every constant within {UNKNOWN_SHARE:.0%}"
+        )
+    nominal[DELAY] = max(known.delay - TICK_DELAYS_S, 0.0)
+    names = list(known.half_widths)
+    return Robots(
+        nominal, _draw(nominal, names, np.array(known.covariance), count), f"the intervals in {file}"
+    )
+
+
+def _read(file: Path) -> Known:
+    try:
+        known = TypeAdapter(Known).validate_json(file.read_bytes())
+        size = len(known.half_widths)
+        if [len(row) for row in known.covariance] != [size] * size:
+            raise LabError(f"{file}: the covariance of {size} constants has {size} rows and columns")
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise LabError(f"{file}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    return known
+
+
+def _draw(
+    nominal: dict[str, float], names: list[str], covariance: Array, count: int
+) -> tuple[dict[str, float], ...]:
+    """Return robots, evenly from the normal distribution of that covariance about the nominal one."""
+    if not count:
+        return ()
+    places = [name for name in names if name in nominal or name in (LAG, INPUT_TO_GYRO)]
+    chosen = [names.index(name) for name in places]
+    own = covariance[np.ix_(chosen, chosen)]
+    root = np.linalg.svd(own)  # semidefinite is enough
+    columns = root.U * np.sqrt(root.S)
+    size = 1 << (count - 1).bit_length()
+    steps = qmc.MultivariateNormalQMC(
+        np.zeros(len(places)), rng=np.random.Generator(np.random.PCG64(1))
+    ).random(size)
+    robots = []
+    for row in steps[:count] @ columns.T:
+        robot = dict(nominal)
+        for name, change in zip(places, row.tolist(), strict=True):
+            if name == LAG:
+                robot[FLAP_RATE] = 1 / max(1 / nominal[FLAP_RATE] + change, 0.005)
+            elif name == INPUT_TO_GYRO:
+                robot[DELAY] = max(nominal[DELAY] + change, 0.0)
+            else:
+                robot[name] = nominal[name] + change
+        robots.append(robot)
+    return tuple(robots)

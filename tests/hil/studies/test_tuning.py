@@ -1,0 +1,71 @@
+"""`floaty tune`: what it refuses, and a whole round from the author's gains and the plate model."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from hil.config import load_config
+from hil.laboratory.robot import Streams
+from hil.world.plant import Plant
+from support.command import floaty
+
+
+def test_the_profile_cad_has_the_plate_model_on_board() -> None:
+    config = load_config("floaty", ["plant.variant=plate"])
+    plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
+    cad = load_config("cad")
+    assert cad.model.model_dump() == pytest.approx(asdict(plant.linearise()) | {"flap_rate": 20.0}, rel=1e-4)
+    assert cad.controller == load_config("as-flown").controller
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--profile", "nobody"], "neither the name of a profile"),
+        (["--profile", "lqr"], "tune makes gains for the built-in control law"),
+        (["--out", "gains.txt"], "--out gains.txt: a profile's name ends in .toml"),
+        (["--repeat", "0"], "--repeat"),
+        (["--board", "abacus"], "--board abacus: expected python"),
+        (["--runs", "/proc/floaty"], "/proc/floaty"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_two(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert floaty(monkeypatch, "tune", *arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("floaty: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.long
+def test_a_round_from_the_authors_gains_and_the_plate_model_hovers_as_the_default_profile_does(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "mine.toml"
+    arguments = (
+        "--profile",
+        "cad",
+        "--repeat",
+        "1",
+        "--out",
+        out,
+        "--runs",
+        tmp_path / "runs",
+        "--robots",
+        "30",
+    )
+    assert floaty(monkeypatch, "tune", *arguments) == 0
+    shown = capsys.readouterr().out
+    assert "least of 31" in shown
+    assert "round 1" in shown
+    for name, folder in (("floaty", "usual"), (str(out), "tuned")):
+        floaty(monkeypatch, "fly", "hover", "--profile", name, "--seed", "7", "--out", tmp_path / folder)
+    usual, tuned = (
+        json.loads((tmp_path / name / "result.json").read_text())["metrics"] for name in ("usual", "tuned")
+    )
+    for axis in ("rms_x", "rms_y"):
+        assert tuned[axis] < 1.15 * usual[axis], axis
