@@ -1,6 +1,8 @@
 """`floaty paper | study | drag-model`: many flights and what they come to, and the mounted robot on the balance."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +23,7 @@ from hil.errors import writing
 
 if TYPE_CHECKING:
     from hil.studies.paper import Paper
+    from hil.studies.paper_identification import Constant
     from hil.studies.study import Study
 
 folder_type = click.Path(path_type=Path)
@@ -78,6 +81,7 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
     from hil.design.analysis import analyse, point_of
     from hil.studies import drag_model
     from hil.studies.paper import fly_paper
+    from hil.studies.paper_identification import fly_identification
     from hil.studies.paper_report import write_paper
 
     announce_compilation()
@@ -86,11 +90,13 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
         flown = fly_paper(rows, studies, seeds, out, notices)
         bench = list(drag_model.measure(load_config(), 1)) if mounted and not flown.interrupted else []
         shape = analyse(point_of(load_config())) if bench else None
-        report = write_paper(out, flown, bench, shape)
+        constants = fly_identification(out, notices) if bench else ()
+        report = write_paper(out, flown, bench, shape, constants)
     _print_rows(flown)
     _print_studies(flown)
     if shape is not None:
         show_claims(shape)
+    _print_constants(constants)
     console.print(f"  {report}", soft_wrap=True)
     if flown.interrupted:
         notices.print("interrupted: the report has the flights that were complete")
@@ -125,6 +131,20 @@ def _print_rows(flown: "Paper") -> None:
     whys = dict.fromkeys(row.why for row, _, _ in flown.misses if row.why)
     for why in whys:
         console.print(f"\n{why}", soft_wrap=True)
+
+
+def _print_constants(constants: "Sequence[Constant]") -> None:
+    from rich.table import Table
+
+    from hil.studies.paper_identification import COLUMNS, WHY
+
+    if not constants:
+        return
+    table = Table(*COLUMNS, title="identification of roll: the paper, and where the truth is known")
+    for one in constants:
+        table.add_row(*astuple(one))
+    Console(highlight=False, width=max(console.width, 160)).print(table)
+    console.print(WHY, soft_wrap=True)
 
 
 def _marked(text: str) -> str:

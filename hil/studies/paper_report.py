@@ -7,7 +7,7 @@ light, the one with the median error dark), `drag-model.html` and `studies.html`
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from math import degrees
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from hil.pictures.panels import marks_of_flight
 from hil.studies import drag_model, drag_model_report
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
+from hil.studies.paper_identification import COLUMNS, WHY, Constant
 from hil.studies.paper_rows import Row
 from hil.studies.study_figures import picture
 from hil.studies.study_run import StudyResult
@@ -43,14 +44,21 @@ OF_EVERY_FLIGHT = PICTURES[:2]  # for an experiment without pictures of its own
 
 
 def write_paper(
-    out: Path, paper: Paper, mounted: Sequence[drag_model.Row] = (), shape: Analysis | None = None
+    out: Path,
+    paper: Paper,
+    mounted: Sequence[drag_model.Row] = (),
+    shape: Analysis | None = None,
+    constants: Sequence[Constant] = (),
 ) -> Path:
     """Write `result.json`, `report.html` and the pictures of the studies; returns the report.
 
     `mounted` is the test of the drag model: with it, its files are written into `drag-model` as well. `shape` is the
-    analysis of the design: with it, its page and pictures are written into `design`.
+    analysis of the design: with it, its page and pictures are written into `design`. `constants` are the rows of the
+    identification.
     """
     content = _content(paper) | ({"design": [asdict(claim) for claim in shape.claims]} if shape else {})
+    if constants:
+        content["identification"] = [asdict(one) for one in constants]
     (out / RESULT).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     if shape:
         (out / "design").mkdir(exist_ok=True)
@@ -85,7 +93,8 @@ def write_paper(
         write_page(out / f"{STUDIES}.html", "paper_studies.html.j2", name=STUDIES, studies=studies, **common)
     return write_page(
         out / REPORT, "paper.html.j2", paper=paper, rows=paper.rows, missing=[row for row, _, _ in paper.misses],
-        studies=studies, bench=bench, shape=shape, commit=commit(), versions=versions(), **common,
+        studies=studies, bench=bench, shape=shape, constants=[astuple(one) for one in constants], columns=COLUMNS,
+        why=WHY, commit=commit(), versions=versions(), **common,
     )  # fmt: skip
 
 

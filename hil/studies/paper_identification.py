@@ -1,0 +1,96 @@
+"""The paper's identification of roll: its printed numbers, its arithmetic, its method and others where the truth is known.
+
+Methods, eq. (roll_dynamics_input_const): from c* of two flights with gains on roll of 0.2 and 0.15 follow a and c. The same
+two flights are flown here, and one with an excitation of u1 for the methods that need it: four minutes of flight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from hil.errors import LabError
+from hil.experiments import find_experiment
+from hil.identify.identify import Identification, identify
+from hil.identify.record import load_record
+from hil.identify.two_controllers import closed_loop, input_constant
+from hil.laboratory.run import Request
+from hil.studies.sweep import Job, fly_all
+
+FLIGHTS = ("two-controllers-1", "two-controllers-2", "identify-u1")
+KEPT = ("log.parquet", "telemetry.csv", "events.jsonl", "result.json")
+STARRED = (-60.0, -48.5)  # [1/s2] paper, Methods: c* of the two controllers
+OWN = (-0.2, -0.15)  # their c
+PRINTED = {"roll_u1": "230 ± 66", "roll_roll": "-16 ± 10", "roll_rate": "-40 ± 12"}
+TITLES = {
+    "roll_u1": "a, roll per u1 [1/s²]",
+    "roll_roll": "c, roll per roll [1/s²]",
+    "roll_rate": "b, roll per rate [1/s]",
+}
+WHY = (
+    "The paper's c* give a = 230 and c = -14, not -16. Its equations find neither here: the angular acceleration in them is "
+    "the derivative of the same spectrum: jωȦ = -ω²A whatever flies. So c* is a mean of -ω², and b* is near 0."
+)
+
+
+COLUMNS = ("constant", "paper", "its arithmetic", "truth", "its method here", "instruments", "joint fit")
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """One row: what everybody makes of it, as text; empty for nothing."""
+
+    title: str
+    paper: str
+    arithmetic: str
+    truth: str
+    paper_method: str
+    instruments: str
+    joint: str
+
+
+def fly_identification(out: Path, notices: Console) -> tuple[Constant, ...]:
+    """Fly and identify; empty after Ctrl-C."""
+    folders = [out / name for name in FLIGHTS]
+    jobs = [
+        Job(Request.of(find_experiment(name), seed=1), folder, KEPT)
+        for name, folder in zip(FLIGHTS, folders, strict=True)
+    ]
+    results, interrupted = fly_all(jobs, notices)
+    if interrupted:
+        return ()
+    for result in results:
+        if result.outcome != "completed":
+            raise LabError(f"{result.folder}: {result.cause}")
+    return constants(identify([load_record(folder, "floaty") for folder in folders]))
+
+
+def constants(found: Identification) -> tuple[Constant, ...]:
+    """Return the rows of an identification with the paper's two flights and an excitation of u1."""
+    a, c = input_constant(STARRED, OWN)
+    computed = {"roll_u1": f"{a:.0f}", "roll_roll": f"{c:.0f}", "roll_rate": ""}
+    rows = [
+        Constant(
+            TITLES[name], PRINTED[name], computed[name], f"{one.truth:.4g}", _pair(one.two_controllers),
+            _pair(one.instrumental), _pair(one.joint),
+        )
+        for name in TITLES
+        for one in [found.constant(name)]
+    ]  # fmt: skip
+    value = {name: found.constant(name) for name in ("roll_u1", "roll_roll")}
+    for number, (starred, own, record) in enumerate(zip(STARRED, OWN, found.free, strict=True), 1):
+        loop = closed_loop(record, "roll")
+        rows.append(
+            Constant(
+                f"c*{number}, roll per roll with a gain of {-own:g} [1/s²]", f"{starred:g}", "",
+                f"{value['roll_roll'].truth + own * value['roll_u1'].truth:.4g}",
+                _pair((float(loop.starred[1]), 1.96 * float(loop.errors[1]))), "", "",
+            )
+        )  # fmt: skip
+    return tuple(rows)
+
+
+def _pair(pair: tuple[float, float]) -> str:
+    return "" if pair[0] != pair[0] else f"{pair[0]:.3g} ± {pair[1]:.2g}"

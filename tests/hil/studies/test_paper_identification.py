@@ -1,0 +1,41 @@
+"""The paper's identification of roll: its arithmetic, beside what its method and others find where the truth is known."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from hil.studies.paper import Paper
+from hil.studies.paper_identification import COLUMNS, WHY, Constant, fly_identification
+from hil.studies.paper_report import write_paper
+from support.html_page import Page
+
+
+def number(text: str) -> float:
+    return float(text.split()[0])
+
+
+@pytest.mark.long
+def test_the_papers_method_misses_what_the_others_find(tmp_path: Path) -> None:
+    a, c, b, first, second = fly_identification(tmp_path, Console(quiet=True))
+    assert [row.arithmetic for row in (a, c)] == ["230", "-14"]
+    assert [row.truth for row in (a, c, b, first, second)] == ["230", "-16", "-40", "-62", "-50.5"]
+    assert [row.paper for row in (first, second)] == ["-60", "-48.5"]
+    for row in (a, b):
+        value, half = (number(part) for part in row.joint.split("±"))
+        assert abs(value - number(row.truth)) < 1.5 * half
+    assert abs(number(b.paper_method) - -40.0) > 0.5 * 40.0, "it finds no damping"
+
+
+@pytest.mark.long
+def test_the_report_has_the_rows_of_the_identification(tmp_path: Path) -> None:
+    rows = [Constant("a", "230 ± 66", "230", "230", "43 ± 131", "211 ± 12", "226 ± 10")]
+    text = write_paper(tmp_path, Paper((), (), False), (), None, rows).read_text(encoding="utf-8")
+    page = Page(text)
+    assert WHY.split(":")[0].replace("'", "&#39;") in text
+    assert list(page.tables["identification"][-1]) == list(dataclasses.astuple(rows[0]))
+    assert list(page.tables["identification"][0]) == list(COLUMNS)
+    told = json.loads((tmp_path / "result.json").read_text())["identification"]
+    assert told == [dataclasses.asdict(row) for row in rows]
