@@ -203,13 +203,10 @@ def _print_round(one: "Round") -> None:
         )
         scale, unit = (100.0, "cm") if axis.metric else (degrees(1.0), "deg")
         flown = [
-            "lost"
-            if result.outcome != "completed"
-            else f"{scale * result.metrics[axis.metric]:.2f} {unit}"
-            if axis.metric
-            else ""
+            "lost" if result.outcome != "completed" else f"{scale * result.metrics[axis.metric]:.2f} {unit}"
             for result in (tuned.before, *one.flown)
-        ]
+            if axis.metric
+        ] or ["", ""]
         before = "not stable" if axis.old_motion is None else f"{scale * axis.old_motion.main:.2f} {unit}"
         after = f"{scale * axis.motion.main:.2f} {unit}"
         moved.add_row(axis.axis.name, before, flown[0], after, flown[1], ", ".join(flown[2:]))

@@ -160,19 +160,23 @@ def tune(profile: str, flights: Flights, count: int) -> Tuned:
         )  # fmt: skip
         old = gains_in(config, axis)
         new = design(task, loops, [regulator(axis, robots.nominal), old])
-        axes.append(_judged(task, loops, every, config, timing, old, new))
-    tuned = Tuned(tuple(axes), robots, age_s, jitter_s, _with_gains(config, axes), before)
-    for one in tuned.axes:
+        axes.append(judged(task, loops, every, config, timing, old, new))
+    refuse_late(axes, jitter_s)
+    return Tuned(tuple(axes), robots, age_s, jitter_s, _with_gains(config, axes), before)
+
+
+def refuse_late(axes: Sequence[TunedAxis], jitter_s: float) -> None:
+    """Raise `LabError` for loops that bear less delay than the link has."""
+    for one in axes:
         least = min(one.least.delay, one.least_late)
         if least < jitter_s:
             raise LabError(
                 f"refused: {one.axis.name} bears {1e3 * least:.1f} ms of delay, and poses come up to "
                 f"{1e3 * jitter_s:.1f} ms later than on the mean"
             )
-    return tuned
 
 
-def _judged(
+def judged(
     task: Task,
     loops: Sequence[Loop],
     every: Sequence[Mapping[str, float]],
@@ -181,6 +185,7 @@ def _judged(
     old: Matrix,
     new: Matrix,
 ) -> TunedAxis:
+    """Return an axis with the margins and the motion of old and new gains; the first loop is the profile's robot."""
     axis = task.axis
     before, found = margins(loops[0], old), [margins(loop, new) for loop in loops]
     late = [

@@ -4,10 +4,15 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hil.config import load_config
+from hil.design.loop import AXES, FREQUENCIES, Timing, build, gains_in, robot_of
+from hil.design.tune import Task
+from hil.errors import LabError
 from hil.laboratory.robot import Streams
+from hil.studies.tuning import judged, refuse_late
 from hil.world.plant import Plant
 from support.command import floaty
 
@@ -39,6 +44,37 @@ def test_bad_input_is_one_line_and_exit_code_two(
     assert error.startswith("floaty: ")
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_loop_that_bears_less_delay_than_the_link_has_is_refused_with_both_numbers() -> None:
+    config, axis = load_config(), AXES[0]
+    robot, timing, gains = robot_of(config), Timing.of(config, 0.04), gains_in(config, axis)
+    task = Task(axis, np.zeros((len(FREQUENCIES), 2, 2), complex), 0.0, 0.0, 0.43, 0.15, 0.0)
+    one = judged(task, [build(axis, robot, config, timing)], [robot], config, timing, gains, gains)
+    least = min(one.least.delay, one.least_late)
+    refuse_late([one], 0.99 * least)
+    with pytest.raises(
+        LabError, match=f"roll, y bears {1e3 * least:.1f} ms of delay, and poses come up to 100.0 ms later"
+    ):
+        refuse_late([one], 0.1)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [([], "its own gains lose the robot"), (["--repeat", "2"], "round 1 ends: identify-u1 lost the robot: ")],
+)
+def test_a_robot_that_is_lost_ends_it_with_a_clear_line(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    arguments: list[str],
+    message: str,
+) -> None:
+    profile = tmp_path / "bad.toml"
+    profile.write_text('base = "cad"\n[controller]\ngain_y = 3.5\n')
+    assert floaty(monkeypatch, "tune", "--profile", profile, "--runs", tmp_path / "runs", *arguments) == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.long
