@@ -131,16 +131,19 @@ def tune(
 ) -> int:
     """Make gains of the paper's control law for the profile's model, and fly them in lockstep with the profile's plant.
 
-    Exit code 0: the new gains hover no worse than the old ones; 1: they do; 2: bad input, no gains, or a lost robot.
+    Exit code 0: the new gains hover no worse than the old ones, which are kept otherwise; 1: they do; 2: bad input, no
+    gains, or a robot lost on the way.
     """
     from hil.identify import need_scipy
 
     need_scipy()
     from hil.config import load_config
-    from hil.studies.tuning import Flights, fly_round, rms, rounds, write_tuned
+    from hil.studies.tuning import Flights, fly_round, rounds, write_tuned
 
     if out is not None and out.suffix != ".toml":
         raise LabError(f"--out {out}: a profile's name ends in .toml")
+    with writing("--runs", runs):
+        runs.mkdir(parents=True, exist_ok=True)
     announce_compilation()
     flights = Flights(seed, board, runs, notices)
     flown: Iterable[Round] = (
@@ -159,12 +162,10 @@ def tune(
             raise
         notices.print(f"{error}; the best round before it counts", soft_wrap=True)
     assert best is not None
-    if best.rms == inf:
-        raise LabError(f"the new gains lose the robot: {best.flown[0].cause}")
     if out is not None:
-        write_tuned(out, profile, load_config(str(best.profile)), "Model and gains by floaty tune.")
+        write_tuned(out, profile, load_config(best.profile), "Model and gains by floaty tune.")
         console.print(f"  {out}   (floaty fly hover --profile {out})", soft_wrap=True)
-    return 0 if best.rms <= rms(best.tuned.before) else 1
+    return 0 if repeat is not None or best.better else 1
 
 
 def _print_round(one: "Round") -> None:
@@ -218,7 +219,8 @@ def _print_round(one: "Round") -> None:
         soft_wrap=True,
     )
     console.print(
-        f"rms distance from the goal: {_distance(rms(tuned.before))}, with the new gains {_distance(one.rms)}"
+        f"rms distance from the goal: {_distance(rms(tuned.before))}, with the new gains {_distance(rms(one.flown[0]))}"
+        + ("" if one.better else ": the old gains are kept")
     )
 
 

@@ -270,12 +270,23 @@ class Round:
 
     tuned: Tuned
     flown: tuple[Result, ...]
-    profile: Path  # that flies the new gains
+    given: str  # the profile that was tuned
+    written: Path  # the one with the new gains
+
+    @property
+    def better(self) -> bool:
+        """Whether the new gains hover no worse than the old ones."""
+        return rms(self.flown[0]) <= rms(self.tuned.before)
 
     @property
     def rms(self) -> float:
-        """Of the profile's robot."""
-        return rms(self.flown[0])
+        """Of the better gains, the profile's robot."""
+        return min(rms(self.flown[0]), rms(self.tuned.before))
+
+    @property
+    def profile(self) -> str:
+        """The profile that flies the better gains."""
+        return str(self.written) if self.better else self.given
 
 
 def fly_round(profile: str, flights: Flights, count: int) -> Round:
@@ -284,7 +295,7 @@ def fly_round(profile: str, flights: Flights, count: int) -> Round:
     path = flights.folder / "tuned.toml"
     write_tuned(path, profile, tuned.config, "Gains by floaty tune.")
     flown = flights.hover("after", str(path), *worst_settings(tuned, tuned.config))
-    return Round(tuned, tuple(flown), path)
+    return Round(tuned, tuple(flown), profile, path)
 
 
 def rounds(profile: str, flights: Flights, count: int, most: int) -> Iterator[Round]:
@@ -304,6 +315,8 @@ def rounds(profile: str, flights: Flights, count: int, most: int) -> Iterator[Ro
         write_profile(model, profile, identify(records))
         one = fly_round(str(model), own, count)
         yield one
+        if one.flown[0].outcome != "completed":
+            raise LabError(f"round {number} ends: the new gains lose the robot: {one.flown[0].cause}")
         if one.rms > BETTER * last:
             return
-        last, profile = one.rms, str(one.profile)
+        last, profile = one.rms, one.profile

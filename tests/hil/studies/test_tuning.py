@@ -33,7 +33,7 @@ def test_the_profile_cad_has_the_plate_model_on_board() -> None:
         (["--out", "gains.txt"], "--out gains.txt: a profile's name ends in .toml"),
         (["--repeat", "0"], "--repeat"),
         (["--board", "abacus"], "--board abacus: expected python"),
-        (["--runs", "/proc/floaty"], "/proc/floaty"),
+        (["--runs", "/proc/floaty"], "--runs /proc/floaty: cannot be written"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_two(
