@@ -100,6 +100,12 @@ def test_at_the_delay_margin_the_loop_begins_to_grow(axis: Axis) -> None:
     assert radius(int(ticks)) < 1.0 < radius(int(ticks) + 1)
 
 
+def test_a_filter_and_predictor_that_know_the_robot_know_its_state_after_any_command() -> None:
+    axis = AXES[3]  # the gyro's mean comes half a tick late; height has no gyro
+    now, states = build(axis, robot_of(CONFIG) | {DELAY: 0.0}, CONFIG, NOW).answers
+    assert now[:, :2, :2].sum(axis=2) == pytest.approx(states[:, :, :2].sum(axis=2), rel=1e-6)
+
+
 def test_the_y_loop_of_the_authors_gains_has_the_pole_that_the_specification_prints() -> None:
     config = load_config("as-flown")
     axis = AXES[0]

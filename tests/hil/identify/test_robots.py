@@ -39,6 +39,7 @@ def test_robots_are_drawn_from_the_covariance_beside_the_profile(tmp_path: Path)
     assert np.cov(drawn.T) == pytest.approx(np.array([[30.0, -2.0], [-2.0, 0.16]]), rel=0.1)
     assert drawn.mean(axis=0) == pytest.approx([110.0, -7.7], abs=0.2)
     lags = np.array([1 / one["flap_rate"] for one in robots.drawn])
+    assert lags.mean() == pytest.approx(0.05, rel=0.01)
     assert lags.std() == pytest.approx(0.002, rel=0.1)
     assert robots.nominal[DELAY] == pytest.approx(0.0045)
     assert {one["roll_u1"] for one in robots.drawn} == {230.0}, "of which nothing is said"
