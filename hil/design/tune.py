@@ -146,7 +146,7 @@ def design(task: Task, loops: Sequence[Loop], start: Sequence[Matrix]) -> Matrix
             found = minimize(dearest, x, method="Nelder-Mead", options=options)
             best = _whole(axis, np.asarray(found.x) * scale)
         costs = np.array([cost(loop, task, best) for loop in loops])
-        if costs.max() <= 1.02 * found.fun:
+        if costs.max() <= 1.02 * found.fun or len(looked_at) == len(loops):
             break
         known = {id(loop) for loop in looked_at}
         ranked = [loops[place] for place in np.argsort(-costs)]

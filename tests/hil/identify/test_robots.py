@@ -93,7 +93,7 @@ def hover(seconds: float) -> tuple[Record, float]:
 
 
 def test_what_the_model_does_not_explain_is_the_flow() -> None:
-    record, per_hz = hover(120.0)
+    record, per_hz = hover(60.0)
     found = flow_of(record, AXES[1], robot_of(CONFIG)).spectrum
     band = (FREQUENCIES > 0.3) & (FREQUENCIES < 8.0)
     assert np.mean(found[band, 1, 1].real) == pytest.approx(per_hz, rel=0.25)
