@@ -93,8 +93,8 @@ class TelemetryLog:
     def close(self) -> None:
         """Write the last row and close the file; a second call does nothing."""
         if not self._file.closed:
-            self._write_row()
-            self._file.close()
+            with self._file:
+                self._write_row()
 
     def _write_row(self) -> None:
         if self._timestamp_ms is not None:

@@ -22,7 +22,7 @@ from hil.commands.options import (
     write_pictures,
 )
 from hil.commands.tables import print_result, print_seeds
-from hil.errors import LabError
+from hil.errors import LabError, writing
 
 if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
@@ -124,7 +124,8 @@ def _fly_one(request: Request, folder: Path, realtime: bool, target: str | None,
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
         make = None if request.in_lockstep else linked_flight
-        result = fly(request, folder, clock, show, view, perfetto, make)
+        with writing("--out", folder):
+            result = fly(request, folder, clock, show, view, perfetto, make)
         progress.update(bar, description="writing recording and report", total=None, now="")
         write_pictures(folder, request.experiment)
         if perfetto:

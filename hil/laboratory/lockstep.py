@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from firmware_py.core_runner import PythonRunner, RunnerFactory
@@ -91,9 +92,10 @@ class ModelledLine:
 
     def close(self) -> None:
         """Close what the station wrote."""
-        for written in (self._telemetry, self._frames):
-            if written is not None:
-                written.close()
+        with ExitStack() as closing:  # all of them, even on a full disk
+            for written in (self._telemetry, self._frames):
+                if written is not None:
+                    closing.callback(written.close)
 
 
 def lockstep_flight(

@@ -8,6 +8,7 @@ metadata; the schema carries configuration, seed, versions and commit. `load_log
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Protocol
@@ -84,10 +85,12 @@ class Recorder:
                 fields.append(pa.field(name, pa.from_numpy_dtype(block.dtype), metadata=metadata_of_column))
         self._schema = pa.schema(fields, metadata=dict(metadata))
         self._hash = hashlib.sha256(" ".join(self._schema.names).encode())
+        self._file: Any = None
         self._stream: Any = None
         self._events: IO[str] | None = None
         if folder is not None:
-            self._stream = pa.ipc.new_stream(str(folder / STREAM), self._schema)
+            self._file = pa.OSFile(str(folder / STREAM), "wb")
+            self._stream = pa.ipc.new_stream(self._file, self._schema)
             self._events = (folder / EVENTS).open("w", encoding="utf-8")
 
     def row(self, now_us: int) -> None:
@@ -121,12 +124,13 @@ class Recorder:
 
         `correct` may put in what became known only after the flight.
         """
-        if self._row:
-            self._write_batch()
-        if self._events is not None:
-            self._events.close()
+        with ExitStack() as closing:  # all of them, even on a full disk
+            for written in (self._file, self._stream, self._events):
+                if written is not None:
+                    closing.callback(written.close)
+            if self._row:
+                self._write_batch()
         if self._folder is not None:
-            self._stream.close()
             finish_log(self._folder, self.release_us, correct)
         return self._hash.hexdigest()
 

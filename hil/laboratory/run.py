@@ -148,8 +148,10 @@ def fly(
     finally:
         factor = pace.end(flight.now_us)
         record = flight.line.record
-        digest = recorder.close(None if record is None else partial(with_goals_sent, record))
-        flight.close()
+        try:
+            digest = recorder.close(None if record is None else partial(with_goals_sent, record))
+        finally:  # the disk may be full
+            flight.close()
         flight.write_schedule(folder)
     log = load_log(folder)
     experiment = request.experiment

@@ -5,10 +5,8 @@ import itertools
 import json
 import os
 import random
-import resource
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -23,6 +21,7 @@ from hil.campaigns.report import write_report
 from hil.campaigns.run import Flyer, Progress, Standing, conduct, interval
 from hil.errors import LabError
 from support.campaigns import BAD_PUSH, planted, spec_of
+from support.full_disk import small_files
 from support.html_page import Page
 
 
@@ -140,19 +139,6 @@ def test_kill_9_loses_no_row_that_was_there_and_repeats_none(
     assert sorted(asked) == list(range(kept, 40))
     flown_into(tmp_path / "straight", spec, workers(spec, 1))
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "straight")
-
-
-@contextmanager
-def small_files(limit: int) -> Iterator[None]:
-    """No file may become larger, as on a disk that is full."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
 
 
 @pytest.mark.parametrize("limit", [30_000, 4_000])

@@ -13,11 +13,13 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import LOCKSTEP
 from hil.laboratory.metrics import METRICS, column, judge
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.report import write_report
+from support.full_disk import small_files
 
 HOVER = EXPERIMENTS["hover"]
 
@@ -201,6 +203,19 @@ def test_a_killed_run_is_readable_up_to_its_last_second(tmp_path: Path) -> None:
     assert (killed.experiment, killed.seed, killed.duration_s, killed.faults) == ("hover", 1, 0.5, ())
     assert killed.versions == result.versions
     assert killed.metrics["rms_x"] == result.metrics["rms_x"]
+
+
+@pytest.mark.parametrize("link", LOCKSTEP)
+def test_a_full_disk_leaves_no_file_of_the_flight_open(tmp_path: Path, link: str) -> None:
+    request = Request.of(HOVER, duration_s=1.0, link=link)
+    with small_files(100_000), pytest.raises(OSError, match="File too large"):
+        fly(request, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} >= {"log.arrows", "events.jsonl", "telemetry.csv"}
+    assert [path for path in open_files() if path.is_relative_to(tmp_path)] == []
+
+
+def open_files() -> list[Path]:
+    return [link.readlink() for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
 
 
 def test_a_folder_with_other_things_in_it_is_left_alone(tmp_path: Path) -> None:

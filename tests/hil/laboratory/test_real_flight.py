@@ -2,10 +2,8 @@
 
 import json
 import math
-import resource
 import shutil
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -47,6 +45,7 @@ from hil.pictures.panels import marks_of_flight
 from hil.pictures.report import write_report
 from hil.pictures.trials import YAW_STEP
 from support.command import floaty
+from support.full_disk import small_files
 from support.html_page import Page
 
 CONFIG = load_config()
@@ -354,20 +353,9 @@ def test_a_real_flight_overwrites_nothing(tmp_path: Path) -> None:
         Bench(Path("/proc/floaty/run"))
 
 
-@contextmanager
-def small_files() -> Iterator[None]:
-    """No file may become larger than 150 kB, as on a disk that is full."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
 def test_a_full_disk_ends_the_record_and_not_the_flight(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "run")
-    with small_files():
+    with small_files(150_000):
         bench.fly(5.0)
         assert len(bench.said) == 1
         assert "no more is recorded" in bench.said[0]
