@@ -70,6 +70,8 @@ class Exchange(Generic[M]):
     send: Callable[[int], object]
     take: Callable[[M], Any]
     waits: bool = False  # the reply comes by itself: send only when it does not
+    patience_us: int = PATIENCE_US
+    missing: str = f"no answer within {PATIENCE_US * 1e-6:.0f} s"  # the error without a reply
 
 
 Settings = tuple[tuple[str, float], ...]
@@ -103,7 +105,7 @@ class Dialogue(Generic[M]):
         """Return the answer once it is there; repeat what was not replied to."""
         if self._exchange is not None and now_us >= self._again_us:
             if now_us >= self._give_up_us:
-                self._end(Answer((), f"no answer within {PATIENCE_US * 1e-6:.0f} s"))
+                self._end(Answer((), self._exchange.missing))
             else:
                 self._again_us = now_us + REPEAT_US
                 self._exchange.send(now_us)
@@ -120,7 +122,7 @@ class Dialogue(Generic[M]):
             self._end(Answer((), str(error)))
         else:
             self._exchange = exchange
-            self._again_us, self._give_up_us = now_us + REPEAT_US, now_us + PATIENCE_US
+            self._again_us, self._give_up_us = now_us + REPEAT_US, now_us + exchange.patience_us
             if not exchange.waits:
                 exchange.send(now_us)
 

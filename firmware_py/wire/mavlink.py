@@ -29,8 +29,8 @@ from firmware_py.wire.mavlink_services import (  # offered here, too
     no_mission as no_mission, parameter as parameter, parameter_list as parameter_list,
     parameter_read as parameter_read, parameter_set as parameter_set,
     parameter_error as parameter_error, ping_answer as ping_answer, protocol_version as protocol_version,
-    refused_mission as refused_mission, station_heartbeat as station_heartbeat, status_text as status_text,
-    timesync as timesync,
+    refusal as refusal, refused_mission as refused_mission, station_heartbeat as station_heartbeat,
+    status_text as status_text, timesync as timesync,
 )  # fmt: skip
 # isort: on
 

@@ -154,6 +154,18 @@ def command_ack(number: int, result: int, to_system: int, to_component: int) -> 
     return dialect.MAVLink_command_ack_message(number, result, 0, 0, to_system, to_component)
 
 
+def refusal(ack: Message) -> str:
+    """Return what a COMMAND_ACK that does not accept says, in the standard's words."""
+    result = _word("MAV_RESULT", ack.result).replace("_", " ").lower()
+    return f"the board refuses {_word('MAV_CMD', ack.command)}: {result}"
+
+
+def _word(enumeration: str, number: int) -> str:
+    """Return what the standard calls a number; the number where it does not."""
+    known = dialect.enums[enumeration].get(number)
+    return str(number) if known is None else known.name.removeprefix(f"{enumeration}_")
+
+
 def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) -> Message:
     """What the board runs: version, up to 8 bytes of the source's revision, the board's serial number."""
     major, minor, patch = version

@@ -195,7 +195,7 @@ class MavlinkLink:
     def _on_command_ack(self, now_us: int, message: Message) -> Sequence[Sample]:
         self.answered = True
         if not self.controls.hear(self._read_us, message) and message.result != ACCEPTED:
-            self.texts.append(f"the board refuses command {message.command}: result {message.result}")
+            self.texts.append(mavlink.refusal(message))
         return ()
 
     def _on_parameter(self, now_us: int, message: Message) -> Sequence[Sample]:
@@ -203,7 +203,8 @@ class MavlinkLink:
         return ()
 
     def _on_text(self, now_us: int, message: Message) -> Sequence[Sample]:
-        self.texts.append(f"board: {message.text}")
+        if not self.controls.hear(self._read_us, message):
+            self.texts.append(f"board: {message.text}")
         return ()
 
     def _on_flight_array(self, now_us: int, message: Message) -> Sequence[Sample]:

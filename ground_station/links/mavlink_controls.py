@@ -15,6 +15,8 @@ from ground_station.links.crtp_controls import unknown
 
 BOARD_COMPONENT = 1  # autopilot
 ARM, TERMINATE = 1, 1
+WARNING = 4  # MAV_SEVERITY
+REASON_US = 200_000  # after a refusal, in which the board may say why
 STOPPED = mavlink.mavlink_name("floaty.stop")  # a latch, which arming alone does not open
 
 
@@ -92,7 +94,11 @@ class MavlinkControls(Dialogue[Message]):
             message, lambda got: got.get_msgId() == mavlink.MSG_COMMAND_ACK and got.command == number
         )
         if reply.result != Result.ACCEPTED:
-            raise ControlsError(f"the board refuses command {number:d}: result {reply.result}")
+            refusal = mavlink.refusal(reply)
+            reason = yield Exchange(
+                lambda now_us: None, _warning, waits=True, patience_us=REASON_US, missing=refusal
+            )
+            raise ControlsError(f"{refusal}: {reason}")
         return ()
 
     def _list_once(self) -> Script[Message]:
@@ -109,6 +115,12 @@ class MavlinkControls(Dialogue[Message]):
 
     def _until(self, message: Message, fits: Callable[[Message], bool]) -> Exchange[Message]:
         return Exchange(lambda now_us: self._send(now_us, message), lambda got: got if fits(got) else None)
+
+
+def _warning(message: Message) -> str | None:
+    """Return the text of a warning."""
+    is_warning = message.get_msgId() == mavlink.MSG_STATUSTEXT and message.severity <= WARNING
+    return message.text if is_warning else None
 
 
 def _is_value_of(message: Message, name: str) -> bool:

@@ -220,6 +220,18 @@ def test_what_the_board_cannot_do_is_refused_in_one_line(bench: Bench) -> None:
     assert "\n" not in told.error
 
 
+def test_over_mavlink_a_refusal_and_its_reason_are_one_line() -> None:
+    bench = MavlinkBench()
+    assert ask(bench, Action.STOP) == Answer(())
+    bench.run(GYRO_ZERO_US)
+    bench.turn()
+    bench.link.texts.clear()
+    assert ask(bench, Action.ARM).error == (
+        "the board refuses COMPONENT_ARM_DISARM: temporarily rejected: not armed: emergency stop; reboot first"
+    )
+    assert list(bench.link.texts) == []
+
+
 def test_a_line_that_loses_much_delays_and_spoils_nothing(bench: Bench) -> None:
     rng = np.random.default_rng(1)
     bench.lossy = lambda: bool(rng.random() < 0.15)

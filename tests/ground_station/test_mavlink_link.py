@@ -15,9 +15,11 @@ from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import ALL_BLOCKS
 from ground_station.config import StationConfig
+from ground_station.controls import REPEAT_US, Action, Request
 from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
+from ground_station.links.mavlink_controls import REASON_US
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.trajectory import Goal, Hold
@@ -222,9 +224,20 @@ def test_texts_and_refusals_are_collected():
     )
     assert list(bench.link.texts) == [
         "board: supervisor: failsafe, silence",
-        "the board refuses command 511: result 4",
+        "the board refuses SET_MESSAGE_INTERVAL: failed",
     ]
     assert bench.link.answered
+
+
+@pytest.mark.parametrize(("result", "word"), [(2, "denied"), (5, "in progress"), (77, "77")])
+def test_a_refusal_without_a_reason_is_told_in_the_standard_s_words(result, word):
+    bench = LinkWithCodec()
+    controls, told = bench.link.controls, dialect.MAVLink_statustext_message(6, b"written by somebody")
+    controls.ask(0, Request(Action.SAVE))
+    bench.hear(1_000, dialect.MAVLink_command_ack_message(245, result), told)
+    assert controls.answer(1_000 + REPEAT_US) is None
+    assert controls.answer(1_000 + REASON_US).error == f"the board refuses PREFLIGHT_STORAGE: {word}"
+    assert list(bench.link.texts) == ["board: written by somebody"]
 
 
 # Time
