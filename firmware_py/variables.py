@@ -19,6 +19,7 @@ from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
 from firmware_py.links.stream import ReadBlock
 from firmware_py.logic.plugs import GROUP
+from firmware_py.rtos.statistics import Load
 from firmware_py.running import Running
 from firmware_py.stock_names import stock_variables
 from firmware_py.wire.scalars import Scalar
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 AGE_UNIT_US = 100  # locSrv.age counts tenths of a millisecond
 BATTERY_FULL_MV = 4200
+LOAD_US = 100_000  # at least, over which the processor's load is told
 PM_BATTERY, PM_LOW = 0, 3  # pm.state
 
 F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
@@ -180,10 +182,12 @@ def _kalman(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
 
 
 def _counters(running: Running) -> Iterator[LogVariable]:
-    """What was lost, and where."""
+    """What was lost, and where; how busy the processor is."""
     yield from _fields("crtp", "malformed unserved dropped", U32, "", running.stack)
     if running.mavlink is not None:
         yield from _fields("mavlink", "frames lost bad refused dropped overruns", U32, "", running.mavlink)
+    load = Load(running.stack.kernel, LOAD_US)
+    yield LogVariable("system.load", F32, "%", lambda: 100 * load())
     yield LogVariable("sensors.dropped", U32, "", partial(getattr, running.measurements, "dropped"))
     yield LogVariable("app.overflows", U32, "", partial(getattr, running.platform, "app_overflows"))
     yield LogVariable("memTst.errCntW", U32, "", partial(getattr, running.tester, "errors"))

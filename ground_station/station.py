@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from firmware_py.wire import WireError
-from firmware_py.wire.telemetry import Sample
+from firmware_py.wire.telemetry import SLOW_BLOCKS, Sample
 from ground_station.config import StationConfig
 from ground_station.latency import LatencyBudget, LinkLatency
 from ground_station.mocap import MocapFrame, judged
@@ -100,7 +100,7 @@ class GroundStation:
         self.frame: MocapFrame | None = None  # the last that was used
         self.track: Track | None = None  # what the tracker made of the last frame
         self.telemetry: dict[int, Sample] = {}  # the newest of each block, by its number
-        self._ask_for_telemetry_us = 0  # put off by every sample that comes
+        self._ask_for_telemetry_us = 0  # put off by every sample of the stream
 
     def on_frame(self, frame: MocapFrame, now_us: int) -> None:
         """Send the frame of each slot, or the first usable one after it."""
@@ -143,7 +143,8 @@ class GroundStation:
             return
         self.counters.samples += len(samples)
         for sample in samples:
-            self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
+            if sample.block not in SLOW_BLOCKS:
+                self._ask_for_telemetry_us = now_us + TELEMETRY_TIMEOUT_US
             self.telemetry[sample.block.id] = sample
             if self._log is not None:
                 goal = self._trajectory.at(now_us)

@@ -13,6 +13,7 @@ from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
 from firmware_py.links.mavlink_world import World
 from firmware_py.links.stream import ReadBlock
+from firmware_py.rtos.statistics import Load
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink, telemetry
 from firmware_py.wire.mavlink_frames import Message
@@ -37,7 +38,7 @@ class FlightMessages:
         self._world = world
         self._control = control
         self._read_block = read_block
-        self._load_since = (0, 0)  # instant and processor time of the last SYS_STATUS [us]
+        self._load = Load(stack.kernel)
 
     def streams(self, rates: StreamRates) -> tuple[Stream, ...]:
         """Return all streams with their intervals after boot."""
@@ -87,14 +88,6 @@ class FlightMessages:
         drop_rate = counters.lost / max(1, counters.frames + counters.lost)
         errors = self._stack.bad + self._stack.refused + self._stack.overruns
         return (mavlink.sys_status(self._supervisor.battery_mv, drop_rate, errors, self._load()),)
-
-    def _load(self) -> float:
-        """Share of the processor's time that was used since this was last asked."""
-        kernel = self._stack.kernel
-        now_us, work_us = kernel.now_us, sum(task.work_us for task in kernel.tasks)
-        last_us, last_work_us = self._load_since
-        self._load_since = (now_us, work_us)
-        return (work_us - last_work_us) / max(1, now_us - last_us)
 
     def _battery(self, tick: int) -> Messages:
         return (mavlink.battery(self._supervisor.battery_mv),)

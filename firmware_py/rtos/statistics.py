@@ -18,6 +18,26 @@ from firmware_py.rtos.task import Task
 LATENCY_BOUNDS_US = (1, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)  # of the histogram's classes
 
 
+class Load:
+    """The share of the processor's time that tasks use: 0 to 1, between the last two calls that are `least_us` apart."""
+
+    def __init__(self, kernel: Kernel, least_us: int = 1) -> None:
+        self._kernel = kernel
+        self._least_us = least_us
+        self._us = self._work_us = 0  # instant and processor time when it was looked at last
+        self._share = 0.0
+
+    def __call__(self) -> float:
+        """Return it."""
+        passed_us = self._kernel.now_us - self._us
+        if passed_us >= self._least_us:
+            busy = (task for task in self._kernel.tasks if task.name != "IDLE")
+            work_us = sum(self._kernel.run_time_us(task) for task in busy)
+            self._share = (work_us - self._work_us) / passed_us
+            self._us, self._work_us = self._kernel.now_us, work_us
+        return self._share
+
+
 @dataclass(frozen=True, slots=True)
 class TaskReport:
     """One task so far. An activation that still lasts counts for the worst response and for the deadline."""

@@ -19,7 +19,7 @@ from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_place, check_pose
 from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.mavlink_services import u16, u32
-from firmware_py.wire.telemetry import ALL_BLOCKS, BLOCKS, TIMESTAMP_MASK, Sample
+from firmware_py.wire.telemetry import ALL_BLOCKS, BATTERY, BLOCKS, LOAD, TIMESTAMP_MASK, Sample
 
 # isort: off
 from firmware_py.wire.mavlink_services import (  # offered here, too
@@ -360,6 +360,12 @@ def read_flight_array(message: Message) -> tuple[Sample, ...]:
     return tuple(
         Sample(block, timestamp_ms, tuple(islice(values, len(block.variables)))) for block in ALL_BLOCKS
     )
+
+
+def read_sys_status(message: Message, timestamp_ms: int) -> tuple[Sample, ...]:
+    """The samples in a SYS_STATUS, which has no time of its own; NaN for a voltage that its board does not know."""
+    voltage = nan if message.voltage_battery == _U16_MAX else 1e-3 * message.voltage_battery
+    return Sample(BATTERY, timestamp_ms, (voltage,)), Sample(LOAD, timestamp_ms, (0.1 * message.load,))
 
 
 def _from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:

@@ -20,6 +20,7 @@ from firmware_py.wire.parameters import SetByName, encode_set_by_name
 from firmware_py.wire.scalars import Scalar
 
 PERIOD_MS = 20  # of the original ground station's log blocks
+SLOW_PERIOD_MS = 500
 TIMESTAMP_MASK = 0xFFFFFF  # of a sample: what a log data packet has room for
 
 
@@ -130,6 +131,10 @@ BLOCKS = (
 # Only while something is excited: other flights have nothing of it on their line.
 EXCITATION = Block(FIRST_ID + 4, _variables("excite", "u1 u2 u3 u4", Scalar.F32, "rad"))
 ALL_BLOCKS = (*BLOCKS, EXCITATION)
+# Not of the stream: stations of real boards ask for them, one by one, for a Crazyflie knows no load. MAVLink: SYS_STATUS.
+BATTERY = Block(FIRST_ID + 5, _variables("pm", "vbat", Scalar.F32, "V"))
+LOAD = Block(FIRST_ID + 6, _variables("system", "load", Scalar.F32, "%"))  # of the processor
+SLOW_BLOCKS = (BATTERY, LOAD)
 
 _BLOCK_OF_ID = {block.id: block for block in ALL_BLOCKS}
 

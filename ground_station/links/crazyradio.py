@@ -31,7 +31,7 @@ from firmware_py.wire.crtp import (
     encode_ext_pose,
 )
 from firmware_py.wire.scalars import PARAMETER_SCALARS
-from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, Block, Sample
+from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, SLOW_BLOCKS, SLOW_PERIOD_MS, Block, Sample
 from ground_station.clock import clock_us
 from ground_station.controls import Answer, Request
 from ground_station.corrections import correct
@@ -155,7 +155,7 @@ class CrazyradioLink(LiveLink):
         crazyflie.add_port_callback(CRTPPort.LOGGING, self._on_log_packet)
         self._telemetry_us = clock_us()
         missing: list[str] = []
-        for block in BLOCKS:
+        for block in (*BLOCKS, *SLOW_BLOCKS):
             absent = [
                 v.name
                 for v in block.variables
@@ -164,7 +164,8 @@ class CrazyradioLink(LiveLink):
             missing += absent
             if absent:
                 continue
-            wanted = LogConfig(block.variables[0].name, PERIOD_MS)
+            period_ms = SLOW_PERIOD_MS if block in SLOW_BLOCKS else PERIOD_MS
+            wanted = LogConfig(block.variables[0].name, period_ms)
             for variable in block.variables:
                 wanted.add_variable(
                     variable.name, LogTocElement.get_cstring_from_id(variable.type.log_number)

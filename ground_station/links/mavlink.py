@@ -82,6 +82,7 @@ class MavlinkLink:
         self._goal_us = 0
         self._asked = False
         self._samples = 0  # of telemetry since the last look
+        self._timestamp_ms: int | None = None  # of the last
         self._look_us = 0  # when to look after the link next
         self.controls = MavlinkControls(self._send, lambda: self._addressee)
         self._time_request_ns = 0  # own clock in the last one
@@ -90,6 +91,7 @@ class MavlinkLink:
             mavlink.MSG_HEARTBEAT: self._on_heartbeat,
             mavlink.MSG_TIMESYNC: self._on_timesync,
             mavlink.MSG_DEBUG_FLOAT_ARRAY: self._on_flight_array,
+            mavlink.MSG_SYS_STATUS: self._on_status,
             mavlink.MSG_COMMAND_ACK: self._on_command_ack,
             mavlink.MSG_PARAM_VALUE: self._on_parameter,
             mavlink.MSG_STATUSTEXT: self._on_text,
@@ -213,5 +215,10 @@ class MavlinkLink:
         except WireError:
             return ()  # somebody's array of another name
         self._samples += 1
+        self._timestamp_ms = samples[0].timestamp_ms
         self.supervisor_state = int(samples[HEALTH].values[SUPERVISOR_STATE])
         return samples
+
+    def _on_status(self, now_us: int, message: Message) -> Sequence[Sample]:
+        """Let it belong to the newest telemetry, once there is some."""
+        return () if self._timestamp_ms is None else mavlink.read_sys_status(message, self._timestamp_ms)

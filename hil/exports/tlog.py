@@ -9,6 +9,7 @@ jump.
 """
 
 from collections.abc import Iterator
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +70,8 @@ def _flown(log: pa.Table) -> Iterator[Said]:
         if row % SLOW == 0:
             state = columns["supervisor.state"][row]
             yield us, BOARD, mavlink.heartbeat(state == State.FLYING, state)
-            if "battery.voltage" in columns:
-                yield us, BOARD, mavlink.battery(round(1000 * columns["battery.voltage"][row]))
+            if "battery.voltage" in columns and isfinite(voltage := columns["battery.voltage"][row]):
+                yield us, BOARD, mavlink.battery(round(1000 * voltage))
         if row % ROWS == 0:
             yield us, STATION, mavlink.pose(us, tuple(truth[row][:3]), tuple(truth[row][3:]))
             for message in _estimated(us // 1000, goal[row], estimate[row]):

@@ -11,7 +11,7 @@ from typing import Any
 from firmware_py.firmware import DEADLINES_US, Firmware
 from firmware_py.logic.plugs import GROUP
 from firmware_py.signals import COUNTERS
-from firmware_py.wire.telemetry import BLOCKS
+from firmware_py.wire.telemetry import BLOCKS, SLOW_BLOCKS
 from ground_station.latency import STAGES
 from ground_station.program import Cockpit
 from ground_station.tracker import Tracker
@@ -232,6 +232,10 @@ def station_channels(
         told = (AGE_UNIT_US * age, count_poses(poses), count_rejected(rejected))
         return (*motion, *attitude, *flaps, *inputs, *told)
 
+    def slow() -> tuple[float, ...]:
+        samples = [ground.telemetry.get(block.id) for block in SLOW_BLOCKS]
+        return tuple(nan if sample is None else sample.values[0] for sample in samples)
+
     def counts() -> tuple[float, ...]:
         counters = ground.counters
         return (
@@ -283,6 +287,7 @@ def station_channels(
                 quantity("link", "latency", "us"),
             ),
         ),
+        Channel("float32", slow, (quantity("battery", "voltage", "V"), quantity("board", "load", "%"))),
         Channel("float32", air, (quantity("link", "quality", "%"), quantity("link", "rssi", "-dBm"))),
         Channel("float64", ground.budget.last, (quantity("age", " ".join(STAGES), "us"),)),
         *tracker,

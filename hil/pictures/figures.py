@@ -17,7 +17,7 @@ from ground_station.latency import STAGES, stages_told
 from hil.laboratory.metrics import BOX, free_flight
 from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
-from hil.pictures import curves, scene
+from hil.pictures import curves, monitor, scene
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import WIDTH
 from hil.pictures.panels import INK, Panel, Plot, Series, lanes, panel
@@ -144,8 +144,13 @@ def _up_and_down(
 
 
 def station(rows: pa.Table) -> Plot:
-    """What a real link and its ground station could not use, and the states."""
-    return Plot((panel(curves.STATION, rows, "not used"), _states(rows)))
+    """What a real link and its ground station could not use, battery and load where the board tells them, the states."""
+    told = [
+        panel(plot, rows, label, height=1.2)
+        for plot, label in ((monitor.BATTERY, "battery"), (monitor.LOAD, "processor"))
+        if plot.needs in rows.column_names and np.isfinite(plot.read(rows)).any()
+    ]
+    return Plot((panel(curves.STATION, rows, "not used"), *told, _states(rows)))
 
 
 def board(rows: pa.Table) -> Plot:
@@ -259,8 +264,8 @@ PICTURES = (
     ),
     Picture(
         "Station",
-        "Poses that were late or could not be used, telemetry that could not be read, since the start; states of the "
-        "supervisor and of the flight: free while the trajectory is judged.",
+        "Poses that were late or could not be used, telemetry that could not be read, since the start; the board's battery "
+        "and load, if it tells them; states of the supervisor and of the flight: free while the trajectory is judged.",
         station,
         needs="link.late",
     ),

@@ -33,6 +33,9 @@ AGE_STAGES = Curves(
 BATTERY = Curves(
     ("a cell",), (GREEN,), "V", lambda rows: column(rows, "battery.voltage")[:, None], needs="battery.voltage"
 )  # fmt: skip
+LOAD = Curves(
+    ("all tasks",), (BLUE,), "%", lambda rows: column(rows, "board.load")[:, None], needs="board.load"
+)  # fmt: skip
 AIR = Curves(
     ("link quality [%]", "RSSI [-dBm]"), (BLUE, ORANGE), "", lambda rows: column(rows, "link.quality", "link.rssi"),
     needs="link.rssi",

@@ -78,6 +78,7 @@ PLOTS: Mapping[str, Curves] = {
     "queue": curves.QUEUE,
 }
 PALE = "flaps/command"
+    "processor/all": monitor.LOAD,  # a real board's; a simulated one's is task by task
 LIMITS = {"position/limit": curves.NEAR_CM, "attitude/limit": curves.ATTITUDE_DEG}
 VIEWS = (  # title and origin of what is plotted; the first two stand alone, the rest are tabs
     ("Position error [cm]", "position"),

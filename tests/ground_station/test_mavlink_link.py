@@ -1,5 +1,6 @@
 """The ground station's MAVLink link without a line: what pymavlink's codec reads of it, and what it makes of pymavlink's."""
 
+import csv
 import hashlib
 import io
 from math import pi
@@ -22,6 +23,7 @@ from ground_station.links.mavlink_budget import TELEMETRY_HZ, link_budget
 from ground_station.links.mavlink_controls import REASON_US
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
+from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Goal, Hold
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
@@ -195,6 +197,34 @@ def test_the_station_logs_what_comes_in_pieces_of_any_size():
         station.on_packet(50_000, bytes((byte,)))
     assert station.counters.samples == 2 * len(ALL_BLOCKS)
     assert station.counters.malformed == 0
+
+
+def status(millivolts, per_mille):
+    return dialect.MAVLink_sys_status_message(0, 0, 0, per_mille, millivolts, -1, -1, 0, 0, 0, 0, 0, 0)
+
+
+def test_battery_and_load_stand_in_the_row_of_the_telemetry_before_them(tmp_path):
+    bench = LinkWithCodec()
+    assert bench.hear(0, status(3_900, 250)) == []  # there is no row yet
+    log = TelemetryLog(tmp_path / "telemetry.csv")
+    station = GroundStation(bench.link, Hold(HOME), log, StationConfig())
+    for message in (*telemetry(20), status(3_900, 250), *telemetry(40), status(0xFFFF, 500), *telemetry(60)):
+        station.on_packet(0, message.pack(bench.codec))
+    log.close()
+    with (tmp_path / "telemetry.csv").open(newline="") as file:
+        rows = [(row["pm.vbat [V]"], row["system.load [%]"]) for row in csv.DictReader(file)]
+    assert rows == [("3.9", "25"), ("nan", "50"), ("nan", "nan")]
+
+
+def test_a_status_does_not_put_off_that_missing_telemetry_is_asked_for():
+    bench = LinkWithCodec()
+    station = GroundStation(bench.link, Hold(HOME), None, StationConfig())
+    for message in telemetry(20):
+        station.on_packet(20_000, message.pack(bench.codec))
+    station.on_packet(400_000, status(3_900, 250).pack(bench.codec))
+    bench.sent.clear()
+    station.on_frame(MocapFrame(500_000, HOME.p_WG, UPRIGHT, True), 540_000)
+    assert [message.param1 for _, message in bench.of(COMMAND)] == [ARRAY]
 
 
 def test_others_are_not_listened_to():

@@ -146,10 +146,16 @@ def test_it_flies_reconnects_after_a_reboot_and_leaves_the_board_in_failsafe(tmp
     assert len(flown) > 100
     errors = [abs(float(row["stateEstimate.x [m]"])) for row in flown]
     assert max(errors) < 0.2
+    rare = ("excite.", "pm.", "system.")  # nothing is excited; battery and load come twice a second
     complete = [
-        row for row in flown if all(value != "nan" or key.startswith("excite.") for key, value in row.items())
-    ]  # nothing is excited
+        row for row in flown if all(value != "nan" or key.startswith(rare) for key, value in row.items())
+    ]
     assert len(complete) / len(flown) > 0.9
+    told = [(float(row["pm.vbat [V]"]), float(row["system.load [%]"])) for row in flown]
+    for values, low, high in zip(zip(*told, strict=True), (3.0, 1.0), (4.3, 60.0), strict=True):
+        known = [value for value in values if value == value]
+        assert len(known) > 0.5 * len(flown) / 25
+        assert low < min(known) <= max(known) < high
 
 
 def fly(folder: Path, *arguments: str) -> dict[str, object]:

@@ -318,6 +318,26 @@ def test_block_at_ten_milliseconds_comes_at_a_hundred_hertz(client: CrtpClient, 
     assert client.packets(LOG, 2) == []
 
 
+def test_the_load_that_is_logged_is_what_the_tasks_took_of_each_period(client: CrtpClient, logs) -> None:
+    assert client.create(7, logs["system.load"][::-1]) == 0
+    assert client.one(LOG, 1, bytes((3, 7, 50))) == bytes((3, 7, 0))
+    kernel, told, true = client.firmware.kernel, [], []
+
+    def busy_us() -> int:
+        return sum(kernel.run_time_us(task) for task in kernel.tasks if task.name != "IDLE")
+
+    client.run(-client.now_us % 500_000 + client.now_us)
+    for _ in range(4):
+        before_us = busy_us()
+        client.sent.clear()
+        client.run(client.now_us + 500_000)
+        true.append(100 * (busy_us() - before_us) / 500_000)
+        (row,) = client.packets(LOG, 2)
+        told.append(struct.unpack_from("<f", row, 4)[0])
+    assert told[1:] == pytest.approx(true[1:], rel=0.03)
+    assert 1.0 < min(told) <= max(told) < 50.0
+
+
 def test_newer_start_counts_in_milliseconds_and_period_zero_sends_once(client: CrtpClient, logs) -> None:
     assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
     assert client.one(LOG, 1, struct.pack("<BBH", 8, 1, 4)) == bytes((8, 1, 0))

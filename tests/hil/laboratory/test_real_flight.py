@@ -15,7 +15,7 @@ from pymavlink import mavutil
 
 import hil.pictures.report
 from firmware_py.wire.supervisor import State
-from firmware_py.wire.telemetry import BLOCKS
+from firmware_py.wire.telemetry import BATTERY, BLOCKS, Sample
 from ground_station.config import StationConfig
 from ground_station.latency import LinkLatency
 from ground_station.links.loopback import LoopbackLink
@@ -362,6 +362,26 @@ def test_a_full_disk_ends_the_record_and_not_the_flight(tmp_path: Path) -> None:
         assert 100 <= load_log(tmp_path / "run").num_rows < 500
     bench.result()
     assert read_result(tmp_path / "run").metrics["lost"] == 0.0
+
+
+def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run")
+    bench.plan.start(bench.now_us)
+    bench.fly(1.0)
+    bench.ground.telemetry[BATTERY.id] = Sample(BATTERY, 0, (3.9,))
+    bench.fly(1.0)
+    bench.result()
+    log = load_log(tmp_path / "run")
+    for name, unit in (("battery.voltage", b"V"), ("board.load", b"%")):
+        assert log.schema.field(name).metadata[b"unit"] == unit
+    voltages = log.column("battery.voltage").to_numpy()
+    assert np.isnan(voltages[:95]).all()
+    assert voltages[105:] == pytest.approx(3.9)
+    assert [panel.label for panel in figures.station(log).panels] == [
+        "not used [so far]",
+        "battery [V]",
+        "states",
+    ]
 
 
 def test_a_counter_of_sixteen_bits_goes_on_where_it_wraps() -> None:
