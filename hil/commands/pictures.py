@@ -4,21 +4,31 @@ from pathlib import Path
 
 import click
 
-from hil.commands.options import console, run_folder
+from hil.commands.options import console, run_folder, say
 from hil.errors import LabError
 
 
 @click.command()
 @run_folder
-def view(run: Path) -> None:
+@click.option(
+    "--at", "at_s", type=float, metavar="S", help="With the time at an instant, seconds from the release."
+)
+@click.option("--web", is_flag=True, help="In a browser; the links of the run's report lead there meanwhile.")
+def view(run: Path, at_s: float | None, web: bool) -> None:
     """Open RUN, a run folder, in the rerun viewer."""
-    from hil.live.window import show_file
+    from hil.live.recording import browse, show_at
+    from hil.live.window import show
     from hil.pictures.viewer import RECORDING, write_run_rrd
 
     path = run / RECORDING
     if not path.is_file():
         write_run_rrd(run)
-    show_file(path)
+    if web:
+        browse(run, at_s or 0.0, say)
+    elif at_s is not None:
+        show_at(run, at_s)
+    else:
+        show(str(path))
 
 
 @click.command()

@@ -11,7 +11,6 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import IO
 from urllib.parse import quote
 
@@ -58,18 +57,32 @@ def serve_web() -> "tuple[str, str, subprocess.Popen[bytes]]":
         ["--port", str(port), "--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", SERVER_MEMORY],
         port,
     )  # fmt: skip
-    return f"http://{LOOPBACK}:{web_port}/?url={quote(address, safe=':/')}", address, server
+    return page_of(web_port, address), address, server
 
 
-def show_file(path: Path) -> None:
-    """Show a recording until the window is closed. Raises `LabError` when no window opens."""
+def serve_viewer(address: str) -> "tuple[int, subprocess.Popen[bytes]]":
+    """Serve the viewer to browsers for what others serve at an address; return the page's port and the process to be ended.
+
+    Raises `LabError` when it does not come up.
+    """
+    web_port = free_port(WEB_PORT)
+    return web_port, _start(["--serve-web", "--web-viewer-port", str(web_port), address], web_port)
+
+
+def page_of(web_port: int, address: str) -> str:
+    """Return the page that shows what is at an address."""
+    return f"http://{LOOPBACK}:{web_port}/?url={quote(address, safe=':/')}"
+
+
+def show(what: str, *options: str) -> None:
+    """Show a recording, a file or an address, until the window is closed. Raises `LabError` when no window opens."""
     _require_display()
     with tempfile.TemporaryFile() as messages:
         code = subprocess.run(
-            [*COMMAND, str(path)], env=_environment(), stderr=messages, check=False
+            [*COMMAND, *options, what], env=_environment(), stderr=messages, check=False
         ).returncode
         if code > 0:
-            raise LabError(f"{path}: the viewer ended with code {code} ({_last_line(messages)})")
+            raise LabError(f"{what}: the viewer ended with code {code} ({_last_line(messages)})")
 
 
 def is_open(host: str, port: int) -> bool:

@@ -23,6 +23,7 @@ from hil.pictures.close_ups import close_ups
 from hil.pictures.curves import own_logic, with_marks
 from hil.pictures.figures import OWN_LOGIC, PICTURES, SCHEDULE, WAY
 from hil.pictures.gallery import pictures_of
+from hil.pictures.links import link_to
 from hil.pictures.pages import draw, write_page, zoomable
 from hil.pictures.panels import marks_of_flight
 from hil.pictures.story import story_of
@@ -86,6 +87,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         marked=marks.kinds,
         pictures=figures,
         close_ups=close,
+        link_to=link_to,
         zoomable=zoomable([*figures, *(one.figure for one in close)]),
         latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ from hil.world.geometry import weigh
 try:
     import rerun as rr
     import rerun.blueprint as rrb
+    from rerun_bindings import CatalogClientInternal
 except ImportError as error:
     raise LabError(f"the viewer needs rerun: {install_command('view')}") from error
 
@@ -558,6 +560,32 @@ def write_run_rrd(folder: Path) -> Path:
 
 class LivePicture:
     """A flight in a viewer that takes it at `address`, while it happens."""
+
+class Recording:
+    """The recording of a run folder, which viewers fetch from here, piece by piece, while this object lives."""
+
+    def __init__(self, folder: Path) -> None:
+        """Write it if it is not there. Raises `LabError` when there is no log."""
+        path = folder / RECORDING
+        if not path.is_file():
+            write_run_rrd(folder)
+        schema = load_log(folder).schema
+        self._timeline, _ = timeline_of(schema.metadata)
+        self._server = rr.server.Server(host="127.0.0.1", datasets={APPLICATION: [path]})
+        # rerun's own client wants a query engine, of which nothing is needed here
+        (inner,) = CatalogClientInternal(self._server.url()).datasets(False)
+        dataset = rr.catalog.DatasetEntry(inner)
+        with TemporaryDirectory() as kept:
+            layout = Path(kept) / "layout.rbl"
+            blueprint(schema).save(APPLICATION, layout)
+            dataset.register_blueprint(layout.as_uri())
+        (segment,) = dataset.segment_ids()
+        self._address = dataset.segment_url(segment)
+
+    def at(self, at_s: float) -> str:
+        """Return the address at which viewers find it, with the time at an instant, seconds from the release."""
+        return f"{self._address}#when={self._timeline}@{at_s:+.3f}s"
+
 
     def __init__(self, address: str) -> None:
         self._recording = rr.RecordingStream(APPLICATION)

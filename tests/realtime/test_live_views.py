@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import time
+import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,9 +13,14 @@ from pathlib import Path
 
 import pytest
 
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.faults import parse
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.run import Request, fly, prepare
 from hil.live.window import COMMAND, LOOPBACK, free_port, is_open
+from hil.pictures.report import write_report
 from support.foxglove_client import FoxgloveClient
+from support.html_page import Page
 from support.serving import Served, serve, started
 from support.serving import free_port as free_udp_port
 
@@ -33,6 +39,19 @@ def page_of(lab: Served) -> str:
     assert address.startswith(f"http://{LOOPBACK}:")
     assert b"rerun" in urllib.request.urlopen(address, timeout=20).read().lower()
     return address
+
+
+def test_the_links_of_a_report_lead_into_the_recording(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    prepare(folder)
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0, faults=[parse("push.y@0.3=1")]), folder)
+    (link,) = Page(write_report(folder).read_text(encoding="utf-8")).links
+    with started("view", folder, "--web") as viewer:
+        page_of(viewer)
+        with urllib.request.urlopen(link, timeout=20) as page:
+            assert b"rerun" in page.read().lower()
+            assert urllib.parse.unquote(page.url).endswith("#when=from_release@+0.300s")
+        assert viewer.interrupt() == 0
 
 
 def wait_for_begin(folder: Path) -> None:

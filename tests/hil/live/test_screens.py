@@ -9,7 +9,7 @@ from hil.errors import LabError
 from hil.live import window
 from hil.live.feed import open_view
 from hil.live.rerun_screen import RerunScreen
-from hil.live.window import DISPLAYS, LOOPBACK, free_port, open_window, show_file
+from hil.live.window import DISPLAYS, LOOPBACK, free_port, open_window, show
 
 
 @pytest.mark.parametrize("target", ["wbe", "connect:here", "connect:127.0.0.1:0", "connect:127.0.0.1:99999"])
@@ -31,11 +31,11 @@ def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp
     monkeypatch.setattr(window, "PORT", free_port(0))
     for name in DISPLAYS:
         monkeypatch.delenv(name, raising=False)
-    for show in (open_window, lambda: show_file(tmp_path / "flight.rrd")):
+    for opens in (open_window, lambda: show(str(tmp_path / "flight.rrd"))):
         with pytest.raises(
             LabError, match=r"^the viewer needs a display, and this computer has none; --view web"
         ):
-            show()
+            opens()
 
 
 def test_a_port_that_is_taken_gives_way_to_one_that_is_free() -> None:

@@ -29,6 +29,7 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import load_schedule
 from hil.pictures import curves
 from hil.pictures.figures import PICTURES, way
+from hil.pictures.links import link_to
 from hil.pictures.pages import library, thinned
 from hil.pictures.report import metric_rows, write_report
 from hil.pictures.story import story_of
@@ -45,7 +46,7 @@ def report(folder: Path) -> Page:
     assert len(page.pictures) + len(page.plots) - len(close_ups) == len(drawn) + len(others)
     assert page.places == list(page.plots)
     assert all(picture.startswith(b"\x89PNG\r\n\x1a\n") for picture in page.pictures)
-    assert page.links == []
+    assert len(page.links) == len(close_ups), "into the recording, and nowhere else"
     assert (folder / "report.html").stat().st_size < 1_000_000
     return page
 
@@ -266,6 +267,9 @@ def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_sh
         "close-up-2": [exact(0.5), exact(2.99)],
         "close-up-3": [exact(-1.01), exact(2.49)],
     }
+    flown = read_result(folder)
+    assert page.links == [link_to(flown, at_s) for at_s in (0.3, 1.0, 1.99)]
+    assert page.links[0].endswith(f":9877/{flown.hash[:16]}/0.30")
     position = lines_of(page.plots["close-up-1"]["panels"][0])
     assert position["y"][0][[0, -1]] == pytest.approx([-0.2, 1.4], abs=0.01)
     shown = page.plots["errors"]["panels"][0]

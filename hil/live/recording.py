@@ -1,0 +1,85 @@
+"""The recording of a run in rerun's viewer at an instant: in its window, or in a browser, by links of the report, too."""
+
+import re
+import signal
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+from hil.errors import LabError
+from hil.laboratory.result import read_result
+from hil.live.window import end, page_of, serve_viewer, show
+from hil.pictures.links import HOST, PORT, key_of
+from hil.pictures.report import REPORT
+from hil.pictures.viewer import Recording
+
+ROUTE = re.compile(r"/(\w+)/(-?\d+(?:\.\d+)?)")
+
+
+def show_at(run: Path, at_s: float) -> None:
+    """Show the recording of a run folder until the window is closed. Raises `LabError` when no window opens."""
+    recording = Recording(run)  # it has to live as long as the window
+    show(recording.at(at_s), "--new")
+
+
+def browse(run: Path, at_s: float, say: Callable[[str], None]) -> None:
+    """Serve the recording of a run folder to browsers, and the links of its report, until Ctrl-C.
+
+    Raises `LabError` when the links' port is taken, or no viewer comes up.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the viewer ends with this process
+    recording = Recording(run)
+    with Links(run, lambda instant_s: page_of(web_port, recording.at(instant_s))) as links:
+        web_port, viewer = serve_viewer(recording.at(at_s))
+        try:
+            say(f"view    {page_of(web_port, recording.at(at_s))}")
+            say(
+                f"report  http://{HOST}:{PORT}/{REPORT}, whose links lead here, as those of the file do, until Ctrl-C"
+            )
+            links.serve_forever()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            end(viewer)
+
+
+class Links(HTTPServer):
+    """Leads from the links of one report to the pages that `page_at` returns for an instant [s]."""
+
+    def __init__(self, run: Path, page_at: Callable[[float], str], port: int = PORT) -> None:
+        self.run, self.page_at = run, page_at
+        self.key = key_of(read_result(run))
+        try:
+            super().__init__((HOST, port), _Visit)
+        except OSError as error:
+            raise LabError(
+                f"{run}: the links of reports lead to port {port}, which is taken ({error.strerror}): "
+                "another floaty view --web?"
+            ) from None
+
+
+class _Visit(BaseHTTPRequestHandler):
+    server: Links
+
+    def do_GET(self) -> None:
+        """Answer one link."""
+        found, report = ROUTE.fullmatch(self.path), self.server.run / REPORT
+        if found is not None and found[1] == self.server.key:
+            self.send_response(HTTPStatus.FOUND)
+            self.send_header("Location", self.server.page_at(float(found[2])))
+            self.end_headers()
+        elif self.path == f"/{REPORT}" and report.is_file():
+            self._tell(HTTPStatus.OK, "text/html", report.read_bytes())
+        else:
+            text = f"Here is {self.server.run}; for another flight: floaty view RUN --web with its folder.\n"
+            self._tell(HTTPStatus.NOT_FOUND, "text/plain", text.encode())
+
+    def _tell(self, status: HTTPStatus, kind: str, content: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", f"{kind}; charset=utf-8")
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        """Nothing: who looks need not be told that he looks."""

@@ -1,0 +1,19 @@
+"""Links from a report into the recording of its flight.
+
+A page that is opened from disk can start no viewer, and in a browser rerun's viewer takes recordings from a server only. So
+the links lead to this computer, where `floaty view RUN --web` answers them, for the run that they belong to.
+"""
+
+from hil.laboratory.result import Result
+
+HOST, PORT = "127.0.0.1", 9877  # beside rerun's own 9876
+
+
+def key_of(result: Result) -> str:
+    """Return what tells the links of one flight from those of others."""
+    return (result.hash or "unfinished")[:16]
+
+
+def link_to(result: Result, at_s: float) -> str:
+    """Return the address of an instant, seconds from the release, of a flight."""
+    return f"http://{HOST}:{PORT}/{key_of(result)}/{at_s:.2f}"

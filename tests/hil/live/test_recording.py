@@ -1,0 +1,77 @@
+"""Links of a report into the recording: each leads to its instant in the viewer's own words, others nowhere."""
+
+import http.client
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.result import read_result
+from hil.laboratory.run import Request, fly, prepare
+from hil.live.recording import Links
+from hil.live.window import free_port
+from hil.pictures.links import HOST, link_to
+from hil.pictures.viewer import Recording
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recording") / "run"
+    prepare(folder)
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), folder)
+    return folder
+
+
+@pytest.fixture
+def links(run: Path) -> Iterator[Links]:
+    with Links(run, lambda at_s: f"http://viewer/{at_s:g}", free_port(0)) as served:
+        thread = threading.Thread(target=served.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield served
+        served.shutdown()
+        thread.join()
+
+
+def answer(links: Links, path: str) -> tuple[int, str | None, str]:
+    """Status, where it leads, and what it says."""
+    connection = http.client.HTTPConnection(HOST, links.server_port, timeout=10)
+    connection.request("GET", path)
+    response = connection.getresponse()
+    told = response.status, response.headers["Location"], response.read().decode()
+    connection.close()
+    return told
+
+
+@pytest.mark.parametrize("at_s", [0.0, 12.25, -0.5])
+def test_a_link_leads_to_its_instant(links: Links, run: Path, at_s: float) -> None:
+    _, _, path = link_to(read_result(run), at_s).split("/", 3)[1:]
+    assert answer(links, f"/{path}")[:2] == (302, f"http://viewer/{at_s:g}")
+
+
+@pytest.mark.parametrize("path", ["/", "/0123456789abcdef/1.00", "/../result.json", "/log.parquet"])
+def test_what_is_no_link_of_this_flight_leads_nowhere(links: Links, run: Path, path: str) -> None:
+    status, where, text = answer(links, path)
+    assert (status, where) == (404, None)
+    assert text.startswith(f"Here is {run}; for another flight: floaty view RUN --web")
+
+
+def test_the_report_is_there_too(links: Links, run: Path) -> None:
+    (run / "report.html").write_text("what was flown")
+    assert answer(links, "/report.html") == (200, None, "what was flown")
+
+
+def test_a_port_that_is_taken_is_one_line(links: Links, run: Path) -> None:
+    with pytest.raises(LabError, match=f"port {links.server_port}, which is taken"):
+        Links(run, str, links.server_port)
+
+
+def test_a_recording_is_served_with_the_time_at_an_instant(run: Path) -> None:
+    recording = Recording(run)
+    assert (run / "flight.rrd").is_file()
+    at = recording.at(0.25)
+    assert at.startswith("rerun+http://127.0.0.1:")
+    assert at.endswith("#when=from_release@+0.250s")
+    assert recording.at(-0.5) == at.replace("+0.250", "-0.500")
