@@ -21,6 +21,7 @@ from hil.laboratory.metrics import column
 STATION_CLOCK = (
     "station.clock"  # column of the log: the clock of the computer, by which a station stamps its record
 )
+STATION_START = b"station_start_us"  # in the metadata of a real flight's log: that clock when its time began
 
 EXPOSED = "cameras.exposed"  # column: when the row's pose was true, by the time of the log [us]
 GAP_US = 100_000  # between two exposures, beyond which nobody knows where the robot was
@@ -51,9 +52,17 @@ def told(folder: Path) -> pa.Table:
 
 
 def told_in_time_of(log: pa.Table, folder: Path) -> pa.Table:
-    """What `told` says, with `t` [us] in the log's time instead of the station's, and the log's metadata."""
-    table = told(folder)
-    if STATION_CLOCK in log.column_names:
+    """What `told` says, with `t` [us] in the log's time instead of the station's, and the log's metadata.
+
+    Nothing for a real flight whose log does not know when it began by the station's clock, as those of before did not.
+    """
+    table, metadata = told(folder), log.schema.metadata or {}
+    if STATION_START in metadata:
+        start_us = int(metadata[STATION_START])
+        table = table.set_column(0, "t", pa.array(column(table, "t") - start_us))
+    elif "cameras.x" in log.column_names:
+        table = table.slice(0, 0)
+    elif STATION_CLOCK in log.column_names:
         times_us = np.interp(column(table, "t"), column(log, STATION_CLOCK), column(log, "t"))
         table = table.set_column(0, "t", pa.array(times_us))
     return table.replace_schema_metadata(log.schema.metadata)

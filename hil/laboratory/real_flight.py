@@ -21,7 +21,7 @@ from ground_station.program import Cockpit
 from ground_station.telemetry_log import TELEMETRY
 from hil.config import LabConfig
 from hil.errors import LabError, writing
-from hil.laboratory.ages import ages_of, told
+from hil.laboratory.ages import STATION_START, ages_of, told
 from hil.laboratory.channels import station_channels
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import RECORD_PERIOD_US
@@ -101,7 +101,11 @@ class RealFlight:
         self._write(lambda recorder: recorder.row(now_us - self._start_us))
 
     def _begin(self, cockpit: Cockpit) -> None:
-        metadata = {**self._origin.metadata(), "config": self._config.model_dump_json()}
+        metadata = {
+            **self._origin.metadata(),
+            "config": self._config.model_dump_json(),
+            STATION_START.decode(): str(self._start_us),
+        }
         channels = station_channels(
             cockpit, lambda: self._is_free, lambda: cockpit.plan.at(self._now_us), self._start_us
         )

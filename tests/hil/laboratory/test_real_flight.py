@@ -29,6 +29,7 @@ from hil.experiments import EXPERIMENTS
 from hil.exports.mcap import write_mcap
 from hil.exports.tlog import write_tlog
 from hil.exports.wide_csv import write_csv
+from hil.laboratory.ages import told, told_in_time_of
 from hil.laboratory.channels import Unwrapped
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import body, free_flight, known, measure
@@ -362,6 +363,24 @@ def test_a_full_disk_ends_the_record_and_not_the_flight(tmp_path: Path) -> None:
         assert 100 <= load_log(tmp_path / "run").num_rows < 500
     bench.result()
     assert read_result(tmp_path / "run").metrics["lost"] == 0.0
+
+
+def test_what_the_station_recorded_stands_in_the_time_of_the_log(
+    both: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """A computer's clock has run for days when a flight begins, here for 7 s."""
+    bench = Bench(tmp_path / "run")
+    shutil.copy(both[0] / "telemetry.csv", tmp_path / "run")
+    bench.fly(1.0)
+    bench.result()
+    log = load_log(tmp_path / "run")
+    ages, by_the_station = told_in_time_of(log, tmp_path / "run"), told(tmp_path / "run")
+    assert ages.num_rows > 100
+    assert ages.column("t").to_pylist() == [
+        t_us - 7_000_000 for t_us in by_the_station.column("t").to_pylist()
+    ]
+    old = log.replace_schema_metadata({})
+    assert told_in_time_of(old, tmp_path / "run").num_rows == 0
 
 
 def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_path: Path) -> None:
