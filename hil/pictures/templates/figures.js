@@ -4,7 +4,7 @@
   const told = JSON.parse(document.getElementById("figures").textContent);
   const SHADES = { held: "#8888882e", fault: "#d55e002e", failsafe: "#cc79a74d", "flap limit": "#b8a900" };
   const MARKS = { operator: "#0072b2", lost: "#000000" };
-  const AXIS_PX = 68, INCH_PX = 88, STRIP_PX = 4, RIGHT_PX = 10, TEXT = "11px system-ui, sans-serif";
+  const AXIS_PX = 76, INCH_PX = 88, STRIP_PX = 4, RIGHT_PX = 10, TEXT = "11px system-ui, sans-serif";
   const PRINTED_PX = 690; // what fits beside the margins of a page of A4
   const charts = [];
   let moving = false;
@@ -95,6 +95,10 @@
         .concat(marks.instants.map((instant) => [instant.t_s, instant.text, MARKS[instant.kind]]))
         .sort((a, b) => a[0] - b[0]);
       ctx.font = TEXT.replace(/^\d+/, (px) => px * scale);
+      ctx.setLineDash([]);
+      ctx.strokeStyle = "#ffffffc0"; // a rim, for what lies behind may have any colour
+      ctx.lineWidth = 3 * scale;
+      ctx.lineJoin = "round";
       for (const [t_s, text, colour] of texts) {
         const at = u.valToPos(t_s, "x", true), width = ctx.measureText(text).width;
         if (at < bbox.left - 1 || at > bbox.left + bbox.width) continue;
@@ -102,8 +106,10 @@
         let row = rows.findIndex((end) => end < x);
         if (row < 0) row = rows.length;
         rows[row] = x + width + 6 * scale;
+        const y = bbox.top + (12 + 13 * row) * scale;
+        ctx.strokeText(text, x, y);
         ctx.fillStyle = colour;
-        ctx.fillText(text, x, bbox.top + (12 + 13 * row) * scale);
+        ctx.fillText(text, x, y);
       }
     }
   }
