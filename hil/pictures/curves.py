@@ -157,6 +157,13 @@ SUPERVISOR = States(
     (ORANGE, SKY, GREEN, RED, GREY),
 )  # firmware_py.wire.supervisor.State, and that of a board that has not told it
 RELEASE = States("flight.free", ("held", "free"), (GREY, BLUE))
+JUDGED = States("flight.free", ("not judged", "judged"), (GREY, BLUE))  # of a real flight
+
+
+def lanes_of(names: Iterable[str]) -> dict[str, States]:
+    """Return the states that are shown of a flight whose log has columns of these names."""
+    free = {"flight": JUDGED} if "cameras.x" in names else {"robot": RELEASE}
+    return {"supervisor": SUPERVISOR, **free}
 
 
 def processor(names: Iterable[str]) -> Curves:

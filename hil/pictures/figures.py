@@ -169,10 +169,10 @@ def board(rows: pa.Table) -> Plot:
 
 
 def _states(rows: pa.Table) -> Panel:
-    """The states of supervisor and robot as bars."""
+    """The states of supervisor and robot, or real flight, as bars."""
     release_us, end_s = release_of(rows.schema.metadata), since_release(rows)[-1:]
     told = []
-    for lane, states in (("robot", curves.RELEASE), ("supervisor", curves.SUPERVISOR)):
+    for lane, states in reversed(curves.lanes_of(rows.column_names).items()):
         begins, names = curves.changes(rows, states)
         colours = dict(zip(states.names, states.colours, strict=True))
         told.append((lane, 1e-6 * (begins - release_us), names, colours))
@@ -265,7 +265,7 @@ PICTURES = (
     Picture(
         "Station",
         "Poses that were late or could not be used, telemetry that could not be read, since the start; the board's battery "
-        "and load, if it tells them; states of the supervisor and of the flight: free while the trajectory is judged.",
+        "and load, if it tells them; states of the supervisor and of the flight.",
         station,
         needs="link.late",
     ),

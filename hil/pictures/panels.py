@@ -117,7 +117,7 @@ def marks_of_flight(log: pa.Table, lost: str | None = None) -> Marks:
     times = since_release(log)
     if len(times) == 0:
         return Marks()
-    held = times[column(log, "flight.free") < 0.5]
+    held = times[(column(log, "flight.free") < 0.5) & (times < 0.0)]
     spells = [Spell("held", held[0], held[-1])] if len(held) > 1 else []
     release_us = release_of(log.schema.metadata)
     for span in spans_of(log.schema.metadata):

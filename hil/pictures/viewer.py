@@ -29,7 +29,7 @@ from hil.laboratory.metrics import BOX, body, column, is_real
 from hil.laboratory.recorder import OPERATOR, RELEASE_US, load_events, load_log, release_of
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures import curves, monitor, scene
-from hil.pictures.curves import Curves, States
+from hil.pictures.curves import Curves
 from hil.pictures.monitor import MARK_COLOURS, RATES, REFUSALS, Rates
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
 from hil.world.geometry import weigh
@@ -78,10 +78,12 @@ PLOTS: Mapping[str, Curves] = {
     "link/air": monitor.AIR,
     "battery": monitor.BATTERY,
     "queue": curves.QUEUE,
+    "processor/all": monitor.LOAD,  # a real board's; a simulated one's is task by task
 }
 PALE = "flaps/command"
-    "processor/all": monitor.LOAD,  # a real board's; a simulated one's is task by task
-LIMITS = {"position/limit": curves.NEAR_CM, "attitude/limit": curves.ATTITUDE_DEG}
+LIMITS = {  # they also keep the axes' ticks apart
+    "position/limit": curves.NEAR_CM, "position/box": 100 * BOX, "attitude/limit": curves.ATTITUDE_DEG,
+}  # fmt: skip
 VIEWS = (  # title and origin of what is plotted; the first two stand alone, the rest are tabs
     ("Position error [cm]", "position"),
     ("Attitude error [deg]", "attitude"),
@@ -97,7 +99,6 @@ VIEWS = (  # title and origin of what is plotted; the first two stand alone, the
     ("Processor [%]", "processor"),
 )
 STRETCHES_SHOWN = 2000  # of the schedule; the whole of it is for Perfetto
-STATES: Mapping[str, States] = {"supervisor": curves.SUPERVISOR, "robot": curves.RELEASE}
 FAULT = re.compile(r"fault (\S+) (begins|ends)")  # texts of the laboratory
 LEGEND = """
 | drawn | what |
@@ -140,6 +141,7 @@ class Stage:
         self._flap_axes = scene.flap_axes(self._geometry)
         self._plots = {path: plot for path, plot in PLOTS.items() if plot.needs in schema.names}
         self._rates = {path: rate for path, rate in RATES.items() if set(rate.columns) <= set(schema.names)}
+        self._states = curves.lanes_of(schema.names)
         self._processor = curves.processor(schema.names)
         self._refusals = {
             name: columns for name, columns in REFUSALS.items() if set(columns) & set(schema.names)
@@ -181,7 +183,7 @@ class Stage:
             values = plot.read(since_fusion)[-rows.num_rows :]
             self._send(f"plot/{path}", column(rows, "t"), rr.Scalars.columns(scalars=values))
         self._add_slow(past, np.arange(before + -self._count % SLOW, past.num_rows, SLOW))
-        for path, states in STATES.items():
+        for path, states in self._states.items():
             begins, names = curves.changes(joined, states)
             self._send(f"state/{path}", begins[fresh:], rr.StateChange.columns(state=names[fresh:]))
         for name, columns in self._refusals.items():
@@ -436,14 +438,15 @@ class Stage:
         if self._processor.names:
             self._name_curve("processor", self._processor)
         for path in LIMITS:
+            name = path.rpartition("/")[2]
             limit = rr.SeriesLines(
-                names=["limit", "limit"], colors=_rgba_array([curves.GREY] * 2), widths=[1.0] * 2
+                names=[name, name], colors=_rgba_array([curves.GREY] * 2), widths=[1.0] * 2
             )
             self._recording.log(f"plot/{path}", limit, static=True)
         for name, colour in MARK_COLOURS.items():
             points = rr.SeriesPoints(names=name, colors=_rgba(colour), markers="diamond", marker_sizes=5.0)
             self._recording.log(f"plot/position/marks/{name.replace(' ', '_')}", points, static=True)
-        for path, states in STATES.items():
+        for path, states in self._states.items():
             lanes = rr.StateConfiguration(values=states.names, colors=_rgba_array(states.colours))
             self._recording.log(f"state/{path}", lanes, static=True)
         none = rr.StateConfiguration(values=["-"], colors=_rgba_array([curves.GREY]))
@@ -558,9 +561,6 @@ def write_run_rrd(folder: Path) -> Path:
     return path
 
 
-class LivePicture:
-    """A flight in a viewer that takes it at `address`, while it happens."""
-
 class Recording:
     """The recording of a run folder, which viewers fetch from here, piece by piece, while this object lives."""
 
@@ -586,6 +586,9 @@ class Recording:
         """Return the address at which viewers find it, with the time at an instant, seconds from the release."""
         return f"{self._address}#when={self._timeline}@{at_s:+.3f}s"
 
+
+class LivePicture:
+    """A flight in a viewer that takes it at `address`, while it happens."""
 
     def __init__(self, address: str) -> None:
         self._recording = rr.RecordingStream(APPLICATION)

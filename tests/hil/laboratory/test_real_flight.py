@@ -260,7 +260,16 @@ def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(
     assert result.outcome == "completed"
     assert result.metrics["flown"] == pytest.approx(EXPERIMENTS["yaw-step"].duration_s, abs=0.03)
     assert result.metrics["max_x"] == pytest.approx(0.0, abs=1e-9)
-    assert load_log(tmp_path / "run").num_rows == pytest.approx(805, abs=2)
+    log = load_log(tmp_path / "run")
+    assert log.num_rows == pytest.approx(805, abs=2)
+    (held,) = marks_of_flight(log).spells
+    assert (held.kind, held.begin_s, held.end_s) == (
+        "held",
+        pytest.approx(-1.0, abs=0.05),
+        pytest.approx(0.0, abs=0.05),
+    )
+    bars = [bar.name for bar in figures.station(log).panels[-1].bars if bar.lane == "flight"]
+    assert bars == ["not judged", "judged", "not judged"]
 
 
 def test_a_comparison_shows_what_was_judged_and_a_second_around_it(tmp_path: Path) -> None:
