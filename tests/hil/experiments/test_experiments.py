@@ -17,7 +17,7 @@ from scipy.signal import TransferFunction, lsim, step
 from hil.config import load_config, profile_names
 from hil.experiments import EXPERIMENTS
 from hil.experiments.airspeed import LIFT_PER_RAD, attainable, hover_angle
-from hil.experiments.measures import recoveries, response, steps
+from hil.experiments.measures import recoveries, response, steps, y_steps
 from hil.experiments.pushes import FAULTS, PUSHES
 from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import METRICS
@@ -73,6 +73,21 @@ def test_a_step_that_does_not_stay_settled_is_not_settled() -> None:
     value[-1] = 0.9
     ((_, settle, _),) = steps(times, value, goal)
     assert math.isnan(settle)
+
+
+@pytest.mark.parametrize(("early_s", "rise_s"), [(0.04, 0.5), (0.49, 0.5), (1.2, np.nan)])
+def test_a_jump_just_before_the_end_is_not_judged(early_s: float, rise_s: float) -> None:
+    """Over a real link the goal may begin to move some ten milliseconds before the flight's time runs."""
+    times = np.arange(0.0, 21.0, 0.01)
+    goal = np.where(times + early_s >= 1.0, np.where((times + early_s - 1.0) // 5 % 2 == 0, 0.1, -0.1), 0.0)
+    y = np.concatenate([np.zeros(50), goal[:-50]])  # half a second late
+    y[times >= 20.3] = y[times < 20.3][-1]  # and nobody follows the last jump
+    table = pyarrow.table({"t": 1e6 * times, "truth.y": y, "goal.y": goal})
+    found = y_steps(table)
+    assert found["rise"] == pytest.approx(rise_s, abs=0.011, nan_ok=True)
+    if early_s < 0.5:
+        assert found["overshoot"] == 0.0
+        assert found["hold_rms"] < 1e-9
 
 
 def test_gain_and_lag_are_those_of_a_first_order_lag() -> None:
