@@ -46,7 +46,7 @@ def list_experiments(file: Path | None, faults: bool) -> None:
     for one in STUDIES.values():
         console.print(f"{one.name:{width}}  {one.question}", soft_wrap=True)
     names = (f"{name} (default)" if name == DEFAULT_PROFILE else name for name in profile_names())
-    console.print(f"\nprofiles: {', '.join(names)}")
+    console.print(f"\nprofiles: {', '.join(names)}", soft_wrap=True)
     console.print("faults: floaty list --faults")
 
 

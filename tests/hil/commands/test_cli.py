@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -99,7 +98,7 @@ def test_list_names_experiments_and_profiles(
     shown = capsys.readouterr().out
     assert shown.startswith("hover  ")
     assert {"as-flown", "design-best", "floaty (default)", "lqr"} <= set(
-        re.split(r",\s+", shown.partition("profiles: ")[2].partition("\n\n")[0])
+        shown.partition("profiles: ")[2].partition("\n")[0].split(", ")
     )
 
 
