@@ -18,6 +18,7 @@ from cflib.utils.power_switch import PowerSwitch
 
 from hil.servers.dongle_plugin import VARIABLE, Backend
 from support.serving import CAMERAS, Served, serve
+from support.telemetry_rows import is_whole
 
 FLOATY = (sys.executable, "-m", "hil.commands")
 URI = "radio://0/80/2M/E7E7E7E7E7"
@@ -146,10 +147,7 @@ def test_it_flies_reconnects_after_a_reboot_and_leaves_the_board_in_failsafe(tmp
     assert len(flown) > 100
     errors = [abs(float(row["stateEstimate.x [m]"])) for row in flown]
     assert max(errors) < 0.2
-    rare = ("excite.", "pm.", "system.")  # nothing is excited; battery and load come twice a second
-    complete = [
-        row for row in flown if all(value != "nan" or key.startswith(rare) for key, value in row.items())
-    ]
+    complete = [row for row in flown if is_whole(row)]
     assert len(complete) / len(flown) > 0.9
     told = [(float(row["pm.vbat [V]"]), float(row["system.load [%]"])) for row in flown]
     for values, low, high in zip(zip(*told, strict=True), (3.0, 1.0), (4.3, 60.0), strict=True):
