@@ -109,6 +109,11 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
         raise LabError(f"{kind} {path}: not TOML: {error}") from None
 
 
+def base_name(profile: str) -> str:
+    """Return what a profile is called as the base of another one, wherever that stands."""
+    return Path(profile).resolve().as_posix() if profile.endswith(".toml") else profile
+
+
 def _read_profile(profile: str, children: tuple[Path, ...]) -> dict[str, Any]:
     path = _find_profile(profile, children)
     tree = read_toml("profile", path)

@@ -13,13 +13,12 @@ from rich.console import Console
 
 from hil.experiments import find_experiment
 from hil.identify.identify import Constant, identify
-from hil.identify.record import load_record
+from hil.identify.record import KEPT, load_record
 from hil.laboratory.run import Request
 from hil.studies.sweep import Job, fly_all
+from hil.studies.tuning import EXCITATIONS
 from hil.world.paper_table import PAPER_TABLE
 
-EXPERIMENTS = tuple(f"identify-u{number}" for number in range(1, 5))
-KEPT = ("log.parquet", "telemetry.csv", "events.jsonl", "result.json")
 FIRST_SEED = 301  # nothing was tuned on these
 # physics.md section 8: with these the robot flies whose rates are damped by its plates alone.
 OPEN = (
@@ -53,12 +52,12 @@ def main(count: int, folder: Path) -> None:
     jobs = [
         Job(Request.of(find_experiment(name), overrides=settings, seed=4 * number + place), folder / f"{robot}-{name}", KEPT)
         for number, (robot, settings) in enumerate(robots.items(), 1)
-        for place, name in enumerate(EXPERIMENTS)
+        for place, name in enumerate(EXCITATIONS)
     ]  # fmt: skip
     fly_all(jobs, Console(stderr=True))
     found: dict[str, list[Constant]] = {}
     for robot in robots:
-        flights = [load_record(folder / f"{robot}-{name}", "floaty") for name in EXPERIMENTS]
+        flights = [load_record(folder / f"{robot}-{name}", "floaty") for name in EXCITATIONS]
         for constant in identify(flights).constants:
             if np.isfinite(constant.truth):
                 found.setdefault(constant.name, []).append(constant)

@@ -7,12 +7,13 @@ import sys
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm, solve_discrete_are
+from scipy.linalg import solve_discrete_are
 
 from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.core.model import derivative
 from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, STATES, VELOCITY
 from hil.config import load_config
+from hil.design.loop import held
 from hil.world.body import MIX
 
 STEP_S = 0.01
@@ -43,8 +44,7 @@ def model(config: FirmwareConfig) -> tuple[Matrix, Matrix]:
         A[:, state] = dx
     B = np.zeros((STATES, 4))
     B[FLAP:] = config.model.flap_rate * MIX
-    both = expm(STEP_S * np.block([[A, B], [np.zeros((4, STATES + 4))]]))
-    return both[:STATES, :STATES], both[:STATES, STATES:]
+    return held(A, B, STEP_S)
 
 
 def regulator(config: FirmwareConfig) -> Matrix:

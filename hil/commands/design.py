@@ -6,9 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 
-from hil.commands.options import announce_compilation, console, profile_option, seed_option, set_option
+from hil.commands.options import (
+    announce_compilation,
+    console,
+    profile_option,
+    seed_option,
+    set_option,
+    wide_console,
+)
 from hil.errors import LabError, writing
 
 if TYPE_CHECKING:
@@ -197,7 +203,7 @@ def show(found: "Analysis") -> None:
     table = Table("input", "alone, inside the flaps' range", "linear, both ways about the hover")
     for row in found.inputs:
         table.add_row(*row)
-    wide = Console(highlight=False, width=max(console.width, 150))
+    wide = wide_console()
     wide.print(table)
     show_claims(found)
 
@@ -210,4 +216,4 @@ def show_claims(found: "Analysis") -> None:
     for claim in found.claims:
         colour = "green" if claim.verdict == "agrees" else "red"
         table.add_row(claim.title, claim.paper, claim.ours, f"[{colour}]{claim.verdict}[/{colour}]")
-    Console(highlight=False, width=max(console.width, 150)).print(table)
+    wide_console().print(table)

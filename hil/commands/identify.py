@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hil.commands.options import announce_compilation, console, notices, profile_option, seed_option
+from hil.commands.options import (
+    announce_compilation,
+    console,
+    notices,
+    profile_option,
+    seed_option,
+    wide_console,
+)
 from hil.errors import LabError, writing
 
 if TYPE_CHECKING:
@@ -68,7 +75,6 @@ def identify(
 
 
 def _print_constants(found: "Identification") -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title="constants, with the half width of their 95 % interval")
@@ -88,7 +94,7 @@ def _print_constants(found: "Identification") -> None:
             one.name, _pair(one.paper), _number(one.truth), _pair(one.two_controllers), _pair(one.instrumental),
             _pair(one.joint), one.unit, _verdict(one),
         )  # fmt: skip
-    Console(highlight=False, width=max(console.width, 150)).print(table)
+    wide_console().print(table)
     if found.excited:
         periods = ", ".join(f"u{one.axis.input + 1}: {one.spectra.periods}" for one in found.excited)
         console.print(
@@ -170,13 +176,12 @@ def tune(
 
 def _print_round(one: "Round") -> None:
     """Print a round: gains, margins, predicted and flown motion."""
-    from rich.console import Console
     from rich.table import Table
 
     from hil.studies.tuning import rms
 
     tuned = one.tuned
-    wide = Console(highlight=False, width=max(console.width, 150))
+    wide = wide_console()
     gains = Table(
         "axis",
         "gains, old",

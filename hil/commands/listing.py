@@ -4,9 +4,8 @@ import math
 from pathlib import Path
 
 import click
-from rich.console import Console
 
-from hil.commands.options import console
+from hil.commands.options import console, wide_console
 from hil.errors import LabError
 
 
@@ -65,4 +64,4 @@ def _list_faults() -> None:
         lasts = f"{kind.duration_s:g} s" if math.isfinite(kind.duration_s) else "to the end"
         only = f" ({kind.needs})" if kind.needs else ""
         table.add_row(name, size, bounds, lasts, kind.outcome, f"{kind.meaning}{only}")
-    Console(highlight=False, width=max(console.width, 150)).print(table)
+    wide_console().print(table)

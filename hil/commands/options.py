@@ -24,6 +24,12 @@ INTERRUPTED = 130
 console = Console(highlight=False)
 notices = Console(stderr=True, highlight=False)
 
+
+def wide_console(width: int = 150) -> Console:
+    """Return the console for a table that needs a width, however narrow the terminal is."""
+    return Console(highlight=False, width=max(console.width, width))
+
+
 run_folder = click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Of everything random."

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
 
 from hil.commands.design import show_claims
 from hil.commands.options import (
@@ -18,6 +17,7 @@ from hil.commands.options import (
     profile_option,
     seed_option,
     set_option,
+    wide_console,
 )  # fmt: skip
 from hil.errors import writing
 
@@ -125,7 +125,7 @@ def _print_rows(flown: "Paper") -> None:
             f"{one.passed} of {len(one.results)}{'' if one.holds else _marked(' FAILS')}" for one in both
         )
         table.add_row("", "limits held", "", *verdicts)
-    Console(highlight=False, width=max(console.width, 160)).print(table)
+    wide_console(160).print(table)
     for row, profile, what in flown.misses:
         console.print(f"{row.title}, {profile}: {'; '.join(what)}", soft_wrap=True)
     whys = dict.fromkeys(row.why for row, _, _ in flown.misses if row.why)
@@ -143,7 +143,7 @@ def _print_constants(constants: "Sequence[Constant]") -> None:
     table = Table(*COLUMNS, title="identification of roll: the paper, and where the truth is known")
     for one in constants:
         table.add_row(*astuple(one))
-    Console(highlight=False, width=max(console.width, 160)).print(table)
+    wide_console(160).print(table)
     console.print(WHY, soft_wrap=True)
 
 

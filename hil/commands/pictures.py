@@ -18,17 +18,14 @@ def view(run: Path, at_s: float | None, web: bool) -> None:
     """Open RUN, a run folder, in the rerun viewer."""
     from hil.live.recording import browse, show_at
     from hil.live.window import show
-    from hil.pictures.viewer import RECORDING, write_run_rrd
+    from hil.pictures.viewer import recording_of
 
-    path = run / RECORDING
-    if not path.is_file():
-        write_run_rrd(run)
     if web:
         browse(run, at_s or 0.0, say)
     elif at_s is not None:
         show_at(run, at_s)
     else:
-        show(str(path))
+        show(str(recording_of(run)))
 
 
 @click.command()

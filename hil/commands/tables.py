@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
-from hil.commands.options import console
+from hil.commands.options import console, wide_console
 
 if TYPE_CHECKING:
     from hil.laboratory.result import Result
@@ -42,7 +40,7 @@ def print_seeds(rows: list[Result]) -> None:
             result.hash[:12],
             verdict,
         )
-    wide = Console(highlight=False, width=max(console.width, 140))
+    wide = wide_console(140)
     wide.print(table)
     completed = [result.metrics for result in rows if result.outcome == "completed"]
     lost = sum(result.outcome == "lost" for result in rows)

@@ -81,12 +81,12 @@ def y_steps(flight: pa.Table) -> Mapping[str, float]:
     """Return the slowest rise, the largest overshoot and the error at rest of a flight with steps in y."""
     times, (y, goal) = seconds(flight), axis_and_goal("y", flight)
     jumps = np.flatnonzero(np.diff(goal)) + 1
-    told = jumps[-1] if len(jumps) and times[-1] - times[jumps[-1]] < TOLD_S else len(times)
-    times, y, goal = times[:told], y[:told], goal[:told]
+    if len(jumps) and times[-1] - times[jumps[-1]] < TOLD_S:
+        times, y, goal, jumps = times[: jumps[-1]], y[: jumps[-1]], goal[: jumps[-1]], jumps[:-1]
     found = steps(times, y, goal)
     if not found:
         return {}
-    edges = np.append(times[1:][np.diff(goal) != 0], times[-1] + ROW_S)[1:]
+    edges = np.append(times[jumps], times[-1] + ROW_S)[1:]
     holding = np.any([(times >= edge - HOLD_S) & (times < edge) for edge in edges], axis=0)
     rise, _, overshoot = np.array(found).T
     return {

@@ -18,7 +18,7 @@ from hil.identify.identify import Identification
 from hil.identify.joint import Excited, excited_axes, whitened
 from hil.identify.record import Record
 from hil.identify.spectra import PERIOD_S
-from hil.identify.two_controllers import closed_loop
+from hil.identify.two_controllers import SIGMAS, closed_loop
 from hil.pictures import curves
 from hil.pictures.drawing import WIDTH, png
 from hil.pictures.pages import data_uri, write_page
@@ -131,7 +131,7 @@ def _identity(records: tuple[Record, ...]) -> Figure:
         axes.axhline(
             loop.starred[1],
             color=curves.BLUE,
-            label=f"c* = {loop.starred[1]:.1f} ± {1.96 * loop.errors[1]:.1f}",
+            label=f"c* = {loop.starred[1]:.1f} ± {SIGMAS * loop.errors[1]:.1f}",
         )
         axes.set(xlabel="ω² [1/s²]", ylabel="jωȦ / A, real part [1/s²]", ylim=(-1000, 100))
         axes.set_title(f"{record.name}: b* = {loop.starred[0]:.2f}")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.config import ModelConfig
-from hil.config import load_config
+from hil.config import base_name, load_config
 from hil.errors import LabError, writing
 from hil.identify.axes import AXES, DELAY, LAG
 from hil.identify.identify import NUISANCES, UNKNOWN, Identification
@@ -24,9 +24,8 @@ from hil.world.servos import WORDS_PER_RADIAN
 TRIM_LEAST = 0.005  # [rad] mean input that is worth a trim
 
 
-def refit(found: Identification, profile: str) -> Estimate:
-    """Return the joint fit with the constants that nobody knows at the profile's values."""
-    model = load_config(profile).model
+def refit(found: Identification, model: ModelConfig) -> Estimate:
+    """Return the joint fit with the constants that nobody knows at a model's values."""
     fixed = {name: getattr(model, name) for name in kept(found, model)}
     excited_constants = {name for one in found.excited for name in one.axis.constants}
     start = {
@@ -55,11 +54,11 @@ def write_profile(path: Path, profile: str, found: Identification) -> None:
     """Write the profile. Raises `LabError` when nothing was identified, or it cannot be written."""
     if not any(constant.verdict != UNKNOWN and constant.name != DELAY for constant in found.constants):
         raise LabError(f"--profile-out {path}: nothing was identified that a profile could hold")
-    fitted = refit(found, profile)
-    base = Path(profile).resolve().as_posix() if profile.endswith(".toml") else profile
+    model = load_config(profile).model
+    fitted = refit(found, model)
     lines = [
         f"# Identified by `floaty identify` from {', '.join(record.name for record in found.records)}.",
-        f'base = "{base}"',
+        f'base = "{base_name(profile)}"',
         "",
     ]
     lines.append("[model]                   # value, half width of the 95 % interval, verdict")
@@ -70,7 +69,7 @@ def write_profile(path: Path, profile: str, found: Identification) -> None:
                 continue
             text = f"{name} = {fitted.values[name]:.6g}"
             lines.append(f"{text:26}# ± {constant.joint[1]:.2g}, {constant.verdict}")
-    if names := kept(found, load_config(profile).model):
+    if names := kept(found, model):
         lines.append(f"# as in {profile}, not identifiable from these flights: {', '.join(names)}")
     lag = found.constant(LAG)
     told = f"lag {1e3 * lag.joint[0]:.1f} ± {1e3 * lag.joint[1]:.1f} ms, {lag.verdict}"

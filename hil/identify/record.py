@@ -27,6 +27,12 @@ Array = NDArray[np.float64]
 BOARD_COLUMN = "board.t [ms]"
 INPUTS = tuple(f"controller.u{i} [rad]" for i in range(1, 5))
 EXCITATIONS = tuple(f"excite.u{i} [rad]" for i in range(1, 5))
+KEPT = (
+    "log.parquet",
+    "telemetry.csv",
+    "events.jsonl",
+    "result.json",
+)  # of a run folder: what is read, and its story
 RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch", "yaw"))
 WRAP_MS = 1 << 24  # of the board's time stamps
 SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 closes

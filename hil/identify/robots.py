@@ -20,9 +20,9 @@ from hil.identify.axes import DELAY as INPUT_TO_GYRO
 from hil.identify.axes import LAG
 from hil.identify.identify import NUISANCES, Identification
 from hil.identify.record import Array
+from hil.identify.two_controllers import SIGMAS
 
 UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, of a constant of which nothing is said
-SIGMAS = 1.96
 FLAP_RATE = "flap_rate"
 
 

@@ -22,7 +22,7 @@ from hil.identify.spectra import Complex
 RATE_HZ, WINDOW = 50.0, 200  # samples; the author's script
 BINS = slice(1, 20)  # 0.25 to 4.75 Hz
 TAPER = (0.0, 1 / 3, 2 / 3)
-SIGMAS = 1.96
+SIGMAS = 1.96  # of a 95 % interval
 # Turning axis: places in the pose of angle and position, the gains on rate, angle and velocity, and the constants' names.
 AXES = {
     "roll": (3, 1, ("gain_p", "gain_roll", "gain_vy"), ("roll_rate", "roll_roll", "roll_vy"), "roll_u1"),

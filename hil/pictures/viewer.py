@@ -30,6 +30,7 @@ from hil.laboratory.recorder import OPERATOR, RELEASE_US, load_events, load_log,
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures import curves, monitor, scene
 from hil.pictures.curves import Curves
+from hil.pictures.links import HOST
 from hil.pictures.monitor import MARK_COLOURS, RATES, REFUSALS, Rates
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
 from hil.world.geometry import weigh
@@ -561,17 +562,21 @@ def write_run_rrd(folder: Path) -> Path:
     return path
 
 
+def recording_of(folder: Path) -> Path:
+    """Return the recording of a run folder, written now if it is not there. Raises `LabError` when there is no log."""
+    path = folder / RECORDING
+    return path if path.is_file() else write_run_rrd(folder)
+
+
 class Recording:
     """The recording of a run folder, which viewers fetch from here, piece by piece, while this object lives."""
 
     def __init__(self, folder: Path) -> None:
-        """Write it if it is not there. Raises `LabError` when there is no log."""
-        path = folder / RECORDING
-        if not path.is_file():
-            write_run_rrd(folder)
+        """Raises `LabError` when there is no log."""
+        path = recording_of(folder)
         schema = load_log(folder).schema
         self._timeline, _ = timeline_of(schema.metadata)
-        self._server = rr.server.Server(host="127.0.0.1", datasets={APPLICATION: [path]})
+        self._server = rr.server.Server(host=HOST, datasets={APPLICATION: [path]})
         # rerun's own client wants a query engine, of which nothing is needed here
         (inner,) = CatalogClientInternal(self._server.url()).datasets(False)
         dataset = rr.catalog.DatasetEntry(inner)

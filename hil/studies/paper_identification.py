@@ -14,13 +14,12 @@ from rich.console import Console
 from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.identify.identify import Identification, identify
-from hil.identify.record import load_record
-from hil.identify.two_controllers import closed_loop, input_constant
+from hil.identify.record import KEPT, load_record
+from hil.identify.two_controllers import SIGMAS, closed_loop, input_constant
 from hil.laboratory.run import Request
 from hil.studies.sweep import Job, fly_all
 
 FLIGHTS = ("two-controllers-1", "two-controllers-2", "identify-u1")
-KEPT = ("log.parquet", "telemetry.csv", "events.jsonl", "result.json")
 STARRED = (-60.0, -48.5)  # [1/s2] paper, Methods: c* of the two controllers
 OWN = (-0.2, -0.15)  # their c
 PRINTED = {"roll_u1": "230 ± 66", "roll_roll": "-16 ± 10", "roll_rate": "-40 ± 12"}
@@ -86,7 +85,7 @@ def constants(found: Identification) -> tuple[Constant, ...]:
             Constant(
                 f"c*{number}, roll per roll with a gain of {-own:g} [1/s²]", f"{starred:g}", "",
                 f"{value['roll_roll'].truth + own * value['roll_u1'].truth:.4g}",
-                _pair((float(loop.starred[1]), 1.96 * float(loop.errors[1]))), "", "",
+                _pair((float(loop.starred[1]), SIGMAS * float(loop.errors[1]))), "", "",
             )
         )  # fmt: skip
     return tuple(rows)

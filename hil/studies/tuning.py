@@ -14,7 +14,7 @@ from typing import get_args
 
 from rich.console import Console
 
-from hil.config import LabConfig, load_config
+from hil.config import LabConfig, base_name, load_config
 from hil.design.loop import (
     ANGLE,
     AXES,
@@ -35,7 +35,7 @@ from hil.experiments import find_experiment
 from hil.identify.flow import flow_of
 from hil.identify.identify import identify
 from hil.identify.profile_out import write_profile
-from hil.identify.record import load_record
+from hil.identify.record import KEPT, load_record
 from hil.identify.robots import FLAP_RATE, Robots, robots_of
 from hil.laboratory.result import Result
 from hil.laboratory.robot import Streams
@@ -46,7 +46,6 @@ from hil.world.plant import Plant
 
 HOVER_S = 60.0
 EXCITATIONS = tuple(f"identify-u{number}" for number in range(1, 5))
-KEPT = ("log.parquet", "telemetry.csv", "events.jsonl", "result.json")
 FLOWN = 3  # of the worst robots
 WORSE = 10  # robots whose margin for late poses is computed, the worst of an axis
 FACTOR_MAX = 4.0  # of plant.constant_factors
@@ -207,7 +206,7 @@ def _flap_range(config: LabConfig) -> float:
 
 def _error_limit(config: LabConfig, axis: Axis) -> float:
     """Return the largest error of the main state for which the flaps alone should suffice."""
-    return config.controller.limit_xy if axis.states[-1] != ANGLE and ANGLE in axis.states else 0.0
+    return config.controller.limit_xy if ANGLE in axis.states else 0.0
 
 
 def _with_gains(config: LabConfig, axes: Sequence[TunedAxis]) -> LabConfig:
@@ -218,8 +217,7 @@ def _with_gains(config: LabConfig, axes: Sequence[TunedAxis]) -> LabConfig:
 def write_tuned(path: Path, base: str, config: LabConfig, about: str) -> None:
     """Write a profile on top of another with what `config` has otherwise: model, trim, gains."""
     old = load_config(base)
-    named = Path(base).resolve().as_posix() if base.endswith(".toml") else base
-    lines = [f"# {about}", f'base = "{named}"']
+    lines = [f"# {about}", f'base = "{base_name(base)}"']
     for section in ("model", "servo", "controller"):
         own, usual = getattr(config, section).model_dump(), getattr(old, section).model_dump()
         changed = {key: value for key, value in own.items() if value != usual[key]}
