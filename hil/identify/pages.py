@@ -1,21 +1,25 @@
 """The page and the pictures of an identification.
 
 For each excited axis: measured and fitted frequency response with the coherence, the errors over the scatter with their
-autocorrelation from line to line, and the answer over one period, measured and simulated from the input, on a flight that
-was not fitted where there is one. For the paper's method the one picture that explains what it finds.
+autocorrelation from line to line, and the answer over one period, measured, simulated from the input and predicted row by
+row, on a flight that was not fitted where there is one. For the paper's method the one picture that explains what it finds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from hil.errors import LabError
 from hil.identify.axes import response
 from hil.identify.identify import Identification
 from hil.identify.joint import Excited, excited_axes, whitened
+from hil.identify.prediction import one_step
 from hil.identify.record import Record
 from hil.identify.spectra import PERIOD_S
 from hil.identify.two_controllers import SIGMAS, closed_loop
@@ -24,6 +28,8 @@ from hil.pictures.drawing import WIDTH, png
 from hil.pictures.pages import data_uri, write_page
 
 OUTPUTS = {"roll": "roll rate", "pitch": "pitch rate", "yaw": "yaw rate", "z": "height"}
+HERTZ = (0.5, 1, 2, 4, 8)
+SHOWN_S = 1.5  # of the one-step prediction
 UNITS = {"roll": "rad/s", "pitch": "rad/s", "yaw": "rad/s", "z": "m"}
 
 
@@ -36,7 +42,10 @@ def write_pages(out: Path, found: Identification, held_out: Record | None) -> Pa
     for axis in dict.fromkeys(one.axis for one in found.excited):
         fitted = [one for one in found.excited if one.axis is axis]
         shown = [one for one in new if one.axis is axis]
-        picture = png(lambda fitted=fitted, shown=shown: _axis(found, fitted, shown))
+        flights = found.records if held_out is None or not shown else (held_out,)
+        picture = png(
+            lambda fitted=fitted, shown=shown, flights=flights: _axis(found, fitted, shown, flights)
+        )
         (out / f"identify_{axis.name}.png").write_bytes(picture)
         figures.append({"title": f"{axis.name}, from u{axis.input + 1}", "image": data_uri(picture)})
     if found.free:
@@ -65,12 +74,15 @@ def _pair(pair: tuple[float, float]) -> str:
     return f"{pair[0]:.4g}" + (f" ± {pair[1]:.2g}" if pair[1] == pair[1] else "")
 
 
-def _axis(found: Identification, fitted: list[Excited], held_out: list[Excited]) -> Figure:
-    """Draw one axis."""
+def _axis(
+    found: Identification, fitted: list[Excited], held_out: list[Excited], records: tuple[Record, ...]
+) -> Figure:
+    """Draw one axis; `records` are those that the shown answer counts."""
     axis = fitted[0].axis
     values = found.estimate.values
-    figure = Figure(figsize=(WIDTH, 5.6), layout="constrained")
-    (gain, phase), (errors, answer) = figure.subplots(2, 2)
+    figure = Figure(figsize=(WIDTH, 8.0), layout="constrained")
+    panels = figure.subplot_mosaic([["gain", "phase"], ["errors", "step"], ["answer", "answer"]])
+    gain, phase, errors, step, answer = panels.values()
     grid = np.geomspace(fitted[0].spectra.w[0], fitted[0].spectra.w[-1], 200)
     model = response(axis, values, grid)[:, 0]
     gain.loglog(grid / 2 / np.pi, np.abs(model), color=curves.BLUE, label="joint fit")
@@ -93,6 +105,9 @@ def _axis(found: Identification, fitted: list[Excited], held_out: list[Excited])
         errors.set_title(f"error over scatter, real and imaginary; from line to line {correlation:+.2f}")
     gain.set(ylabel=f"{OUTPUTS[axis.name]} per u{axis.input + 1} [{UNITS[axis.name]}/rad]")
     gain.legend(loc="lower left")
+    for axes in (gain, phase):
+        axes.set_xticks(HERTZ, [f"{hertz:g}" for hertz in HERTZ])
+        axes.xaxis.set_minor_locator(NullLocator())
     phase.set(xlabel="frequency [Hz]", ylabel="phase [deg]")
     errors.axhspan(-2, 2, color=curves.GREY, alpha=0.2)
     errors.set(xlabel="frequency [Hz]")
@@ -110,7 +125,25 @@ def _axis(found: Identification, fitted: list[Excited], held_out: list[Excited])
         "a flight that was not fitted" if held_out else "the fitted flight; --validate RUN: another"
     )
     answer.legend(loc="upper right")
+    _one_step(step, records[seen.record], seen, values, found.estimate.late[0 if held_out else seen.record])
     return figure
+
+
+def _one_step(axes: Axes, record: Record, seen: Excited, values: Mapping[str, float], late: float) -> None:
+    """Draw what the model expects of the next row, each time."""
+    name = seen.axis.name
+    t, measured, predicted = one_step(record, seen.axis.input, values, late)
+    left = np.std((measured - predicted)[len(t) // 10 :])  # when the filter has settled
+    t -= t[0]
+    axes.plot(t, measured, ".", markersize=3, color=curves.RED)
+    axes.plot(t, predicted, color=curves.BLUE, label=f"predicted {1e3 * record.period_s:.0f} ms before")
+    middle = t[-1] / 2
+    inside = (t > middle) & (t < middle + SHOWN_S)
+    level, reach = measured[inside].mean(), 1.3 * np.ptp(measured[inside]) / 2
+    axes.set(xlim=(middle, middle + SHOWN_S), ylim=(level - reach, level + reach), xlabel="time [s]")
+    axes.set(ylabel=f"{OUTPUTS[name]} [{UNITS[name]}]")
+    axes.set_title(f"one step ahead: error {left:.2g} of {np.std(measured):.2g} {UNITS[name]} rms")
+    axes.legend(loc="upper right")
 
 
 def _identity(records: tuple[Record, ...]) -> Figure:

@@ -12,6 +12,7 @@ from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import load_config
 from hil.errors import LabError
 from hil.identify.identify import IDENTIFIED, UNKNOWN, Identification, identify
+from hil.identify.prediction import one_step
 from hil.identify.profile_out import write_profile
 from hil.identify.record import BOARD_COLUMN, EXCITATIONS, INPUTS, RATES, load_record
 from hil.identify.two_controllers import closed_loop, input_constant
@@ -196,3 +197,16 @@ def test_the_papers_equations_find_no_damping_whatever_the_robot_has(tmp_path: P
     loop = closed_loop(record, "pitch")
     assert abs(loop.starred[0]) < 0.1 * abs(PITCH["pitch_rate"])
     assert np.median((loop.acceleration / loop.angle).real / -(loop.w**2)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_true_constants_predict_the_next_row_best(tmp_path: Path) -> None:
+    record = load_record(written(tmp_path, flight(3, 30.0)), "floaty")
+    truth = PITCH | {"lag": PITCH["lag"], "delay": 1e-3 * ACTUATION_MS + 0.01}
+
+    def error(**changed: float) -> float:
+        _, measured, predicted = one_step(record, 1, truth | changed, 0.0)
+        return float(np.std((measured - predicted)[200:]))
+
+    _, measured, _ = one_step(record, 1, truth, 0.0)
+    assert error() < 0.5 * np.std(np.diff(measured))  # of expecting no change
+    assert error() < min(error(pitch_u2=-450.0), error(pitch_u2=-1800.0), error(lag=0.15))

@@ -1,0 +1,48 @@
+"""One-step prediction: what the identified model, in the board's stationary filter, expects of the next sample.
+
+A simulation from the input alone forgets what the flow did; a prediction is corrected by every sample, so that what is left
+are the flow's accelerations of one step, the noise of the sensors, and what the model has wrong. A step is from one row of
+the telemetry to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from hil.design.loop import AXES, RATE, dynamics, filter_gain, held
+from hil.identify.axes import DELAY, LAG
+from hil.identify.flow import PLACES
+from hil.identify.record import Array, Record
+
+
+def one_step(
+    record: Record, input: int, values: Mapping[str, float], late: float
+) -> tuple[Array, Array, Array]:
+    """Return instants t (N,) [s], what was measured, and what was predicted a step before, (N,) each.
+
+    The signal is the axis' angular rate [rad/s] in B, of u4 the height [m] in W, without their means. `values` are those of
+    `hil.identify.joint`; poses come `late` [s] after their stamps.
+    """
+    axis, step = AXES[input], record.period_s
+    flow, columns = dynamics(axis, {**values, "flap_rate": 1 / values[LAG]})
+    Phi, G = held(flow, columns[:, :1], step)
+    K, C = filter_gain(axis, record.config, Phi)
+    first = max(record.t[0] + values[DELAY], record.pose_t[0] - late)
+    t = np.arange(first, min(record.t[-1], record.pose_t[-1] - late), step)
+    place, angle = PLACES[input]
+    shown = [
+        np.interp(t + late, record.pose_t, record.pose[:, column]) for column in dict.fromkeys((place, angle))
+    ]
+    turn = [np.interp(t, record.t, record.rates[:, input])] if RATE in axis.states else []
+    measured = np.stack([*turn, *shown], axis=1)
+    # What acts on the mean until the next step; `delay` counts the half tick by which an input that is held is late.
+    u = np.interp(t - values[DELAY] + step / 2, record.t, record.u[:, input])
+    measured -= measured.mean(axis=0)
+    u -= u.mean()
+    state, predicted = np.zeros(len(Phi)), np.empty_like(measured)
+    for row, (now, command) in enumerate(zip(measured, u, strict=True)):
+        predicted[row] = C @ state
+        state = Phi @ (state + K @ (now - predicted[row])) + G[:, 0] * command
+    return t, measured[:, 0], predicted[:, 0]
