@@ -108,7 +108,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
 # stay out of all that flies; these files look at what was flown, or are done before.
 AFTER_THE_FLIGHT = (
     "hil/laboratory/metrics.py", "hil/pictures/", "hil/experiments/measures.py", "hil/experiments/take_off.py",
-    "hil/design/", "hil/identify/", "hil/campaigns/findings.py",
+    "hil/design/", "hil/identify/", "hil/campaigns/findings.py", "hil/studies/paper_scaling.py",
 )  # fmt: skip
 BY_PROCESSOR = """
     math.sin math.cos math.tan math.asin math.acos math.atan math.atan2 math.exp math.expm1 math.log math.log1p math.log2
@@ -119,7 +119,7 @@ BY_PROCESSOR = """
 CONFINED |= dict.fromkeys(BY_PROCESSOR, AFTER_THE_FLIGHT)
 CONFINED["click"] = CONFINED["rich"] = (
     "hil/commands/", "hil/studies/sweep.py", "hil/studies/paper.py", "hil/studies/tuning.py",
-    "hil/studies/paper_identification.py",
+    "hil/studies/paper_identification.py", "hil/studies/paper_scaling.py",
 )  # fmt: skip
 CONFINED |= dict.fromkeys(
     ("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",)

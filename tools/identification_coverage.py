@@ -1,8 +1,8 @@
 """How good `floaty identify` is where the truth is known: python tools/identification_coverage.py [ROBOTS] [FOLDER].
 
 Flies identify-u1 to identify-u4 on the plants `methods` and `methods_open` and on ROBOTS (default 5) drawn inside the
-Table's ± with servo lags of ±20 %, and says how many of the joint fit's 95 % intervals hold the truth and how far each
-constant is off on the mean. On two idle cores it takes ten minutes.
+Table's ± with servo lags of ±20 %, and says how many of the 95 % intervals hold the truth, the joint fit's and the
+instruments', and how far each constant of the joint fit is off on the mean. On two idle cores it takes ten minutes.
 """
 
 import sys
@@ -63,7 +63,9 @@ def main(count: int, folder: Path) -> None:
                 found.setdefault(constant.name, []).append(constant)
     everything = [constant for several in found.values() for constant in several]
     print(
-        f"{len(robots)} robots: {np.mean([one.contains_truth for one in everything]):.0%} of the intervals hold the truth"
+        f"{len(robots)} robots: {np.mean([one.contains_truth for one in everything]):.0%} of the intervals hold the truth, "
+        f"{np.mean([abs(one.instrumental[0] - one.truth) <= one.instrumental[1] for one in everything]):.0%} of the "
+        "instruments'"
     )
     for name, several in found.items():
         bias = np.mean([one.best / one.truth - 1 for one in several])

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,6 +83,7 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
     from hil.studies.paper import fly_paper
     from hil.studies.paper_identification import fly_identification
     from hil.studies.paper_report import write_paper
+    from hil.studies.paper_scaling import fly_scaling
 
     announce_compilation()
     with writing("--out", out):
@@ -91,6 +92,8 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
         bench = list(drag_model.measure(load_config(), 1)) if mounted and not flown.interrupted else []
         shape = analyse(point_of(load_config())) if bench else None
         constants = fly_identification(out, notices) if bench else ()
+        if shape is not None and constants:
+            shape = replace(shape, claims=[*shape.claims, *fly_scaling(out, notices)])
         report = write_paper(out, flown, bench, shape, constants)
     _print_rows(flown)
     _print_studies(flown)

@@ -1,7 +1,7 @@
 """Agility against size, out of flights: the paper's robot, half and twice as long, each in its own updraft.
 
-The masses go with the cube of the length, so that the updraft goes with its root (eq. airflow_proportionality). All three fly
-an excitation of u3 and one of u1, and `floaty identify` finds from the telemetry alone what an input accelerates.
+The masses go with the cube of the length, so that the updraft goes with its root (eq. airflow_proportionality). All three
+fly an excitation of u3 and one of u1, and `floaty identify` finds from the telemetry alone what an input accelerates.
 """
 
 from __future__ import annotations
