@@ -71,16 +71,17 @@ class Scheduler:
         self._calls = 0  # of the kernel at this instant
         self._until_us = 0  # how far `run` goes
 
-    def run(self, now_us: int) -> None:
+    def run(self, now_us: int, until_us: int = 0) -> None:
         """Does all that falls due up to and including `now_us`, until every task waits or works.
 
-        Hardware that a task sets going may `stop_before` an instant meanwhile: then the run ends there.
+        Then it goes on by itself up to and including `until_us`, where that is later. Hardware that a task sets going may
+        `stop_before` an instant meanwhile: then the run ends there.
         """
         if not self._started:
             raise KernelError("run before start")
         if now_us < self.now_us:
             raise KernelError(f"time runs backwards: from {self.now_us} us to {now_us} us")
-        self._until_us = now_us
+        self._until_us = max(now_us, until_us)
         wake_us = self.next_wake_us
         if self._interrupted and (wake_us is None or wake_us > now_us):
             wake_us = now_us

@@ -29,10 +29,13 @@ class Laboratory:
         self.robots: list[Robot] = []
         self.now_us = 0
         self.end_us = NEVER_US
+        self._alone = False  # one robot and no wall clock: nobody takes turns with it
 
     def run(self, progress: Progress | None = None) -> None:
         """Go from one instant at which anything happens to the next, until `end_us`; may be called again."""
         clock, next_progress_us = self.clock, self.now_us
+        self._alone = not clock.paced and len(self.robots) == 1
+        self._run_firmware()
         while self.now_us < min(WARM_UP_US, self.end_us):
             self._step(FREE)
         clock.start(self.now_us)
@@ -48,23 +51,38 @@ class Laboratory:
 
     def _step(self, clock: Clock) -> None:
         events = self.events
-        now_us = self.end_us if events.next_us is None else min(events.next_us, self.end_us)
-        robot, wake_us, other_us = self._first_to_wake()
-        if robot is not None and wake_us < now_us:
-            if clock.paced:
-                now_us = wake_us
-            else:
-                robot.run(max(wake_us, min(now_us, other_us) - 1))
-                if other_us < now_us or (events.next_us is not None and events.next_us < now_us):
-                    return  # another one comes first, or a task has set hardware going that acts earlier
-        now_us = clock.wait_until(now_us)
+        now_us = self._next_event_us()
+        if not self._alone:
+            robot, wake_us, other_us = self._first_to_wake()
+            if robot is not None and wake_us < now_us:
+                if clock.paced:
+                    now_us = wake_us
+                else:
+                    robot.run(max(wake_us, min(now_us, other_us) - 1))
+                    if other_us < now_us or (events.next_us is not None and events.next_us < now_us):
+                        return  # another one comes first, or a task has set hardware going that acts earlier
+        if clock.paced:
+            now_us = clock.wait_until(now_us)
         for robot in self.robots:
             robot.advance(now_us)
-        clock.serve(now_us)
+        if clock.paced:
+            clock.serve(now_us)
         events.run(now_us)
-        for robot in self.robots:
-            robot.run(now_us)
         self.now_us = now_us
+        self._run_firmware()
+
+    def _next_event_us(self) -> int:
+        """Return when hardware acts next, or the end."""
+        next_us, end_us = self.events.next_us, self.end_us
+        return end_us if next_us is None or next_us > end_us else next_us
+
+    def _run_firmware(self) -> None:
+        """Run the firmware of this instant; one that is alone goes on up to the next thing that hardware does."""
+        if self._alone:
+            self.robots[0].run(self.now_us, self._next_event_us() - 1)
+        else:
+            for robot in self.robots:
+                robot.run(self.now_us)
 
     def _first_to_wake(self) -> tuple[Robot | None, int, int]:
         """Return the robot whose firmware acts first, when, and when the next one does."""

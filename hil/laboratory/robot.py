@@ -142,10 +142,10 @@ class Robot:
         wake_us = self.firmware.kernel.next_wake_us
         return None if wake_us is None else wake_us + self.booted_us
 
-    def run(self, now_us: int) -> None:
-        """Run the firmware's tasks up to this instant, until all are blocked or busy."""
+    def run(self, now_us: int, until_us: int = 0) -> None:
+        """Run the firmware's tasks up to this instant, until all are blocked or busy; and on to a later one, if given."""
         if self.powered:
-            self.firmware.kernel.run(now_us - self.booted_us)
+            self.firmware.kernel.run(now_us - self.booted_us, until_us - self.booted_us)
 
     def advance(self, now_us: int) -> None:
         """Bring the processor's clock to this instant, before hardware acts; nothing was due before it."""
