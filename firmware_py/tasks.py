@@ -47,7 +47,7 @@ def sensors_task(
             yield from kernel.yield_if_pending()
         yield from measurements.send_nowait((GYRO, counts))
         yield from measurements.send_nowait((ACCELEROMETER, counts))
-        yield from data_ready.give()
+        yield from data_ready.give_nowait()
 
 
 def stabilizer_task(
@@ -67,7 +67,7 @@ def stabilizer_task(
             yield from kernel.delay_until(kernel.tick_count + 1)
         core.watchdog_fed_us = kernel.now_us
         yield from kernel.work(cost.stabilizer_us)
-        yield from estimator_run.give()
+        yield from estimator_run.give_nowait()
         if kernel.tick_count >= control_tick:
             control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
             yield from kernel.work(costs.control_us())

@@ -87,10 +87,17 @@ class Kernel(Scheduler):
 
     def run_time_us(self, task: Task) -> int:
         """Processor time that the task consumed up to now, between two runs; of the idle task what all others left."""
-        if task is self._idle:
-            return self.now_us - sum(self.run_time_us(other) for other in self.tasks if other is not task)
-        left_us = self._work_end_us - self.now_us if task is self.current else task.work_left_us
-        return task.work_us - left_us
+        return self.run_times_us()[self.tasks.index(task)]
+
+    def run_times_us(self) -> list[int]:
+        """The same of all tasks, in the order of their creation."""
+        idle, current, current_left_us = self._idle, self.current, self._work_end_us - self.now_us
+        times_us = [
+            0 if task is idle else task.work_us - (current_left_us if task is current else task.work_left_us)
+            for task in self.tasks
+        ]
+        rest_us = self.now_us - sum(times_us)
+        return [rest_us if task is idle else us for task, us in zip(self.tasks, times_us, strict=True)]
 
     def work(self, duration_us: int) -> Iterable[int]:
         """Takes processor time; others may run in between."""

@@ -97,7 +97,7 @@ class Queue(Generic[T]):
         items.append(item)
         if len(items) > self.high_water:
             self.high_water = len(items)
-        return kernel.switch_if(kernel.wake(self._receivers.pop(0))) if self._receivers else GO_ON
+        return kernel.wake_first(self._receivers) if self._receivers else GO_ON
 
     def receive(self, timeout: int = FOREVER) -> Generator[int, None, T | None]:
         """Takes the oldest item, waiting up to `timeout` ticks for one; None when none came."""
@@ -140,7 +140,7 @@ class Queue(Generic[T]):
             kernel.record("Q_RECV", self.number, len(items))
         item = items.popleft()
         if self._senders:
-            kernel.switch_if(kernel.wake(self._senders.pop(0)))
+            kernel.wake_first(self._senders)
         return item
 
     def overwrite(self, item: T) -> Iterable[int]:
@@ -162,7 +162,7 @@ class Queue(Generic[T]):
         self._items.clear()
         self._items.append(item)
         self.high_water = 1
-        return kernel.switch_if(kernel.wake(self._receivers.pop(0))) if self._receivers else GO_ON
+        return kernel.wake_first(self._receivers) if self._receivers else GO_ON
 
     def reset(self) -> Iterable[int]:
         """Empties the queue; one sender that waited for space goes on, as with xQueueReset.
@@ -175,7 +175,7 @@ class Queue(Generic[T]):
             raise kernel.misplaced(f"queue {self.name}: reset")
         kernel.count_call()
         self._items.clear()
-        return kernel.switch_if(kernel.wake(self._senders.pop(0))) if self._senders else GO_ON
+        return kernel.wake_first(self._senders) if self._senders else GO_ON
 
     def peek(self) -> T | None:
         """The oldest item, left in place; None when there is none."""

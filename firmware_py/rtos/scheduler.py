@@ -217,6 +217,13 @@ class Scheduler:
             place = self._delayed.index(task)
             del self._delayed[place], self._wake_ticks[place]
 
+    def wake_first(self, waiters: list[ControlBlock]) -> Iterable[int]:
+        """Wakes the first of them; returns what the plain call that did it returns."""
+        if self.wake(waiters.pop(0)) and self.preemption:
+            self._switch_pending = True
+            return SWITCH
+        return GO_ON
+
     def switch_if(self, outranked: bool) -> Iterable[int]:
         """What a plain call returns after it made another task ready that may outrank the running one."""
         if outranked and self.preemption:

@@ -82,7 +82,7 @@ class Semaphore:
         if kernel.trace is not None:
             kernel.record("Q_SEND", self.number, self.count)
         self.count += 1
-        return kernel.switch_if(kernel.wake(self._takers.pop(0))) if self._takers else GO_ON
+        return kernel.wake_first(self._takers) if self._takers else GO_ON
 
     def give_from_isr(self) -> bool:
         """Like `give`, from an interrupt."""

@@ -129,7 +129,7 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
     def counts() -> tuple[int, ...]:
         return (
             queue.high_water, queue.dropped,
-            *[task.deadline_misses for task in timed], *[kernel.run_time_us(task) for task in tasks],
+            *[task.deadline_misses for task in timed], *kernel.run_times_us()[: len(tasks)],
         )  # fmt: skip
 
     flaps = "flap_1 flap_2 flap_3 flap_4"
