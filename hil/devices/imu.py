@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from firmware_py.elementary import cos, sin, tan
 from hil.devices.config import ImuConfig
 from hil.errors import LabError
+from hil.world import layout as at
 from hil.world.compiled import compiled
 from hil.world.motion import GRAVITY
 from hil.world.noise import normal
@@ -49,15 +50,21 @@ def channel(row: View, truth: float, draw: float) -> int:
 
 
 @compiled
-def channels(rows: View, omega: View, force: View, draws: View) -> Counts:
-    """Turn omega [rad/s] and specific force [m/s2], both in B, into S and then into counts."""
+def channels(rows: View, truth: View, draws: View) -> Counts:
+    """Turn rates and specific force of the plant's array, in B, into S and then into counts."""
+    ox, oy, fx, fy = (
+        truth[at.OMEGA],
+        truth[at.OMEGA + 1],
+        truth[at.SPECIFIC_FORCE],
+        truth[at.SPECIFIC_FORCE + 1],
+    )
     return (
-        channel(rows[0], COS * omega[0] + SIN * omega[1], draws[0]),
-        channel(rows[1], COS * omega[1] - SIN * omega[0], draws[1]),
-        channel(rows[2], omega[2], draws[2]),
-        channel(rows[3], COS * force[0] + SIN * force[1], draws[3]),
-        channel(rows[4], COS * force[1] - SIN * force[0], draws[4]),
-        channel(rows[5], force[2], draws[5]),
+        channel(rows[0], COS * ox + SIN * oy, draws[0]),
+        channel(rows[1], COS * oy - SIN * ox, draws[1]),
+        channel(rows[2], truth[at.OMEGA + 2], draws[2]),
+        channel(rows[3], COS * fx + SIN * fy, draws[3]),
+        channel(rows[4], COS * fy - SIN * fx, draws[4]),
+        channel(rows[5], truth[at.SPECIFIC_FORCE + 2], draws[5]),
     )
 
 
@@ -93,7 +100,7 @@ class VirtualImu:
         """Return gyro x y z and accelerometer x y z counts, in S, of the plant as it is now."""
         if not self._draws:
             self._draws = list(normal(self._rng, (NOISE_ROWS, 6)))
-        return channels(self._rows, plant.omega_B, plant.specific_force_B, self._draws.pop())
+        return channels(self._rows, plant.truth, self._draws.pop())
 
     def set_noise_scale(self, scale: float) -> None:
         """Scale the white noise of all channels; 1 as configured."""

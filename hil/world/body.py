@@ -107,6 +107,7 @@ def place_plates(s: State, geometry: GeometryConfig, hover_angle: float) -> None
     s[at.BASE_AREA] = geometry.base_side * geometry.base_side
     s[at.AXIS_HEIGHT] = height
     s[at.HOVER_FLAPS : at.HOVER_FLAPS + 4] = SIGNS * hover_angle
+    s[at.HOVER_TURN : at.HOVER_TURN + 2] = cos(hover_angle), -sin(hover_angle)
     lift = np.array([[0.0, 0.0, height], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     parts = flap_plates(geometry)
     for flap in range(4):

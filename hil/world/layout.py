@@ -83,6 +83,7 @@ MASS = _take()
 INERTIA = _take(3)
 DRAG_FACTOR = _take()
 HOVER_FLAPS = _take(4)  # [rad] signed
+HOVER_TURN = _take(2)  # cos phi and sin phi of all of them
 AXIS_HEIGHT = _take()  # [m] flap axes above the centre of mass
 FLOW_POINTS = _take(8)  # [m] x, y of the point where each flap's flow is taken, in B
 PRESSURE = _take()  # [kg/m3] rho C_D / 2

@@ -54,7 +54,7 @@ class Plant:
     """Body, servos, tether and the air around them.
 
     Attributes (read-only numpy views of the present truth, SI):
-        state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
+        truth (layout.SIZE,) everything; state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
         p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
         wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
         servo_trim (4,) [rad] and servo_speed (4,), pushes (6,) force [N, W] and torque [N m, B]: as they were last set;
@@ -102,7 +102,7 @@ class Plant:
 
         self._rng = rng_gust
         self._draws = normal(rng_gust, (NOISE_ROWS, 14))
-        self.state = self._view(at.P, 17)
+        self.truth, self.state = self._view(0, at.SIZE), self._view(at.P, 17)
         self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
         self.omega_B, self.flaps = self._view(at.OMEGA, 3), self._view(at.FLAPS, 4)
         self.specific_force_B, self.flow_W = self._view(at.SPECIFIC_FORCE, 3), self._view(at.FLOW, 3)

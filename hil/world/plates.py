@@ -23,6 +23,7 @@ LIFT_U4_MAX = 0.55  # [rad] the lift ratio l(u4) is fitted for |u4| up to here
 UPFLOW_MIN = 0.1  # [m/s] keeps the slope of the wind finite when the air stands still
 
 State = NDArray[np.float64]  # (layout.SIZE,)
+Wrench = tuple[float, float, float, float, float, float]  # force [N] and torque [N m]
 
 
 @compiled
@@ -84,45 +85,55 @@ def flap_upflow(s: State, flap: int) -> float:
 
 
 @compiled
+def strike(s: State, plate: int, c: float, d: float, ux: float, uy: float, uz: float) -> Wrench:
+    """Return force and torque of a plate of a flap with this cosine and sine, in the wind (ux, uy, uz) at the flap; in B."""
+    n, r = at.NORMAL + 9 * plate, at.CENTRE + 9 * plate
+    ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
+    nx = s[n] + s[n + 3] * c + s[n + 6] * d
+    ny = s[n + 1] + s[n + 4] * c + s[n + 7] * d
+    nz = s[n + 2] + s[n + 5] * c + s[n + 8] * d
+    rx = s[r] + s[r + 3] * c + s[r + 6] * d
+    ry = s[r + 1] + s[r + 4] * c + s[r + 7] * d
+    rz = s[r + 2] + s[r + 5] * c + s[r + 8] * d
+    wn = (ux - oy * rz + oz * ry) * nx + (uy - oz * rx + ox * rz) * ny
+    wn += (uz - ox * ry + oy * rx) * nz
+    f = s[at.PRESSURE] * s[at.AREA + plate] * wn * abs(wn)
+    fx, fy, fz = f * nx, f * ny, f * nz
+    return fx, fy, fz, ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx
+
+
+@compiled
+def added(a: Wrench, b: Wrench) -> Wrench:
+    """Return the sum of two forces and torques."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
+
+
+@compiled
 def press(s: State) -> None:
     """Write force and torque of all plates as they stand (DRAG) and at the hover angle (HOVER_DRAG), in B."""
-    ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
     bz = s[at.WIND + 2]
     base = s[at.PRESSURE] * s[at.BASE_AREA] * bz * abs(bz)
-    for i in range(6):
-        s[at.DRAG + i] = s[at.HOVER_DRAG + i] = 0.0
-    s[at.DRAG + 2] = s[at.HOVER_DRAG + 2] = s[at.PLATE_FORCES + 2] = base
-    s[at.PLATE_FORCES] = s[at.PLATE_FORCES + 1] = 0.0
+    s[at.PLATE_FORCES], s[at.PLATE_FORCES + 1], s[at.PLATE_FORCES + 2] = 0.0, 0.0, base
+    total = hover = (0.0, 0.0, base, 0.0, 0.0, 0.0)
     for flap in range(4):
         more = flap_upflow(s, flap)
         ux = s[at.WIND] + s[at.R + 6] * more
         uy = s[at.WIND + 1] + s[at.R + 7] * more
         uz = s[at.WIND + 2] + s[at.R + 8] * more
+        angle = -s[at.FLAPS + flap] if flap % 2 == 0 else s[at.FLAPS + flap]  # 0 and 2 are mirror images of 1
+        c, d = sine_ahead(angle, 1), sine_ahead(angle, 0)
+        flat, kink = strike(s, 2 * flap, c, d, ux, uy, uz), strike(s, 2 * flap + 1, c, d, ux, uy, uz)
+        total = added(added(total, flat), kink)
         arrow = at.PLATE_FORCES + 3 + 3 * flap
-        s[arrow] = s[arrow + 1] = s[arrow + 2] = 0.0
-        for pose in range(2 if s[at.CORRECTED] != 0.0 else 1):
-            angle = s[at.FLAPS + flap] if pose == 0 else s[at.HOVER_FLAPS + flap]
-            phi = -angle if flap % 2 == 0 else angle  # flaps 1 and 3 (0 and 2 here) are mirror images of 2
-            c, d = sine_ahead(phi, 1), sine_ahead(phi, 0)
-            total = at.DRAG if pose == 0 else at.HOVER_DRAG
-            for plate in range(2 * flap, 2 * flap + 2):
-                n, r = at.NORMAL + 9 * plate, at.CENTRE + 9 * plate
-                nx = s[n] + s[n + 3] * c + s[n + 6] * d
-                ny = s[n + 1] + s[n + 4] * c + s[n + 7] * d
-                nz = s[n + 2] + s[n + 5] * c + s[n + 8] * d
-                rx = s[r] + s[r + 3] * c + s[r + 6] * d
-                ry = s[r + 1] + s[r + 4] * c + s[r + 7] * d
-                rz = s[r + 2] + s[r + 5] * c + s[r + 8] * d
-                wn = (ux - oy * rz + oz * ry) * nx + (uy - oz * rx + ox * rz) * ny
-                wn += (uz - ox * ry + oy * rx) * nz
-                f = s[at.PRESSURE] * s[at.AREA + plate] * wn * abs(wn)
-                fx, fy, fz = f * nx, f * ny, f * nz
-                s[total], s[total + 1], s[total + 2] = s[total] + fx, s[total + 1] + fy, s[total + 2] + fz
-                s[total + 3] += ry * fz - rz * fy
-                s[total + 4] += rz * fx - rx * fz
-                s[total + 5] += rx * fy - ry * fx
-                if pose == 0:
-                    s[arrow], s[arrow + 1], s[arrow + 2] = s[arrow] + fx, s[arrow + 1] + fy, s[arrow + 2] + fz
+        s[arrow], s[arrow + 1], s[arrow + 2] = flat[0] + kink[0], flat[1] + kink[1], flat[2] + kink[2]
+        if s[at.CORRECTED] != 0.0:
+            c, d = s[at.HOVER_TURN], s[at.HOVER_TURN + 1]
+            hover = added(hover, strike(s, 2 * flap, c, d, ux, uy, uz))
+            hover = added(hover, strike(s, 2 * flap + 1, c, d, ux, uy, uz))
+    s[at.DRAG], s[at.DRAG + 1], s[at.DRAG + 2] = total[0], total[1], total[2]
+    s[at.DRAG + 3], s[at.DRAG + 4], s[at.DRAG + 5] = total[3], total[4], total[5]
+    s[at.HOVER_DRAG], s[at.HOVER_DRAG + 1], s[at.HOVER_DRAG + 2] = hover[0], hover[1], hover[2]
+    s[at.HOVER_DRAG + 3], s[at.HOVER_DRAG + 4], s[at.HOVER_DRAG + 5] = hover[3], hover[4], hover[5]
 
 
 @compiled
