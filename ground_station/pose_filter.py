@@ -7,6 +7,7 @@ it is off, which goes into the reference after every step.
 
 from dataclasses import dataclass
 from math import sqrt
+from typing import NamedTuple
 
 from firmware_py.geometry import IDENTITY, Quaternion, Vector
 
@@ -23,9 +24,8 @@ class Noise:
     acceleration: float
 
 
-@dataclass(frozen=True, slots=True)
-class Covariance:
-    """Of a value and its slope: the variances and what both share."""
+class Covariance(NamedTuple):
+    """Of a value and its slope: the variances and what both share. A tuple: each frame makes four of them."""
 
     value: float
     both: float
@@ -46,9 +46,8 @@ class Covariance:
         total = self.value + noise.value * noise.value
         return self.value / total, self.both / total
 
-    def updated(self, noise: Noise) -> "Covariance":
-        """After a measurement: (I - K H) P."""
-        k_value, k_slope = self.gains(noise)
+    def updated(self, k_value: float, k_slope: float) -> "Covariance":
+        """After a measurement that counted with these gains: (I - K H) P."""
         return Covariance(
             self.value - k_value * self.value,
             self.both - k_value * self.both,
@@ -136,7 +135,7 @@ class PoseFilter:
         (position, rotation), (of_position, of_rotation) = self._covariances, self._noises
         k_p, k_v = position.gains(of_position)
         k_theta, k_w = rotation.gains(of_rotation)
-        self._covariances = position.updated(of_position), rotation.updated(of_rotation)
+        self._covariances = position.updated(k_p, k_v), rotation.updated(k_theta, k_w)
         self._p, self._v = _corrected(self._p, self._v, p_WB, k_p, k_v)
         self._theta, self._w = _corrected(self._theta, self._w, theta, k_theta, k_w)
         self._turn()

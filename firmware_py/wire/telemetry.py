@@ -46,19 +46,21 @@ class Variable:
     scale: float | None = None  # of the value on the wire to that of a sample; None: they are equal
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Variables that travel together in one packet; at most 26 bytes."""
+    """Variables that travel together in one packet; at most 26 bytes. There is one object per block: the tables below."""
 
     id: int
     variables: tuple[Variable, ...]
-    layout: struct.Struct = field(init=False, repr=False, compare=False)
+    layout: struct.Struct = field(init=False, repr=False)
+    is_scaled: bool = field(init=False, repr=False)  # whether any of them has a scale
 
     def __post_init__(self) -> None:
         layout = struct.Struct("<" + "".join(variable.type.format for variable in self.variables))
         if layout.size > MAX_LOG_VALUES:
             raise WireError(f"log block {self.id}: {layout.size} bytes, at most {MAX_LOG_VALUES} fit")
         object.__setattr__(self, "layout", layout)
+        object.__setattr__(self, "is_scaled", any(item.scale is not None for item in self.variables))
 
     def pack(self, values: Sequence[float]) -> bytes:
         """The bytes of what the log variables show; integers wrap at their width."""
@@ -80,6 +82,8 @@ class Block:
 
     def si_of(self, values: Sequence[float]) -> tuple[float, ...]:
         """The values of a sample, of what the log variables show."""
+        if not self.is_scaled:
+            return tuple(values)
         return tuple(
             value if variable.scale is None else value / variable.scale
             for variable, value in zip(self.variables, values, strict=True)
