@@ -4,11 +4,13 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE  # the tests start many programs: each would compile all sources anew
 
-.PHONY: fly test test-all check bench clients clean
+.PHONY: fly test test-all check bench fast wheel clients clean
 
 fly: .venv/fly.stamp
 	$(BIN)/floaty fly hover
 
+# Tests replace parts of classes, which compiled ones (`make fast`) do not let them; those have tests of their own.
+test test-all: export FLOATY_PURE = 1
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto
 
@@ -28,6 +30,13 @@ clients: .venv/test.stamp
 bench: .venv/test.stamp
 	$(BIN)/python tools/bench.py
 
+# The lockstep loop's modules compiled by mypyc, with the C compiler of this machine; everything else does without one.
+fast: .venv/fast.stamp
+	$(BIN)/python tools/fast.py
+
+wheel: .venv/fast.stamp
+	FLOATY_COMPILED=1 $(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
+
 .venv/pip.stamp:
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip
@@ -41,5 +50,9 @@ bench: .venv/test.stamp
 	$(BIN)/python -m pip install --quiet --editable '.[test]'
 	@touch $@
 
+.venv/fast.stamp: .venv/fly.stamp
+	$(BIN)/python -m pip install --quiet --editable '.[fast]'
+	@touch $@
+
 clean:
-	rm -rf .venv runs
+	rm -rf .venv runs dist firmware_py/compiled

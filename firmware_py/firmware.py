@@ -112,7 +112,7 @@ class Firmware:
         self._supervisor.connected = self._client_is_there
         board, core, link, supervisor = self._board, self._core, self.link, self._supervisor
         settings = _radio_settings(board)
-        if all(byte == 0xFF for byte in board.deck_memory):
+        if board.deck_memory == b"\xff" * len(board.deck_memory):
             board.deck_memory[:] = encode_one_wire(*DECK)
         tester, storage = Tester(), ParameterStorage(board.eeprom)
         pilot = supervisor.goals = Pilot(config.predictor.default_age_us)
@@ -141,7 +141,7 @@ class Firmware:
         self.variables = log_variables(running)
         read = telemetry_reader(self.variables)
         fields = running.core.parameters.fields
-        own = parameters(running, TelemetryStream(link, read, lambda: fields.excite_kind != EXCITE_OFF))
+        own = parameters(running, TelemetryStream(link, read, lambda: bool(fields.excite_kind != EXCITE_OFF)))
         self.parameters = (*own, *stock_parameters(running))
         LogService(link, self.variables)
         ParameterService(link, self.parameters, storage)

@@ -18,16 +18,18 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "firmware_py.elementary": (),
     "firmware_py.compiling": (),
     "firmware_py.extras": (),
+    "firmware_py.fast": (),
     "firmware_py": ("firmware_py",),
     "ground_station": (
         "ground_station", "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.extras",
+        "firmware_py.fast",
     ),
     "hil": (
         "hil", "ground_station",
         "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
         "firmware_py.config", "firmware_py.signals", "firmware_py.rtos", "firmware_py.thief",
         "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.compiling",
-        "firmware_py.errors", "firmware_py.extras", "firmware_py.logic",
+        "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic",
     ),
 }  # fmt: skip
 

@@ -23,6 +23,7 @@ from rich.table import Table
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input
+from firmware_py.fast import STALE, STATE
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
@@ -133,7 +134,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:  # warm up
         fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 1.0), Path(folder))
 
-    table = Table(title="floaty bench")
+    table = Table(title=f"floaty bench: {STATE}")
     table.add_column("what")
     table.add_column("value", justify="right")
     table.add_column("share of the loop", justify="right")
@@ -163,6 +164,8 @@ def main() -> None:
                 "start to first tick, first compilation ever", f"{start_up_s(Path(folder)):.1f} s", ""
             )
     Console(width=100).print(table)
+    if STALE:
+        print(f"what `make fast` has compiled is not used: {STALE}")
 
 
 if __name__ == "__main__":

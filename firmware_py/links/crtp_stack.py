@@ -9,6 +9,7 @@ firmware: whoever sends unasked then stops, and throws away what waits (`hang_up
 """
 
 from collections.abc import Callable, Generator
+from typing import Final
 
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig
@@ -26,7 +27,7 @@ SYSLINK_QUEUE = 8
 DELIVERY_QUEUE = 5
 TRANSMIT_QUEUE = 120
 PORT_QUEUE = 16  # Crazyflie firmware
-SILENCE_US = 1_000_000  # Crazyflie firmware: RADIO_ACTIVITY_TIMEOUT_MS
+SILENCE_US: Final = 1_000_000  # Crazyflie firmware: RADIO_ACTIVITY_TIMEOUT_MS
 
 
 class CrtpStack:

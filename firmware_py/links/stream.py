@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.wire import telemetry
 
-ReadBlock = Callable[[telemetry.Block], Sequence[float]]
+ReadBlock = Callable[[telemetry.Block], Sequence[telemetry.Number]]
 
 
 class TelemetryStream:

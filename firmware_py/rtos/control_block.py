@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from typing import Any
+from typing import Any, Final
 
 # Which list holds the task. A wait without timeout is a suspension, as in FreeRTOS.
-READY, DELAYED, SUSPENDED, DELETED = range(4)
+READY: Final = 0
+DELAYED: Final = 1
+SUSPENDED: Final = 2
+DELETED: Final = 3
 
-NO_DEADLINE_US = 1 << 62
+NO_DEADLINE_US: Final = 1 << 62
 
 
 class ControlBlock:

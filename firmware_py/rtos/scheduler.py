@@ -13,26 +13,29 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable
-from typing import Any
+from typing import Any, Final
 
 from firmware_py.rtos.control_block import DELAYED, DELETED, READY, SUSPENDED, ControlBlock
 from firmware_py.rtos.errors import KernelError, StuckTaskError, TaskError
 
-SWITCH = (0,)  # what a call returns for `yield from` when the processor may go to another task
-GO_ON: tuple[int, ...] = ()  # ... and when the caller just continues
+SWITCH: Final = (0,)  # what a call returns for `yield from` when the processor may go to another task
+GO_ON: Final[tuple[int, ...]] = ()  # ... and when the caller just continues
 
-FOREVER = -1  # a timeout that never ends, FreeRTOS's portMAX_DELAY; any other timeout is a number of ticks
+FOREVER: Final = (
+    -1
+)  # a timeout that never ends, FreeRTOS's portMAX_DELAY; any other timeout is a number of ticks
 
-TICK_US = 1000
-MAX_PRIORITIES = 7  # the Crazyflie's six, 0 to 5, and one above them for what stands for interrupts
+TICK_US: Final = 1000
+MAX_PRIORITIES: Final = 7  # the Crazyflie's six, 0 to 5, and one above them for what stands for interrupts
 # Calls of the kernel, or switches, at one instant after which the running task counts as stuck. The most that a task
 # of the firmware needs is 25.
-STUCK_CALLS = 10_000
-_STUCK_SWITCHES = range(STUCK_CALLS)
-_FOR_EVER_US = 1 << 50
+STUCK_CALLS: Final = 10_000
+_FOR_EVER_US: Final = 1 << 50
 
 # Whose code runs at the moment: whoever makes the tasks before the start, a task, or an interrupt between two runs.
-BEFORE_START, IN_TASK, IN_INTERRUPT = range(3)
+BEFORE_START: Final = 0
+IN_TASK: Final = 1
+IN_INTERRUPT: Final = 2
 
 # Instant [us], event, who, and two numbers that depend on the event; as in tests/vectors/README.md, without CALL and RET.
 Trace = Callable[[int, str, str, int, int], None]
@@ -318,7 +321,7 @@ class Scheduler:
             task.work_left_us = 0 if task is idle else self._work_end_us - now_us
         result: Any = 0
         try:
-            for _ in _STUCK_SWITCHES:
+            for _ in range(STUCK_CALLS):
                 if switch:
                     self._switch_pending = False
                     ring = self.rings[self._ready_bits.bit_length() - 1]

@@ -24,6 +24,8 @@ SLOW_PERIOD_MS = 500
 TIMESTAMP_MASK = 0xFFFFFF  # of a sample: what a log data packet has room for
 
 
+Number = int | float  # what a log variable shows: whole where its type on the wire is
+
 STREAM = "telemetry.stream"  # uint8 parameter: 1 switches the stream on
 FIRST_ID = 0xF1
 
@@ -62,7 +64,7 @@ class Block:
         object.__setattr__(self, "layout", layout)
         object.__setattr__(self, "is_scaled", any(item.scale is not None for item in self.variables))
 
-    def pack(self, values: Sequence[float]) -> bytes:
+    def pack(self, values: Sequence[Number]) -> bytes:
         """The bytes of what the log variables show; integers wrap at their width."""
         if len(values) != len(self.variables):
             raise WireError(f"log block {self.id}: {len(values)} values for {len(self.variables)} variables")
@@ -72,7 +74,7 @@ class Block:
             pairs = zip(self.variables, values, strict=True)
             return self.layout.pack(*(variable.type.cast(value) for variable, value in pairs))
 
-    def unpack(self, packed: bytes) -> tuple[float, ...]:
+    def unpack(self, packed: bytes) -> tuple[Number, ...]:
         """The values of a sample; `WireError` for a wrong length."""
         if len(packed) != self.layout.size:
             raise WireError(
@@ -80,7 +82,7 @@ class Block:
             )
         return self.si_of(self.layout.unpack(packed))
 
-    def si_of(self, values: Sequence[float]) -> tuple[float, ...]:
+    def si_of(self, values: Sequence[Number]) -> tuple[Number, ...]:
         """The values of a sample, of what the log variables show."""
         if not self.is_scaled:
             return tuple(values)
@@ -96,7 +98,7 @@ class Sample:
 
     block: Block
     timestamp_ms: int  # in the bits of TIMESTAMP_MASK
-    values: tuple[float, ...]  # in the order of block.variables
+    values: tuple[Number, ...]  # in the order of block.variables
 
 
 def _variables(group: str, names: str, type: Scalar, unit: str) -> tuple[Variable, ...]:
@@ -143,7 +145,7 @@ SLOW_BLOCKS = (BATTERY, LOAD)
 _BLOCK_OF_ID = {block.id: block for block in ALL_BLOCKS}
 
 
-def encode_block(block: Block, timestamp_ms: int, values: Sequence[float]) -> bytes:
+def encode_block(block: Block, timestamp_ms: int, values: Sequence[Number]) -> bytes:
     """The complete packet with what the log variables of a block show; integers wrap at their width."""
     return encode_log_data(block.id, timestamp_ms, block.pack(values))
 

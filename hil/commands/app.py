@@ -7,6 +7,7 @@ import sys
 
 import click
 
+from firmware_py.fast import STALE, STATE
 from hil.commands.campaign import campaign
 from hil.commands.compare import compare
 from hil.commands.deploy import deploy
@@ -25,7 +26,9 @@ from hil.errors import LabError
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="floaty-hil", prog_name="floaty")
+@click.version_option(
+    package_name="floaty-hil", prog_name="floaty", message=f"%(prog)s, version %(version)s, {STATE}"
+)
 def app() -> None:
     """Floaty virtual laboratory: firmware, ground station and wind tunnel, joined by real bytes."""
 
@@ -40,6 +43,8 @@ for command in (
 
 def main() -> None:
     """Run the command line and leave with its exit code."""
+    if STALE:
+        print(f"floaty: pure Python, not what `make fast` has compiled: {STALE}", file=sys.stderr)
     try:
         code = app.main(standalone_mode=False)
     except LabError as error:

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from typing import Final
 
 import numpy as np
 
@@ -38,8 +39,8 @@ from hil.events import EventQueue
 
 Receiver = Callable[[int, bytes], object]  # (now_us, packet)
 
-POLL_BYTES = 1  # an empty poll is one header byte
-EMPTY_ACK_BYTES = 3  # with nothing else to say the nRF51 reports its signal strength
+POLL_BYTES: Final = 1  # an empty poll is one header byte
+EMPTY_ACK_BYTES: Final = 3  # with nothing else to say the nRF51 reports its signal strength
 
 
 @dataclass(slots=True)

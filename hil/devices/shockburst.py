@@ -13,17 +13,18 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
+from typing import Final
 
 from firmware_py.elementary import power
 from hil.devices.config import RadioConfig
 from hil.events import EventQueue
 
-MAX_PACKET = 32  # bytes, of the nRF24
-RETRIES = 3  # by the dongle (ARC), as cflib sets it
-TURN_ROUND_US = 130  # nRF24: settling before each transmission
-FRAME_BITS = 73  # preamble 8, address 40, control field 9, CRC 16
-SYSLINK_FRAME_BYTES = 6  # start 2, type, length, checksum 2
-SYSLINK_BYTE_US = 10  # the line between nRF51 and STM32: 1 Mbaud, 10 bits per byte
+MAX_PACKET: Final = 32  # bytes, of the nRF24
+RETRIES: Final = 3  # by the dongle (ARC), as cflib sets it
+TURN_ROUND_US: Final = 130  # nRF24: settling before each transmission
+FRAME_BITS: Final = 73  # preamble 8, address 40, control field 9, CRC 16
+SYSLINK_FRAME_BYTES: Final = 6  # start 2, type, length, checksum 2
+SYSLINK_BYTE_US: Final = 10  # the line between nRF51 and STM32: 1 Mbaud, 10 bits per byte
 
 
 def air_us(size: int, bits_per_second: int) -> int:

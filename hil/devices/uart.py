@@ -132,7 +132,7 @@ class VirtualSerial:
     """
 
     def __init__(self, config: SerialConfig, events: EventQueue, rng: np.random.Generator) -> None:
-        self.connected = True
+        self.connected: bool = True
         self.uplink_bit_error_rate = config.uplink_bit_error_rate
         self.downlink_bit_error_rate = config.downlink_bit_error_rate
         self._config = config

@@ -1,0 +1,109 @@
+"""Compiled modules are used while they fit their sources, and fly the same bits; `make fast`."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+
+import pytest
+
+from firmware_py.fast import RECORD, SWITCH, CompiledModules, digest, usable
+
+ROOT = Path(__file__).parent.parent.parent
+FLY = """
+import sys
+from pathlib import Path
+from hil.experiments import find_experiment
+from hil.laboratory.faults import parse
+from hil.laboratory.run import Request, fly, prepare
+for number, link in enumerate(("radio", "mavlink")):
+    prepare(folder := Path(sys.argv[1]) / str(number))
+    faults = [parse("push.y@1=1"), parse("mocap.dropout@1.5:0.3")]
+    request = Request.of(find_experiment("hover"), "floaty", ["markers.enabled=true"], 4, 3.0, link, faults)
+    print(fly(request, folder).hash)
+"""
+
+
+@pytest.fixture
+def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A source, and a compiled module that was made of it."""
+    monkeypatch.delenv(SWITCH, raising=False)
+    source, file = tmp_path / "flow.py", f"flow{EXTENSION_SUFFIXES[0]}"
+    source.write_text("SPEED = 9.5\n")
+    (tmp_path / "compiled").mkdir()
+    (tmp_path / "compiled" / file).write_bytes(b"")
+    record = {"sources": {"flow.py": digest(source)}, "modules": {"flow": file}}
+    (tmp_path / "compiled" / RECORD).write_text(json.dumps(record))
+    return tmp_path
+
+
+def test_a_compiled_module_is_found_while_its_sources_are_what_it_was_made_of(tree: Path) -> None:
+    files, why = usable(tree / "compiled", tree)
+    assert (list(files), why) == (["flow"], "")
+    spec = CompiledModules(files).find_spec("flow", None)
+    assert spec is not None
+    assert spec.origin == str(tree / "compiled" / f"flow{EXTENSION_SUFFIXES[0]}")
+    assert CompiledModules(files).find_spec("other", None) is None
+
+
+def test_a_changed_source_makes_all_modules_pure_and_is_named(tree: Path) -> None:
+    (tree / "flow.py").write_text("SPEED = 9.6\n")
+    assert usable(tree / "compiled", tree) == ({}, "flow.py has changed since")
+
+
+def test_a_missing_source_makes_all_modules_pure(tree: Path) -> None:
+    (tree / "flow.py").unlink()
+    assert usable(tree / "compiled", tree) == ({}, "flow.py has changed since")
+
+
+def test_modules_of_another_python_are_not_used(tree: Path) -> None:
+    record = json.loads((tree / "compiled" / RECORD).read_text())
+    record["modules"]["flow"] = "flow.cpython-39-other.so"
+    (tree / "compiled" / "flow.cpython-39-other.so").write_bytes(b"")
+    (tree / "compiled" / RECORD).write_text(json.dumps(record))
+    files, why = usable(tree / "compiled", tree)
+    assert not files
+    assert "none of this Python's modules" in why
+
+
+def test_pure_python_can_be_demanded(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(SWITCH, "1")
+    assert usable(tree / "compiled", tree) == ({}, "")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: nothing can be compiled here")
+def test_compiled_flights_have_the_same_hashes_until_a_source_changes(tmp_path: Path) -> None:
+    for name in ("firmware_py", "ground_station", "hil", "profiles", "tools"):
+        shutil.copytree(
+            ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("compiled", "__pycache__")
+        )
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+
+    def run(*arguments: str, **environment: str) -> tuple[str, str]:
+        variables = {name: value for name, value in os.environ.items() if name != SWITCH}
+        variables |= {"PYTHONPATH": str(tmp_path), **environment}
+        done = subprocess.run(
+            [sys.executable, *arguments],
+            cwd=tmp_path,
+            env=variables,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout, done.stderr
+
+    run("tools/fast.py")
+    assert "compiled by mypyc" in run("-c", "from hil.commands.app import main; main()", "--version")[0]
+    pure = run("-c", FLY, str(tmp_path / "pure"), FLOATY_PURE="1")
+    assert run("-c", FLY, str(tmp_path / "compiled")) == pure
+    with (tmp_path / "firmware_py" / "tasks.py").open("a") as source:
+        source.write("# one more line\n")
+    told, noticed = run("-c", "from hil.commands.app import main; main()", "--version")
+    assert "pure Python" in told
+    assert noticed.splitlines() == [
+        "floaty: pure Python, not what `make fast` has compiled: firmware_py/tasks.py has changed since"
+    ]

@@ -1,0 +1,99 @@
+"""Compiles the modules of the lockstep loop with mypyc into `firmware_py/compiled/`: same sources, same hashes, faster.
+
+    python tools/fast.py    (`make fast`; needs a C compiler and Python's headers, takes a minute or two)
+
+`firmware_py/fast.py` uses them until one of their sources changes. Modules that define pydantic models or functions for
+numba cannot be compiled, and what runs once per flight need not be. Compiled code makes a float of an int where a float is
+declared: modules in which numbers are whole or not depending on a table (log variables, telemetry blocks) stay as they are.
+"""
+
+import ast
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import setuptools  # mypyc looks whether it is there
+from mypyc.build import mypycify
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+os.environ["FLOATY_PURE"] = "1"  # what may lie there already is none of this program's business
+
+from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from here, and pure
+
+PACKAGES = ("firmware_py", "ground_station", "hil")
+MODULES = {
+    "firmware_py": "firmware geometry measurements pilot planner supervisor tasks",
+    "firmware_py/links": "crtp_stack localisation stream",
+    "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",
+    "firmware_py/wire": "crtp telemetry",
+    "ground_station": "corrections latency mocap pose_filter station telemetry_log tracker",
+    "ground_station/links": "loopback",
+    "hil": "events",
+    "hil/devices": "board cameras imu radio shockburst",
+    "hil/laboratory": "channels flight laboratory lockstep recorder robot",
+    "hil/world": "battery plant",
+}
+FILES = [f"{folder}/{name}.py" for folder, names in MODULES.items() for name in names.split()]
+
+
+def sources_of(modules: Iterable[str], root: Path = ROOT) -> list[Path]:
+    """Return the files of ours on which modules depend, themselves included: mypyc takes types and constants from them."""
+    found: set[Path] = set()
+    waiting = [root / module for module in modules]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += _imported(path, root)
+    return sorted(found)
+
+
+def _imported(path: Path, root: Path) -> Iterator[Path]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        for name in names:
+            if name.partition(".")[0] in PACKAGES:
+                for file in (
+                    root / f"{name.replace('.', '/')}.py",
+                    root / name.replace(".", "/") / "__init__.py",
+                ):
+                    if file.is_file():
+                        yield file
+
+
+def build(modules: Iterable[str] = FILES) -> None:
+    """Compile the modules of this tree; what was compiled before is gone from the first moment on."""
+    modules = list(modules)
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    sources = {str(path.relative_to(ROOT)): digest(path) for path in sources_of(modules)}
+    os.chdir(ROOT)
+    with tempfile.TemporaryDirectory() as work:
+        extensions = mypycify(modules, opt_level="2", debug_level="0", multi_file=True, target_dir=work)
+        distribution = setuptools.Distribution({"name": "floaty-compiled", "ext_modules": extensions})
+        command = distribution.get_command_obj("build_ext")
+        command.build_lib, command.build_temp = f"{work}/lib", f"{work}/temp"
+        command.parallel = os.cpu_count()
+        command.ensure_finalized()
+        command.run()
+        FOLDER.mkdir()
+        files = {}
+        for extension in extensions:
+            built = Path(command.get_ext_fullpath(extension.name))
+            files[extension.name] = extension.name + "".join(built.suffixes)
+            shutil.move(built, FOLDER / files[extension.name])
+    record = {"sources": sources, "modules": files}
+    (FOLDER / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    build()
+    print(f"{len(FILES)} modules compiled; floaty --version says whether they are in use")
