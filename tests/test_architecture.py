@@ -71,7 +71,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "multiprocessing": ("hil/studies/sweep.py",),
     "concurrent": ("hil/studies/sweep.py", "hil/campaigns/cluster.py"),
     "unicorn": ("firmware_py/export/cortex_m4.py",),
-    "elftools": ("firmware_py/export/arm_image.py",),
+    "elftools": ("firmware_py/export/arm_image.py", "hil/devices/stm32f405/image.py"),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
     "subprocess": (
         "hil/laboratory/result.py", "hil/live/", "hil/servers/linked.py",

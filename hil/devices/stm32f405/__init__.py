@@ -1,0 +1,1 @@
+"""The microcontroller of the Crazyflie, which executes an image as it is flashed, and what is read of it while it runs."""
