@@ -79,7 +79,8 @@ CONFINED: dict[str, tuple[str, ...]] = {
         "firmware_py/export/native.py", "firmware_py/export/arm_image.py", "firmware_py/export/plain.py",
     ),
     "socket": (
-        "hil/clock.py", "hil/live/window.py", "hil/servers/dongle_plugin.py", "hil/servers/dongle_server.py",
+        "hil/clock.py", "hil/devices/stm32f405/gdb.py",
+        "hil/live/window.py", "hil/servers/dongle_plugin.py", "hil/servers/dongle_server.py",
         "hil/servers/udp_server.py", "hil/servers/serial_server.py", "hil/servers/motive.py",
         "ground_station/sources/optitrack.py", "ground_station/sources/motioncapture_process.py",
     ),

@@ -74,7 +74,7 @@ static volatile uint32_t queue[8], queue_head, queue_tail;
 extern uint32_t data_load[], data_begin[], data_end[], bss_begin[], bss_end[], main_stack_top[];
 void run_scenario(uint32_t number);
 
-void assertFail(const char *expression, const char *file, int line) {
+__attribute__((noinline)) void assertFail(const char *expression, const char *file, int line) {
   (void)expression;
   __asm volatile("cpsid i");
   snapshot.magicNumber = MAGIC_ASSERT;

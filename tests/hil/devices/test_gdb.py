@@ -1,0 +1,279 @@
+"""GDB's remote serial protocol, byte by byte, as its manual describes it (appendix "Remote Protocol")."""
+
+import socket
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from struct import pack, unpack_from
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("unicorn")
+
+from hil.devices.stm32f405.gdb import GdbServer
+from hil.devices.stm32f405.gdb_protocol import (
+    PACKET_SIZE,
+    REGISTERS,
+    SIGINT,
+    SIGTRAP,
+    RemoteProtocol,
+    Wish,
+    framed,
+    unescaped,
+)
+from hil.devices.stm32f405.image import Image
+from hil.errors import LabError
+from support import stm32_firmware
+from support.bare_cortex import BareCortex
+
+RAM = 0x2000_0000
+
+
+@pytest.fixture(scope="module")
+def image() -> Image:
+    return Image(stm32_firmware.build())
+
+
+@pytest.fixture
+def machine(image: Image) -> BareCortex:
+    return BareCortex(image)
+
+
+@pytest.fixture
+def protocol(machine: BareCortex) -> RemoteProtocol:
+    return RemoteProtocol(machine)
+
+
+def ask(protocol: RemoteProtocol, payload: bytes) -> bytes:
+    """Return the content of the answer to a packet."""
+    answer = protocol.receive(framed(payload))
+    assert answer[:2] == b"+$", answer
+    assert answer[-3:] == b"#%02x" % (sum(answer[2:-3]) % 256)
+    return unescaped(answer[2:-3])
+
+
+def test_a_packet_has_the_checksum_of_its_bytes() -> None:
+    # The manual's example of an empty answer, and sums by hand.
+    assert framed(b"") == b"$#00"
+    assert framed(b"OK") == b"$OK#9a"
+    assert framed(b"a#b") == b"$a}\x03b#43"
+
+
+@given(st.binary(max_size=300))
+def test_binary_data_survives_its_escapes(data: bytes) -> None:
+    packet = framed(data)
+    assert packet.count(b"#") == 1
+    assert b"$" not in packet[1:]
+    assert unescaped(packet[1:-3]) == data
+
+
+@settings(max_examples=25)
+@given(cuts=st.lists(st.integers(1, 20), max_size=12))
+def test_packets_may_arrive_in_pieces(image: Image, cuts: list[int]) -> None:
+    machine = BareCortex(image)
+    protocol = RemoteProtocol(machine)
+    stream = b"+" + framed(b"qAttached") + b"+" + framed(b"p0f") + b"+" + framed(b"m20000000,4")
+    answers = b""
+    for cut in cuts:
+        answers += protocol.receive(stream[:cut])
+        stream = stream[cut:]
+    answers += protocol.receive(stream)
+    pc = machine.register("pc")
+    assert answers == b"+" + framed(b"1") + b"+" + framed(pack("<I", pc).hex().encode()) + b"+" + framed(
+        b"00000000"
+    )
+
+
+def test_a_wrong_checksum_is_asked_for_again_and_an_answer_repeated(protocol: RemoteProtocol) -> None:
+    assert protocol.receive(b"$?#00") == b"-"
+    assert protocol.receive(b"$?#3f") == b"+$T05thread:1;#d7"
+    assert protocol.receive(b"-") == b"$T05thread:1;#d7"
+    assert protocol.receive(b"+") == b""
+
+
+def test_without_acknowledgements_only_answers_are_sent(protocol: RemoteProtocol) -> None:
+    assert ask(protocol, b"QStartNoAckMode") == b"OK"
+    assert protocol.receive(framed(b"?")) == framed(b"T05thread:1;")
+    assert protocol.receive(b"$?#00") == b""
+
+
+def test_what_is_not_known_is_answered_with_nothing(protocol: RemoteProtocol) -> None:
+    for packet in (b"vMustReplyEmpty", b"qTStatus", b"R00", b"b", b"Z2,20000000,4", b"QPassSignals:", b"_"):
+        assert ask(protocol, packet) == b""
+
+
+@pytest.mark.parametrize(
+    "packet", [b"m", b"m,", b"m20000000", b"mxyz,4", b"p", b"pff", b"P0", b"P0=12", b"G00", b"M20000000,4:00",
+               b"X20000000,4:0", b"Z0", b"Z1,", b"vCont;", b"vCont;x", b"c-1", b"M20000000,1:zz"],
+)  # fmt: skip
+def test_a_malformed_packet_changes_nothing(
+    protocol: RemoteProtocol, machine: BareCortex, packet: bytes
+) -> None:
+    before = ask(protocol, b"g")
+    assert ask(protocol, packet) == b"E01"
+    assert ask(protocol, b"g") == before
+    assert machine.breakpoints == set()
+    assert protocol.wish is Wish.STAND
+
+
+@settings(max_examples=25)
+@given(st.lists(st.binary(max_size=30) | st.sampled_from([b"$", b"#", b"m", b"vCont;", b"}"]), max_size=8))
+def test_nothing_that_arrives_raises(image: Image, pieces: list[bytes]) -> None:
+    protocol = RemoteProtocol(BareCortex(image))
+    for piece in pieces:
+        protocol.receive(piece)
+        protocol.receive(framed(piece))
+
+
+def test_the_supported_features_are_those_that_are_there(protocol: RemoteProtocol) -> None:
+    features = ask(protocol, b"qSupported:multiprocess+;swbreak+;hwbreak+").split(b";")
+    assert b"PacketSize=%x" % PACKET_SIZE in features
+    assert {b"QStartNoAckMode+", b"qXfer:features:read+", b"vContSupported+"} <= set(features)
+    assert ask(protocol, b"vCont?") == b"vCont;c;C;s;S"
+    assert (ask(protocol, b"qfThreadInfo"), ask(protocol, b"qsThreadInfo"), ask(protocol, b"qC")) == (
+        b"m1",
+        b"l",
+        b"QC1",
+    )
+
+
+def test_the_target_description_numbers_the_registers_as_they_are_sent(protocol: RemoteProtocol) -> None:
+    text, piece = b"", b"m"
+    while piece[:1] == b"m":
+        piece = ask(protocol, b"qXfer:features:read:target.xml:%x,64" % len(text))
+        text += piece[1:]
+    root = ElementTree.fromstring(text)
+    registers = [(r.get("name"), int(r.get("bitsize") or 0) // 8) for r in root.iter("reg")]
+    assert registers == list(REGISTERS)
+    assert [f.get("name") for f in root.iter("feature")] == [
+        "org.gnu.gdb.arm.m-profile", "org.gnu.gdb.arm.vfp", "org.gnu.gdb.arm.m-system",
+    ]  # fmt: skip
+    assert [name for name, _ in registers[:17]] == [*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"]
+
+
+def test_registers_are_read_and_written_one_by_one_and_all_at_once(
+    protocol: RemoteProtocol, machine: BareCortex
+) -> None:
+    number = {name: index for index, (name, _) in enumerate(REGISTERS)}
+    assert ask(protocol, b"P%x=78563412" % number["r7"]) == b"OK"
+    assert ask(protocol, b"P%x=%s" % (number["d3"], pack("<d", -1.5).hex().encode())) == b"OK"
+    assert (machine.register("r7"), machine.register("d3")) == (
+        0x1234_5678,
+        unpack_from("<Q", pack("<d", -1.5))[0],
+    )
+    assert ask(protocol, b"p%x" % number["r7"]) == b"78563412"
+    everything = bytearray.fromhex(ask(protocol, b"g").decode())
+    assert len(everything) == sum(size for _, size in REGISTERS)
+    assert everything[28:32] == bytes.fromhex("78563412")
+    everything[28:32] = bytes(4)
+    everything[13 * 4 : 14 * 4] = pack("<I", 0x2000_1230)
+    assert ask(protocol, b"G" + everything.hex().encode()) == b"OK"
+    assert (machine.register("r7"), machine.register("sp")) == (0, 0x2000_1230)
+
+
+@pytest.mark.parametrize("command", [b"M", b"X"])
+def test_memory_is_read_and_written(protocol: RemoteProtocol, command: bytes) -> None:
+    data = bytes(range(0x20, 0x30)) + b"}}*$#"
+    written = data.hex().encode() if command == b"M" else data
+    assert ask(protocol, b"%s20000100,%x:%s" % (command, len(data), written)) == b"OK"
+    assert bytes.fromhex(ask(protocol, b"m20000100,%x" % len(data)).decode()) == data
+    assert ask(protocol, command + b"20000100,0:") == b"OK"
+
+
+def test_memory_that_is_not_there_is_an_error(protocol: RemoteProtocol) -> None:
+    assert ask(protocol, b"m30000000,4") == b"E0e"
+    assert ask(protocol, b"M30000000,1:00") == b"E0e"
+
+
+def test_code_is_where_the_image_says(protocol: RemoteProtocol, image: Image) -> None:
+    assert bytes.fromhex(ask(protocol, b"m8004000,800").decode()) == image.code[:0x800]
+
+
+@pytest.fixture
+def client(machine: BareCortex) -> Iterator[tuple[GdbServer, socket.socket]]:
+    server = GdbServer(machine, 0)
+    with socket.create_connection(("127.0.0.1", server.port)) as client:
+        client.settimeout(10.0)
+        yield server, client
+    server.close()
+
+
+def test_a_run_ends_in_front_of_a_breakpoint_and_a_step_behind_one_instruction(
+    client: tuple[GdbServer, socket.socket], machine: BareCortex, image: Image
+) -> None:
+    server, line = client
+    there = image.reset + 8
+    line.sendall(framed(b"QStartNoAckMode") + framed(b"Z1,%x,2" % there) + framed(b"c"))
+    assert server.hold() is Wish.RUN
+    assert machine.register("pc") == image.reset
+    line.sendall(framed(b"pf") + framed(b"s") + framed(b"pf") + framed(b"z1,%x,2" % there) + framed(b"D"))
+    machine.run_to_stop(server)
+    assert machine.register("pc") == there
+    assert machine.run(server) is Wish.DETACH
+    assert machine.register("pc") in (there + 2, there + 4)
+    pcs = [framed(pack("<I", pc).hex().encode()) for pc in (there, machine.register("pc"))]
+    stopped = framed(b"T05thread:1;")
+    assert (
+        line.recv(4096) == b"+" + framed(b"OK") * 2 + stopped + pcs[0] + stopped + pcs[1] + framed(b"OK") * 2
+    )
+
+
+def test_a_breakpoint_where_the_machine_stands_does_not_hold_it_again(
+    client: tuple[GdbServer, socket.socket], machine: BareCortex, image: Image
+) -> None:
+    server, line = client
+    line.sendall(
+        framed(b"Z0,%x,2" % image.reset)
+        + framed(b"Z0,%x,2" % (image.reset + 8))
+        + framed(b"c")
+        + framed(b"D")
+    )
+    assert machine.run(server) is Wish.DETACH
+    assert machine.register("pc") == image.reset + 8
+
+
+def test_ctrl_c_stops_a_run(client: tuple[GdbServer, socket.socket], machine: BareCortex) -> None:
+    server, line = client
+    machine.write(RAM + 0x100, bytes.fromhex("fee7"))  # b .
+    machine.set_register("pc", RAM + 0x100)
+    line.sendall(framed(b"QStartNoAckMode") + framed(b"c"))
+    assert server.hold() is Wish.RUN
+    assert not server.wants_to_stop()
+    line.sendall(b"\x03")
+    assert server.wants_to_stop()
+    line.sendall(framed(b"D"))
+    assert server.hold(SIGINT) is Wish.DETACH
+    assert line.recv(4096) == b"+" + framed(b"OK") + framed(b"T02thread:1;") + framed(b"OK")
+
+
+def test_who_hangs_up_lets_the_machine_go_and_another_may_come(
+    client: tuple[GdbServer, socket.socket], machine: BareCortex, image: Image
+) -> None:
+    server, line = client
+    line.sendall(framed(b"Z0,%x,2" % image.reset))
+    line.shutdown(socket.SHUT_WR)
+    assert server.hold() is Wish.DETACH
+    assert machine.breakpoints == set()
+    assert not server.wants_to_stop()
+    with socket.create_connection(("127.0.0.1", server.port)) as other:
+        assert server.wants_to_stop()
+        other.sendall(framed(b"k"))
+        assert server.hold() is Wish.KILL
+
+
+def test_time_stands_still_while_the_debugger_asks(
+    client: tuple[GdbServer, socket.socket], machine: BareCortex
+) -> None:
+    server, line = client
+    before = [machine.register(name) for name, _ in REGISTERS]
+    line.sendall(b"".join(framed(b"m20000000,4") for _ in range(50)) + framed(b"c"))
+    assert server.hold(SIGTRAP) is Wish.RUN
+    assert [machine.register(name) for name, _ in REGISTERS] == before
+
+
+def test_a_port_that_is_taken_is_refused(machine: BareCortex) -> None:
+    server = GdbServer(machine, 0)
+    with pytest.raises(LabError, match=rf"--gdb {server.port}: Address already in use"):
+        GdbServer(machine, server.port)
+    server.close()

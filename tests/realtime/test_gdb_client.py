@@ -1,0 +1,86 @@
+"""GDB itself, Debian's `gdb-multiarch`, at the server of `--gdb`."""
+
+import shutil
+import subprocess
+
+import pytest
+
+pytest.importorskip("unicorn")
+
+from hil.devices.stm32f405.gdb import GdbServer
+from hil.devices.stm32f405.gdb_protocol import Wish
+from hil.devices.stm32f405.image import Image
+from support import stm32_firmware
+from support.bare_cortex import BareCortex
+
+GDB = "gdb-multiarch"
+ASSERTION = 3  # of `enum planted`
+
+
+@pytest.fixture(autouse=True)
+def installed() -> None:
+    if shutil.which(GDB) is None:
+        pytest.skip(f"{GDB} is not installed: apt-get install {GDB}")
+
+
+def debugged(machine: BareCortex, image: Image, *commands: str) -> list[str]:
+    """Return what GDB prints when it gives the machine these commands and leaves."""
+    server = GdbServer(machine, 0)
+    everything = ("set confirm off", f"target remote 127.0.0.1:{server.port}", *commands, "detach")
+    words = [word for command in everything for word in ("-ex", command)]
+    gdb = subprocess.Popen(
+        (GDB, "-nx", "-batch", *words, str(image.path)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        assert machine.run(server) is Wish.DETACH
+        printed, _ = gdb.communicate(timeout=30)
+    finally:
+        gdb.kill()
+        server.close()
+    return printed.splitlines()
+
+
+@pytest.mark.parametrize("compiler", ["clang", "gcc"])
+def test_gdb_stops_at_a_breakpoint_and_names_who_called(compiler: str) -> None:
+    image = Image(stm32_firmware.build(compiler))
+    printed = debugged(
+        BareCortex(image), image, f"set var $r0 = {ASSERTION}", "set var $lr = 0xffffffff", "set var $pc = go_wrong",
+        "break assertFail", "continue", "backtrace 2", "print $pc == (long)assertFail & ~1", "info breakpoints",
+    )  # fmt: skip
+    text = "\n".join(printed)
+    assert "Breakpoint 1, assertFail (" in text
+    assert any(line.startswith("#0  assertFail (") and "firmware.c:" in line for line in printed)
+    assert any(
+        line.startswith("#1 ") and "go_wrong (how=" in line and "firmware.c:" in line for line in printed
+    )
+    assert "breakpoint already hit 1 time" in text
+
+
+def test_gdb_reads_and_changes_registers_and_memory() -> None:
+    image = Image(stm32_firmware.build())
+    machine = BareCortex(image)
+    printed = debugged(
+        machine, image, "set var $d5 = -2.5", "print $d5", "print $s10", "set var $basepri = 0x50", "print/x $basepri",
+        "set var $r9 = 0xcafe", "print/x $r9", "set var xTickCount = 4711", "print xTickCount",
+        "set var tasks[2].pcTaskName[1] = 'q'", "print tasks[2].pcTaskName", "x/1i $pc",
+    )  # fmt: skip
+    values = [line.partition(" = ")[2] for line in printed if line.startswith("$")]
+    assert values[0] == "-2.5"
+    assert values[2:5] == ["0x50", "0xcafe", "4711"]
+    assert values[5] == r'"\000q\000\000\000\000\000"'
+    assert machine.register("d5") == 0xC004_0000_0000_0000
+    assert machine.register("basepri") == 0x50
+    assert any("Reset_Handler" in line and ":" in line for line in printed[-4:])
+
+
+def test_gdb_steps_one_instruction_and_one_line() -> None:
+    image = Image(stm32_firmware.build())
+    machine = BareCortex(image)
+    printed = debugged(machine, image, "print/x $pc", "stepi", "print/x $pc", "next", "print/x $pc")
+    before, behind, line = (int(text.partition(" = ")[2], 16) for text in printed if text.startswith("$"))
+    assert before == image.reset
+    assert behind - before in (2, 4)
+    assert line > behind
