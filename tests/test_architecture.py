@@ -70,9 +70,9 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "prompt_toolkit": ("ground_station/terminal.py",),
     "multiprocessing": ("hil/studies/sweep.py",),
     "concurrent": ("hil/studies/sweep.py", "hil/campaigns/cluster.py"),
-    "unicorn": ("firmware_py/export/cortex_m4.py",),
+    "unicorn": ("firmware_py/export/cortex_m4.py", "hil/devices/stm32f405/chip.py"),
     "elftools": ("firmware_py/export/arm_image.py", "hil/devices/stm32f405/image.py"),
-    "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
+    "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py", "hil/devices/stm32f405/chip.py"),
     "subprocess": (
         "hil/laboratory/result.py", "hil/live/", "hil/servers/linked.py",
         "ground_station/sources/motioncapture_client.py",

@@ -45,13 +45,13 @@ def build_image(source: str, header: str, folder: Path, optimisation: str = "-Os
     texts = {"floaty_core.c": source, "floaty_core.h": header}
     texts.update({name: (SOURCES / name).read_text(encoding="utf-8") for name in ("rt.c", "flash.ld")})
     flags = (*TARGET_FLAGS, optimisation, "-fno-builtin", "-T", "flash.ld")
-    return read_image(_compile(texts, ("floaty_core.c", "rt.c"), flags, "floaty_core.elf", folder))
+    return read_image(compile_texts(texts, ("floaty_core.c", "rt.c"), flags, "floaty_core.elf", folder))
 
 
 def build_meter(folder: Path) -> Path:
     """Compile arm/meter.c into a library for this machine. Raises `ExportError`."""
     text = (SOURCES / "meter.c").read_text(encoding="utf-8")
-    return _compile({"meter.c": text}, ("meter.c",), HOST_FLAGS, "meter.so", folder)
+    return compile_texts({"meter.c": text}, ("meter.c",), HOST_FLAGS, "meter.so", folder)
 
 
 def read_image(path: Path, alone: bool = True) -> Image:
@@ -114,7 +114,7 @@ def _constants(symbols: Sequence[tuple[int, str]], size: int) -> frozenset[int]:
     return frozenset(found)
 
 
-def _compile(
+def compile_texts(
     texts: dict[str, str], inputs: Sequence[str], flags: Sequence[str], output: str, folder: Path
 ) -> Path:
     """Compile texts in a folder of their own, unless that was done before; returns the path of the output."""

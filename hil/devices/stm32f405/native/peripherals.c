@@ -1,0 +1,227 @@
+/* Where a peripheral's register is: what has behaviour here or in a file of its own, and what only keeps what is written.
+
+RCC says that every clock is ready, PWR that the voltage is, FLASH that it is idle; GPIO, EXTI, the watchdog, ADC, USB
+without a host, and the random numbers are here (chapters 7, 5, 3, 8, 12, 21, 13, 34, 24). */
+#include "machine.h"
+
+enum { LSI_HZ = 32000 };
+
+struct range {
+    uint32_t base;
+    uint8_t kind, index;
+};
+enum { NONE, PLAIN, TIMER, BUS, USART, DMA, PORT, EXTI, RCC, PWR, FLASH, WATCHDOG, ADC };
+
+/* By address in steps of 0x400. */
+static struct range find(uint32_t offset)
+{
+    static const struct range ranges[] = {
+        {0x00000, TIMER, 1}, {0x00400, TIMER, 2}, {0x00800, TIMER, 3}, {0x00C00, TIMER, 4}, {0x01000, TIMER, 5},
+        {0x01400, TIMER, 6}, {0x01800, TIMER, 11}, {0x01C00, TIMER, 12}, {0x02000, TIMER, 13}, {0x02800, PLAIN, 0},
+        {0x02C00, PLAIN, 0}, {0x03000, WATCHDOG, 0}, {0x04400, USART, 1}, {0x04800, USART, 2}, {0x04C00, USART, 3},
+        {0x05000, USART, 4}, {0x05400, BUS, 0}, {0x05800, BUS, 1}, {0x05C00, BUS, 2}, {0x07000, PWR, 0},
+        {0x10000, TIMER, 0}, {0x10400, TIMER, 7}, {0x11000, USART, 0}, {0x11400, USART, 5}, {0x12000, ADC, 0},
+        {0x13800, PLAIN, 0}, {0x13C00, EXTI, 0}, {0x14000, TIMER, 8}, {0x14400, TIMER, 9}, {0x14800, TIMER, 10},
+        {0x20000, PORT, 0}, {0x20400, PORT, 1}, {0x20800, PORT, 2}, {0x20C00, PORT, 3}, {0x21000, PORT, 4},
+        {0x21400, PORT, 5}, {0x21800, PORT, 6}, {0x21C00, PORT, 7}, {0x22000, PORT, 8}, {0x23800, RCC, 0},
+        {0x23C00, FLASH, 0}, {0x26000, DMA, 0}, {0x26400, DMA, 1},
+    };
+    static const struct range nothing = {0, NONE, 0};
+    for (unsigned i = 0; i < sizeof ranges / sizeof *ranges; i++)
+        if (ranges[i].base == (offset & ~0x3FFu))
+            return ranges[i];
+    return nothing;
+}
+
+static void note_unknown(struct machine *m, uint32_t address)
+{
+    for (uint32_t i = 0; i < m->unknown_count; i++)
+        if (m->unknown[i] == address)
+            return;
+    if (m->unknown_count < 16)
+        m->unknown[m->unknown_count++] = address;
+}
+
+/* GPIO */
+
+static uint32_t levels(struct machine *m, unsigned port)
+{
+    uint32_t mode = m->plain[(0x20000 + 0x400 * port) / 4], out = 0;
+    for (unsigned pin = 0; pin < 16; pin++)
+        out |= (uint32_t)((mode >> 2 * pin & 3) == 1) << pin;
+    return (m->output[port] & out) | (m->input[port] & ~out & 0xFFFF);
+}
+
+static uint32_t port_read(struct machine *m, unsigned port, uint32_t at)
+{
+    if (at == 0x10)
+        return levels(m, port);
+    return at == 0x14 ? m->output[port] : m->plain[(0x20000 + 0x400 * port + at) / 4];
+}
+
+static void port_write(struct machine *m, unsigned port, uint32_t at, uint32_t value, unsigned size)
+{
+    if (at == 0x14)
+        m->output[port] = value & 0xFFFF;
+    else if (at == 0x18) /* the half that sets wins */
+        m->output[port] = ((m->output[port] & ~(size == 4 ? value >> 16 : 0)) | value) & 0xFFFF;
+    else if (at == 0x1A)
+        m->output[port] &= ~value;
+    else
+        m->plain[(0x20000 + 0x400 * port + at) / 4] = value;
+}
+
+/* EXTI */
+
+static void update_exti(struct machine *m)
+{
+    uint32_t on = m->exti[5] & m->exti[0];
+    for (unsigned line = 0; line < 5; line++)
+        set_line(m, 6 + line, on >> line & 1);
+    set_line(m, 23, (on & 0x3E0) != 0);
+    set_line(m, 40, (on & 0xFC00) != 0);
+}
+
+/* A pin gets another level from outside. */
+void machine_pin(struct machine *m, uint32_t port, uint32_t pin, uint32_t high)
+{
+    uint32_t was = m->input[port] >> pin & 1, source = m->plain[(0x13808 + pin / 4 * 4) / 4] >> pin % 4 * 4 & 15;
+    m->input[port] = (m->input[port] & ~(1u << pin)) | (high & 1) << pin;
+    if (was != (high & 1) && source == port && m->exti[high ? 2 : 3] >> pin & 1) {
+        m->exti[5] |= 1u << pin;
+        update_exti(m);
+    }
+}
+
+static void exti_write(struct machine *m, uint32_t at, uint32_t value)
+{
+    if (at == 0x14) {
+        m->exti[5] &= ~value;
+    } else if (at == 0x10) {
+        m->exti[5] |= value & m->exti[0];
+    } else if (at < 0x10) {
+        m->exti[at / 4] = value;
+    }
+    update_exti(m);
+}
+
+/* RCC: every clock that is switched on is ready, and the one that is chosen runs. */
+
+static uint32_t rcc_read(struct machine *m, uint32_t at)
+{
+    uint32_t value = m->plain[(0x23800 + at) / 4];
+    switch (at) {
+    case 0x00: return value | (value & 0x05010001) << 1;
+    case 0x08: return (value & ~12u) | (value & 3) << 2;
+    case 0x70: return value | (value & 1) << 1;
+    case 0x74: return value | (value & 1) << 1;
+    default: return value;
+    }
+}
+
+static void rcc_write(struct machine *m, uint32_t at, uint32_t value)
+{
+    uint32_t *reg = &m->plain[(0x23800 + at) / 4];
+    if (at == 0x74) /* the causes of resets are cleared together, by RMVF */
+        *reg = value >> 24 & 1 ? value & 1 : (*reg & 0xFE000000) | (value & 1);
+    else
+        *reg = value;
+}
+
+/* Independent watchdog */
+
+static void watchdog_write(struct machine *m, uint32_t at, uint32_t value)
+{
+    if (at == 4)
+        m->watchdog_prescaler = value & 7;
+    if (at == 8)
+        m->watchdog_reload = value & 0xFFF;
+    if (at == 0 && value == 0xCCCC)
+        m->watchdog_on = 1;
+    if (at == 0 && m->watchdog_on && (value == 0xAAAA || value == 0xCCCC)) {
+        unsigned power = m->watchdog_prescaler < 6 ? m->watchdog_prescaler : 6;
+        plan(m, DUE_WATCHDOG, m->now + (CLOCK_HZ / LSI_HZ * (4ull << power)) * (m->watchdog_reload + 1ull));
+    }
+}
+
+static uint32_t watchdog_read(struct machine *m, uint32_t at)
+{
+    return at == 4 ? m->watchdog_prescaler : at == 8 ? m->watchdog_reload : 0;
+}
+
+uint64_t peripheral_read(uc_engine *uc, uint64_t where, unsigned size, void *user)
+{
+    struct machine *m = user;
+    uint32_t offset = (uint32_t)where & ~3u, at = offset & 0x3FF, shift = 8 * ((uint32_t)where & 3), value;
+    struct range range = find(offset);
+    (void)uc;
+    (void)size;
+    switch (range.kind) {
+    case TIMER: value = timer_read(m, range.index, at); break;
+    case BUS: value = bus_read(m, range.index, at); break;
+    case USART: value = usart_read(m, range.index, at); break;
+    case DMA: value = dma_read(m, range.index, at); break;
+    case PORT: value = port_read(m, range.index, at); break;
+    case EXTI: value = at < 0x18 ? m->exti[at / 4] : 0; break;
+    case RCC: value = rcc_read(m, at); break;
+    case PWR: value = at == 4 ? m->plain[offset / 4] | 0xC008 : m->plain[offset / 4]; break; /* VOSRDY and others */
+    case FLASH: value = at == 0x0C ? 0 : m->plain[offset / 4]; break;
+    case WATCHDOG: value = watchdog_read(m, at); break;
+    case ADC: value = at == 0 ? 0x12 : at == 0x4C ? 0x800 : m->plain[offset / 4]; break; /* done, half of the range */
+    case PLAIN: value = m->plain[offset / 4]; break;
+    default:
+        note_unknown(m, 0x40000000 + offset - at);
+        value = 0;
+    }
+    return value >> shift;
+}
+
+void peripheral_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t given, void *user)
+{
+    struct machine *m = user;
+    uint32_t offset = (uint32_t)where, at = offset & 0x3FF, value = (uint32_t)given;
+    struct range range = find(offset);
+    (void)uc;
+    switch (range.kind) {
+    case TIMER: timer_write(m, range.index, at, value); break;
+    case BUS: bus_write(m, range.index, at, value); break;
+    case USART: usart_write(m, range.index, at, value); break;
+    case DMA: dma_write(m, range.index, at, value); break;
+    case PORT: port_write(m, range.index, at, value, size); break;
+    case EXTI: exti_write(m, at, value); break;
+    case RCC: rcc_write(m, at & ~3u, value << 8 * (at & 3)); break;
+    case WATCHDOG: watchdog_write(m, at, value); break;
+    case PWR: case FLASH: case ADC: case PLAIN: m->plain[offset / 4] = value; break;
+    default: note_unknown(m, 0x40000000 + (offset & ~0x3FFu));
+    }
+}
+
+uint64_t usb_read(uc_engine *uc, uint64_t where, unsigned size, void *user)
+{
+    struct machine *m = user;
+    uint32_t offset = (uint32_t)where;
+    (void)uc;
+    (void)size;
+    if (offset == 0x10) /* GRSTCTL: idle, and no reset is under way */
+        return 0x80000000;
+    if (offset == 0x60804) /* RNG: a number is ready */
+        return 1;
+    if (offset == 0x60808) {
+        m->random ^= m->random << 13;
+        m->random ^= m->random >> 17;
+        m->random ^= m->random << 5;
+        return m->random;
+    }
+    if (offset >= 0x40000)
+        note_unknown(m, 0x50000000 + (offset & ~0x3FFu));
+    return 0;
+}
+
+void usb_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t value, void *user)
+{
+    (void)uc;
+    (void)where;
+    (void)size;
+    (void)value;
+    (void)user;
+}
