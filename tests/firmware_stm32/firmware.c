@@ -454,8 +454,8 @@ void Reset_Handler(void) {
   start(3, "FILTER", filter, 3);
   start(4, "FROZEN", frozen, 3);
   start(5, "IDLE", rest, 0);
-  SCB_SHPR(14 - 4) = 0xF0; /* PendSV and SysTick last of all */
-  SCB_SHPR(15 - 4) = 0xF0;
+  SCB_SHPR(14) = 0xF0; /* PendSV and SysTick last of all */
+  SCB_SHPR(15) = 0xF0;
   SYST_RVR = 168000 - 1;
   SYST_CVR = 0;
   SYST_CSR = 7;

@@ -273,7 +273,11 @@ static uint32_t system_word(struct machine *m, uint32_t offset)
     switch (offset) {
     case 0x1000: return 1; /* DWT CTRL */
     case 0x1004: return (uint32_t)m->now; /* CYCCNT */
-    case 0xE010: return m->tick_ctrl;
+    case 0xE010: {
+        uint32_t control = m->tick_ctrl;
+        m->tick_ctrl &= ~(1u << 16); /* reading clears COUNTFLAG, B3.3.3 */
+        return control;
+    }
     case 0xE014: return m->tick_load;
     case 0xE018: return tick_value(m);
     case 0xED00: return 0x410FC241;

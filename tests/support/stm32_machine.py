@@ -1,0 +1,40 @@
+"""The tests' own firmware on the emulated microcontroller."""
+
+from struct import pack, unpack
+
+import numpy as np
+import pytest
+
+pytest.importorskip("unicorn")
+
+from hil.devices.stm32f405.chip import CYCLES_PER_US, Chip, Why, build_machine
+from hil.devices.stm32f405.image import Image
+from support.stm32_firmware import BUILD, build
+
+
+class FirmwareOnChip:
+    """One image on one chip with an EEPROM, from power-on; variables are read and written by name."""
+
+    def __init__(self, compiler: str = "clang", **variables: int) -> None:
+        self.image = Image(build(compiler))
+        self.chip = Chip(self.image.code, self.image.base, build_machine(BUILD))
+        self.eeprom = np.full(8192, 0xFF, np.uint8)
+        self.chip.add_device(1, 0x50, self.eeprom, 2)
+        for name, value in variables.items():
+            self.poke(name, value)
+
+    def run(self, us: int) -> Why:
+        """Run until that long after power-on, or until something stops the chip."""
+        return self.chip.run(us * CYCLES_PER_US)
+
+    def peek(self, name: str, index: int = 0) -> int:
+        """Return a word of a variable."""
+        return self.peek_all(name, index + 1)[index]
+
+    def peek_all(self, name: str, count: int) -> list[int]:
+        """Return the first words of a variable."""
+        return list(unpack(f"<{count}I", self.chip.read(self.image.symbol(name).address, 4 * count)))
+
+    def poke(self, name: str, value: int) -> None:
+        """Change a word."""
+        self.chip.write(self.image.symbol(name).address, pack("<I", value))
