@@ -76,8 +76,7 @@ class GdbServer:
         if data:
             self._send(self._protocol.receive(data))
         else:
-            self._debuggee.breakpoints.clear()
-            self._protocol.wish = Wish.DETACH
+            self._protocol.leave(Wish.DETACH)
             self._part()
 
     def _send(self, data: bytes) -> None:

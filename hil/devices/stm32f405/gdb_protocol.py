@@ -129,6 +129,7 @@ class RemoteProtocol:
         self._debuggee = debuggee
         self._framing = Framing(bytearray())
         self._items: list[bytes] = []
+        self._own: set[int] = set()  # breakpoints of the debugger: others may have set some as well
         self._acknowledging = True
         self._signal = SIGTRAP
         self._last = b""
@@ -143,8 +144,8 @@ class RemoteProtocol:
             b"m": self._read,
             b"M": lambda rest: self._write(rest, _unhex),
             b"X": lambda rest: self._write(rest, unescaped),
-            b"Z": lambda rest: self._breakpoint(rest, self._debuggee.breakpoints.add),
-            b"z": lambda rest: self._breakpoint(rest, self._debuggee.breakpoints.discard),
+            b"Z": lambda rest: self._breakpoint(rest, True),
+            b"z": lambda rest: self._breakpoint(rest, False),
             b"c": lambda rest: self._resume(Wish.RUN, rest),
             b"s": lambda rest: self._resume(Wish.STEP, rest),
             b"C": lambda rest: self._resume(Wish.RUN, rest.partition(b";")[2]),
@@ -175,6 +176,12 @@ class RemoteProtocol:
         self.wish, self._signal, self.interrupted = Wish.STAND, signal, False
         self._last = framed(self._stop_reply())
         return self._last + self.receive(b"")
+
+    def leave(self, wish: Wish) -> None:
+        """Leave no breakpoint behind at the machine."""
+        self._debuggee.breakpoints -= self._own
+        self._own.clear()
+        self.wish = wish
 
     def _answered(self, item: bytes) -> bytes:
         if item == bytes((INTERRUPT,)):
@@ -244,11 +251,17 @@ class RemoteProtocol:
             self._debuggee.write(address, data)
         return b"OK"
 
-    def _breakpoint(self, rest: bytes, change: Callable[[int], None]) -> bytes:
+    def _breakpoint(self, rest: bytes, on: bool) -> bytes:
         kind, _, place = rest.partition(b",")
         if kind not in (b"0", b"1"):
             return b""  # no watchpoints
-        change(_hex(place.partition(b",")[0]) & ~1)
+        address = {_hex(place.partition(b",")[0]) & ~1}
+        if on:
+            self._own |= address - self._debuggee.breakpoints
+            self._debuggee.breakpoints |= address
+        else:
+            self._debuggee.breakpoints -= address & self._own
+            self._own -= address
         return b"OK"
 
     def _resume(self, wish: Wish, address: bytes) -> bytes:
@@ -284,8 +297,7 @@ class RemoteProtocol:
         return b"OK"
 
     def _leave(self, wish: Wish, answer: bytes) -> bytes:
-        self._debuggee.breakpoints.clear()
-        self.wish = wish
+        self.leave(wish)
         return answer
 
 

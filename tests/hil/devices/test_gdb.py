@@ -262,6 +262,15 @@ def test_who_hangs_up_lets_the_machine_go_and_another_may_come(
         assert server.hold() is Wish.KILL
 
 
+def test_breakpoints_of_others_stay(protocol: RemoteProtocol, machine: BareCortex) -> None:
+    machine.breakpoints |= {0x0800_5000, 0x0800_6000}
+    for packet in (b"Z0,8005000,2", b"Z0,8007000,2", b"z0,8005000,2", b"z0,8006000,2"):
+        assert ask(protocol, packet) == b"OK"
+    assert machine.breakpoints == {0x0800_5000, 0x0800_6000, 0x0800_7000}
+    assert ask(protocol, b"D") == b"OK"
+    assert machine.breakpoints == {0x0800_5000, 0x0800_6000}
+
+
 def test_time_stands_still_while_the_debugger_asks(
     client: tuple[GdbServer, socket.socket], machine: BareCortex
 ) -> None:
