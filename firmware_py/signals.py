@@ -9,6 +9,7 @@ from firmware_py.core.structs import Control, Estimator
 from firmware_py.core.subset import Block
 from firmware_py.supervisor import Supervisor
 
+ESTIMATOR, CONTROL = Estimator.dtype, Control.dtype  # how they lie in memory, here and in an image
 COUNTERS = ("fused", "refused", "jumps", "too_old", "invalid", "bounded", "resets", "horizon", "pose_age_us")
 
 
@@ -27,7 +28,7 @@ class Signals:
     @classmethod
     def of(cls, estimator: Block[Estimator], control: Block[Control], supervisor: Supervisor) -> "Signals":
         """Look into the blocks of a running core."""
-        start = dict(Estimator.dtype.fields or {})[COUNTERS[0]][1]
+        start = dict(ESTIMATOR.fields or {})[COUNTERS[0]][1]
         counters = np.ndarray(len(COUNTERS), np.int32, estimator.memory.data, start)
         fields = control.fields
         return cls(estimator.fields.now, counters, fields.u, fields.flap, fields.count, supervisor)

@@ -97,11 +97,11 @@ def read_image(path: Path, alone: bool = True) -> Image:
         entries = {name: addresses[f"floaty_core_{name}"] | 1 for name in ENTRIES}
     except KeyError as error:
         raise ExportError(f"{path}: there is no function {error.args[0]}") from None
-    return Image(path, bytes(code) + bytes(len(code) % 2), entries, _constants(symbols, len(code)))
+    return Image(path, bytes(code) + bytes(len(code) % 2), entries, constants_of(symbols, len(code)))
 
 
-def _constants(symbols: Sequence[tuple[int, str]], size: int) -> frozenset[int]:
-    """Return the half words between the mapping symbols $d and $t."""
+def constants_of(symbols: Sequence[tuple[int, str]], size: int) -> frozenset[int]:
+    """Return the half words of flash between the mapping symbols $d and $t: address and name of each symbol."""
     marks = sorted(
         (address, name[:2])
         for address, name in symbols

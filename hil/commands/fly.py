@@ -52,8 +52,15 @@ SEEDS_MAX = 10_000
 )  # fmt: skip
 @click.option(
     "--board", metavar="BOARD", default="python", show_default=True,
-    help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated).",
+    help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated); or the "
+    "image of a Crazyflie's firmware, an ELF file, which flies whole.",
 )  # fmt: skip
+@click.option(
+    "--elf",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="With a .bin as --board: the ELF that it was made of.",
+)
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
 )
@@ -70,6 +77,7 @@ def fly(
     perfetto: bool,
     link: str,
     board: str,
+    elf: Path | None,
     out: Path | None,
 ) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
@@ -88,7 +96,7 @@ def fly(
 
     faults = [parse(text) for text in fault_texts]
     requests = [
-        Request.of(chosen, profile, overrides, seed + index, duration, link, faults, board)
+        Request.of(chosen, profile, overrides, seed + index, duration, link, faults, board, elf)
         for index in range(seeds)
     ]
     announce_compilation()

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
-from firmware_py.rtos import Kernel
 from firmware_py.wire.mavlink_numbers import Result
 from hil.events import EventQueue
 
@@ -27,6 +26,19 @@ class Uart(Protocol):
 
     def write(self, now_us: int, data: bytes) -> bool:
         """Send bytes; False when they do not fit into the transmit buffer."""
+        ...
+
+
+class Processing(Protocol):
+    """The time of a booted processor, counted from its boot."""
+
+    @property
+    def now_us(self) -> int:
+        """The present instant."""
+        ...
+
+    def stop_before(self, us: int) -> None:
+        """Let it run no further than to the instant before that one."""
         ...
 
 
@@ -54,7 +66,7 @@ class VirtualBoard:
         self._radio = radio
         self._console = console
         self._uart = uart
-        self._kernel: Kernel | None = None
+        self._kernel: Processing | None = None
         self._events: EventQueue | None = None
         self._booted_us = 0
 
@@ -62,7 +74,7 @@ class VirtualBoard:
         """Begin a processor's time at an instant of the hardware's; `run_on` follows when it has booted."""
         self._kernel, self._booted_us = None, now_us
 
-    def run_on(self, kernel: Kernel, events: EventQueue) -> None:
+    def run_on(self, kernel: Processing, events: EventQueue) -> None:
         """Join the pins to a booted processor and to the queue of hardware events."""
         self._kernel, self._events = kernel, events
 

@@ -8,6 +8,7 @@ Facts: Bitcraze's nRF51 firmware and bootloader, reference/crazyflie-clients-and
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
@@ -96,8 +97,10 @@ class Nrf51:
         events: EventQueue,
         processor: Processor,
         air: Air,
+        wire_us: Callable[[bytes], int] = syslink_us,
     ) -> None:
         self.air = air
+        self._wire_us = wire_us  # how long a packet takes to the STM32, or from it
         self.power = Power.RUNNING
         self.settings = settings  # while the firmware runs, which may change them
         self.bootloader = Bootloader()
@@ -131,7 +134,7 @@ class Nrf51:
 
     def send(self, now_us: int, data: bytes) -> bool:
         """Take a packet of the STM32 for the ground; False when the queue is full."""
-        return self._end.put(Waiting(now_us + syslink_us(data), now_us, data))
+        return self._end.put(Waiting(now_us + self._wire_us(data), now_us, data))
 
     def _reply(self, now_us: int, data: bytes) -> None:
         """Put a packet of its own into the queue."""
@@ -171,7 +174,7 @@ class Nrf51:
         if _kind(data) == RADIO and len(data) > 3:
             self._events.at(now_us + RETUNE_DELAY_US, partial(self._retune, data[2], data[3]))
         elif len(data) > 1 or data[0] & NULL_MASK != NULL:
-            self._events.at(now_us + syslink_us(data), partial(self._pass_on, data, broadcast))
+            self._events.at(now_us + self._wire_us(data), partial(self._pass_on, data, broadcast))
         elif self.power is Power.RUNNING:
             self._processor.polled(now_us)
 

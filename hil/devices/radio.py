@@ -70,9 +70,16 @@ class VirtualRadio:
     """Carries packets of 1..32 bytes both ways through `medium`; `connect` it before use."""
 
     def __init__(
-        self, config: RadioConfig, events: EventQueue, rng: np.random.Generator, medium: Air | None = None
+        self,
+        config: RadioConfig,
+        events: EventQueue,
+        rng: np.random.Generator,
+        medium: Air | None = None,
+        wire_us: Callable[[bytes], int] = syslink_us,
     ) -> None:
+        """`wire_us`: how long a packet takes between the board's two chips."""
         self.medium = medium or Air.of(config)
+        self._wire_us = wire_us
         self.up = DirectionCounters()
         self.down = DirectionCounters()
 
@@ -116,7 +123,7 @@ class VirtualRadio:
     def downlink(self, now_us: int, data: bytes) -> bool:
         """Take a packet for the ground; False when the nRF51's queue is full and the sender has to wait."""
         _check_size(data)
-        counters, ready_us = self.down, now_us + syslink_us(data)
+        counters, ready_us = self.down, now_us + self._wire_us(data)
         if not self._board.put(Waiting(ready_us, now_us, data)):
             counters.dropped += 1
             return False
@@ -190,7 +197,7 @@ class VirtualRadio:
         if self._answer_size is None:
             if self._board.takes(self._counter) and self._uploading is not None:
                 deliver = partial(self._deliver_up, self._uploading)
-                self._events.at(now_us + syslink_us(self._uploading.data), deliver)
+                self._events.at(now_us + self._wire_us(self._uploading.data), deliver)
             else:
                 self._on_poll(now_us)
             answer = self._board.answer(now_us)

@@ -18,6 +18,7 @@ from ground_station.tracker import Tracker
 from ground_station.trajectory import Goal, Trajectory
 from hil.devices.cameras import VirtualMocap
 from hil.devices.radio import VirtualRadio
+from hil.devices.stm32f405.firmware import ImageFirmware
 from hil.laboratory.faults import Fault
 from hil.laboratory.recorder import Channel, Quantity
 from hil.laboratory.robot import Robot
@@ -69,7 +70,7 @@ def tracker_channel(tracker: Tracker) -> Channel:
     )
 
 
-def logic_channels(firmware: Firmware) -> tuple[Channel, ...]:
+def logic_channels(firmware: Firmware | ImageFirmware) -> tuple[Channel, ...]:
     """Return what logic of the user's own logs."""
     own = [variable for variable in firmware.variables if variable.name.startswith(f"{GROUP}.")]
     channels = []
@@ -85,7 +86,7 @@ def _all(reads: Sequence[Callable[[], float]]) -> Callable[[], list[float]]:
     return lambda: [read() for read in reads]
 
 
-def excitation_channel(firmware: Firmware) -> Channel:
+def excitation_channel(firmware: Firmware | ImageFirmware) -> Channel:
     """Return what is added to the inputs for identification."""
     reads = [variable.read for variable in firmware.variables if variable.name.startswith("excite.")]
     return Channel("float32", _all(reads), (quantity("excite", "u1 u2 u3 u4", "rad"),))
@@ -118,7 +119,7 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
     """Return the channels of any flight; the first column, `t`, is the recorder's own."""
     plant, board, firmware = robot.plant, robot.board, robot.firmware
     signals, queue = firmware.signals, firmware.measurements
-    kernel = firmware.kernel
+    kernel: Any = firmware.kernel  # ours or an image's, whose tasks have names and run times alike
     tasks = tuple(kernel.tasks)
     timed = [task for task in tasks if task.name in DEADLINES_US]
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.core_runner import PythonRunner
 from firmware_py.wire.supervisor import Cause
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock
@@ -28,7 +28,7 @@ from hil.laboratory.channels import (
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.laboratory import Laboratory, Progress
 from hil.laboratory.recorder import Channel, Recorder
-from hil.laboratory.robot import Robot, Streams
+from hil.laboratory.robot import Executor, Robot, Streams
 from hil.laboratory.schedule import WINDOW_US, ScheduleTrace
 
 RECORD_PERIOD_US = 10_000
@@ -125,7 +125,7 @@ class Flight:
         radio: bool,
         mavlink: bool,
         faults: Sequence[Fault] = (),
-        runner: RunnerFactory = PythonRunner,
+        runner: Executor = PythonRunner,
         trace_all: bool = False,
     ) -> None:
         self.config = config

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from firmware_py.core_runner import PythonRunner, RunnerFactory
+from firmware_py.core_runner import PythonRunner
 from firmware_py.extras import install_command
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
@@ -24,6 +24,7 @@ from hil.laboratory.faults import Fault
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.recorder import Channel
+from hil.laboratory.robot import Executor
 
 RADIO, MAVLINK = "radio", "mavlink"
 LOCKSTEP = (RADIO, MAVLINK)  # links that are simulated whole
@@ -40,7 +41,7 @@ class ModelledLine:
             Goal(config.flight.home, 0.0), config.flight.release_us
         )
         self.tracker = tracker_of(config.tracker, config.mocap.period_us)
-        self.radio = VirtualRadio(config.radio, flight.events, flight.streams.radio, robot.air)
+        self.radio = VirtualRadio(config.radio, flight.events, flight.streams.radio, robot.air, robot.wire_us)
         robot.send_packet = self.radio.downlink
         self._frames: FrameLog | None = None
         self._link, self._channel = (
@@ -108,7 +109,7 @@ def lockstep_flight(
     trace_all: bool = False,
     link: str = RADIO,
     faults: Sequence[Fault] = (),
-    runner: RunnerFactory = PythonRunner,
+    runner: Executor = PythonRunner,
 ) -> Flight:
     """Return a flight that is released at `flight.release_us`, over a modelled link."""
     flight = Flight(

@@ -7,6 +7,7 @@ go and what stands at the other end of its UART is handed in.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,8 @@ from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import VirtualImu
 from hil.devices.markers import Sighting
 from hil.devices.rigid_body import make_markers
-from hil.devices.shockburst import Air
+from hil.devices.shockburst import Air, syslink_us
+from hil.devices.stm32f405.firmware import ChipImage, ImageFirmware
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue
@@ -29,10 +31,14 @@ from hil.world.battery import Battery
 from hil.world.plant import Plant
 
 IMU_PERIOD_US = 1_000
+BENCH_NOISE = (
+    0.05  # of that in flight, before the fans run: the stock firmware wants less than 100 counts squared
+)
 MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms before its step
 
 See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, what was seen of the markers)
 Say = Callable[[str, str], None]  # (source, text)
+Executor = RunnerFactory | ChipImage  # of the flight core, or of all that is flashed
 SendPacket = Callable[[int, bytes], bool]  # (now_us, packet): False when it has to wait
 
 
@@ -57,7 +63,8 @@ class Robot:
     """Built at rest in its holder at home, with the firmware running; `watch` sets IMU and cameras going.
 
     `air` (of its radio) and `uart` are what faults of its lines turn, None for a line that it has not. `firmware` is that
-    of the present boot; `restart` is what a reset of its processor comes to, and may be replaced.
+    of the present boot; `wire_us` is how long packets take from its radio chip to it, or back, where it does not count that
+    itself; `restart` is what a reset of its processor comes to, and may be replaced.
     """
 
     def __init__(
@@ -68,7 +75,7 @@ class Robot:
         say: Say,
         radio: bool = True,
         mavlink: bool = False,
-        runner: RunnerFactory = PythonRunner,
+        runner: Executor = PythonRunner,
     ) -> None:
         home, offset = config.flight.home, config.flight.start_offset
         self.start_W = (home[0] + offset[0], home[1] + offset[1], home[2] + offset[2])
@@ -91,6 +98,8 @@ class Robot:
         self.uart = VirtualSerial(config.serial, events, streams.serial) if mavlink else None
         self.send_packet: SendPacket = _nobody_listens
         self._runner = runner
+        self.wire_us: Callable[[bytes], int] = _no_time if isinstance(runner, ChipImage) else syslink_us
+        self.polled_by_host = False  # by one that is real: empty polls need no model
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
         self.booted_us = 0
@@ -106,11 +115,20 @@ class Robot:
         if self.uart is not None:
             self.uart.read()  # a booted processor begins with an empty buffer
         self.board.boot(now_us)
-        self.firmware = Firmware(self.config, self.board, mavlink=self.uart is not None, runner=self._runner)
+        self.firmware = self._firmware(now_us)
         self.board.run_on(self.firmware.kernel, self.events)
         if self._thief is not None:
             share, self._thief = self._thief.share, self.firmware.add_thief()
             self._thief.share = share
+
+    def _firmware(self, now_us: int) -> Firmware | ImageFirmware:
+        """Return the firmware of a new boot; an image gets power some time before the laboratory's time begins."""
+        if not isinstance(self._runner, ChipImage):
+            return Firmware(self.config, self.board, mavlink=self.uart is not None, runner=self._runner)
+        specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is that of any other board
+        specimen.set_noise_scale(BENCH_NOISE)
+        rest = None if now_us else lambda: specimen.sample(self.plant)
+        return ImageFirmware(self._runner, self.board, rest, polls=not self.polled_by_host)
 
     def cut_power(self) -> None:
         """Stop the firmware: the servos keep their last pulse."""
@@ -232,6 +250,11 @@ def with_system(config: LabConfig, system: int) -> LabConfig:
 
 
 MAX_SYSTEM = 255
+
+
+def _no_time(data: bytes) -> int:
+    """Take no time: the chip's own serial line does."""
+    return 0
 
 
 def _nobody_listens(now_us: int, data: bytes) -> bool:

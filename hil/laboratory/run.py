@@ -22,15 +22,17 @@ from firmware_py.rtos import WatchdogError
 from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
+from hil.devices.stm32f405.firmware import ChipImage
 from hil.errors import LabError, writing
 from hil.laboratory.ages import ages_of, told, with_goals_sent
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.faults import Fault, check
 from hil.laboratory.flight import Flight
-from hil.laboratory.lockstep import LOCKSTEP, lockstep_flight
+from hil.laboratory.lockstep import LOCKSTEP, MAVLINK, lockstep_flight
 from hil.laboratory.metrics import check_limits, free_flight, judge, measure
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
 from hil.laboratory.result import RESULT, Origin, Outcome, QueueReport, Result, commit, versions, write_result
+from hil.laboratory.robot import Executor
 
 LOADED_US = 250_000  # every part of the core has been called by then
 BUILD = Path("runs/build")
@@ -49,11 +51,18 @@ class Request:
     duration_s: float
     link: str = "radio"  # radio and mavlink: in lockstep; a URI: a station in a process of its own, paced
     faults: tuple[Fault, ...] = ()  # on top of the experiment's own; `LabError` for those that cannot act
-    board: str = PYTHON  # what executes the flight core
+    board: str = PYTHON  # what executes the flight core, or the path of an image that is flashed whole
+    elf: Path | None = None  # with the names of an image that has none
 
     def __post_init__(self) -> None:
-        if self.board not in BOARDS:
-            raise LabError(f"--board {self.board}: expected {', '.join(BOARDS[:-1])} or {BOARDS[-1]}")
+        if self.is_image and not Path(self.board).is_file():
+            raise LabError(
+                f"--board {self.board}: expected {', '.join(BOARDS)}, or an image of a Crazyflie's firmware: an ELF file"
+            )
+        if self.is_image and self.link == MAVLINK:
+            raise LabError(f"--link {self.link}: {self.board} speaks CRTP over its radio, not MAVLink")
+        if self.elf is not None and not self.is_image:
+            raise LabError(f"--elf {self.elf}: goes with an image as --board, not with {self.board}")
         if self.board != PYTHON and not self.in_lockstep:
             raise LabError(f"--board {self.board}: --link {self.link}: only python flies over a link")
         if not 0.0 < self.duration_s <= DURATION_MAX_S:
@@ -75,12 +84,18 @@ class Request:
         link: str = "radio",
         faults: Sequence[Fault] = (),
         board: str = PYTHON,
+        elf: Path | None = None,
     ) -> Request:
         """Return the request for an experiment: its settings on the profile, `overrides` on both. Raises `LabError`."""
         overrides = (*experiment.settings, *overrides)
         config = load_config(profile, overrides)
         duration_s = experiment.duration_s if duration_s is None else duration_s
-        return cls(experiment, config, profile, overrides, seed, duration_s, link, tuple(faults), board)
+        return cls(experiment, config, profile, overrides, seed, duration_s, link, tuple(faults), board, elf)
+
+    @property
+    def is_image(self) -> bool:
+        """Whether the board executes an image that is flashed whole."""
+        return self.board not in BOARDS
 
     @property
     def in_lockstep(self) -> bool:
@@ -204,7 +219,11 @@ class _Pace:
 def lockstep(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` when its board cannot be had here."""
     try:
-        runner = runner_of(request.board, BUILD, request.config.logic)
+        runner: Executor = (
+            ChipImage.load(Path(request.board), request.elf, BUILD)
+            if request.is_image
+            else runner_of(request.board, BUILD, request.config.logic)
+        )
     except FirmwareError as error:
         raise LabError(f"--board {request.board}: {error}") from None
     return lockstep_flight(

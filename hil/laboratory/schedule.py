@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from firmware_py.rtos import Kernel
+from hil.devices.stm32f405.processor import Processor
 
 FILE = "schedule.parquet"
 WINDOW_US = 50_000
@@ -32,7 +33,7 @@ class Run:
 class ScheduleTrace:
     """Collects the kernel's trace between `begin` and `end`; the flight plans both as events."""
 
-    def __init__(self, kernel: Kernel) -> None:
+    def __init__(self, kernel: Kernel | Processor) -> None:
         self._kernel = kernel
         self._rows: list[tuple[int, str, str, int, int]] = []
 

@@ -4,6 +4,7 @@ from firmware_py.firmware import Firmware
 from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from hil.config import LabConfig
+from hil.devices.stm32f405.firmware import ImageFirmware
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.laboratory.channels import quantity
@@ -22,7 +23,9 @@ def link_of(config: LabConfig, line: VirtualSerial) -> MavlinkLink:
         raise LabError(f"--link mavlink: {error}") from None
 
 
-def serial_channel(uart: VirtualSerial, firmware: Firmware, link: MavlinkLink | None) -> Channel:
+def serial_channel(
+    uart: VirtualSerial, firmware: Firmware | ImageFirmware, link: MavlinkLink | None
+) -> Channel:
     """Return what a serial line counts; without a `link` the station's frames are unknown and stay 0.
 
     `link.*` counts pieces of the stream, `serial.*` bytes, bits and frames.

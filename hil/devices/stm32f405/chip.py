@@ -50,6 +50,18 @@ class Why(IntFlag):
     STEP = 64
 
 
+class Task(ctypes.Structure):
+    """A task of the scheduler in the image, by the address of its control block."""
+
+    _fields_ = (("cycles", ctypes.c_uint64), ("block", ctypes.c_uint32), ("times", ctypes.c_uint32))
+
+
+class TaskSwitch(ctypes.Structure):
+    """A task gets the processor."""
+
+    _fields_ = (("now", ctypes.c_uint64), ("block", ctypes.c_uint32), ("unused", ctypes.c_uint32))
+
+
 class State(ctypes.Structure):
     """The head of `struct machine`."""
 
@@ -58,6 +70,7 @@ class State(ctypes.Structure):
         ("instructions", ctypes.c_uint64),
         ("exceptions", ctypes.c_uint64),
         ("sleeping", ctypes.c_uint64),
+        ("next_due", ctypes.c_uint64),
         ("pc", ctypes.c_uint32),
         ("why", ctypes.c_uint32),
         ("asleep", ctypes.c_uint32),
@@ -66,6 +79,15 @@ class State(ctypes.Structure):
         ("unknown_count", ctypes.c_uint32),
         ("unknown", ctypes.c_uint32 * 16),
         ("compare", ctypes.c_uint32 * 4 * 14),
+        ("current_place", ctypes.c_uint32),
+        ("tracing", ctypes.c_uint32),
+        ("task_count", ctypes.c_uint32),
+        ("switch_count", ctypes.c_uint32),
+        ("running_since", ctypes.c_uint64),
+        ("tasks", Task * 32),
+        ("running", ctypes.c_uint32),
+        ("locked", ctypes.c_uint32),
+        ("switches", TaskSwitch * 4096),
     )
 
 
@@ -138,7 +160,8 @@ class Chip:
         self._run.argtypes = (ctypes.c_void_p, ctypes.c_uint64)
         self._sent = ctypes.create_string_buffer(LINE_BYTES)
         self._kept: list[NDArray[np.uint8]] = []  # memory of devices
-        self.breakpoints: set[int] = set()
+        self.breakpoints: set[int] = set()  # addresses before whose instructions a run stops
+        self._planted: set[int] = set()
         self.reset(POWER_ON)
 
     def _map(self, const: Any) -> None:
@@ -166,6 +189,8 @@ class Chip:
 
     def run(self, until_cycles: int) -> Why:
         """Run up to an instant, or until something outside is to be done."""
+        if self.breakpoints != self._planted:
+            self._plant()
         return Why(self._run(self._machine, until_cycles))
 
     def step(self) -> Why:
@@ -213,13 +238,16 @@ class Chip:
 
     def read(self, address: int, size: int) -> bytes:
         """Return memory. Raises `LabError` where there is none."""
+        return self.view(address, size).tobytes()
+
+    def view(self, address: int, size: int) -> NDArray[np.uint8]:
+        """Return memory that goes on to change. Raises `LabError` where there is none."""
         array, begin = self._place(address, size)
-        return array[begin : begin + size].tobytes()
+        return array[begin : begin + size]
 
     def write(self, address: int, data: bytes) -> None:
         """Change memory. Raises `LabError` where there is none."""
-        array, begin = self._place(address, len(data))
-        array[begin : begin + len(data)] = np.frombuffer(data, np.uint8)
+        self.view(address, len(data))[:] = np.frombuffer(data, np.uint8)
 
     def _place(self, address: int, size: int) -> tuple[NDArray[np.uint8], int]:
         for base, array in (
@@ -234,26 +262,23 @@ class Chip:
         return [self.register(name) for name in (*(f"r{i}" for i in range(13)), "sp", "lr", "pc", "xpsr")]
 
     def register(self, name: str) -> int:
-        """Return a register by its name: r0..r12, sp, lr, pc, xpsr, msp, psp, primask, basepri, control, s0..s31, fpscr."""
-        if name == "pc":
-            return int(self.state.pc)
-        return int(self._cpu.reg_read(self._numbers[name])) & 0xFFFF_FFFF
+        """Return a register: r0..r12, sp, lr, pc, xpsr, msp, psp, primask, basepri, control, s0..s31, d0..d15, fpscr."""
+        return int(self.state.pc) if name == "pc" else int(self._cpu.reg_read(self._numbers[name]))
 
     def set_register(self, name: str, value: int) -> None:
         """Change a register."""
         if name == "pc":
             self.state.pc = value & ~1
         else:
-            self._cpu.reg_write(self._numbers[name], value & 0xFFFF_FFFF)
+            self._cpu.reg_write(self._numbers[name], value)
 
-    def set_breakpoint(self, address: int, on: bool) -> None:
-        """Stop before the instruction at an address, or no longer."""
-        if (address in self.breakpoints) == on:
-            return
-        if not self._library.machine_break(self._machine, address, int(on)):
-            raise LabError("more breakpoints than there is room for")
-        self.breakpoints ^= {address}
-        self._cpu.ctl_flush_tb()
+    def _plant(self) -> None:
+        """Tell the machine of the breakpoints."""
+        for address in self.breakpoints ^ self._planted:
+            if not self._library.machine_break(self._machine, address, int(address in self.breakpoints)):
+                raise LabError("more breakpoints than there is room for")
+        self._planted = set(self.breakpoints)
+        self._cpu.ctl_flush_tb()  # hooks act on what is translated after them
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
@@ -271,7 +296,7 @@ def _sums(code: bytes, base: int, constants: frozenset[int]) -> list[NDArray[np.
 
 def _register_numbers(arm_const: Any) -> dict[str, int]:
     names = (
-        *(f"r{i}" for i in range(13)), *(f"s{i}" for i in range(32)),
+        *(f"r{i}" for i in range(13)), *(f"s{i}" for i in range(32)), *(f"d{i}" for i in range(16)),
         "sp", "lr", "xpsr", "msp", "psp", "primask", "basepri", "faultmask", "control", "fpscr",
     )  # fmt: skip
     return {name: getattr(arm_const, f"UC_ARM_REG_{name.upper()}") for name in names}

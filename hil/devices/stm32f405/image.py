@@ -11,6 +11,7 @@ from pathlib import Path
 from struct import iter_unpack, unpack_from
 from typing import Any
 
+from firmware_py.export.arm_image import constants_of
 from firmware_py.extras import install_command
 from hil.devices.stm32f405.debug_info import DebugInfo
 from hil.errors import LabError, hint
@@ -23,7 +24,7 @@ MEMORIES = (
 ERASED = b"\xff"
 HEADER_SIZE, ARM, BITS_32, LITTLE_ENDIAN = 52, 40, 1, 1
 LOADED = 1  # PT_LOAD
-OBJECT, FUNCTION = 1, 2  # STT_OBJECT, STT_FUNC
+NO_TYPE, OBJECT, FUNCTION = 0, 1, 2  # STT_NOTYPE, STT_OBJECT, STT_FUNC
 MACHINES = {3: "x86", 8: "MIPS", 62: "x86-64", 94: "Xtensa", 183: "AArch64", 243: "RISC-V"}
 
 
@@ -55,7 +56,10 @@ class Image:
         self.base = min(address for address, _ in segments)  # of the vector table
         self.code = _joined(segments, self.base) if elf is None else _same(path, content, segments, self.base)
         self._check_vectors()
-        self._functions, self._variables, self.debug = _names(elf_path, elf_content)
+        self._functions, self._variables, self.debug, marks = _names(elf_path, elf_content)
+        before = (self.base - FLASH) // 2
+        found = constants_of(marks, self.base - FLASH + len(self.code))
+        self.constants = frozenset(index - before for index in found)  # half words that are no instructions
         self._starts = [function.address for function in self._functions]
 
     @property
@@ -206,8 +210,10 @@ def _same(path: Path, content: bytes, segments: list[tuple[int, bytes]], base: i
     return content
 
 
-def _names(path: Path, content: bytes) -> tuple[list[Symbol], dict[str, list[Symbol]], DebugInfo]:
-    """Return the functions by address, the variables by name, and the debugging information."""
+def _names(
+    path: Path, content: bytes
+) -> tuple[list[Symbol], dict[str, list[Symbol]], DebugInfo, list[tuple[int, str]]]:
+    """Return the functions by address, the variables by name, the debugging information, and what marks code and data."""
     try:
         from elftools.common.exceptions import DWARFError, ELFError
         from elftools.construct import ConstructError
@@ -242,6 +248,7 @@ def _names(path: Path, content: bytes) -> tuple[list[Symbol], dict[str, list[Sym
     )
     variables: dict[str, list[Symbol]] = {}
     for kind, symbol in symbols:
-        if kind == OBJECT:
+        if kind == OBJECT or (kind == NO_TYPE and not symbol.name.startswith("$")):
             variables.setdefault(symbol.name, []).append(symbol)
-    return sorted(code, key=lambda function: function.address), variables, debug
+    marks = [(symbol.address, symbol.name) for _, symbol in symbols if symbol.name[:2] in ("$d", "$t")]
+    return sorted(code, key=lambda function: function.address), variables, debug, marks

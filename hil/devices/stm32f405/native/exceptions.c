@@ -119,6 +119,7 @@ unsigned next_exception(struct machine *m, int waking)
 static void lock_up(struct machine *m, uint32_t pc)
 {
     m->why |= WHY_LOCKUP;
+    m->locked = 1;
     m->pc = pc;
     m->stopping = 1;
     m->engine.emu_stop(m->engine.uc);
@@ -169,6 +170,27 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     set(m, R_PC, m->pc);
 }
 
+/* The scheduler may have chosen another task. */
+static void look_at_task(struct machine *m)
+{
+    uint32_t *current = word(m, m->current_place), i = 0;
+    if (!current || (m->task_count && m->task[m->running].block == *current))
+        return;
+    if (m->task_count)
+        m->task[m->running].cycles += m->now - m->running_since;
+    m->running_since = m->now;
+    while (i < m->task_count && m->task[i].block != *current)
+        i++;
+    if (i == TASKS)
+        i--; /* all that find no room are one */
+    else if (i == m->task_count)
+        m->task[m->task_count++].block = *current;
+    m->task[i].times++;
+    m->running = i;
+    if (m->tracing && m->switch_count < SWITCHES)
+        m->task_switch[m->switch_count++] = (struct task_switch){.now = m->now, .block = *current};
+}
+
 void leave(struct machine *m, uint32_t exc_return)
 {
     unsigned exception = get(m, R_XPSR) & 0x1FF;
@@ -203,6 +225,8 @@ void leave(struct machine *m, uint32_t exc_return)
     m->now += RETURN_CYCLES;
     m->pc = saved[6];
     set(m, R_PC, m->pc | 1);
+    if (m->current_place && (exception == PENDSV || exception == SVC))
+        look_at_task(m);
 }
 
 /* Enter the handler of a fault, or HardFault where it is off or comes inside itself (B1.5.14). */

@@ -17,7 +17,7 @@ enum {
     PERIPHERALS_SIZE = 0x80000,
     TIMERS = 14, BUSES = 3, USARTS = 6, PORTS = 9, DMAS = 2, STREAMS = 8,
     EXCEPTIONS = 128, IRQ = 16, /* exception number of interrupt 0 */
-    DEVICES = 8, BREAKPOINTS = 64, LINE_BYTES = 4096,
+    DEVICES = 8, BREAKPOINTS = 64, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
 };
 
 /* Exceptions, B1.5.2. */
@@ -90,16 +90,33 @@ struct dma {
     struct stream stream[STREAMS];
 };
 
+struct task { /* by its control block: cycles that it had the processor for, interrupts included */
+    uint64_t cycles;
+    uint32_t block, times;
+};
+
+struct task_switch {
+    uint64_t now;
+    uint32_t block, unused;
+};
+
 struct machine {
     /* What Python reads: keep the order of `chip.State`. */
     uint64_t now, instructions, exceptions, sleeping; /* `sleeping`: cycles spent in WFI */
+    uint64_t next_due;
     uint32_t pc, why, asleep, watchdog_on;
     uint32_t fault_address, unknown_count;
     uint32_t unknown[16];
     uint32_t compare[TIMERS][4];
+    uint32_t current_place; /* address of the pointer to the running task's control block, 0: unknown */
+    uint32_t tracing, task_count, switch_count;
+    uint64_t running_since;
+    struct task task[TASKS]; /* the running one is `task[running]` */
+    uint32_t running, locked;
+    struct task_switch task_switch[SWITCHES];
 
     struct engine engine;
-    uint64_t until, next_due, due[SLOTS];
+    uint64_t until, due[SLOTS];
     const uint32_t *instructions_before, *cycles_before; /* of every half word of flash */
     uint64_t next_address;
     uint8_t *flash, *ram, *ccm;

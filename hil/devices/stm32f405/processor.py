@@ -1,0 +1,173 @@
+"""The chip as the laboratory's time line sees it, and the tasks of the scheduler in its image.
+
+Run times and switches are counted by the machine itself, whenever the scheduler's pointer to the running task has moved.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from firmware_py.rtos import TaskReport
+from hil.devices.stm32f405.chip import CYCLES_PER_US, Chip, Why
+from hil.devices.stm32f405.image import Image
+
+NEVER_US = 1 << 62
+RUNNING_TASK = "pxCurrentTCB"
+TASK_PRIORITY, TASK_NAME, NAME_LENGTH = 44, 52, 16  # places in FreeRTOS' control block without MPU, V10
+
+
+@dataclass(frozen=True, slots=True)
+class ChipTask:
+    """A task of the image's scheduler. Deadlines are not known of it."""
+
+    name: str
+    priority: int
+    block: int
+    deadline_misses: int = 0
+
+
+Trace = Callable[[int, str, str, int, int], None]
+
+
+class Processor:
+    """The chip's time as `firmware_py.rtos.Kernel` shows it: microseconds since the firmware's boot."""
+
+    queues: tuple[Any, ...] = ()
+
+    def __init__(self, chip: Chip, image: Image, act: Callable[[Why], None]) -> None:
+        self.chip = chip
+        self.trace: Trace | None = None
+        self.ahead_us = 0  # of the chip's time before the boot's
+        self._act = act
+        self._names: dict[int, ChipTask] = {}
+        self._target_us = 0
+        self._limit_us = NEVER_US
+        self._every: list[tuple[int, int, Callable[[], None]]] = []  # next instant, period
+        if image.has(RUNNING_TASK):
+            chip.state.current_place = image.symbol(RUNNING_TASK).address
+
+    def every(self, period_us: int, do: Callable[[], None]) -> None:
+        """Do something again and again by the chip's time."""
+        self._every.append((self.now_us + period_us, period_us, do))
+
+    def begin(self, us: int) -> None:
+        """Let an instant be the one from which time counts."""
+        self.ahead_us += us
+        self._target_us -= us
+        self._every = [(at_us - us, period_us, do) for at_us, period_us, do in self._every]
+
+    @property
+    def now_us(self) -> int:
+        """The present instant; the chip itself may have finished a block of code beyond it."""
+        return min(self.chip.now_us - self.ahead_us, self._target_us)
+
+    @property
+    def next_wake_us(self) -> int:
+        """The next instant at which the chip acts without the outside."""
+        own_us = min((at_us for at_us, _, _ in self._every), default=NEVER_US)
+        state, ready_us = self.chip.state, self.chip.now_us - self.ahead_us + 1
+        if state.asleep or state.locked:
+            ready_us = -(-int(state.next_due) // CYCLES_PER_US) - self.ahead_us
+        return min(own_us, ready_us)
+
+    def advance(self, now_us: int) -> None:
+        """Bring the chip to an instant."""
+        self.run(now_us)
+
+    def run(self, now_us: int) -> None:
+        """Run the chip up to an instant, or to one that hardware needs before."""
+        self._target_us, self._limit_us = now_us, NEVER_US
+        while True:
+            own = min(self._every, key=lambda entry: entry[0], default=(NEVER_US, 0, None))
+            until_us = min(now_us, self._limit_us, own[0])
+            until = (until_us + self.ahead_us) * CYCLES_PER_US
+            if self.chip.state.now < until:
+                why = self.chip.run(until)
+                if why:
+                    self._act(why)
+            elif own[2] is not None and until_us == own[0]:
+                self._every.remove(own)
+                self._every.append((own[0] + own[1], own[1], own[2]))
+                own[2]()
+            else:
+                break
+        self._pass_switches_on()
+
+    def stop_before(self, us: int) -> None:
+        """Let the chip run no further than to the microsecond before that one."""
+        self._limit_us = min(self._limit_us, us - 1)
+
+    # Tasks
+
+    @property
+    def tasks(self) -> list[ChipTask]:
+        """Return the tasks that have run, in the order in which they first did."""
+        state = self.chip.state
+        return [self._task(state.tasks[index].block) for index in range(state.task_count)]
+
+    @property
+    def current(self) -> ChipTask:
+        """Return the task that has the processor."""
+        state = self.chip.state
+        if not state.task_count:
+            return ChipTask("-", 0, 0)
+        return self._task(state.tasks[state.running].block)
+
+    def run_time_us(self, task: ChipTask) -> int:
+        """Return how long a task has had the processor, interrupts and sleep in the idle task included."""
+        state = self.chip.state
+        for index in range(state.task_count):
+            if state.tasks[index].block == task.block:
+                since = state.now - state.running_since if index == state.running else 0
+                return int(state.tasks[index].cycles + since) // CYCLES_PER_US
+        return 0
+
+    def activations(self, task: ChipTask) -> int:
+        """Return how often a task got the processor."""
+        state = self.chip.state
+        return sum(t.times for t in state.tasks[: state.task_count] if t.block == task.block)
+
+    def set_trace(self, trace: Trace | None) -> None:
+        """Report every task that gets the processor, or no longer."""
+        self.trace = trace
+        self.chip.state.tracing = trace is not None
+        self.chip.state.switch_count = 0
+
+    def _pass_switches_on(self) -> None:
+        state = self.chip.state
+        if self.trace is None:
+            return
+        for switch in state.switches[: state.switch_count]:
+            task = self._task(switch.block)
+            self.trace(switch.now // CYCLES_PER_US - self.ahead_us, "IN", task.name, task.priority, 0)
+        state.switch_count = 0
+
+    def _task(self, block: int) -> ChipTask:
+        if block not in self._names:
+            name = self.chip.read(block + TASK_NAME, NAME_LENGTH).split(b"\0")[0].decode(errors="replace")
+            taken = sum(task.name.split("#")[0] == name for task in self._names.values())
+            priority = struct.unpack("<I", self.chip.read(block + TASK_PRIORITY, 4))[0]
+            self._names[block] = ChipTask(f"{name}#{taken + 1}" if taken else name, priority, block)
+        return self._names[block]
+
+
+class ImageStatistics:
+    """How long the image's tasks have run."""
+
+    def __init__(self, kernel: Processor) -> None:
+        self._kernel = kernel
+
+    def reports(self) -> list[TaskReport]:
+        """The tasks in the order in which they first ran."""
+        kernel = self._kernel
+        return [
+            TaskReport(
+                name=task.name, priority=task.priority, run_time_us=kernel.run_time_us(task),
+                activations=kernel.activations(task), worst_response_us=0, worst_latency_us=0, latency_histogram=(),
+                deadline_us=None, deadline_misses=0,
+            )
+            for task in kernel.tasks
+        ]  # fmt: skip

@@ -1,0 +1,54 @@
+"""Syslink, the serial protocol between nRF51 and STM32: two start bytes, type, length, data, two sums (Fletcher's).
+
+Facts: Bitcraze's syslink documentation, reference/crazyflie-clients-and-protocol.md part 3.
+"""
+
+from collections.abc import Iterator
+
+START = b"\xbc\xcf"
+RAW, RAW_BROADCAST = 0x00, 0x06  # radio packets
+BATTERY = 0x13  # flags, volts, amperes, degrees Celsius
+SCAN_MEMORIES = 0x20  # of decks; the answer is their number
+VERSION = 0x30
+OVERHEAD = 6
+EMPTY = b"\xff"  # a radio packet without contents
+
+
+def encode(kind: int, data: bytes) -> bytes:
+    """Return the frame."""
+    body = bytes((kind, len(data))) + data
+    return START + body + _sums(body)
+
+
+class Decoder:
+    """Cuts a stream of bytes into frames; `broken` counts those with wrong sums."""
+
+    def __init__(self) -> None:
+        self.broken = 0
+        self._bytes = b""
+
+    def take(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Yield type and data of every frame that is whole by now."""
+        self._bytes += data
+        while (begin := self._bytes.find(START)) >= 0:
+            rest = self._bytes[begin:]
+            if len(rest) < OVERHEAD or len(rest) < OVERHEAD + rest[3]:
+                self._bytes = rest
+                return
+            end = OVERHEAD + rest[3]
+            body = rest[2 : end - 2]
+            if _sums(body) == rest[end - 2 : end]:
+                self._bytes = rest[end:]
+                yield body[0], body[2:]
+            else:
+                self.broken += 1
+                self._bytes = rest[2:]
+        self._bytes = self._bytes[-1:]  # it may be the first byte of the next start
+
+
+def _sums(body: bytes) -> bytes:
+    first = second = 0
+    for byte in body:
+        first = (first + byte) & 0xFF
+        second = (second + first) & 0xFF
+    return bytes((first, second))
