@@ -88,7 +88,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "secrets": (),
     "numpy.random.default_rng": ("hil/laboratory/robot.py", "hil/campaigns/sampling.py"),
     "numpy.random.seed": (),
-    "cflib": ("ground_station/links/crazyradio.py", "ground_station/flashing.py"),
+    "cflib": ("ground_station/links/crazyradio.py", "ground_station/links/packets.py", "ground_station/flashing.py"),
     "serial": ("ground_station/links/mavlink_serial.py",),
     "pymavlink": (
         "firmware_py/wire/mavlink.py", "firmware_py/wire/mavlink_layouts.py", "firmware_py/wire/mavlink_services.py",

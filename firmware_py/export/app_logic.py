@@ -15,6 +15,7 @@ CALLS_HEADER = """\
 #pragma once
 
 #include "floaty_app.h"
+#include "floaty_wire.h"
 
 {memory}
 static inline void call_reset(void) {{
@@ -42,7 +43,21 @@ static inline void call_hover(FloatyControl *control) {{
 /* Tells the supervisor whether own logic has put out NaN or infinity. */
 static inline void call_guard(void) {{
 {guard}}}
+
+/* The memory of a core that does not fly. */
+typedef struct {{
+{members}}} FloatyMemory;
+
+static inline int32_t call_on(FloatyMemory *on, uint8_t entry) {{
+  switch (entry) {{
+    case FLOATY_CALL_RESET: floaty_core_reset({on_reset}); return 0;
+    case FLOATY_CALL_FILE_POSE: return floaty_core_file_pose({on_file_pose});
+    case FLOATY_CALL_ESTIMATE: floaty_core_estimate({on_estimate}); return 0;
+    default: floaty_core_control({on_control}); return 0;
+  }}
+}}
 """
+CORE_TYPES = {name: f"Floaty{struct}" for name, struct in CORE_STRUCTS.items()}
 LOG_TYPES = {"f32": "LOG_FLOAT", "i32": "LOG_INT32"}
 
 
@@ -75,7 +90,9 @@ def calls_header(config: LogicConfig) -> str:
         scratch="".join(f"  static {types[name]} {name};\n" for name in scratch),
         hover=_listed(calls["control"], alone),
         guard=guard if types else "",
+        members="".join(f"  {kind} {name};\n" for name, kind in {**CORE_TYPES, **types}.items()),
         **{call: _listed(names, places) for call, names in calls.items()},
+        **{f"on_{call}": ", ".join(f"&on->{name}" for name in names) for call, names in calls.items()},
     )
 
 

@@ -21,6 +21,7 @@ from firmware_py.config import (
 )
 from firmware_py.core.subset import f32
 from firmware_py.export.app_logic import calls_header, own_logs
+from firmware_py.export.app_wire import wire_header
 from firmware_py.export.errors import ExportError
 from firmware_py.export.profile_c import profile_source
 from firmware_py.export.reading import float_literal
@@ -163,6 +164,7 @@ def app_files(config: FirmwareConfig, profile: str) -> dict[str, str]:
     files["src/floaty_profile.c"] = profile_source(config)
     files["src/floaty_settings.h"] = _settings(config, profile)
     files["src/floaty_calls.h"] = calls_header(config.logic)
+    files["src/floaty_wire.h"] = wire_header()
     toc = files["src/floaty_toc.c"].replace("/* @logs */", own_logs(config.logic))
     files["src/floaty_toc.c"] = _toc(toc, app_parameters(config))
     return files

@@ -44,6 +44,10 @@ int32_t stub_connected = 1;
 int32_t stub_after_watchdog, stub_after_assert, stub_self_test_passed;
 int32_t stub_ratios[4];
 char stub_console[4096];
+uint32_t stub_cycles = 1000; /* that the processor counts from one look at the counter to the next */
+int32_t stub_suspended;
+int32_t stub_transmit_full;
+CoreDebug_Type stub_core_debug;
 
 uint64_t usecTimestamp(void) { return stub_now_us - stub_usec_reset_us; }
 TickType_t xTaskGetTickCount(void) { return stub_first_tick + (TickType_t)(stub_now_us / 1000); }
@@ -205,6 +209,47 @@ void stub_radio(int port, int channel, const uint8_t *data, int length) {
   if (callbacks[port]) {
     callbacks[port](&packet);
   }
+}
+
+/* Packets to the ground wait until the test takes them. */
+#define TRANSMIT_QUEUE 200
+static CRTPPacket transmitted[TRANSMIT_QUEUE];
+static int first_transmitted, count_transmitted;
+
+int crtpSendPacket(CRTPPacket *packet) {
+  if (stub_transmit_full || count_transmitted == TRANSMIT_QUEUE) {
+    return pdFALSE;
+  }
+  transmitted[(first_transmitted + count_transmitted++) % TRANSMIT_QUEUE] = *packet;
+  return pdTRUE;
+}
+
+/* Takes the next packet, header and data; returns its length, 0 when there is none. */
+int stub_transmitted(uint8_t *data) {
+  if (count_transmitted == 0) {
+    return 0;
+  }
+  const CRTPPacket *packet = &transmitted[first_transmitted];
+  data[0] = packet->header;
+  memcpy(data + 1, packet->data, packet->size);
+  first_transmitted = (first_transmitted + 1) % TRANSMIT_QUEUE;
+  count_transmitted -= 1;
+  return packet->size + 1;
+}
+
+/* Cycles are counted when both have been switched on. */
+DWT_Type *stub_dwt(void) {
+  static DWT_Type dwt;
+  if ((stub_core_debug.DEMCR & CoreDebug_DEMCR_TRCENA_Msk) && (dwt.CTRL & DWT_CTRL_CYCCNTENA_Msk)) {
+    dwt.CYCCNT += stub_cycles;
+  }
+  return &dwt;
+}
+
+void vTaskSuspendAll(void) { stub_suspended += 1; }
+BaseType_t xTaskResumeAll(void) {
+  stub_suspended -= 1;
+  return pdTRUE;
 }
 
 static void look(void) {

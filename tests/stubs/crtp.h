@@ -17,4 +17,5 @@ typedef struct {
 } __attribute__((packed)) CRTPPacket;
 typedef void (*CrtpCallback)(CRTPPacket *);
 void crtpRegisterPortCB(int, CrtpCallback);
+int crtpSendPacket(CRTPPacket *);
 bool crtpIsConnected(void);

@@ -58,6 +58,8 @@ TYPE(xQueueCreateStatic(1, 1, NULL, NULL), QueueHandle_t)
 TYPE(xQueueSend(NULL, NULL, 0), BaseType_t)
 FUNCTION(xTaskGetTickCount, TickType_t, void)
 FUNCTION(vTaskDelay, void, TickType_t)
+FUNCTION(vTaskSuspendAll, void, void)
+FUNCTION(xTaskResumeAll, BaseType_t, void)
 FUNCTION(xTaskCreateStatic, TaskHandle_t, TaskFunction_t, const char *, uint32_t, void *, UBaseType_t, StackType_t *,
          StaticTask_t *)
 
@@ -86,6 +88,7 @@ static const CRTPPacket port_6_channel_1 __attribute__((unused)) = {.port = 6, .
 _Static_assert(SAME(CrtpCallback, void (*)(CRTPPacket *)), "CRTP");
 FUNCTION(crtpRegisterPortCB, void, int, CrtpCallback)
 FUNCTION(crtpIsConnected, bool, void)
+FUNCTION(crtpSendPacket, int, CRTPPacket *)
 FUNCTION(consolePutchar, int, int)
 FUNCTION(eprintf, int, int (*)(int), const char *, ...)
 TYPE(DEBUG_PRINT("%s %d\n", "", 0), int)
@@ -220,6 +223,18 @@ VALUE(TIM3_BASE, 0x40000400)
 VALUE(TIM5_BASE, 0x40000C00)
 _Static_assert(SAME(__typeof__(GPIOA), GPIO_TypeDef *) && SAME(__typeof__(GPIOB), GPIO_TypeDef *), "ports");
 _Static_assert(SAME(__typeof__(TIM3), TIM_TypeDef *) && SAME(__typeof__(TIM5), TIM_TypeDef *), "timers");
+/* ARM's CMSIS */
+VALUE(DWT_BASE, 0xE0001000)
+VALUE(CoreDebug_BASE, 0xE000EDF0)
+_Static_assert(SAME(__typeof__(DWT), DWT_Type *) && SAME(__typeof__(CoreDebug), CoreDebug_Type *), "debug");
+VALUE(offsetof(DWT_Type, CTRL), 0)
+VALUE(offsetof(DWT_Type, CYCCNT), 4)
+VALUE(offsetof(CoreDebug_Type, DHCSR), 0)
+VALUE(offsetof(CoreDebug_Type, DCRSR), 4)
+VALUE(offsetof(CoreDebug_Type, DCRDR), 8)
+VALUE(offsetof(CoreDebug_Type, DEMCR), 12)
+VALUE(DWT_CTRL_CYCCNTENA_Msk, 1)
+VALUE(CoreDebug_DEMCR_TRCENA_Msk, 1 << 24)
 VALUE(GPIO_Mode_AF, 2)
 VALUE(GPIO_OType_OD, 1)
 VALUE(GPIO_Speed_2MHz, 0)

@@ -21,6 +21,26 @@ extern TIM_TypeDef stub_tim3, stub_tim5;
 #define GPIOB ((GPIO_TypeDef *)GPIOB_BASE)
 #define TIM3 ((TIM_TypeDef *)TIM3_BASE)
 #define TIM5 ((TIM_TypeDef *)TIM5_BASE)
+/* ARM's own: the processor's counter of cycles */
+typedef struct {
+  volatile uint32_t CTRL, CYCCNT;
+} DWT_Type;
+typedef struct {
+  volatile uint32_t DHCSR, DCRSR, DCRDR, DEMCR;
+} CoreDebug_Type;
+#define DWT_CTRL_CYCCNTENA_Msk 1ul
+#define CoreDebug_DEMCR_TRCENA_Msk (1ul << 24)
+#ifdef __arm__
+#define DWT_BASE 0xE0001000ul
+#define CoreDebug_BASE 0xE000EDF0ul
+#else
+DWT_Type *stub_dwt(void); /* each look takes some cycles */
+extern CoreDebug_Type stub_core_debug;
+#define DWT_BASE stub_dwt()
+#define CoreDebug_BASE &stub_core_debug
+#endif
+#define DWT ((DWT_Type *)DWT_BASE)
+#define CoreDebug ((CoreDebug_Type *)CoreDebug_BASE)
 typedef enum { GPIO_Mode_AF = 2 } GPIOMode_TypeDef;
 typedef enum { GPIO_OType_OD = 1 } GPIOOType_TypeDef;
 typedef enum { GPIO_Speed_2MHz = 0 } GPIOSpeed_TypeDef;

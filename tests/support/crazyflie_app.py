@@ -92,9 +92,19 @@ class Pins(ctypes.Structure):
     )
 
 
-def build_app(folder: Path, config: LabConfig | None = None) -> Path:
-    """Export the app, of the default profile unless told otherwise, and return it as a shared library."""
+def build_app(
+    folder: Path, config: LabConfig | None = None, plant: tuple[str, str, str] | None = None
+) -> Path:
+    """Export the app, of the default profile unless told otherwise, and return it as a shared library.
+
+    `plant` is a mistake: in a file, the first of two texts is replaced by the second, once.
+    """
     write_app(config or load_config(), "floaty", folder)
+    if plant is not None:
+        source = folder / "src" / plant[0]
+        text = source.read_text()
+        assert plant[1] in text
+        source.write_text(text.replace(plant[1], plant[2], 1))
     compiler = min(
         compilers(), key=lambda one: one.name == "zig"
     )  # the system's, if there is one: it is faster
@@ -157,6 +167,9 @@ class App:
         self.after_watchdog = ctypes.c_int32.in_dll(c, "stub_after_watchdog")
         self.after_assert = ctypes.c_int32.in_dll(c, "stub_after_assert")
         self.self_test_passed = ctypes.c_int32.in_dll(c, "stub_self_test_passed")
+        self.cycles = ctypes.c_uint32.in_dll(c, "stub_cycles")
+        self.suspended = ctypes.c_int32.in_dll(c, "stub_suspended")
+        self.transmit_full = ctypes.c_int32.in_dll(c, "stub_transmit_full")
         self.ratios = (ctypes.c_int32 * 4).in_dll(c, "stub_ratios")
         self.supervisor = Supervisor.in_dll(c, "floaty_supervisor")
         self.timers = [Timer.in_dll(c, name) for name in ("stub_tim3", "stub_tim5")]
@@ -197,6 +210,12 @@ class App:
     def radio(self, data: bytes, port: int = LOCALISATION, channel: int = GENERIC) -> None:
         """Receive a packet."""
         self.c.stub_radio(port, channel, data, len(data))
+
+    def sent(self) -> bytes:
+        """Take the next packet to the ground, empty when there is none."""
+        packet = ctypes.create_string_buffer(32)
+        length = self.c.stub_transmitted(packet)
+        return packet.raw[:length]
 
     def app_channel(self, data: bytes) -> None:
         """Receive a packet of the app channel."""

@@ -920,7 +920,7 @@ def test_the_stubs_are_as_the_firmwares_headers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("header", sorted(STUBS.glob("*.h")), ids=lambda header: header.name)
 def test_the_stubs_declare_nothing_that_the_facts_do_not_state(header: Path) -> None:
-    words_of_c = "typedef enum union extern inline return packed section used aligned format printf opaque"
+    words_of_c = "volatile typedef enum union extern inline return packed section used aligned format printf opaque"
     only_in_stubs = (
         r"stub_\w+|\w+_PLACE|(LOG|PARAM)_ADD_(GROUP|FULL)|(sensorData|setpoint)_s|__(logs|params)_|stop_"
     )
@@ -970,11 +970,11 @@ def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) ->
     ).stdout
     stack = {
         name: deepest_stack(arm_build)[name]
-        for name in ("estimatorOutOfTree", "controllerOutOfTree", "app_task", "appInit")
+        for name in ("estimatorOutOfTree", "controllerOutOfTree", "app_task", "appInit", "receive")
     }
     print(f"flash {text + data} B, RAM {data + bss} B, stack {stack} B")
-    assert text + data < 20_000
-    assert data + bss < 10_000
+    assert text + data < 24_000
+    assert data + bss < 16_000  # a core that flies, one for the port
     assert "ccm" not in sections.lower()
     assert max(stack.values()) < STABILIZER_STACK // 2
 

@@ -26,6 +26,7 @@
 #include "usec_time.h"
 #include "watchdog.h"
 
+#include "floaty_port.h"
 #include "floaty_settings.h"
 
 #define CHANNEL_GENERIC 1
@@ -121,6 +122,7 @@ static void app_task(void *unused) {
 
   wait_for_self_test();
   crtpRegisterPortCB(CRTP_PORT_LOCALIZATION, receive_localisation);
+  floaty_port_init();
   DEBUG_PRINT("core %s, profile %s %s\n", FLOATY_CORE_VERSION, FLOATY_PROFILE_NAME, floaty_profile_hash);
   floaty_toc_report();
   if (restarted) {

@@ -1,0 +1,177 @@
+/* See floaty_port.h.
+ *
+ * Requests arrive in the task CRTP-RX, and are executed there. What flies is not touched, and while it flies nothing is
+ * executed. A call is measured with the scheduler suspended: no other task runs in it, interrupts do.
+ */
+#include "floaty_port.h"
+
+#include <string.h>
+
+#include "FreeRTOS.h"
+#include "task.h"
+
+#include "crtp.h"
+#include "stm32fxxx.h"
+
+#include "floaty_calls.h"
+
+#define CLOCK_MHZ 168
+
+_Static_assert(sizeof FLOATY_CORE_VERSION > FLOATY_NAME_SIZE, "the core's hash");
+_Static_assert(sizeof(FloatyMemory) <= UINT16_MAX, "offsets have 16 bits");
+
+static FloatyMemory memory;
+static uint8_t session;           /* 0: none */
+static uint16_t done;             /* its requests that were executed */
+static uint16_t last_call;        /* number of the last call */
+static FloatyWireCalled called;   /* and its answer */
+
+/* CRC-32 as of zlib. */
+static uint32_t digest(void) {
+  static const uint32_t TABLE[16] = {
+      0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4, 0x4db26158, 0x5005713c,
+      0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c, 0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c,
+  };
+  const uint8_t *bytes = (const uint8_t *)&memory;
+  uint32_t crc = 0xffffffff;
+  for (uint32_t i = 0; i < sizeof memory; i++) {
+    crc ^= bytes[i];
+    crc = TABLE[crc & 15] ^ crc >> 4;
+    crc = TABLE[crc & 15] ^ crc >> 4;
+  }
+  return ~crc;
+}
+
+static uint8_t hello(uint8_t wanted, uint8_t *body) {
+  FloatyWireAbout about = {FLOATY_VERSION, floaty_supervisor.state, sizeof memory, 0, CLOCK_MHZ, "", ""};
+  if (wanted != session) {
+    session = wanted;
+    done = 0;
+    memset(&memory, 0, sizeof memory);
+    CoreDebug->DEMCR |= CoreDebug_DEMCR_TRCENA_Msk;
+    DWT->CTRL |= DWT_CTRL_CYCCNTENA_Msk;
+  }
+  about.done = done;
+  memcpy(about.core, FLOATY_CORE_VERSION, sizeof about.core);
+  memcpy(about.profile, floaty_profile_hash, sizeof about.profile);
+  memcpy(body, &about, sizeof about);
+  return sizeof about;
+}
+
+static void execute(uint8_t entry) {
+  vTaskSuspendAll();
+  const uint32_t begin = DWT->CYCCNT;
+  called.answer = (int8_t)call_on(&memory, entry);
+  called.cycles = DWT->CYCCNT - begin;
+  xTaskResumeAll();
+  called.digest = digest();
+}
+
+/* What serves a request returns the size of its answer, NO_ANSWER, or what refuses it. */
+#define NO_ANSWER (-1)
+#define REFUSED(REASON) (-1 - FLOATY_REFUSAL_##REASON)
+
+/* Whether a piece lies in the memory. */
+static bool inside(uint32_t offset, uint32_t size) {
+  return offset + size <= sizeof memory;
+}
+
+static int write_memory(const uint8_t *data, uint32_t length, bool is_new) {
+  FloatyWirePlace place;
+  if (length < sizeof place) {
+    return REFUSED(OUTSIDE);
+  }
+  memcpy(&place, data, sizeof place);
+  length -= sizeof place;
+  if (!inside(place.offset, length)) {
+    return REFUSED(OUTSIDE);
+  }
+  if (is_new) {
+    memcpy((uint8_t *)&memory + place.offset, data + sizeof place, length);
+  }
+  return 0;
+}
+
+static int read_memory(const uint8_t *data, uint32_t length, uint8_t *body) {
+  FloatyWirePlaceSize place;
+  if (length < sizeof place) {
+    return REFUSED(OUTSIDE);
+  }
+  memcpy(&place, data, sizeof place);
+  if (place.size > FLOATY_READ_MAX || !inside(place.offset, place.size)) {
+    return REFUSED(OUTSIDE);
+  }
+  memcpy(body, (const uint8_t *)&memory + place.offset, place.size);
+  return place.size;
+}
+
+static int call(const uint8_t *data, uint32_t length, uint16_t number, bool is_new, uint8_t *body) {
+  if (length < sizeof(FloatyWireCall) || data[0] > FLOATY_CALL_CONTROL) {
+    return REFUSED(OUTSIDE);
+  }
+  if (is_new) {
+    execute(data[0]);
+    last_call = number;
+  } else if (number != last_call) {
+    return NO_ANSWER; /* it was long on its way */
+  }
+  memcpy(body, &called, sizeof called);
+  return sizeof called;
+}
+
+static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t length, uint8_t *body) {
+  const int16_t ahead = (int16_t)(head->number - done);
+  const bool is_new = ahead == 0;
+  int size;
+  if (head->kind == FLOATY_KIND_HELLO && head->session != 0) {
+    return hello(head->session, body);
+  }
+  if (head->session != session || session == 0) {
+    return REFUSED(NO_SESSION);
+  }
+  if (floaty_supervisor.state == FLOATY_FLYING) {
+    return REFUSED(FLYING);
+  }
+  if (ahead > 0) {
+    return NO_ANSWER; /* one before it was lost: the host sends both again */
+  }
+  switch (head->kind) {
+    case FLOATY_KIND_WRITE: size = write_memory(data, length, is_new); break;
+    case FLOATY_KIND_READ: size = read_memory(data, length, body); break;
+    case FLOATY_KIND_CALL: size = call(data, length, head->number, is_new, body); break;
+    default: return REFUSED(OUTSIDE);
+  }
+  if (is_new && size >= 0) {
+    done += 1;
+  }
+  return size;
+}
+
+static void receive(CRTPPacket *packet) {
+  static CRTPPacket answer;
+  FloatyWireHead head;
+  uint8_t *body = answer.data + sizeof head;
+  if (packet->channel != FLOATY_CHANNEL_CALLS || packet->size < sizeof head) {
+    return;
+  }
+  memcpy(&head, packet->data, sizeof head);
+  int size = serve(&head, packet->data + sizeof head, packet->size - sizeof head, body);
+  if (size == NO_ANSWER) {
+    return;
+  }
+  if (size < 0) {
+    const FloatyWireWhy why = {(uint8_t)(NO_ANSWER - size)};
+    head.kind = FLOATY_KIND_REFUSED;
+    memcpy(body, &why, sizeof why);
+    size = sizeof why;
+  }
+  memcpy(answer.data, &head, sizeof head);
+  answer.port = FLOATY_PORT_CORE;
+  answer.channel = FLOATY_CHANNEL_CALLS;
+  answer.size = (uint8_t)(sizeof head + (uint32_t)size);
+  crtpSendPacket(&answer); /* when the queue is full it is lost: the host asks again */
+}
+
+void floaty_port_init(void) {
+  crtpRegisterPortCB(FLOATY_PORT_CORE, receive);
+}

@@ -1,0 +1,184 @@
+"""The CRTP port on which a real board executes the flight core call by call; `floaty_wire.h` of the app is made from this.
+
+The board keeps memory of its own for it, beside that which flies: the structs of the core, and of own logic, one behind
+the other in the order of `CoreBlocks.named`. A packet is one request of the host or one answer of the board, little-endian.
+Each begins with HEAD: the kind, the session, and the number of the request in it. An answer has the head of its request.
+
+    HELLO   ->                       a session begins, memory is zero; asked again, it is only answered
+            <- ABOUT                 what answers
+    WRITE   -> PLACE, bytes          into the memory
+            <-
+    CALL    -> CALL                  execute an entry point
+            <- CALLED
+    READ    -> PLACE_SIZE            of the memory
+            <- bytes
+    (any)   <- REFUSED               with a reason
+
+A board executes the requests of a session in the order of their numbers, from 0 on, and each once. A number above the next
+one is not answered: one before it was lost. A request that comes again is answered again and not executed again, READ
+with the memory as it is then; of calls only the last one. So the host may send many at once and repeats those without an
+answer; it goes on behind a call when everything up to it has been answered.
+"""
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from firmware_py.wire import WireError
+from firmware_py.wire.crtp import MAX_DATA
+
+PORT_CORE = 10
+CHANNEL_CALLS = 0
+VERSION = 1  # of this protocol
+NAME_SIZE = 8  # characters of a hash
+
+
+class Kind(IntEnum):
+    """What a request wants, and what it is answered with."""
+
+    HELLO = 0
+    WRITE = 1
+    CALL = 2
+    READ = 3
+    REFUSED = 4
+
+
+class Refusal(IntEnum):
+    """Why a board does not do it."""
+
+    NO_SESSION = 1  # it has rebooted, or somebody else has begun one
+    FLYING = 2
+    OUTSIDE = 3  # of the memory, or no such call
+
+
+class Call(IntEnum):
+    """The entry points; `firmware_py.core.entry`."""
+
+    RESET = 0
+    FILE_POSE = 1
+    ESTIMATE = 2
+    CONTROL = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A piece of a packet: its fields in their order, each with its code of `struct`."""
+
+    name: str
+    fields: tuple[tuple[str, str], ...]
+
+    @property
+    def struct(self) -> struct.Struct:
+        """What packs it."""
+        return struct.Struct("<" + "".join(code for _, code in self.fields))
+
+
+HEAD = Layout("Head", (("kind", "B"), ("session", "B"), ("number", "H")))
+ABOUT = Layout("About", (
+    ("version", "B"),  # VERSION
+    ("state", "B"),  # of the supervisor: firmware_py.wire.supervisor.State
+    ("size", "H"),  # [B] of the memory
+    ("done", "H"),  # requests of this session that were executed
+    ("clock_mhz", "H"),  # of the processor, whose cycles are counted
+    ("core", f"{NAME_SIZE}s"),  # how the hash of the core's sources begins
+    ("profile", f"{NAME_SIZE}s"),  # and that of the parameters in the app
+))  # fmt: skip
+PLACE = Layout("Place", (("offset", "H"),))
+PLACE_SIZE = Layout("PlaceSize", (("offset", "H"), ("size", "B")))
+CALL = Layout("Call", (("call", "B"),))
+CALLED = Layout("Called", (
+    ("answer", "b"),  # of file_pose; 0 of the others
+    ("cycles", "I"),  # that the call took, with the interrupts in it; no other task runs meanwhile
+    ("digest", "I"),  # CRC-32 of the whole memory afterwards, as zlib.crc32
+))  # fmt: skip
+WHY = Layout("Why", (("reason", "B"),))
+LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY)
+
+_HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY = (layout.struct for layout in LAYOUTS)
+WRITE_MAX = MAX_DATA - _HEAD.size - _PLACE.size  # bytes in a packet
+READ_MAX = MAX_DATA - _HEAD.size
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What answers on the port."""
+
+    version: int
+    state: int
+    size: int
+    done: int
+    clock_mhz: int
+    core: str
+    profile: str
+
+
+@dataclass(frozen=True, slots=True)
+class Called:
+    """What a call came to."""
+
+    answer: int
+    cycles: int
+    digest: int
+
+
+@dataclass(frozen=True, slots=True)
+class CoreAnswer:
+    """An answer; `body` is what follows its head."""
+
+    kind: int
+    session: int
+    number: int
+    body: bytes
+
+    def about(self) -> About:
+        """Read the answer to HELLO."""
+        *numbers, core, profile = _unpack(_ABOUT, self.body)
+        return About(*numbers, core.decode("ascii", "replace"), profile.decode("ascii", "replace"))
+
+    def called(self) -> Called:
+        """Read the answer to CALL."""
+        return Called(*_unpack(_CALLED, self.body))
+
+    def refusal(self) -> int:
+        """Read why."""
+        return int(_unpack(_WHY, self.body)[0])
+
+
+def hello() -> tuple[Kind, bytes]:
+    """Begin a session."""
+    return Kind.HELLO, b""
+
+
+def write(offset: int, data: bytes) -> tuple[Kind, bytes]:
+    """Write up to `WRITE_MAX` bytes."""
+    return Kind.WRITE, _PLACE.pack(offset) + data
+
+
+def call(entry: Call) -> tuple[Kind, bytes]:
+    """Execute an entry point."""
+    return Kind.CALL, _CALL.pack(entry)
+
+
+def read(offset: int, size: int) -> tuple[Kind, bytes]:
+    """Read up to `READ_MAX` bytes."""
+    return Kind.READ, _PLACE_SIZE.pack(offset, size)
+
+
+def encode_request(kind: Kind, body: bytes, session: int, number: int) -> bytes:
+    """Return the data of the packet."""
+    return _HEAD.pack(kind, session, number & 0xFFFF) + body
+
+
+def decode_answer(data: bytes) -> CoreAnswer:
+    """Read the data of a packet; `WireError` when it has no head."""
+    if len(data) < _HEAD.size:
+        raise WireError(f"an answer of {len(data)} bytes: at least {_HEAD.size} are expected")
+    kind, session, number = _HEAD.unpack_from(data)
+    return CoreAnswer(kind, session, number, data[_HEAD.size :])
+
+
+def _unpack(layout: struct.Struct, body: bytes) -> tuple[Any, ...]:
+    if len(body) < layout.size:
+        raise WireError(f"{len(body)} bytes behind the head: at least {layout.size} are expected")
+    return layout.unpack_from(body)

@@ -1,0 +1,151 @@
+"""The host's end of the core's port: sends the requests of a batch, repeats those that are not answered, in any loss.
+
+`firmware_py.wire.core_port` has the rules by which a board executes each request once. Knows no link: `packets` carries.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+from firmware_py.wire import WireError
+from firmware_py.wire.core_port import (
+    READ_MAX,
+    VERSION,
+    About,
+    CoreAnswer,
+    Kind,
+    Refusal,
+    decode_answer,
+    encode_request,
+    hello,
+    read,
+)
+from ground_station.clock import clock_us
+from ground_station.errors import LinkError
+
+Request = tuple[Kind, bytes]
+
+WINDOW = 12  # requests under way at once: a board's queue has room for 16 packets
+FIRST_WAIT_S = 0.1  # for an answer, before requests are repeated
+LONGEST_WAIT_S = 0.4
+SILENCE_S = 3.0  # after which the board is given up
+SESSIONS = 255
+TEXTS: dict[int, str] = {
+    Refusal.NO_SESSION: "it has rebooted, or another program uses it",
+    Refusal.FLYING: "it flies: nothing else is executed until it is in failsafe",
+    Refusal.OUTSIDE: "it refuses a request: its app is another version",
+}
+
+
+class Packets(Protocol):
+    """Carries the data of packets on the core's port; some may be lost, doubled or late."""
+
+    def send(self, data: bytes) -> None:
+        """Send to the board; raises `LinkError`."""
+        ...
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return what comes next within that time, else None; raises `LinkError`."""
+        ...
+
+    def close(self) -> None:
+        """Give the link back."""
+        ...
+
+
+class CoreClient:
+    """A board's core; `begin` first. `name` is what the user calls the board. Every method raises `LinkError`."""
+
+    def __init__(self, packets: Packets, name: str) -> None:
+        self.name = name
+        self.sent = 0  # packets
+        self.repeated = 0  # of these
+        self._packets = packets
+        self._session = clock_us() % SESSIONS + 1
+        self._number = 0  # of the next request
+
+    def begin(self) -> About:
+        """Begin a session, with all memory on the board zero."""
+        for _ in range(SESSIONS):
+            self._session, self._number = self._session % SESSIONS + 1, 0
+            try:
+                about = self._exchange([hello()])[0].about()
+            except WireError as error:
+                raise LinkError(f"{self.name}: {error}") from None
+            if about.version != VERSION:
+                raise LinkError(
+                    f"{self.name}: its app speaks version {about.version}, expected {VERSION}: export and flash it again"
+                )
+            if about.done == 0:  # otherwise an earlier program's session had that number
+                return about
+        raise LinkError(f"{self.name}: it begins no session")
+
+    def execute(self, requests: Sequence[Request]) -> list[CoreAnswer]:
+        """Have requests executed in their order, at most one of them a call; returns their answers."""
+        answers = self._exchange(requests)
+        self._number = (self._number + len(requests)) & 0xFFFF
+        return answers
+
+    def memory(self, size: int) -> bytes:
+        """Read the memory, all of it."""
+        pieces = [read(offset, min(READ_MAX, size - offset)) for offset in range(0, size, READ_MAX)]
+        return b"".join(answer.body for answer in self.execute(pieces))
+
+    def close(self) -> None:
+        """Give the link back."""
+        self._packets.close()
+
+    def _exchange(self, requests: Sequence[Request]) -> list[CoreAnswer]:
+        answers: dict[int, CoreAnswer] = {}
+        sent = begin = 0  # requests that were sent, and that were answered without a gap
+        wait_s, silent_s = FIRST_WAIT_S, 0.0
+        while begin < len(requests):
+            for index in range(sent, min(begin + WINDOW, len(requests))):
+                self._send(requests[index], index)
+                sent = index + 1
+            answer = self._receive(wait_s, len(requests))
+            if answer is not None:
+                wait_s, silent_s = FIRST_WAIT_S, 0.0
+                answers[answer.number - self._number & 0xFFFF] = answer
+                while begin in answers:
+                    begin += 1
+                continue
+            silent_s += wait_s
+            if silent_s >= SILENCE_S:
+                raise LinkError(f"{self.name}: silent for {SILENCE_S:.0f} s")
+            wait_s = min(2.0 * wait_s, LONGEST_WAIT_S)
+            for index in range(begin, sent):
+                if index not in answers:
+                    self._send(requests[index], index)
+                    self.repeated += 1
+        return [answers[index] for index in range(len(requests))]
+
+    def _send(self, request: Request, index: int) -> None:
+        self.sent += 1
+        self._packets.send(encode_request(*request, self._session, self._number + index))
+
+    def _receive(self, timeout_s: float, count: int) -> CoreAnswer | None:
+        """Return an answer to one of `count` requests; one to an earlier request is none."""
+        for data in iter(lambda: self._packets.receive(timeout_s), None):
+            try:
+                answer = decode_answer(data)
+            except WireError:
+                continue
+            if answer.session == self._session and answer.number - self._number & 0xFFFF < count:
+                if answer.kind == Kind.REFUSED:
+                    raise LinkError(f"{self.name}: {TEXTS.get(answer.refusal(), 'it refuses a request')}")
+                return answer
+        return None
+
+
+def runs(places: Sequence[int], longest: int) -> Iterator[tuple[int, int]]:
+    """Yield (offset, size) of pieces up to `longest` that cover sorted places, with small gaps."""
+    begin = end = -1
+    for place in places:
+        if begin >= 0 and place - begin < longest:
+            end = place
+            continue
+        if begin >= 0:
+            yield begin, end + 1 - begin
+        begin = end = place
+    if begin >= 0:
+        yield begin, end + 1 - begin

@@ -1,0 +1,75 @@
+"""Single packets of the core's port to and from a board, over whatever link cflib knows: radio, USB or UDP.
+
+No table of contents is fetched and nothing of the board's other services is used, so that it is ready at once.
+"""
+
+import re
+
+import cflib.crtp
+from cflib.crtp.crtpstack import CRTPPacket
+
+from firmware_py.wire.core_port import CHANNEL_CALLS, PORT_CORE
+from firmware_py.wire.crtp import header
+from ground_station.clock import clock_us
+from ground_station.errors import LinkError
+from ground_station.links.core_client import CoreClient
+from ground_station.links.crazyradio import URIS, quiet_cflib
+
+USB = r"usb://\d"
+HEADER = header(PORT_CORE, CHANNEL_CALLS)
+
+
+class CflibPackets:
+    """`ground_station.links.core_client.Packets` of a URI. Raises `LinkError` when there is no such link."""
+
+    def __init__(self, uri: str) -> None:
+        if not any(re.fullmatch(pattern, uri) for pattern in (*URIS, USB)):
+            raise LinkError(f"{uri}: expected radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://127.0.0.1:19850")
+        quiet_cflib()
+        if not cflib.crtp.CLASSES:
+            cflib.crtp.init_drivers()
+        self._uri = uri
+        self._lost = ""
+        try:
+            self._driver = cflib.crtp.get_link_driver(uri, lambda statistics: None, self._lose)
+        except Exception as error:  # cflib raises bare exceptions
+            raise LinkError(f"{uri}: {_first_line(str(error))}") from None
+        if self._driver is None:
+            raise LinkError(f"{uri}: no driver for this link")
+
+    def send(self, data: bytes) -> None:
+        """Send to the board."""
+        self._driver.send_packet(CRTPPacket(HEADER, list(data)))
+        self._check()
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return what comes next on the port within that time, else None."""
+        end_us = clock_us() + round(timeout_s * 1e6)
+        while True:
+            left_s = (end_us - clock_us()) * 1e-6
+            packet = self._driver.receive_packet(left_s) if left_s > 0.0 else None
+            self._check()
+            if packet is None:
+                return None
+            if packet.port == PORT_CORE and packet.channel == CHANNEL_CALLS:
+                return bytes(packet.data)
+
+    def close(self) -> None:
+        """Give the link back."""
+        self._driver.close()
+
+    def _lose(self, text: str) -> None:
+        self._lost = self._lost or _first_line(text)
+
+    def _check(self) -> None:
+        if self._lost:
+            raise LinkError(f"{self._uri}: lost: {self._lost}")
+
+
+def open_core(uri: str) -> CoreClient:
+    """Return a board's core. Raises `LinkError`."""
+    return CoreClient(CflibPackets(uri), uri)
+
+
+def _first_line(text: str) -> str:
+    return next(iter(text.strip().splitlines()), "no reason given")

@@ -1,0 +1,121 @@
+"""A flight core that a real board executes, call by call: the fourth plug of the core runner.
+
+The memory of the core lies here, as with every board, and on the board. Before a call, what has changed here is written
+there; after it, the board tells a CRC of all its bytes. What the call should have come to is computed here beside it:
+where the CRC confirms that, nothing has to be read, otherwise all memory is. So what flies is what the board computed.
+"""
+
+from __future__ import annotations
+
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.export.cortex_m4 import Load
+from firmware_py.wire.core_port import WRITE_MAX, About, Call, Called, call, write
+from ground_station.errors import LinkError
+from ground_station.links.core_client import CoreClient, runs
+
+Bytes = NDArray[np.uint8]
+
+
+class RealCore:
+    """A `CoreRunner` and a `CoreCosts`; `load` counts cycles by entry point, as the board measures them.
+
+    `about` is the board. Raises `LinkError` when the board does not answer, or its memory is of another layout.
+    """
+
+    def __init__(self, blocks: CoreBlocks, client: CoreClient) -> None:
+        self.load = {entry.name.lower(): Load() for entry in Call}
+        self.unexpected = 0  # calls that came to something else than here
+        self._client = client
+        self._here = _bytes_of(blocks)
+        # where a call is computed without touching what flies
+        self._copy = CoreBlocks(blocks.parameters.kind.allocate(), PythonRunner, blocks.logic)
+        self._expected = _bytes_of(self._copy)
+        size = sum(memory.size for memory in self._here)
+        self.about: About = client.begin()
+        if self.about.size != size:
+            raise LinkError(
+                f"{client.name}: its core has {self.about.size} B of memory, this one {size}: export and flash it again"
+            )
+        self._there = np.zeros(size, np.uint8)  # the board's memory
+        self._filed_cycles = 0  # for poses since the last step of the estimator
+        # the call whose results the board has, and its inputs
+        self._ahead: tuple[str, Bytes, Called] | None = None
+
+    def reset(self) -> None:
+        """Start the estimator."""
+        self._call("reset")
+
+    def file_pose(self) -> int:
+        """File the input's pose."""
+        called = self._call("file_pose")
+        self._filed_cycles += called.cycles
+        return called.answer
+
+    def estimate(self) -> None:
+        """Run one tick of the estimator."""
+        self._call("estimate")
+        self._filed_cycles = 0
+
+    def control(self) -> None:
+        """Run one tick of the controller."""
+        self._call("control")
+
+    def estimate_us(self) -> int:
+        """Return the processor time of the estimator's next call, with that of the poses filed since the last one."""
+        return self._microseconds(self._filed_cycles + self._look_ahead("estimate").cycles)
+
+    def control_us(self) -> int:
+        """Return the processor time of the controller's next call."""
+        return self._microseconds(self._look_ahead("control").cycles)
+
+    def _call(self, name: str) -> Called:
+        """Have an entry point executed and let its results out; what was executed ahead on the same inputs is taken."""
+        inputs = np.concatenate(self._here)
+        if self._ahead is not None and self._ahead[0] == name and np.array_equal(self._ahead[1], inputs):
+            called = self._ahead[2]
+        else:
+            called = self._execute(name, inputs)
+        self._ahead = None
+        self.load[name].add(0, called.cycles)
+        _fill(self._here, self._there)
+        return called
+
+    def _look_ahead(self, name: str) -> Called:
+        """Have an entry point executed without letting its results out."""
+        inputs = np.concatenate(self._here)
+        called = self._execute(name, inputs)
+        self._ahead = name, inputs, called
+        return called
+
+    def _execute(self, name: str, inputs: Bytes) -> Called:
+        changed = np.flatnonzero(inputs != self._there).tolist()
+        data = inputs.tobytes()
+        requests = [write(offset, data[offset : offset + size]) for offset, size in runs(changed, WRITE_MAX)]
+        answers = self._client.execute((*requests, call(Call[name.upper()])))
+        called = answers[-1].called()
+        _fill(self._expected, inputs)
+        getattr(self._copy.run, name)()
+        self._there = np.concatenate(self._expected)
+        if crc32(self._there.data) != called.digest:
+            self.unexpected += 1
+            self._there = np.frombuffer(self._client.memory(self._there.size), np.uint8)
+        return called
+
+    def _microseconds(self, cycles: int) -> int:
+        return -(-cycles // self.about.clock_mhz)
+
+
+def _bytes_of(blocks: CoreBlocks) -> tuple[Bytes, ...]:
+    return tuple(block.memory.view(np.uint8) for block in blocks.named.values())
+
+
+def _fill(memories: tuple[Bytes, ...], data: Bytes) -> None:
+    place = 0
+    for memory in memories:
+        memory[:] = data[place : place + memory.size]
+        place += memory.size

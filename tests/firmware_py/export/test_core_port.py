@@ -1,0 +1,339 @@
+"""The exported app executes the core call by call for a host: each request once, whatever the link does to packets."""
+
+import struct
+from functools import partial
+from pathlib import Path
+from zlib import crc32
+
+import pytest
+
+from firmware_py.config import parameters_of
+from firmware_py.core.structs import Estimator, Input, Parameters
+from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.export.c99 import translate
+from firmware_py.export.profile_c import profile_hash
+from firmware_py.wire import WireError
+from firmware_py.wire.core_port import (
+    LAYOUTS,
+    NAME_SIZE,
+    PORT_CORE,
+    READ_MAX,
+    WRITE_MAX,
+    Call,
+    CoreAnswer,
+    Kind,
+    Refusal,
+    call,
+    decode_answer,
+    encode_request,
+    hello,
+    read,
+    write,
+)
+from firmware_py.wire.supervisor import State
+from ground_station.errors import LinkError
+from ground_station.links.core_client import CoreClient
+from hil.config import load_config
+from hil.deploy.check import FAULTS, check_flight
+from hil.devices.real_core import RealCore
+from hil.experiments import find_experiment
+from hil.laboratory.faults import parse
+from hil.laboratory.run import Request
+from support.app_packets import AppPackets
+from support.crazyflie_app import App, build_app
+from support.own_logic import LAW, own_config
+
+TICK = Parameters.dtype.itemsize + Input.dtype.itemsize + Estimator.dtype.fields["tick"][1]  # where it lies
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_app(tmp_path_factory.mktemp("app"))
+
+
+@pytest.fixture
+def app(library: Path, tmp_path: Path) -> App:
+    app = App(library, tmp_path / "copy.so")
+    app.boot()
+    return app
+
+
+def ask(app: App, number: int, request: tuple[Kind, bytes], session: int = 7) -> CoreAnswer | None:
+    """Send one packet; None: it is not answered."""
+    app.radio(encode_request(*request, session, number), PORT_CORE, 0)
+    packet = app.sent()
+    assert app.sent() == b""
+    return decode_answer(packet[1:]) if packet else None
+
+
+def begun(app: App) -> App:
+    """A session with the profile's parameters in memory, the estimator started: three requests and more are done."""
+    ask(app, 0, hello())
+    data = parameters_of(load_config()).bytes()
+    pieces = [write(offset, data[offset : offset + WRITE_MAX]) for offset in range(0, len(data), WRITE_MAX)]
+    for number, request in enumerate((*pieces, call(Call.RESET))):
+        assert ask(app, number, request).kind == request[0]
+    return app
+
+
+BEGUN = -(-Parameters.dtype.itemsize // WRITE_MAX) + 1  # requests of `begun`
+
+
+def ticks(app: App, number: int) -> int:
+    return struct.unpack("<i", ask(app, number, read(TICK, 4)).body)[0]
+
+
+def test_a_session_begins_with_what_is_on_board_and_memory_of_zeros(app: App) -> None:
+    about = ask(app, 0, hello()).about()
+    assert f'"{about.core}' in translate().header
+    assert profile_hash(load_config()).startswith(about.profile)
+    assert len(about.core) == len(about.profile) == NAME_SIZE
+    assert (about.done, about.state, about.clock_mhz) == (0, State.CALIBRATING, 168)
+    blocks = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    assert about.size == sum(len(block.bytes()) for block in blocks.named.values())
+    assert ask(app, 0, read(about.size - READ_MAX, READ_MAX)).body == bytes(READ_MAX)
+
+
+def test_a_call_is_answered_with_cycles_and_the_digest_of_all_memory(app: App) -> None:
+    blocks = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    blocks.run.reset()
+    begun(app)
+    app.cycles.value = 4321
+    blocks.run.estimate()
+    called = ask(app, BEGUN, call(Call.ESTIMATE)).called()
+    assert called.digest == crc32(b"".join(block.bytes() for block in blocks.named.values()))
+    assert (called.answer, called.cycles) == (0, 4321)
+    assert app.suspended.value == 0
+
+
+def test_a_call_that_comes_again_is_answered_again_and_not_executed(app: App) -> None:
+    begun(app)
+    first = ask(app, BEGUN, call(Call.ESTIMATE))
+    assert ask(app, BEGUN, call(Call.ESTIMATE)) == first
+    assert ticks(app, BEGUN + 1) == 1
+
+
+def test_a_write_that_was_long_on_its_way_writes_nothing(app: App) -> None:
+    begun(app)
+    late = write(TICK, struct.pack("<i", 77))
+    ask(app, BEGUN, write(TICK, struct.pack("<i", 5)))
+    ask(app, BEGUN + 1, call(Call.ESTIMATE))
+    assert ask(app, BEGUN, late).kind == Kind.WRITE
+    assert ticks(app, BEGUN + 2) == 6
+
+
+def test_an_older_call_that_comes_late_is_neither_executed_nor_answered(app: App) -> None:
+    begun(app)
+    ask(app, BEGUN, call(Call.ESTIMATE))
+    ask(app, BEGUN + 1, call(Call.ESTIMATE))
+    assert ask(app, BEGUN, call(Call.ESTIMATE)) is None
+    assert ticks(app, BEGUN + 2) == 2
+
+
+def test_behind_a_lost_request_nothing_is_executed_or_answered(app: App) -> None:
+    begun(app)
+    assert ask(app, BEGUN + 1, call(Call.ESTIMATE)) is None
+    assert ticks(app, BEGUN) == 0
+
+
+@pytest.mark.long
+def test_numbers_go_on_behind_65535(app: App) -> None:
+    ask(app, 0, hello())
+    for number in range(65_540):
+        answer = ask(app, number, write(TICK, struct.pack("<i", number)))
+        assert answer.number == number & 0xFFFF
+    assert ticks(app, 65_540) == 65_539
+
+
+def test_a_second_hello_of_a_session_changes_nothing(app: App) -> None:
+    begun(app)
+    ask(app, BEGUN, call(Call.ESTIMATE))
+    assert ask(app, 0, hello()).about().done == BEGUN + 1
+    assert ticks(app, BEGUN + 1) == 1
+
+
+def test_a_new_session_ends_the_old_one(app: App) -> None:
+    begun(app)
+    assert ask(app, 0, hello(), session=8).about().done == 0
+    assert ask(app, BEGUN, call(Call.ESTIMATE)).refusal() == Refusal.NO_SESSION
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        read(4868 - 3, 4), read(0, READ_MAX + 1), write(4868 - 3, bytes(4)), (Kind.CALL, b"\4"), (Kind.CALL, b""),
+        (Kind.WRITE, b"\0"), (Kind.READ, b"\0\0"), (9, b""),
+    ],
+)  # fmt: skip
+def test_what_lies_outside_is_refused_and_takes_no_number(app: App, request_: tuple[Kind, bytes]) -> None:
+    begun(app)
+    assert ask(app, BEGUN, request_).refusal() == Refusal.OUTSIDE
+    assert ticks(app, BEGUN) == 0
+
+
+def test_in_flight_nothing_is_executed_and_what_flies_is_never_touched(app: App) -> None:
+    flies = app.estimator()
+    begun(app)
+    ask(app, BEGUN, call(Call.ESTIMATE))
+    assert app.estimator() == flies
+    app.supervisor.state = State.FLYING
+    assert ask(app, BEGUN + 1, call(Call.ESTIMATE)).refusal() == Refusal.FLYING
+    app.supervisor.state = State.FAILSAFE
+    assert ticks(app, BEGUN + 1) == 1
+
+
+def test_a_packet_without_a_head_or_on_another_channel_is_not_answered(app: App) -> None:
+    app.radio(b"\0\7\0", PORT_CORE, 0)
+    app.radio(encode_request(*hello(), 7, 0), PORT_CORE, 1)
+    assert app.sent() == b""
+    assert ask(app, 0, hello(), session=0).refusal() == Refusal.NO_SESSION
+    with pytest.raises(WireError):
+        decode_answer(b"\0\7\0")
+
+
+def test_every_layout_is_as_long_in_c(tmp_path: Path, library: Path) -> None:
+    header = (library.parent / "src" / "floaty_wire.h").read_text()
+    sizes = {"uint8_t": 1, "int8_t": 1, "char": NAME_SIZE, "uint16_t": 2, "uint32_t": 4}
+    for layout in LAYOUTS:
+        body = header.split(f"}} __attribute__((packed)) FloatyWire{layout.name};")[0].rsplit("{", 1)[1]
+        assert layout.struct.size == sum(sizes[line.split()[0]] for line in body.strip().splitlines())
+
+
+# The host's end
+
+
+def client_of(app: App, mess: float = 0.0) -> tuple[CoreClient, AppPackets]:
+    packets = AppPackets(app, mess)
+    return CoreClient(packets, "app"), packets
+
+
+@pytest.mark.parametrize("mess", [0.0, 0.1])
+def test_a_flight_on_the_app_has_the_bits_of_python_after_every_call_in_any_loss(
+    app: App, mess: float
+) -> None:
+    client, _ = client_of(app, mess)
+    request = Request.of(find_experiment("hover"), duration_s=2.0, faults=(parse("mocap.outlier@1"),))
+    checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
+    (target,) = checked.targets
+    assert checked.equal
+    assert (checked.outcome, target.ticks) == ("completed", 300)
+    assert target.calls > 700
+    assert (client.repeated > 100) == (mess > 0)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mess", [0.0, 0.1])
+def test_a_flight_with_fourteen_faults_has_the_bits_of_python_on_the_app(app: App, mess: float) -> None:
+    client, _ = client_of(app, mess)
+    request = Request.of(find_experiment("hover"), duration_s=65.0, faults=tuple(map(parse, FAULTS)))
+    checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
+    assert checked.equal
+    assert checked.targets[0].ticks == 6600
+
+
+def test_own_logic_is_executed_on_the_app_too(tmp_path: Path) -> None:
+    config = own_config(tmp_path, LAW)
+    app = App(build_app(tmp_path / "app", config), tmp_path / "copy.so")
+    app.boot()
+    client, _ = client_of(app)
+    hover = find_experiment("hover")
+    request = Request(hover, config, "own", (), 1, 0.5)
+    checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
+    assert checked.equal
+    assert checked.targets[0].calls > 300
+
+
+def test_what_the_board_computes_flies_even_where_it_is_wrong(tmp_path: Path) -> None:
+    folder = tmp_path / "app"
+    library = build_app(
+        folder, plant=("floaty_core.c", "control->count[flap] =", "control->count[flap] = 1 +")
+    )
+    app = App(library, tmp_path / "copy.so")
+    app.boot()
+    client, _ = client_of(app)
+    blocks = CoreBlocks(parameters_of(load_config()), partial(RealCore, client=client))
+    right = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    for core in (blocks, right):
+        core.run.reset()
+        core.run.control()
+    assert blocks.control.fields.count.tolist() == [count + 1 for count in right.control.fields.count]
+    assert blocks.run.unexpected == 1
+
+
+def test_measured_cycles_become_processor_time_whatever_is_changed_before_the_call(app: App) -> None:
+    client, _ = client_of(app)
+    app.cycles.value = 168 * 100 + 1
+    blocks = CoreBlocks(parameters_of(load_config()), partial(RealCore, client=client))
+    right = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    for core in (blocks, right):
+        core.run.reset()
+        core.run.estimate()
+    assert blocks.run.control_us() == 101  # executed ahead on the board ...
+    for core in (blocks, right):
+        core.data.fields.mode = 1  # ... on other inputs than it then gets
+        core.run.control()
+    assert [block.bytes() for block in blocks.named.values()] == [
+        block.bytes() for block in right.named.values()
+    ]
+    assert [load.calls for load in blocks.run.load.values()] == [1, 0, 1, 1]
+    assert client.sent > 0
+
+
+def test_an_estimate_is_charged_with_the_poses_filed_before_it(app: App) -> None:
+    client, _ = client_of(app)
+    blocks = CoreBlocks(parameters_of(load_config()), partial(RealCore, client=client))
+    blocks.run.reset()
+    app.cycles.value = 168 * 50
+    blocks.run.file_pose()
+    assert blocks.run.estimate_us() == 100
+    blocks.run.estimate()
+    assert blocks.run.estimate_us() == 50
+
+
+def test_a_board_that_reboots_is_told_from_one_that_is_silent(
+    app: App, library: Path, tmp_path: Path
+) -> None:
+    client, packets = client_of(app)
+    client.begin()
+    packets.app = App(library, tmp_path / "rebooted.so")
+    packets.app.boot()
+    with pytest.raises(LinkError, match=r"^app: it has rebooted, or another program uses it$"):
+        client.execute([call(Call.RESET)])
+    packets.silent = True
+    with pytest.raises(LinkError, match=r"^app: silent for 3 s$"):
+        client.begin()
+
+
+def test_a_full_transmit_queue_on_board_only_delays(app: App) -> None:
+    client, packets = client_of(app)
+    client.begin()
+    receive = packets.receive
+
+    def empties(timeout_s: float) -> bytes | None:
+        answer = receive(timeout_s)
+        app.transmit_full.value = answer is not None
+        return answer
+
+    app.transmit_full.value = 1
+    packets.receive = empties
+    assert len(client.memory(200)) == 200
+    assert client.repeated > 0
+
+
+def test_a_session_number_that_was_in_use_is_not_taken(app: App) -> None:
+    client, _ = client_of(app)
+    client.begin()
+    client.execute([call(Call.RESET)])
+    client._session -= 1  # an earlier program had the number that would come next
+    assert client.begin().done == 0
+    assert client.execute([read(0, 4)])[0].body == bytes(4)
+
+
+def test_a_core_of_another_layout_is_refused_in_one_line(app: App, tmp_path: Path) -> None:
+    client, _ = client_of(app)
+    config = own_config(tmp_path, LAW)
+    request = Request(find_experiment("hover"), config, "own", (), 1, 0.5)
+    with pytest.raises(
+        LinkError, match=r"^app: its core has 4868 B of memory, this one \d+: export and flash it again$"
+    ):
+        check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
