@@ -27,8 +27,12 @@ RAM, RAM_SIZE = 0x2000_0000, 0x2_0000
 CCM, CCM_SIZE = 0x1000_0000, 0x1_0000
 SYSTEM, SYSTEM_SIZE = 0x1FFF_0000, 0x1_0000
 OTP, UNIQUE_ID, FLASH_KBYTES = 0x1FFF_7800, 0x1FFF_7A10, 0x1FFF_7A22
-ERASED = b"\xff"
+WINDOWS = (
+    (0x4000_0000, 0x8_0000, "peripheral"), (0x5000_0000, 0x8_0000, "usb"), (0xE000_0000, 0x10_0000, "system"),
+)  # fmt: skip
+ACCESS = (ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint)  # engine, offset, size
 LINE_BYTES = 4096
+WAIT_FOR_INTERRUPT = 0xBF30  # elsewhere than at an instruction it is not looked at
 SOURCES = Path(__file__).parent / "native"
 POWER_ON, SOFTWARE, WATCHDOG = (
     0x0C00_0000,
@@ -156,8 +160,11 @@ class Chip:
             *(ctypes.c_void_p(array.ctypes.data) for array in pointers),
         ):
             raise LabError("unicorn refuses the machine's hooks")
+        for index in np.flatnonzero(np.frombuffer(code[: len(code) & ~1], "<u2") == WAIT_FOR_INTERRUPT):
+            self._library.machine_sleeps_at(self._machine, base + 2 * int(index))
         self._run = self._library.machine_run
         self._run.argtypes = (ctypes.c_void_p, ctypes.c_uint64)
+        self._registers = [self._window(*window) for window in WINDOWS]
         self._sent = ctypes.create_string_buffer(LINE_BYTES)
         self._kept: list[NDArray[np.uint8]] = []  # memory of devices
         self.breakpoints: set[int] = set()  # addresses before whose instructions a run stops
@@ -179,6 +186,13 @@ class Chip:
             self._cpu.mem_map_ptr(place, array.size, rights, array.ctypes.data)
         self.set_system(UNIQUE_ID, bytes(range(1, 13)))
         self.set_system(FLASH_KBYTES, (FLASH_SIZE // 1024).to_bytes(2, "little"))
+
+    def _window(self, base: int, size: int, name: str) -> tuple[int, int, Any, Any]:
+        """Return where registers lie, and what reads and writes them."""
+        read, write = getattr(self._library, f"{name}_read"), getattr(self._library, f"{name}_write")
+        read.restype, read.argtypes = ctypes.c_uint64, (*ACCESS, ctypes.c_void_p)
+        write.restype, write.argtypes = None, (*ACCESS, ctypes.c_uint64, ctypes.c_void_p)
+        return base, base + size, read, write
 
     # Time
 
@@ -237,7 +251,14 @@ class Chip:
     # Debugging
 
     def read(self, address: int, size: int) -> bytes:
-        """Return memory. Raises `LabError` where there is none."""
+        """Return memory, or registers as the core would read them. Raises `LabError` where there is neither."""
+        for base, end, read, _ in self._registers:
+            if base <= address and address + size <= end:
+                words = range(address & ~3, address + size, 4)
+                found = b"".join(
+                    read(None, at - base, 4, self._machine).to_bytes(8, "little")[:4] for at in words
+                )
+                return found[address & 3 :][:size]
         return self.view(address, size).tobytes()
 
     def view(self, address: int, size: int) -> NDArray[np.uint8]:
@@ -246,7 +267,13 @@ class Chip:
         return array[begin : begin + size]
 
     def write(self, address: int, data: bytes) -> None:
-        """Change memory. Raises `LabError` where there is none."""
+        """Change memory or registers. Raises `LabError` where there is none."""
+        for base, end, _, write in self._registers:
+            if base <= address and address + len(data) <= end:
+                for at in range(0, len(data), 4):
+                    word = data[at : at + 4]
+                    write(None, address + at - base, len(word), int.from_bytes(word, "little"), self._machine)
+                return
         self.view(address, len(data))[:] = np.frombuffer(data, np.uint8)
 
     def _place(self, address: int, size: int) -> tuple[NDArray[np.uint8], int]:

@@ -148,6 +148,44 @@ static void on_break(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     stop(m, (uint32_t)address);
 }
 
+/* Sleep until something wakes the core, without leaving the engine: WFI comes ten thousand times a second. */
+static void on_sleep(uc_engine *uc, uint64_t address, uint32_t size, void *user)
+{
+    struct machine *m = user;
+    uint32_t after = (uint32_t)address + size;
+    if (m->stepping)
+        return;
+    for (;;) {
+        if (m->next_due <= m->now)
+            let_happen(m);
+        if (m->now >= m->until || m->why) {
+            m->asleep = 1;
+            stop(m, after);
+            return;
+        }
+        if (next_exception(m, 1))
+            break;
+        uint64_t next = m->next_due < m->until ? m->next_due : m->until;
+        m->sleeping += next - m->now;
+        m->now = next;
+    }
+    unsigned exception = next_exception(m, 0);
+    if (exception) {
+        enter(m, exception, after);
+    } else { /* masked: it goes on behind the instruction */
+        m->pc = after;
+        after |= 1;
+        m->engine.reg_write(uc, R_PC, &after);
+    }
+}
+
+/* Have an instruction looked at that sleeps. */
+int machine_sleeps_at(struct machine *m, uint32_t address)
+{
+    uint64_t hook;
+    return m->engine.hook_add(m->engine.uc, &hook, HOOK_CODE, (void *)on_sleep, m, (uint64_t)address, (uint64_t)address);
+}
+
 uint64_t machine_size(void)
 {
     return sizeof(struct machine);
