@@ -247,6 +247,7 @@ def command_of(request: Request) -> str | None:
     words += _options("--fault", map(str, request.faults))
     words += ["--link", request.link] if request.link != RADIO else []
     words += ["--board", request.board] if request.board != PYTHON else []
+    words += ["--elf", str(request.elf)] if request.elf is not None else []
     return shlex.join(words)
 
 

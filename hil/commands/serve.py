@@ -52,6 +52,11 @@ BOARDS_MAX = 10
     "--baud", type=click.IntRange(9600, 3_000_000), metavar="N",
     help="Bits per second of the serial line.  [default: the profile's]",
 )  # fmt: skip
+@click.option(
+    "--board",
+    metavar="FILE",
+    help="The image of a Crazyflie's firmware, an ELF file, which every board executes whole.",
+)
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option("--station", is_flag=True, help="Fly with the built-in ground station.")
 @click.option(
@@ -84,6 +89,7 @@ def serve(
     radio_port: int,
     mavlink: str | None,
     baud: int | None,
+    board: str | None,
     boards: int,
     station: bool,
     motive: bool,
@@ -112,9 +118,11 @@ def serve(
         udp = UDP_PORT
     if udp is not None and udp + boards - 1 > 65535:
         raise LabError(f"--udp {udp}: there are no {boards} ports from there on")
+    from firmware_py.core_runner import PythonRunner
     from hil.config import load_config
     from hil.laboratory.fault_kinds import MARKERS_ON
     from hil.laboratory.faults import check, parse
+    from hil.laboratory.run import image_at
     from hil.servers.live_faults import LiveFaults
     from hil.servers.motive import Streaming
     from hil.servers.serial_server import parse_addresses
@@ -131,8 +139,11 @@ def serve(
     faults = [parse(text) for text in fault_texts]
     check(faults, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
     announce_compilation()
+    if board is not None and ends:
+        raise LabError(f"--mavlink {mavlink}: {board} speaks CRTP over its radio, not MAVLink")
+    runner = PythonRunner if board is None else image_at(board, None)
     view = open_live(target)
-    server = Server(config, boards, seed, say, mavlink=bool(ends), faults=faults, state=state, onlooker=view)
+    server = Server(config, boards, seed, say, bool(ends), faults, state, view, runner)
     try:
         if radio:
             address = server.ends.serve_radio(radio_port)

@@ -100,6 +100,7 @@ class Robot:
         self._runner = runner
         self.wire_us: Callable[[bytes], int] = _no_time if isinstance(runner, ChipImage) else syslink_us
         self.polled_by_host = False  # by one that is real: empty polls need no model
+        self.executes_image = isinstance(runner, ChipImage)
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
         self.booted_us = 0

@@ -55,10 +55,8 @@ class Request:
     elf: Path | None = None  # with the names of an image that has none
 
     def __post_init__(self) -> None:
-        if self.is_image and not Path(self.board).is_file():
-            raise LabError(
-                f"--board {self.board}: expected {', '.join(BOARDS)}, or an image of a Crazyflie's firmware: an ELF file"
-            )
+        if self.is_image:
+            check_image(self.board)
         if self.is_image and self.link == MAVLINK:
             raise LabError(f"--link {self.link}: {self.board} speaks CRTP over its radio, not MAVLink")
         if self.elf is not None and not self.is_image:
@@ -216,11 +214,28 @@ class _Pace:
         return (now_us - self._us) * 1e3 / (time.monotonic_ns() - self._ns)
 
 
+def check_image(board: str) -> None:
+    """Raise `LabError` when no file is where `--board` says."""
+    if not Path(board).is_file():
+        raise LabError(
+            f"--board {board}: expected {', '.join(BOARDS)}, or an image of a Crazyflie's firmware: an ELF file"
+        )
+
+
+def image_at(board: str, elf: Path | None) -> ChipImage:
+    """Return what `--board` and `--elf` name. Raises `LabError` when it is no image that runs here."""
+    check_image(board)
+    try:
+        return ChipImage.load(Path(board), elf, BUILD)
+    except FirmwareError as error:
+        raise LabError(f"--board {board}: {error}") from None
+
+
 def lockstep(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` when its board cannot be had here."""
     try:
         runner: Executor = (
-            ChipImage.load(Path(request.board), request.elf, BUILD)
+            image_at(request.board, request.elf)
             if request.is_image
             else runner_of(request.board, BUILD, request.config.logic)
         )

@@ -18,6 +18,7 @@ from ground_station.trajectory import Goal, Hold
 from hil.clock import Readers
 from hil.devices.nrf51 import RATES, Nrf51, RadioSettings
 from hil.devices.radio import VirtualRadio
+from hil.devices.stm32f405.firmware import POLL_PERIOD_US
 from hil.errors import LabError
 from hil.laboratory.robot import Robot
 from hil.servers.board_files import BoardFiles
@@ -64,12 +65,15 @@ class ServedRobot:
         if robot.uart is not None:
             robot.uart.connect(robot.uart_ready, self._from_line)
         patient = config.radio.model_copy(update={"uplink_queue": UDP_QUEUE})
-        self.udp_radio = VirtualRadio(patient, events, rng, robot.air)
+        self.udp_radio = VirtualRadio(patient, events, rng, robot.air, robot.wire_us)
         self.udp_radio.connect(robot.packet_received, self._to_udp)
         settings = RadioSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
-        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, events, self, robot.air)
+        self.nrf51 = Nrf51(
+            settings, chip, config.radio.downlink_queue, events, self, robot.air, robot.wire_us
+        )
         robot.send_packet = self._send
+        robot.polled_by_host = True
         robot.restart = self.start
         robot.board.eeprom[:CONFIG_SIZE] = self._factory_config()
         self._files = BoardFiles(state, number, robot.board) if state is not None else None
@@ -87,7 +91,14 @@ class ServedRobot:
     def serve_udp(self, port: int, readers: Readers) -> str:
         """Be reachable over UDP, too; returns the URI."""
         self.udp = UdpServer(port, readers, self.udp_radio.uplink)
+        if self.robot.executes_image:
+            self.robot.events.every(POLL_PERIOD_US, self.robot.events.now_us, self._poll)
         return f"udp://127.0.0.1:{self.udp.port}"
+
+    def _poll(self, now_us: int) -> None:
+        """Fetch what an image has to say, as the dongle of a client on UDP would: no poll of it is modelled."""
+        if self.udp is not None and self.udp.has_session(now_us):
+            self.robot.polled(now_us)
 
     def serve_mavlink(self, address: Address, readers: Readers) -> str:
         """Lead the serial line out; returns what MAVProxy calls its end. Only for a robot with a UART."""

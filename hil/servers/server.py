@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from firmware_py.core_runner import PythonRunner
+from firmware_py.firmware import Firmware
 from firmware_py.rtos import WatchdogError
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Paced, Readers
@@ -26,7 +28,7 @@ from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.recorder import Channel, Onlooker, Recorder
-from hil.laboratory.robot import Robot, Streams, with_system
+from hil.laboratory.robot import Executor, Robot, Streams, with_system
 from hil.servers.dongle_server import DongleServer
 from hil.servers.holder import Holder
 from hil.servers.motive import Streaming, VirtualMotive
@@ -111,9 +113,9 @@ class Shown:
 
     def __init__(self, served: ServedRobot, onlooker: Onlooker) -> None:
         self._served = served
-        served.robot.thief.share = (
-            0.0  # a task that a fault may add later: the columns are those of all tasks
-        )
+        if isinstance(served.robot.firmware, Firmware):
+            # A task that a fault may add later: the columns are those of all tasks.
+            served.robot.thief.share = 0.0
         self._firmware = served.robot.firmware
         config = served.robot.config
         metadata = {"experiment": "served", "link": "served:", "config": config.model_dump_json()}
@@ -144,7 +146,7 @@ class Server:
     """`count` robots that are let go when they fly, and put back when they are lost; `run` them after opening ends.
 
     `faults` act from the first release of each robot on. `say` gets lines for the user, `onlooker` sees the
-    first robot. EEPROM and deck memories are kept in the folder `state`.
+    first robot. EEPROM and deck memories are kept in the folder `state`; `runner` executes what is on board.
     """
 
     def __init__(
@@ -157,6 +159,7 @@ class Server:
         faults: Sequence[Fault] = (),
         state: Path | None = None,
         onlooker: Onlooker | None = None,
+        runner: Executor = PythonRunner,
     ) -> None:
         self.clock = Paced()
         self.lab = Laboratory(self.clock)
@@ -166,6 +169,7 @@ class Server:
         self._faults = faults
         self._state = state
         self._onlooker = onlooker
+        self._runner = runner
         self._shown: Shown | None = None
         for number in range(1, count + 1):
             own = with_system(config, config.mavlink.system + number - 1) if mavlink else config
@@ -177,7 +181,7 @@ class Server:
             if number == 1 and self._onlooker is not None:
                 self._onlooker.note(self.lab.now_us, source, text)
 
-        robot = Robot(config, self.lab.events, streams, say, radio=True, mavlink=mavlink)
+        robot = Robot(config, self.lab.events, streams, say, True, mavlink, self._runner)
         served = ServedRobot(number, robot, streams.radio, self._say, self._state)
         robot.plant.hold()
         self.lab.robots.append(robot)

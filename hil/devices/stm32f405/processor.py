@@ -147,7 +147,12 @@ class Processor:
 
     def _task(self, block: int) -> ChipTask:
         if block not in self._names:
-            name = self.chip.read(block + TASK_NAME, NAME_LENGTH).split(b"\0")[0].decode(errors="replace")
+            name = (
+                self.chip.read(block + TASK_NAME, NAME_LENGTH)
+                .split(b"\0")[0]
+                .decode(errors="replace")
+                .replace(" ", "_")
+            )
             taken = sum(task.name.split("#")[0] == name for task in self._names.values())
             priority = struct.unpack("<I", self.chip.read(block + TASK_PRIORITY, 4))[0]
             self._names[block] = ChipTask(f"{name}#{taken + 1}" if taken else name, priority, block)
