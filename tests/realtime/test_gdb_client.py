@@ -2,16 +2,18 @@
 
 import shutil
 import subprocess
+from collections.abc import Callable
 
 import pytest
 
 pytest.importorskip("unicorn")
 
-from hil.devices.stm32f405.gdb import GdbServer
-from hil.devices.stm32f405.gdb_protocol import Wish
+from hil.devices.stm32f405.chip import CYCLES_PER_US, Chip
+from hil.devices.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.devices.stm32f405.image import Image
 from support import stm32_firmware
 from support.bare_cortex import BareCortex
+from support.stm32_machine import FirmwareOnChip
 
 GDB = "gdb-multiarch"
 ASSERTION = 3  # of `enum planted`
@@ -23,8 +25,10 @@ def installed() -> None:
         pytest.skip(f"{GDB} is not installed: apt-get install {GDB}")
 
 
-def debugged(machine: BareCortex, image: Image, *commands: str) -> list[str]:
-    """Return what GDB prints when it gives the machine these commands and leaves."""
+def debugged(
+    machine: BareCortex | Chip, image: Image, *commands: str, run: Callable[[GdbServer], object] | None = None
+) -> list[str]:
+    """Return what GDB prints when it gives the machine these commands and leaves; `run` runs the machine meanwhile."""
     server = GdbServer(machine, 0)
     everything = ("set confirm off", f"target remote 127.0.0.1:{server.port}", *commands, "detach")
     words = [word for command in everything for word in ("-ex", command)]
@@ -35,7 +39,7 @@ def debugged(machine: BareCortex, image: Image, *commands: str) -> list[str]:
         text=True,
     )
     try:
-        assert machine.run(server) is Wish.DETACH
+        run(server) if run is not None else machine.run(server)
         printed, _ = gdb.communicate(timeout=30)
     finally:
         gdb.kill()
@@ -84,3 +88,23 @@ def test_gdb_steps_one_instruction_and_one_line() -> None:
     assert before == image.reset
     assert behind - before in (2, 4)
     assert line > behind
+
+
+def test_gdb_sees_through_an_interrupt_into_the_task_below_it() -> None:
+    machine = FirmwareOnChip("gcc")
+    chip = machine.chip
+
+    def run(server: GdbServer) -> None:
+        debugged_chip = DebuggedChip(chip, server)
+        while chip.now_us < 30_000:
+            debugged_chip.run(30_000 * CYCLES_PER_US)
+
+    printed = debugged(
+        chip, machine.image, "break USART6_Handler", "break DMA1_Stream0_Handler", "continue", "backtrace",
+        "print i2c_reads", "print/x $psp > 0x20000000", "delete", "print $basepri", run=run,
+    )  # fmt: skip
+    frames = [line.split(" ", 1)[1].strip() for line in printed if line.startswith("#")]
+    assert frames[0].startswith("DMA1_Stream0_Handler ()")
+    assert frames[1] == "<signal handler called>"
+    assert any("report ()" in frame or "spin" in frame or "rest ()" in frame for frame in frames[2:])
+    assert machine.peek("i2c_reads") >= 1

@@ -91,6 +91,8 @@ class State(ctypes.Structure):
         ("tasks", Task * 32),
         ("running", ctypes.c_uint32),
         ("locked", ctypes.c_uint32),
+        ("resume", ctypes.c_uint32),
+        ("skip_at", ctypes.c_uint32),
         ("switches", TaskSwitch * 4096),
     )
 
@@ -197,6 +199,11 @@ class Chip:
     # Time
 
     @property
+    def in_block(self) -> bool:
+        """Whether it stands where it would not have stood by itself, in the middle of a block of instructions."""
+        return bool(self.state.resume == self.state.pc)
+
+    @property
     def now_us(self) -> int:
         """Microseconds since power-on."""
         return int(self.state.now) // CYCLES_PER_US
@@ -267,7 +274,7 @@ class Chip:
         return array[begin : begin + size]
 
     def write(self, address: int, data: bytes) -> None:
-        """Change memory or registers. Raises `LabError` where there is none."""
+        """Change memory, code too, or registers. Raises `LabError` where there is none."""
         for base, end, _, write in self._registers:
             if base <= address and address + len(data) <= end:
                 for at in range(0, len(data), 4):
@@ -275,6 +282,8 @@ class Chip:
                     write(None, address + at - base, len(word), int.from_bytes(word, "little"), self._machine)
                 return
         self.view(address, len(data))[:] = np.frombuffer(data, np.uint8)
+        if FLASH <= address < FLASH + FLASH_SIZE:
+            self._cpu.ctl_flush_tb()
 
     def _place(self, address: int, size: int) -> tuple[NDArray[np.uint8], int]:
         for base, array in (

@@ -1,13 +1,14 @@
-"""`--gdb PORT`: a debugger on 127.0.0.1 at the machine in lockstep.
+"""`--gdb PORT`: a debugger on 127.0.0.1 at the chip in lockstep.
 
-Who runs the machine calls `hold` where it is to stand: nothing else of the laboratory runs until the debugger lets it go,
-so that no time passes in tunnel and radio. Between two slices of a run it asks `wants_to_stop`.
+While the chip stands at a breakpoint nothing else of the laboratory runs, so that no time passes in tunnel and radio, and
+the flight goes on as if it had never stood. Ctrl-C is seen each time the laboratory lets the chip run.
 """
 
 import select
 import socket
 
-from hil.devices.stm32f405.gdb_protocol import SIGTRAP, Debuggee, RemoteProtocol, Wish
+from hil.devices.stm32f405.chip import Chip, Why
+from hil.devices.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol, Wish
 from hil.errors import LabError
 
 HOST = "127.0.0.1"
@@ -56,6 +57,10 @@ class GdbServer:
         self._receive()
         return self._protocol.interrupted
 
+    def stops_at(self, address: int) -> bool:
+        """Return whether the debugger has a breakpoint there."""
+        return self._protocol.has_breakpoint(address)
+
     def close(self) -> None:
         """Give the port back."""
         self._part()
@@ -90,3 +95,39 @@ class GdbServer:
         if self._client is not None:
             self._client.close()
             self._client = None
+
+
+class DebuggedChip:
+    """Runs a chip as its debugger wants it; at first it waits for one."""
+
+    def __init__(self, chip: Chip, server: GdbServer) -> None:
+        self._chip, self._server = chip, server
+        self._wish = Wish.STAND
+
+    def run(self, until_cycles: int) -> Why:
+        """Run up to an instant, or until something outside is to be done, as `Chip.run`.
+
+        Raises `KeyboardInterrupt` when the debugger ends it.
+        """
+        if self._wish is Wish.STAND or self._server.wants_to_stop():
+            self._hold(SIGINT)
+        seen = Why.TIME
+        while True:
+            stands = self._wish is Wish.STEP
+            # What is to be done outside is done between two blocks, as without a debugger.
+            until = int(self._chip.state.now) if seen else until_cycles
+            seen |= self._chip.step() & ~Why.STEP if stands else self._chip.run(until)
+            if seen & Why.BREAK and self._server.stops_at(self._chip.register("pc")):
+                seen &= ~Why.BREAK
+                stands = True
+            if stands:
+                self._hold(SIGTRAP)
+            if seen & Why.BREAK or (
+                not self._chip.in_block and (seen or self._chip.state.now >= until_cycles)
+            ):
+                return seen
+
+    def _hold(self, signal: int) -> None:
+        self._wish = self._server.hold(signal)
+        if self._wish is Wish.KILL:
+            raise KeyboardInterrupt

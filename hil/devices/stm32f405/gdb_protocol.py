@@ -177,6 +177,10 @@ class RemoteProtocol:
         self._last = framed(self._stop_reply())
         return self._last + self.receive(b"")
 
+    def has_breakpoint(self, address: int) -> bool:
+        """Return whether the debugger has set one there."""
+        return address in self._own
+
     def leave(self, wish: Wish) -> None:
         """Leave no breakpoint behind at the machine."""
         self._debuggee.breakpoints -= self._own

@@ -2,7 +2,7 @@
 
 import socket
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from struct import pack, unpack_from
 
 import pytest
@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("unicorn")
 
-from hil.devices.stm32f405.gdb import GdbServer
+from hil.devices.stm32f405.chip import CYCLES_PER_US, Why
+from hil.devices.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.devices.stm32f405.gdb_protocol import (
     PACKET_SIZE,
     REGISTERS,
@@ -26,6 +27,7 @@ from hil.devices.stm32f405.image import Image
 from hil.errors import LabError
 from support import stm32_firmware
 from support.bare_cortex import BareCortex
+from support.stm32_machine import FirmwareOnChip
 
 RAM = 0x2000_0000
 
@@ -286,3 +288,64 @@ def test_a_port_that_is_taken_is_refused(machine: BareCortex) -> None:
     with pytest.raises(LabError, match=rf"--gdb {server.port}: Address already in use"):
         GdbServer(machine, server.port)
     server.close()
+
+
+def on_chip(packets: Callable[[Image], list[bytes]], end_us: int) -> tuple[FirmwareOnChip, bytes]:
+    """The firmware on the chip after a run with a debugger that sends these packets, and what it was answered."""
+    machine = FirmwareOnChip()
+    server = GdbServer(machine.chip, 0)
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(b"".join(map(framed, packets(machine.image))))
+        chip = DebuggedChip(machine.chip, server)
+        try:
+            while machine.chip.now_us < end_us:
+                assert chip.run(end_us * CYCLES_PER_US) in (Why.TIME, Why.SERIAL, Why.COMPARE)
+        finally:
+            server.close()
+        answers = b"".join(iter(lambda: line.recv(1 << 16), b""))
+    return machine, answers
+
+
+def test_a_run_that_a_debugger_stopped_and_stepped_is_the_run_without_one() -> None:
+    def packets(image: Image) -> list[bytes]:
+        switch = image.symbol("vTaskSwitchContext").address
+        return [
+            b"QStartNoAckMode",
+            b"Z0,%x,2" % switch,
+            *[b"c"] * 20,
+            *[b"s"] * 50,
+            b"z0,%x,2" % switch,
+            b"D",
+        ]
+
+    stopped, answers = on_chip(packets, 30_000)
+    assert answers.count(framed(b"T05thread:1;")) == 70
+    alone = FirmwareOnChip()
+    while alone.chip.now_us < 30_000:
+        alone.run(30_000)
+    assert bytes(stopped.chip.ram) == bytes(alone.chip.ram)
+    assert stopped.chip.state.now == alone.chip.state.now
+    assert stopped.chip.state.instructions == alone.chip.state.instructions
+
+
+def test_the_chip_waits_for_its_debugger_and_stands_at_its_first_instruction() -> None:
+    machine, answers = on_chip(lambda _: [b"QStartNoAckMode", b"pf", b"me000ed28,4", b"D"], 2_000)
+    reset = framed(pack("<I", machine.image.reset).hex().encode())
+    assert answers == b"+" + framed(b"OK") + reset + framed(b"00000000") + framed(b"OK")
+
+
+def test_a_breakpoint_of_others_is_theirs() -> None:
+    machine = FirmwareOnChip()
+    place = machine.image.symbol("vTaskSwitchContext").address
+    machine.chip.breakpoints.add(place)
+    server = GdbServer(machine.chip, 0)
+    with socket.create_connection(("127.0.0.1", server.port)) as line:
+        line.sendall(framed(b"c"))
+        assert DebuggedChip(machine.chip, server).run(5_000 * CYCLES_PER_US) == Why.BREAK
+    assert machine.chip.register("pc") == place
+    server.close()
+
+
+def test_kill_ends_the_flight_like_ctrl_c() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        on_chip(lambda _: [b"k"], 2_000)

@@ -84,7 +84,15 @@ static void count(struct machine *m, uint64_t address, uint32_t size)
 static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
+    uint32_t resumed = m->resume;
     (void)uc;
+    m->resume = NOWHERE;
+    if (m->stepping && m->stepping++ > 1) { /* the instruction was the last of its block */
+        stop(m, (uint32_t)address);
+        return;
+    }
+    if (resumed == (uint32_t)address) /* in the middle of a block, all of which was counted when it began */
+        return;
     if (m->next_due <= m->now)
         let_happen(m);
     if (m->now >= m->until || m->why) {
@@ -134,16 +142,11 @@ static void on_break(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     struct machine *m = user;
     (void)uc;
     (void)size;
-    if (m->skip_break && m->pc == (uint32_t)address) {
-        m->skip_break = 0;
+    if (m->skip_at == (uint32_t)address) {
+        m->skip_at = NOWHERE;
         return;
     }
-    uint64_t end = m->next_address; /* the block was counted whole, and its rest will be again */
-    if (address >= FLASH_BASE && end <= FLASH_BASE + FLASH_SIZE && end > address) {
-        m->now -= m->cycles_before[(end - FLASH_BASE) / 2] - m->cycles_before[(address - FLASH_BASE) / 2];
-        m->instructions -= m->instructions_before[(end - FLASH_BASE) / 2] - m->instructions_before[(address - FLASH_BASE) / 2];
-        m->next_address = address;
-    }
+    m->skip_at = m->resume = (uint32_t)address;
     m->why |= WHY_BREAK;
     stop(m, (uint32_t)address);
 }
@@ -250,6 +253,7 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     m->plain[0x23800 / 4] = 0x83;
     memcpy(words, m->flash + (vectors - FLASH_BASE), sizeof words);
     words[0] &= ~3u; /* as the register does, B1.4.7 */
+    m->resume = m->skip_at = NOWHERE;
     for (int i = 0; i < 13; i++)
         m->engine.reg_write(m->engine.uc, 66 + i, &zero);
     m->engine.reg_write(m->engine.uc, 120, &thumb);
@@ -299,11 +303,15 @@ uint32_t machine_run(struct machine *m, uint64_t until)
     m->until = until;
     m->why = 0;
     m->stepping = 0;
-    m->skip_break = 1;
+    if (m->skip_at != m->pc) /* somebody has gone elsewhere since */
+        m->skip_at = NOWHERE;
     for (;;) {
-        let_happen(m);
-        if (m->why || m->now >= until)
-            return m->why;
+        if (m->resume != m->pc) {
+            m->resume = NOWHERE;
+            let_happen(m);
+            if (m->why || m->now >= until)
+                return m->why;
+        }
         if (m->asleep || m->locked) {
             if (m->locked || !next_exception(m, 1)) {
                 uint64_t next = m->next_due < until ? m->next_due : until;
@@ -314,6 +322,8 @@ uint32_t machine_run(struct machine *m, uint64_t until)
             m->asleep = 0;
         }
         execute(m, 0);
+        if (m->why & WHY_BREAK)
+            return m->why;
     }
 }
 
@@ -321,7 +331,10 @@ uint32_t machine_run(struct machine *m, uint64_t until)
 uint32_t machine_step(struct machine *m)
 {
     m->why = 0;
-    let_happen(m);
+    if (m->resume != m->pc) {
+        m->resume = NOWHERE;
+        let_happen(m);
+    }
     if (m->asleep) {
         while (!next_exception(m, 1) && m->next_due != NEVER) {
             m->now = m->next_due;
@@ -329,12 +342,15 @@ uint32_t machine_step(struct machine *m)
         }
         m->asleep = 0;
     }
-    m->stepping = 1;
-    m->skip_break = 1;
     uint32_t pc = m->pc;
+    m->stepping = 1;
+    m->skip_at = pc;
     execute(m, 1);
     m->stepping = 0;
-    if (m->pc == pc + 2 && !(m->why))
+    if (!m->stopping && m->pc > pc && m->pc - pc <= 4 && m->pc < m->next_address)
+        m->resume = m->pc;
+    m->skip_at = m->pc;
+    if (m->pc == pc + 2 && !m->why)
         m->asleep = m->flash[(pc - FLASH_BASE) % FLASH_SIZE] == 0x30 && m->flash[(pc + 1 - FLASH_BASE) % FLASH_SIZE] == 0xBF;
     return m->why | WHY_STEP;
 }

@@ -113,6 +113,8 @@ struct machine {
     uint64_t running_since;
     struct task task[TASKS]; /* the running one is `task[running]` */
     uint32_t running, locked;
+    uint32_t resume;  /* where the middle of a block goes on that was counted as a whole */
+    uint32_t skip_at; /* the breakpoint at which somebody has stood already */
     struct task_switch task_switch[SWITCHES];
 
     struct engine engine;
@@ -120,7 +122,7 @@ struct machine {
     const uint32_t *instructions_before, *cycles_before; /* of every half word of flash */
     uint64_t next_address;
     uint8_t *flash, *ram, *ccm;
-    uint32_t stopping, attention, fault, stepping, skip_break;
+    uint32_t stopping, attention, fault, stepping;
     uint64_t break_hook[BREAKPOINTS];
     uint32_t break_address[BREAKPOINTS];
 
