@@ -75,8 +75,7 @@ extern uint32_t data_load[], data_begin[], data_end[], bss_begin[], bss_end[], m
 void run_scenario(uint32_t number);
 
 __attribute__((noinline)) void assertFail(const char *expression, const char *file, int line) {
-  (void)expression;
-  __asm volatile("cpsid i");
+  __asm volatile("cpsid i" ::"r"(expression)); /* a debugger finds it there */
   snapshot.magicNumber = MAGIC_ASSERT;
   snapshot.type = ASSERTED;
   snapshot.file.fileName = file;

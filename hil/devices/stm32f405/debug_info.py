@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from hil.devices.stm32f405.call_frames import CallFrames
 from hil.errors import LabError, hint
 
 AGGREGATES = ("DW_TAG_structure_type", "DW_TAG_union_type")
@@ -45,6 +46,11 @@ class DebugInfo:
     def __init__(self, dwarf: Any, path: Path) -> None:
         self._dwarf, self._path = dwarf, path
         self._lines: dict[int, list[tuple[int, str]]] = {}
+
+    @cached_property
+    def frames(self) -> CallFrames:
+        """Return what tells the callers of a function."""
+        return CallFrames(self._dwarf)
 
     def line_at(self, address: int) -> str:
         """Return file and line of an address of code as `file.c:12`, empty when the compiler did not say."""

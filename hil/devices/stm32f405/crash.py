@@ -1,0 +1,176 @@
+"""What a firmware died of, in words: a fault, an assertion or its watchdog, with task, function, line and who called.
+
+A handler of faults and `assertFail` are looked at when their first instruction is about to run: `addresses` are the
+breakpoints of that. The bits are those of the ARMv7-M Architecture Reference Manual, B3.2.15 and B3.2.16.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from struct import unpack, unpack_from
+from typing import Protocol
+
+from hil.devices.stm32f405.call_frames import LR, PC, SP
+from hil.devices.stm32f405.freertos import FreeRtos
+from hil.devices.stm32f405.image import Image
+from hil.errors import LabError
+
+CFSR, HFSR, MMFAR, BFAR = 0xE000_ED28, 0xE000_ED2C, 0xE000_ED34, 0xE000_ED38
+USES_PSP, NO_FLOATS = 1 << 2, 1 << 4  # in EXC_RETURN
+FRAME, FLOATS, PADDED = 0x20, 0x48, 1 << 9
+FAULTS = {3: "HardFault", 4: "MemManage fault", 5: "BusFault", 6: "UsageFault"}
+FIRST_INTERRUPT = 16
+ASSERTION = "assertFail"
+CFSR_WORDS = {
+    0: "an instruction fetched where none may be executed", 1: "access to protected memory",
+    3: "protected memory while returning from an exception", 4: "protected memory while entering an exception",
+    5: "protected memory while storing floats", 8: "an instruction fetched where there is no memory",
+    9: "access to where there is no memory", 10: "a write to where there is no memory, some instructions ago",
+    11: "no memory at the stack pointer while returning from an exception",
+    12: "no memory at the stack pointer while entering an exception",
+    13: "no memory at the stack pointer while storing floats",
+    16: "undefined instruction", 17: "jump to an even address: not Thumb code", 18: "invalid return from an exception",
+    19: "the floating-point unit is switched off", 24: "unaligned access", 25: "division by zero",
+}  # fmt: skip
+MMFAR_VALID, BFAR_VALID = 1 << 7, 1 << 15
+VECTOR_UNREADABLE = 1 << 1  # in HFSR
+
+
+class Machine(Protocol):
+    """A machine that stands still; memory includes the registers of the system control block."""
+
+    def read(self, address: int, size: int) -> bytes:
+        """Return memory; raises `LabError` where there is none."""
+        ...
+
+    def register(self, name: str) -> int:
+        """Return r0 to r12, sp, lr, pc, xpsr, msp or psp."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Crash:
+    """Why the firmware did not go on."""
+
+    what: str  # what happened
+    who: str  # the task or interrupt in which it happened
+    trace: tuple[str, ...]  # where, in its caller, and so on: each `function (file.c:12)`
+
+    def __str__(self) -> str:
+        return f"{self.what}, in {self.who}: {' < '.join(self.trace)}"
+
+
+class CrashReports:
+    """The crashes of one image on one machine."""
+
+    def __init__(self, image: Image, machine: Machine) -> None:
+        self._image, self._machine = image, machine
+        self._kernel = FreeRtos(image, machine.read) if image.has("pxCurrentTCB") else None
+        self._handlers = {self._vector(number) & ~1 for number in FAULTS}
+        self._assertion = image.symbol(ASSERTION).address if image.has(ASSERTION) else 0
+
+    @property
+    def addresses(self) -> frozenset[int]:
+        """Return where the machine has to stop for `here`, once: a handler may be a loop of one instruction."""
+        return frozenset({*self._handlers, self._assertion} - {0})
+
+    def here(self) -> Crash:
+        """Return what happened, at one of `addresses`."""
+        if self._machine.register("pc") == self._assertion:
+            return self._assertion_failed()
+        return self._fault()
+
+    def watchdog(self) -> Crash:
+        """Return who ran when the watchdog had waited long enough."""
+        what = "watchdog reset: nobody fed it in time; this ran then"
+        number = self._machine.register("xpsr") & 0x1FF
+        return Crash(what, self._who(number), self._trace(self._registers()))
+
+    def lockup(self) -> Crash:
+        """Return where the processor gave up: at a fault inside the handler of a fault, or on the way there."""
+        what = f"lock-up, no fault handler could run: {self._reasons()}"
+        number = self._machine.register("xpsr") & 0x1FF
+        return Crash(what, self._who(number), self._trace(self._registers()))
+
+    def _assertion_failed(self) -> Crash:
+        expression, file = (self._text(self._machine.register(name)) for name in ("r0", "r1"))
+        what = f"assertion {expression} failed at {file}:{self._machine.register('r2')}"
+        number = self._machine.register("xpsr") & 0x1FF
+        return Crash(what, self._who(number), self._trace(self._registers())[1:])
+
+    def _fault(self) -> Crash:
+        exc_return = self._machine.register("lr")
+        frame = self._machine.register("psp" if exc_return & USES_PSP else "msp")
+        number = self._machine.register("xpsr") & 0x1FF
+        what = (
+            f"{FAULTS[number]}: {self._reasons()}"
+            if number in FAULTS
+            else f"{self._who(number)} is not handled"
+        )
+        try:
+            stacked = unpack("<8I", self._machine.read(frame, FRAME))
+        except LabError:
+            return Crash(f"{what}; there is no memory at its stack pointer, 0x{frame:08x}", self._who(0), ())
+        registers = self._registers() | dict(zip((0, 1, 2, 3, 12, LR, PC), stacked, strict=False))
+        size = FRAME + (0 if exc_return & NO_FLOATS else FLOATS) + (4 if stacked[7] & PADDED else 0)
+        registers[SP] = frame + size
+        return Crash(what, self._who(stacked[7] & 0x1FF), self._trace(registers))
+
+    def _reasons(self) -> str:
+        """Return the bits of the fault status registers in words."""
+        status, hard = self._word(CFSR), self._word(HFSR)
+        reasons = [words for bit, words in CFSR_WORDS.items() if status >> bit & 1]
+        if hard & VECTOR_UNREADABLE:
+            reasons.append("the vector of an exception could not be read")
+        where = ""
+        if status & (BFAR_VALID | MMFAR_VALID):
+            where = f" at 0x{self._word(BFAR if status & BFAR_VALID else MMFAR):08x}"
+        return (" and ".join(reasons) or "for a reason that its registers do not say") + where
+
+    def _who(self, number: int) -> str:
+        """Return the task, or the handler of the exception with that number."""
+        if number:
+            name = self._image.function_at(self._vector(number) & ~1) or "no handler"
+            what = (
+                f"interrupt {number - FIRST_INTERRUPT}"
+                if number >= FIRST_INTERRUPT
+                else f"exception {number}"
+            )
+            return f"{what} ({name})"
+        if self._kernel is None or not self._kernel.running:
+            return "main, before the scheduler ran"
+        return f"task {self._kernel.current().name}"
+
+    def _trace(self, registers: dict[int, int]) -> tuple[str, ...]:
+        """Return the places of a backtrace, as far as the stack can be read and functions were called."""
+        pcs: list[int] = []
+        with suppress(LabError):
+            for pc in self._image.debug.frames.backtrace(registers, self._word):
+                if pcs and not self._image.function_at(pc):
+                    break
+                pcs.append(pc)
+        # Compilers forget where a function's early end has its frame. Then the link register still knows the caller.
+        caller = (registers[LR] & ~1) - 1
+        if len(pcs) == 1 and self._image.function_at(caller) not in ("", self._image.function_at(pcs[0])):
+            pcs.append(caller)
+        return tuple(self._image.place(pc) for pc in pcs)
+
+    def _registers(self) -> dict[int, int]:
+        """Return r0 to pc as they are, by number."""
+        names = (*(f"r{n}" for n in range(13)), "sp", "lr", "pc")
+        return {number: self._machine.register(name) for number, name in enumerate(names)}
+
+    def _vector(self, exception: int) -> int:
+        offset = 4 * exception
+        return (
+            int(unpack_from("<I", self._image.code, offset)[0]) if offset + 4 <= len(self._image.code) else 0
+        )
+
+    def _text(self, address: int) -> str:
+        """Return a string of the image's constants."""
+        try:
+            return self._machine.read(address, 128).partition(b"\0")[0].decode(errors="replace")
+        except LabError:
+            return f"0x{address:08x}"
+
+    def _word(self, address: int) -> int:
+        return int(unpack("<I", self._machine.read(address, 4))[0])

@@ -1,0 +1,195 @@
+"""What is read of a running firmware: its kernel's tasks, and what it died of, with task, function, line and callers."""
+
+import os
+import re
+from pathlib import Path
+from struct import pack
+
+import pytest
+
+from hil.devices.stm32f405.chip import Why
+from hil.devices.stm32f405.crash import CrashReports
+from hil.devices.stm32f405.freertos import FreeRtos
+from hil.devices.stm32f405.image import Image
+from hil.errors import LabError
+from support.stm32_firmware import SOURCES
+from support.stm32_machine import FirmwareOnChip
+
+MS = 1000
+BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG = range(1, 5)
+FIRMWARE = (SOURCES / "firmware.c").read_text(encoding="utf-8").splitlines()
+COMPILERS = pytest.mark.parametrize("compiler", ["clang", "gcc"])
+
+
+def line_of(text: str) -> int:
+    """The only line of the firmware with that text."""
+    (found,) = (number for number, line in enumerate(FIRMWARE, 1) if text in line)
+    return found
+
+
+def run_to_end(machine: FirmwareOnChip, end_ms: int) -> Why:
+    """Run until something else than outputs stops the chip, or for so long."""
+    why = Why.SERIAL
+    while why and not why & ~(Why.SERIAL | Why.COMPARE):
+        why = machine.run(end_ms * MS)
+    return why
+
+
+@COMPILERS
+def test_the_tasks_are_those_that_were_created(compiler: str) -> None:
+    machine = FirmwareOnChip(compiler)
+    kernel = FreeRtos(machine.image, machine.chip.read)
+    assert not kernel.running
+    with pytest.raises(LabError, match="no task has run yet"):
+        kernel.current()
+    run_to_end(machine, 30)
+    tasks = {task.name: task for task in kernel.tasks()}
+    assert kernel.running
+    assert kernel.tick_count == machine.peek("xTickCount") > 20
+    assert {name: task.priority for name, task in tasks.items()} == {
+        "FILTER": 3, "FROZEN": 3, "REPORT": 2, "SPIN-0": 1, "SPIN-1": 1, "IDLE": 0,
+    }  # fmt: skip
+    # FILTER waits for a sample without a time-out, which FreeRTOS keeps with the suspended; REPORT waits for its time.
+    assert [tasks[name].state for name in ("FILTER", "FROZEN", "REPORT", "IDLE")] == [
+        "blocked", "suspended", "blocked", "ready",
+    ]  # fmt: skip
+    assert {tasks["SPIN-0"].state, tasks["SPIN-1"].state} == {"ready", "running"}
+    assert tasks[kernel.current().name].state == "running"
+
+
+@COMPILERS
+def test_the_high_water_mark_is_what_was_never_written(compiler: str) -> None:
+    machine = FirmwareOnChip(compiler)
+    kernel = FreeRtos(machine.image, machine.chip.read)
+    run_to_end(machine, 30)
+    free = {task.name: task.stack_free_bytes for task in kernel.tasks()}
+    stacks = machine.image.symbol("stacks")
+    for number, name in enumerate(("REPORT", "SPIN-0", "SPIN-1", "FILTER", "FROZEN", "IDLE")):
+        stack = machine.chip.read(stacks.address + 1024 * number, 1024)
+        assert free[name] == re.match(b"\xa5*", stack).end()  # type: ignore[union-attr]
+        assert 600 < free[name] < 1000
+    machine.chip.write(stacks.address + 64, b"\x00")
+    assert {task.name: task.stack_free_bytes for task in kernel.tasks()}["REPORT"] == 64
+
+
+def test_an_image_without_freertos_is_refused() -> None:
+    machine = FirmwareOnChip()
+    kernel = FreeRtos(machine.image, machine.chip.read)
+    with pytest.raises(LabError, match="no variable or function is called xFreeBytesRemaining"):
+        assert kernel.heap_free_bytes
+
+
+def crashed(machine: FirmwareOnChip) -> str:
+    """Run into the first crash and return it in words."""
+    reports = CrashReports(machine.image, machine.chip)
+    machine.chip.breakpoints |= reports.addresses
+    assert run_to_end(machine, 100) == Why.BREAK
+    return str(reports.here())
+
+
+@COMPILERS
+def test_a_bus_fault_is_told_with_address_task_function_line_and_callers(compiler: str) -> None:
+    text = crashed(FirmwareOnChip(compiler, planted=BUS_FAULT))
+    place = f"go_wrong (firmware.c:{line_of('return REGISTER(0x30000000)')})"
+    caller = f"report (firmware.c:{line_of('go_wrong(planted)')})"
+    reason = "access to where there is no memory at 0x30000000"
+    assert text == f"HardFault: {reason}, in task REPORT: {place} < {caller}"
+
+
+@COMPILERS
+def test_an_undefined_instruction_is_told_where_it_stands(compiler: str) -> None:
+    text = crashed(FirmwareOnChip(compiler, planted=UNDEFINED))
+    place = f"go_wrong (firmware.c:{line_of('udf #7')})"
+    assert text.startswith(f"HardFault: undefined instruction, in task REPORT: {place} < report (firmware.c:")
+
+
+@COMPILERS
+def test_an_assertion_is_told_with_its_text_and_who_made_it(compiler: str) -> None:
+    machine = FirmwareOnChip(compiler, planted=ASSERTION)
+    text = crashed(machine)
+    line = line_of("assert_that(how != ASSERTION)")
+    caller = f"report (firmware.c:{line_of('go_wrong(planted)')})"
+    assert text == (
+        f"assertion how != ASSERTION failed at firmware.c:{line}, in task REPORT: go_wrong (firmware.c:{line}) < {caller}"
+    )
+    # What the firmware itself keeps for after the reset says the same.
+    machine.chip.breakpoints.clear()
+    assert run_to_end(machine, 100) & Why.RESET
+    magic, _, file, kept = machine.peek_all("snapshot", 4)
+    assert (magic, kept) == (0x2F8A_001F, line)
+    assert machine.chip.read(file, 11) == b"firmware.c\0"
+
+
+def test_a_watchdog_reset_is_told_with_who_ran_then() -> None:
+    machine = FirmwareOnChip(planted=HUNGRY_WATCHDOG)
+    reports = CrashReports(machine.image, machine.chip)
+    assert run_to_end(machine, 400) & Why.WATCHDOG
+    text = str(reports.watchdog())
+    assert re.match(r"watchdog reset: nobody fed it in time; this ran then, in task SPIN-[01]: ", text)
+    assert re.search(r"check_fp_registers \(firmware.c:\d+\) < spin_[01] \(firmware.c:\d+\)", text)
+
+
+def test_a_fault_in_an_interrupt_names_its_handler() -> None:
+    machine = FirmwareOnChip()
+    reports = CrashReports(machine.image, machine.chip)
+    run_to_end(machine, 30)
+    # The handler's first instruction becomes an undefined one; the code around it is not touched.
+    handler = machine.image.symbol("EXTI15_10_Handler").address
+    machine.chip.write(handler, bytes.fromhex("00de"))
+    machine.chip.breakpoints |= reports.addresses
+    machine.chip.pin("C", 14, True)
+    assert run_to_end(machine, 100) == Why.BREAK
+    assert str(reports.here()).startswith(
+        "HardFault: undefined instruction, in interrupt 40 (EXTI15_10_Handler): EXTI15_10_Handler (firmware.c:"
+    )
+
+
+def test_a_frame_that_cannot_be_read_is_told() -> None:
+    machine = FirmwareOnChip(planted=BUS_FAULT)
+    crashed(machine)
+    machine.chip.set_register("psp", 0x3000_0000)
+    text = str(CrashReports(machine.image, machine.chip).here())
+    assert text.endswith("0x30000000; there is no memory at its stack pointer, 0x30000000, in task REPORT: ")
+
+
+def test_a_fault_that_cannot_be_handled_is_told_as_a_lock_up() -> None:
+    machine = FirmwareOnChip()
+    run_to_end(machine, 30)
+    while machine.chip.register("xpsr") & 0x1FF:
+        machine.chip.step()
+    machine.chip.set_register("sp", 0x3000_0000)
+    assert run_to_end(machine, 100) == Why.LOCKUP
+    text = str(CrashReports(machine.image, machine.chip).lockup())
+    assert text.startswith("lock-up, no fault handler could run: access to where there is no memory ")
+    assert re.search(r", in task [\w-]+: \w+ \(firmware.c:\d+\)", text)
+
+
+def test_before_the_scheduler_main_is_named() -> None:
+    machine = FirmwareOnChip(planted=BUS_FAULT)
+    reports = CrashReports(machine.image, machine.chip)
+    machine.chip.breakpoints |= {machine.image.symbol("assertFail").address}
+    machine.chip.set_register("pc", machine.image.symbol("go_wrong").address)
+    machine.chip.set_register("r0", ASSERTION)
+    machine.chip.set_register("lr", machine.image.reset | 1)
+    assert run_to_end(machine, 100) == Why.BREAK
+    assert "in main, before the scheduler ran: go_wrong (" in str(reports.here())
+
+
+ELF = os.environ.get("FLOATY_CF2_ELF", "")
+
+
+@pytest.mark.skipif(
+    not ELF, reason="FLOATY_CF2_ELF names no ELF of a Crazyflie: its kernel and lines are not read"
+)
+def test_a_real_crazyflie_image_is_read() -> None:
+    image = Image(Path(ELF))
+    memory = bytearray(0x2_0000)
+
+    def read(address: int, size: int) -> bytes:
+        return bytes(memory[address - 0x2000_0000 :][:size])
+
+    kernel = FreeRtos(image, read)
+    memory[image.symbol("xTickCount").address - 0x2000_0000 :][:4] = pack("<I", 0)
+    assert kernel.tick_count == 0
+    assert image.place(image.symbol("assertFail").address).startswith("assertFail (cfassert.c:")
+    assert kernel.heap_free_bytes == 0
