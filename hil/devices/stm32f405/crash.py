@@ -20,6 +20,7 @@ FRAME, FLOATS, PADDED = 0x20, 0x48, 1 << 9
 FAULTS = {3: "HardFault", 4: "MemManage fault", 5: "BusFault", 6: "UsageFault"}
 FIRST_INTERRUPT = 16
 ASSERTION = "assertFail"
+LONGEST_TEXT = 128
 CFSR_WORDS = {
     0: "an instruction fetched where none may be executed", 1: "access to protected memory",
     3: "protected memory while returning from an exception", 4: "protected memory while entering an exception",
@@ -145,14 +146,23 @@ class CrashReports:
         pcs: list[int] = []
         with suppress(LabError):
             for pc in self._image.debug.frames.backtrace(registers, self._word):
-                if pcs and not self._image.function_at(pc):
-                    break
+                if pcs and not self._follows_call(pc + 1):
+                    break  # nobody calls the function of a task
                 pcs.append(pc)
         # Compilers forget where a function's early end has its frame. Then the link register still knows the caller.
         caller = (registers[LR] & ~1) - 1
-        if len(pcs) == 1 and self._image.function_at(caller) not in ("", self._image.function_at(pcs[0])):
+        elsewhere = self._image.function_at(caller) != self._image.function_at(registers[PC])
+        if len(pcs) == 1 and elsewhere and self._follows_call(caller + 1):
             pcs.append(caller)
         return tuple(self._image.place(pc) for pc in pcs)
+
+    def _follows_call(self, address: int) -> bool:
+        """Return whether the instruction before an address of the image is BL or BLX."""
+        at = address - 4 - self._image.base
+        if not 0 <= at <= len(self._image.code) - 4:
+            return False
+        first, second = unpack_from("<2H", self._image.code, at)
+        return (first & 0xF800 == 0xF000 and second & 0xD000 == 0xD000) or second & 0xFF87 == 0x4780
 
     def _registers(self) -> dict[int, int]:
         """Return r0 to pc as they are, by number."""
@@ -166,11 +176,12 @@ class CrashReports:
         )
 
     def _text(self, address: int) -> str:
-        """Return a string of the image's constants."""
+        """Return a string of the image's constants; its address when there is none."""
         try:
-            return self._machine.read(address, 128).partition(b"\0")[0].decode(errors="replace")
-        except LabError:
+            text = self._machine.read(address, LONGEST_TEXT).partition(b"\0")[0].decode("ascii")
+        except (LabError, UnicodeDecodeError):
             return f"0x{address:08x}"
+        return text
 
     def _word(self, address: int) -> int:
         return int(unpack("<I", self._machine.read(address, 4))[0])

@@ -22,6 +22,7 @@ from firmware_py.signals import CONTROL, COUNTERS, ESTIMATOR
 from firmware_py.wire.supervisor import Cause, State
 from hil.devices.stm32f405 import syslink
 from hil.devices.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why, build_machine
+from hil.devices.stm32f405.crash import CrashReports
 from hil.devices.stm32f405.crazyflie import RADIO_BUSY, SYSLINK_USART, CrazyflieBoard
 from hil.devices.stm32f405.image import Image
 from hil.devices.stm32f405.log_table import LogVariable, log_table
@@ -101,6 +102,8 @@ class ImageFirmware:
         self.image = image = flashed.image
         self._board = board
         self.chip = Chip(image.code, image.base, flashed.library, image.constants)
+        self._crashes = CrashReports(image, self.chip)
+        self.chip.breakpoints |= self._crashes.addresses
         self.parts = CrazyflieBoard(self.chip, np.frombuffer(board.eeprom, np.uint8))
         self.kernel = Processor(self.chip, image, self._act)
         self._decoder = syslink.Decoder()
@@ -170,15 +173,21 @@ class ImageFirmware:
             if all(counts) and counts != self._counts:
                 self._counts = counts
                 self._board.write_compare(counts)
-        if why & (Why.RESET | Why.WATCHDOG):
-            cause = WATCHDOG if why & Why.WATCHDOG else SOFTWARE
-            text = "watchdog reset" if cause == WATCHDOG else "reset by software"
-            task, place = self.kernel.current.name, self.image.place(self.chip.register("pc"))
-            self._board.debug_write(f"{text}, in task {task} at {place}")
-            self.chip.reset(cause)
+        if why & Why.BREAK:
+            self._board.debug_write(str(self._crashes.here()))
+            self.chip.breakpoints -= self._crashes.addresses  # a handler may be a loop of one instruction
         if why & Why.LOCKUP:
-            place = self.image.place(self.chip.register("pc"))
-            self._board.debug_write(f"the processor has locked up: a fault inside HardFault at {place}")
+            self._board.debug_write(str(self._crashes.lockup()))
+        if why & Why.WATCHDOG:
+            self._board.debug_write(str(self._crashes.watchdog()))
+            self._reset(WATCHDOG)
+        elif why & Why.RESET:
+            self._board.debug_write("reset by software")
+            self._reset(SOFTWARE)
+
+    def _reset(self, cause: int) -> None:
+        self.chip.reset(cause)
+        self.chip.breakpoints |= self._crashes.addresses
 
     def _answer(self, kind: int, data: bytes) -> None:
         """Do what the nRF51 does with a frame of the STM32."""

@@ -120,6 +120,15 @@ def test_an_assertion_is_told_with_its_text_and_who_made_it(compiler: str) -> No
     assert machine.chip.read(file, 11) == b"firmware.c\0"
 
 
+def test_an_assertion_without_a_text_is_told_by_its_addresses() -> None:
+    machine = FirmwareOnChip(planted=ASSERTION)
+    crashed(machine)
+    machine.chip.set_register("r0", 0x3000_0000)
+    machine.chip.set_register("r1", 0x0808_0000)  # erased flash
+    text = str(CrashReports(machine.image, machine.chip).here())
+    assert text.startswith("assertion 0x30000000 failed at 0x08080000:")
+
+
 def test_a_watchdog_reset_is_told_with_who_ran_then() -> None:
     machine = FirmwareOnChip(planted=HUNGRY_WATCHDOG)
     reports = CrashReports(machine.image, machine.chip)
