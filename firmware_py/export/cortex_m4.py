@@ -51,12 +51,18 @@ class Load:
         self.worst_instructions = max(self.worst_instructions, instructions)
         self.worst_cycles = max(self.worst_cycles, cycles)
 
+    def merge(self, other: "Load") -> None:
+        """Take in what another one has counted."""
+        self.calls += other.calls
+        self.instructions += other.instructions
+        self.cycles += other.cycles
+        self.worst_instructions = max(self.worst_instructions, other.worst_instructions)
+        self.worst_cycles = max(self.worst_cycles, other.worst_cycles)
+
     def __str__(self) -> str:
         mean = self.instructions / max(self.calls, 1)
-        return (
-            f"{self.calls:6} calls, {mean:8.0f} instructions ({self.worst_instructions} at most), "
-            f"{self.mean_us:6.1f} us ({self.worst_us:.1f})"
-        )
+        counted = f" {mean:8.0f} instructions ({self.worst_instructions} at most)," if mean else ""
+        return f"{self.calls:6} calls,{counted} {self.mean_us:6.1f} us ({self.worst_us:.1f})"
 
     @property
     def mean_us(self) -> float:
@@ -73,9 +79,9 @@ class Load:
 class Usage:
     """What the core takes of the board: memory, and by entry point processor time."""
 
-    flash_bytes: int
+    flash_bytes: int | None  # None: of a real board not known
     ram_bytes: int  # the structs
-    stack_bytes: int  # the deepest that it has been
+    stack_bytes: int | None  # the deepest that it has been
     entries: dict[str, Load]
 
 

@@ -133,8 +133,9 @@ class CoreAnswer:
 
     def about(self) -> About:
         """Read the answer to HELLO."""
-        *numbers, core, profile = _unpack(_ABOUT, self.body)
-        return About(*numbers, core.decode("ascii", "replace"), profile.decode("ascii", "replace"))
+        version, state, size, done, clock_mhz, *names = _unpack(_ABOUT, self.body)
+        core, profile = (name.decode("ascii", "replace") for name in names)
+        return About(version, state, size, done, clock_mhz, core, profile)
 
     def called(self) -> Called:
         """Read the answer to CALL."""

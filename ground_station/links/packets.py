@@ -12,7 +12,6 @@ from firmware_py.wire.core_port import CHANNEL_CALLS, PORT_CORE
 from firmware_py.wire.crtp import header
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
-from ground_station.links.core_client import CoreClient
 from ground_station.links.crazyradio import URIS, quiet_cflib
 
 USB = r"usb://\d"
@@ -64,11 +63,6 @@ class CflibPackets:
     def _check(self) -> None:
         if self._lost:
             raise LinkError(f"{self._uri}: lost: {self._lost}")
-
-
-def open_core(uri: str) -> CoreClient:
-    """Return a board's core. Raises `LinkError`."""
-    return CoreClient(CflibPackets(uri), uri)
 
 
 def _first_line(text: str) -> str:

@@ -15,7 +15,7 @@ from hil.errors import LabError
 
 if TYPE_CHECKING:
     from hil.deploy.check import Checked
-    from hil.deploy.targets import MachineCode
+    from hil.deploy.targets import Loads, MachineCode
     from hil.laboratory.flight import Flight
 
 console = Console(highlight=False, markup=False)
@@ -45,7 +45,8 @@ def deploy() -> None:
 )  # fmt: skip
 @click.option(
     "--targets", "target_text", metavar="NAME,...",
-    help="What to compare with numba: plain, c-O0, c-O2, cortex-m4.  [default: all]",
+    help="What to compare with numba: plain, c-O0, c-O2, cortex-m4, and real boards: radio://…, usb://0, udp://…  "
+    "[default: all but boards]",
 )  # fmt: skip
 @click.option(
     "--source", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
@@ -89,14 +90,17 @@ def check(
         with _progress(str(request.experiment.name)) as show:
             checked.append(check_flight(request, toolbox.factories, show))
         _print_flight(checked[-1])
-        if checked[-1].outcome == "interrupted":
+        if checked[-1].outcome == "interrupted" or checked[-1].failed:
             break
     _print_sum(checked)
     if toolbox.machine_code is not None:
         _print_machine_code(toolbox.machine_code)
+    counted = {} if toolbox.machine_code is None else toolbox.machine_code.entries
+    for board, measured in toolbox.boards.items():
+        _print_measured(board, measured, counted)
     if checked[-1].outcome == "interrupted":
         return INTERRUPTED
-    return 0 if all(one.equal for one in checked) else 1
+    return 0 if all(one.equal and not one.failed for one in checked) else 1
 
 
 @contextmanager
@@ -147,6 +151,22 @@ def _print_machine_code(code: MachineCode) -> None:
         f"load at {CLOCK_MHZ} MHz: mean {mean:.1%}, worst tick {worst:.1%} ({ticks.worst_us:.0f} us of 10 ms)",
         soft_wrap=True,
     )
+
+
+def _print_measured(board: str, measured: Loads, counted: Loads) -> None:
+    """Print the cycles that a board has measured, beside those that the machine code was counted to take."""
+    console.print(f"{board}: cycles per call, mean and worst, as measured on the board", soft_wrap=True)
+    for name, load in measured.items():
+        if load.calls == 0:
+            continue
+        beside = ""
+        if name in counted and counted[name].calls:
+            one = counted[name]
+            beside = f"   counted {one.cycles / one.calls:9.0f} {one.worst_cycles:9}"
+        console.print(
+            f"  {name:<10}{load.calls:>7} calls {load.cycles / load.calls:9.0f} {load.worst_cycles:9}{beside}",
+            soft_wrap=True,
+        )
 
 
 def _read(source: Path) -> str:

@@ -52,8 +52,9 @@ SEEDS_MAX = 10_000
 )  # fmt: skip
 @click.option(
     "--board", metavar="BOARD", default="python", show_default=True,
-    help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated); or the "
-    "image of a Crazyflie's firmware, an ELF file, which flies whole.",
+    help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated); the image "
+    "of a Crazyflie's firmware, an ELF file, which flies whole; or a real board, which does not fly meanwhile: "
+    "radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://HOST:PORT.",
 )  # fmt: skip
 @click.option(
     "--elf",
@@ -102,6 +103,8 @@ def fly(
     announce_compilation()
     if seeds > 1 and not requests[0].in_lockstep:
         raise LabError(f"--link {link}: --seeds is for flights in lockstep")
+    if seeds > 1 and "://" in board:
+        raise LabError(f"--board {board}: --seeds {seeds}: a real board is in one flight at a time")
     if seeds > 1:
         return _fly_many(requests, out or Path("runs"))
     folder = out or Path("runs") / f"{chosen.name}-{seed}"

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
 from firmware_py.export.errors import ExportError
 from firmware_py.export.side_by_side import SideBySide, Target
-from firmware_py.rtos import WatchdogError
+from firmware_py.rtos import TaskError, WatchdogError
+from ground_station.errors import LinkError
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.faults import Fault, parse
@@ -36,8 +37,13 @@ class Checked:
     """One flight and how the targets did."""
 
     request: Request
-    outcome: str  # completed, lost (and why), interrupted
+    outcome: str  # completed, lost (and why), interrupted, error (and which)
     targets: tuple[Target, ...]
+
+    @property
+    def failed(self) -> bool:
+        """Whether a board did not hold out to the end."""
+        return self.outcome.startswith("error")
 
     @property
     def equal(self) -> bool:
@@ -61,7 +67,7 @@ def check_flight(
         def side_by_side(blocks: CoreBlocks) -> CoreRunner:
             try:
                 made.append(SideBySide(blocks, targets))
-            except ExportError as error:
+            except (ExportError, LinkError) as error:
                 raise LabError(str(error)) from None
             return made[0]
 
@@ -74,6 +80,10 @@ def check_flight(
             outcome = "interrupted" if end.interrupted else f"lost: {end.lost}" if end.lost else "completed"
         except WatchdogError as error:
             outcome = f"lost: {error}"
+        except TaskError as error:
+            if not isinstance(error.__cause__, LinkError):
+                raise
+            outcome = f"error: board {error.__cause__}"
         finally:
             flight.close()
     return Checked(request, outcome, tuple(made[0].targets))

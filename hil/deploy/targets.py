@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,22 +16,29 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.native import NativeRunner, build
 from firmware_py.export.plain import PlainRunner
 from firmware_py.logic.loading import translation_of
+from hil.devices.real_core import RealCore, is_link, open_real_core
 from hil.errors import LabError
 from hil.laboratory.run import BUILD
 
 PLAIN, C_O0, C_O2, CORTEX_M4 = TARGETS = ("plain", "c-O0", "c-O2", "cortex-m4")
+Loads = dict[str, Load]  # by entry point
 OPTIMISATION = {C_O0: "-O0", C_O2: "-O2"}
 TICK_HZ = 100
 
 
 def target_names(text: str | None) -> tuple[str, ...]:
-    """Return the targets that a comma-separated text names; None: all. Raises `LabError`."""
+    """Return the targets that a comma-separated text names, real boards by their links; None: all but those.
+
+    Raises `LabError`.
+    """
     if text is None:
         return TARGETS
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
     for name in names:
-        if name not in TARGETS:
-            raise LabError(f"--targets {text}: {name!r} is none of {', '.join(TARGETS)}")
+        if name not in TARGETS and not is_link(name):
+            raise LabError(
+                f"--targets {text}: {name!r} is none of {', '.join(TARGETS)}, and no link to a board"
+            )
     return names
 
 
@@ -59,6 +66,7 @@ class MachineCode:
 
     flash_bytes: int | None  # None: with a firmware around it
     ticks: Load
+    entries: Loads = field(default_factory=dict)
     ram_bytes: int = 0
     stack_bytes: int = 0
 
@@ -81,6 +89,7 @@ class Toolbox:
         self, names: Sequence[str], logic: LogicConfig, source: str | None = None, elf: Path | None = None
     ) -> None:
         self.machine_code: MachineCode | None = None
+        self.boards: dict[str, Loads] = {name: {} for name in names if is_link(name)}  # as they measured it
         self._native: dict[str, RunnerFactory] = {}
         self._names = names
         if elf and CORTEX_M4 not in names:
@@ -115,11 +124,28 @@ class Toolbox:
             stack.callback(self._measure, runner)
             return runner
 
+        def board(uri: str) -> RunnerFactory:
+            client = open_real_core(uri, "--targets", stack)
+
+            def runner_of(blocks: CoreBlocks) -> CoreRunner:
+                runner = RealCore(blocks, client)
+                stack.callback(add_loads, self.boards[uri], runner.load)
+                return runner
+
+            return runner_of
+
         factories = {**self._native, PLAIN: plain, CORTEX_M4: cortex_m4}
-        return {name: factories[name] for name in self._names}
+        return {name: board(name) if is_link(name) else factories[name] for name in self._names}
 
     def _measure(self, runner: Metered) -> None:
         """Note what memory a flight took."""
         assert self.machine_code is not None
         self.machine_code.ram_bytes = runner.ram_bytes
         self.machine_code.stack_bytes = max(self.machine_code.stack_bytes, runner.stack_bytes)
+        add_loads(self.machine_code.entries, runner.load)
+
+
+def add_loads(total: Loads, flight: Loads) -> None:
+    """Add what a flight took to what all before it have taken."""
+    for name, load in flight.items():
+        total.setdefault(name, Load()).merge(load)

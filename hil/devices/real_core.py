@@ -7,18 +7,46 @@ where the CRC confirms that, nothing has to be read, otherwise all memory is. So
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.core_runner import CoreBlocks, PythonRunner
-from firmware_py.export.cortex_m4 import Load
+from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
+from firmware_py.export.cortex_m4 import Load, Usage
+from firmware_py.extras import install_command
 from firmware_py.wire.core_port import WRITE_MAX, About, Call, Called, call, write
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient, runs
+from hil.errors import LabError
 
 Bytes = NDArray[np.uint8]
+
+
+def is_link(board: str) -> bool:
+    """Whether a board is a real one, named by the URI of its link."""
+    return "://" in board
+
+
+def open_real_core(uri: str, option: str, stack: ExitStack) -> CoreClient:
+    """Return a board's core, whose link is closed with the stack. Raises `LabError` that names the option."""
+    try:
+        from ground_station.links.packets import CflibPackets
+
+        client = CoreClient(CflibPackets(uri), uri)
+    except ImportError as error:
+        raise LabError(f"{option} {uri}: {error}: {install_command('radio')}") from None
+    except LinkError as error:
+        raise LabError(f"{option} {error}") from None
+    stack.callback(client.close)
+    return client
+
+
+def real_core(uri: str, stack: ExitStack) -> RunnerFactory:
+    """Return what executes the core on a board, until the stack is closed. Raises `LabError`."""
+    client = open_real_core(uri, "--board", stack)
+    return lambda blocks: RealCore(blocks, client)
 
 
 class RealCore:
@@ -72,6 +100,11 @@ class RealCore:
     def control_us(self) -> int:
         """Return the processor time of the controller's next call."""
         return self._microseconds(self._look_ahead("control").cycles)
+
+    @property
+    def usage(self) -> Usage:
+        """What the core has taken so far."""
+        return Usage(None, self.about.size, None, self.load)
 
     def _call(self, name: str) -> Called:
         """Have an entry point executed and let its results out; what was executed ahead on the same inputs is taken."""

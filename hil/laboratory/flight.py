@@ -7,6 +7,7 @@ line, `hil.laboratory.linked` leads the robot out to a ground station in a proce
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -129,6 +130,7 @@ class Flight:
         trace_all: bool = False,
     ) -> None:
         self.config = config
+        self.closing = ExitStack()  # what ends with it
         self.experiment = experiment
         self.faults = (*experiment.faults, *faults)
         self.streams = Streams.of_seed(seed)
@@ -258,4 +260,5 @@ class Flight:
 
     def close(self) -> None:
         """Close what the flight itself opened."""
-        self.line.close()
+        with self.closing:
+            self.line.close()

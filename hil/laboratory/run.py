@@ -10,6 +10,7 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,9 +20,11 @@ from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.cortex_m4 import CortexM4Runner
 from firmware_py.logic.loading import digest_of
 from firmware_py.rtos import WatchdogError
+from ground_station.errors import LinkError
 from ground_station.telemetry_log import TELEMETRY
 from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
+from hil.devices.real_core import RealCore, is_link, real_core
 from hil.devices.stm32f405.firmware import ChipImage
 from hil.errors import LabError, writing
 from hil.laboratory.ages import ages_of, told, with_goals_sent
@@ -93,7 +96,7 @@ class Request:
     @property
     def is_image(self) -> bool:
         """Whether the board executes an image that is flashed whole."""
-        return self.board not in BOARDS
+        return self.board not in BOARDS and not is_link(self.board)
 
     @property
     def in_lockstep(self) -> bool:
@@ -156,7 +159,8 @@ def fly(
         outcome, cause = "lost", str(error)
         recorder.note(flight.now_us, "board", cause)
     except Exception as error:
-        cause = f"{type(error).__name__}: {error}"
+        board_failed = isinstance(error.__cause__, LinkError)
+        cause = f"board {error.__cause__}" if board_failed else f"{type(error).__name__}: {error}"
         recorder.note(flight.now_us, "lab", cause)
     finally:
         factor = pace.end(flight.now_us)
@@ -186,7 +190,7 @@ def fly(
             QueueReport(queue.name, queue.length, queue.high_water, queue.dropped)
             for queue in firmware.kernel.queues
         ),
-        usage=firmware.runner.usage if isinstance(firmware.runner, CortexM4Runner) else None,
+        usage=firmware.runner.usage if isinstance(firmware.runner, CortexM4Runner | RealCore) else None,
         ages=ages_of(told(folder), log, request.link),
         hash=digest,
         real_time_factor=round(factor, 2),
@@ -218,7 +222,8 @@ def check_image(board: str) -> None:
     """Raise `LabError` when no file is where `--board` says."""
     if not Path(board).is_file():
         raise LabError(
-            f"--board {board}: expected {', '.join(BOARDS)}, or an image of a Crazyflie's firmware: an ELF file"
+            f"--board {board}: expected {', '.join(BOARDS)}, an image of a Crazyflie's firmware: an ELF file, or the link "
+            "to a real board"
         )
 
 
@@ -233,18 +238,28 @@ def image_at(board: str, elf: Path | None) -> ChipImage:
 
 def lockstep(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` when its board cannot be had here."""
+    with ExitStack() as stack:
+        runner = _runner(request, stack)
+        try:
+            flight = lockstep_flight(
+                request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all,
+                request.link, request.faults, runner,
+            )  # fmt: skip
+        except LinkError as error:
+            raise LabError(f"--board {error}") from None
+        flight.closing = stack.pop_all()
+    return flight
+
+
+def _runner(request: Request, stack: ExitStack) -> Executor:
+    if is_link(request.board):
+        return real_core(request.board, stack)
     try:
-        runner: Executor = (
-            image_at(request.board, request.elf)
-            if request.is_image
-            else runner_of(request.board, BUILD, request.config.logic)
-        )
+        if request.is_image:
+            return image_at(request.board, request.elf)
+        return runner_of(request.board, BUILD, request.config.logic)
     except FirmwareError as error:
         raise LabError(f"--board {request.board}: {error}") from None
-    return lockstep_flight(
-        request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all,
-        request.link, request.faults, runner,
-    )  # fmt: skip
 
 
 def prepare(folder: Path) -> None:

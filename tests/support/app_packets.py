@@ -15,6 +15,7 @@ class AppPackets:
         self.app = app
         self.mess = mess
         self.silent = False
+        self.closed = 0
         self._rng = np.random.default_rng(1)
         self._up: deque[bytes] = deque()
         self._down: deque[bytes] = deque()
@@ -31,7 +32,7 @@ class AppPackets:
         return self._down.popleft() if self._down and not self.silent else None
 
     def close(self) -> None:
-        pass
+        self.closed += 1
 
     def _pass(self, queue: deque[bytes], data: bytes) -> None:
         lost, doubled, overtakes = (self._rng.random(3) < self.mess).tolist()

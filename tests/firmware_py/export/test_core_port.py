@@ -36,6 +36,7 @@ from ground_station.links.core_client import CoreClient
 from hil.config import load_config
 from hil.deploy.check import FAULTS, check_flight
 from hil.devices.real_core import RealCore
+from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.run import Request
@@ -334,6 +335,6 @@ def test_a_core_of_another_layout_is_refused_in_one_line(app: App, tmp_path: Pat
     config = own_config(tmp_path, LAW)
     request = Request(find_experiment("hover"), config, "own", (), 1, 0.5)
     with pytest.raises(
-        LinkError, match=r"^app: its core has 4868 B of memory, this one \d+: export and flash it again$"
+        LabError, match=r"^app: its core has 4868 B of memory, this one \d+: export and flash it again$"
     ):
         check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)

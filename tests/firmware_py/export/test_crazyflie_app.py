@@ -920,7 +920,9 @@ def test_the_stubs_are_as_the_firmwares_headers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("header", sorted(STUBS.glob("*.h")), ids=lambda header: header.name)
 def test_the_stubs_declare_nothing_that_the_facts_do_not_state(header: Path) -> None:
-    words_of_c = "volatile typedef enum union extern inline return packed section used aligned format printf opaque"
+    words_of_c = (
+        "volatile typedef enum union extern inline return packed section used aligned format printf opaque"
+    )
     only_in_stubs = (
         r"stub_\w+|\w+_PLACE|(LOG|PARAM)_ADD_(GROUP|FULL)|(sensorData|setpoint)_s|__(logs|params)_|stop_"
     )
