@@ -80,6 +80,11 @@ class Paced:
         """Let the simulated instant be now."""
         self._start_ns = time.monotonic_ns() - now_us * 1000
 
+    def shift(self, by_us: int) -> None:
+        """Let every instant be later by that on the wall clock, or earlier."""
+        if self._start_ns is not None:
+            self._start_ns += by_us * 1000
+
     def now_us(self) -> int:
         """The simulated instant that the wall clock has reached; only after `start`."""
         assert self._start_ns is not None

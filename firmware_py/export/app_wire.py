@@ -3,19 +3,27 @@
 from enum import IntEnum
 
 from firmware_py.wire import core_port
-from firmware_py.wire.core_port import LAYOUTS, Call, Kind, Layout, Refusal
+from firmware_py.wire.core_port import LAYOUTS, Call, Hil, Kind, Layout, Refusal
 
 C_TYPES = {"B": "uint8_t", "b": "int8_t", "H": "uint16_t", "h": "int16_t", "I": "uint32_t"}
 
 
 def wire_header() -> str:
     """Return floaty_wire.h."""
-    constants = ("PORT_CORE", "CHANNEL_CALLS", "VERSION", "NAME_SIZE", "READ_MAX")
+    constants = (
+        "PORT_CORE",
+        "CHANNEL_CALLS",
+        "CHANNEL_LOOP",
+        "HIL_WAITING",
+        "VERSION",
+        "NAME_SIZE",
+        "READ_MAX",
+    )
     return "\n\n".join((
         "/* The packets of the core's port, as in firmware_py/wire/core_port.py. Written by `floaty deploy`. */\n"
         "#pragma once\n\n#include <stdint.h>",
         "\n".join(f"#define FLOATY_{name} {getattr(core_port, name)}" for name in constants),
-        *(_enumeration(kind) for kind in (Kind, Refusal, Call)),
+        *(_enumeration(kind) for kind in (Kind, Refusal, Call, Hil)),
         *(_struct(layout) for layout in LAYOUTS),
     )) + "\n"  # fmt: skip
 

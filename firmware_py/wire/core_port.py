@@ -12,15 +12,24 @@ Each begins with HEAD: the kind, the session, and the number of the request in i
             <- CALLED
     READ    -> PLACE_SIZE            of the memory
             <- bytes
+    LOOP    -> MODE                  hardware in the loop: a mode from the next millisecond on
+            <-
     (any)   <- REFUSED               with a reason
 
 A board executes the requests of a session in the order of their numbers, from 0 on, and each once. A number above the next
 one is not answered: one before it was lost. A request that comes again is answered again and not executed again, READ
 with the memory as it is then; of calls only the last one. So the host may send many at once and repeats those without an
 answer; it goes on behind a call when everything up to it has been answered.
+
+Hardware in the loop, on a channel of its own, without sessions or repetition. The board flies as always, but each
+millisecond with the gyro sample of the host that is next: SAMPLES, and SAMPLE up to four times. It takes the first one
+when `HIL_WAITING` samples wait. Where the next one is not there it takes the last one again (late); a gap in the numbers
+is filled (lost), what came before is left out (doubled). After each controller step it tells the host: LOOP. A second
+without samples ends the mode. With every change of the mode the gyro's zero is sought again and the estimator started.
 """
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -30,8 +39,11 @@ from firmware_py.wire.crtp import MAX_DATA
 
 PORT_CORE = 10
 CHANNEL_CALLS = 0
+CHANNEL_LOOP = 1
 VERSION = 1  # of this protocol
 NAME_SIZE = 8  # characters of a hash
+HIL_WAITING = 8  # samples of 1 ms
+SAMPLES_MAX = 4  # in a packet
 
 
 class Kind(IntEnum):
@@ -42,6 +54,7 @@ class Kind(IntEnum):
     CALL = 2
     READ = 3
     REFUSED = 4
+    LOOP = 5
 
 
 class Refusal(IntEnum):
@@ -59,6 +72,14 @@ class Call(IntEnum):
     FILE_POSE = 1
     ESTIMATE = 2
     CONTROL = 3
+
+
+class Hil(IntEnum):
+    """Hardware in the loop."""
+
+    OFF = 0  # the board's own gyro, servos move
+    STILL = 1  # the host's samples, servos stay at hover
+    MOVING = 2  # the host's samples, servos move as well
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +114,24 @@ CALLED = Layout("Called", (
     ("digest", "I"),  # CRC-32 of the whole memory afterwards, as zlib.crc32
 ))  # fmt: skip
 WHY = Layout("Why", (("reason", "B"),))
-LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY)
+MODE = Layout("Mode", (("mode", "B"),))
+SAMPLES = Layout("Samples", (("number", "H"),))  # of the first sample
+SAMPLE = Layout("Sample", (("x", "h"), ("y", "h"), ("z", "h")))  # [counts] of the gyro, sensor frame
+LOOP = Layout("Loop", (
+    ("used", "H"),  # number of the next sample, when the controller ran
+    ("waiting", "B"),  # samples in the buffer then
+    ("state", "B"),  # of the supervisor
+    ("cause", "B"),
+    ("late", "H"), ("lost", "H"), ("doubled", "H"),
+    ("m1", "H"), ("m2", "H"), ("m3", "H"), ("m4", "H"),  # timer counts that the controller puts out
+    ("fused", "H"), ("refused", "H"),  # poses
+    ("age", "H"),  # [0.1 ms] of the last one
+))  # fmt: skip
+LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY, MODE, SAMPLES, SAMPLE, LOOP)
 
-_HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY = (layout.struct for layout in LAYOUTS)
+_HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _MODE, _SAMPLES, _SAMPLE, _LOOP = (
+    layout.struct for layout in LAYOUTS
+)
 WRITE_MAX = MAX_DATA - _HEAD.size - _PLACE.size  # bytes in a packet
 READ_MAX = MAX_DATA - _HEAD.size
 
@@ -164,6 +200,42 @@ def call(entry: Call) -> tuple[Kind, bytes]:
 def read(offset: int, size: int) -> tuple[Kind, bytes]:
     """Read up to `READ_MAX` bytes."""
     return Kind.READ, _PLACE_SIZE.pack(offset, size)
+
+
+def loop(mode: Hil) -> tuple[Kind, bytes]:
+    """Switch hardware in the loop."""
+    return Kind.LOOP, _MODE.pack(mode)
+
+
+@dataclass(frozen=True, slots=True)
+class Looped:
+    """What the board tells of itself in the loop."""
+
+    used: int
+    waiting: int
+    state: int
+    cause: int
+    late: int
+    lost: int
+    doubled: int
+    counts: tuple[int, int, int, int]
+    fused: int
+    refused: int
+    age_us: int
+
+
+def encode_samples(number: int, samples: Sequence[Sequence[int]]) -> bytes:
+    """Return the data of a packet with up to `SAMPLES_MAX` gyro samples, of which the first has this number."""
+    return _SAMPLES.pack(number & 0xFFFF) + b"".join([_SAMPLE.pack(*sample) for sample in samples])
+
+
+def decode_looped(data: bytes) -> Looped:
+    """Read what the board tells; `WireError` when it is too short."""
+    *head, m1, m2, m3, m4, fused, refused, age = _unpack(_LOOP, data)
+    used, waiting, state, cause, late, lost, doubled = head
+    return Looped(
+        used, waiting, state, cause, late, lost, doubled, (m1, m2, m3, m4), fused, refused, 100 * age
+    )
 
 
 def encode_request(kind: Kind, body: bytes, session: int, number: int) -> bytes:

@@ -47,6 +47,14 @@ class Packets(Protocol):
         """Return what comes next within that time, else None; raises `LinkError`."""
         ...
 
+    def tell(self, packet: bytes) -> None:
+        """Send a whole packet of any port, behind what was told before; does not wait for the link."""
+        ...
+
+    def told(self) -> list[bytes]:
+        """Return the whole packets that came since the last call of this or `receive`; raises `LinkError`."""
+        ...
+
     def close(self) -> None:
         """Give the link back."""
         ...
@@ -59,7 +67,7 @@ class CoreClient:
         self.name = name
         self.sent = 0  # packets
         self.repeated = 0  # of these
-        self._packets = packets
+        self.packets = packets
         self._session = clock_us() % SESSIONS + 1
         self._number = 0  # of the next request
 
@@ -92,7 +100,7 @@ class CoreClient:
 
     def close(self) -> None:
         """Give the link back."""
-        self._packets.close()
+        self.packets.close()
 
     def _exchange(self, requests: Sequence[Request]) -> list[CoreAnswer]:
         answers: dict[int, CoreAnswer] = {}
@@ -121,11 +129,11 @@ class CoreClient:
 
     def _send(self, request: Request, index: int) -> None:
         self.sent += 1
-        self._packets.send(encode_request(*request, self._session, self._number + index))
+        self.packets.send(encode_request(*request, self._session, self._number + index))
 
     def _receive(self, timeout_s: float, count: int) -> CoreAnswer | None:
         """Return an answer to one of `count` requests; one to an earlier request is none."""
-        for data in iter(lambda: self._packets.receive(timeout_s), None):
+        for data in iter(lambda: self.packets.receive(timeout_s), None):
             try:
                 answer = decode_answer(data)
             except WireError:

@@ -1,9 +1,10 @@
-"""Single packets of the core's port to and from a board, over whatever link cflib knows: radio, USB or UDP.
+"""Single packets to and from a board, over whatever link cflib knows: radio, USB or UDP.
 
 No table of contents is fetched and nothing of the board's other services is used, so that it is ready at once.
 """
 
 import re
+from functools import partial
 
 import cflib.crtp
 from cflib.crtp.crtpstack import CRTPPacket
@@ -13,6 +14,7 @@ from firmware_py.wire.crtp import header
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
 from ground_station.links.crazyradio import URIS, quiet_cflib
+from ground_station.links.live_link import Sender
 
 USB = r"usb://\d"
 HEADER = header(PORT_CORE, CHANNEL_CALLS)
@@ -29,6 +31,7 @@ class CflibPackets:
             cflib.crtp.init_drivers()
         self._uri = uri
         self._lost = ""
+        self._sender = Sender()
         try:
             self._driver = cflib.crtp.get_link_driver(uri, lambda statistics: None, self._lose)
         except Exception as error:  # cflib raises bare exceptions
@@ -53,8 +56,21 @@ class CflibPackets:
             if packet.port == PORT_CORE and packet.channel == CHANNEL_CALLS:
                 return bytes(packet.data)
 
+    def tell(self, packet: bytes) -> None:
+        """Send a whole packet of any port, behind what was told before; does not wait for the link."""
+        self._sender.put(partial(self._driver.send_packet, CRTPPacket(packet[0], list(packet[1:]))))
+
+    def told(self) -> list[bytes]:
+        """Return the whole packets that came since the last call of this or `receive`."""
+        came = []
+        while (packet := self._driver.receive_packet(0)) is not None:
+            came.append(bytes((packet.header,)) + bytes(packet.data))
+        self._check()
+        return came
+
     def close(self) -> None:
         """Give the link back."""
+        self._sender.close()
         self._driver.close()
 
     def _lose(self, text: str) -> None:

@@ -63,6 +63,11 @@ SEEDS_MAX = 10_000
     help="With a .bin as --board: the ELF that it was made of.",
 )
 @click.option(
+    "--hil", "in_loop", is_flag=False, flag_value="still", metavar="[moving]",
+    help="Let the board of --board fly by its own tasks and clock, with the gyro samples of the virtual IMU; its servos "
+    "stay at hover, or move as well.",
+)  # fmt: skip
+@click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
 )
 def fly(
@@ -79,6 +84,7 @@ def fly(
     link: str,
     board: str,
     elf: Path | None,
+    in_loop: str | None,
     out: Path | None,
 ) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
@@ -90,6 +96,10 @@ def fly(
     chosen = find_experiment(experiment)
     if seeds > 1 and (realtime or target or perfetto):
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
+    if in_loop not in (None, "still", "moving"):
+        raise LabError(f"--hil {in_loop}: expected --hil or --hil moving")
+    if seeds > 1 and in_loop:
+        raise LabError(f"--hil: --seeds {seeds}: a real board is in one flight at a time")
     if perfetto:
         import hil.exports.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
     from hil.laboratory.faults import parse
@@ -108,15 +118,18 @@ def fly(
     if seeds > 1:
         return _fly_many(requests, out or Path("runs"))
     folder = out or Path("runs") / f"{chosen.name}-{seed}"
-    return _fly_one(requests[0], folder, realtime, target, perfetto)
+    return _fly_one(requests[0], folder, realtime, target, perfetto, in_loop)
 
 
-def _fly_one(request: Request, folder: Path, realtime: bool, target: str | None, perfetto: bool) -> int:
+def _fly_one(
+    request: Request, folder: Path, realtime: bool, target: str | None, perfetto: bool, in_loop: str | None
+) -> int:
     """Fly one seed with all its pictures; returns the exit code."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from hil.clock import FreeRunning, Paced
     from hil.laboratory.run import fly, prepare
+    from hil.servers.in_the_loop import in_the_loop
     from hil.servers.linked import linked_flight
 
     view = open_live(target)
@@ -134,7 +147,7 @@ def _fly_one(request: Request, folder: Path, realtime: bool, target: str | None,
         def show(now_us: int, flight: Flight) -> None:
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
-        make = None if request.in_lockstep else linked_flight
+        make = in_the_loop(in_loop == "moving") if in_loop else None if request.in_lockstep else linked_flight
         with writing("--out", folder):
             result = fly(request, folder, clock, show, view, perfetto, make)
         progress.update(bar, description="writing recording and report", total=None, now="")

@@ -18,6 +18,7 @@ from ground_station.tracker import Tracker
 from ground_station.trajectory import Goal, Trajectory
 from hil.devices.cameras import VirtualMocap
 from hil.devices.radio import VirtualRadio
+from hil.devices.real_firmware import RealFirmware
 from hil.devices.stm32f405.firmware import ImageFirmware
 from hil.laboratory.faults import Fault
 from hil.laboratory.recorder import Channel, Quantity
@@ -60,6 +61,19 @@ def battery_channel(battery: Battery) -> Channel:
     )
 
 
+def loop_channel(firmware: RealFirmware) -> Channel:
+    """Return what the loop through a real board costs and counts."""
+
+    def read() -> tuple[int, ...]:
+        told = firmware.told
+        counted = (0, 0, 0, 0) if told is None else (told.waiting, told.late, told.lost, told.doubled)
+        return (firmware.delay_us, firmware.added_us, *counted)
+
+    return Channel(
+        "int32", read, (quantity("loop", "delay added", "us"), quantity("loop", "waiting late lost doubled"))
+    )
+
+
 def tracker_channel(tracker: Tracker) -> Channel:
     """Return what the tracker makes of frames."""
     counters = tracker.counters
@@ -70,7 +84,7 @@ def tracker_channel(tracker: Tracker) -> Channel:
     )
 
 
-def logic_channels(firmware: Firmware | ImageFirmware) -> tuple[Channel, ...]:
+def logic_channels(firmware: Firmware | ImageFirmware | RealFirmware) -> tuple[Channel, ...]:
     """Return what logic of the user's own logs."""
     own = [variable for variable in firmware.variables if variable.name.startswith(f"{GROUP}.")]
     channels = []
@@ -86,7 +100,7 @@ def _all(reads: Sequence[Callable[[], float]]) -> Callable[[], list[float]]:
     return lambda: [read() for read in reads]
 
 
-def excitation_channel(firmware: Firmware | ImageFirmware) -> Channel:
+def excitation_channel(firmware: Firmware | ImageFirmware | RealFirmware) -> Channel:
     """Return what is added to the inputs for identification."""
     reads = [variable.read for variable in firmware.variables if variable.name.startswith("excite.")]
     return Channel("float32", _all(reads), (quantity("excite", "u1 u2 u3 u4", "rad"),))
@@ -133,6 +147,15 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
             *[task.deadline_misses for task in timed], *kernel.run_times_us()[: len(tasks)],
         )  # fmt: skip
 
+    scheduler = () if not tasks else (  # a real board does not tell what its tasks do
+        Channel(
+            "int64", counts, (
+                quantity("rtos", "measurements_high_water measurements_dropped"),
+                quantity("late", " ".join(task.name for task in timed)),
+                Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),
+            ),
+        ),
+    )  # fmt: skip
     flaps = "flap_1 flap_2 flap_3 flap_4"
     forces = " ".join(
         f"{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz"
@@ -177,15 +200,7 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
             _view(signals.counters),
             (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us")),
         ),
-        Channel(
-            "int64",
-            counts,
-            (
-                quantity("rtos", "measurements_high_water measurements_dropped"),
-                quantity("late", " ".join(task.name for task in timed)),
-                Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),
-            ),
-        ),
+        *scheduler,
     )
 
 

@@ -17,6 +17,7 @@ from firmware_py.wire.supervisor import Cause
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock
 from hil.config import LabConfig
+from hil.devices.real_firmware import RealFirmware
 from hil.events import EventQueue
 from hil.laboratory.channels import (
     battery_channel,
@@ -24,6 +25,7 @@ from hil.laboratory.channels import (
     fault_channel,
     flight_channels,
     logic_channels,
+    loop_channel,
     marker_channel,
 )
 from hil.laboratory.faults import Fault, Switchboard
@@ -192,6 +194,8 @@ class Flight:
         line, tracker = self.line.channels()
         excited = (excitation_channel(robot.firmware),) if any(self.config.excitation.rms) else ()
         own = logic_channels(robot.firmware)
+        if isinstance(robot.firmware, RealFirmware):
+            own = (*own, loop_channel(robot.firmware))
         battery = battery_channel(robot.battery)
         return (*channels, *line, battery, *tracker, *markers, *faults, *excited, *own)
 

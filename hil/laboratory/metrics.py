@@ -90,6 +90,15 @@ METRICS: Mapping[str, Metric] = {
     "line_up": Metric("share", "max", "mean load of the serial line to the board"),
     "line_down": Metric("share", "max", "mean load of the serial line from the board"),
     "line_overrun": Metric("bytes", "max", "lost because the board's receive buffer was full"),
+    "loop_delay": Metric(
+        "s", "max", "mean time from a gyro sample to the flaps that it moved, of a board in the loop"
+    ),
+    "loop_added": Metric(
+        "s", "max", "mean age that the link to a board in the loop adds to poses, and that they tell"
+    ),
+    "samples_late": Metric("", "max", "milliseconds for which a board in the loop had no gyro sample"),
+    "samples_lost": Metric("", "max", "gyro samples that never came"),
+    "samples_doubled": Metric("", "max", "gyro samples that came again, or too late"),
     "estimator_late_from": Metric("share", "min", "thief's load at which KALMAN first misses a deadline"),
     "controller_late_from": Metric(
         "share", "min", "thief's load at which STABILIZER first misses a deadline"
@@ -224,6 +233,12 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
         busy = column(flight, "serial.up_busy", "serial.down_busy")
         values["line_up"], values["line_down"] = (busy[-1] - busy[0]) * 1e-6 / values["flown"]
         values["line_overrun"] = float(column(flight, "serial.overrun")[-1])
+    if "loop.delay" in table.schema.names:
+        values["loop_delay"], values["loop_added"] = (
+            column(flight, "loop.delay", "loop.added").mean(axis=0) * 1e-6
+        )
+        for name in ("late", "lost", "doubled"):
+            values[f"samples_{name}"] = float(column(flight, f"loop.{name}")[-1])
     if is_real(table):
         values["poses_refused"] = float(column(flight, "estimator.rejected")[-1])
         values["unseen"] = _unseen(table)

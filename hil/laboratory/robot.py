@@ -21,6 +21,7 @@ from hil.devices.board import VirtualBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import VirtualImu
 from hil.devices.markers import Sighting
+from hil.devices.real_firmware import RealBoard, RealFirmware
 from hil.devices.rigid_body import make_markers
 from hil.devices.shockburst import Air, syslink_us
 from hil.devices.stm32f405.firmware import ChipImage, ImageFirmware
@@ -38,7 +39,7 @@ MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms b
 
 See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, what was seen of the markers)
 Say = Callable[[str, str], None]  # (source, text)
-Executor = RunnerFactory | ChipImage  # of the flight core, or of all that is flashed
+Executor = RunnerFactory | ChipImage | RealBoard  # of the flight core, or of all that is flashed
 SendPacket = Callable[[int, bytes], bool]  # (now_us, packet): False when it has to wait
 
 
@@ -122,8 +123,10 @@ class Robot:
             share, self._thief = self._thief.share, self.firmware.add_thief()
             self._thief.share = share
 
-    def _firmware(self, now_us: int) -> Firmware | ImageFirmware:
+    def _firmware(self, now_us: int) -> Firmware | ImageFirmware | RealFirmware:
         """Return the firmware of a new boot; an image gets power some time before the laboratory's time begins."""
+        if isinstance(self._runner, RealBoard):
+            return RealFirmware(self._runner, self.board)
         if not isinstance(self._runner, ChipImage):
             return Firmware(self.config, self.board, mavlink=self.uart is not None, runner=self._runner)
         specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is that of any other board

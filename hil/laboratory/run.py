@@ -159,8 +159,8 @@ def fly(
         outcome, cause = "lost", str(error)
         recorder.note(flight.now_us, "board", cause)
     except Exception as error:
-        board_failed = isinstance(error.__cause__, LinkError)
-        cause = f"board {error.__cause__}" if board_failed else f"{type(error).__name__}: {error}"
+        first = error.__cause__ or error
+        cause = f"board {first}" if isinstance(first, LinkError) else f"{type(error).__name__}: {error}"
         recorder.note(flight.now_us, "lab", cause)
     finally:
         factor = pace.end(flight.now_us)

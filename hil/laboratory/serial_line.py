@@ -4,6 +4,7 @@ from firmware_py.firmware import Firmware
 from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from hil.config import LabConfig
+from hil.devices.real_firmware import RealFirmware
 from hil.devices.stm32f405.firmware import ImageFirmware
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
@@ -24,7 +25,7 @@ def link_of(config: LabConfig, line: VirtualSerial) -> MavlinkLink:
 
 
 def serial_channel(
-    uart: VirtualSerial, firmware: Firmware | ImageFirmware, link: MavlinkLink | None
+    uart: VirtualSerial, firmware: Firmware | ImageFirmware | RealFirmware, link: MavlinkLink | None
 ) -> Channel:
     """Return what a serial line counts; without a `link` the station's frames are unknown and stay 0.
 

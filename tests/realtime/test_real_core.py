@@ -75,3 +75,26 @@ def test_a_board_that_is_killed_in_flight_ends_it_in_one_line_with_what_was_flow
         f"board {uri}: lost: Error communicating with Crazyflie",
     )
     assert 50 < load_log(out).num_rows < 200
+
+
+@pytest.mark.parametrize("medium", ["radio", "udp"])
+@pytest.mark.parametrize(
+    ("overrides", "holds"),
+    [((), True), (LOSSY, True), (("radio.uplink_loss=0.3", "radio.downlink_loss=0.3"), True)],
+    ids=["good", "10 %", "30 %"],
+)  # fmt: skip
+def test_hover_with_the_board_in_the_loop_holds_all_limits_for_twenty_seconds(
+    library: Path, medium: str, overrides: tuple[str, ...], holds: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    with board(library, *overrides) as served:
+        plug(served)
+        (uri,) = served.line(f"{medium} ")
+        out = tmp_path / "run"
+        code = floaty(monkeypatch, "fly", "hover", "--duration", "20", "--board", uri, "--hil", "--out", out)
+        result = read_result(out)
+        figures = {
+            name: result.metrics[name] for name in result.metrics if name.startswith(("loop_", "samples_"))
+        }
+        print(medium, overrides, figures, result.stood_still_ms)
+        assert (code == 0) == holds, result.verdicts
+        assert 0.005 < result.metrics["loop_delay"] < 0.03

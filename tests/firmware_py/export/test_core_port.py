@@ -194,7 +194,7 @@ def test_a_packet_without_a_head_or_on_another_channel_is_not_answered(app: App)
 
 def test_every_layout_is_as_long_in_c(tmp_path: Path, library: Path) -> None:
     header = (library.parent / "src" / "floaty_wire.h").read_text()
-    sizes = {"uint8_t": 1, "int8_t": 1, "char": NAME_SIZE, "uint16_t": 2, "uint32_t": 4}
+    sizes = {"uint8_t": 1, "int8_t": 1, "int16_t": 2, "char": NAME_SIZE, "uint16_t": 2, "uint32_t": 4}
     for layout in LAYOUTS:
         body = header.split(f"}} __attribute__((packed)) FloatyWire{layout.name};")[0].rsplit("{", 1)[1]
         assert layout.struct.size == sum(sizes[line.split()[0]] for line in body.strip().splitlines())

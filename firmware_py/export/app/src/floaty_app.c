@@ -37,6 +37,7 @@
 #include "usec_time.h"
 
 #include "floaty_gyro_zero.h"
+#include "floaty_hil.h"
 #include "floaty_servos.h"
 #include "floaty_settings.h"
 
@@ -158,6 +159,9 @@ static void take_measurements(stabilizerStep_t step) {
   }
   for (int axis = 0; axis < 3; axis++) {
     counts[axis] = logGetInt(gyro_raw[axis]);
+  }
+  floaty_hil_sample(counts);
+  for (int axis = 0; axis < 3; axis++) {
     floaty_input.gyro_sum[axis] += counts[axis];
   }
   floaty_input.gyro_samples += 1;
@@ -240,9 +244,28 @@ bool estimatorOutOfTreeTest(void) {
   return gyro_found;
 }
 
+/* Another gyro measures from now on, and what was flown before is over. */
+static void begin_afresh(void) {
+  FloatyPose pose;
+  while (xQueueReceive(pose_queue, &pose, 0) == pdTRUE) {
+    /* of another flight */
+  }
+  memset(&gyro_zero, 0, sizeof gyro_zero);
+  memset(floaty_input.gyro_bias, 0, sizeof floaty_input.gyro_bias);
+  memset(floaty_input.gyro_sum, 0, sizeof floaty_input.gyro_sum);
+  floaty_input.gyro_samples = 0;
+  floaty_supervisor.calibrated = false;
+  floaty_supervisor.pose_seen = false;
+  call_reset();
+  floaty_hover();
+}
+
 void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (!gyro_found) {
     return; /* without a gyro Floaty stays calibrating, flaps at hover */
+  }
+  if (floaty_hil_switched()) {
+    begin_afresh();
   }
   if (asked(&floaty_requests.reset)) {
     call_reset();
@@ -305,7 +328,10 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
       floaty_input.mode = MODE_HOVER; /* nobody is there who could take the angles back */
     }
     call_control();
-    floaty_servos_write(floaty_control.count);
+    if (floaty_hil_mode() != FLOATY_HIL_STILL) {
+      floaty_servos_write(floaty_control.count);
+    }
+    floaty_hil_tell();
     controlled_tick = xTaskGetTickCount();
   }
   if (stabilizerStep % BATTERY_STEPS == 0) {

@@ -14,6 +14,7 @@
 #include "stm32fxxx.h"
 
 #include "floaty_calls.h"
+#include "floaty_hil.h"
 
 #define CLOCK_MHZ 168
 
@@ -119,6 +120,16 @@ static int call(const uint8_t *data, uint32_t length, uint16_t number, bool is_n
   return sizeof called;
 }
 
+static int loop(const uint8_t *data, uint32_t length, bool is_new) {
+  if (length < sizeof(FloatyWireMode) || data[0] > FLOATY_HIL_MOVING) {
+    return REFUSED(OUTSIDE);
+  }
+  if (is_new) {
+    floaty_hil_ask(data[0]);
+  }
+  return 0;
+}
+
 static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t length, uint8_t *body) {
   const int16_t ahead = (int16_t)(head->number - done);
   const bool is_new = ahead == 0;
@@ -129,7 +140,7 @@ static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t lengt
   if (head->session != session || session == 0) {
     return REFUSED(NO_SESSION);
   }
-  if (floaty_supervisor.state == FLOATY_FLYING) {
+  if (floaty_supervisor.state == FLOATY_FLYING && floaty_hil_mode() == FLOATY_HIL_OFF) {
     return REFUSED(FLYING);
   }
   if (ahead > 0) {
@@ -138,6 +149,7 @@ static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t lengt
   switch (head->kind) {
     case FLOATY_KIND_WRITE: size = write_memory(data, length, is_new); break;
     case FLOATY_KIND_READ: size = read_memory(data, length, body); break;
+    case FLOATY_KIND_LOOP: size = loop(data, length, is_new); break;
     case FLOATY_KIND_CALL: size = call(data, length, head->number, is_new, body); break;
     default: return REFUSED(OUTSIDE);
   }
@@ -151,6 +163,10 @@ static void receive(CRTPPacket *packet) {
   static CRTPPacket answer;
   FloatyWireHead head;
   uint8_t *body = answer.data + sizeof head;
+  if (packet->channel == FLOATY_CHANNEL_LOOP) {
+    floaty_hil_receive(packet);
+    return;
+  }
   if (packet->channel != FLOATY_CHANNEL_CALLS || packet->size < sizeof head) {
     return;
   }

@@ -1,0 +1,29 @@
+/* Hardware in the loop: IMU samples come from a host instead of the sensor, and what the board makes of them goes back.
+ *
+ * The board's own loop, tasks, radio and supervisor run as always. firmware_py/wire/core_port.py has the packets.
+ */
+#pragma once
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "crtp.h"
+#include "stabilizer_types.h"
+
+/* Any task: asks for a mode, a FLOATY_HIL_...; it is there from the next step on. */
+void floaty_hil_ask(uint8_t mode);
+
+/* The mode that is in force. */
+uint8_t floaty_hil_mode(void);
+
+/* The receiving task: takes a packet with samples. */
+void floaty_hil_receive(const CRTPPacket *packet);
+
+/* The stabilizer task, once per step: whether the mode has just changed, and everything begins afresh. */
+bool floaty_hil_switched(void);
+
+/* The stabilizer task, once per step: puts the host's sample in place of the sensor's, if the mode says so. */
+void floaty_hil_sample(int32_t counts[3]);
+
+/* The stabilizer task, after a controller step: tells the host. */
+void floaty_hil_tell(void);

@@ -1,0 +1,192 @@
+"""A real board in the loop: its firmware flies with the samples of the virtual gyro, its servo counts drive the plant.
+
+It stands where `Firmware` stands in a robot, and shows as much of it as a board tells over the link: the state of its
+supervisor, its servo counts, and some counters. What the core estimates is not told; those columns of the log are NaN.
+Corrections go to the board as in a real flight. Between the instant that the board's gyro shows and the one at which its
+flaps act lie the way of the samples to the board, their wait there, and the way of the counts back: the loop's own delay,
+which is measured. A pose tells an age that contains the link's way, as every pose does, half of what is no wait.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import nan
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from firmware_py.board import Board
+from firmware_py.signals import COUNTERS
+from firmware_py.thief import Thief
+from firmware_py.wire import WireError, crtp
+from firmware_py.wire.core_port import (
+    CHANNEL_LOOP,
+    HIL_WAITING,
+    PORT_CORE,
+    SAMPLES_MAX,
+    Hil,
+    Looped,
+    decode_looped,
+    encode_samples,
+    loop,
+)
+from firmware_py.wire.crtp import Packet, decode_ext_pose, encode_ext_pose
+from firmware_py.wire.supervisor import Cause, State
+from ground_station.errors import LinkError
+from ground_station.links.core_client import CoreClient
+from hil.errors import LabError
+
+SAMPLE_US = 1000
+SILENCE_US = 1_000_000
+BATCH_US = (SAMPLES_MAX - 1) * SAMPLE_US // 2  # that a sample waits on the mean for its packet
+SLEW_US = 25  # by which time is moved, a hundred times a second, for each sample that too many wait on board
+SLEW_MAX_US = 200
+KEPT = 50  # of what the board told, half a second: what the loop adds is their mean
+
+
+class _Clock:
+    """What a kernel is to the laboratory, for a processor that nobody here schedules."""
+
+    next_wake_us = None
+    tasks: tuple[object, ...] = ()
+    queues: tuple[object, ...] = ()
+    trace = None
+    current = SimpleNamespace(name="real board", priority=0)
+
+    def __init__(self) -> None:
+        self.now_us = 0
+
+    def advance(self, now_us: int) -> None:
+        """Let it be so late."""
+        self.now_us = now_us
+
+    def run(self, now_us: int, until_us: int = 0) -> None:
+        """Let it be so late; nothing happens by itself."""
+        self.now_us = now_us
+
+    def run_times_us(self) -> list[int]:
+        """Nothing, for no task."""
+        return []
+
+    def set_trace(self, take: object) -> None:
+        """Nothing: what a board's tasks do is not told."""
+
+
+@dataclass(frozen=True, slots=True)
+class RealBoard:
+    """A board that is to fly in the loop; `moving`: its servos move as well.
+
+    `slew` lets simulated time be later by microseconds, or earlier.
+    """
+
+    client: CoreClient
+    moving: bool
+    slew: Callable[[int], None]
+
+
+class RealFirmware:
+    """The firmware of a board in the loop. Raises `LinkError` when the board does not answer."""
+
+    variables: tuple[Any, ...] = ()
+    parameters: tuple[Any, ...] = ()
+    runner = None
+    mavlink = None
+    measurements = SimpleNamespace(high_water=0, dropped=0)
+    statistics = SimpleNamespace(reports=tuple)
+
+    def __init__(self, real: RealBoard, board: Board) -> None:
+        self.kernel: Any = _Clock()
+        self.told: Looped | None = None  # by the board, last
+        self.delay_us = 0  # from a sample to the counts that came of it, lately
+        self.added_us = 0  # the link's way, which corrections tell on top of their age
+        self.signals: Any = SimpleNamespace(
+            estimate=np.full(16, nan, np.float32), counters=np.zeros(len(COUNTERS), np.int32),
+            u=np.full(4, nan, np.float32), flap=np.full(4, nan, np.float32), count=np.zeros(4, np.int32),
+            supervisor=SimpleNamespace(state=State.CALIBRATING, cause=Cause.NONE),
+        )  # fmt: skip
+        self._board = board
+        self._client = real.client
+        self._slew = real.slew
+        self._mode = Hil.MOVING if real.moving else Hil.STILL
+        self._samples: list[Sequence[int]] = []
+        self._count = 0  # samples so far
+        self._heard_us = 0
+        self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT)  # whole, and what of it waited in buffers
+        self._about = real.client.begin()
+
+    def __str__(self) -> str:
+        return f"{self._client.name}: core {self._about.core}, profile {self._about.profile}, in the loop"
+
+    def imu_ready(self) -> None:
+        """The virtual IMU has a sample: hand it on, and take what the board has told."""
+        if self._count == 0:  # what compiles has been compiled: from now on samples come
+            self._client.execute([loop(self._mode)])
+        self._samples.append(self._board.read_imu()[:3])
+        self._count += 1
+        if len(self._samples) == SAMPLES_MAX:
+            data = encode_samples(self._count - SAMPLES_MAX, self._samples)
+            self._client.packets.tell(crtp.encode(Packet(PORT_CORE, CHANNEL_LOOP, data)))
+            self._samples.clear()
+        for raw in self._client.packets.told():
+            self._hear(raw)
+
+    def radio_received(self, data: bytes, broadcast: bool = False) -> None:
+        """Hand a correction on, with the age that it has for this board; nothing else is for it."""
+        packet = crtp.decode(data)
+        if packet.port != crtp.PORT_LOCALISATION:
+            return
+        try:
+            pose = decode_ext_pose(packet.data)
+        except WireError:
+            self._client.packets.tell(data)
+            return
+        age_us = None if pose.age_us is None else pose.age_us + self.added_us
+        self._client.packets.tell(encode_ext_pose(pose.p_GB, pose.q_GB, age_us))
+
+    def radio_polled(self) -> None:
+        """Nothing: the board's own radio is polled."""
+
+    def uart_ready(self) -> None:
+        """Nothing: no serial line leads to the board."""
+
+    def check_watchdog(self) -> None:
+        """Raise `LinkError` when the board has told nothing for too long."""
+        if self.kernel.now_us - self._heard_us > SILENCE_US:
+            raise LinkError(f"{self._client.name}: silent for {SILENCE_US * 1e-6:.0f} s")
+
+    def add_thief(self) -> Thief:
+        """Refuse: there is no task here that could take processor time."""
+        raise LabError("--hil: the processor time of a real board cannot be taken")
+
+    def leave(self) -> None:
+        """Let the board go back to its own gyro."""
+        self._client.execute([loop(Hil.OFF)])
+
+    def _hear(self, raw: bytes) -> None:
+        packet = crtp.decode(raw)
+        if packet.port != PORT_CORE or packet.channel != CHANNEL_LOOP:
+            return
+        told = self.told = decode_looped(packet.data)
+        self._heard_us = self.kernel.now_us
+        supervisor = self.signals.supervisor
+        supervisor.state, supervisor.cause = State(told.state), Cause(told.cause)
+        counters = self.signals.counters
+        counters[COUNTERS.index("fused")] = told.fused
+        counters[COUNTERS.index("refused")] = told.refused
+        counters[COUNTERS.index("pose_age_us")] = told.age_us
+        self.signals.count[:] = told.counts
+        self._board.write_compare(told.counts)
+        if told.used:
+            self._measure(told)
+
+    def _measure(self, told: Looped) -> None:
+        """Take in how old the sample was from which these counts came, and keep as many waiting as the board wants."""
+        delay = (self._count - told.used) & 0xFFFF
+        self._delays.append((delay * SAMPLE_US, told.waiting * SAMPLE_US + BATCH_US))
+        total_us, waited_us = (sum(values) // len(self._delays) for values in zip(*self._delays, strict=True))
+        self.delay_us, self.added_us = total_us, max(0, total_us - waited_us) // 2
+        surplus_us = SLEW_US * (told.waiting - HIL_WAITING)
+        self._slew(max(-SLEW_MAX_US, min(SLEW_MAX_US, surplus_us)))

@@ -1,0 +1,71 @@
+"""A flight with a real board in the loop: the plant's clock follows the board's, everything else is as in lockstep.
+
+The board flies by its own tasks with the samples of the virtual IMU (`hil.devices.real_firmware`); cameras, ground station
+and the modelled radio with its faults are those of a flight in lockstep, behind which the corrections go to the board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import cast
+
+from ground_station.errors import LinkError
+from ground_station.links.core_client import CoreClient
+from hil.clock import Clock, Paced
+from hil.devices.real_core import is_link, open_real_core
+from hil.devices.real_firmware import RealBoard, RealFirmware
+from hil.errors import LabError
+from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import RADIO, ModelledLine
+from hil.laboratory.run import MakeFlight, Request
+
+HOLD_US = 2_000_000  # in the holder at least: the gyro's zero has to be found through the link
+
+
+def in_the_loop(moving: bool) -> MakeFlight:
+    """Return what puts such flights together; `moving`: the board's servos move as well."""
+
+    def flight_of(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
+        if not is_link(request.board) or request.link != RADIO:
+            raise LabError(
+                f"--hil: --board {request.board} --link {request.link}: expected the link to a real board as --board"
+            )
+        paced = Paced()
+        with ExitStack() as stack:
+            client = open_real_core(request.board, "--board", stack)
+            flight = flight_in_the_loop(request, client, paced, paced.shift, moving, telemetry)
+            stack.callback(_leave, flight)
+            flight.closing = stack.pop_all()
+        return flight
+
+    return flight_of
+
+
+def flight_in_the_loop(
+    request: Request, client: CoreClient, clock: Clock, slew: Callable[[int], None], moving: bool = False,
+    telemetry: Path | None = None,
+) -> Flight:  # fmt: skip
+    """Return a flight on the clock that `slew` moves. Raises `LabError` when there is no board."""
+
+    held = max(request.config.flight.release_us, HOLD_US)
+    start = request.config.flight.model_copy(update={"release_us": held})
+    config = request.config.model_copy(update={"flight": start})
+    try:
+        flight = Flight(
+            config, request.experiment, request.duration_s, request.seed, clock, True, False, request.faults,
+            RealBoard(client, moving, slew),
+        )  # fmt: skip
+    except LinkError as error:
+        raise LabError(f"--board {error}") from None
+    flight.line = ModelledLine(flight, RADIO, telemetry)
+    flight.plan(held)
+    flight.watch()
+    flight.events.at(0, lambda now_us: flight.note("board", str(flight.robot.firmware)))
+    return flight
+
+
+def _leave(flight: Flight) -> None:
+    with suppress(LinkError):  # it is gone already
+        cast(RealFirmware, flight.robot.firmware).leave()

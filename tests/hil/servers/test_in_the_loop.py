@@ -1,0 +1,342 @@
+"""A board flies with the host's gyro samples: the exported app and the laboratory on one time line, with a bad link."""
+
+from pathlib import Path
+
+import pytest
+
+from firmware_py.wire.core_port import (
+    CHANNEL_LOOP,
+    HIL_WAITING,
+    PORT_CORE,
+    SAMPLES_MAX,
+    Hil,
+    Looped,
+    decode_looped,
+    encode_samples,
+    loop,
+)
+from firmware_py.wire.crtp import encode_ext_pose
+from firmware_py.wire.supervisor import Cause, State
+from ground_station.errors import LinkError
+from ground_station.links import packets
+from ground_station.links.core_client import CoreClient
+from hil.clock import FreeRunning, Paced
+from hil.experiments import find_experiment
+from hil.laboratory.faults import parse
+from hil.laboratory.flight import Flight
+from hil.laboratory.recorder import load_log
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
+from hil.pictures.report import write_report
+from hil.servers.in_the_loop import flight_in_the_loop
+from support.app_air import AppAir
+from support.command import floaty
+from support.crazyflie_app import App, build_app
+
+URI = "udp://127.0.0.1:9"
+POSE = encode_ext_pose((0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 40_000)[1:]
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_app(tmp_path_factory.mktemp("app"))
+
+
+@pytest.fixture
+def app(library: Path, tmp_path: Path) -> App:
+    app = App(library, tmp_path / "copy.so")
+    app.boot()
+    return app
+
+
+# The board's end
+
+
+class Host:
+    """Sends samples to an app and steps it, a millisecond each."""
+
+    def __init__(self, app: App, mode: Hil = Hil.STILL) -> None:
+        self.app = app
+        self.step = 0
+        self.count = 0
+        self.looped: list[Looped] = []
+        self.client = CoreClient(AppAir(app), "app")
+        self.client.begin()
+        self.client.execute([loop(mode)])
+
+    def send(
+        self, sample: tuple[int, int, int] = (3, -2, 1), number: int | None = None, count: int = 1
+    ) -> None:
+        data = encode_samples(self.count if number is None else number, [sample] * count)
+        self.app.radio(data, PORT_CORE, CHANNEL_LOOP)
+        self.count += count if number is None else 0
+
+    def run(self, steps: int, *, sending: bool = True, poses: bool = False) -> None:
+        for _ in range(steps):
+            if sending:
+                self.send()
+            self.step += 1
+            if poses and self.step % 20 == 0:
+                self.app.radio(POSE)
+            self.app.step(self.step)
+            while packet := self.app.sent():
+                assert packet[0] == PORT_CORE << 4 | CHANNEL_LOOP
+                self.looped.append(decode_looped(packet[1:]))
+
+
+@pytest.fixture
+def host(app: App) -> Host:
+    return Host(app)
+
+
+def test_a_board_tells_its_state_and_counts_a_hundred_times_a_second(host: Host) -> None:
+    host.run(1000, poses=True)
+    assert len(host.looped) == 100
+    told = host.looped[-1]
+    assert (told.state, told.cause) == (State.FLYING, Cause.NONE)
+    assert told.counts == tuple(int(host.app.log(f"floaty.m{i}")) for i in (1, 2, 3, 4))
+    assert (told.late, told.lost, told.doubled) == (0, 0, 0)
+    assert (told.fused, told.age_us) == (
+        host.app.log("kalman.fused"),
+        1000 * host.app.log("locSrv.age") // 10,
+    )
+    assert told.fused > 0
+
+
+def test_samples_are_taken_one_a_step_when_enough_wait(host: Host) -> None:
+    host.run(100)
+    told = host.looped[-1]
+    assert told.used + told.waiting == host.count
+    assert told.waiting in (HIL_WAITING - 1, HIL_WAITING)
+
+
+def test_the_gyro_is_the_hosts_and_its_zero_is_found_anew(host: Host) -> None:
+    host.app.gyro[:] = (1000, 1000, 1000)
+    assert not host.app.supervisor.calibrated
+    host.run(560, poses=True)
+    assert host.app.supervisor.calibrated
+    assert host.looped[-1].state == State.FLYING
+    assert (
+        max(map(abs, (host.app.log(f"stateEstimate.{axis}_rate") for axis in ("roll", "pitch", "yaw"))))
+        < 0.01
+    )
+
+
+def test_servos_stay_at_hover_unless_they_are_to_move(library: Path, tmp_path: Path) -> None:
+    for mode in (Hil.STILL, Hil.MOVING):
+        app = App(library, tmp_path / f"{mode}.so")
+        app.boot()
+        hover = app.counts()
+        host = Host(app, mode)
+        host.run(1000, poses=True)
+        assert list(host.looped[-1].counts) != hover
+        assert app.counts() == (hover if mode == Hil.STILL else list(host.looped[-1].counts))
+
+
+def test_a_board_that_flies_is_not_taken_into_the_loop(app: App) -> None:
+    for step in range(1, 1001):
+        if step % 20 == 0:
+            app.radio(POSE)
+        app.step(step)
+    assert app.supervisor.state == State.FLYING
+    with pytest.raises(LinkError, match=r"^app: it flies"):
+        Host(app)
+    assert app.sent() == b""
+
+
+def test_a_step_without_a_sample_repeats_the_last_one_and_is_counted(host: Host) -> None:
+    host.run(100)
+    host.run(40, sending=False)
+    assert host.looped[-1].late in range(20, 40)
+    late = host.looped[-1].late
+    host.run(50)
+    assert host.looped[-1].late in (late, late + 1, late + 2)
+    assert host.looped[-1].waiting <= 1
+
+
+def test_a_gap_in_the_numbers_is_filled_and_what_comes_again_is_left_out(host: Host) -> None:
+    host.run(100)
+    host.count += 4
+    host.run(100)
+    assert host.looped[-1].lost == 4
+    host.send(number=host.count - 3, count=3)
+    host.run(10)
+    assert (host.looped[-1].lost, host.looped[-1].doubled) == (4, 3)
+    assert host.looped[-1].used + host.looped[-1].waiting == host.count
+
+
+def test_samples_beyond_the_buffer_are_lost_and_counted(host: Host) -> None:
+    host.run(100)
+    for _ in range(20):
+        host.send(count=SAMPLES_MAX)
+    host.run(200)
+    told = host.looped[-1]
+    assert 0 < told.lost <= 200
+    assert told.waiting <= 64
+    assert told.used + told.waiting in range(300, host.count)
+
+
+def test_a_host_that_stops_for_half_a_second_leads_to_the_failsafe_and_back(host: Host) -> None:
+    host.run(1000, poses=True)
+    before = len(host.looped)
+    host.run(520, sending=False)
+    assert (host.looped[-1].state, host.looped[-1].cause) == (State.FAILSAFE, Cause.SILENCE)
+    assert host.looped[-1].late >= 500 - HIL_WAITING
+    host.run(100, poses=True)
+    assert host.looped[-1].state == State.FLYING
+    assert len(host.looped) == before + 62
+
+
+def test_a_host_that_is_gone_for_a_second_gives_the_board_its_own_gyro_back(host: Host) -> None:
+    host.run(1000, poses=True)
+    hover = host.app.counts()
+    host.run(990 + HIL_WAITING, sending=False)
+    told = len(host.looped)
+    host.run(30, sending=False)
+    assert len(host.looped) <= told + 2
+    assert host.app.supervisor.state == State.CALIBRATING
+    assert host.app.counts() == hover
+    host.run(600, sending=False, poses=True)
+    assert host.app.supervisor.state == State.FLYING
+
+
+def test_a_board_that_is_asked_into_the_loop_and_gets_no_sample_leaves_it(host: Host) -> None:
+    host.run(1005, sending=False)
+    told = len(host.looped)
+    assert told in (100, 101)
+    host.run(100, sending=False)
+    assert len(host.looped) == told
+
+
+# Flights
+
+
+def flown(
+    folder: Path, app: App, duration_s: float, faults: tuple[str, ...] = (), **link: float
+) -> tuple[Result, AppAir]:
+    air = AppAir(app, **link)
+
+    def flight_of(request: Request, telemetry: Path, clock: object, trace_all: bool) -> Flight:
+        client = CoreClient(air, "app")
+        flight = flight_in_the_loop(request, client, FreeRunning(), air.slew, telemetry=telemetry)
+        air.join(flight.events)
+        return flight
+
+    prepare(folder)
+    request = Request.of(
+        find_experiment("hover"), duration_s=duration_s, board=URI, faults=tuple(map(parse, faults))
+    )
+    return fly(request, folder, flight_of=flight_of), air
+
+
+def test_a_flight_in_the_loop_holds_all_limits_and_tells_the_loops_delay(app: App, tmp_path: Path) -> None:
+    result, _ = flown(tmp_path / "run", app, 2.0, delay_us=3000)
+    assert result.passed
+    metrics = result.metrics
+    assert metrics["failsafe"] == metrics["samples_late"] == metrics["samples_lost"] == 0
+    assert metrics["loop_delay"] == pytest.approx((HIL_WAITING + 2 * 3) * 1e-3, abs=2e-3)
+    assert metrics["loop_added"] == pytest.approx(3e-3, abs=1e-3)
+    assert metrics["age_mean"] == pytest.approx(41e-3 + metrics["loop_added"], abs=1e-3)
+    log = load_log(tmp_path / "run")
+    assert max(log["motor.m1"].to_pylist()) > 34_000
+    assert not {"rtos.measurements_dropped", "late.KALMAN"} & set(log.column_names)
+    page = write_report(tmp_path / "run").read_text(encoding="utf-8")
+    assert "loop_delay" in page
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "link",
+    [
+        {"delay_us": 3000}, {"delay_us": 8000}, {"delay_us": 3000, "jitter_us": 5000, "loss": 0.1},
+        {"delay_us": 3000, "loss": 0.2},
+    ],
+    ids=["radio", "slow", "10 %", "20 %"],
+)  # fmt: skip
+def test_hover_holds_all_limits_in_the_loop_for_twenty_seconds(
+    app: App, tmp_path: Path, link: dict[str, float]
+) -> None:
+    result, _ = flown(tmp_path / "run", app, 20.0, **link)
+    assert result.passed
+    assert result.metrics["failsafe"] == 0
+    assert (result.metrics["samples_lost"] > 500) == (link.get("loss", 0.0) > 0)
+
+
+@pytest.mark.long
+def test_a_loop_that_is_too_slow_for_the_hover_neither_falls_nor_hides_it(app: App, tmp_path: Path) -> None:
+    result, _ = flown(tmp_path / "run", app, 20.0, delay_us=3000, jitter_us=5000, loss=0.3)
+    metrics = result.metrics
+    assert (result.outcome, metrics["failsafe"]) == ("completed", 0)
+    assert metrics["loop_delay"] > 0.027
+    assert metrics["samples_lost"] > 5000
+    assert metrics["attitude_max"] < 0.35
+
+
+def test_faults_of_plant_and_cameras_act_in_the_loop(app: App, tmp_path: Path) -> None:
+    result, _ = flown(tmp_path / "run", app, 2.0, ("mocap.dropout@0.5:0.8", "push.y@0.2=0.5"))
+    assert result.metrics["failsafe"] == pytest.approx(0.3, abs=0.1)
+    assert result.metrics["max_y"] > 0.01
+
+
+def test_a_board_that_dies_in_the_loop_ends_the_flight_in_one_line(app: App, tmp_path: Path) -> None:
+    air = AppAir(app)
+
+    def flight_of(request: Request, telemetry: Path, clock: object, trace_all: bool) -> Flight:
+        flight = flight_in_the_loop(request, CoreClient(air, "app"), FreeRunning(), air.slew)
+        air.join(flight.events)
+        flight.events.at(2_500_000, lambda now_us: setattr(air, "dead", True))
+        return flight
+
+    prepare(tmp_path / "run")
+    request = Request.of(find_experiment("hover"), duration_s=10.0, board=URI)
+    result = fly(request, tmp_path / "run", flight_of=flight_of)
+    assert (result.outcome, result.cause) == ("error", "board app: silent for 1 s")
+    assert load_log(tmp_path / "run").num_rows in range(340, 360)
+
+
+@pytest.mark.parametrize(("drift", "slower"), [(2e-3, True), (-2e-3, False)])
+def test_the_plants_clock_follows_the_boards(app: App, tmp_path: Path, drift: float, slower: bool) -> None:
+    air = AppAir(app, drift=drift)
+    request = Request.of(find_experiment("hover"), duration_s=4.0, board=URI)
+    flight = flight_in_the_loop(request, CoreClient(air, "app"), FreeRunning(), air.slew)
+    air.join(flight.events)
+    flight.run()
+    assert (sum(air.slewed[-100:]) > 0) == slower
+    assert max(map(abs, air.slewed)) <= 200
+
+
+def test_a_paced_clock_can_be_moved() -> None:
+    clock = Paced()
+    clock.shift(1000)
+    clock.start(0)
+    ahead_us = clock.ahead_us(500_000)
+    clock.shift(300_000)
+    assert clock.ahead_us(500_000) > ahead_us + 200_000
+
+
+def test_processor_time_of_a_real_board_cannot_be_taken(app: App) -> None:
+    request = Request.of(find_experiment("overload"), duration_s=1.0, board=URI)
+    with pytest.raises(Exception, match="the processor time of a real board cannot be taken"):
+        flight_in_the_loop(request, CoreClient(AppAir(app), "app"), FreeRunning(), lambda us: None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--hil",), "--hil: --board python --link radio: expected the link to a real board as --board"),
+        (("--hil", "--board", URI, "--link", "mavlink"), "expected the link to a real board as --board"),
+        (("--hil", "shaking", "--board", URI), "--hil shaking: expected --hil or --hil moving"),
+        (("--hil", "--board", URI, "--seeds", "2"), "--seeds 2: a real board is in one flight at a time"),
+        (("--hil", "--board", URI), f"--board {URI}: silent for 3 s"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_in_the_loop_is_refused_in_one_line(
+    app: App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...], said: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    air = AppAir(app)
+    air.silent = True
+    monkeypatch.setattr(packets, "CflibPackets", lambda uri: air)
+    assert floaty(monkeypatch, "fly", "hover", *arguments) == 2
+    assert said in capsys.readouterr().err
