@@ -52,6 +52,7 @@ class Translation:
     header: str
     source: str
     functions: tuple[str, ...]
+    version: str = ""  # hash of the Python sources
 
 
 def core_texts() -> dict[str, str]:
@@ -82,7 +83,8 @@ def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = N
     used = {id(constant) for printer in printers.values() for constant in printer.constants}
     version = hashlib.sha256("\0".join(texts[module.name] for module in modules).encode()).hexdigest()[:12]
     header = _header(modules, [printers[kernel.c_name] for kernel in public], version)
-    return Translation(header, _source(modules, printed, used), tuple(kernel.c_name for kernel in kernels))
+    names = tuple(kernel.c_name for kernel in kernels)
+    return Translation(header, _source(modules, printed, used), names, version)
 
 
 def _tell_constants_apart(modules: list[Module]) -> None:

@@ -14,6 +14,8 @@ Each begins with HEAD: the kind, the session, and the number of the request in i
             <- bytes
     LOOP    -> MODE                  hardware in the loop: a mode from the next millisecond on
             <-
+    HEALTH  ->
+            <- HEALTH                how the board is; in flight as well
     (any)   <- REFUSED               with a reason
 
 A board executes the requests of a session in the order of their numbers, from 0 on, and each once. A number above the next
@@ -55,6 +57,7 @@ class Kind(IntEnum):
     READ = 3
     REFUSED = 4
     LOOP = 5
+    HEALTH = 6
 
 
 class Refusal(IntEnum):
@@ -114,6 +117,13 @@ CALLED = Layout("Called", (
     ("digest", "I"),  # CRC-32 of the whole memory afterwards, as zlib.crc32
 ))  # fmt: skip
 WHY = Layout("Why", (("reason", "B"),))
+HEALTH = Layout("Health", (
+    ("gyro_x", "h"), ("gyro_y", "h"), ("gyro_z", "h"),  # [counts] now, of the board's own gyro
+    ("calibrated", "B"),  # 1: the gyro's zero is known
+    ("battery_mv", "H"),
+    ("heap_free", "I"),  # [B] of RAM
+    ("m1", "H"), ("m2", "H"), ("m3", "H"), ("m4", "H"),  # timer counts of the servos
+))  # fmt: skip
 MODE = Layout("Mode", (("mode", "B"),))
 SAMPLES = Layout("Samples", (("number", "H"),))  # of the first sample
 SAMPLE = Layout("Sample", (("x", "h"), ("y", "h"), ("z", "h")))  # [counts] of the gyro, sensor frame
@@ -127,9 +137,9 @@ LOOP = Layout("Loop", (
     ("fused", "H"), ("refused", "H"),  # poses
     ("age", "H"),  # [0.1 ms] of the last one
 ))  # fmt: skip
-LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY, MODE, SAMPLES, SAMPLE, LOOP)
+LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY, HEALTH, MODE, SAMPLES, SAMPLE, LOOP)
 
-_HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _MODE, _SAMPLES, _SAMPLE, _LOOP = (
+_HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _HEALTH, _MODE, _SAMPLES, _SAMPLE, _LOOP = (
     layout.struct for layout in LAYOUTS
 )
 WRITE_MAX = MAX_DATA - _HEAD.size - _PLACE.size  # bytes in a packet
@@ -159,6 +169,17 @@ class Called:
 
 
 @dataclass(frozen=True, slots=True)
+class Health:
+    """How a board is."""
+
+    gyro: tuple[int, ...]  # [counts] sensor frame
+    calibrated: bool
+    battery_mv: int
+    heap_free: int  # [B]
+    counts: tuple[int, int, int, int]  # of the servos
+
+
+@dataclass(frozen=True, slots=True)
 class CoreAnswer:
     """An answer; `body` is what follows its head."""
 
@@ -176,6 +197,11 @@ class CoreAnswer:
     def called(self) -> Called:
         """Read the answer to CALL."""
         return Called(*_unpack(_CALLED, self.body))
+
+    def health(self) -> "Health":
+        """Read the answer to HEALTH."""
+        *gyro, calibrated, battery_mv, heap_free, m1, m2, m3, m4 = _unpack(_HEALTH, self.body)
+        return Health(tuple(gyro), bool(calibrated), battery_mv, heap_free, (m1, m2, m3, m4))
 
     def refusal(self) -> int:
         """Read why."""
@@ -200,6 +226,11 @@ def call(entry: Call) -> tuple[Kind, bytes]:
 def read(offset: int, size: int) -> tuple[Kind, bytes]:
     """Read up to `READ_MAX` bytes."""
     return Kind.READ, _PLACE_SIZE.pack(offset, size)
+
+
+def health() -> tuple[Kind, bytes]:
+    """Ask how the board is."""
+    return Kind.HEALTH, b""
 
 
 def loop(mode: Hil) -> tuple[Kind, bytes]:

@@ -10,7 +10,7 @@ import click
 from firmware_py.fast import STALE, STATE
 from hil.commands.campaign import campaign
 from hil.commands.compare import compare
-from hil.commands.deploy import deploy
+from hil.commands.deploy import board, deploy
 from hil.commands.design import design
 from hil.commands.fly import fly
 from hil.commands.identify import identify, tune
@@ -36,7 +36,7 @@ def app() -> None:
 for command in (
     fly, new, list_experiments, view, report, export, serve, station, param, compare, paper, study, identify, tune,
     drag_model, design,
-    campaign, deploy,
+    campaign, deploy, board,
 ):  # fmt: skip
     app.add_command(command)
 

@@ -1,16 +1,19 @@
-"""`floaty deploy export | check | flash`: the flight core as C for a Crazyflie, proof that it is the one that flew."""
+"""`floaty deploy export | check | flash`: the flight core as C for a Crazyflie, proof that it is the one that flew.
+
+And `floaty board doctor`: what is connected, in a minute.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
 
-from hil.commands.options import INTERRUPTED, announce_compilation, notices, profile_option, set_option
+from hil.commands.options import INTERRUPTED, announce_compilation, notices, profile_option, say, set_option
 from hil.errors import LabError
 
 if TYPE_CHECKING:
@@ -226,3 +229,35 @@ def flash(image: Path, uri: str) -> None:
         except LinkError as error:
             raise LabError(f"{image}: {error}") from None
     console.print(f"{len(content)} bytes written and read back; the board starts")
+
+
+@click.group()
+def board() -> None:
+    """Look at a real board."""
+
+
+@board.command()
+@click.argument("link", metavar="LINK")
+@profile_option
+@set_option
+def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
+    """Say what is at LINK (radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT), and whether it is as it should be.
+
+    The board must not fly, and nothing moves. Exit code 0: all is well; 1: something is not; 2: nobody answers.
+    """
+    from ground_station.errors import LinkError
+    from hil.config import load_config
+    from hil.deploy.doctor import examine
+    from hil.devices.real_core import open_real_core
+
+    config = load_config(profile, overrides)
+    well = True
+    with ExitStack() as stack:
+        client = open_real_core(link, "LINK", stack)
+        try:
+            for finding in examine(client, config):
+                say(f"{'  ' if finding.good else '! '}{finding.subject:<10}{finding.text}")
+                well = well and finding.good
+        except LinkError as error:
+            raise LabError(str(error)) from None
+    return 0 if well else 1

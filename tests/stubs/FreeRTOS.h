@@ -6,6 +6,7 @@ typedef long BaseType_t;
 typedef unsigned long UBaseType_t;
 typedef uint32_t TickType_t;
 typedef uint32_t StackType_t;
+size_t xPortGetFreeHeapSize(void);
 #define pdFALSE ((BaseType_t)0)
 #define pdTRUE ((BaseType_t)1)
 #define M2T(X) ((unsigned int)(X))

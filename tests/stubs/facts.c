@@ -41,6 +41,7 @@
 
 /* FreeRTOS.h, queue.h, task.h */
 _Static_assert(SAME(BaseType_t, long) && SAME(UBaseType_t, unsigned long) && SAME(TickType_t, uint32_t), "FreeRTOS");
+FUNCTION(xPortGetFreeHeapSize, size_t, void)
 VALUE(pdFALSE, 0)
 VALUE(pdTRUE, 1)
 TYPE(M2T(20), unsigned)

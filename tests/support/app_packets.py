@@ -16,6 +16,7 @@ class AppPackets:
         self.mess = mess
         self.silent = False
         self.closed = 0
+        self.services: list[bytes] = []  # what the firmware around the app would say
         self._rng = np.random.default_rng(1)
         self._up: deque[bytes] = deque()
         self._down: deque[bytes] = deque()
@@ -30,6 +31,12 @@ class AppPackets:
 
     def receive(self, timeout_s: float) -> bytes | None:
         return self._down.popleft() if self._down and not self.silent else None
+
+    def tell(self, packet: bytes) -> None:
+        self.app.radio(packet[1:], packet[0] >> 4, packet[0] & 3)
+
+    def told(self) -> list[bytes]:
+        return self.services
 
     def close(self) -> None:
         self.closed += 1

@@ -149,6 +149,12 @@ static void hand_pose_to_core(FloatyPose *pose, stabilizerStep_t step) {
   }
 }
 
+void floaty_gyro(int32_t counts[3]) {
+  for (int axis = 0; axis < 3; axis++) {
+    counts[axis] = gyro_found ? logGetInt(gyro_raw[axis]) : 0;
+  }
+}
+
 static void take_measurements(stabilizerStep_t step) {
   measurement_t measurement;
   FloatyPose pose;
@@ -157,9 +163,7 @@ static void take_measurements(stabilizerStep_t step) {
   while (estimatorDequeue(&measurement)) {
     /* Gyro and accelerometer as the firmware filters them, and whatever a deck measures: not needed here. */
   }
-  for (int axis = 0; axis < 3; axis++) {
-    counts[axis] = logGetInt(gyro_raw[axis]);
-  }
+  floaty_gyro(counts);
   floaty_hil_sample(counts);
   for (int axis = 0; axis < 3; axis++) {
     floaty_input.gyro_sum[axis] += counts[axis];

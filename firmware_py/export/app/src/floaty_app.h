@@ -43,6 +43,9 @@ extern FloatyRequests floaty_requests;
 /* floaty_app.c: sets the core up and lets the servos pulse, at hover. The first call of all. */
 void floaty_begin(void);
 
+/* floaty_app.c: the raw counts of the board's own gyro, zero where there is none that is known. */
+void floaty_gyro(int32_t counts[3]);
+
 /* floaty_app.c: hands a pose to the stabilizer task; when the queue is full the oldest one goes. */
 void floaty_queue_pose(const FloatyPose *pose);
 

@@ -11,6 +11,7 @@
 #include "task.h"
 
 #include "crtp.h"
+#include "pm.h"
 #include "stm32fxxx.h"
 
 #include "floaty_calls.h"
@@ -130,6 +131,25 @@ static int loop(const uint8_t *data, uint32_t length, bool is_new) {
   return 0;
 }
 
+static int health(uint8_t *body) {
+  int32_t gyro[3];
+  floaty_gyro(gyro);
+  const FloatyWireHealth answer = {
+      .gyro_x = (int16_t)gyro[0],
+      .gyro_y = (int16_t)gyro[1],
+      .gyro_z = (int16_t)gyro[2],
+      .calibrated = floaty_supervisor.calibrated,
+      .battery_mv = (uint16_t)(1000.0f * pmGetBatteryVoltage()),
+      .heap_free = (uint32_t)xPortGetFreeHeapSize(),
+      .m1 = (uint16_t)floaty_control.count[0],
+      .m2 = (uint16_t)floaty_control.count[1],
+      .m3 = (uint16_t)floaty_control.count[2],
+      .m4 = (uint16_t)floaty_control.count[3],
+  };
+  memcpy(body, &answer, sizeof answer);
+  return sizeof answer;
+}
+
 static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t length, uint8_t *body) {
   const int16_t ahead = (int16_t)(head->number - done);
   const bool is_new = ahead == 0;
@@ -140,7 +160,8 @@ static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t lengt
   if (head->session != session || session == 0) {
     return REFUSED(NO_SESSION);
   }
-  if (floaty_supervisor.state == FLOATY_FLYING && floaty_hil_mode() == FLOATY_HIL_OFF) {
+  if (floaty_supervisor.state == FLOATY_FLYING && floaty_hil_mode() == FLOATY_HIL_OFF &&
+      head->kind != FLOATY_KIND_HEALTH) {
     return REFUSED(FLYING);
   }
   if (ahead > 0) {
@@ -149,6 +170,7 @@ static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t lengt
   switch (head->kind) {
     case FLOATY_KIND_WRITE: size = write_memory(data, length, is_new); break;
     case FLOATY_KIND_READ: size = read_memory(data, length, body); break;
+    case FLOATY_KIND_HEALTH: size = health(body); break;
     case FLOATY_KIND_LOOP: size = loop(data, length, is_new); break;
     case FLOATY_KIND_CALL: size = call(data, length, head->number, is_new, body); break;
     default: return REFUSED(OUTSIDE);

@@ -1,0 +1,148 @@
+"""What is connected, in plain words: firmware, app, link, memory, core, IMU and servos of a real board.
+
+Nothing moves, nothing is left behind: the core that is tried has memory of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from firmware_py.config import parameters_of
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.export.profile_c import profile_hash
+from firmware_py.logic.loading import load_logic, translation_of
+from firmware_py.wire import crtp
+from firmware_py.wire.core_port import READ_MAX, WRITE_MAX, About, health, read, write
+from firmware_py.wire.platform import PLATFORM_VERSION, VERSION_FIRMWARE
+from firmware_py.wire.supervisor import State
+from ground_station.clock import clock_us, wait
+from ground_station.errors import LinkError
+from ground_station.links.core_client import CoreClient
+from hil.config import LabConfig
+from hil.devices.real_core import RealCore
+
+ROUND_TRIPS = 100
+BURST = 600  # packets
+LOOKS = 60  # at the gyro, with as many different samples
+TICKS = 20  # of the core
+VERSION_TIMEOUT_S = 1.0
+STILL_COUNTS = 100.0  # standard deviation; that of the board's own search for the zero
+ZERO_MAX = 100.0  # [counts] 6 deg/s: the data sheet allows 1 deg/s
+PULSE_COUNTS = (21_000, 42_000)
+BATTERY_MV = (3_000, 4_350)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line: what was looked at, what was found, and whether that is as it should be."""
+
+    subject: str
+    text: str
+    good: bool = True
+
+
+def examine(client: CoreClient, config: LabConfig) -> Iterator[Finding]:
+    """Yield what is found. Raises `LinkError` when the board does not answer, or flies."""
+    about = client.begin()
+    yield _firmware(client)
+    yield from _app(about, config)
+    yield _link(client)
+    yield _memory(client, about.size)
+    yield from _health(client)
+    yield _core(client, about, config)
+
+
+def _firmware(client: CoreClient) -> Finding:
+    """Ask the stock firmware's platform service."""
+    ask = bytes((VERSION_FIRMWARE,))
+    client.packets.tell(crtp.encode(crtp.Packet(crtp.PORT_PLATFORM, PLATFORM_VERSION, ask)))
+    end_us = clock_us() + round(VERSION_TIMEOUT_S * 1e6)
+    while clock_us() < end_us:
+        for packet in map(crtp.decode, client.packets.told()):
+            if (packet.port, packet.channel, packet.data[:1]) == (crtp.PORT_PLATFORM, PLATFORM_VERSION, ask):
+                return Finding("firmware", packet.data[1:].rstrip(b"\0").decode("ascii", "replace"))
+        wait(0.005)
+    return Finding("firmware", "does not tell its version", good=False)
+
+
+def _app(about: About, config: LabConfig) -> Iterator[Finding]:
+    here, profile = translation_of(config.logic).version, profile_hash(config)
+    same = here.startswith(about.core)
+    yield Finding(
+        "core", f"{about.core}, {'as here' if same else f'{here[: len(about.core)]} here: export and flash it again'}", same
+    )  # fmt: skip
+    same = profile.startswith(about.profile)
+    yield Finding(
+        "profile", f"{about.profile}, {'as here' if same else f'{profile[: len(about.profile)]} here'}", same
+    )
+    yield Finding("state", State(about.state).name.lower())
+
+
+def _link(client: CoreClient) -> Finding:
+    trips_us = []
+    for _ in range(ROUND_TRIPS):
+        start_us = clock_us()
+        client.execute([read(0, READ_MAX)])
+        trips_us.append(clock_us() - start_us)
+    repeated, start_us = client.repeated, clock_us()
+    client.execute([read(0, READ_MAX)] * BURST)
+    rate = BURST / max(1, clock_us() - start_us) * 1e6
+    trip = f"round trip {median(trips_us) / 1000:.1f} ms, the longest {max(trips_us) / 1000:.1f}"
+    again = f"{client.repeated - repeated} of {BURST} repeated"
+    return Finding("link", f"{trip}; {rate:.0f} packets/s each way, {again}")
+
+
+def _memory(client: CoreClient, size: int) -> Finding:
+    pattern = np.arange(size, dtype=np.uint32) * 2654435761 >> 13
+    data = pattern.astype(np.uint8).tobytes()
+    client.execute([write(at, data[at : at + WRITE_MAX]) for at in range(0, size, WRITE_MAX)])
+    wrong = sum(one != other for one, other in zip(client.memory(size), data, strict=True))
+    return Finding("memory", f"{size} B written and read back, {wrong} of them wrong", wrong == 0)
+
+
+def _health(client: CoreClient) -> Iterator[Finding]:
+    looks = [client.execute([health()])[0].health() for _ in range(LOOKS)]
+    last = looks[-1]
+    low, high = BATTERY_MV
+    yield Finding("battery", f"{last.battery_mv / 1000:.2f} V", low <= last.battery_mv <= high)
+    yield Finding("RAM", f"{last.heap_free} B free")
+    counts = np.array([look.gyro for look in looks], float)
+    zero, noise = counts.mean(axis=0), counts.std(axis=0)
+    known = "" if last.calibrated else ", zero not found yet"
+    told = f"zero at {zero[0]:.0f} {zero[1]:.0f} {zero[2]:.0f} counts, noise {noise.max():.1f}{known}"
+    if not noise.any():
+        yield Finding("gyro", f"dead or frozen: {LOOKS} times the same counts", good=False)
+    elif noise.max() > STILL_COUNTS:
+        yield Finding("gyro", f"alive; the board moves: {told}")
+    else:
+        yield Finding("gyro", f"alive: {told}", bool(abs(zero).max() <= ZERO_MAX))
+    fit = all(PULSE_COUNTS[0] <= count <= PULSE_COUNTS[1] for count in last.counts)
+    yield Finding("servos", f"pulses of {' '.join(f'{count / 21:.0f}' for count in last.counts)} us", fit)
+
+
+def _core(client: CoreClient, about: About, config: LabConfig) -> Finding:
+    """Have some ticks computed there and here."""
+    try:
+        blocks = CoreBlocks(
+            parameters_of(config), lambda blocks: RealCore(blocks, client), load_logic(config.logic)
+        )
+    except LinkError as error:
+        return Finding("computes", str(error).removeprefix(f"{client.name}: "), good=False)
+    core = blocks.run
+    assert isinstance(core, RealCore)
+    core.reset()
+    for _ in range(TICKS):
+        core.estimate()
+        core.control()
+    cycles = core.load["estimate"].cycles // TICKS, core.load["control"].cycles // TICKS
+    times = f"estimate {cycles[0]} cycles, control {cycles[1]}, at {about.clock_mhz} MHz"
+    verdict = (
+        "the same bits as here"
+        if core.unexpected == 0
+        else f"OTHER bits than here in {core.unexpected} calls"
+    )
+    return Finding("computes", f"{verdict}; {times}", core.unexpected == 0)

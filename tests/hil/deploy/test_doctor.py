@@ -1,0 +1,151 @@
+"""`floaty board doctor`: what is connected, in plain words, on the exported app."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from firmware_py.wire.supervisor import State
+from ground_station.links import packets
+from support.app_packets import AppPackets
+from support.command import floaty
+from support.crazyflie_app import App, build_app
+
+URI = "udp://127.0.0.1:9"
+VERSION = b"\xd1\x012026.08 +2"  # as the platform service of the stock firmware answers
+
+
+class Board(AppPackets):
+    """An app with a still gyro and a firmware around it."""
+
+    def __init__(self, app: App) -> None:
+        super().__init__(app)
+        self.noise, self.zero = 3.0, 8.0
+        self.services = [VERSION]
+
+    def send(self, data: bytes) -> None:
+        self.app.gyro[:] = [int(count) for count in self._rng.normal(self.zero, self.noise, 3)]
+        super().send(data)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_app(tmp_path_factory.mktemp("app"))
+
+
+@pytest.fixture
+def board(library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Board:
+    app = App(library, tmp_path / "copy.so")
+    app.boot()
+    board = Board(app)
+    monkeypatch.setattr(packets, "CflibPackets", lambda uri: board)
+    return board
+
+
+def findings(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+    lines = capsys.readouterr().out.splitlines()
+    return {line[2:12].strip(): line[:2].strip() + line[12:] for line in lines}
+
+
+def test_a_board_that_is_well_is_described_and_left_as_it_was(
+    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flies = board.app.estimator()
+    board.app.cycles.value = 5000
+    assert floaty(monkeypatch, "board", "doctor", URI) == 0
+    found = findings(capsys)
+    subjects = "firmware core profile state link memory battery RAM gyro servos computes"
+    assert " ".join(found) == subjects
+    assert found["firmware"] == "2026.08 +2"
+    assert found["core"].endswith("as here")
+    assert found["profile"].endswith("as here")
+    assert found["state"] == "calibrating"
+    assert "packets/s each way, 0 of 600 repeated" in found["link"]
+    assert found["memory"] == "4868 B written and read back, 0 of them wrong"
+    assert (found["battery"], found["RAM"]) == ("3.90 V", "7000 B free")
+    assert found["gyro"].startswith("alive: zero at ")
+    assert (
+        found["servos"]
+        == "pulses of " + " ".join(f"{count / 21:.0f}" for count in board.app.counts()) + " us"
+    )
+    assert found["computes"] == "the same bits as here; estimate 5000 cycles, control 5000, at 168 MHz"
+    assert board.app.estimator() == flies
+    assert board.closed == 1
+
+
+def freeze(board: Board) -> None:
+    board.noise = 0.0
+
+
+def shake(board: Board) -> None:
+    board.noise = 500.0
+
+
+def displace(board: Board) -> None:
+    board.zero = 300.0
+
+
+def discharge(board: Board) -> None:
+    board.app.battery.value = 2.9
+
+
+def forget(board: Board) -> None:
+    board.services = []
+
+
+@pytest.mark.parametrize(
+    ("ail", "subject", "said"),
+    [
+        (freeze, "gyro", "!dead or frozen: 60 times the same counts"),
+        (displace, "gyro", "!alive: zero at 300"),
+        (discharge, "battery", "!2.90 V"),
+        (forget, "firmware", "!does not tell its version"),
+    ],
+)  # fmt: skip
+def test_what_is_not_well_is_marked_and_is_exit_code_one(
+    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    ail: Callable[[Board], None], subject: str, said: str,
+) -> None:  # fmt: skip
+    ail(board)
+    monkeypatch.setattr("hil.deploy.doctor.VERSION_TIMEOUT_S", 0.02)
+    assert floaty(monkeypatch, "board", "doctor", URI) == 1
+    found = findings(capsys)
+    assert found[subject].startswith(said)
+    assert [text for text in found.values() if text.startswith("!")] == [found[subject]]
+
+
+def test_a_board_in_someones_hand_moves_and_is_well(
+    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shake(board)
+    assert floaty(monkeypatch, "board", "doctor", URI) == 0
+    assert findings(capsys)["gyro"].startswith("alive; the board moves")
+
+
+def test_another_profile_than_here_is_told(
+    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "board", "doctor", URI, "--profile", "as-flown") == 1
+    assert findings(capsys)["profile"].startswith("!1a557b31, ")
+
+
+@pytest.mark.long
+def test_a_core_that_computes_otherwise_is_found(
+    tmp_path: Path, board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant = ("floaty_core.c", "control->count[flap] =", "control->count[flap] = 1 ^")
+    board.app = App(build_app(tmp_path / "app", plant=plant), tmp_path / "other.so")
+    board.app.boot()
+    assert floaty(monkeypatch, "board", "doctor", URI) == 1
+    assert findings(capsys)["computes"].startswith("!OTHER bits than here in 20 calls")
+
+
+@pytest.mark.parametrize(
+    ("state", "silent", "said"), [(State.FLYING, False, "it flies"), (0, True, "silent for 3 s")]
+)
+def test_a_board_that_flies_or_says_nothing_is_left_alone_in_one_line(
+    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], state: int, silent: bool, said: str,
+) -> None:  # fmt: skip
+    board.app.supervisor.state, board.silent = state, silent
+    assert floaty(monkeypatch, "board", "doctor", URI) == 2
+    assert f"floaty: {URI}: {said}" in capsys.readouterr().err
