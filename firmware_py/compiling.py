@@ -12,8 +12,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numba
 import numpy as np
+
+# Numba would load the BLAS of scipy, which takes longer than all the rest of it; nothing that is compiled here uses one.
+if hide_scipy := "scipy" not in sys.modules:
+    sys.modules["scipy"] = None  # type: ignore[assignment] # an import fails
+import numba
+import numba.np.arraymath  # which looks for it, when the first function is compiled or loaded
+
+if hide_scipy:
+    del sys.modules["scipy"]
 
 PLAIN = bool(getattr(numba.config, "DISABLE_JIT"))  # noqa: B009 - set by numba at run time
 

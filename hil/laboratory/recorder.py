@@ -7,10 +7,13 @@ metadata; the schema carries configuration, seed, versions and commit. `load_log
 
 import hashlib
 import json
+import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import IO, Any, Protocol
 
 import numpy as np
@@ -21,6 +24,15 @@ from numpy.typing import NDArray
 
 from hil.errors import LabError
 from hil.laboratory.ages import at_exposure
+
+if "pandas" not in sys.modules:
+    # The first array imports pandas, to know its types, which takes a second or so, in mid-flight. Shown one that it takes
+    # for too old, Arrow does without, until somebody calls `to_pandas`.
+    sys.modules["pandas"] = ModuleType("pandas")
+    sys.modules["pandas"].__version__ = "0"  # type: ignore[attr-defined]
+    with warnings.catch_warnings(action="ignore"):
+        pa.array([()])
+    del sys.modules["pandas"]
 
 ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to disk
 ROWS_SHOWN = 20  # together, to who looks on: five times a second
@@ -156,12 +168,7 @@ class Recorder:
         return columns
 
     def _batch(self, columns: list[NDArray[Any]]) -> pa.RecordBatch:
-        return pa.record_batch([_array(values) for values in columns], schema=self._schema)
-
-
-def _array(values: NDArray[Any]) -> pa.Array:
-    """Return an array of Arrow over values; not by `pa.array`, which imports pandas, in mid-flight, for seconds."""
-    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
+        return pa.RecordBatch.from_arrays([pa.array(values) for values in columns], schema=self._schema)
 
 
 def finish_log(
