@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,9 @@ from hil.commands.options import (
     close_live,
     console,
     fault_option,
+    gdb_option,
     notices,
+    open_debugger,
     open_live,
     profile_option,
     seed_option,
@@ -62,6 +65,7 @@ SEEDS_MAX = 10_000
     metavar="FILE",
     help="With a .bin as --board: the ELF that it was made of.",
 )
+@gdb_option
 @click.option(
     "--hil", "in_loop", is_flag=False, flag_value="still", metavar="[moving]",
     help="Let the board of --board fly by its own tasks and clock, with the gyro samples of the virtual IMU; its servos "
@@ -85,6 +89,7 @@ def fly(
     board: str,
     elf: Path | None,
     in_loop: str | None,
+    gdb: int | None,
     out: Path | None,
 ) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
@@ -110,6 +115,8 @@ def fly(
         Request.of(chosen, profile, overrides, seed + index, duration, link, faults, board, elf)
         for index in range(seeds)
     ]
+    if gdb is not None and (seeds > 1 or not requests[0].is_image):
+        raise LabError(f"--gdb {gdb}: goes with one flight of an image as --board")
     announce_compilation()
     if seeds > 1 and not requests[0].in_lockstep:
         raise LabError(f"--link {link}: --seeds is for flights in lockstep")
@@ -118,22 +125,29 @@ def fly(
     if seeds > 1:
         return _fly_many(requests, out or Path("runs"))
     folder = out or Path("runs") / f"{chosen.name}-{seed}"
-    return _fly_one(requests[0], folder, realtime, target, perfetto, in_loop)
+    return _fly_one(requests[0], folder, realtime, target, perfetto, in_loop, gdb)
 
 
 def _fly_one(
-    request: Request, folder: Path, realtime: bool, target: str | None, perfetto: bool, in_loop: str | None
+    request: Request,
+    folder: Path,
+    realtime: bool,
+    target: str | None,
+    perfetto: bool,
+    in_loop: str | None,
+    gdb: int | None,
 ) -> int:
     """Fly one seed with all its pictures; returns the exit code."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from hil.clock import FreeRunning, Paced
-    from hil.laboratory.run import fly, prepare
+    from hil.laboratory.run import fly, lockstep, prepare
     from hil.servers.in_the_loop import in_the_loop
     from hil.servers.linked import linked_flight
 
     view = open_live(target)
     prepare(folder)
+    debugger = open_debugger(gdb, request.elf or Path(request.board))
     clock = Paced() if realtime else FreeRunning()
     columns = (
         TextColumn("{task.description}"),
@@ -147,7 +161,9 @@ def _fly_one(
         def show(now_us: int, flight: Flight) -> None:
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
-        make = in_the_loop(in_loop == "moving") if in_loop else None if request.in_lockstep else linked_flight
+        make = partial(lockstep, debugger=debugger) if request.in_lockstep else linked_flight
+        if in_loop:
+            make = in_the_loop(in_loop == "moving")
         with writing("--out", folder):
             result = fly(request, folder, clock, show, view, perfetto, make)
         progress.update(bar, description="writing recording and report", total=None, now="")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import sys
 from contextlib import closing
@@ -15,6 +16,7 @@ from rich.console import Console
 from hil.errors import LabError
 
 if TYPE_CHECKING:
+    from hil.devices.stm32f405.gdb import GdbServer
     from hil.laboratory.experiment import Experiment
     from hil.laboratory.result import Result
     from hil.live.feed import LiveView
@@ -58,6 +60,24 @@ view_option = click.option(
     "--view", "target", is_flag=False, flag_value="window", metavar="[web|connect:HOST:PORT|foxglove]",
     help="Watch live: in the rerun viewer, in a browser, in a viewer that is open somewhere, in Foxglove.",
 )  # fmt: skip
+
+
+gdb_option = click.option(
+    "--gdb", type=click.IntRange(0, 65535), metavar="PORT",
+    help="With an image as --board: wait for GDB on this port of 127.0.0.1 (0: any); time stands still at its breakpoints.",
+)  # fmt: skip
+
+
+def open_debugger(port: int | None, image: Path) -> GdbServer | None:
+    """Open the port that `--gdb` asks for; it says what to type when it waits, and ends with the command."""
+    if port is None:
+        return None
+    from hil.devices.stm32f405.gdb import GdbServer
+
+    def waiting(port: int) -> None:
+        say(f"waiting for gdb-multiarch {shlex.quote(str(image))} -ex 'target remote 127.0.0.1:{port}'")
+
+    return click.get_current_context().with_resource(closing(GdbServer(port, waiting)))
 
 
 def announce_compilation() -> None:

@@ -13,6 +13,8 @@ from hil.commands.options import (
     announce_compilation,
     close_live,
     fault_option,
+    gdb_option,
+    open_debugger,
     open_live,
     profile_option,
     say,
@@ -57,6 +59,7 @@ BOARDS_MAX = 10
     metavar="FILE",
     help="The image of a Crazyflie's firmware, an ELF file, which every board executes whole.",
 )
+@gdb_option
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option("--station", is_flag=True, help="Fly with the built-in ground station.")
 @click.option(
@@ -90,6 +93,7 @@ def serve(
     mavlink: str | None,
     baud: int | None,
     board: str | None,
+    gdb: int | None,
     boards: int,
     station: bool,
     motive: bool,
@@ -141,7 +145,10 @@ def serve(
     announce_compilation()
     if board is not None and ends:
         raise LabError(f"--mavlink {mavlink}: {board} speaks CRTP over its radio, not MAVLink")
-    runner = PythonRunner if board is None else image_at(board, None)
+    if gdb is not None and (board is None or boards > 1):
+        raise LabError(f"--gdb {gdb}: goes with one board and an image as --board")
+    debugger = open_debugger(gdb, Path(board or ""))
+    runner = PythonRunner if board is None else image_at(board, None, debugger)
     view = open_live(target)
     server = Server(config, boards, seed, say, bool(ends), faults, state, view, runner)
     try:

@@ -26,6 +26,7 @@ from hil.clock import Clock
 from hil.config import DEFAULT_PROFILE, LabConfig, load_config
 from hil.devices.real_core import RealCore, is_link, real_core
 from hil.devices.stm32f405.firmware import ChipImage
+from hil.devices.stm32f405.gdb import GdbServer
 from hil.errors import LabError, writing
 from hil.laboratory.ages import ages_of, told, with_goals_sent
 from hil.laboratory.experiment import Experiment
@@ -227,19 +228,21 @@ def check_image(board: str) -> None:
         )
 
 
-def image_at(board: str, elf: Path | None) -> ChipImage:
+def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
     """Return what `--board` and `--elf` name. Raises `LabError` when it is no image that runs here."""
     check_image(board)
     try:
-        return ChipImage.load(Path(board), elf, BUILD)
+        return ChipImage.load(Path(board), elf, BUILD, debugger)
     except FirmwareError as error:
         raise LabError(f"--board {board}: {error}") from None
 
 
-def lockstep(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
+def lockstep(
+    request: Request, telemetry: Path, clock: Clock | None, trace_all: bool, debugger: GdbServer | None = None
+) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` when its board cannot be had here."""
     with ExitStack() as stack:
-        runner = _runner(request, stack)
+        runner = _runner(request, stack, debugger)
         try:
             flight = lockstep_flight(
                 request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all,
@@ -251,12 +254,12 @@ def lockstep(request: Request, telemetry: Path, clock: Clock | None, trace_all: 
     return flight
 
 
-def _runner(request: Request, stack: ExitStack) -> Executor:
+def _runner(request: Request, stack: ExitStack, debugger: GdbServer | None) -> Executor:
     if is_link(request.board):
         return real_core(request.board, stack)
     try:
         if request.is_image:
-            return image_at(request.board, request.elf)
+            return image_at(request.board, request.elf, debugger)
         return runner_of(request.board, BUILD, request.config.logic)
     except FirmwareError as error:
         raise LabError(f"--board {request.board}: {error}") from None

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("unicorn")
 
-from hil.devices.stm32f405.chip import CYCLES_PER_US, Chip
+from hil.devices.stm32f405.chip import CYCLES_PER_US
 from hil.devices.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.devices.stm32f405.image import Image
 from support import stm32_firmware
@@ -25,11 +25,9 @@ def installed() -> None:
         pytest.skip(f"{GDB} is not installed: apt-get install {GDB}")
 
 
-def debugged(
-    machine: BareCortex | Chip, image: Image, *commands: str, run: Callable[[GdbServer], object] | None = None
-) -> list[str]:
-    """Return what GDB prints when it gives the machine these commands and leaves; `run` runs the machine meanwhile."""
-    server = GdbServer(machine, 0)
+def debugged(run: Callable[[GdbServer], object], image: Image, *commands: str) -> list[str]:
+    """Return what GDB prints when it gives these commands and leaves; `run` runs a machine for it meanwhile."""
+    server = GdbServer(0)
     everything = ("set confirm off", f"target remote 127.0.0.1:{server.port}", *commands, "detach")
     words = [word for command in everything for word in ("-ex", command)]
     gdb = subprocess.Popen(
@@ -39,7 +37,7 @@ def debugged(
         text=True,
     )
     try:
-        run(server) if run is not None else machine.run(server)
+        run(server)
         printed, _ = gdb.communicate(timeout=30)
     finally:
         gdb.kill()
@@ -51,7 +49,7 @@ def debugged(
 def test_gdb_stops_at_a_breakpoint_and_names_who_called(compiler: str) -> None:
     image = Image(stm32_firmware.build(compiler))
     printed = debugged(
-        BareCortex(image), image, f"set var $r0 = {ASSERTION}", "set var $lr = 0xffffffff", "set var $pc = go_wrong",
+        BareCortex(image).run_for, image, f"set var $r0 = {ASSERTION}", "set var $lr = 0xffffffff", "set var $pc = go_wrong",
         "break assertFail", "continue", "backtrace 2", "print $pc == (long)assertFail & ~1", "info breakpoints",
     )  # fmt: skip
     text = "\n".join(printed)
@@ -67,8 +65,8 @@ def test_gdb_reads_and_changes_registers_and_memory() -> None:
     image = Image(stm32_firmware.build())
     machine = BareCortex(image)
     printed = debugged(
-        machine, image, "set var $d5 = -2.5", "print $d5", "print $s10", "set var $basepri = 0x50", "print/x $basepri",
-        "set var $r9 = 0xcafe", "print/x $r9", "set var xTickCount = 4711", "print xTickCount",
+        machine.run_for, image, "set var $d5 = -2.5", "print $d5", "print $s10", "set var $basepri = 0x50",
+        "print/x $basepri", "set var $r9 = 0xcafe", "print/x $r9", "set var xTickCount = 4711", "print xTickCount",
         "set var tasks[2].pcTaskName[1] = 'q'", "print tasks[2].pcTaskName", "x/1i $pc",
     )  # fmt: skip
     values = [line.partition(" = ")[2] for line in printed if line.startswith("$")]
@@ -83,7 +81,7 @@ def test_gdb_reads_and_changes_registers_and_memory() -> None:
 def test_gdb_steps_one_instruction_and_one_line() -> None:
     image = Image(stm32_firmware.build())
     machine = BareCortex(image)
-    printed = debugged(machine, image, "print/x $pc", "stepi", "print/x $pc", "next", "print/x $pc")
+    printed = debugged(machine.run_for, image, "print/x $pc", "stepi", "print/x $pc", "next", "print/x $pc")
     before, behind, line = (int(text.partition(" = ")[2], 16) for text in printed if text.startswith("$"))
     assert before == image.reset
     assert behind - before in (2, 4)
@@ -100,8 +98,8 @@ def test_gdb_sees_through_an_interrupt_into_the_task_below_it() -> None:
             debugged_chip.run(30_000 * CYCLES_PER_US)
 
     printed = debugged(
-        chip, machine.image, "break USART6_Handler", "break DMA1_Stream0_Handler", "continue", "backtrace",
-        "print i2c_reads", "print/x $psp > 0x20000000", "delete", "print $basepri", run=run,
+        run, machine.image, "break USART6_Handler", "break DMA1_Stream0_Handler", "continue", "backtrace",
+        "print i2c_reads", "print/x $psp > 0x20000000", "delete", "print $basepri",
     )  # fmt: skip
     frames = [line.split(" ", 1)[1].strip() for line in printed if line.startswith("#")]
     assert frames[0].startswith("DMA1_Stream0_Handler ()")

@@ -50,6 +50,11 @@ class BareCortex:
     def set_register(self, name: str, value: int) -> None:
         self._uc.reg_write(NUMBERS[name], value)
 
+    def run_for(self, server: GdbServer) -> None:
+        """Be the machine of a debugger until it leaves."""
+        server.attach(self)
+        self.run(server)
+
     def run(self, server: GdbServer) -> Wish:
         """Do what the debugger wants until it leaves."""
         signal = SIGTRAP

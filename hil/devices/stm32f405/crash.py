@@ -162,7 +162,7 @@ class CrashReports:
         if not 0 <= at <= len(self._image.code) - 4:
             return False
         first, second = unpack_from("<2H", self._image.code, at)
-        return (first & 0xF800 == 0xF000 and second & 0xD000 == 0xD000) or second & 0xFF87 == 0x4780
+        return bool((first & 0xF800 == 0xF000 and second & 0xD000 == 0xD000) or second & 0xFF87 == 0x4780)
 
     def _registers(self) -> dict[int, int]:
         """Return r0 to pc as they are, by number."""

@@ -24,6 +24,7 @@ from hil.devices.stm32f405 import syslink
 from hil.devices.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why, build_machine
 from hil.devices.stm32f405.crash import CrashReports
 from hil.devices.stm32f405.crazyflie import RADIO_BUSY, SYSLINK_USART, CrazyflieBoard
+from hil.devices.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.devices.stm32f405.image import Image
 from hil.devices.stm32f405.log_table import LogVariable, log_table
 from hil.devices.stm32f405.processor import ImageStatistics, Processor
@@ -80,11 +81,12 @@ class ChipImage:
 
     image: Image
     library: Path
+    debugger: GdbServer | None = None
 
     @classmethod
-    def load(cls, path: Path, elf: Path | None, folder: Path) -> ChipImage:
+    def load(cls, path: Path, elf: Path | None, folder: Path, debugger: GdbServer | None = None) -> ChipImage:
         """Read an image and compile the machine into a folder. Raises `LabError` and `ExportError`."""
-        return cls(Image(path, elf), build_machine(folder))
+        return cls(Image(path, elf), build_machine(folder), debugger)
 
 
 class ImageFirmware:
@@ -106,6 +108,8 @@ class ImageFirmware:
         self.chip.breakpoints |= self._crashes.addresses
         self.parts = CrazyflieBoard(self.chip, np.frombuffer(board.eeprom, np.uint8))
         self.kernel = Processor(self.chip, image, self._act)
+        if flashed.debugger is not None:
+            self.kernel.run_chip = DebuggedChip(self.chip, flashed.debugger).run
         self._decoder = syslink.Decoder()
         self._waiting: list[bytes] = []  # for the nRF51, whose queue is full
         self._line = b""

@@ -6,6 +6,7 @@ the flight goes on as if it had never stood. Ctrl-C is seen each time the labora
 
 import select
 import socket
+from collections.abc import Callable
 
 from hil.devices.stm32f405.chip import Chip, Why
 from hil.devices.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol, Wish
@@ -18,16 +19,21 @@ READ_SIZE = 4096
 class GdbServer:
     """One debugger at a time. Raises `LabError` when the port cannot be had."""
 
-    def __init__(self, debuggee: Debuggee, port: int) -> None:
-        """Listen; port 0 takes a free one."""
-        self._debuggee = debuggee
-        self._protocol = RemoteProtocol(debuggee)
+    def __init__(self, port: int, waiting: Callable[[int], None] = lambda _: None) -> None:
+        """Listen; port 0 takes a free one. `waiting` gets the port when the machine stands and waits for a debugger."""
+        self._waiting = waiting
         self._client: socket.socket | None = None
         try:
             self._listener = socket.create_server((HOST, port))
         except OSError as error:
             raise LabError(f"--gdb {port}: {error.strerror or error}") from None
         self._listener.setblocking(True)
+
+    def attach(self, debuggee: Debuggee) -> None:
+        """Let it be this machine from now on; who debugged another one has to come again."""
+        self._part()
+        self._debuggee = debuggee
+        self._protocol = RemoteProtocol(debuggee)
 
     @property
     def port(self) -> int:
@@ -67,6 +73,7 @@ class GdbServer:
         self._listener.close()
 
     def _welcome(self) -> None:
+        self._waiting(self.port)
         self._client, _ = self._listener.accept()
         self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._protocol = RemoteProtocol(self._debuggee)
@@ -101,6 +108,7 @@ class DebuggedChip:
     """Runs a chip as its debugger wants it; at first it waits for one."""
 
     def __init__(self, chip: Chip, server: GdbServer) -> None:
+        server.attach(chip)
         self._chip, self._server = chip, server
         self._wish = Wish.STAND
 

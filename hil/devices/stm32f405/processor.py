@@ -42,6 +42,7 @@ class Processor:
         self.trace: Trace | None = None
         self.ahead_us = 0  # of the chip's time before the boot's
         self._act = act
+        self.run_chip = chip.run  # a debugger runs it in its own way
         self._names: dict[int, ChipTask] = {}
         self._target_us = 0
         self._limit_us = NEVER_US
@@ -85,7 +86,7 @@ class Processor:
             until_us = min(now_us, self._limit_us, own[0])
             until = (until_us + self.ahead_us) * CYCLES_PER_US
             if self.chip.state.now < until:
-                why = self.chip.run(until)
+                why = self.run_chip(until)
                 if why:
                     self._act(why)
             elif own[2] is not None and until_us == own[0]:

@@ -194,7 +194,8 @@ def test_code_is_where_the_image_says(protocol: RemoteProtocol, image: Image) ->
 
 @pytest.fixture
 def client(machine: BareCortex) -> Iterator[tuple[GdbServer, socket.socket]]:
-    server = GdbServer(machine, 0)
+    server = GdbServer(0)
+    server.attach(machine)
     with socket.create_connection(("127.0.0.1", server.port)) as client:
         client.settimeout(10.0)
         yield server, client
@@ -283,17 +284,17 @@ def test_time_stands_still_while_the_debugger_asks(
     assert [machine.register(name) for name, _ in REGISTERS] == before
 
 
-def test_a_port_that_is_taken_is_refused(machine: BareCortex) -> None:
-    server = GdbServer(machine, 0)
+def test_a_port_that_is_taken_is_refused() -> None:
+    server = GdbServer(0)
     with pytest.raises(LabError, match=rf"--gdb {server.port}: Address already in use"):
-        GdbServer(machine, server.port)
+        GdbServer(server.port)
     server.close()
 
 
 def on_chip(packets: Callable[[Image], list[bytes]], end_us: int) -> tuple[FirmwareOnChip, bytes]:
     """The firmware on the chip after a run with a debugger that sends these packets, and what it was answered."""
     machine = FirmwareOnChip()
-    server = GdbServer(machine.chip, 0)
+    server = GdbServer(0)
     with socket.create_connection(("127.0.0.1", server.port)) as line:
         line.sendall(b"".join(map(framed, packets(machine.image))))
         chip = DebuggedChip(machine.chip, server)
@@ -338,7 +339,7 @@ def test_a_breakpoint_of_others_is_theirs() -> None:
     machine = FirmwareOnChip()
     place = machine.image.symbol("vTaskSwitchContext").address
     machine.chip.breakpoints.add(place)
-    server = GdbServer(machine.chip, 0)
+    server = GdbServer(0)
     with socket.create_connection(("127.0.0.1", server.port)) as line:
         line.sendall(framed(b"c"))
         assert DebuggedChip(machine.chip, server).run(5_000 * CYCLES_PER_US) == Why.BREAK
