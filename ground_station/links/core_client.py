@@ -48,7 +48,7 @@ class Packets(Protocol):
         ...
 
     def tell(self, packet: bytes) -> None:
-        """Send a whole packet of any port, behind what was told before; does not wait for the link."""
+        """Send a whole packet of any port, behind what was told before, or drop it when the link is too slow for all."""
         ...
 
     def told(self) -> list[bytes]:

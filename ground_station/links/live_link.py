@@ -44,6 +44,11 @@ class Sender:
         """Let a job be done when those before it are."""
         self._jobs.put(job)
 
+    @property
+    def waiting(self) -> int:
+        """How many jobs wait."""
+        return self._jobs.qsize()
+
     def close(self) -> None:
         """Let the thread end behind what waits; a job that hangs is left alone."""
         self._jobs.put(None)

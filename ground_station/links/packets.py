@@ -16,6 +16,7 @@ from ground_station.errors import LinkError
 from ground_station.links.crazyradio import URIS, quiet_cflib
 from ground_station.links.live_link import Sender
 
+TOLD_WAITING = 12  # packets; later than behind these nobody wants another one
 USB = r"usb://\d"
 HEADER = header(PORT_CORE, CHANNEL_CALLS)
 
@@ -57,8 +58,9 @@ class CflibPackets:
                 return bytes(packet.data)
 
     def tell(self, packet: bytes) -> None:
-        """Send a whole packet of any port, behind what was told before; does not wait for the link."""
-        self._sender.put(partial(self._driver.send_packet, CRTPPacket(packet[0], list(packet[1:]))))
+        """Send a whole packet of any port, behind what was told before, or drop it when the link is too slow for all."""
+        if self._sender.waiting < TOLD_WAITING:
+            self._sender.put(partial(self._driver.send_packet, CRTPPacket(packet[0], list(packet[1:]))))
 
     def told(self) -> list[bytes]:
         """Return the whole packets that came since the last call of this or `receive`."""
