@@ -161,9 +161,8 @@ def _fly_one(
         def show(now_us: int, flight: Flight) -> None:
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
-        make = partial(lockstep, debugger=debugger) if request.in_lockstep else linked_flight
-        if in_loop:
-            make = in_the_loop(in_loop == "moving")
+        own = in_the_loop(in_loop == "moving") if in_loop else partial(lockstep, debugger=debugger)
+        make = own if in_loop or request.in_lockstep else linked_flight
         with writing("--out", folder):
             result = fly(request, folder, clock, show, view, perfetto, make)
         progress.update(bar, description="writing recording and report", total=None, now="")
