@@ -34,6 +34,7 @@ from hil.world.plant import Plant
 ROOT = Path(__file__).parent.parent
 FLIGHT_S = 30.0
 REPEATS = 3
+IMAGE_S = 5.0  # of flight
 
 
 def best(measure: Callable[[], float]) -> float:
@@ -125,6 +126,13 @@ def start_up_s(cache: Path | None) -> float:
     return time.perf_counter() - start
 
 
+def image_factor(elf: str) -> float:
+    """Real-time factor of the binary that FLOATY_CF2_ELF names, without its start."""
+    request = Request.of(EXPERIMENTS["hover"], duration_s=IMAGE_S, board=elf)
+    with tempfile.TemporaryDirectory() as folder:
+        return fly(request, Path(folder)).real_time_factor
+
+
 def main() -> None:
     arguments = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -158,6 +166,8 @@ def main() -> None:
     table.add_row("recorder and telemetry log", f"{(recorded - bare) / simulated_s * 1e3:.2f} us/ms",
                   f"{100.0 * (recorded - bare) / recorded:.0f} %")  # fmt: skip
     table.add_row("start to first tick, warm", f"{best(lambda: start_up_s(None)):.2f} s", "")
+    if elf := os.environ.get("FLOATY_CF2_ELF"):
+        table.add_row("whole binary in the emulated chip", f"{image_factor(elf):.1f} x real time", "")
     if options.compile:
         with tempfile.TemporaryDirectory() as folder:
             table.add_row(

@@ -138,6 +138,7 @@ class Flight:
         self.streams = Streams.of_seed(seed)
         self.lab = Laboratory(clock)
         self.recorder: Recorder | None = None
+        self._early: list[tuple[str, str]] = []  # what was said before there was one
         self.lost: str | None = None
         self.logic_failed: str | None = None  # what own logic did, and when
         self.over = False
@@ -202,6 +203,8 @@ class Flight:
     def run(self, progress: Progress | None = None) -> Outcome:
         """Fly to the end, the crash, or Ctrl-C; the log is left open for the caller to close."""
         interrupted = False
+        for source, text in self._early:
+            self.note(source, text)
         try:
             self.lab.run(progress)
         except KeyboardInterrupt:
@@ -256,6 +259,8 @@ class Flight:
         """Put a line into the event log."""
         if self.recorder is not None:
             self.recorder.note(self.now_us, source, text)
+        else:
+            self._early.append((source, text))
 
     def write_schedule(self, folder: Path) -> None:
         """Write what was traced of the scheduler."""

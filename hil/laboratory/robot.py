@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from firmware_py.config import parameters_of
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from firmware_py.firmware import Firmware
 from firmware_py.thief import Thief
@@ -132,7 +133,11 @@ class Robot:
         specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is that of any other board
         specimen.set_noise_scale(BENCH_NOISE)
         rest = None if now_us else lambda: specimen.sample(self.plant)
-        return ImageFirmware(self._runner, self.board, rest, polls=not self.polled_by_host)
+        firmware = ImageFirmware(self._runner, self.board, rest, polls=not self.polled_by_host)
+        if rest is not None:
+            for text in firmware.differences(parameters_of(self.config).memory):
+                self.say("lab", f"the image flies with its own {text}")
+        return firmware
 
     def cut_power(self) -> None:
         """Stop the firmware: the servos keep their last pulse."""

@@ -78,8 +78,9 @@ class Processor:
         """Bring the chip to an instant."""
         self.run(now_us)
 
-    def run(self, now_us: int) -> None:
-        """Run the chip up to an instant, or to one that hardware needs before."""
+    def run(self, now_us: int, until_us: int = 0) -> None:
+        """Run the chip up to an instant, and on to a later one, if given; less far where hardware acts before."""
+        now_us = max(now_us, until_us)
         self._target_us, self._limit_us = now_us, NEVER_US
         while True:
             own = min(self._every, key=lambda entry: entry[0], default=(NEVER_US, 0, None))
@@ -117,19 +118,18 @@ class Processor:
             return ChipTask("-", 0, 0)
         return self._task(state.tasks[state.running].block)
 
-    def run_time_us(self, task: ChipTask) -> int:
-        """Return how long a task has had the processor, interrupts and sleep in the idle task included."""
+    def run_times_us(self) -> list[int]:
+        """Return how long each task has had the processor, interrupts and the idle task's sleep included, over resets."""
         state = self.chip.state
-        for index in range(state.task_count):
-            if state.tasks[index].block == task.block:
-                since = state.now - state.running_since if index == state.running else 0
-                return int(state.tasks[index].cycles + since) // CYCLES_PER_US
-        return 0
+        cycles = [task.cycles for task in state.tasks[: state.task_count]]
+        if cycles:
+            cycles[state.running] += state.now - state.running_since
+        return [own // CYCLES_PER_US for own in cycles]
 
-    def activations(self, task: ChipTask) -> int:
-        """Return how often a task got the processor."""
+    def activations(self) -> list[int]:
+        """Return how often each task got the processor."""
         state = self.chip.state
-        return sum(t.times for t in state.tasks[: state.task_count] if t.block == task.block)
+        return [task.times for task in state.tasks[: state.task_count]]
 
     def set_trace(self, trace: Trace | None) -> None:
         """Report every task that gets the processor, or no longer."""
@@ -169,11 +169,11 @@ class ImageStatistics:
     def reports(self) -> list[TaskReport]:
         """The tasks in the order in which they first ran."""
         kernel = self._kernel
+        counted = zip(kernel.tasks, kernel.run_times_us(), kernel.activations(), strict=True)
         return [
             TaskReport(
-                name=task.name, priority=task.priority, run_time_us=kernel.run_time_us(task),
-                activations=kernel.activations(task), worst_response_us=0, worst_latency_us=0, latency_histogram=(),
-                deadline_us=None, deadline_misses=0,
+                name=task.name, priority=task.priority, run_time_us=run_time_us, activations=activations,
+                worst_response_us=0, worst_latency_us=0, latency_histogram=(), deadline_us=None, deadline_misses=0,
             )
-            for task in kernel.tasks
+            for task, run_time_us, activations in counted
         ]  # fmt: skip

@@ -242,7 +242,7 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     for (unsigned n = 0; n < TIMERS; n++)
         m->timer[n].arr = n == 1 || n == 4 ? 0xFFFFFFFF : 0xFFFF;
     m->enabled[0] = 0xFFFF; /* the system's own exceptions */
-    m->attention = m->asleep = m->locked = m->task_count = m->why = m->watchdog_on = m->watchdog_prescaler = 0;
+    m->attention = m->asleep = m->locked = m->why = m->watchdog_on = m->watchdog_prescaler = 0;
     m->watchdog_reload = 0xFFF;
     m->vtor = vectors;
     m->aircr = m->shcsr = m->cfsr = m->hfsr = m->bfar = m->scr = m->cpacr = m->tick_ctrl = m->tick_load = 0;

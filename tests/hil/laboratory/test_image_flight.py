@@ -1,0 +1,134 @@
+"""A real build of the Crazyflie firmware with the exported app flies: the ELF that FLOATY_CF2_ELF names, byte for byte."""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("unicorn")
+
+from hil.errors import LabError
+from hil.experiments import find_experiment
+from hil.laboratory.faults import parse
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.schedule import load_schedule, runs
+
+ELF = os.environ.get("FLOATY_CF2_ELF", "")
+flies = pytest.mark.skipif(
+    not ELF, reason="FLOATY_CF2_ELF names no build of the Crazyflie firmware: no image was flown"
+)
+HOVER = find_experiment("hover")
+
+
+def flown(folder: Path, duration_s: float, *faults: str, seed: int = 1, board: str = ELF) -> Result:
+    prepare(folder)
+    chosen = [parse(text) for text in faults]
+    return fly(Request.of(HOVER, seed=seed, duration_s=duration_s, faults=chosen, board=board), folder)
+
+
+def said(folder: Path) -> list[str]:
+    return [event["text"] for event in load_events(folder)]
+
+
+@pytest.mark.long
+@flies
+def test_the_image_hovers_within_all_limits_and_twice_alike(tmp_path: Path) -> None:
+    first, second = (flown(tmp_path / name, 4.0) for name in ("a", "b"))
+    assert first.outcome == "completed"
+    assert first.passed, [verdict for verdict in first.verdicts if not verdict.passed]
+    assert first.hash == second.hash
+    assert "FLOATY: supervisor: flying" in said(tmp_path / "a")
+    tasks = {one.task for one in runs(load_schedule(tmp_path / "a"))}
+    assert {"STABILIZE", "SENSORS", "IDLE"} <= tasks
+
+
+@pytest.mark.long
+@flies
+def test_the_image_falls_into_its_failsafe_when_poses_stop_and_recovers(tmp_path: Path) -> None:
+    result = flown(tmp_path, 4.0, "radio.cut@1:1.5")
+    assert result.outcome == "completed"
+    assert (
+        0.8 < result.metrics["failsafe"] < 1.2
+    )  # from 0.5 s after the last pose to the first one afterwards
+    assert "FLOATY: supervisor: flying" in said(tmp_path)
+
+
+@pytest.mark.long
+@flies
+def test_the_image_answers_a_push_as_the_python_board_does(tmp_path: Path) -> None:
+    binary = flown(tmp_path / "binary", 4.0, "push.y@1=1")
+    python = flown(tmp_path / "python", 4.0, "push.y@1=1", board="python")
+    assert binary.metrics["max_y"] == pytest.approx(python.metrics["max_y"], abs=0.01)
+    ages = [
+        load_log(tmp_path / board).column("estimator.pose_age_us").to_numpy()[-100:].mean()
+        for board in ("binary", "python")
+    ]
+    assert ages[0] == pytest.approx(ages[1], abs=10_000)
+
+
+def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hil.devices.stm32f405 import firmware
+    from hil.laboratory import run
+    from support.stm32_firmware import BUILD, build
+
+    monkeypatch.setattr(firmware, "WARM_UP_US", 20_000)
+    monkeypatch.setattr(run, "BUILD", BUILD)
+    elf = build("clang")
+    request = Request.of(HOVER, duration_s=0.1, board=str(elf), overrides=("flight.release_us=50000",))
+    prepare(tmp_path / "run")
+    result = fly(request, tmp_path / "run")
+    assert (result.outcome, result.cause) == ("completed", None)
+    assert len(result.tasks) > 1
+    names = [f"cpu.{task.name}" for task in result.tasks]
+    log = load_log(tmp_path / "run")
+    assert [name for name in log.column_names if name.startswith("cpu.")] == names
+    assert {one.task for one in runs(load_schedule(tmp_path / "run"))} <= {task.name for task in result.tasks}
+
+
+@pytest.mark.parametrize(
+    ("board", "text"),
+    [
+        (
+            "no-such-board",
+            "expected python, c, cortex-m4, or an image of a Crazyflie's firmware: an ELF file",
+        ),
+        (str(Path(__file__)), "not an ELF file; a .bin needs --elf FILE, the ELF that it was made of"),
+    ],
+)
+def test_what_is_no_image_is_refused_in_one_line(tmp_path: Path, board: str, text: str) -> None:
+    with pytest.raises(LabError) as refused:
+        flown(tmp_path / "run", 1.0, board=board)
+    assert str(refused.value).endswith(text)
+    assert "\n" not in str(refused.value)
+
+
+def test_an_image_has_no_serial_line_for_mavlink() -> None:
+    with pytest.raises(LabError, match="speaks CRTP over its radio, not MAVLink"):
+        Request.of(HOVER, link="mavlink", board=str(Path(__file__)))
+
+
+def test_an_elf_beside_another_board_is_refused() -> None:
+    with pytest.raises(LabError, match=r"--elf x\.elf: goes with an image as --board, not with python"):
+        Request.of(HOVER, elf=Path("x.elf"))
+
+
+def test_without_a_compiler_an_image_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from firmware_py.export import arm_image
+    from support.stm32_firmware import build
+
+    def missing(name: str) -> str:
+        raise arm_image.PackageNotFoundError(name)
+
+    elf = build("clang")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(arm_image, "version", missing)
+    with pytest.raises(LabError, match=r"--board .*: the compiler ziglang is missing"):
+        flown(tmp_path / "run", 1.0, board=str(elf))
+    shutil.rmtree(tmp_path / "run")
