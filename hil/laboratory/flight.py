@@ -18,6 +18,7 @@ from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock
 from hil.config import LabConfig
 from hil.devices.real_firmware import RealFirmware
+from hil.devices.stm32f405.firmware import ImageFirmware
 from hil.events import EventQueue
 from hil.laboratory.channels import (
     battery_channel,
@@ -210,6 +211,9 @@ class Flight:
         except KeyboardInterrupt:
             interrupted = True
             self.note("lab", "interrupted by the user")
+        firmware = self.robot.firmware
+        if isinstance(firmware, ImageFirmware) and (left := firmware.memory_left()):
+            self.note("board", left)
         outcome = Outcome(self.now_us, self.lost, interrupted)
         self.over = True
         self.line.finish(self.lab)

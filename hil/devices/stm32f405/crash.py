@@ -63,9 +63,8 @@ class Crash:
 class CrashReports:
     """The crashes of one image on one machine."""
 
-    def __init__(self, image: Image, machine: Machine) -> None:
-        self._image, self._machine = image, machine
-        self._kernel = FreeRtos(image, machine.read) if image.has("pxCurrentTCB") else None
+    def __init__(self, image: Image, machine: Machine, kernel: FreeRtos | None) -> None:
+        self._image, self._machine, self._kernel = image, machine, kernel
         self._handlers = {self._vector(number) & ~1 for number in FAULTS}
         self._assertion = image.symbol(ASSERTION).address if image.has(ASSERTION) else 0
 

@@ -24,6 +24,7 @@ from hil.devices.stm32f405 import syslink
 from hil.devices.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why, build_machine
 from hil.devices.stm32f405.crash import CrashReports
 from hil.devices.stm32f405.crazyflie import RADIO_BUSY, SYSLINK_USART, CrazyflieBoard
+from hil.devices.stm32f405.freertos import HEAP
 from hil.devices.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.devices.stm32f405.image import Image
 from hil.devices.stm32f405.log_table import LogVariable, log_table
@@ -106,10 +107,10 @@ class ImageFirmware:
         self.image = image = flashed.image
         self._board = board
         self.chip = Chip(image.code, image.base, flashed.library, image.constants)
-        self._crashes = CrashReports(image, self.chip)
-        self.chip.breakpoints |= self._crashes.addresses
         self.parts = CrazyflieBoard(self.chip, np.frombuffer(board.eeprom, np.uint8))
         self.kernel = Processor(self.chip, image, self._act)
+        self._crashes = CrashReports(image, self.chip, self.kernel.kernel)
+        self.chip.breakpoints |= self._crashes.addresses
         if flashed.debugger is not None:
             self.kernel.run_chip = DebuggedChip(self.chip, flashed.debugger).run
         self._decoder = syslink.Decoder()
@@ -174,6 +175,15 @@ class ImageFirmware:
                 f"the image uses a peripheral that is not modelled, at 0x{address:08x}: it reads as 0"
             )
         self._unknown = state.unknown_count
+
+    def memory_left(self) -> str:
+        """Return in words what of stacks and heap was never used; empty for an image without FreeRTOS."""
+        kernel = self.kernel.kernel
+        if kernel is None or not kernel.running:
+            return ""
+        stacks = ", ".join(f"{task.name} {task.stack_free_bytes}" for task in kernel.tasks())
+        heap = f"; free in the heap: {kernel.heap_free_bytes}" if self.image.has(HEAP) else ""
+        return f"bytes never used of stacks: {stacks}{heap}"
 
     def add_thief(self) -> Any:
         """Raise `LabError`: nobody can add a task to an image."""

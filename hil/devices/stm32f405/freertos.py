@@ -17,6 +17,7 @@ UNUSED = 0xA5  # what a stack is filled with
 WAITING_FOR_NOTIFICATION = 1
 STACK_CHUNK, MOST_TASKS = 64, 256
 SWITCH = "vTaskSwitchContext"
+HEAP = "xFreeBytesRemaining"  # of heap_4
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +56,14 @@ class FreeRtos:
     @property
     def heap_free_bytes(self) -> int:
         """Return what heap_4 has left."""
-        return self._word(self._image.symbol("xFreeBytesRemaining").address)
+        return self._word(self._image.symbol(HEAP).address)
 
     def current(self) -> TaskView:
         """Return the task that has the processor. Raises `LabError` before the first one has it."""
         task = self._word(self._current)
         if not task:
             raise LabError(f"{self._image.path}: no task has run yet")
-        return self._view(task, "running")
+        return self.task(task, "running")
 
     def tasks(self) -> list[TaskView]:
         """Return all tasks, by priority and name."""
@@ -78,7 +79,7 @@ class FreeRtos:
             for task, state in states.items()
         }
         states |= {task: "running" for task in (self._word(self._current),) if task}
-        views = [self._view(task, state) for task, state in states.items()]
+        views = [self.task(task, state) for task, state in states.items()]
         return sorted(views, key=lambda view: (-view.priority, view.name))
 
     def _members(self, name: str) -> Iterator[int]:
@@ -97,7 +98,8 @@ class FreeRtos:
         notified = self._read(task + self._task["ucNotifyState"].offset, 1)[0]
         return event != 0 or notified == WAITING_FOR_NOTIFICATION
 
-    def _view(self, task: int, state: str) -> TaskView:
+    def task(self, task: int, state: str) -> TaskView:
+        """Return the task with the control block at an address."""
         name = self._task["pcTaskName"]
         text = self._read(task + name.offset, name.size).partition(b"\0")[0].decode(errors="replace")
         priority = self._word(task + self._task["uxPriority"].offset)

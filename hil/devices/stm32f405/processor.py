@@ -5,18 +5,17 @@ Run times and switches are counted by the machine itself, whenever the scheduler
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from firmware_py.rtos import TaskReport
 from hil.devices.stm32f405.chip import CYCLES_PER_US, Chip, Why
+from hil.devices.stm32f405.freertos import FreeRtos
 from hil.devices.stm32f405.image import Image
 
 NEVER_US = 1 << 62
 RUNNING_TASK = "pxCurrentTCB"
-TASK_PRIORITY, TASK_NAME, NAME_LENGTH = 44, 52, 16  # places in FreeRTOS' control block without MPU, V10
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +46,8 @@ class Processor:
         self._target_us = 0
         self._limit_us = NEVER_US
         self._every: list[tuple[int, int, Callable[[], None]]] = []  # next instant, period
-        if image.has(RUNNING_TASK):
+        self.kernel = FreeRtos(image, chip.read) if image.has(RUNNING_TASK) else None
+        if self.kernel is not None:
             chip.state.current_place = image.symbol(RUNNING_TASK).address
 
     def every(self, period_us: int, do: Callable[[], None]) -> None:
@@ -148,15 +148,11 @@ class Processor:
 
     def _task(self, block: int) -> ChipTask:
         if block not in self._names:
-            name = (
-                self.chip.read(block + TASK_NAME, NAME_LENGTH)
-                .split(b"\0")[0]
-                .decode(errors="replace")
-                .replace(" ", "_")
-            )
+            assert self.kernel is not None
+            view = self.kernel.task(block, "running")
+            name = view.name.replace(" ", "_")
             taken = sum(task.name.split("#")[0] == name for task in self._names.values())
-            priority = struct.unpack("<I", self.chip.read(block + TASK_PRIORITY, 4))[0]
-            self._names[block] = ChipTask(f"{name}#{taken + 1}" if taken else name, priority, block)
+            self._names[block] = ChipTask(f"{name}#{taken + 1}" if taken else name, view.priority, block)
         return self._names[block]
 
 

@@ -27,6 +27,10 @@ def line_of(text: str) -> int:
     return found
 
 
+def reports_of(machine: FirmwareOnChip) -> CrashReports:
+    return CrashReports(machine.image, machine.chip, FreeRtos(machine.image, machine.chip.read))
+
+
 def run_to_end(machine: FirmwareOnChip, end_ms: int) -> Why:
     """Run until something else than outputs stops the chip, or for so long."""
     why = Why.SERIAL
@@ -81,7 +85,7 @@ def test_an_image_without_freertos_is_refused() -> None:
 
 def crashed(machine: FirmwareOnChip) -> str:
     """Run into the first crash and return it in words."""
-    reports = CrashReports(machine.image, machine.chip)
+    reports = reports_of(machine)
     machine.chip.breakpoints |= reports.addresses
     assert run_to_end(machine, 100) == Why.BREAK
     return str(reports.here())
@@ -125,13 +129,13 @@ def test_an_assertion_without_a_text_is_told_by_its_addresses() -> None:
     crashed(machine)
     machine.chip.set_register("r0", 0x3000_0000)
     machine.chip.set_register("r1", 0x0808_0000)  # erased flash
-    text = str(CrashReports(machine.image, machine.chip).here())
+    text = str(reports_of(machine).here())
     assert text.startswith("assertion 0x30000000 failed at 0x08080000:")
 
 
 def test_a_watchdog_reset_is_told_with_who_ran_then() -> None:
     machine = FirmwareOnChip(planted=HUNGRY_WATCHDOG)
-    reports = CrashReports(machine.image, machine.chip)
+    reports = reports_of(machine)
     assert run_to_end(machine, 400) & Why.WATCHDOG
     text = str(reports.watchdog())
     assert re.match(r"watchdog reset: nobody fed it in time; this ran then, in task SPIN-[01]: ", text)
@@ -140,7 +144,7 @@ def test_a_watchdog_reset_is_told_with_who_ran_then() -> None:
 
 def test_a_fault_in_an_interrupt_names_its_handler() -> None:
     machine = FirmwareOnChip()
-    reports = CrashReports(machine.image, machine.chip)
+    reports = reports_of(machine)
     run_to_end(machine, 30)
     # The handler's first instruction becomes an undefined one; the code around it is not touched.
     handler = machine.image.symbol("EXTI15_10_Handler").address
@@ -157,7 +161,7 @@ def test_a_frame_that_cannot_be_read_is_told() -> None:
     machine = FirmwareOnChip(planted=BUS_FAULT)
     crashed(machine)
     machine.chip.set_register("psp", 0x3000_0000)
-    text = str(CrashReports(machine.image, machine.chip).here())
+    text = str(reports_of(machine).here())
     assert text.endswith("0x30000000; there is no memory at its stack pointer, 0x30000000, in task REPORT: ")
 
 
@@ -168,14 +172,14 @@ def test_a_fault_that_cannot_be_handled_is_told_as_a_lock_up() -> None:
         machine.chip.step()
     machine.chip.set_register("sp", 0x3000_0000)
     assert run_to_end(machine, 100) == Why.LOCKUP
-    text = str(CrashReports(machine.image, machine.chip).lockup())
+    text = str(reports_of(machine).lockup())
     assert text.startswith("lock-up, no fault handler could run: access to where there is no memory ")
     assert re.search(r", in task [\w-]+: \w+ \(firmware.c:\d+\)", text)
 
 
 def test_before_the_scheduler_main_is_named() -> None:
     machine = FirmwareOnChip(planted=BUS_FAULT)
-    reports = CrashReports(machine.image, machine.chip)
+    reports = reports_of(machine)
     machine.chip.breakpoints |= {machine.image.symbol("assertFail").address}
     machine.chip.set_register("pc", machine.image.symbol("go_wrong").address)
     machine.chip.set_register("r0", ASSERTION)
