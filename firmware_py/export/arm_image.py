@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,7 @@ def constants_of(symbols: Sequence[tuple[int, str]], size: int) -> frozenset[int
         if name[:2] in ("$d", "$t") and FLASH <= address < FLASH + size
     )
     found: set[int] = set()
-    for (begin, kind), (end, _) in zip(marks, [*marks[1:], (FLASH + size, "$t")], strict=True):
+    for (begin, kind), (end, _) in pairwise([*marks, (FLASH + size, "$t")]):
         if kind == "$d":
             found.update(range((begin - FLASH) // 2, (end - FLASH + 1) // 2))
     return frozenset(found)

@@ -310,7 +310,7 @@ static void i2c_read_by_dma(void) {
   i2c_reads++;
 }
 
-static void send_line(void) {
+__attribute__((noinline)) static void send_line(void) {
   static char line[] = "tick 00000000\n";
   uint32_t value = xTickCount;
   for (uint32_t i = 12; i > 4; i--, value >>= 4) {

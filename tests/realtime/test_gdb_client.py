@@ -1,8 +1,11 @@
 """GDB itself, Debian's `gdb-multiarch`, at the server of `--gdb`."""
 
+import json
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +16,7 @@ from hil.devices.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.devices.stm32f405.image import Image
 from support import stm32_firmware
 from support.bare_cortex import BareCortex
+from support.paths import ROOT
 from support.stm32_machine import FirmwareOnChip
 
 GDB = "gdb-multiarch"
@@ -106,3 +110,45 @@ def test_gdb_sees_through_an_interrupt_into_the_task_below_it() -> None:
     assert frames[1] == "<signal handler called>"
     assert any("report ()" in frame or "spin" in frame or "rest ()" in frame for frame in frames[2:])
     assert machine.peek("i2c_reads") >= 1
+
+
+def test_a_flight_that_stood_at_breakpoints_has_the_hash_of_one_that_did_not(tmp_path: Path) -> None:
+    elf = str(stm32_firmware.build())
+    command = [
+        sys.executable,
+        "-m",
+        "hil.commands",
+        "fly",
+        "hover",
+        "--duration",
+        "0.2",
+        "--board",
+        elf,
+        "--out",
+    ]
+    alone = subprocess.run(
+        [*command, str(tmp_path / "alone")], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
+    assert alone.returncode in (0, 1), alone.stderr
+    flight = subprocess.Popen(
+        [*command, str(tmp_path / "debugged"), "--gdb", "0"], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert flight.stdout is not None
+        words = next(line for line in flight.stdout if line.startswith("waiting for "))
+        where = words.rpartition(" ")[2].rstrip("'\n")
+        commands = ("set remotetimeout 60", f"target remote {where}", "break assertFail", "break send_line", "continue",
+                    "stepi", "next", "print xTickCount", "continue", "backtrace", "detach")  # fmt: skip
+        options = [word for text in commands for word in ("-ex", text)]
+        gdb = subprocess.run(
+            (GDB, "-nx", "-batch", *options, elf), capture_output=True, text=True, timeout=120
+        )
+        assert "Breakpoint 2, send_line" in gdb.stdout, gdb.stdout + gdb.stderr
+        flight.communicate(timeout=300)
+    finally:
+        flight.kill()
+    assert flight.returncode == alone.returncode
+    first, second = (
+        json.loads((tmp_path / name / "result.json").read_text()) for name in ("alone", "debugged")
+    )
+    assert first["hash"] == second["hash"]

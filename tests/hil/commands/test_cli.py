@@ -74,6 +74,8 @@ def test_a_failed_limit_is_exit_code_one(
         (["param", "set", "a=b", "--link", "udp://127.0.0.1:1"], "a=b: expected NAME=VALUE"),
         (["param", "list", "--link", "usb://1"], "usb://1: expected radio://"),
         (["fly", "hover", "--seeds", "2", "--perfetto"], "--seeds 2"),
+        (["fly", "hover", "--gdb", "3333"], "--gdb 3333: goes with one flight of an image as --board"),
+        (["serve", "--gdb", "3333"], "--gdb 3333: goes with one board and an image as --board"),
         (["fly", "hover", "--bogus"], "No such option"),
         (["fly"], "Missing argument"),
         (["report", "nowhere"], "nowhere"),

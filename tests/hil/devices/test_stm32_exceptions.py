@@ -18,7 +18,7 @@ FP_FILLED = [0x2200 + n for n in range(32)]
 FPSCR = 0x03C0_0000
 RUN_US = 200_000
 
-COMPILERS = pytest.mark.parametrize("compiler", ["clang", "gcc"])
+COMPILERS = pytest.mark.parametrize("compiler", ["clang", pytest.param("gcc", marks=pytest.mark.long)])
 
 
 def recorded(scenario: int, compiler: str) -> tuple[list[int], FirmwareOnChip]:

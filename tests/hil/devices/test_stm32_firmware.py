@@ -9,7 +9,7 @@ from support.stm32_machine import FirmwareOnChip
 
 MS = 1000
 ASSERTION, HUNGRY_WATCHDOG = 3, 4
-COMPILERS = pytest.mark.parametrize("compiler", ["clang", "gcc"])
+COMPILERS = pytest.mark.parametrize("compiler", ["clang", pytest.param("gcc", marks=pytest.mark.long)])
 
 
 def run(machine: FirmwareOnChip, begin_ms: int, end_ms: int, gyro: bool = True) -> bytes:

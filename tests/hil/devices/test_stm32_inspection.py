@@ -18,7 +18,7 @@ from support.stm32_machine import FirmwareOnChip
 MS = 1000
 BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG = range(1, 5)
 FIRMWARE = (SOURCES / "firmware.c").read_text(encoding="utf-8").splitlines()
-COMPILERS = pytest.mark.parametrize("compiler", ["clang", "gcc"])
+COMPILERS = pytest.mark.parametrize("compiler", ["clang", pytest.param("gcc", marks=pytest.mark.long)])
 
 
 def line_of(text: str) -> int:

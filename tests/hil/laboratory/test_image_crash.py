@@ -40,6 +40,7 @@ def said(folder: Path, planted: int, duration_s: float, monkeypatch: pytest.Monk
     return [event["text"] for event in load_events(folder / "run")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("planted", "expected"),
     [
@@ -63,6 +64,7 @@ def test_what_an_image_dies_of_is_an_event(
         assert "reset by software" in texts
 
 
+@pytest.mark.long
 def test_a_flight_ends_with_what_was_never_used_of_the_stacks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
