@@ -1,18 +1,23 @@
 """Where the time goes: real-time factor of whole flights and the cost of their parts, side by side in one run.
 
-    python tools/bench.py            everything but the first compilation
-    python tools/bench.py --compile  also a first compilation in an empty cache (about half a minute)
+    python tools/bench.py             everything but the first compilation
+    python tools/bench.py --compile   also a first compilation in an empty cache (about half a minute)
+    python tools/bench.py --json FILE also writes the figures there
 
-Absolute figures are of this machine at this moment; compare rows of one run, not of two.
+Figures are processor time, but for the start, of this machine at this moment: compare rows of one run, not of two. Peers in
+the same run: simpy on the scheduler's scenario, a flight of RotorPy (extra `bench`), and as the floor a loop of as many
+events in which nothing happens.
 """
 
 import argparse
+import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from heapq import heapreplace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +28,7 @@ from rich.table import Table
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input
+from firmware_py.extras import install_command
 from firmware_py.fast import STALE, STATE
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
@@ -35,6 +41,9 @@ ROOT = Path(__file__).parent.parent
 FLIGHT_S = 30.0
 REPEATS = 3
 IMAGE_S = 5.0  # of flight
+# Of the events of a hover: IMU, exposures, their frames, rows of the log, and what the radio does.
+EVENT_PERIODS_US = (1000, 5000, 5000, 10_000, 4000, 4000, 4000)
+ROTORPY_S = 5.0
 
 
 def best(measure: Callable[[], float]) -> float:
@@ -44,16 +53,16 @@ def best(measure: Callable[[], float]) -> float:
 
 def us_per_call(call: Callable[[], object], count: int) -> float:
     def measure() -> float:
-        start = time.perf_counter()
+        start = time.process_time()
         for _ in range(count):
             call()
-        return (time.perf_counter() - start) / count * 1e6
+        return (time.process_time() - start) / count * 1e6
 
     return best(measure)
 
 
 def flight_s(recorded: bool) -> float:
-    """Wall time of one hover, with or without recorder and telemetry log."""
+    """Processor time of one hover, with or without recorder and telemetry log."""
 
     def measure() -> float:
         with tempfile.TemporaryDirectory() as folder:
@@ -61,12 +70,12 @@ def flight_s(recorded: bool) -> float:
             flight = lockstep_flight(load_config(), EXPERIMENTS["hover"], FLIGHT_S, 1, telemetry)
             if recorded:
                 flight.recorder = Recorder(Path(folder), flight.channels(), {})
-            start = time.perf_counter()
+            start = time.process_time()
             flight.run()
             if flight.recorder is not None:
                 flight.recorder.close()
             flight.close()
-            return time.perf_counter() - start
+            return time.process_time() - start
 
     return best(measure)
 
@@ -133,47 +142,104 @@ def image_factor(elf: str) -> float:
         return fly(request, Path(folder)).real_time_factor
 
 
+def empty_loop_us() -> float:
+    """Microseconds of one millisecond of a loop with as many events as a hover has, in which nothing happens."""
+    heap = [(period_us, period_us) for period_us in sorted(EVENT_PERIODS_US)]
+
+    def nothing(now_us: int) -> None:
+        pass
+
+    def millisecond() -> None:
+        end_us = heap[0][0] + 1000
+        while heap[0][0] < end_us:
+            now_us, period_us = heap[0]
+            heapreplace(heap, (now_us + period_us, period_us))
+            nothing(now_us)
+
+    return us_per_call(millisecond, 20_000)
+
+
+def rotorpy_s() -> float:
+    """Processor time of a hover of RotorPy's quadrotor with its own controller; ImportError without the package."""
+    from rotorpy.controllers.quadrotor_control import SE3Control
+    from rotorpy.environments import Environment
+    from rotorpy.trajectories.hover_traj import HoverTraj
+    from rotorpy.vehicles.crazyflie_params import quad_params
+    from rotorpy.vehicles.multirotor import Multirotor
+
+    def measure() -> float:
+        flight = Environment(Multirotor(quad_params), SE3Control(quad_params), HoverTraj())
+        start = time.process_time()
+        flight.run(t_final=ROTORPY_S)
+        return time.process_time() - start
+
+    return best(measure)
+
+
+class Figures:
+    """What was measured: a table to look at, and the same to be read by programs."""
+
+    def __init__(self) -> None:
+        self.table = Table(title=f"floaty bench: {STATE}")
+        self.values: dict[str, float | str] = {"code": STATE}
+        self.table.add_column("what")
+        self.table.add_column("value", justify="right")
+        self.table.add_column("compared", justify="right")
+
+    def add(self, name: str, value: float, unit: str, compared: str = "", digits: int = 2) -> None:
+        """Take a figure."""
+        self.table.add_row(name, f"{value:.{digits}f} {unit}", compared)
+        self.values[f"{name} [{unit}]"] = round(value, 4)
+
+
 def main() -> None:
     arguments = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     arguments.add_argument("--compile", action="store_true", help="measure a first compilation too")
+    arguments.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     options = arguments.parse_args()
     with tempfile.TemporaryDirectory() as folder:  # warm up
         fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 1.0), Path(folder))
 
-    table = Table(title=f"floaty bench: {STATE}")
-    table.add_column("what")
-    table.add_column("value", justify="right")
-    table.add_column("share of the loop", justify="right")
+    figures = Figures()
     bare, recorded = flight_s(recorded=False), flight_s(recorded=True)
     simulated_s = FLIGHT_S + load_config().flight.release_us * 1e-6
     loop_us = recorded / simulated_s * 1e3
-    table.add_row("whole loop, recorded", f"{simulated_s / recorded:.0f} x real time", "")
-    table.add_row("whole loop, not recorded", f"{simulated_s / bare:.0f} x real time", "")
-    table.add_row("one simulated millisecond", f"{loop_us:.1f} us", "100 %")
+    figures.add("whole loop, recorded", simulated_s / recorded, "x real time", digits=0)
+    figures.add("whole loop, not recorded", simulated_s / bare, "x real time", digits=0)
+    try:
+        slower = simulated_s / recorded * (peer_s := rotorpy_s()) / ROTORPY_S
+        figures.add(
+            "RotorPy, a hover at 100 Hz", ROTORPY_S / peer_s, "x real time", f"{slower:.1f} x slower", 1
+        )
+    except ImportError as error:
+        print(f"RotorPy is left out ({error}): {install_command('bench')}", file=sys.stderr)
+    figures.add("one simulated millisecond", loop_us, "us", "100 %")
 
     def part(name: str, us: float, per_ms: float) -> None:
-        table.add_row(name, f"{us:.2f} us", f"{100.0 * us * per_ms / loop_us:.0f} %")
+        figures.add(name, us, "us", f"{100.0 * us * per_ms / loop_us:.0f} %")
 
+    part("floor: its events in an empty loop", empty_loop_us(), 1.0)
     estimate_us, control_us = core_us()
     part("core: estimator tick (100 Hz)", estimate_us, 0.1)
     part("core: controller tick (100 Hz)", control_us, 0.1)
     part("plant: one millisecond", plant_us(), 1.0)
     kernel_us, simpy_us = kernel_us_per_activation(), simpy_us_per_activation()
     part("scheduler: one activation (4 per ms)", kernel_us, 4.0)
-    table.add_row("simpy on the same scenario", f"{simpy_us:.2f} us", f"{simpy_us / kernel_us:.1f} x ours")
-    table.add_row("recorder and telemetry log", f"{(recorded - bare) / simulated_s * 1e3:.2f} us/ms",
-                  f"{100.0 * (recorded - bare) / recorded:.0f} %")  # fmt: skip
-    table.add_row("start to first tick, warm", f"{best(lambda: start_up_s(None)):.2f} s", "")
+    figures.add("simpy on the same scenario", simpy_us, "us", f"{simpy_us / kernel_us:.1f} x ours")
+    part("recorder and telemetry log, per ms", (recorded - bare) / simulated_s * 1e3, 1.0)
+    figures.add("start to first tick, warm", best(lambda: start_up_s(None)), "s")
     if elf := os.environ.get("FLOATY_CF2_ELF"):
-        table.add_row("whole binary in the emulated chip", f"{image_factor(elf):.1f} x real time", "")
+        figures.add("whole binary in the emulated chip", image_factor(elf), "x real time", digits=1)
     if options.compile:
         with tempfile.TemporaryDirectory() as folder:
-            table.add_row(
-                "start to first tick, first compilation ever", f"{start_up_s(Path(folder)):.1f} s", ""
+            figures.add(
+                "start to first tick, first compilation ever", start_up_s(Path(folder)), "s", digits=1
             )
-    Console(width=100).print(table)
+    Console(width=100).print(figures.table)
+    if options.json:
+        options.json.write_text(json.dumps(figures.values, indent=1) + "\n", encoding="utf-8")
     if STALE:
         print(f"what `make fast` has compiled is not used: {STALE}")
 

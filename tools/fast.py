@@ -2,9 +2,9 @@
 
     python tools/fast.py    (`make fast`; needs a C compiler and Python's headers, takes a minute or two)
 
-`firmware_py/fast.py` uses them until one of their sources changes. Modules that define pydantic models or functions for
-numba cannot be compiled, and what runs once per flight need not be. Compiled code makes a float of an int where a float is
-declared: modules in which numbers are whole or not depending on a table (log variables, telemetry blocks) stay as they are.
+`firmware_py/fast.py` uses them until one of their sources changes. Modules that define pydantic models, functions for numba
+or protocols that are checked at run time cannot be compiled, nor may what others inherit from or what pydantic reads; and
+what runs once per flight need not be. Compiled code makes a float of an int where `float` stands: what may be whole says so.
 """
 
 import ast
@@ -31,8 +31,7 @@ MODULES = {
     "firmware_py/links": "crtp_stack localisation stream",
     "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",
     "firmware_py/wire": "crtp telemetry",
-    "ground_station": "corrections latency mocap pose_filter station telemetry_log tracker",
-    "ground_station/links": "loopback",
+    "ground_station": "corrections mocap pose_filter station telemetry_log tracker",
     "hil": "events",
     "hil/devices": "board cameras imu radio shockburst",
     "hil/laboratory": "channels flight laboratory lockstep recorder robot",

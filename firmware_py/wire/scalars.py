@@ -31,7 +31,7 @@ class Scalar(Enum):
         self.size = self.layout.size
         self.is_float = format in "fe"
 
-    def cast(self, value: float) -> float:
+    def cast(self, value: float) -> int | float:
         """The value that this type holds in place of `value`."""
         if self.is_float:
             try:
