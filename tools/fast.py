@@ -3,8 +3,9 @@
     python tools/fast.py    (`make fast`; needs a C compiler and Python's headers, takes a minute or two)
 
 `firmware_py/fast.py` uses them until one of their sources changes. Modules that define pydantic models, functions for numba
-or protocols that are checked at run time cannot be compiled, nor may what others inherit from or what pydantic reads; and
-what runs once per flight need not be. Compiled code makes a float of an int where `float` stands: what may be whole says so.
+or protocols that are checked at run time cannot be compiled, nor may what others inherit from or copy, or what pydantic
+reads; and what runs once per flight need not be. Compiled code makes a float of an int where `float` stands: what may be
+whole says so.
 """
 
 import ast
@@ -33,7 +34,7 @@ MODULES = {
     "firmware_py/wire": "crtp telemetry",
     "ground_station": "corrections mocap pose_filter station telemetry_log tracker",
     "hil": "events",
-    "hil/devices": "board cameras imu radio shockburst",
+    "hil/devices": "board cameras radio shockburst",
     "hil/laboratory": "channels flight laboratory lockstep recorder robot",
     "hil/world": "battery plant",
 }
