@@ -24,7 +24,7 @@ from ground_station.errors import LinkError
 
 Request = tuple[Kind, bytes]
 
-WINDOW = 12  # requests under way at once: a board's queue has room for 16 packets
+WINDOW = 4  # requests under way at once: a board's queue has room for 5 packets, and it reboots when that overflows
 FIRST_WAIT_S = 0.1  # for an answer, before requests are repeated
 LONGEST_WAIT_S = 0.4
 SILENCE_S = 3.0  # after which the board is given up

@@ -321,6 +321,27 @@ def test_a_full_transmit_queue_on_board_only_delays(app: App) -> None:
     assert client.repeated > 0
 
 
+def test_no_more_requests_are_under_way_than_the_boards_queue_holds(app: App) -> None:
+    client, packets = client_of(app)
+    client.begin()
+    under_way, most = [0], [0]
+    send, receive = packets.send, packets.receive
+
+    def counted_send(data: bytes) -> None:
+        under_way[0] += 1
+        most[0] = max(most[0], under_way[0])
+        send(data)
+
+    def counted_receive(timeout_s: float) -> bytes | None:
+        answer = receive(timeout_s)
+        under_way[0] -= answer is not None
+        return answer
+
+    packets.send, packets.receive = counted_send, counted_receive
+    client.memory(4868)
+    assert most[0] == 4  # RADIOLINK_CRTP_QUEUE_SIZE is 5, and an assert in the firmware guards it
+
+
 def test_a_session_number_that_was_in_use_is_not_taken(app: App) -> None:
     client, _ = client_of(app)
     client.begin()
