@@ -212,7 +212,8 @@ class Chip:
         """Run up to an instant, or until something outside is to be done."""
         if self.breakpoints != self._planted:
             self._plant()
-        return Why(self._run(self._machine, until_cycles))
+        why = self._run(self._machine, until_cycles)
+        return Why(why) if why else Why.TIME
 
     def step(self) -> Why:
         """Execute one instruction."""

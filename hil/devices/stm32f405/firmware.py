@@ -120,7 +120,7 @@ class ImageFirmware:
         self._unknown = 0
         self.kernel.every(BATTERY_PERIOD_US, self._report_battery)
         if polls:
-            self.kernel.every(POLL_PERIOD_US, self.radio_polled)
+            self.kernel.every(POLL_PERIOD_US, lambda now_us: self.radio_polled())
         table = {variable.name: variable for variable in log_table(image, self.chip)}
         self.variables = [v for v in table.values() if v.name.startswith("excite.")]
         self.parameters: tuple[Any, ...] = ()
@@ -239,7 +239,7 @@ class ImageFirmware:
         for line in lines:
             self._board.debug_write(line.decode(errors="replace"))
 
-    def _report_battery(self) -> None:
+    def _report_battery(self, now_us: int) -> None:
         volts = self._board.read_battery_mv() / 1000
         self.chip.feed(
             SYSLINK_USART, syslink.encode(syslink.BATTERY, struct.pack("<Bfff", 0, volts, 0.0, 25.0))

@@ -13,6 +13,7 @@ from firmware_py.rtos import TaskReport
 from hil.devices.stm32f405.chip import CYCLES_PER_US, Chip, Why
 from hil.devices.stm32f405.freertos import FreeRtos
 from hil.devices.stm32f405.image import Image
+from hil.events import EventQueue
 
 NEVER_US = 1 << 62
 RUNNING_TASK = "pxCurrentTCB"
@@ -45,20 +46,19 @@ class Processor:
         self._names: dict[int, ChipTask] = {}
         self._target_us = 0
         self._limit_us = NEVER_US
-        self._every: list[tuple[int, int, Callable[[], None]]] = []  # next instant, period
+        self._own = EventQueue()  # by the chip's time
         self.kernel = FreeRtos(image, chip.read) if image.has(RUNNING_TASK) else None
         if self.kernel is not None:
             chip.state.current_place = image.symbol(RUNNING_TASK).address
 
-    def every(self, period_us: int, do: Callable[[], None]) -> None:
+    def every(self, period_us: int, do: Callable[[int], object]) -> None:
         """Do something again and again by the chip's time."""
-        self._every.append((self.now_us + period_us, period_us, do))
+        self._own.every(period_us, self.chip.now_us + period_us, do)
 
     def begin(self, us: int) -> None:
         """Let an instant be the one from which time counts."""
         self.ahead_us += us
         self._target_us -= us
-        self._every = [(at_us - us, period_us, do) for at_us, period_us, do in self._every]
 
     @property
     def now_us(self) -> int:
@@ -68,7 +68,7 @@ class Processor:
     @property
     def next_wake_us(self) -> int:
         """The next instant at which the chip acts without the outside."""
-        own_us = min((at_us for at_us, _, _ in self._every), default=NEVER_US)
+        own_us = NEVER_US if self._own.next_us is None else self._own.next_us - self.ahead_us
         state, ready_us = self.chip.state, self.chip.now_us - self.ahead_us + 1
         if state.asleep or state.locked:
             ready_us = -(-int(state.next_due) // CYCLES_PER_US) - self.ahead_us
@@ -82,18 +82,19 @@ class Processor:
         """Run the chip up to an instant, and on to a later one, if given; less far where hardware acts before."""
         now_us = max(now_us, until_us)
         self._target_us, self._limit_us = now_us, NEVER_US
+        own, state = self._own, self.chip.state
         while True:
-            own = min(self._every, key=lambda entry: entry[0], default=(NEVER_US, 0, None))
-            until_us = min(now_us, self._limit_us, own[0])
-            until = (until_us + self.ahead_us) * CYCLES_PER_US
-            if self.chip.state.now < until:
+            until_us = min(now_us, self._limit_us) + self.ahead_us
+            own_is_due = own.next_us is not None and own.next_us <= until_us
+            if own_is_due and own.next_us is not None:
+                until_us = own.next_us
+            until = until_us * CYCLES_PER_US
+            if state.now < until:
                 why = self.run_chip(until)
                 if why:
                     self._act(why)
-            elif own[2] is not None and until_us == own[0]:
-                self._every.remove(own)
-                self._every.append((own[0] + own[1], own[1], own[2]))
-                own[2]()
+            elif own_is_due:
+                own.run(until_us)
             else:
                 break
         self._pass_switches_on()
