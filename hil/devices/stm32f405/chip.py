@@ -217,7 +217,10 @@ class Chip:
 
     def step(self) -> Why:
         """Execute one instruction."""
-        return Why(self._library.machine_step(self._machine))
+        self._cpu.ctl_flush_tb()  # hooks act on what is translated after them, and until it is forgotten
+        why = Why(self._library.machine_step(self._machine))
+        self._cpu.ctl_flush_tb()
+        return why
 
     def reset(self, cause: int) -> None:
         """Reset the processor: memory stays, time goes on."""

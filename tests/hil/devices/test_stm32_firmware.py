@@ -89,3 +89,20 @@ def test_a_failed_assertion_keeps_its_snapshot_over_the_reset() -> None:
         why = machine.run(100 * MS)
     assert why & Why.RESET
     assert machine.peek("snapshot") == 0x2F8A_001F
+
+
+def test_a_step_into_an_interrupt_ends_in_front_of_its_handler() -> None:
+    machine = FirmwareOnChip()
+    chip, handler = machine.chip, machine.image.symbol("EXTI15_10_Handler").address
+    run(machine, 0, 20)
+    while chip.register("xpsr") & 0x1FF:
+        chip.step()
+    chip.pin("C", 14, True)
+    before = chip.state.exceptions
+    while chip.state.exceptions == before:
+        chip.step()
+    assert (chip.register("pc"), chip.register("xpsr") & 0x1FF) == (handler, 16 + 40)
+    instructions = chip.state.instructions
+    chip.step()
+    assert chip.register("pc") - handler in (2, 4)
+    assert chip.state.instructions > instructions

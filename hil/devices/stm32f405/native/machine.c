@@ -327,6 +327,19 @@ uint32_t machine_run(struct machine *m, uint64_t until)
     }
 }
 
+/* Stop in front of the second instruction of a step, in the middle of its block. */
+static void on_step(uc_engine *uc, uint64_t address, uint32_t size, void *user)
+{
+    struct machine *m = user;
+    (void)uc;
+    (void)size;
+    if (!m->first_step && !m->stopping) {
+        m->resume = (uint32_t)address;
+        stop(m, (uint32_t)address);
+    }
+    m->first_step = 0;
+}
+
 /* Execute one instruction, or enter one exception. */
 uint32_t machine_step(struct machine *m)
 {
@@ -345,10 +358,12 @@ uint32_t machine_step(struct machine *m)
     uint32_t pc = m->pc;
     m->stepping = 1;
     m->skip_at = pc;
-    execute(m, 1);
+    uint64_t hook;
+    m->engine.hook_add(m->engine.uc, &hook, HOOK_CODE, (void *)on_step, m, (uint64_t)1, (uint64_t)0);
+    m->first_step = 1;
+    execute(m, 0);
+    m->engine.hook_del(m->engine.uc, hook);
     m->stepping = 0;
-    if (!m->stopping && m->pc > pc && m->pc - pc <= 4 && m->pc < m->next_address)
-        m->resume = m->pc;
     m->skip_at = m->pc;
     if (m->pc == pc + 2 && !m->why)
         m->asleep = m->flash[(pc - FLASH_BASE) % FLASH_SIZE] == 0x30 && m->flash[(pc + 1 - FLASH_BASE) % FLASH_SIZE] == 0xBF;

@@ -122,7 +122,7 @@ struct machine {
     const uint32_t *instructions_before, *cycles_before; /* of every half word of flash */
     uint64_t next_address;
     uint8_t *flash, *ram, *ccm;
-    uint32_t stopping, attention, fault, stepping;
+    uint32_t stopping, attention, fault, stepping, first_step;
     uint64_t break_hook[BREAKPOINTS];
     uint32_t break_address[BREAKPOINTS];
 
