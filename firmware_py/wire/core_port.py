@@ -26,8 +26,9 @@ answer; it goes on behind a call when everything up to it has been answered.
 Hardware in the loop, on a channel of its own, without sessions or repetition. The board flies as always, but each
 millisecond with the gyro sample of the host that is next: SAMPLES, and SAMPLE up to four times. It takes the first one
 when `HIL_WAITING` samples wait. Where the next one is not there it takes the last one again (late); a gap in the numbers
-is filled (lost), what came before is left out (doubled). After each controller step it tells the host: LOOP. A second
-without samples ends the mode. With every change of the mode the gyro's zero is sought again and the estimator started.
+is filled (lost), what came before is left out (doubled), and of more than 32 that wait only the newest eight are taken.
+After each controller step it tells the host: LOOP. A second without samples ends the mode. With every change of the mode
+the gyro's zero is sought again and the estimator started.
 """
 
 import struct

@@ -43,7 +43,7 @@ SAMPLE_US = 1000
 SILENCE_US = 1_000_000
 BATCH_US = (SAMPLES_MAX - 1) * SAMPLE_US // 2  # that a sample waits on the mean for its packet
 SLEW_US = 25  # by which time is moved, a hundred times a second, for each sample that too many wait on board
-SLEW_MAX_US = 200
+SLEW_MAX_US = 1000
 KEPT = 50  # of what the board told, half a second: what the loop adds is their mean
 
 

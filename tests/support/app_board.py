@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from firmware_py.board import EEPROM_SIZE
 from hil.clock import Paced
 from hil.config import LabConfig, load_config
-from hil.devices.shockburst import Air
+from hil.devices.shockburst import Air, syslink_us
 from hil.events import EventQueue
 from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.robot import Streams
@@ -37,6 +37,8 @@ class AppRobot:
     """What `ServedRobot` and `Laboratory` need of a robot, with the app in it and nothing around it."""
 
     uart = None
+    polled_by_host = executes_image = False
+    wire_us = staticmethod(syslink_us)
     next_wake_us = None
 
     def __init__(self, library: Path, folder: Path, events: EventQueue, config: LabConfig) -> None:

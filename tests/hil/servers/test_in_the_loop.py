@@ -171,9 +171,9 @@ def test_samples_beyond_the_buffer_are_lost_and_counted(host: Host) -> None:
         host.send(count=SAMPLES_MAX)
     host.run(200)
     told = host.looped[-1]
-    assert 0 < told.lost <= 200
-    assert told.waiting <= 64
-    assert told.used + told.waiting in range(300, host.count)
+    assert told.lost in range(70, 90)
+    assert told.waiting <= HIL_WAITING
+    assert told.used + told.waiting == host.count
 
 
 def test_a_host_that_stops_for_half_a_second_leads_to_the_failsafe_and_back(host: Host) -> None:
@@ -302,7 +302,7 @@ def test_the_plants_clock_follows_the_boards(app: App, tmp_path: Path, drift: fl
     air.join(flight.events)
     flight.run()
     assert (sum(air.slewed[-100:]) > 0) == slower
-    assert max(map(abs, air.slewed)) <= 200
+    assert max(map(abs, air.slewed)) <= 1000
 
 
 def test_a_paced_clock_can_be_moved() -> None:

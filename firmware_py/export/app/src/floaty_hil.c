@@ -11,6 +11,7 @@
 #include "floaty_wire.h"
 
 #define BUFFER 64       /* samples; a power of two, of which 65536 is a multiple */
+#define WAITING_MAX 32 /* samples: more would only make the loop slower */
 #define SILENT_STEPS 1000 /* without a sample the mode ends */
 
 typedef struct {
@@ -39,14 +40,9 @@ uint8_t floaty_hil_mode(void) {
   return mode;
 }
 
-/* False when the buffer is full: then the sample is missing when the next one comes. */
-static bool put(const Sample *sample) {
-  if ((uint16_t)(received - used) >= BUFFER) {
-    return false;
-  }
+static void put(const Sample *sample) {
   buffer[received % BUFFER] = *sample;
   received += 1;
-  return true;
 }
 
 void floaty_hil_receive(const CRTPPacket *packet) {
@@ -61,13 +57,18 @@ void floaty_hil_receive(const CRTPPacket *packet) {
   }
   const uint32_t count = (packet->size - sizeof head) / sizeof(Sample);
   for (uint32_t i = 0; i < count; i++) {
-    const int16_t ahead = (int16_t)(head.number + i - received);
+    int16_t ahead = (int16_t)(head.number + i - received);
     if (ahead < 0) {
       doubled += 1;
       continue;
     }
-    for (int16_t missing = 0; missing < ahead && put(&newest); missing++) {
-      lost += 1; /* time goes on without it */
+    lost += (uint16_t)ahead;
+    if (ahead > BUFFER) {
+      received += (uint16_t)(ahead - BUFFER);
+      ahead = BUFFER;
+    }
+    for (; ahead > 0; ahead--) {
+      put(&newest); /* time goes on without it */
     }
     memcpy(&newest, packet->data + sizeof head + i * sizeof newest, sizeof newest);
     put(&newest);
@@ -93,7 +94,12 @@ void floaty_hil_sample(int32_t counts[3]) {
   if (mode == FLOATY_HIL_OFF) {
     return;
   }
-  const uint16_t waiting = (uint16_t)(received - used);
+  uint16_t waiting = (uint16_t)(received - used);
+  if (waiting > WAITING_MAX) { /* the newest ones count */
+    lost += (uint16_t)(waiting - FLOATY_HIL_WAITING);
+    waiting = FLOATY_HIL_WAITING;
+    used = (uint16_t)(received - waiting);
+  }
   running = running || waiting >= FLOATY_HIL_WAITING;
   silent_steps += 1;
   if (running && waiting > 0) {
