@@ -168,7 +168,12 @@ class Recorder:
         return columns
 
     def _batch(self, columns: list[NDArray[Any]]) -> pa.RecordBatch:
-        return pa.RecordBatch.from_arrays([pa.array(values) for values in columns], schema=self._schema)
+        return pa.record_batch([_array(values) for values in columns], schema=self._schema)
+
+
+def _array(values: NDArray[Any]) -> pa.Array:
+    """Return an array of Arrow over values; not by `pa.array`, which imports modules in mid-flight."""
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
 
 
 def finish_log(

@@ -44,6 +44,7 @@ def test_importing_the_package_loads_nothing_else() -> None:
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
 
 
+@pytest.mark.long
 def test_flying_loads_no_drawing_and_no_link() -> None:
     check = "import hil, sys; hil.fly; sys.exit(any(name in sys.modules for name in ('matplotlib', 'cflib', 'rerun')))"
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0

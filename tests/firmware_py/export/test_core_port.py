@@ -232,6 +232,7 @@ def test_a_flight_with_fourteen_faults_has_the_bits_of_python_on_the_app(app: Ap
     assert checked.targets[0].ticks == 6600
 
 
+@pytest.mark.long
 def test_own_logic_is_executed_on_the_app_too(tmp_path: Path) -> None:
     config = own_config(tmp_path, LAW)
     app = App(build_app(tmp_path / "app", config), tmp_path / "copy.so")
@@ -244,6 +245,7 @@ def test_own_logic_is_executed_on_the_app_too(tmp_path: Path) -> None:
     assert checked.targets[0].calls > 300
 
 
+@pytest.mark.long
 def test_what_the_board_computes_flies_even_where_it_is_wrong(tmp_path: Path) -> None:
     folder = tmp_path / "app"
     library = build_app(

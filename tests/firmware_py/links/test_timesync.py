@@ -52,6 +52,7 @@ def test_the_offset_is_off_by_no_more_than_half_of_the_shortest_round_trip(
         assert abs(offset_us - AHEAD_US) <= best_us + aging_us + 1
 
 
+@pytest.mark.long
 @given(st.integers(-DRIFT_PPM, DRIFT_PPM), st.lists(st.tuples(delays, delays), min_size=40, max_size=40))
 def test_drifting_clocks_never_contradict_themselves(ppm: int, rounds: list[tuple[int, int]]) -> None:
     clock = RemoteClock()

@@ -183,6 +183,7 @@ def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
     assert Path("run/report.html").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("view", [["--view", "--realtime"], ["--view", "wbe"]])
 def test_a_viewer_that_cannot_open_is_one_line_and_leaves_no_folder(
     view: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -164,6 +164,7 @@ def discrete_model() -> tuple[np.ndarray, np.ndarray]:
     return A, B
 
 
+@pytest.mark.long
 def test_the_lqr_s_gains_are_the_optimum_of_all_16_states_for_the_weights_that_its_tool_states() -> None:
     tool = runpy.run_path(str(ROOT / "tools" / "lqr_gains.py"))
     computed = tool["gains"](tool["regulator"](load_config()))
@@ -178,6 +179,7 @@ def test_the_lqr_s_gains_are_the_optimum_of_all_16_states_for_the_weights_that_i
     assert matrix(dict(declared)) == pytest.approx(K, abs=2e-3 * np.abs(K).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("roll", [0.0, 0.05])
 def test_the_lqr_feeds_all_16_states_back(roll: float) -> None:
     config = load_config("lqr")

@@ -153,6 +153,7 @@ def test_a_robot_that_answers_later_has_less_delay_left() -> None:
     assert margins(usual, gains).delay - margins(slow, gains).delay == pytest.approx(0.005, abs=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", AXES, ids=NAMES)
 def test_designed_gains_move_less_inside_their_margins_than_the_regulator_s(axis: Axis) -> None:
     loop = build(axis, robot_of(CONFIG), CONFIG, NOW)
@@ -166,6 +167,7 @@ def test_designed_gains_move_less_inside_their_margins_than_the_regulator_s(axis
     assert motion(loop, task(axis), gains).input < 0.25 * 0.43
 
 
+@pytest.mark.long
 def test_robots_that_no_gains_hold_are_refused() -> None:
     axis, robot = AXES[0], robot_of(CONFIG)
     robots = [robot, robot | {"roll_u1": -robot["roll_u1"], "y_u1": -robot["y_u1"]}]

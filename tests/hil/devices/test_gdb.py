@@ -307,6 +307,7 @@ def on_chip(packets: Callable[[Image], list[bytes]], end_us: int) -> tuple[Firmw
     return machine, answers
 
 
+@pytest.mark.long
 def test_a_run_that_a_debugger_stopped_and_stepped_is_the_run_without_one() -> None:
     def packets(image: Image) -> list[bytes]:
         switch = image.symbol("vTaskSwitchContext").address

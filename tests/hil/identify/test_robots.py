@@ -92,6 +92,7 @@ def hover(seconds: float) -> tuple[Record, float]:
     ), per_hz  # fmt: skip
 
 
+@pytest.mark.long
 def test_what_the_model_does_not_explain_is_the_flow() -> None:
     record, per_hz = hover(60.0)
     found = flow_of(record, AXES[1], robot_of(CONFIG)).spectrum

@@ -48,6 +48,7 @@ def frame(t_us: int, *way_us: int) -> MocapFrame:
     return MocapFrame(t_us, HOME, UPRIGHT, True, *instants[1:])
 
 
+@pytest.mark.long
 @given(st.lists(st.tuples(stage, stage, stage, stage, stage), min_size=1, max_size=30))
 def test_the_budget_is_numpys_mean_and_percentile_of_each_stage(times: list[tuple[int, ...]]) -> None:
     rows = [row_of(frame(7_000, *way[:3]), 7_000 + sum(way[:4]), way[4]) for way in times]

@@ -20,6 +20,7 @@ def test_an_unknown_target_says_what_is_allowed(target: str) -> None:
         RerunScreen(target)
 
 
+@pytest.mark.long
 def test_a_viewer_that_is_not_there_is_said_before_the_flight() -> None:
     port = free_port(0)
     with pytest.raises(LabError, match=f"connect:127.0.0.1:{port}: no viewer listens there"):

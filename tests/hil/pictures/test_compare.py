@@ -161,6 +161,7 @@ def test_flights_that_are_released_at_other_instants_are_compared_by_the_time_si
     assert told["y"].rms == pytest.approx(np.sqrt((miss**2).mean()), rel=1e-6)
 
 
+@pytest.mark.long
 def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
     a, b = load_run(runs["one"]), load_run(runs["two"])
     figure = pair((a.log, b.log), ("a", "b"))

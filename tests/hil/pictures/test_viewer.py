@@ -148,6 +148,7 @@ def live_sink(path: Path, port: int) -> "subprocess.Popen[bytes]":
     )
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the sink is interrupted
 def test_a_live_flight_sends_what_the_file_holds(folder: Path, tmp_path: Path) -> None:
     whole, path = rows_by_entity(viewer.write_run_rrd(folder)), tmp_path / "live.rrd"

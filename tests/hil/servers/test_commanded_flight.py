@@ -51,6 +51,7 @@ class Script:
         return float(np.abs(self.robot.plant.p_WB - (x, y, z)).max())
 
 
+@pytest.mark.long
 def test_a_standard_sequence_takes_off_moves_and_lands() -> None:
     script = Script()
     assert not script.robot.free  # it waits in its holder

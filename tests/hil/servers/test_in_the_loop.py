@@ -229,6 +229,7 @@ def flown(
     return fly(request, folder, flight_of=flight_of), air
 
 
+@pytest.mark.long
 def test_a_flight_in_the_loop_holds_all_limits_and_tells_the_loops_delay(app: App, tmp_path: Path) -> None:
     result, _ = flown(tmp_path / "run", app, 2.0, delay_us=3000)
     assert result.passed

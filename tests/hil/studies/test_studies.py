@@ -145,6 +145,7 @@ def test_the_predictors_cliff(tmp_path: Path) -> None:
         assert outcome == ("lost" if "no predictor" in name else "holds"), (name, seed)
 
 
+@pytest.mark.long
 def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold(tmp_path: Path) -> None:
     study = STUDIES["loss"]
     variant, size, request = next(flights_of(study, 1))

@@ -176,6 +176,7 @@ def test_no_two_tests_share_a_folder() -> None:
 # What is flown
 
 
+@pytest.mark.long
 def test_a_mark_repeats_a_test_for_every_seed_board_and_profile(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
         import pytest
