@@ -1,5 +1,6 @@
 """The offset between two clocks, against clocks whose offset is known."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
