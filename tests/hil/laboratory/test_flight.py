@@ -85,7 +85,7 @@ def test_without_a_tracker_the_log_says_nothing_of_it(tmp_path: Path) -> None:
 
 
 HEALTHY = (
-    *(pytest.param(name, (), marks=() if name == "yaw-step" else pytest.mark.long) for name in EXPERIMENTS),
+    *((name, ()) for name in EXPERIMENTS if name != "endurance"),
     ("hover", ("push.x@1=20",)),
     ("hover", ("push.y@1=20",)),
     ("hover", ("push.z@1=-20",)),
