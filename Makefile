@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 unexport PYTHONDONTWRITEBYTECODE  # the tests start many programs: each would compile all sources anew
 
-.PHONY: fly test test-all check bench fast wheel clients clean
+.PHONY: fly test test-all check bench docs pictures fast dist wheel clients clean
 
 fly: .venv/fly.stamp
 	$(BIN)/floaty fly hover
@@ -16,8 +16,8 @@ test: .venv/test.stamp
 
 # Real-time tests run one at a time and beside nothing else; one that failed on a machine that stood still is repeated.
 test-all: .venv/test.stamp
-	$(BIN)/python -m pytest -n auto -m 'not realtime'
-	$(BIN)/python -m pytest -m realtime --reruns 2 --only-rerun InconclusiveError
+	$(BIN)/python -m pytest -n auto -m 'not realtime' --durations 20
+	$(BIN)/python -m pytest -m realtime --reruns 2 --only-rerun InconclusiveError --durations 20
 
 check: .venv/test.stamp
 	$(BIN)/floaty deploy check
@@ -27,12 +27,24 @@ clients: .venv/test.stamp
 	$(BIN)/python -m pip install --quiet --editable '.[clients]'
 	$(BIN)/python -m pip install --quiet --no-deps 'MAVProxy>=1.8.75'
 
+# The documentation as a site: site/index.html. Both variables silence advertisements of the makers.
+docs: .venv/docs.stamp
+	NO_MKDOCS_2_WARNING=1 DISABLE_MKDOCS_2_WARNING=true $(BIN)/mkdocs build --strict --quiet
+
+# The documentation's pictures anew, with chromium; one alone: make pictures ONLY=report.png
+pictures: .venv/docs.stamp
+	$(BIN)/python tools/pictures.py $(ONLY)
+
 bench: .venv/test.stamp
 	$(BIN)/python tools/bench.py
 
 # The lockstep loop's modules compiled by mypyc, with the C compiler of this machine; everything else does without one.
 fast: .venv/fast.stamp
 	$(BIN)/python tools/fast.py
+
+# A wheel of pure Python for any machine, and the sdist from which it was built; `make wheel`: compiled, for this Python.
+dist: .venv/test.stamp
+	$(BIN)/python -m build --no-isolation
 
 wheel: .venv/fast.stamp
 	FLOATY_COMPILED=1 $(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
@@ -50,9 +62,13 @@ wheel: .venv/fast.stamp
 	$(BIN)/python -m pip install --quiet --editable '.[test]'
 	@touch $@
 
+.venv/docs.stamp: .venv/fly.stamp
+	$(BIN)/python -m pip install --quiet --editable '.[docs,export]'
+	@touch $@
+
 .venv/fast.stamp: .venv/fly.stamp
 	$(BIN)/python -m pip install --quiet --editable '.[fast]'
 	@touch $@
 
 clean:
-	rm -rf .venv runs dist firmware_py/compiled
+	rm -rf .venv runs dist site firmware_py/compiled

@@ -5,7 +5,9 @@ from typing import Protocol
 
 from firmware_py.wire.mavlink_numbers import Result
 
-ImuCounts = tuple[int, int, int, int, int, int]  # gyro x y z, accelerometer x y z, int16, sensor frame
+# Gyro x y z, accelerometer x y z, int16, sensor frame. The six are passed on and not unpacked: code compiled by mypyc would
+# take a tuple of known length apart and put it together again at every hand.
+ImuCounts = tuple[int, ...]
 
 EEPROM_SIZE = 8192
 DECK_MEMORY_SIZE = 112
@@ -55,5 +57,5 @@ class Board(Protocol):
         ...
 
     def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
-        """Let a part of the robot fail, by MAVLink's numbers; hardware that cannot do that says UNSUPPORTED."""
+        """Let a part of the robot fail, by MAVLink's numbers; hardware that cannot do that answers UNSUPPORTED."""
         ...

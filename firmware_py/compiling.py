@@ -1,8 +1,8 @@
 """Compilation by numba: IEEE arithmetic as it is written, kept on disk, and never older than its sources.
 
-Without fast maths LLVM neither reorders nor fuses, so that every processor computes the same bits. Numba recognises what it
-has kept by the file of the function alone, not by the files of what was inlined; here the content of all sources counts,
-wherever the cache lies (`__pycache__`, `NUMBA_CACHE_DIR`). What is stale is overwritten.
+Without fast maths LLVM neither reorders nor fuses, so every processor computes the same bits. Numba decides by the file of
+the function alone whether its cached code is current, not by the files of what was inlined; here the content of all
+sources counts, wherever the cache lies (`__pycache__`, `NUMBA_CACHE_DIR`). Stale code is overwritten.
 """
 
 import hashlib
@@ -47,10 +47,10 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
-    """Return whether a compiled function needs no compiling on this machine."""
+    """Return whether a function has been compiled on this machine already."""
     return PLAIN or bool(_kept(function)._load_index())
 
 
 def _kept(dispatcher: Any) -> Any:
-    """Return numba's index of what it has kept of a function."""
+    """Return numba's index of the cached code of a function."""
     return dispatcher._cache._cache_file

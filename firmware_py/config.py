@@ -74,10 +74,10 @@ class PredictorConfig(Section):
 
     enabled: bool = Field(description="false: every pose counts as current, as in the original firmware")
     age: Literal["measured", "fixed"] = Field(
-        description="measured: poses tell their age and the horizon follows; fixed: always `horizon` ticks"
+        description="measured: poses state their age and the horizon follows it; fixed: always `horizon` ticks"
     )
     horizon: int = Field(ge=1, le=HORIZON_LIMIT, description="first or fixed horizon [ticks of 10 ms]")
-    default_age_us: int = Field(ge=0, le=120_000, description="age of a pose that does not tell it [us]")
+    default_age_us: int = Field(ge=0, le=120_000, description="age of a pose that does not state it [us]")
 
 
 class ControllerConfig(Section):
@@ -175,7 +175,7 @@ Rate = Annotated[float, Field(ge=0, le=1000)]
 class StreamRates(Section):
     """How often the board sends each message unasked after boot; 0 switches it off. [Hz]"""
 
-    heartbeat: Rate = Field(description="HEARTBEAT; clients give up after some seconds without")
+    heartbeat: Rate = Field(description="HEARTBEAT; clients give up after some seconds without one")
     sys_status: Rate = Field(description="SYS_STATUS")
     battery_status: Rate = Field(description="BATTERY_STATUS")
     attitude: Rate = Field(description="ATTITUDE")
@@ -201,7 +201,7 @@ class MavlinkConfig(Section):
 
 
 class LogicConfig(BaseModel):
-    """Modules of the user's own in the core, and values of their parameters (docs/own-logic.md)."""
+    """The user's own modules in the core, and values of their parameters (docs/howto/own-logic.md)."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     __pydantic_extra__: dict[str, float] = Field(init=False)
@@ -228,7 +228,8 @@ class FirmwareConfig(Section):
     supervisor: SupervisorConfig
     cpu: CpuConfig
     mavlink: MavlinkConfig
-    logic: LogicConfig = Field(default_factory=LogicConfig)  # of which the profile states what there is
+    # The profile states only what it has of this section.
+    logic: LogicConfig = Field(default_factory=LogicConfig)
 
 
 def parameters_of(config: FirmwareConfig) -> Block[Parameters]:

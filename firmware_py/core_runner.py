@@ -36,7 +36,7 @@ class CoreRunner(Protocol):
 
 @runtime_checkable
 class CoreCosts(Protocol):
-    """Tells how long the core's next call takes on the board's processor, on the memory as it is now."""
+    """States how long the core's next call takes on the board's processor, on the memory as it is now."""
 
     def estimate_us(self) -> int:
         """Return the processor time of the estimator's tick."""
@@ -141,5 +141,5 @@ class ConfiguredCosts:
 
 
 def costs_of(runner: CoreRunner, cpu: CpuConfig) -> CoreCosts:
-    """Return what tells the costs: the runner itself where it can and may."""
+    """Return the source of the costs: the runner itself if it measures them and the profile allows it."""
     return runner if cpu.measured and isinstance(runner, CoreCosts) else ConfiguredCosts(cpu)

@@ -1,6 +1,6 @@
 """Elementary functions from + - * / and square roots in a fixed order: the same bits on every processor.
 
-The C library has code of its own for processors with fused multiply-add, and last bits differ; so has numpy. These power
+The C library has separate code for processors with fused multiply-add, and the last bits differ; so has numpy. These power
 series come within 5 units in the last place. `sine_ahead`, `exp` and `atan2` can be compiled, with the same bits: they call
 nothing of ours. The flight core has float32 functions of its own.
 """
@@ -59,7 +59,7 @@ def tan(angle: float) -> float:
 
 
 def exp(x: float) -> float:
-    """Exponential function; 0 and infinity beyond what can be told."""
+    """Exponential function; 0 or infinity beyond the range of a double."""
     if x < EXP_MIN:
         return 0.0
     if x > EXP_MAX:
@@ -112,7 +112,7 @@ def asin(x: float) -> float:
 
 
 def power(base: float, exponent: int) -> float:
-    """`base` to a whole power that is not negative."""
+    """`base` to the power of a non-negative integer."""
     result = 1.0
     while exponent:
         if exponent & 1:

@@ -1,9 +1,9 @@
-"""Compiled modules: what `make fast` has built is imported in place of its sources, as long as it was built of these.
+"""Compiled modules: what `make fast` has built is imported in place of the sources, as long as they have not changed since.
 
-`tools/fast.py` compiles the modules of the lockstep loop with mypyc. What it makes lies in `firmware_py/compiled/`, where
-Python itself does not look, beside a record of the sources that it was made of. A finder ahead of all others hands it out
-while the record fits the sources as they are now; when it does not fit, all modules are pure Python and `STALE` says why.
-With FLOATY_PURE in the environment they are, too: under a debugger, and in tests that replace parts of a class.
+`tools/fast.py` compiles the modules of the lockstep loop with mypyc. The results lie in `firmware_py/compiled/`, where
+Python itself does not look, beside a record of their sources. A finder ahead of all others returns them
+while the record matches the present sources; when it does not, all modules are pure Python and `STALE` says why.
+They also are with FLOATY_PURE in the environment: under a debugger, and in tests that replace parts of a class.
 """
 
 import hashlib
@@ -40,12 +40,12 @@ class CompiledModules(MetaPathFinder):
 
 
 def digest(source: Path) -> str:
-    """Return what tells one content of a file from another; empty when there is no file."""
+    """Return a hash of a file's content; empty when there is no file."""
     return hashlib.sha256(source.read_bytes()).hexdigest() if source.is_file() else ""
 
 
 def usable(folder: Path = FOLDER, root: Path = ROOT) -> tuple[dict[str, Path], str]:
-    """Return the compiled modules, by name, and why those that are there are not used."""
+    """Return the compiled modules by name, and, if there are some that cannot be used, why."""
     if SWITCH in os.environ or not (folder / RECORD).is_file():
         return {}, ""
     record = json.loads((folder / RECORD).read_text(encoding="utf-8"))

@@ -50,7 +50,8 @@ if TYPE_CHECKING:
     from firmware_py.links.mavlink_stack import MavlinkStack
 
 MEASUREMENT_QUEUE = 20  # original firmware
-DEADLINES_US = {  # of each activation: whatever the flight path does in a tick is over before the next one
+# Of each activation: the work of the flight path in a tick is done before the next one.
+DEADLINES_US = {
     "SENSORS": 1000,
     "STABILIZER": 1000,
     "KALMAN": 1000,
@@ -60,9 +61,9 @@ DECK = (0xBC, 0xF1, "bcFloaty", "A")  # vendor, product, name, revision of the d
 
 
 class Firmware:
-    """A booted board. `kernel`, `variables` and `parameters` may be looked at; `signals` are views on the core.
+    """A booted board. `kernel`, `variables` and `parameters` may be read; `signals` are views on the core.
 
-    Only with `mavlink` the UART speaks MAVLink, and pymavlink is needed. `runner` executes the flight core.
+    With `mavlink` the UART speaks MAVLink, which needs pymavlink. `runner` executes the flight core.
     """
 
     def __init__(
@@ -162,7 +163,7 @@ class Firmware:
         own: tuple[Parameter, ...],
         read: ReadBlock,
     ) -> None:
-        """Create what MAVLink clients find."""
+        """Create the services for MAVLink clients."""
         from firmware_py.links.mavlink_absent import answer_for_what_is_not_there
         from firmware_py.links.mavlink_commands import CommandService
         from firmware_py.links.mavlink_on_request import RequestedMessages
@@ -214,7 +215,7 @@ class Firmware:
             self.mavlink.uart_ready()
 
     def check_watchdog(self) -> None:
-        """Raise `WatchdogError` when the stabilizer has not come round for too long; hardware, called now and then."""
+        """Raise `WatchdogError` when the stabilizer has not run for too long; called by the hardware now and then."""
         late_us = self.kernel.now_us - self._core.watchdog_fed_us
         if late_us > WATCHDOG_US:
             text = f"watchdog reset, STABILIZER has not run for {late_us / 1000:.0f} ms and this task has the processor"
@@ -225,7 +226,7 @@ class Firmware:
         self.kernel.run(now_us)
 
     def add_thief(self) -> Thief:
-        """Add a task that takes a share of every tick before all others; it takes nothing until told to."""
+        """Add a task that takes a share of every tick before all others; it takes nothing until its share is set."""
         thief = Thief()
         self.kernel.create_task("THIEF", PRIORITY, thief_task, self.kernel, thief)
         return thief

@@ -9,7 +9,7 @@ from firmware_py.supervisor import Manual, Supervisor
 
 
 class ManualFlaps:
-    """Keeps what was asked for; `apply` brings it into force after a change."""
+    """Keeps the requested angles and words; `apply` brings them into force after a change."""
 
     def __init__(self, supervisor: Supervisor, parameters: Parameters, data: Input) -> None:
         self.mode = Manual.OFF

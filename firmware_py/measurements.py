@@ -11,7 +11,7 @@ ACCELEROMETER: Final = 1  # not used by the filter, as in the original, but it t
 POSE: Final = 2
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PoseMeasurement:
     """A pose and when it arrived on board."""
 

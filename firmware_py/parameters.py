@@ -1,4 +1,4 @@
-"""The parameters of the firmware: what may be changed on the running board, with its limits.
+"""The parameters of the firmware: what may be changed on the running board, with limits.
 
 Names are the Crazyflie's and the original Floaty's. Limits are those of the configuration, where there is one.
 """
@@ -28,7 +28,7 @@ from firmware_py.logic.plugs import GROUP
 from firmware_py.running import Running
 from firmware_py.supervisor import Manual
 from firmware_py.variables import F32, I8, I16, SCALARS, U8, U16, U32
-from firmware_py.wire.parameter_names import GAINS, SIGNALS
+from firmware_py.wire.parameter_names import CORE, GAINS, SIGNALS
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.telemetry import STREAM
 
@@ -61,6 +61,8 @@ def parameters(running: Running, stream: TelemetryStream) -> tuple[Parameter, ..
             lambda value: setattr(core, "predict", int(value)), 0, 1, persistent=True,
         ),
         _field("delayComp.horizon", "10 ms", core, "horizon", PredictorConfig, U8),
+        _field("delayComp.defaultAge", "us", core, "default_age_us", PredictorConfig, Scalar.I32),
+        *(_field(name, "", core, key, section) for name, key, section in core_fields()),
         *_excitation(core),
         *_kalman(running),
         *_supervision(running, stream),
@@ -70,6 +72,16 @@ def parameters(running: Running, stream: TelemetryStream) -> tuple[Parameter, ..
         ),
         *_identity(),
     )  # fmt: skip
+
+
+def core_fields() -> Iterator[tuple[str, str, type[BaseModel]]]:
+    """Yield what of the core the original had no name for: the board's name, the core's, its configuration."""
+    sections: dict[str, type[BaseModel]] = {
+        "model": ModelConfig, "estimator": EstimatorConfig, "controller": ControllerConfig, "allocation": AllocationConfig,
+    }  # fmt: skip
+    for path, name in CORE.items():
+        section, key = path.split(".")
+        yield name, key, sections[section]
 
 
 def configured_limits(section: type[BaseModel], field: str) -> tuple[float, float]:
@@ -189,7 +201,7 @@ def _kalman(running: Running) -> Iterator[Parameter]:
 
 
 def _supervision(running: Running, stream: TelemetryStream) -> Iterator[Parameter]:
-    """Failsafe and telemetry. The stop of the Crazyflie firmware holds until a reboot, Floaty's own can be left."""
+    """Failsafe and telemetry. The stop of the Crazyflie firmware holds until a reboot, Floaty's own can be undone."""
     supervisor, kernel = running.supervisor, running.stack.kernel
 
     def lock(value: float) -> None:
@@ -222,7 +234,7 @@ def _supervision(running: Running, stream: TelemetryStream) -> Iterator[Paramete
 
 
 def _own_logic(running: Running) -> Iterator[Parameter]:
-    """What modules of the user's have declared as Tunable."""
+    """What the user's modules have declared as Tunable."""
     logic = running.core.logic
     for own in () if logic is None else logic.loaded.parameters:
         array, scalar = running.core.named[own.block].memory[own.name], SCALARS[own.base]
@@ -232,8 +244,8 @@ def _own_logic(running: Running) -> Iterator[Parameter]:
         )  # fmt: skip
 
 
-# cfclient's flight and lighthouse tabs and Bitcraze's QA suite read these without asking whether there are any: without them
-# they end in KeyError. Of other decks that are not there the table says nothing.
+# cfclient's flight and lighthouse tabs and Bitcraze's QA suite read these without asking whether they exist: without them
+# they end in KeyError. Other absent decks have no entry.
 ABSENT_DECKS = (
     "bcAI", "bcDWM1000", "bcFlow", "bcFlow2", "bcLighthouse4", "bcLoco", "bcMultiranger", "bcUSD", "bcZRanger",
     "bcZRanger2",

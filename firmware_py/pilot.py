@@ -15,7 +15,7 @@ SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHU
 
 
 class Pilot:
-    """`absolute` says what poses are. `goal` is what the last error was formed against, None for a correction as it came."""
+    """`absolute` says what poses are. `goal` is what the last error was formed against, None for an unchanged correction."""
 
     def __init__(self, default_age_us: int) -> None:
         self.planner = Planner()
@@ -26,7 +26,7 @@ class Pilot:
         self._default_age_us = default_age_us
 
     def flies(self, now_us: int) -> bool:
-        """Whether there is something to fly to; what comes over other links than CRTP is not the pilot's."""
+        """Whether there is something to fly to; poses from links other than CRTP do not pass the pilot."""
         idle = self.planner.phase(now_us) is Phase.IDLE
         return not (self.absolute and idle and self.here is not None)
 
@@ -36,30 +36,30 @@ class Pilot:
         return self._setpoint_us is not None
 
     def forsaken(self, now_us: int) -> bool:
-        """Whether set-points lead and no more of them come."""
+        """Whether set-points lead and have stopped arriving."""
         return self._setpoint_us is not None and now_us - self._setpoint_us >= SETPOINT_SILENCE_US
 
     def follow(self, path: Path, now_us: int, lands: bool = False) -> None:
-        """Take up a path of the high-level commander, which needs nobody any more."""
+        """Start a path of the high-level commander, which needs no further messages."""
         self.planner.follow(path, now_us, lands)
         self._setpoint_us = None
 
     def hold(self, position: Vector, yaw: float, now_us: int) -> None:
-        """Fly to a set-point; the next one has to come soon."""
+        """Fly to a set-point; the next one has to arrive soon."""
         self.planner.follow(stay(position, yaw), now_us)
         self._setpoint_us = now_us
 
     def release(self) -> None:
-        """Notice that nobody promises further set-points; what the last one said stays in force."""
+        """Note that no further set-points are promised; the last one stays in force."""
         self._setpoint_us = None
 
     def abort(self) -> None:
-        """Give up what was to be flown."""
+        """Give up the path or set-point."""
         self.planner.stop()
         self._setpoint_us = None
 
     def begin(self, now_us: int) -> Motion | None:
-        """Where a new path begins: where the present one is, else where the robot is; None when nobody knows."""
+        """Where a new path begins: where the present one is, else where the robot is; None when that is not known."""
         if self.planner.phase(now_us) is not Phase.IDLE:
             return self.planner.at(now_us)
         return self.here if self.absolute else ORIGIN
@@ -69,7 +69,7 @@ class Pilot:
         return self.planner.at(now_us) if self.planner.phase(now_us) is not Phase.IDLE else self.goal
 
     def error(self, pose: PoseMessage, now_us: int) -> PoseMessage:
-        """Return what the estimator takes for a pose that has just arrived."""
+        """Return the error that the estimator takes for a pose that has just arrived."""
         age_us = self._default_age_us if pose.age_us is None else pose.age_us
         if self.absolute:
             self.here = Motion(pose.p_GB, to_euler_zyx(pose.q_GB)[2])

@@ -1,8 +1,8 @@
-"""The planner behind the high-level commander: from "take off", "go to" or a stored trajectory to where to fly when.
+"""The planner behind the high-level commander: from "take off", "go to" or a stored trajectory to goals over time.
 
 A path is a row of pieces, each a polynomial of 7th degree in time for x, y, z and yaw. Between two states of motion it is
 the one whose jerk vanishes at both ends. Positions in the frame of the external poses [m], angles in rad, times in seconds
-from the begin of the path. Only + - * / in a fixed order, and the functions of `elementary`: the same bits everywhere.
+from the beginning of the path. Only + - * / in a fixed order, and the functions of `elementary`: the same bits everywhere.
 Meaning of the commands: crazyflie-firmware 2a18fc29 (crtp_commander_high_level.c, planner.c).
 """
 
@@ -38,12 +38,12 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Pieces one after the other, slower by `timescale`, perhaps backwards, perhaps turned and moved to another begin."""
+    """Pieces one after the other, slower by `timescale`, perhaps reversed, or turned and moved to another starting point."""
 
     pieces: tuple[Piece, ...]
     timescale: float = 1.0
     reverse: bool = False
-    turn: float = 0.0  # about the path's begin, then
+    turn: float = 0.0  # about the path's starting point, then
     shift: Vector = (0.0, 0.0, 0.0)
 
     @property
@@ -52,7 +52,7 @@ class Path:
         return sum(piece.duration for piece in self.pieces) * self.timescale
 
     def at(self, t: float) -> Motion:
-        """The motion at a time; before the begin and after the end it stands there."""
+        """The motion at a time; before the beginning and after the end it rests there."""
         stands = not 0.0 <= t < self.duration
         t = min(max(t, 0.0), self.duration) / self.timescale
         if self.reverse:
@@ -118,7 +118,7 @@ class Planner:
         self._begin_us = 0
 
     def phase(self, now_us: int) -> Phase:
-        """What it does now: the end of a landing is the end of the flight."""
+        """The present phase; the end of a landing is the end of the flight."""
         if self._phase is Phase.LANDING and self._time(now_us) >= self._path.duration:
             self._phase = Phase.IDLE
         return self._phase
@@ -132,11 +132,11 @@ class Planner:
         return self._path.at(self._time(t_us))
 
     def stop(self) -> None:
-        """End the flight where it is."""
+        """End the flight at the present position."""
         self._phase = Phase.IDLE
 
     def follow(self, path: Path, now_us: int, landing: bool = False) -> None:
-        """Take up a path, from now on."""
+        """Start a path now."""
         self._path, self._begin_us = path, now_us
         self._phase = Phase.LANDING if landing else Phase.FLYING
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class StockState:
-    """What clients have set, by name."""
+    """Values that clients have set, by name."""
 
     settings: dict[str, float] = field(default_factory=dict)
     test_value: float = 0.0  # system.testLogParam, shown by sys.testLogParam
@@ -33,7 +33,7 @@ class StockState:
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """The parts of a running board that variables and parameters look into."""
+    """The parts of a running board that variables and parameters read."""
 
     board: Board
     core: CoreBlocks

@@ -1,4 +1,4 @@
-"""What an observer outside the board may look at: views on the running core and its counters, read only."""
+"""What an observer outside the board may read: views on the running core and its counters."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ class Signals:
 
     @classmethod
     def of(cls, estimator: Block[Estimator], control: Block[Control], supervisor: Supervisor) -> "Signals":
-        """Look into the blocks of a running core."""
+        """Return the views on the blocks of a running core."""
         start = dict(ESTIMATOR.fields or {})[COUNTERS[0]][1]
         counters = np.ndarray(len(COUNTERS), np.int32, estimator.memory.data, start)
         fields = control.fields

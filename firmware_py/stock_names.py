@@ -1,8 +1,8 @@
-"""Names of the stock Crazyflie firmware that its clients use, beside those that Floaty has a quantity of its own for.
+"""Names of the stock Crazyflie firmware that its clients use, beside those for which Floaty has a quantity of its own.
 
-Live where the board has the quantity. The rest belongs to hardware or controllers that Floaty has not: as on a Crazyflie
-without that deck, or with another controller in charge, the values are there, can be set and stored, and do nothing.
-`tests/vectors/stock_names.json` holds the clients' list with the types of crazyflie-firmware 2a18fc29.
+They are live where the board has the quantity. The rest belongs to hardware or controllers that Floaty lacks: as on a
+Crazyflie without that deck, or with another controller in charge, the values are there, can be set and stored, and do
+nothing. `tests/vectors/stock_names.json` holds the clients' list with the types of crazyflie-firmware 2a18fc29.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -57,7 +57,7 @@ RESTING = (
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Parameters of one group that are kept and do nothing: names, and the stock defaults of all of them."""
+    """Parameters of one group that are stored and have no effect: names, and the stock defaults of all of them."""
 
     group: str
     names: str
@@ -102,7 +102,7 @@ SETTINGS = (
     Setting("ring", "headlightEnable", U8, (0,)),
     Setting("ring", "solidRed solidGreen solidBlue", U8, (20, 20, 20)),
     Setting("sound", "effect", U8, (0,), True),
-    Setting("stabilizer", "estimator", U8, (2,)),  # whatever it says, Floaty's own estimates
+    Setting("stabilizer", "estimator", U8, (2,)),  # whatever its value, Floaty's own estimator runs
     Setting("stabilizer", "controller", U8, (0,)),  # and controls
     Setting("tdoaEngine", "logId logOthrId", U8, (0, 0)),
 )
@@ -183,29 +183,29 @@ def stock_parameters(running: Running) -> Iterator[Parameter]:
         "system.testLogParam", U8, "", lambda: running.stock.test_value,
         lambda value: setattr(running.stock, "test_value", value), 0, 0xFF,
     )  # fmt: skip
-    for name, tell in (
-        ("system.taskDump", _tell_tasks),
-        ("system.storageStats", _tell_storage),
+    for name, lines in (
+        ("system.taskDump", _task_lines),
+        ("system.storageStats", _storage_lines),
         ("system.assertInfo", lambda running: ("No assert information found",)),
         ("health.startPropTest", lambda running: ("health: there are no propellers to test",)),
-        ("health.startBatTest", _tell_battery),
+        ("health.startBatTest", _battery_lines),
     ):
-        yield _button(running, name, tell)
+        yield _button(running, name, lines)
 
 
-def _button(running: Running, name: str, tell: Callable[[Running], Iterable[str]]) -> Parameter:
-    """A parameter that lets the console say something when it is set, and reads 0 again at once."""
+def _button(running: Running, name: str, lines: Callable[[Running], Iterable[str]]) -> Parameter:
+    """A parameter that prints lines on the console when it is set, and reads 0 again at once."""
 
     def press(value: float) -> None:
         if value:
-            for line in tell(running):
+            for line in lines(running):
                 running.say(line)
 
     return Parameter(name, U8, "", lambda: 0, press, 0, 0xFF)
 
 
-def _tell_tasks(running: Running) -> Iterator[str]:
-    """The share of the processor's time that each task has taken since boot."""
+def _task_lines(running: Running) -> Iterator[str]:
+    """The share of the processor's time that each task has used since boot."""
     kernel = running.stack.kernel
     yield "Task dump"
     yield "Load\tName"
@@ -213,12 +213,12 @@ def _tell_tasks(running: Running) -> Iterator[str]:
         yield f"{100 * kernel.run_time_us(task) / max(1, kernel.now_us):.2f}\t{task.name}"
 
 
-def _tell_storage(running: Running) -> Iterator[str]:
+def _storage_lines(running: Running) -> Iterator[str]:
     """How full the parameters' memory is."""
     used, size, items = running.storage.used, running.storage.size, len(running.storage.load())
     yield f"Used storage: {items} items stored, {used} of {size} bytes ({100 * used // size} %)"
 
 
-def _tell_battery(running: Running) -> Iterator[str]:
+def _battery_lines(running: Running) -> Iterator[str]:
     supervisor = running.supervisor
     yield f"health: battery {supervisor.battery_mv} mV, at least {supervisor.low_battery_mv} needed"

@@ -1,19 +1,19 @@
 """The supervisor decides, before every controller step, whether the loop may be closed.
 
 Whatever forbids it leads to the same defined flap state, the hover angles, and is announced once on the console. State
-and cause are log variables (`supervisor.state`, `supervisor.cause`). The way back depends on the cause:
+and cause are log variables (`supervisor.state`, `supervisor.cause`). How it ends depends on the cause:
 
     silence         no accepted pose for 500 ms (parameter): the next accepted pose ends it
     out of bounds   the estimator was held at its bounds for 200 ms: ends after 500 ms inside them
     disarmed        by request: ends with the request to arm
-    not finite      own logic put out NaN or infinity, the controller or the estimator: ends with a recovery request
+    not finite      own logic returned NaN or infinity, the controller or the estimator: ends with a recovery request
     emergency stop  by request, because a started emergency stop watchdog was not fed for 1 s, or because a stream of
                     set-points fell silent for 2 s: ends only with a reboot. A stop by the parameter floaty.stop ends
                     with a recovery request, too
     low battery     below the limit for 5 s: ends only with a recovery request when the voltage is back above it
 
 Before the first pose, and with absolute poses while the high-level commander has nothing to do, it waits. The board arms
-itself at boot. One outlier pose is refused by the estimator's gate and is no reason for anything here.
+itself at boot. One outlier pose is refused by the estimator's gate and has no effect here.
 """
 
 from collections.abc import Callable
@@ -41,19 +41,60 @@ class Manual(IntEnum):
 
 
 class GoalSource(Protocol):
-    """Who knows where to fly."""
+    """Knows where to fly."""
 
     def flies(self, now_us: int) -> bool:
         """Whether there is something to fly to."""
         ...
 
     def forsaken(self, now_us: int) -> bool:
-        """Whether somebody who led step by step has fallen silent."""
+        """Whether set-points led the robot and have stopped arriving."""
         ...
 
     def abort(self) -> None:
-        """Give up what was planned: the robot may not fly."""
+        """Give up the plan, because the robot may not fly."""
         ...
+
+
+class BoundsWatch:
+    """Notices when the estimator has been held at its bounds for too long; `estimator` is the core's fields."""
+
+    def __init__(self, estimator: Estimator) -> None:
+        self.estimator = estimator
+        self._bounded = 0
+        self._episode_start_us = self._bounded_us = self._outside_until_us = NEVER_US
+
+    def is_outside(self, now_us: int) -> bool:
+        """Whether the state counts as out of bounds; called every 10 ms."""
+        bounded = int(self.estimator.bounded)
+        if bounded != self._bounded:
+            self._bounded = bounded
+            if now_us - self._bounded_us > EPISODE_GAP_US:
+                self._episode_start_us = now_us
+            self._bounded_us = now_us
+            if now_us - self._episode_start_us >= EPISODE_LIMIT_US or now_us < self._outside_until_us:
+                self._outside_until_us = now_us + BOUNDS_RECOVERY_US
+        return now_us < self._outside_until_us
+
+
+class LogicWatch:
+    """Remembers in `cause` which of the user's modules has returned NaN or infinity since `reset`."""
+
+    def __init__(self) -> None:
+        self.cause = Cause.NONE
+        self._controller_faults = self._estimator_faults = 0
+
+    def see(self, controller_faults: int, estimator_faults: int) -> None:
+        """Take how often that has happened since boot."""
+        if estimator_faults > self._estimator_faults:
+            self.cause = Cause.ESTIMATOR_NOT_FINITE
+        elif controller_faults > self._controller_faults:
+            self.cause = Cause.CONTROLLER_NOT_FINITE
+        self._controller_faults, self._estimator_faults = controller_faults, estimator_faults
+
+    def reset(self) -> None:
+        """Forget the cause."""
+        self.cause = Cause.NONE
 
 
 class Supervisor:
@@ -74,16 +115,13 @@ class Supervisor:
         self.battery_mv = 0
         self.goals: GoalSource | None = None  # None: there is always something to fly to
         self.connected: Callable[[], bool] = lambda: True  # whether a client is there
-        self._estimator = estimator
+        self.logic = LogicWatch()
+        self.bounds = BoundsWatch(estimator)
         self._announce = announce
         self._stopped = self._locked = False
-        self._not_finite = Cause.NONE
-        self._controller_faults = self._estimator_faults = 0
         self._battery_empty = False
         self._battery_good_us = 0
-        self._watchdog_us: int | None = None  # instant at which it bites, None until it is fed once
-        self._bounded = 0
-        self._episode_start_us = self._bounded_us = self._outside_until_us = NEVER_US
+        self._watchdog_us: int | None = None  # instant at which it triggers, None until it is fed once
 
     @property
     def stopped(self) -> bool:
@@ -97,22 +135,22 @@ class Supervisor:
 
     @property
     def battery_empty(self) -> bool:
-        """Whether the battery was found empty."""
+        """Whether the battery counts as empty."""
         return self._battery_empty
 
     @property
     def can_be_armed(self) -> bool:
-        """Whether a request to arm is obeyed: neither a stop nor the battery is in its way."""
-        return not self._stopped and not self._battery_empty and self._not_finite is Cause.NONE
+        """Whether a request to arm is obeyed: neither a stop nor the battery forbids it."""
+        return not self._stopped and not self._battery_empty and self.logic.cause is Cause.NONE
 
     @property
     def can_fly(self) -> bool:
-        """Whether poses are all that is needed."""
+        """Whether nothing but poses is needed."""
         return self.calibrated and self.armed and self.can_be_armed
 
     def mode(self, now_us: int) -> int:
         """Return the controller's mode at this instant and announce a change of state; called every 10 ms."""
-        self._watch_bounds(now_us)
+        outside = self.bounds.is_outside(now_us)
         if self._watchdog_us is not None and now_us >= self._watchdog_us:
             self.emergency_stop()
         if self.goals is not None:
@@ -120,7 +158,7 @@ class Supervisor:
                 self.emergency_stop()
             if not self.can_fly:
                 self.goals.abort()
-        state, cause = self._state(now_us)
+        state, cause = self._state(now_us, outside)
         if state is not self.state or cause is not self.cause:
             self.state, self.cause = state, cause
             reason = "" if cause is Cause.NONE else f", {cause.name.lower().replace('_', ' ')}"
@@ -146,7 +184,7 @@ class Supervisor:
         self._stopped = True
 
     def feed_watchdog(self, now_us: int) -> None:
-        """Start the emergency stop watchdog, or keep it from biting for another second."""
+        """Start the emergency stop watchdog, or hold it off for another second."""
         self._watchdog_us = now_us + WATCHDOG_US
 
     def arm(self, armed: bool) -> bool:
@@ -157,38 +195,30 @@ class Supervisor:
         return True
 
     def recover(self, now_us: int) -> bool:
-        """Leave what lasts: stop, logic that failed, and with a good voltage the low battery.
+        """Leave a lasting failsafe: a stop, logic that failed, and with a good voltage the low battery.
 
-        False while the battery is low. The emergency stop is none of what can be left.
+        False while the battery is low. The emergency stop cannot be left.
         """
         self._stopped = self._locked
-        self._not_finite = Cause.NONE
+        self.logic.reset()
         if self.battery_mv >= self.low_battery_mv:
             self._battery_empty = False
             self._battery_good_us = now_us
         return not self._battery_empty
 
-    def see_logic(self, controller_faults: int, estimator_faults: int) -> None:
-        """Take in how often own logic has put out NaN or infinity."""
-        if estimator_faults > self._estimator_faults:
-            self._not_finite = Cause.ESTIMATOR_NOT_FINITE
-        elif controller_faults > self._controller_faults:
-            self._not_finite = Cause.CONTROLLER_NOT_FINITE
-        self._controller_faults, self._estimator_faults = controller_faults, estimator_faults
-
     def see_battery(self, now_us: int, battery_mv: int) -> None:
-        """Take in the supply voltage [mV]."""
+        """Take the supply voltage [mV]."""
         self.battery_mv = battery_mv
         if battery_mv >= self.low_battery_mv:
             self._battery_good_us = now_us
         elif now_us - self._battery_good_us >= BATTERY_LOW_US:
             self._battery_empty = True
 
-    def _state(self, now_us: int) -> tuple[State, Cause]:
+    def _state(self, now_us: int, outside: bool) -> tuple[State, Cause]:
         if self._stopped:
             return State.FAILSAFE, Cause.EMERGENCY_STOP
-        if self._not_finite is not Cause.NONE:
-            return State.FAILSAFE, self._not_finite
+        if self.logic.cause is not Cause.NONE:
+            return State.FAILSAFE, self.logic.cause
         if self._battery_empty:
             return State.FAILSAFE, Cause.LOW_BATTERY
         if not self.armed:
@@ -199,18 +229,6 @@ class Supervisor:
             return State.WAITING, Cause.NONE
         if now_us - self.last_pose_us >= self.pose_timeout_us:
             return State.FAILSAFE, Cause.SILENCE
-        if now_us < self._outside_until_us:
+        if outside:
             return State.FAILSAFE, Cause.OUT_OF_BOUNDS
         return State.FLYING, Cause.NONE
-
-    def _watch_bounds(self, now_us: int) -> None:
-        """Notice how long the estimator has been held at its bounds."""
-        bounded = int(self._estimator.bounded)
-        if bounded == self._bounded:
-            return
-        self._bounded = bounded
-        if now_us - self._bounded_us > EPISODE_GAP_US:
-            self._episode_start_us = now_us
-        self._bounded_us = now_us
-        if now_us - self._episode_start_us >= EPISODE_LIMIT_US or now_us < self._outside_until_us:
-            self._outside_until_us = now_us + BOUNDS_RECOVERY_US

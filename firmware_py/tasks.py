@@ -23,7 +23,7 @@ TICKS_PER_STEP = 10  # 100 Hz
 CONTROL_PHASE = 0  # the controller runs in ticks 0, 10, 20 …
 POWER_PERIOD = 100  # original firmware
 ESTIMATOR_PHASE = 9  # and the estimator in the ticks before
-DATA_TIMEOUT = 1  # tick edge without a sample at which the stabilizer goes on without the IMU
+DATA_TIMEOUT = 1  # tick edges without a sample after which the stabilizer runs without the IMU
 
 
 def sensors_task(
@@ -72,7 +72,7 @@ def stabilizer_task(
             control_tick = next_step(kernel.tick_count, CONTROL_PHASE)
             yield from kernel.work(costs.control_us())
             if core.guard is not None:
-                supervisor.see_logic(int(core.guard.controller_faults), int(core.guard.estimator_faults))
+                supervisor.logic.see(int(core.guard.controller_faults), int(core.guard.estimator_faults))
             core.data.fields.mode = i32(supervisor.mode(kernel.now_us))
             yield from kernel.yield_if_pending()
             core.run.control()
@@ -88,7 +88,7 @@ def estimator_task(
     core: CoreBlocks,
     costs: CoreCosts,
 ) -> Task:
-    """Take in measurements at 1 kHz, estimate at 100 Hz."""
+    """Take measurements at 1 kHz, estimate at 100 Hz."""
     data = core.data.fields
     samples = x = y = z = 0
     step_tick = next_step(kernel.tick_count, ESTIMATOR_PHASE)
@@ -114,7 +114,7 @@ def estimator_task(
 
 
 def power_task(kernel: Kernel, board: Board, supervisor: Supervisor) -> Task:
-    """Look at the supply voltage at 10 Hz."""
+    """Measure the supply voltage at 10 Hz."""
     wake_tick = kernel.tick_count
     while True:
         supervisor.see_battery(kernel.now_us, board.read_battery_mv())

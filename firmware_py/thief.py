@@ -1,4 +1,4 @@
-"""A task that takes processor time from all others: a load to test them with, no part of a flight."""
+"""A task that takes processor time from all others: a test load, no part of a flight."""
 
 from collections.abc import Generator
 

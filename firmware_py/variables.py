@@ -1,8 +1,8 @@
 """The log variables of the firmware: names as on the Crazyflie and on the original Floaty, values from the running core.
 
 Units are Floaty's (angles in rad) except where Crazyflie's own programs look: attitudes in `stateEstimate` and `stabilizer`
-are in degrees with the nose up positive, `gyro` and `acc` in deg/s and g. Position, velocity and yaw are those of the frame
-of the poses: of corrections the goal frame, what the board knows is its error; of absolute poses the cameras'.
+are in degrees with the nose up positive, `gyro` and `acc` in deg/s and g. Position, velocity and yaw are in the frame
+of the poses: for corrections the goal frame, because the board knows only its error; for absolute poses the cameras'.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 AGE_UNIT_US = 100  # locSrv.age counts tenths of a millisecond
 BATTERY_FULL_MV = 4200
-LOAD_US = 100_000  # at least, over which the processor's load is told
+# The least time over which the processor's load is averaged.
+LOAD_US = 100_000
 PM_BATTERY, PM_LOW = 0, 3  # pm.state
 
 F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
@@ -86,7 +87,7 @@ def _fields(group: str, names: str, scalar: Scalar, unit: str, fields: object) -
 
 
 def _parts(group: str, names: str, unit: str, read: Callable[[int], float]) -> Iterator[LogVariable]:
-    """Name the parts of a vector that are computed when they are asked for, each by its index."""
+    """Name the parts of a vector that are computed on demand, each by its index."""
     for index, name in enumerate(names.split()):
         yield LogVariable(f"{group}.{name}", F32, unit, partial(read, index))
 
@@ -134,7 +135,7 @@ def _legacy_angle(running: Running, axis: int) -> float:
 
 
 def _crazyflie(running: Running) -> Iterator[LogVariable]:
-    """What only Crazyflie's own programs look at."""
+    """Variables that only the Crazyflie's own programs read."""
     board, bias = running.board, running.core.data.fields.gyro_bias
 
     def rate(axis: int) -> float:
@@ -182,7 +183,7 @@ def _kalman(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
 
 
 def _counters(running: Running) -> Iterator[LogVariable]:
-    """What was lost, and where; how busy the processor is."""
+    """What was lost, and where; the load of the processor."""
     yield from _fields("crtp", "malformed unserved dropped", U32, "", running.stack)
     if running.mavlink is not None:
         yield from _fields("mavlink", "frames lost bad refused dropped overruns", U32, "", running.mavlink)
@@ -194,7 +195,7 @@ def _counters(running: Running) -> Iterator[LogVariable]:
 
 
 def _own_logic(core: CoreBlocks) -> Iterator[LogVariable]:
-    """What modules of the user's have declared as Logged."""
+    """What the user's modules have declared as Logged."""
     for own in () if core.logic is None else core.logic.loaded.variables:
         array = core.named[own.block].memory[own.field]
         read = partial(array.item, 0) if own.index is None else partial(array.item, 0, own.index)

@@ -11,7 +11,7 @@ class StationConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     corrections_hz: float = Field(
-        50.0, ge=1, le=200, description="corrections per second [Hz], if there are as many frames; original"
+        50.0, ge=1, le=200, description="corrections per second [Hz], if there are that many frames; original"
     )
     link_latency_us: int = Field(
         1400,
@@ -22,7 +22,7 @@ class StationConfig(BaseModel):
 
 
 class TrackerConfig(BaseModel):
-    """What the ground station takes for a pose of the robot."""
+    """What the ground station accepts as a pose of the robot."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -48,14 +48,14 @@ class TrackerConfig(BaseModel):
         8.0,
         ge=3,
         le=20,
-        description="standard deviations that position or rotation may be off [1]: 7 mm or 3 deg from frame to frame; "
+        description="standard deviations by which position or rotation may deviate [1]: 7 mm or 3 deg from frame to frame; "
         "5.2 at most in all experiments",
     )
     reacquire_us: int = Field(
         400_000,
         ge=50_000,
         le=5_000_000,
-        description="without a good pose, then the track begins anew [us]; the board's failsafe comes after 500 ms",
+        description="without a good pose, then the track begins again [us]; the board's failsafe comes after 500 ms",
     )
 
 
@@ -101,6 +101,6 @@ class CaptureConfig(BaseModel):
         5000,
         ge=0,
         le=500_000,
-        description="vicon, qualisys, vrpn: exposure to arrival, since their client says no times [us]; "
+        description="vicon, qualisys, vrpn: exposure to arrival, since their client reports no times [us]; "
         "chosen, to be measured",
     )

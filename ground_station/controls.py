@@ -1,7 +1,8 @@
 """What an operator may do with a board beside flying it: its parameters, arming, the emergency stop.
 
-A request begins with `ask`; whoever keeps the link going calls `answer` until there is one. Nobody waits in here, so that
-poses go on. `Dialogue` is what all protocols have in common: a script of exchanges, each repeated until its reply comes.
+A request begins with `ask`; whoever runs the link calls `answer` until there is one. Nothing blocks here, so that
+poses are still sent. `Dialogue` is what all protocols have in common: a script of exchanges, each repeated until its reply
+comes.
 """
 
 from __future__ import annotations
@@ -17,23 +18,23 @@ PATIENCE_US = 2_000_000  # without a reply, until it is given up
 
 
 class ControlsError(Exception):
-    """The board refuses, does not know what is meant, or does not answer; the text is one line."""
+    """The board refuses, does not know the parameter, or does not answer; the text is one line."""
 
 
 class Action(Enum):
-    """What may be asked for."""
+    """What may be requested."""
 
     LIST = "list"  # parameters and their values: all, or at least those whose names begin with a name
     READ = "read"
     WRITE = "write"
     SAVE = "save"  # the persistent parameters, for the next boot
-    ARM = "arm"  # and leave what can be left without a reboot
+    ARM = "arm"  # and leave every state that ends without a reboot
     STOP = "stop"  # at once: flaps at hover until the board reboots
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One wish; `name` is the board's own."""
+    """One request; `name` is the board's own."""
 
     action: Action
     name: str = ""
@@ -42,7 +43,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of it: the parameters that were asked for, by the names of the link; `error` is empty if all is well."""
+    """The result: the requested parameters, by the names of the link; `error` is empty if all is well."""
 
     values: tuple[tuple[str, float], ...]
     error: str = ""
@@ -89,20 +90,20 @@ class Dialogue(Generic[M]):
         self._again_us = self._give_up_us = 0
 
     def ask(self, now_us: int, request: Request) -> None:
-        """Begin; an older request is forgotten."""
+        """Begin; an older request is dropped."""
         self._answer = None
         self._script = self._script_of(request)
         self._go_on(now_us, None)
 
     def hear(self, now_us: int, message: M) -> bool:
-        """Take a message; whether it was the reply that was waited for."""
+        """Take a message; return whether it was the expected reply."""
         reply = None if self._exchange is None else self._exchange.take(message)
         if reply is not None:
             self._go_on(now_us, reply)
         return reply is not None
 
     def answer(self, now_us: int) -> Answer | None:
-        """Return the answer once it is there; repeat what was not replied to."""
+        """Return the answer once it is there; repeat what was not answered."""
         if self._exchange is not None and now_us >= self._again_us:
             if now_us >= self._give_up_us:
                 self._end(Answer((), self._exchange.missing))

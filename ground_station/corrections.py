@@ -11,13 +11,13 @@ from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Correction:
-    """The pose of the body in the goal frame and how long ago it was so."""
+    """The pose of the body in the goal frame and its age."""
 
     p_GB: tuple[float, float, float]  # [m]
     q_GB: tuple[float, float, float, float]  # w x y z
-    age_us: int  # since the exposure, when the board has it
+    age_us: int  # from the exposure to the arrival on board
 
 
 def correct(frame: MocapFrame, goal: Goal, arrival_us: int) -> Correction:

@@ -2,8 +2,8 @@
 
 
 class LinkError(Exception):
-    """The board cannot be reached, or not any more, or not like this; the text is one line."""
+    """The board cannot be reached, or no longer, or not with this address; the text is one line."""
 
 
 class MocapError(Exception):
-    """Motion capture cannot be reached, or does not say what it should; the text is one line."""
+    """Motion capture cannot be reached, or its answer is unusable; the text is one line."""

@@ -15,13 +15,13 @@ from cflib.bootloader.cloader import Cloader
 from ground_station.errors import LinkError
 from ground_station.links.crazyradio import quiet_cflib
 
-Progress = Callable[[str, int, int], None]  # "writing" or "checking", bytes done, bytes in all
+Progress = Callable[[str, int, int], None]  # "writing" or "checking", bytes done, bytes in total
 
 URI = r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?"
 START = 0x0800_4000  # of the firmware in the flash of the STM32F405; the bootloader lies below
 FLASH_END = 0x0810_0000
 MEMORIES = ((0x2000_0000, 0x2002_0000), (0x1000_0000, 0x1001_0000))  # where the stack may begin
-QUIET_S = 0.2  # without an answer nothing is on the way any more
+QUIET_S = 0.2  # without an answer nothing is in flight any more
 READ_TRIES = 3
 
 

@@ -17,7 +17,7 @@ class FrameRate:
         self._measured = False
 
     def on_frame(self, t_us: int) -> str:
-        """Take an exposure; a line for the user, empty almost always."""
+        """Take an exposure; returns a line for the user, which is almost always empty."""
         if self._measured:
             return ""
         exposures_us = self._exposures_us
@@ -27,11 +27,13 @@ class FrameRate:
         self._measured = True
         period_us = median(later - earlier for earlier, later in pairwise(exposures_us))
         rate_hz = 1e6 / period_us
-        as_told = abs(period_us - self._period_us) <= TOLERANCE * self._period_us
+        as_configured = abs(period_us - self._period_us) <= TOLERANCE * self._period_us
         slow = rate_hz < (1.0 - TOLERANCE) * self._corrections_hz
-        if as_told and not slow:
+        if as_configured and not slow:
             return ""
-        expected = "" if as_told else f", not every {self._period_us * 1e-3:.1f} ms as mocap.period_us says"
+        expected = (
+            "" if as_configured else f", not every {self._period_us * 1e-3:.1f} ms as mocap.period_us says"
+        )
         leaving = f"{rate_hz:.0f}, not {self._corrections_hz:g}" if slow else f"{self._corrections_hz:g}"
         return (
             f"motion capture: a frame every {period_us * 1e-3:.1f} ms{expected}: "

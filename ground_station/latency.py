@@ -2,7 +2,7 @@
 
 Camera: until the motion capture computer has the images. Processing: until the pose leaves it. Network: until the
 station has it. Station: until the link gets it. Link: until the board has it. "mocap" is the first three in one, for
-sources that do not tell them apart. Times in microseconds.
+sources that do not report them separately. Times in microseconds.
 """
 
 from collections import deque
@@ -15,7 +15,7 @@ from ground_station.mocap import MocapFrame
 STAGES = ("camera", "processing", "network", "mocap", "station", "link")
 SENT_POSES = 250  # that the budget is made of: 5 s at 50 Hz
 
-Row = tuple[float, ...]  # the time in each of `STAGES` of one pose; nan: not told
+Row = tuple[float, ...]  # the time in each of `STAGES` of one pose; nan: not reported
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class LinkLatency:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """What many poses spent in a stage."""
+    """The time that many poses spent in a stage."""
 
     name: str
     mean_us: float
@@ -40,7 +40,7 @@ class Stage:
 
 
 def row_of(frame: MocapFrame, sent_us: int, link_us: int) -> Row:
-    """The way of a pose that the link got at `sent_us`."""
+    """The latency of a pose that the link got at `sent_us`, by stages."""
     arrived_us = sent_us if frame.arrived_us is None else frame.arrived_us
     rest = (arrived_us - frame.t_us, sent_us - arrived_us, link_us)
     if frame.received_us is None or frame.transmitted_us is None:
@@ -50,17 +50,17 @@ def row_of(frame: MocapFrame, sent_us: int, link_us: int) -> Row:
 
 
 def budget_of(rows: Sequence[Row], medium: str) -> tuple[Stage, ...]:
-    """The stages that are told, and the age on board as "pose" ahead of them; empty without poses."""
+    """The reported stages, and the age on board as "pose" ahead of them; empty without poses."""
     if not rows:
         return ()
     columns = dict(zip(STAGES, zip(*rows, strict=True), strict=True))
     pose = _stage("pose", [sum(row[3:]) for row in rows])
-    stages = (_stage(medium if name == "link" else name, columns[name]) for name in stages_told(columns))
+    stages = (_stage(medium if name == "link" else name, columns[name]) for name in reported_stages(columns))
     return (pose, *stages)
 
 
-def stages_told(columns: Mapping[str, Sequence[float]]) -> tuple[str, ...]:
-    """The stages that add up to the age: "mocap" only where one of those before it is not told."""
+def reported_stages(columns: Mapping[str, Sequence[float]]) -> tuple[str, ...]:
+    """The stages that add up to the age: "mocap" only where one of those before it is not reported."""
     apart = [name for name in STAGES[:3] if not isnan(sum(columns[name]))]
     return (*(apart if len(apart) == 3 else ("mocap",)), *STAGES[4:])
 
@@ -79,7 +79,7 @@ def budget_line(budget: Sequence[Stage]) -> str:
 
 
 class LatencyBudget:
-    """The ways of the poses that were sent last."""
+    """The latencies of the poses that were sent last."""
 
     def __init__(self) -> None:
         self._link: LinkLatency | None = None  # of the last pose
@@ -91,7 +91,7 @@ class LatencyBudget:
         self._sent.append((frame, sent_us, link.us))
 
     def last(self) -> Row:
-        """The way of the last pose, all nan before."""
+        """The latency of the last pose by stages, all nan before the first."""
         return row_of(*self._sent[-1]) if self._sent else (nan,) * len(STAGES)
 
     def __str__(self) -> str:

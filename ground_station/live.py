@@ -1,7 +1,7 @@
-"""The ground station with real hardware: poses from a source, a link to a board, until told to stop.
+"""The ground station with real hardware: poses from a source, a link to a board, until stopped.
 
-It connects again when the link is lost, shows how the link does and how old poses are, and leaves the board with its
-flaps at hover: the corrections stop first, and the link is closed when the board has noticed.
+It connects again when the link is lost, shows the state of the link and the age of poses, and leaves the board with its
+flaps at hover: the corrections stop first, and the link is closed when the board is in failsafe.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ FAILSAFE_TIMEOUT_US = 2_000_000
 
 @dataclass(slots=True)
 class LiveStation:
-    """Runs a ground station; `say` gets lines for the user, `stopping` tells when to end."""
+    """Runs a ground station; `say` gets lines for the user, `stopping` returns whether to end."""
 
     link: LiveLink
     station: GroundStation
@@ -35,8 +35,8 @@ class LiveStation:
     turn: Callable[[int], None]  # called again and again with the instant while the link holds
 
     def run(self) -> None:
-        """Fly until told to stop; raises `LinkError` when there are no poses or no board."""
-        self._tell()
+        """Fly until stopped; raises `LinkError` when there are no poses or no board."""
+        self._report()
         self._connect()
         try:
             while not self.stopping():
@@ -51,20 +51,20 @@ class LiveStation:
     def _connect(self) -> None:
         self.link.open(self._serve_source)
         self.say(f"connected to {self.link.uri}")
-        self._tell()
+        self._report()
 
     def _serve_source(self) -> bool:
-        """Keep the source going while the link connects; whether to stop that."""
+        """Keep the source going while the link connects; return whether to give up."""
         self._drop_waiting()
         return self.stopping()
 
     def _drop_waiting(self) -> None:
-        """Take the frames that nobody wants any more."""
+        """Discard the frames that are waiting."""
         while self.source.receive(0.0) is not None:
             pass
 
     def _reconnect(self, cause: LinkError) -> None:
-        """Try until it works or takes too long."""
+        """Try until it succeeds or takes too long."""
         deadline_us = clock_us() + RECONNECT_TIMEOUT_US
         self.link.close()
         while not self.stopping():
@@ -95,7 +95,7 @@ class LiveStation:
                 pose_us = now_us
             self._take_telemetry()
             self.turn(now_us)
-            self._tell()
+            self._report()
             self.link.check()
             if now_us - status_us >= STATUS_PERIOD_US:
                 status_us = now_us
@@ -105,7 +105,7 @@ class LiveStation:
         for t_us, packet in self.link.received():
             self.station.on_packet(t_us, packet)
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         for notice in self.source.notices() + self.station.notices() + self.link.notices():
             self.say(notice)
 

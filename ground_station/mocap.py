@@ -1,4 +1,4 @@
-"""What a motion capture system says about the robot."""
+"""What a motion capture system reports about the robot."""
 
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -6,9 +6,9 @@ from typing import Protocol
 from firmware_py.wire.crtp import FAR
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class MocapFrame:
-    """The body's pose in the world at one exposure of the cameras, and when it passed where; None: not told.
+    """The body's pose in the world at one exposure of the cameras, and the instants of its stages; None: not reported.
 
     All instants are of the ground station's clock.
     """
@@ -16,14 +16,14 @@ class MocapFrame:
     t_us: int  # the exposure
     p_WB: tuple[float, float, float]  # [m]
     q_WB: tuple[float, float, float, float]  # w x y z
-    valid: bool  # False: the body was not tracked, the pose means nothing; True is what the system says until `judged`
+    valid: bool  # False: the body was not tracked and the pose has no meaning; True is only the system's word until `judged`
     received_us: int | None = None  # the motion capture computer has the images
     transmitted_us: int | None = None  # the pose leaves it
     arrived_us: int | None = None  # the ground station has it
 
 
 def judged(frame: MocapFrame) -> MocapFrame:
-    """A frame as the station takes it, from whatever source: valid only if its numbers are a place and a rotation.
+    """A frame from any source, valid only if its numbers are a position and a rotation.
 
     The comparisons are false for NaN and infinity, too.
     """
@@ -49,7 +49,7 @@ class MocapSource(Protocol):
         ...
 
     def summary(self) -> str:
-        """A few words on how it does."""
+        """A few words on its state."""
         ...
 
     def close(self) -> None:

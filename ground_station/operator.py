@@ -1,7 +1,7 @@
 """What an operator types while a board flies: a line, an act, an event.
 
-A request to the board is answered while poses go on; the next line waits for the answer, but `stop` for nothing. What cannot
-be done is one line and changes nothing. `say` answers at the terminal, `note` puts what was done into the record.
+A request to the board is answered while poses are sent; the next line waits for the answer, but `stop` waits for nothing. A
+refused request is one line and changes nothing. `say` answers at the terminal, `note` records what was done.
 """
 
 from __future__ import annotations
@@ -18,36 +18,33 @@ from ground_station.controls import Action, Answer, ControlsError, Request, Sett
 from ground_station.program import Cockpit
 from ground_station.trajectory import Goal, Hold, Trajectory
 
-HELP = """goal X Y Z [YAW]     fly to a place in W [m, deg]; without a yaw as it is
+HELP = """goal X Y Z [YAW]     fly to a place in W [m, deg]; without YAW it is unchanged
 fly NAME             fly the trajectory of an experiment from here on
 set NAME VALUE       change a parameter: set controller.gain_y -2.0, set extCtrl.y_P 2.0
-get NAME             what a parameter is
-params [GROUP]       all of them, or those whose names begin so
+get NAME             show a parameter
+params [GROUP]       show all, or those whose names begin with GROUP
 save                 keep the parameters for the board's next boot
-reset                set those that were changed to the values that last flew well
-arm                  leave what a recovery can end, and arm
+reset                set changed parameters to the values that last flew well
+arm                  recover where that is possible, and arm
 stop                 emergency stop: flaps at hover, until the board reboots
-mark TEXT            note something in the record
-help                 this"""
+mark TEXT            add a note to the record
+help                 show this list"""
 COMMANDS = tuple(line.split()[0] for line in HELP.splitlines())
-LINES = 100  # that wait for their turn
-REACH = 1.0  # [m] from home, beyond which no goal is meant: the tunnel is 1.2 m wide
-WELL, WELL_US = (
-    0.10,
-    5_000_000,
-)  # values fly well when the robot has kept within 10 cm of its goal that long with them
+LINES = 100  # that wait to be executed
+REACH = 1.0  # [m] from home, beyond which a goal is refused as a mistake: the tunnel is 1.2 m wide
+# Values count as good when the robot has kept within this distance [m] of its goal for this long with them.
+WELL, WELL_US = 0.10, 5_000_000
 
-Talk = Generator[
-    Request, Settings, str
-]  # with the board; returns what was done, empty if there is nothing to note
+# A dialogue with the board; returns what was done, empty if there is nothing to note.
+Talk = Generator[Request, Settings, str]
 FindTrajectory = Callable[[str], Callable[[Goal, int], Trajectory]]
 
 
 class Operator:
-    """`take` lines as they come, `turn` in every turn of the station's loop.
+    """Call `take` for each line and `turn` in every turn of the station's loop.
 
-    `find` returns the trajectory of a name, or raises `ControlsError`. `know`, if there is one, is told every value of a
-    parameter that becomes known, all of them at first.
+    `find` returns the trajectory of a name, or raises `ControlsError`. `know`, if there is one, is called with every value
+    of a parameter that becomes known, all of them at first.
     """
 
     def __init__(
@@ -61,17 +58,17 @@ class Operator:
         self._say = say
         self._note = note
         self._know = know
-        self._is_learning = know is not None  # nobody has asked yet for all parameters
+        self._is_learning = know is not None  # all parameters are still to be requested
         self._lines: deque[str] = deque()
         self._talk: Talk | None = None
-        self._line = ""  # that is being done
+        self._line = ""  # that is being executed
         self._set: dict[str, float] = {}  # values that were changed, by the names of the link
         self._good: dict[str, float] = {}  # those of them that last flew well
         self._well_since_us: int | None = None
-        self.known: Sequence[str] = tuple(OF_PROFILE)  # names of parameters, for who completes what is typed
+        self.known: Sequence[str] = tuple(OF_PROFILE)  # names of parameters, for completion
 
     def take(self, line: str) -> None:
-        """Do what a line says when its turn comes."""
+        """Queue a line for execution."""
         if line.strip() == "stop":
             self._lines.clear()
             self._lines.append(line)
@@ -79,10 +76,10 @@ class Operator:
         elif len(self._lines) < LINES:
             self._lines.append(line)
         else:
-            self._say(f"{line}: {LINES} lines wait already; it is not done")
+            self._say(f"{line}: {LINES} lines wait already; it is dropped")
 
     def turn(self, cockpit: Cockpit, now_us: int) -> None:
-        """Go on with what is being done, or begin the next."""
+        """Continue the present line, or begin the next."""
         self._watch(cockpit, now_us)
         if self._talk is not None:
             answer = cockpit.link.answer(now_us)
@@ -126,9 +123,7 @@ class Operator:
         if command == "help":
             return self._help()
         near = get_close_matches(command, COMMANDS, 1)
-        raise ControlsError(
-            f"unknown{f'; did you mean {near[0]}?' if near else '; help shows what there is'}"
-        )
+        raise ControlsError(f"unknown{f'; did you mean {near[0]}?' if near else '; help lists the commands'}")
 
     def _hear(self, cockpit: Cockpit, now_us: int, answer: Answer) -> None:
         try:
@@ -156,7 +151,7 @@ class Operator:
         else:
             cockpit.link.ask(now_us, request)
 
-    # What can be typed; those that ask the board nothing yield nothing
+    # The commands; those that do not need the board yield nothing
 
     def _goal(self, words: list[str], cockpit: Cockpit, now_us: int) -> Talk:
         numbers = [_number(word) for word in words]
@@ -206,7 +201,7 @@ class Operator:
         self.known = tuple(dict.fromkeys((*self.known, *(name for name, _ in values))))
         chosen = [f"{name} {value:.6g}" for name, value in values if name.lower().startswith(group)]
         if not chosen:
-            raise ControlsError(f"params {words[0]}: no parameter begins so")
+            raise ControlsError(f"params {words[0]}: no parameter begins with that")
         for line in chosen:
             self._say(line)
         return ""
@@ -223,7 +218,7 @@ class Operator:
         _words(words, "reset", 0)
         changed = {name: value for name, value in self._good.items() if self._set[name] != value}
         if not changed:
-            raise ControlsError("nothing to reset: what is set is what last flew well")
+            raise ControlsError("nothing to reset: the values that are set are those that last flew well")
         for name, value in changed.items():
             ((_, self._set[name]),) = yield Request(Action.WRITE, name, value)
         return "reset " + ", ".join(f"{name} {value:.6g}" for name, value in changed.items())
@@ -240,7 +235,7 @@ class Operator:
         yield
 
     def _watch(self, cockpit: Cockpit, now_us: int) -> None:
-        """Remember values that have flown well for a while."""
+        """Remember values after they have flown well for a while."""
         frame, flying = cockpit.ground.frame, cockpit.link.supervisor_state == State.FLYING
         goal = cockpit.plan.at(now_us).p_WG
         near = frame is not None and hypot(*(a - b for a, b in zip(frame.p_WB, goal, strict=True))) <= WELL
@@ -262,7 +257,7 @@ def _number(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise ControlsError(f"{text!r} is no number") from None
+        raise ControlsError(f"{text!r} is not a number") from None
     if not isfinite(value):
-        raise ControlsError(f"{text!r} is no finite number")
+        raise ControlsError(f"{text!r} is not a finite number")
     return value

@@ -2,7 +2,7 @@
 
 All axes are alike: how uncertain position and velocity are, and with which gains a pose counts, is computed for one axis,
 and likewise for angle and rate. The attitude lives in a reference quaternion; the filter's angle is the small rotation that
-it is off, which goes into the reference after every step.
+it deviates by, which is moved into the reference after every step.
 """
 
 from dataclasses import dataclass
@@ -33,21 +33,21 @@ class Covariance(NamedTuple):
 
     def predicted(self, t: float, noise: Noise) -> "Covariance":
         """A step of `t` [s] later: F P F' + Q with F = (1 t; 0 1), Q = a^2 (t^4/4 t^3/2; t^3/2 t^2)."""
-        change, way = t * noise.acceleration, 0.5 * t * t * noise.acceleration  # of slope and value
+        change, shift = t * noise.acceleration, 0.5 * t * t * noise.acceleration  # of slope and value
         both = self.both + t * self.slope
         return Covariance(
-            self.value + t * (self.both + both) + way * way,
-            both + way * change,
+            self.value + t * (self.both + both) + shift * shift,
+            both + shift * change,
             self.slope + change * change,
         )
 
     def gains(self, noise: Noise) -> tuple[float, float]:
-        """With which a measurement counts for the value and for the slope [1, 1/s]: P H' / (H P H' + R)."""
+        """The weights of a measurement for the value and for the slope [1, 1/s]: P H' / (H P H' + R)."""
         total = self.value + noise.value * noise.value
         return self.value / total, self.both / total
 
     def updated(self, k_value: float, k_slope: float) -> "Covariance":
-        """After a measurement that counted with these gains: (I - K H) P."""
+        """After a measurement with these gains: (I - K H) P."""
         return Covariance(
             self.value - k_value * self.value,
             self.both - k_value * self.both,
@@ -82,7 +82,7 @@ class PoseFilter:
         return self._p, self._q
 
     def begin(self, p_WB: Vector, q_WB: Quaternion) -> None:
-        """Know this pose and nothing before it."""
+        """Start from this pose and forget everything before it."""
         self._p, self._v, self._theta, self._w = p_WB, NOTHING, NOTHING, NOTHING
         self._covariances = self._first
         w, x, y, z = q_WB
@@ -90,7 +90,7 @@ class PoseFilter:
         self._q = (n * w, n * x, n * y, n * z)
 
     def predict(self, steps: int, widen: bool) -> None:
-        """Go on by `steps`; without `widen` the uncertainty stays as it is."""
+        """Predict `steps` ahead; without `widen` the uncertainty stays as it is."""
         for _ in range(steps - 1):
             self._move()
             self._turn()
@@ -109,11 +109,11 @@ class PoseFilter:
         (position, rotation), (p, r) = self._covariances, self._noises
         return position.value + p.value * p.value, rotation.value + r.value * r.value
 
-    def off(self, p_WB: Vector, q_WB: Quaternion) -> tuple[float, float, Vector]:
+    def deviation(self, p_WB: Vector, q_WB: Quaternion) -> tuple[float, float, Vector]:
         """How far a pose is from the prediction, squared [m^2, rad^2], and its rotation from the reference.
 
         Rotations are twice Gibbs's vector, 2 tan(angle / 2) about the axis [rad]: the angle itself where it is small, and
-        far beyond every gate where it is not.
+        far beyond every gate where it is not small.
         """
         x, y, z = self._p
         a, b, c = self._theta
@@ -142,7 +142,7 @@ class PoseFilter:
         return self._v, self._w
 
     def leave_out(self) -> tuple[Vector, Vector]:
-        """Take no pose this time; returns velocity and rate as predicted."""
+        """Skip the pose of this frame; returns velocity and rate as predicted."""
         self._turn()
         return self._v, self._w
 
@@ -154,7 +154,7 @@ class PoseFilter:
         self._theta = (t * p, t * q, t * r)
 
     def _turn(self) -> None:
-        """Put the attitude error into the reference."""
+        """Move the attitude error into the reference."""
         a, b, c = self._theta
         w, x, y, z = self._q
         a, b, c = 0.5 * a, 0.5 * b, 0.5 * c

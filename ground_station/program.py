@@ -1,6 +1,6 @@
-"""The ground station as a program: cameras, link, tracker, trajectory and records wired together, until told to stop.
+"""The ground station as a program: cameras, link, tracker, trajectory and records wired together, until stopped.
 
-It knows nothing of the laboratory: what a profile says of it arrives as `GroundSettings`.
+It knows nothing of the laboratory: its part of a profile arrives as `GroundSettings`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import FlightPlan, Goal, Trajectory
 
-ASK_PERIOD_S = 0.002  # between two looks for an answer
+ASK_PERIOD_S = 0.002  # between two polls for an answer
 
 
 @dataclass(frozen=True, slots=True)
 class GroundSettings:
-    """What a profile says of the ground station."""
+    """The ground station's part of a profile."""
 
     station: StationConfig
     tracker: TrackerConfig
@@ -50,7 +50,7 @@ class Session:
     """What is flown. `start_s`: when the trajectory's clock begins, after the board first flies."""
 
     uri: str
-    mocap: str | None  # on top of the settings' capture
+    mocap: str | None  # overrides the settings' capture
     trajectory: Callable[[Goal, int], Trajectory]  # (home, start [us])
     start_s: float = 0.0
     log: Path | None = None  # telemetry
@@ -60,7 +60,7 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Cockpit:
-    """What those have before them who record or steer a flight."""
+    """What a recorder or an operator of a flight sees."""
 
     link: LiveLink
     ground: GroundStation
@@ -77,7 +77,7 @@ def fly(
     stopping: Callable[[], bool],
     hands: Sequence[Hand] = (),
 ) -> None:
-    """Fly until told to stop, or to the end of a replay.
+    """Fly until stopped, or to the end of a replay.
 
     Raises `LinkError` or `MocapError` when there is no board or there are no poses, `OSError` for a file that cannot be
     written, `ImportError` for a package that is missing.
@@ -115,7 +115,7 @@ def fly(
 
 
 def ask(link: LiveLink, request: Request) -> Answer:
-    """Ask a board that is connected and not flown from here; raises `LinkError` when it is lost."""
+    """Send a request to a board that is connected and not flown from here; raises `LinkError` when it is lost."""
     link.ask(clock_us(), request)
     while (answer := link.answer(clock_us())) is None:
         for t_us, data in link.received():
@@ -127,13 +127,13 @@ def ask(link: LiveLink, request: Request) -> Answer:
 
 
 def run_until(stopping: Callable[[], bool], duration_s: float | None) -> Callable[[], bool]:
-    """Return what says when to end: when told to, or after a while from now on."""
+    """Return the function that says when to end: when stopped, or after a duration from now on."""
     start_us = clock_us()
     return lambda: stopping() or (duration_s is not None and clock_us() - start_us > duration_s * 1e6)
 
 
 def _open_source(mocap: str | None, capture: CaptureConfig) -> MocapSource:
-    """Return where poses come from, connected."""
+    """Return the connected source of poses."""
     try:
         source = find_source(mocap, capture)
         source.open()

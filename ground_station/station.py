@@ -1,5 +1,5 @@
-"""The ground station: frames in, poses and goals out, telemetry into the log. It never looks at a clock: callers
-bring the time.
+"""The ground station: frames in, poses and goals out, telemetry into the log. It never reads a clock: callers
+pass the time.
 
 The tracker, if there is one, decides which frames are used. A tracked pose leaves with the goal of the moment, as in
 the original: a new goal counts at once, not after the camera's latency.
@@ -22,14 +22,14 @@ TELEMETRY_TIMEOUT_US = 500_000  # of silence, after which the board is asked aga
 
 
 class Link(Protocol):
-    """One way to the board and its protocol."""
+    """A link to the board with its protocol."""
 
     def start_telemetry(self, now_us: int) -> None:
         """Ask the board for its telemetry."""
         ...
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Send what the board needs of a tracked pose and the goal; `WireError` for a pose that cannot be sent."""
+        """Send a tracked pose and the goal in the form that the board needs; `WireError` for a pose that cannot be sent."""
         ...
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
@@ -44,7 +44,7 @@ class Link(Protocol):
 
 @dataclass(slots=True)
 class StationCounters:
-    """What went through the ground station."""
+    """Counters of the ground station."""
 
     frames: int = 0  # from motion capture
     invalid: int = 0  # of these, not tracked, refused or not a pose
@@ -73,14 +73,14 @@ class Slots:
         return t_us >= self._next_us - self._early_us
 
     def take(self, t_us: int) -> None:
-        """Fill the slot of the frame exposed at `t_us`, and those that passed empty."""
+        """Fill the slot of the frame exposed at `t_us`, and those that passed unused."""
         assert self._next_us is not None
         passed = (t_us + self._early_us - self._next_us) // self._period_us
         self._next_us += (passed + 1) * self._period_us
 
 
 class GroundStation:
-    """Passive: `on_frame` for each frame of motion capture, `on_packet` for whatever comes from the board."""
+    """Passive: `on_frame` for each frame of motion capture, `on_packet` for whatever arrives from the board."""
 
     def __init__(
         self,
@@ -97,10 +97,10 @@ class GroundStation:
         self._trajectory = trajectory
         self._log = log
         self._slots = Slots(round(1e6 / config.corrections_hz))
-        self.frame: MocapFrame | None = None  # the last that was used
-        self.track: Track | None = None  # what the tracker made of the last frame
+        self.frame: MocapFrame | None = None  # the last one used
+        self.track: Track | None = None  # the tracker's result for the last frame
         self.telemetry: dict[int, Sample] = {}  # the newest of each block, by its number
-        self._ask_for_telemetry_us = 0  # put off by every sample of the stream
+        self._ask_for_telemetry_us = 0  # postponed by every sample of the stream
 
     def on_frame(self, frame: MocapFrame, now_us: int) -> None:
         """Send the frame of each slot, or the first usable one after it."""

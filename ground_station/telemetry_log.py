@@ -1,8 +1,8 @@
 """The ground station's own record of a flight: a CSV file with one row per telemetry time stamp.
 
 A row joins the blocks that carry the same time stamp with what the ground station itself knew when the first
-of them arrived: its clock, the goal, the last usable pose, what the tracker says and where the age of the last sent
-pose came from. What was missing is `nan`. The header names each column's unit: `stateEstimate.x [m]`. The file is
+of them arrived: its clock, the goal, the last usable pose, the tracker's result and where the age of the last sent
+pose came from. Missing values are `nan`. The header names each column's unit: `stateEstimate.x [m]`. The file is
 complete to about a second when the process dies; memory holds one row.
 """
 

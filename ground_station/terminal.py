@@ -1,4 +1,4 @@
-"""Lines that are typed while a station flies: with history and completion at a terminal, as they come out of a pipe.
+"""Lines that are typed while a station flies: with history and completion at a terminal, line by line from a pipe.
 
 A thread reads, so that the flight never waits. The only file that knows prompt_toolkit.
 """
@@ -17,7 +17,7 @@ from prompt_toolkit import PromptSession
 from prompt_toolkit.completion import WordCompleter
 from prompt_toolkit.patch_stdout import patch_stdout
 
-LINES = 1000  # that nobody has fetched
+LINES = 1000  # that wait to be fetched
 READ_SIZE = 4096
 CLOSE_TIMEOUT_S = 1.0
 
@@ -31,11 +31,11 @@ class Terminal:
         self._session: PromptSession[str] | None = None
         try:
             descriptor = sys.stdin.fileno()
-        except (AttributeError, OSError, ValueError):  # there is none
+        except (AttributeError, OSError, ValueError):  # there is no standard input
             return
         read = self._read
         if os.isatty(descriptor):
-            if not _in_foreground(descriptor):  # whoever reads there is stopped
+            if not _in_foreground(descriptor):  # a background process that reads is stopped
                 return
             if sys.stdout.isatty():
                 completer = WordCompleter(lambda: list(words()), WORD=True)
@@ -55,7 +55,7 @@ class Terminal:
         return lines
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal."""
         self._closing = True
         if self._session is None:
             return
@@ -66,7 +66,7 @@ class Terminal:
 
     def _leave(self) -> None:
         assert self._session is not None
-        with suppress(Exception):  # a line was just finished: the thread looks whether to go on
+        with suppress(Exception):  # a line was just finished: the thread checks whether to go on
             self._session.app.exit(exception=EOFError)
 
     def _put(self, line: str) -> None:
@@ -85,7 +85,7 @@ class Terminal:
 
     def _prompt(self, descriptor: int) -> None:
         assert self._session is not None
-        with patch_stdout():  # what is said meanwhile stands above the line that is being typed
+        with patch_stdout():  # output appears above the line that is being typed
             while not self._closing:
                 try:
                     self._put(self._session.prompt("> "))

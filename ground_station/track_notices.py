@@ -1,4 +1,4 @@
-"""What the tracker tells the user: one line for all that happened within half a second."""
+"""The tracker's notices for the user: one line for all events within half a second."""
 
 from dataclasses import dataclass
 from math import degrees
@@ -8,29 +8,29 @@ GATHER_US = 500_000
 
 @dataclass(slots=True)
 class TrackNotices:
-    """Collects what happened until it is due; times are those of frames."""
+    """Collects events until a line is due; times are those of frames."""
 
     _refused: int = 0
     _distance: float = 0.0  # the largest [m]
     _angle: float = 0.0  # [rad]
     _lost: bool = False
-    _gap_us: int | None = None  # before a track that begun anew
+    _gap_us: int | None = None  # before a track that began again
     _due_us: int | None = None
 
     def refused(self, t_us: int, distance: float, angle: float) -> None:
-        """A pose was so far from the prediction [m, rad]."""
+        """A pose was refused at this distance from the prediction [m, rad]."""
         self._refused += 1
         self._distance = max(self._distance, distance)
         self._angle = max(self._angle, angle)
         self._happened(t_us)
 
     def lost(self, t_us: int) -> None:
-        """There is no track any more."""
+        """The track was lost."""
         self._lost = True
         self._happened(t_us)
 
-    def begun_anew(self, t_us: int, gap_us: int) -> None:
-        """There is one again, `gap_us` after the last good pose."""
+    def begun_again(self, t_us: int, gap_us: int) -> None:
+        """A new track began `gap_us` after the last good pose."""
         self._gap_us = gap_us
         self._happened(t_us)
 
@@ -38,19 +38,19 @@ class TrackNotices:
         """At most one line, by a clock that may jump."""
         if self._due_us is None or 0 < self._due_us - t_us <= GATHER_US:
             return []
-        told = []
+        notices = []
         if self._refused:
             poses = "1 pose" if self._refused == 1 else f"{self._refused} poses"
-            told.append(
-                f"{poses} refused, up to {self._distance:.2f} m and {degrees(self._angle):.0f} deg off"
+            notices.append(
+                f"{poses} refused, up to {self._distance:.2f} m and {degrees(self._angle):.0f} deg from the prediction"
             )
         if self._gap_us is not None:
-            told.append(f"track begun anew after {self._gap_us * 1e-6:.1f} s")
+            notices.append(f"track begun again after {self._gap_us * 1e-6:.1f} s")
         elif self._lost:
-            told.append("track lost")
+            notices.append("track lost")
         self._refused, self._distance, self._angle = 0, 0.0, 0.0
         self._lost, self._gap_us, self._due_us = False, None, None
-        return [f"motion capture: {'; '.join(told)}"]
+        return [f"motion capture: {'; '.join(notices)}"]
 
     def _happened(self, t_us: int) -> None:
         if self._due_us is None:

@@ -1,8 +1,8 @@
 """The tracker between motion capture and link: refuses wrong poses, knows the velocity.
 
 Good frames pass unchanged: smoothing would be a delay that the board's filter does not know. A pose is refused when it is
-further from the prediction than noise and pushes explain. Nothing good for `reacquire_us`: the track is lost, and begins
-anew when three poses fit one another, which wrong ones rarely do. The first track begins so, too.
+further from the prediction than noise and pushes explain. Without a good pose for `reacquire_us` the track is lost, and it
+begins again when three poses fit one another, which wrong ones rarely do. The first track begins so, too.
 """
 
 from dataclasses import dataclass, replace
@@ -17,20 +17,20 @@ from ground_station.pose_filter import PoseFilter
 from ground_station.track_notices import TrackNotices
 
 POSES = 3  # that begin a track
-FIT_US = 50_000  # between them; one that comes later says nothing about the others
+FIT_US = 50_000  # between them; a later one does not confirm the others
 WIDEN_US = 60_000  # refused poses widen the gate until then only, else they would open it to themselves
 UNKNOWN: Vector = (nan, nan, nan)
 
 
 class Quality(IntEnum):
-    """What became of a frame."""
+    """What the tracker decided about a frame."""
 
-    NONE = 0  # there is no track, or nothing was seen
+    NONE = 0  # there is no track, or the body was not seen
     REFUSED = 1  # it fits neither the track nor the time
     TRACKED = 3  # good; records of earlier versions have 2 for a predicted pose
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Track:
     """The frame to be used, and how the robot moves; NaN without a track."""
 
@@ -42,7 +42,7 @@ class Track:
 
 @dataclass(slots=True)
 class TrackerCounters:
-    """What happened to frames."""
+    """Counters of frames."""
 
     refused: int = 0
     restarts: int = 0  # tracks begun but the first
@@ -65,9 +65,9 @@ class Tracker:
             config.angular_acceleration,
         )
         self._notices = TrackNotices()
-        self._poses = 0  # that fit, up to `POSES`
-        self._tracking = False  # there are as many
-        self._patience_us = FIT_US  # how far the last good frame may be away
+        self._poses = 0  # that fit one another, up to `POSES`
+        self._tracking = False  # there are `POSES` of them
+        self._patience_us = FIT_US  # how old the last good frame may be
         self._t_us = 0  # of the newest frame
         self._good_us = 0  # of the newest that the filter has taken
         self._lost_us: int | None = None  # of the last good frame before a track was lost
@@ -75,17 +75,17 @@ class Tracker:
         self._widening = max(1, WIDEN_US // period_us)
 
     def take(self, frame: MocapFrame) -> Track:
-        """What is to be used in the place of `frame`."""
+        """Return the frame to be used in place of `frame`."""
         track = self._take(frame)
         self.quality = track.quality
         return track
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call, half a second late so that one line tells it all."""
+        """Lines for the user since the last call, half a second late so that one line has all of them."""
         return self._notices.due(self._t_us)
 
     def summary(self) -> str:
-        """A few words on how it does."""
+        """A few words on its state."""
         counters = self.counters
         return f"{self.quality.name.lower()} ({counters.refused} refused, {counters.restarts} restarts)"
 
@@ -107,10 +107,10 @@ class Tracker:
         self._filter.predict(steps, self._refused_in_a_row < self._widening)
         if not frame.valid:
             return self._without_pose(frame, Quality.NONE)
-        distance2, angle2, theta = self._filter.off(frame.p_WB, frame.q_WB)
+        distance2, angle2, theta = self._filter.deviation(frame.p_WB, frame.q_WB)
         position2, rotation2 = self._filter.variances
         if distance2 > self._gate2 * position2 or angle2 > self._gate2 * rotation2:
-            if not self._tracking:  # one of them is wrong: the newest gets its chance
+            if not self._tracking:  # one of them is wrong: the newest is tried
                 self._begin(frame)
                 return _without(frame, Quality.NONE)
             self.counters.refused += 1
@@ -141,7 +141,7 @@ class Tracker:
         self._tracking, self._patience_us = True, self._config.reacquire_us
         if self._lost_us is not None:
             self.counters.restarts += 1
-            self._notices.begun_anew(t_us, t_us - self._lost_us)
+            self._notices.begun_again(t_us, t_us - self._lost_us)
 
     def _lose(self) -> None:
         if self._tracking:
@@ -151,7 +151,7 @@ class Tracker:
         self._tracking, self._patience_us = False, FIT_US
 
     def _without_pose(self, frame: MocapFrame, quality: Quality) -> Track:
-        """A pose is missing or wrong: the prediction tells the velocity, and no pose goes out."""
+        """A pose is missing or wrong: the velocity is predicted, and no pose is sent."""
         v_WB, w_B = self._filter.leave_out()
         if not self._tracking:
             return _without(frame, quality)

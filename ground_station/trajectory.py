@@ -1,4 +1,4 @@
-"""Where the robot shall be: goals as functions of time.
+"""Where the robot has to be: goals as functions of time.
 
 `Hold` stays; `Offsets` adds one signal per axis to a home goal. The experiments of the paper are one line
 each, for example `Offsets(home, start_us, yaw=Sine(pi / 2, 0.15))`. Signals count time from the start of the
@@ -40,9 +40,9 @@ class Hold:
 
 
 class FlightPlan:
-    """What a station flies: `home` until it is told to `start`, then the trajectory that `make(home, start_us)` returns.
+    """What a station flies: `home` until `start` is called, then the trajectory that `make(home, start_us)` returns.
 
-    Whoever steers has the last word.
+    An operator's `steer` overrides it.
     """
 
     def __init__(self, home: Goal, make: Callable[[Goal, int], Trajectory]) -> None:
@@ -129,23 +129,22 @@ class Offsets:
         )
 
 
-Way = Callable[
-    [float], Sequence[float]
-]  # time since the start [s] to x, y, z [m] from home, W, and maybe yaw [rad]
+# From the time since the start [s] to x, y, z [m] from home, W, and optionally yaw [rad].
+PathFunction = Callable[[float], Sequence[float]]
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """`home` until `start_us`, then `home` and what a function of time returns. `at` raises `ValueError` for no goal."""
+    """`home` until `start_us`, then `home` and what a function of time returns. `at` raises `ValueError` otherwise."""
 
     home: Goal
     start_us: int
-    way: Way
+    path: PathFunction
 
     def at(self, t_us: int) -> Goal:
         if t_us < self.start_us:
             return self.home
-        offset = self.way((t_us - self.start_us) * 1e-6)
+        offset = self.path((t_us - self.start_us) * 1e-6)
         try:
             dx, dy, dz, turn = (*map(float, offset), 0.0)[:4] if len(offset) in (3, 4) else ()
         except (TypeError, ValueError):
@@ -158,9 +157,9 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class Along:
-    """A trajectory of a function of time: what an experiment that moves the goal has for its trajectory."""
+    """Makes a trajectory from a function of time, for experiments that move the goal."""
 
-    way: Way
+    path: PathFunction
 
     def __call__(self, home: Goal, start_us: int) -> Trajectory:
-        return Course(home, start_us, self.way)
+        return Course(home, start_us, self.path)

@@ -1,6 +1,6 @@
 """The world around the board and the bench that joins them: plant, tunnel, sensors, links, harness, experiments.
 
-What a program of one's own needs of it is in `hil.api`, and can be imported from here: `from hil import fly`. It is loaded
+What a user's program needs is in `hil.api`, and can be imported from here: `from hil import fly`. It is loaded
 when it is first used.
 """
 

@@ -1,7 +1,7 @@
-"""The laboratory for programs of one's own: fly, look at what was flown, say what shall be flown.
+"""The laboratory for the user's own programs: fly, read the results, define experiments.
 
-`docs/python-api.md` has an example of each. Lengths are in m, angles in rad, forces in N, times in s, but a log's own clock,
-`t`, which counts microseconds; frames are W (world, z up) and B (body, x forward, y left, z up).
+`docs/howto/python.md` has an example of each. Lengths are in m, angles in rad, forces in N, times in s, except a log's own
+clock, `t`, which counts microseconds; frames are W (world, z up) and B (body, x forward, y left, z up).
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class Options(TypedDict, total=False):
     link: str  # radio and mavlink: in lockstep; a URI: in real time; default: radio
     faults: Sequence[Fault | str]  # on top of the experiment's own
     board: str  # what executes the flight core: python, c or cortex-m4; default: python
-    trajectory: Callable[[Goal, int], Trajectory]  # instead of the experiment's, like Along(way)
+    trajectory: Callable[[Goal, int], Trajectory]  # instead of the experiment's, like Along(path)
 
 
 def request_of(experiment: Experiment | str, **options: Unpack[Options]) -> Request:
-    """Return what can be flown: an experiment, or the name of one or FILE.py:NAME. Raises `LabError` for bad input."""
+    """Return the request for an experiment, an object, a name or FILE.py:NAME. Raises `LabError` for bad input."""
     chosen = find_experiment(experiment) if isinstance(experiment, str) else experiment
     if "trajectory" in options:
         chosen = replace(chosen, trajectory=options["trajectory"])
@@ -79,7 +79,7 @@ def fly(
     report: bool = False,
     **options: Unpack[Options],
 ) -> Run:
-    """Fly once, into a run folder, by default `runs/EXPERIMENT-SEED`; what was in it is replaced.
+    """Fly once, into a run folder, by default `runs/EXPERIMENT-SEED`; its former content is replaced.
 
     `flown` is an experiment, the name of one, FILE.py:NAME, or a `Request`, which takes no options. `progress` shows the
     time in flight on standard error, or is called with the share of the flight that is over. `report` writes `report.html`.
@@ -100,7 +100,7 @@ def fly(
 
     def on_progress(now_us: int, flight: Flight) -> None:
         if show is not None:
-            show(min(now_us / flight.end_us, 1.0))  # almost nothing while the release is not planned
+            show(min(now_us / flight.end_us, 1.0))  # almost 0 while the release is not planned
 
     result = fly_into(request, folder, progress=on_progress, flight_of=_maker_of(request))
     if show is not None:
@@ -127,19 +127,19 @@ def load_run(folder: Path | str) -> Run:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A flight and its folder. `experiment` is None when it is not known here any more."""
+    """A flight and its folder. `experiment` is None when it is no longer known here."""
 
     result: Result
     experiment: Experiment | None
 
     @property
     def folder(self) -> Path:
-        """Where log, result and pictures lie."""
+        """The folder of log, result and pictures."""
         return self.result.folder
 
     @property
     def passed(self) -> bool:
-        """Whether the flight came to an end of its own and held every limit."""
+        """Whether the flight was completed and held every limit."""
         return self.result.passed
 
     @property
@@ -149,12 +149,12 @@ class Run:
 
     @property
     def cause(self) -> str | None:
-        """Why the flight was lost or went wrong."""
+        """Why the flight was lost or failed."""
         return self.result.cause
 
     @property
     def metrics(self) -> Mapping[str, float]:
-        """Figures of the flight after the release, in the unit of `unit_of`; NaN where it has none."""
+        """Figures of the flight after the release, in the unit of `unit_of`; NaN where the flight has no value."""
         return self.result.metrics
 
     @property
@@ -200,7 +200,7 @@ class Run:
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """What board, station and laboratory said: `t_us`, `source`, `text`."""
+        """The events of board, station and laboratory: `t_us`, `source`, `text`."""
         return load_events(self.folder)
 
     @property
@@ -220,7 +220,7 @@ class Run:
         return f"<{self.result.experiment}, seed {self.result.seed}: {self.outcome}, {how}; {self.folder}>"
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
+        """Return the HTML that a notebook shows."""
         rows = "".join(
             f"<tr><td>{escape(verdict.metric)}</td><td>{escape(str(verdict))}</td>"
             f"<td>{'holds' if verdict.holds else '<b>fails</b>'}</td></tr>"
@@ -256,7 +256,7 @@ def _options(name: str, values: Iterable[str]) -> list[str]:
 
 
 def _shown(request: Request) -> Progress:
-    """Return what shows the progress in one line of standard error, which a notebook shows as well."""
+    """Return the callback that shows the progress in one line of standard error, which a notebook shows as well."""
 
     def show(share: float) -> None:
         text = f"\r{request.experiment.name}, seed {request.seed}: {share:4.0%} of {request.duration_s:g} s"

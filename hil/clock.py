@@ -13,10 +13,10 @@ class Clock(Protocol):
     """Waits until a simulated instant may happen."""
 
     paced: bool
-    stood_still_us: int  # how long simulated time stood still in all, because the machine was too slow
+    stood_still_us: int  # how long simulated time stood still in total, because the machine was too slow
 
     def start(self, now_us: int) -> None:
-        """Let the simulated instant be now."""
+        """Start the clock at the simulated instant."""
         ...
 
     def wait_until(self, now_us: int) -> int:
@@ -24,7 +24,7 @@ class Clock(Protocol):
         ...
 
     def serve(self, now_us: int) -> None:
-        """Take what arrived from outside, at the instant that `wait_until` returned."""
+        """Read what arrived from outside, at the instant that `wait_until` returned."""
         ...
 
     def notices(self) -> list[str]:
@@ -56,9 +56,9 @@ class FreeRunning:
 class Paced:
     """One simulated second per real second.
 
-    A little lateness is made up for. More than `STALL_US` is a stall: simulated time goes on from where it stood, because
-    clients outside would see a burst of the past otherwise, and a line says how long it stood. `readers` has who is called,
-    with the instant, when a socket or a file descriptor is readable.
+    A little lateness is caught up. More than `STALL_US` is a stall: simulated time continues from where it stood, because
+    outside clients would otherwise get a burst of past data, and a line reports how long it stood. `readers` are called
+    with the instant when their socket or file descriptor is readable.
     """
 
     paced = True
@@ -73,17 +73,21 @@ class Paced:
         self._readable: list[socket.socket | int] = []
         self._served_us = 0  # the latest instant
         self._start_ns: int | None = None  # when simulated time was 0
-        self._told_us = 0  # of the standstill
+        self._reported_us = 0  # standstill that was reported
         self._next_notice_us = 0
 
     def start(self, now_us: int) -> None:
-        """Let the simulated instant be now."""
+        """Start the clock at the simulated instant."""
         self._start_ns = time.monotonic_ns() - now_us * 1000
 
     def shift(self, by_us: int) -> None:
-        """Let every instant be later by that on the wall clock, or earlier."""
+        """Shift every instant on the wall clock, later when positive."""
         if self._start_ns is not None:
             self._start_ns += by_us * 1000
+
+    def late_us(self, now_us: int) -> int:
+        """By how much a simulated instant is over; only after `start`."""
+        return self.now_us() - now_us
 
     def now_us(self) -> int:
         """The simulated instant that the wall clock has reached; only after `start`."""
@@ -99,7 +103,7 @@ class Paced:
         """How long it is until the simulated instant may happen, 0 when it may; the first call sets the start."""
         if self._start_ns is None:
             self.start(now_us)
-        late_us = self.now_us() - now_us
+        late_us = self.late_us(now_us)
         if late_us > self.STALL_US:
             self.start(now_us)
             self.stood_still_us += late_us
@@ -120,15 +124,15 @@ class Paced:
     def serve(self, now_us: int) -> None:
         """Call the readers of what is readable."""
         for readable in self._readable:
-            if readable in self.readers:  # not closed by one of the others
+            if readable in self.readers:  # not closed by another reader
                 self.readers[readable](now_us)
         self._readable = []
 
     def notices(self) -> list[str]:
         """Lines for the user since the last call, one per simulated second at the most."""
-        fresh_us = self.stood_still_us - self._told_us
+        fresh_us = self.stood_still_us - self._reported_us
         if fresh_us == 0 or self.now_us() < self._next_notice_us:
             return []
-        self._told_us = self.stood_still_us
+        self._reported_us = self.stood_still_us
         self._next_notice_us = self.now_us() + self.NOTICE_PERIOD_US
         return [f"this machine was too slow: time stood still for {fresh_us / 1000:.0f} ms"]

@@ -100,7 +100,7 @@ def _locate_logic(tree: dict[str, Any], folder: Path) -> None:
 
 
 def read_toml(kind: str, path: Path) -> dict[str, Any]:
-    """Return what a file of a kind ("profile", ..) says. Raises `LabError` when it cannot be read, or is not TOML."""
+    """Return the table of a TOML file of a kind ("profile"). Raises `LabError` when it cannot be read or is not TOML."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -110,7 +110,7 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
 
 
 def base_name(profile: str) -> str:
-    """Return what a profile is called as the base of another one, wherever that stands."""
+    """Return the name of a profile as the base of another one, wherever that is stored."""
     return Path(profile).resolve().as_posix() if profile.endswith(".toml") else profile
 
 

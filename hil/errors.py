@@ -4,19 +4,29 @@ import difflib
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
+
+from firmware_py.extras import install_command
 
 OURS = [Path(__file__).parent.parent / package for package in ("hil", "ground_station", "firmware_py")]
 PYTHON = Path(traceback.__file__).parent
 
 
 class LabError(Exception):
-    """Something the user asked for cannot be done; the text says what, the value, and what is allowed."""
+    """A request of the user cannot be fulfilled; the text says what, the value, and what is allowed."""
+
+
+def require(what: str, extra: str, *modules: str) -> None:
+    """Raise `LabError` with the command that installs an extra when something needs a module that is missing."""
+    for module in modules:
+        if find_spec(module) is None:
+            raise LabError(f"{what}: {module} is missing: {install_command(extra)}")
 
 
 @contextmanager
 def writing(option: str, path: Path | None) -> Iterator[None]:
-    """Turn an `OSError` of what is written where an option says into the `LabError` that says so."""
+    """Turn an `OSError` while writing to an option's path into a `LabError` that names the option."""
     try:
         yield
     except OSError as error:
@@ -24,14 +34,14 @@ def writing(option: str, path: Path | None) -> Iterator[None]:
 
 
 def hint(word: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return the nearest of the known words as a question; with none near, `otherwise`, or all of them."""
+    """Return the nearest of the known words as a question; without a near one `otherwise`, or all of them."""
     names = list(known)
     near = difflib.get_close_matches(word, names, 1, 0.5)
     return f"did you mean {near[0]}?" if near else otherwise or f"there are {', '.join(names) or 'none'}"
 
 
 def blame(error: BaseException) -> str:
-    """Return an error of code that is not ours as one line: file, line, and what it says."""
+    """Return an error of the user's code as one line: file, line and message."""
     text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, SyntaxError):
         return f"{Path(error.filename or '?').name}:{error.lineno}: {error.msg}"
@@ -45,7 +55,7 @@ def blame(error: BaseException) -> str:
 
 
 def _is_known(file: Path) -> bool:
-    """Whether a file is ours or Python's own."""
+    """Whether a file belongs to this project or to Python."""
     if file.name.startswith("<") or any(file.is_relative_to(folder) for folder in OURS):
         return True
     if file.is_relative_to(PYTHON) and "site-packages" not in file.parts:

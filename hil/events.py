@@ -11,7 +11,7 @@ Callback = Callable[[int], object]  # receives the planned instant [us]
 
 
 class EventQueue:
-    """What the hardware does next. `next_us`: the earliest planned instant, None when there is none."""
+    """The planned events of the hardware. `next_us`: the earliest planned instant, None when there is none."""
 
     __slots__ = ("_heap", "_order", "next_us", "now_us")
 
@@ -32,7 +32,7 @@ class EventQueue:
         self._plan(start_us, period_us, callback)
 
     def run(self, now_us: int) -> None:
-        """Run everything due by `now_us`, what the callbacks themselves plan by then included."""
+        """Run everything due by `now_us`, including what the callbacks plan until then."""
         heap = self._heap
         try:
             while heap and heap[0][0] <= now_us:

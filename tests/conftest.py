@@ -5,6 +5,7 @@ fails while this machine stood still is inconclusive and repeated. All other tes
 Property tests try the same examples on every machine, and look for new ones with FLOATY_FUZZ set.
 """
 
+import gc
 import os
 import threading
 import time
@@ -54,6 +55,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.is_relative_to(REALTIME):
             item.add_marker("realtime")
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector what stays anyway: modules and tests, a sixth of the time of `make test`."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_xdist_auto_num_workers() -> int:

@@ -35,7 +35,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
 
 # The rooms of hil from the ground up: a room imports from itself and from floors below, a `config` also from other configs.
 FLOORS = (
-    ("errors", "clock", "events"),
+    ("errors", "clock", "events", "installation"),
     ("world",),
     ("devices",),
     ("config",),
@@ -74,7 +74,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "elftools": ("firmware_py/export/arm_image.py", "hil/devices/stm32f405/image.py"),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py", "hil/devices/stm32f405/chip.py"),
     "subprocess": (
-        "hil/laboratory/result.py", "hil/live/", "hil/servers/linked.py",
+        "hil/installation.py", "hil/live/", "hil/servers/linked.py",
         "ground_station/sources/motioncapture_client.py",
         "firmware_py/export/native.py", "firmware_py/export/arm_image.py", "firmware_py/export/plain.py",
     ),
@@ -124,9 +124,8 @@ CONFINED["click"] = CONFINED["rich"] = (
     "hil/commands/", "hil/studies/sweep.py", "hil/studies/paper.py", "hil/studies/tuning.py",
     "hil/studies/paper_identification.py", "hil/studies/paper_scaling.py",
 )  # fmt: skip
-CONFINED |= dict.fromkeys(
-    ("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",)
-)  # of a whole flight
+# Of a whole flight.
+CONFINED |= dict.fromkeys(("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",))
 NORMAL_NOISE = "hil/world/noise.py"
 DRAWS = (
     "standard_normal",
@@ -275,7 +274,7 @@ def test_every_confined_file_exists() -> None:
     assert {file for file in files if not (ROOT / file).exists()} == set()
 
 
-ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+ARCHITECTURE = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
 
 
 def test_every_file_that_the_architecture_names_exists() -> None:

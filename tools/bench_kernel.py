@@ -17,12 +17,8 @@ from firmware_py.rtos import TICK_US, Kernel, Queue, Semaphore
 
 ACTIVATIONS_PER_TICK = 4
 IMU_PHASE_US = 300
-WORK_US = (
-    30,
-    50,
-    50,
-    200,
-)  # of sensors, stabilizer before and after the tick, estimator; where work is switched on
+# Of sensors, stabilizer before and after the tick, estimator; where work is switched on.
+WORK_US = (30, 50, 50, 200)
 
 
 def kernel_run(ticks: int, work: bool = False) -> int:

@@ -62,9 +62,8 @@ class Scenario:
     semaphores: dict[int, tuple[int, int]] = field(default_factory=dict)  # id to maximum and initial count
     timers: list[tuple[str, int, bool, Operation]] = field(default_factory=list)
     interrupts: list[Interrupt] = field(default_factory=list)
-    tasks: list[tuple[str, int, bool, list[Operation]]] = field(
-        default_factory=list
-    )  # name, priority, once, ...
+    # Name, priority, once, ...
+    tasks: list[tuple[str, int, bool, list[Operation]]] = field(default_factory=list)
 
     def kinds(self) -> dict[str, Any]:
         """What each operand may name."""
@@ -232,9 +231,8 @@ class Run:
             case "delay":
                 yield from kernel.delay(operands[0])
             case "delay_until":
-                early = (
-                    kernel.tick_count < wake_tick[0]
-                )  # FreeRTOS takes this for an overflow and does not wait
+                # FreeRTOS takes this for an overflow and does not wait.
+                early = kernel.tick_count < wake_tick[0]
                 wake_tick[0] += operands[0]
                 waits = not early and wake_tick[0] > kernel.tick_count
                 yield from kernel.delay_until(0 if early else wake_tick[0])

@@ -20,7 +20,7 @@ from hil.studies.tuning import EXCITATIONS
 from hil.world.paper_table import PAPER_TABLE
 
 FIRST_SEED = 301  # nothing was tuned on these
-# physics.md section 8: with these the robot flies whose rates are damped by its plates alone.
+# With these the robot flies whose rates are damped by its plates alone.
 OPEN = (
     "plant.variant=methods_open",
     "controller.gain_y=-0.75",

@@ -68,7 +68,7 @@ def feedback(parameters: Parameters, estimator: Estimator, control: Control) -> 
 
 @kernel
 def sign(flap: Integer) -> f32:
-    """Return the sign of a flap's angle: eq. (input_signals) turns flaps 1 and 3 the other way than 2 and 4."""
+    """Return the sign of a flap's angle: eq. (input_signals) turns flaps 1 and 3 in the opposite direction to 2 and 4."""
     if flap % 2 == 0:
         return f32(1.0)
     return f32(-1.0)

@@ -1,4 +1,4 @@
-"""What stands behind logic of one's own: only numbers get past it, and whoever hands over something else is counted.
+"""The guard behind the user's own logic: only finite numbers get past it, and NaN or infinity is counted.
 
 The default core has no such logic and does without.
 """
@@ -13,7 +13,7 @@ _allocate = controller.allocate
 
 
 class Guard(Struct):
-    """How often own logic has put out NaN or infinity."""
+    """How often own logic has returned NaN or infinity."""
 
     controller_faults: i32  # ticks
     estimator_faults: i32

@@ -1,6 +1,6 @@
 """The delay predictor: poses wait for their instant, and the delayed state is brought to now.
 
-A pose tells its age. It is filed under the tick at which it was true and fused when the filter, which runs a horizon
+A pose states its age. It is filed under the tick at which it was true and fused when the filter, which runs a horizon
 behind, arrives there. From the filter's state the linear model then steps to the present through the buffered commands,
 with the body rates replaced by the buffered gyro samples. When ages are measured, the horizon follows them: at once when
 a pose comes too late, one tick at a time when poses have been younger for a second. With the predictor off, every pose

@@ -80,7 +80,7 @@ class Parameters(Struct):
     predict: i32  # 0: every pose is taken as current
     age_measured: i32  # 1: the age comes with the pose and the horizon follows it; 0: always `horizon`
     horizon: i32  # ticks, 1..12: the fixed age, or the first one
-    default_age_us: i32  # of a pose that does not tell its age
+    default_age_us: i32  # of a pose that does not state its age
     # controller: proportional, integrator on z only
     gain_y: f32
     gain_vy: f32
@@ -142,7 +142,7 @@ class Estimator(Struct):
     pose: Annotated[F32s, 32, 6]  # position [m] and attitude [rad] in G
     pose_lag: Annotated[F32s, 32]  # [s] the pose was true this long before its tick
     pose_waiting: Annotated[I32s, 32]
-    # a refused pose, kept to tell a jump of the goal from an outlier
+    # a refused pose, kept to distinguish a jump of the goal from an outlier
     suspect: Annotated[F32s, 6]
     suspect_tick: i32
     suspect_waiting: i32

@@ -1,4 +1,4 @@
-"""The typed subset of Python in which the flight core is written, and its two ways to run.
+"""The typed subset of Python in which the flight core is written, and how it runs.
 
 Subset: module constants `f32(..)`, `i32(..)` and plain ints; state structs (`class Name(Struct)` with `f32`, `i32` or
 `Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs; `for` over `range`,

@@ -15,9 +15,8 @@ ACCELEROMETER_SCALE = 24 / 32768  # [g per count] at +-24 g
 COS_45 = sqrt(0.5)
 
 SAMPLES = 512  # original firmware
-VARIANCE_LIMIT = (
-    10_000.0  # [counts^2] 0.1 rad/s rms: more than sensor noise in the flow, less than a moving robot
-)
+# [counts^2] 0.1 rad/s rms: more than sensor noise in the flow, less than a moving robot.
+VARIANCE_LIMIT = 10_000.0
 
 
 def body_of(v_S: Vector) -> Vector:

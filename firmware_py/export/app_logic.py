@@ -1,4 +1,4 @@
-"""What the exported app has of logic of one's own: memory, parameters, log variables, and how it enters the core.
+"""The user's own logic in the exported app: memory, parameters, log variables, and how the app enters the core.
 
 The default core has none; then only the calls remain.
 """
@@ -40,7 +40,7 @@ static inline void call_hover(FloatyControl *control) {{
 {scratch}  floaty_core_control({hover});
 }}
 
-/* Tells the supervisor whether own logic has put out NaN or infinity. */
+/* Reports to the supervisor whether own logic has returned NaN or infinity. */
 static inline void call_guard(void) {{
 {guard}}}
 
@@ -62,7 +62,7 @@ LOG_TYPES = {"f32": "LOG_FLOAT", "i32": "LOG_INT32"}
 
 
 def own_types(logic: Logic | None) -> dict[str, str]:
-    """Return the C types of the blocks that come to the core's, by name."""
+    """Return the C types of the blocks that own logic adds to the core's, by name."""
     if logic is None:
         return {}
     types = {"guard": "FloatyGuard"}

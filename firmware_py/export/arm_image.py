@@ -1,7 +1,7 @@
 """The exported core as machine code of a Cortex-M4F, hard float, linked alone for the flash of an STM32F405.
 
-The compiler is the clang inside the package `ziglang`. What was built once for the same text, flags and compiler is found
-again in the build folder.
+The compiler is the clang inside the package `ziglang`. An image that was already built from the same
+text, flags and compiler is taken from the build folder.
 """
 
 import hashlib

@@ -70,7 +70,7 @@ def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = N
     texts = core_texts() if texts is None else texts
     modules = read_modules(texts, own)
     kernels = [thing for module in modules for thing in module.defined if isinstance(thing, Kernel)]
-    _tell_constants_apart(modules)
+    _rename_equal_constants(modules)
     for kernel in kernels:
         find_writes(kernel)
     public = [kernel for kernel in kernels if kernel.public]
@@ -87,7 +87,7 @@ def translate(texts: Mapping[str, str] | None = None, own: Mapping[str, str] = N
     return Translation(header, _source(modules, printed, used), names, version)
 
 
-def _tell_constants_apart(modules: list[Module]) -> None:
+def _rename_equal_constants(modules: list[Module]) -> None:
     """Put the module's name before the constants that several modules define."""
     owned = [(module, thing) for module in modules for thing in module.defined if isinstance(thing, Constant)]
     counts = Counter(constant.c_name for _, constant in owned)

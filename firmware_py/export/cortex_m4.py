@@ -1,7 +1,7 @@
 """The flight core as ARM machine code, executed instruction by instruction by the emulator unicorn.
 
 An emulated Cortex-M4F has the image in flash and the structs with a stack in RAM. A call copies the structs in,
-runs one entry point to its end and copies them out: what comes back is what the board would compute. On the way,
+runs one entry point to its end and copies them out: the result is what the board would compute. Meanwhile
 `arm/meter.c` counts instructions and cycles, which become the processor time of the tasks: upper figures of ARM's manual
 for every instruction, flash read through a cache that is empty when the call begins, 168 MHz.
 """
@@ -29,13 +29,13 @@ STACK_PATTERN = 0xA5
 STACK_LEAST = 0x1000
 REGISTERS = 4  # that carry arguments
 ALIGNMENT = 16
-UNDEFINED = b"\xde"  # two of them are UDF: whoever goes astray in empty flash is stopped
+UNDEFINED = b"\xde"  # two of them are UDF: a stray jump into empty flash is stopped
 LANDING = FLASH + FLASH_SIZE - 16  # where a call returns to, and stops
 
 
 @dataclass(slots=True)
 class Load:
-    """What an entry point has taken so far, over all calls."""
+    """Instructions and cycles of an entry point so far, over all calls."""
 
     calls: int = 0
     instructions: int = 0
@@ -44,7 +44,7 @@ class Load:
     worst_cycles: int = 0
 
     def add(self, instructions: int, cycles: int) -> None:
-        """Take in one call."""
+        """Add one call."""
         self.calls += 1
         self.instructions += instructions
         self.cycles += cycles
@@ -52,7 +52,7 @@ class Load:
         self.worst_cycles = max(self.worst_cycles, cycles)
 
     def merge(self, other: "Load") -> None:
-        """Take in what another one has counted."""
+        """Add what another load has counted."""
         self.calls += other.calls
         self.instructions += other.instructions
         self.cycles += other.cycles
@@ -77,11 +77,11 @@ class Load:
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What the core takes of the board: memory, and by entry point processor time."""
+    """What the core uses of the board: memory, and processor time by entry point."""
 
-    flash_bytes: int | None  # None: of a real board not known
+    flash_bytes: int | None  # None: not known of a real board
     ram_bytes: int  # the structs
-    stack_bytes: int | None  # the deepest that it has been
+    stack_bytes: int | None  # at most so far
     entries: dict[str, Load]
 
 
@@ -179,7 +179,7 @@ class CortexM4Runner:
 
     @property
     def stack_bytes(self) -> int:
-        """The deepest that the stack has been."""
+        """How many bytes of stack were used at most so far."""
         touched = self._ram[self._stack_end :] != STACK_PATTERN
         return int(touched.size - touched.argmax()) if touched.any() else 0
 
@@ -190,11 +190,11 @@ class CortexM4Runner:
 
     @property
     def usage(self) -> Usage:
-        """What the core has taken so far."""
+        """What the core has used so far."""
         return Usage(len(self.image.code), self.ram_bytes, self.stack_bytes, self.load)
 
     def _call(self, name: str) -> int:
-        """Run an entry point and let its results out; what was computed ahead from the same inputs is taken."""
+        """Run an entry point and copy its results out; results computed ahead from the same inputs are reused."""
         if self._ahead is None or self._ahead != (name, self._inputs()):
             self._execute(name)
         self._ahead = None
@@ -204,7 +204,7 @@ class CortexM4Runner:
         return ctypes.c_int32(self._cpu.reg_read(self._result)).value
 
     def _look_ahead(self, name: str) -> int:
-        """Run an entry point without letting its results out; returns its cycles."""
+        """Run an entry point without copying its results out; returns its cycles."""
         self._execute(name)
         self._ahead = name, self._inputs()
         return self._meter.cycles
@@ -261,7 +261,7 @@ class Meter:
         return int(self._state[5])
 
     def _attach(self, cpu: Any) -> None:
-        """Have the library called for every block; unicorn's Python would come between and cost a hundred times more."""
+        """Have the library called for every block; a callback in Python would cost a hundred times more."""
         from unicorn import UC_HOOK_BLOCK
         from unicorn.unicorn_py3.unicorn import uclib
 

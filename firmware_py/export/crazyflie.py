@@ -4,6 +4,7 @@
 table of parameters are written into their places here. `app/README.md` says how the app is built and how it behaves.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import pi
 from pathlib import Path
@@ -11,14 +12,15 @@ from pathlib import Path
 from firmware_py.config import (
     AllocationConfig,
     ControllerConfig,
-    EstimatorConfig,
     ExcitationConfig,
     FirmwareConfig,
+    LogicConfig,
     ModelConfig,
     PredictorConfig,
     SupervisorConfig,
     parameters_of,
 )
+from firmware_py.core.structs import Parameters
 from firmware_py.core.subset import f32
 from firmware_py.export.app_logic import calls_header, own_logs
 from firmware_py.export.app_wire import wire_header
@@ -27,7 +29,7 @@ from firmware_py.export.profile_c import profile_source
 from firmware_py.export.reading import float_literal
 from firmware_py.logic.loading import load_logic, translation_of
 from firmware_py.logic.plugs import GROUP
-from firmware_py.parameters import FLAPS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits
+from firmware_py.parameters import FLAPS, SETPOINT_LIMIT, TRIM_LIMIT, configured_limits, core_fields
 from firmware_py.wire.parameter_names import GAINS, SIGNALS
 
 TEMPLATES = Path(__file__).parent / "app"
@@ -39,6 +41,13 @@ PARAM_TYPES = {
     "I16": "PARAM_INT16",
     "U8": "PARAM_UINT8",
 }
+TARGETS = (
+    ("extCtrl.target_yaw", 3, pi),
+    ("setpoint.X", 0, SETPOINT_LIMIT),
+    ("setpoint.Y", 1, SETPOINT_LIMIT),
+    ("setpoint.Z", 2, SETPOINT_LIMIT),
+    ("setpoint.Yaw", 3, pi),
+)
 C_TYPES = {"F32": "float", "I32": "int32_t", "U16": "uint16_t", "I16": "int16_t", "U8": "uint8_t"}
 
 
@@ -65,90 +74,86 @@ class AppParameter:
 def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
     """Return the table of parameters with a profile's values, in the order of the groups."""
     core = parameters_of(config).fields
-
-    def field(
-        name: str, field: str, section: type, kind: str = "F32", target_kind: str = "F32", sign: int = 1
-    ) -> AppParameter:
-        low, high = sorted(sign * limit for limit in configured_limits(section, field))
-        value = sign * getattr(core, field).item()
-        return AppParameter(
-            name, kind, f"floaty_parameters.{field}", target_kind, value, low, high, scale=sign
-        )
-
-    def target(name: str, index: int, limit: float) -> AppParameter:
-        c = f"floaty_parameters.target[{index}]"
-        return AppParameter(name, "F32", c, "F32", core.target.item(index), -limit, limit, persistent=False)
-
-    def supervision(name: str, key: str, scale: int) -> AppParameter:
-        low, high = configured_limits(SupervisorConfig, key)
-        value = getattr(config.supervisor, key)
-        c = f"floaty_supervisor.{key}"
-        return AppParameter(name, "U16", c, "I32", value // scale, low / scale, high / scale, scale)
-
-    logic = load_logic(config.logic)
-    own = [] if logic is None else [
-        AppParameter(
-            f"{GROUP}.{one.name}", one.base.upper(), f"floaty_{one.block}.{one.name}", one.base.upper(),
-            logic.values[one.name], one.mark.low, one.mark.high,
-        )
-        for one in logic.loaded.parameters
-    ]  # fmt: skip
-    manual = AppParameter("extCtrl.manual", "U8", "floaty_supervisor.manual", "U8", 0, 0, 2, persistent=False)
     return (
-        *(
-            field(f"extCtrl.{name}", gain, ControllerConfig, sign=sign)
-            for name, (gain, sign) in GAINS.items()
-        ),
-        manual,
-        *(
-            AppParameter(
-                f"extCtrl.{name}", "F32", f"floaty_input.manual[{i}]", "F32", 0.0, -pi / 2, pi / 2,
-                persistent=False,
-            )
-            for i, name in enumerate(FLAPS)
-        ),
-        target("extCtrl.target_yaw", 3, pi),
-        target("setpoint.X", 0, SETPOINT_LIMIT),
-        target("setpoint.Y", 1, SETPOINT_LIMIT),
-        target("setpoint.Z", 2, SETPOINT_LIMIT),
-        target("setpoint.Yaw", 3, pi),
-        *(
-            AppParameter(
-                f"motorShifts.{name}", "I16", f"floaty_parameters.trim[{i}]", "F32",
-                int(core.trim.item(i)), -TRIM_LIMIT, TRIM_LIMIT,
-            )
-            for i, name in enumerate(FLAPS)
-        ),
-        field("RandConsts.flapHoverAng", "hover_angle", AllocationConfig),
-        field("RandConsts.flapTimeConst", "flap_rate", ModelConfig),
-        AppParameter(
-            "delayComp.activate", "U8", "floaty_parameters.predict", "I32", core.predict.item(), 0, 1
-        ),
-        field("delayComp.horizon", "horizon", PredictorConfig, "U8", "I32"),
-        AppParameter(
-            "excite.signal", "U8", "floaty_parameters.excite_kind", "I32", 0, 0, len(SIGNALS) - 1, persistent=False
-        ),
-        *(
-            AppParameter(
-                f"excite.u{i + 1}", "F32", f"floaty_parameters.excite_rms[{i}]", "F32", core.excite_rms.item(i),
-                *configured_limits(ExcitationConfig, f"u{i + 1}"), persistent=False,
-            )
-            for i in range(4)
-        ),
-        *(
-            AppParameter(
-                f"excite.{end}", "F32", f"floaty_parameters.excite_{end}", "F32",
-                getattr(config.excitation, end), *configured_limits(ExcitationConfig, end), persistent=False,
-            )
-            for end in ("low", "high")
-        ),
-        field("FloatyKalm.maxPos", "bound_position", EstimatorConfig),
-        field("FloatyKalm.maxVel", "bound_velocity", EstimatorConfig),
+        *_controls(core),
+        *_robot(core),
+        *(_field(core, name, key, section) for name, key, section in core_fields()),
+        *_excitation(core, config.excitation),
         AppParameter("extPose.absolute", "U8", "floaty_absolute", "U8", 0, 0, 1),
-        supervision("supervisor.poseTimeout", "pose_timeout_us", 1000),
-        supervision("supervisor.lowBattery", "low_battery_mv", 1),
-        *own,
-    )  # fmt: skip
+        _supervision(config, "supervisor.poseTimeout", "pose_timeout_us", 1000),
+        _supervision(config, "supervisor.lowBattery", "low_battery_mv", 1),
+        *_own_logic(config.logic),
+    )
+
+
+def _field(
+    core: Parameters,
+    name: str,
+    field: str,
+    section: type,
+    kind: str = "F32",
+    target_kind: str = "F32",
+    sign: int = 1,
+) -> AppParameter:
+    """Return a parameter that is a number in the core, with the limits of its configuration."""
+    low, high = sorted(sign * limit for limit in configured_limits(section, field))
+    value = sign * getattr(core, field).item()
+    return AppParameter(name, kind, f"floaty_parameters.{field}", target_kind, value, low, high, scale=sign)
+
+
+def _controls(core: Parameters) -> Iterator[AppParameter]:
+    """Yield gains, flap angles from outside, and the set-point."""
+    for name, (gain, sign) in GAINS.items():
+        yield _field(core, f"extCtrl.{name}", gain, ControllerConfig, sign=sign)
+    yield AppParameter("extCtrl.manual", "U8", "floaty_supervisor.manual", "U8", 0, 0, 2, persistent=False)
+    for i, name in enumerate(FLAPS):
+        c = f"floaty_input.manual[{i}]"
+        yield AppParameter(f"extCtrl.{name}", "F32", c, "F32", 0.0, -pi / 2, pi / 2, persistent=False)
+    for name, i, limit in TARGETS:
+        c = f"floaty_parameters.target[{i}]"
+        yield AppParameter(name, "F32", c, "F32", core.target.item(i), -limit, limit, persistent=False)
+
+
+def _robot(core: Parameters) -> Iterator[AppParameter]:
+    """Yield trims, hover angle, servo lag and the predictor."""
+    for i, name in enumerate(FLAPS):
+        c, trim = f"floaty_parameters.trim[{i}]", int(core.trim.item(i))
+        yield AppParameter(f"motorShifts.{name}", "I16", c, "F32", trim, -TRIM_LIMIT, TRIM_LIMIT)
+    yield _field(core, "RandConsts.flapHoverAng", "hover_angle", AllocationConfig)
+    yield _field(core, "RandConsts.flapTimeConst", "flap_rate", ModelConfig)
+    yield AppParameter(
+        "delayComp.activate", "U8", "floaty_parameters.predict", "I32", core.predict.item(), 0, 1
+    )
+    yield _field(core, "delayComp.horizon", "horizon", PredictorConfig, "U8", "I32")
+    yield _field(core, "delayComp.defaultAge", "default_age_us", PredictorConfig, "I32", "I32")
+
+
+def _excitation(core: Parameters, config: ExcitationConfig) -> Iterator[AppParameter]:
+    """Yield the excitation; a board that boots excites nothing."""
+    c = "floaty_parameters.excite_kind"
+    yield AppParameter("excite.signal", "U8", c, "I32", 0, 0, len(SIGNALS) - 1, persistent=False)
+    fields = [(f"u{i + 1}", f"excite_rms[{i}]", core.excite_rms.item(i)) for i in range(4)]
+    fields += [("low", "excite_low", config.low), ("high", "excite_high", config.high)]
+    for name, field, value in fields:
+        c, limits = f"floaty_parameters.{field}", configured_limits(ExcitationConfig, name)
+        yield AppParameter(f"excite.{name}", "F32", c, "F32", value, *limits, persistent=False)
+
+
+def _supervision(config: FirmwareConfig, name: str, key: str, scale: int) -> AppParameter:
+    low, high = configured_limits(SupervisorConfig, key)
+    value = getattr(config.supervisor, key)
+    c = f"floaty_supervisor.{key}"
+    return AppParameter(name, "U16", c, "I32", value // scale, low / scale, high / scale, scale)
+
+
+def _own_logic(config: LogicConfig) -> Iterator[AppParameter]:
+    """Yield what the user's modules have declared as Tunable."""
+    if (logic := load_logic(config)) is None:
+        return
+    for one in logic.loaded.parameters:
+        kind, c = one.base.upper(), f"floaty_{one.block}.{one.name}"
+        value = logic.values[one.name]
+        yield AppParameter(f"{GROUP}.{one.name}", kind, c, kind, value, one.mark.low, one.mark.high)
 
 
 def app_files(config: FirmwareConfig, profile: str) -> dict[str, str]:

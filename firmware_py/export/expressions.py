@@ -62,7 +62,7 @@ class Expressions:
         self.kernel = kernel
         self.module: Module = kernel.scope
         self.names: dict[str, Kind] = dict(kernel.arguments)
-        self.constants: list[Constant] = []  # used
+        self.constants: list[Constant] = []  # those that the kernel uses
         self.read: set[str] = set()
         self.loops: dict[str, tuple[int, int]] = {}  # the values of loop variables, where they are known
 
@@ -149,10 +149,10 @@ class Expressions:
             if not 0 <= least <= most < size:
                 reach = f"{least}..{most}" if least < most else str(least)
                 which = "" if ast.unparse(index) == reach else f", which is {reach}"
-                told = (
+                text_of_range = (
                     f"index {ast.unparse(index)}{which}: {describe(array.kind)} of {size} has 0..{size - 1}"
                 )
-                raise self.refuse(index, told)
+                raise self.refuse(index, text_of_range)
         return Value(text, Kind(array.kind.base))
 
     def _reach(self, node: ast.expr) -> tuple[int, int] | None:

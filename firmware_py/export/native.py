@@ -1,6 +1,6 @@
 """The exported C on this machine: compiled into a shared library and called on the memory of the core's blocks.
 
-Libraries are kept in a folder by what they were made from; one that is there is not compiled again. The compiler is
+Libraries are cached in a folder by a hash of what they were made from. The compiler is
 `ziglang` from PyPI (extra `deploy`) or the system's.
 """
 
@@ -66,7 +66,7 @@ def build(
     compiler: Compiler | None = None,
     flags: tuple[str, ...] = (),
 ) -> Path:
-    """Return the shared library of the core, compiled now unless it is in the folder already."""
+    """Return the shared library of the core; it is compiled unless the folder has it."""
     compiler = compiler or find_compiler()
     zig = ZIG_FLAGS if compiler.name == "zig" else ()
     command = (*compiler.command, optimisation, *FLAGS, *LIBRARY_FLAGS, *zig, *flags)
@@ -100,7 +100,7 @@ def _version(*command: str) -> str:
 
 
 def _output(command: tuple[str, ...], environment: dict[str, str]) -> str:
-    """Return what a command says; its first complaint becomes an `ExportError`."""
+    """Return the output of a command. Raises `ExportError` with its first complaint."""
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | environment, check=False)
     if done.returncode != 0:
         complaints = [line for line in done.stderr.splitlines() if "error" in line] or [

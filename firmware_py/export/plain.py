@@ -1,8 +1,8 @@
 """The flight core as plain Python, in a process of its own: numba is switched on or off for a whole process.
 
 `PlainRunner` is the parent's end, `serve` the child's. A call goes over the pipe as one byte, its index in `CALLS`, and the
-memory of all blocks; the result, an int32, and the memory come back. The child learns from its arguments which logic of
-the user's own flies.
+memory of all blocks; the result, an int32, and the memory come back. The child's arguments say which own
+logic flies.
 """
 
 import json
@@ -109,7 +109,7 @@ def serve(calls: BinaryIO, answers: BinaryIO, logic: Logic | None) -> None:
     size = 1 + _size(memories)
     while len(call := calls.read(size)) == size:
         _spread(call[1:], memories)
-        with np.errstate(all="ignore"):  # infinities and NaN are the comparison's business
+        with np.errstate(all="ignore"):  # the comparison deals with infinities and NaN
             result = getattr(blocks.run, CALLS[call[0]])()
         answers.write(RESULT.pack(result or 0) + b"".join(memory.tobytes() for memory in memories))
         answers.flush()
@@ -117,5 +117,5 @@ def serve(calls: BinaryIO, answers: BinaryIO, logic: Logic | None) -> None:
 
 if __name__ == "__main__":
     assert PLAIN
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     serve(sys.stdin.buffer, sys.stdout.buffer, load_logic(LogicConfig(**json.loads(sys.argv[1]))))

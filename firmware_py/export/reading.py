@@ -1,6 +1,6 @@
 """Reads the modules of the flight core: constants, structs and the signatures of the kernels, with their comments.
 
-What stands inside a kernel is left to `expressions.py` and `functions.py`. Nothing is run: the text alone counts.
+The body of a kernel is left to `expressions.py` and `functions.py`. The text is only parsed, never run.
 """
 
 import ast

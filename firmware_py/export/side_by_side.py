@@ -1,7 +1,7 @@
 """Several implementations of the flight core in one flight: the same inputs, the whole memory compared after every call.
 
-The reference flies; the others, the targets, run on memory of their own that starts as the reference's does and gets
-nothing from it but what the tasks write: parameters and inputs. A target that has differed once is not run again, because
+The reference flies; the other targets run on memory of their own, which starts equal to the reference's and then receives
+only what the tasks write: parameters and inputs. A target that has differed once is not run again, because
 everything that follows would differ too.
 """
 
@@ -21,7 +21,7 @@ class Divergence:
 
     tick: int  # of the estimator; 0: before its first
     call: str  # the entry point after which it showed
-    where: str  # struct, `answer`, or what stopped the target
+    where: str  # struct, `answer`, or the error that stopped the target
     differences: tuple[Difference, ...]  # all of that struct; none when the target was stopped
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""The console: lines of text to whoever listens, on port 0 in pieces of at most 30 bytes, and to the debug pins."""
+"""The console: lines of text on port 0, in pieces of at most 30 bytes, to other links and to the debug pins."""
 
 from collections.abc import Callable, Iterator
 
@@ -12,7 +12,7 @@ LINE_LIMIT = 200  # letters
 
 
 class Console:
-    """Takes lines from anywhere on board; its task sends them when nothing else has to be done."""
+    """Takes lines from anywhere on board; its task sends them when no other task is ready."""
 
     def __init__(self, stack: CrtpStack, board: Board) -> None:
         self._stack = stack
@@ -22,9 +22,9 @@ class Console:
         stack.kernel.create_task("CONSOLE", 0, self._task)
 
     def write(self, line: str) -> None:
-        """Take a line without its end. A plain call: also code that cannot wait has something to say.
+        """Take a line without its end. A plain call, so that code that cannot wait can use it.
 
-        A task that has let something write gives way with `yield_if_pending`.
+        After it a task lets others run with `yield_if_pending`.
         """
         self._board.debug_write(line)
         self._lines.send_nowait(line)

@@ -4,8 +4,9 @@ Uplink: radio interrupt -> SYSLINK (queue 8) -> CRTP-RX (delivery queue 5) -> a 
 Downlink: services -> transmit queue (120) -> CRTP-TX -> radio chip.
 Replies of the services' own tasks wait for space in the transmit queue. What is sent unasked, and what the receiving
 task answers itself, is dropped when the queue is full: a deaf partner must not keep poses from coming in.
-A partner of whom the radio chip has heard nothing for a second, not even an empty poll, is gone, as in the Crazyflie
-firmware: whoever sends unasked then stops, and throws away what waits (`hang_up`), so that the next one gets no old rows.
+When the radio chip has received nothing for a second, not even an empty poll, the partner is gone, as in the Crazyflie
+firmware: services that send unasked then stop and discard what is queued (`hang_up`), so that the next partner gets no old
+rows.
 """
 
 from collections.abc import Callable, Generator
@@ -19,9 +20,8 @@ from firmware_py.wire.crtp import Packet
 
 Task = Generator[int, None, None]
 Handler = Callable[[Packet], Task]
-Answer = Callable[
-    [Packet], tuple[bytes, ...]
-]  # a request to the data of its replies, on the same port and channel
+# From a request to the data of its replies, on the same port and channel.
+Answer = Callable[[Packet], tuple[bytes, ...]]
 
 SYSLINK_QUEUE = 8
 DELIVERY_QUEUE = 5
@@ -37,10 +37,11 @@ class CrtpStack:
         self.kernel = kernel
         self.cost = cost
         self.malformed = 0  # packets that no service could read
-        self.unserved = 0  # well-formed packets of ports that nobody serves
+        self.unserved = 0  # well-formed packets to ports without a service
         self.unicasts = 0  # packets to this board
         self.broadcasts = 0  # packets to all boards
-        self._heard_us = 0  # when the radio chip last heard the partner
+        # When the radio chip last received anything.
+        self._heard_us = 0
         self._board = board
         self._handlers: dict[int, Handler] = {}
         self._ports: dict[int, Queue[Packet]] = {}
@@ -59,7 +60,7 @@ class CrtpStack:
 
     @property
     def connected(self) -> bool:
-        """Whether somebody has been heard within the last second."""
+        """Whether anything was received within the last second."""
         return self.kernel.now_us - self._heard_us < SILENCE_US
 
     def received(self, data: bytes, broadcast: bool = False) -> None:
@@ -70,11 +71,11 @@ class CrtpStack:
             self.unicasts += not broadcast
 
     def polled(self) -> None:
-        """Notice that the radio chip has heard an empty packet; called from its interrupt."""
+        """Note that the radio chip has received an empty packet; called from its interrupt."""
         self._heard_us = self.kernel.now_us
 
     def hang_up(self) -> Task:
-        """Throw away what waits to be sent."""
+        """Discard what is queued for sending."""
         yield from self._transmit.reset()
 
     def handle(self, port: int, handler: Handler) -> None:
@@ -104,7 +105,7 @@ class CrtpStack:
             yield from self._transmit.send(reply, timeout)
 
     def offer(self, data: bytes) -> Generator[int, None, bool]:
-        """Queue a complete packet that nobody asked for; False when it was dropped."""
+        """Queue a complete packet that was not requested; False when it was dropped."""
         return self._transmit.send(data, 0)
 
     def deliver(self, data: bytes) -> Generator[int, None, bool]:

@@ -1,8 +1,8 @@
 """The high-level commander on port 8, its trajectory memory, and the set-points of ports 3 and 7.
 
-With absolute poses set-points are flown that say where to be, each a step of the goal; the others are refused.
+With absolute poses, set-points that give a position are flown, each a step of the goal; the others are refused.
 
-Commands are few and planned at once, in the receiving task. Each is answered with the head of itself and a status in the
+Commands are few and are planned at once, in the receiving task. Each is answered with its own head and a status in the
 fourth byte, as the stock firmware answers.
 """
 
@@ -114,7 +114,7 @@ class HighLevelService:
         return self._climb(self._vertical(command, fields, begin, lands), begin, lands)
 
     def _vertical(self, command: Command, fields: tuple[float, ...], begin: Motion, lands: bool) -> Vertical:
-        """Bring the three ways to take off or to land to one."""
+        """Reduce the three kinds of commands to take off or to land to one."""
         if command in (Command.TAKE_OFF, Command.LAND):
             return Vertical._make(fields)
         if command in (Command.TAKE_OFF_1, Command.LAND_1):
@@ -159,13 +159,13 @@ class HighLevelService:
         return OK
 
     def _see_attitude(self, packet: Packet) -> Task:
-        """Port 3: roll, pitch, yaw rate and thrust. Without thrust it is what clients send when they leave."""
+        """Port 3: roll, pitch, yaw rate and thrust. Clients send it without thrust when they disconnect."""
         if any(packet.data[12:14]):
             self._refuse("attitude")
         yield from self._stack.kernel.yield_if_pending()
 
     def _see_setpoint(self, packet: Packet) -> Task:
-        """Port 7: set-points, and the notice that no more of them come."""
+        """Port 7: set-points, and the notice that no more will come."""
         kind = packet.data[0] if packet.data else None
         if packet.channel == setpoints.CHANNEL_NOTICE:
             self._pilot.release()
@@ -176,7 +176,7 @@ class HighLevelService:
         yield from self._stack.kernel.yield_if_pending()
 
     def _follow(self, kind: int, data: bytes) -> None:
-        """Fly to a set-point, if it says where to be and poses where that is."""
+        """Fly to a set-point if it gives a position and poses are absolute."""
         if kind in (setpoints.POSITION, setpoints.FULL_STATE) and self._pilot.absolute:
             place = setpoints.decode_place(data)
             if self._supervisor.can_fly:
@@ -185,7 +185,7 @@ class HighLevelService:
             self._refuse(setpoints.NAMES.get(kind, f"type {kind}"))
 
     def _refuse(self, kind: str) -> None:
-        """Say once that set-points of this kind are not flown."""
+        """Report once that set-points of this kind are not flown."""
         now_us = self._stack.kernel.now_us
         if now_us - self._setpoint_us.get(kind, -LINE_PERIOD_US) >= LINE_PERIOD_US:
             instead = (

@@ -1,7 +1,7 @@
-"""The log service: clients put variables together to blocks, the board sends each block at its period.
+"""The log service: clients group variables into blocks, the board sends each block at its period.
 
-Port 5: channel 0 is the TOC, 1 makes, starts and stops blocks (version 2), 2 carries the data. Periods count in 10 ms,
-or with the newer command in 1 ms; 0 sends a block once. A refused request leaves everything as it was. When the partner is
+Port 5: channel 0 is the TOC, 1 creates, starts and stops blocks (version 2), 2 carries the data. Periods count in 10 ms,
+or with the newer command in 1 ms; 0 sends a block once. A refused request changes nothing. When the partner is
 gone, the first block that falls due deletes them all, as in the Crazyflie firmware.
 """
 
@@ -80,7 +80,7 @@ class LogService:
         stack.kernel.create_task("LOG", 1, self._task)
 
     def answer(self, packet: Packet) -> tuple[bytes, ...]:
-        """Return the reply to one request; raises `WireError` for what is none."""
+        """Return the reply to one request; raises `WireError` for a malformed one."""
         data = packet.data
         if packet.channel == toc.CHANNEL:
             return (self.toc.answer(data, bytes((MAX_BLOCKS, MAX_VARIABLES))),)

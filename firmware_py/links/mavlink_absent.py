@@ -1,6 +1,6 @@
-"""What ground stations look for and a Floaty has not: missions, fences, rally points, logs, modes to choose from.
+"""What ground stations ask for and a Floaty does not have: missions, fences, rally points, logs, selectable modes.
 
-Each question gets the answer that says so, because a client that hears nothing asks again and again. The end of a
+Each question is answered with "none", because a client that gets no answer asks again and again. The end of a
 transaction, MISSION_ACK or LOG_REQUEST_END, is not answered.
 """
 

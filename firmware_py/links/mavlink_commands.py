@@ -1,6 +1,6 @@
 """Commands, each acknowledged to its sender, and the small services that clients expect to be answered.
 
-A command that comes again, because its acknowledgement was lost, acts again the same way and is acknowledged again.
+A command that is repeated because its acknowledgement was lost is executed and acknowledged again.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ FORCE = 21196  # MAVLink's magic number for disarming in flight
 REBOOT = 1  # PREFLIGHT_REBOOT_SHUTDOWN
 REBOOT_IN_FLIGHT = 20190226  # REBOOT_SHUTDOWN_CONDITIONS_FORCE
 STOP = "floaty.stop"  # a parameter
-REBOOT_TICKS = 200  # before the reset: what was said leaves, 1 kB even at 57600 baud
+REBOOT_TICKS = 200  # before the reset: time to send what is queued, 1 kB even at 57600 baud
 
 
 Outcome = tuple[Result, Sequence[Message]]  # and what is sent after the acknowledgement
@@ -54,7 +54,7 @@ class CommandService:
             Command.COMPONENT_ARM_DISARM: self._arm,
             Command.GET_HOME_POSITION: lambda command: self._once(mavlink.MSG_HOME_POSITION),
             Command.INJECT_FAILURE: self._fail,
-            Command.GET_MESSAGE_INTERVAL: self._tell_interval,
+            Command.GET_MESSAGE_INTERVAL: self._report_interval,
             Command.SET_MESSAGE_INTERVAL: self._set_interval,
             Command.REQUEST_MESSAGE: lambda command: self._once(_whole(command.param1)),
             Command.REQUEST_PROTOCOL_VERSION: lambda command: self._once(mavlink.MSG_PROTOCOL_VERSION),
@@ -114,7 +114,7 @@ class CommandService:
             self._board.reset()
 
     def _fail(self, command: Message) -> Outcome:
-        """Let the world do it; hardware that flies has no way to."""
+        """Let the simulated hardware fail; real hardware cannot."""
         unit, failing, instance = (
             _whole(value) for value in (command.param1, command.param2, command.param3)
         )
@@ -136,7 +136,7 @@ class CommandService:
         done = self._streams.set_interval(_whole(command.param1), _whole(command.param2))
         return DONE if done else DENIED
 
-    def _tell_interval(self, command: Message) -> Outcome:
+    def _report_interval(self, command: Message) -> Outcome:
         number = _whole(command.param1)
         if not 0 <= number <= 0xFFFF:
             return DENIED

@@ -1,4 +1,4 @@
-"""Messages that nobody gets unasked: at an interval with SET_MESSAGE_INTERVAL, once with REQUEST_MESSAGE."""
+"""Messages that are sent only on request: at an interval with SET_MESSAGE_INTERVAL, once with REQUEST_MESSAGE."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,7 +18,7 @@ ReadImu = Callable[[], tuple[Vector, Vector]]  # rates [rad/s, B] and accelerati
 
 
 class RequestedMessages:
-    """Makes messages of what is true now."""
+    """Makes messages from the present values."""
 
     def __init__(self, supervisor: Supervisor, world: World, read_imu: ReadImu, home: Vector) -> None:
         self._supervisor = supervisor

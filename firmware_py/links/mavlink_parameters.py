@@ -1,9 +1,9 @@
-"""The parameter protocol: list, read by index or by name, set. Only what can be written is in the list.
+"""The parameter protocol: list, read by index or by name, set. The list has only writable parameters.
 
-Every value travels as REAL32, the one encoding that all ground stations agree on. Whatever becomes of a request to set,
-the answer carries the value that is in force. What cannot be done is answered with PARAM_ERROR, each time, and for people
-with a text, once. The list is sent one by one, each when the line has taken the one before; a
-request for the list while it is on its way starts it anew.
+Every value travels as REAL32, the one encoding that all ground stations agree on. Whether a request to set succeeds or
+not, the answer carries the value that is in force. A failure is answered with PARAM_ERROR each time, and with a text for
+the operator once. The list is sent one parameter at a time, each when the line has taken the one before; a
+request for the list while it is being sent starts it again.
 """
 
 from collections.abc import Sequence
@@ -87,7 +87,7 @@ class MavlinkParameters:
         return number
 
     def _refuse(self, complaint: str) -> NoReturn:
-        """Say why, but not again and again."""
+        """Report why, but do not repeat the same complaint."""
         if complaint != self._complaint:
             self._complaint = complaint
             self._stack.reply(mavlink.status_text(WARNING, complaint))
@@ -98,7 +98,7 @@ class MavlinkParameters:
         return mavlink.parameter(self._names[number], value, number, len(self._parameters))
 
     def _hash(self) -> Message:
-        """A number that changes with the names and with any value, by which clients know their copy."""
+        """A number that changes with the names and with any value, by which clients recognise their cached copy."""
         content = b"".join(
             name.encode() + parameter.value()
             for name, parameter in zip(self._names, self._parameters, strict=True)

@@ -15,12 +15,14 @@ from firmware_py.wire import mavlink
 from firmware_py.wire.crtp import PoseMessage
 from firmware_py.wire.mavlink_frames import Message
 
-OLDEST_US = 500_000  # an age beyond is no age: poses that old are of no use to anybody
-EARLIEST_US = -5_000  # the clocks' offset is not known better than this
-SYNC_PERIOD = 487  # ticks; prime, so that the poses' and the telemetry's frames are not always in the way
+# An older pose is of no use, so a greater age is taken as unknown.
+OLDEST_US = 500_000
+EARLIEST_US = -5_000  # the clocks' offset is known no better than this
+# In ticks; prime, so that requests do not always collide with the frames of poses and telemetry.
+SYNC_PERIOD = 487
 FIRST_SYNC_PERIOD = 97
 FIRST_SYNCS = 5
-PATIENCE = 50  # requests; some partners never answer
+PATIENCE = 50  # requests after which it gives up, because some partners never answer
 
 
 class PoseService:

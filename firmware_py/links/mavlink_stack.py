@@ -20,7 +20,7 @@ Handler = Callable[[Message], object]
 
 TRANSMIT_QUEUE = 32
 UNASKED_LIMIT = 24  # messages in the queue beyond which nothing is sent unasked
-SILENCE_TICKS = 50  # after which MAV-RX lets the receiver look through half a frame again
+SILENCE_TICKS = 50  # after which MAV-RX lets the receiver search half a frame again
 
 SILENCE_US = 3_000_000  # three heartbeats of a ground station
 INFO, WARNING = 6, 4  # MAV_SEVERITY
@@ -33,10 +33,11 @@ class MavlinkStack:
         self.kernel = kernel
         self.system = config.system
         self.component = config.component
-        self.refused = 0  # messages that no service could use
-        self.unserved = 0  # messages that nobody here reads, or that are for others
-        self._heard_us = 0  # when a message came last
-        self._unsent = 0  # messages that nobody asked for and the line had no time for, or that fit no frame
+        self.refused = 0  # messages that a service refused
+        self.unserved = 0  # messages that no service reads, or that are for other systems
+        self._heard_us = 0  # when a message was last received
+        # Unrequested messages for which the line had no time, and messages that fit no frame.
+        self._unsent = 0
         self._cost_us = cost.mavlink_us
         self._board = board
         signing = Signing(bytes.fromhex(config.signing_key)) if config.signing_key else None
@@ -53,33 +54,33 @@ class MavlinkStack:
 
     @property
     def frames(self) -> int:
-        """Frames that came."""
+        """Frames received."""
         return self.counters.frames
 
     @property
     def lost(self) -> int:
-        """Frames that did not come."""
+        """Frames lost."""
         return self.counters.lost
 
     @property
     def bad(self) -> int:
-        """Frames that were damaged or not signed as they must be."""
+        """Frames that were damaged or not correctly signed."""
         counters = self.counters
         return counters.bad_crc + counters.bad_signature + counters.unsigned + counters.replayed
 
     @property
     def dropped(self) -> int:
-        """Messages for which the line had no time, or that say what no frame can hold."""
+        """Messages for which the line had no time, or that fit no frame."""
         return self._unsent + self._transmit.dropped
 
     @property
     def overruns(self) -> int:
-        """Bytes that the UART lost because nobody fetched them in time."""
+        """Bytes that the UART lost because they were not read in time."""
         return self._board.uart_overruns
 
     @property
     def connected(self) -> bool:
-        """Whether somebody has been heard lately."""
+        """Whether a message was received lately."""
         return self.kernel.now_us - self._heard_us < SILENCE_US
 
     def uart_ready(self) -> None:
@@ -91,18 +92,18 @@ class MavlinkStack:
         self._handlers[number] = handler
 
     def reply(self, message: Message) -> None:
-        """Queue what somebody asked for. A plain call, for handlers; dropped when the queue is full."""
+        """Queue a message that was requested. A plain call, for handlers; dropped when the queue is full."""
         self._transmit.send_nowait(message)
 
     def offer(self, message: Message) -> Iterable[int]:
-        """Queue what nobody asked for, if there is time for it."""
+        """Queue a message that was not requested, if the line has time for it."""
         if len(self._transmit) >= UNASKED_LIMIT:
             self._unsent += 1
             return GO_ON
         return self._transmit.send_nowait(message)
 
     def deliver(self, message: Message) -> Task:
-        """Queue one of many messages and wait until it is on its way; for one task."""
+        """Queue one of many messages and wait until the line has taken it; for use by one task only."""
         self._paced = message
         yield from self._transmit.send(message)
         yield from self._paced_sent.take()
@@ -134,7 +135,7 @@ class MavlinkStack:
             self.refused += 1
 
     def _is_ours(self, message: Message) -> bool:
-        """Whether we are among those that it is for; 0 stands for all."""
+        """Whether this board is addressed; 0 stands for all."""
         system = getattr(message, "target_system", 0)
         component = getattr(message, "target_component", 0)
         return system in (0, self.system) and component in (0, self.component)

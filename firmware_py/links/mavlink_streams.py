@@ -1,7 +1,7 @@
 """Messages that the board sends by itself, each at its own interval, which clients may change.
 
 Intervals are whole ticks and count from boot: messages of one interval are made in the same tick and carry the same time
-stamp, and a tick that was missed moves nothing.
+stamp, and a missed tick shifts nothing.
 """
 
 from collections.abc import Callable, Sequence
@@ -81,14 +81,14 @@ class StreamService:
         return True
 
     def interval_us(self, number: int) -> int:
-        """Return how often a message is sent, as MESSAGE_INTERVAL tells it."""
+        """Return how often a message is sent, as MESSAGE_INTERVAL reports it."""
         stream = self._streams.get(number)
         if stream is None:
             return NONE_SUCH
         return OFF if stream.interval_ticks is None else stream.interval_ticks * TICK_US
 
     def make(self, number: int) -> Sequence[Message]:
-        """Return the messages of a stream as they are now; none when there is no such stream."""
+        """Return the messages of a stream as they are now; empty when there is no such stream."""
         stream = self._streams.get(number)
         return stream.make(self._stack.kernel.tick_count) if stream else ()
 

@@ -1,7 +1,7 @@
 """What the streams carry: the running board's values as messages, with the tick as time stamp.
 
 Our own ground station takes the flight array: the telemetry blocks as the board knows them, relative to the goal that the
-last pose was seen from. For those of others the standard's messages are absolute in W.
+last pose was seen from. For other stations the standard's messages are absolute in W.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ Messages = Sequence[Message]
 
 
 class FlightMessages:
-    """Makes messages of what is true now; `read_block` returns the values of a telemetry block."""
+    """Makes messages from the present values; `read_block` returns the values of a telemetry block."""
 
     def __init__(
         self,

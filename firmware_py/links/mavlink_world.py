@@ -1,4 +1,4 @@
-"""Where the robot is in the world: the estimator knows its error from the goal that the last pose was seen from."""
+"""Where the robot is in the world: the estimator only has the error from the goal against which the last pose was taken."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from firmware_py.links.mavlink_poses import PoseService
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """Reads the running board; every call tells what is true now."""
+    """Reads the running board; every call returns the present values."""
 
     estimator: Estimator
     poses: PoseService

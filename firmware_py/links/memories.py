@@ -1,7 +1,7 @@
 """Memories on port 4: the EEPROM, a deck's one-wire memory, the memory tester, the commander's trajectories.
 
-Channel 0 tells which there are, 1 reads, 2 writes. The tester's byte at any address is the address modulo 256: reading
-gives it, writing compares with it and counts what differs.
+Channel 0 lists them, 1 reads, 2 writes. The tester's byte at any address is the address modulo 256: reading
+returns it, writing compares with it and counts differences.
 """
 
 import struct
@@ -70,7 +70,7 @@ class Tester:
         self.errors = 0
 
     def read(self, address: int, length: int) -> bytes:
-        """Return the bytes that have to be there."""
+        """Return the expected bytes."""
         return bytes(index & 0xFF for index in range(address, address + length))
 
     def write(self, address: int, data: bytes) -> None:
@@ -80,14 +80,14 @@ class Tester:
 
 
 class MemoryService:
-    """Serves memories; their number is their place."""
+    """Serves memories; their number is their index."""
 
     def __init__(self, stack: CrtpStack, memories: Sequence[Memory]) -> None:
         self._memories = memories
         stack.serve("MEM", 1, PORT_MEMORIES, self.answer)
 
     def answer(self, packet: Packet) -> tuple[bytes, ...]:
-        """Return the reply to one request; raises `WireError` for what is none."""
+        """Return the reply to one request; raises `WireError` for a malformed one."""
         data = packet.data
         if packet.channel == INFO:
             return (self._info(data),)

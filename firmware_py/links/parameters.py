@@ -1,6 +1,6 @@
 """The parameter service: read, write and keep the values that may be changed while the board runs.
 
-A write is refused when the value is not a number or out of range; whatever happened, the reply carries the value that is
+A write is refused when the value is not a number or out of range; either way the reply carries the value that is
 in force. Persistent parameters can be stored in the EEPROM and are applied at the next boot.
 """
 
@@ -33,7 +33,7 @@ from firmware_py.wire.scalars import Scalar
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """What can be set: `group.name`, type and unit, how to read and write it, and what it may be.
+    """What can be set: `group.name`, type and unit, how to read and write it, and its limits.
 
     Without `write` it is read only. `minimum` and `maximum` are inclusive.
     """
@@ -49,12 +49,12 @@ class Parameter:
 
     @property
     def type_byte(self) -> int:
-        """The type with its flags as the TOC tells it."""
+        """The type with its flags as the TOC reports it."""
         flags = TYPE_READ_ONLY if self.write is None else 0
         return self.scalar.parameter_number | flags | (TYPE_EXTENDED if self.persistent else 0)
 
     def value(self) -> bytes:
-        """Return the value in force as it travels."""
+        """Return the value in force as bytes on the wire."""
         return self.scalar.pack(self.read())
 
     def set(self, value: float) -> int:
@@ -84,7 +84,7 @@ class ParameterService:
         stack.serve("PARAM", 1, PORT_PARAMETERS, self.answer)
 
     def answer(self, packet: Packet) -> tuple[bytes, ...]:
-        """Return the replies to one request; raises `WireError` for what is none."""
+        """Return the replies to one request; raises `WireError` for a malformed one."""
         data = packet.data
         if packet.channel == toc.CHANNEL:
             return (self.toc.answer(data),)
@@ -109,7 +109,7 @@ class ParameterService:
         return status
 
     def _set_by_name(self, data: bytes) -> tuple[bytes, ...]:
-        """Set, reply, and tell everybody who read the value before."""
+        """Set, reply, and notify clients that have read the value before."""
         request = decode_set_by_name(data)
         number = self._numbers.get(request.name)
         if number is None:

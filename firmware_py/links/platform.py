@@ -45,7 +45,7 @@ SOURCE_TEXT = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")  # by which clients k
 
 
 class PlatformService:
-    """Answers on the ports of link, platform and supervisor. The application echoes what comes on its channel."""
+    """Answers on the ports of link, platform and supervisor. The application echoes what it receives on its channel."""
 
     def __init__(self, stack: CrtpStack, supervisor: Supervisor, pilot: Pilot) -> None:
         self._stack = stack
@@ -61,7 +61,7 @@ class PlatformService:
 
     @property
     def app_overflows(self) -> int:
-        """Packets that the application lost because it was too slow."""
+        """Packets lost because the application was too slow."""
         return self._app.dropped
 
     def bits(self) -> int:
@@ -86,9 +86,8 @@ class PlatformService:
         """Return the state, or the outcome of a command; the emergency stops are not answered."""
         supervisor, data = self._supervisor, packet.data
         command = data[0] if data else 0
-        if (
-            packet.channel == SUPERVISOR_INFO and 0 < command <= GET_BITS
-        ):  # all bits, or the one with this number
+        # A request for all bits, or for the one with this number.
+        if packet.channel == SUPERVISOR_INFO and 0 < command <= GET_BITS:
             answer = self.bits().to_bytes(2, "little")
             if command < GET_BITS:
                 answer = bytes((self.bits() >> command - 1 & 1,))
@@ -105,7 +104,7 @@ class PlatformService:
         raise WireError(f"supervisor channel {packet.channel}: {data.hex()} is unknown")
 
     def _command(self, data: bytes) -> bytes:
-        """Arm, disarm or recover; return whether it succeeded and what is now true."""
+        """Arm, disarm or recover; return whether it succeeded and the new state."""
         if data[0] == COMMAND_RECOVER:
             recovered = self._supervisor.recover(self._stack.kernel.now_us)
             return bytes((recovered, recovered))
@@ -131,7 +130,7 @@ class PlatformService:
 
 
 def answer_link(packet: Packet) -> tuple[bytes, ...]:
-    """Echo on channel 0, say who we are on channel 1, swallow the rest."""
+    """Echo on channel 0, identify the board on channel 1, ignore the rest."""
     if packet.channel == LINK_ECHO:
         return (packet.data,)
     return (SOURCE_TEXT,) if packet.channel == LINK_SOURCE else ()
@@ -152,7 +151,7 @@ def supervisor_bits(supervisor: Supervisor) -> int:
 
 
 def commander_bits(pilot: Pilot, now_us: int) -> int:
-    """Return the rest of it: the high-level commander flies, has come to its path's end, is overruled by set-points."""
+    """Return the rest of it: the high-level commander flies, has reached its path's end, is overruled by set-points."""
     flies = pilot.planner.phase(now_us) is not Phase.IDLE
     overruled = flies and pilot.led
     flags = flies and not overruled, pilot.planner.finished(now_us), overruled

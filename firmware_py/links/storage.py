@@ -1,7 +1,7 @@
 """Parameter values that survive a power cycle: a checked list of names and bytes in the upper part of the EEPROM.
 
 Layout from address 1024: `FPS1`, length of the list u16, CRC-32 of the list u32, then for each parameter the length of
-its name, the name, the length of its value, the value. Anything that does not check is an empty list.
+its name, the name, the length of its value, the value. A list that fails these checks counts as empty.
 """
 
 import struct
@@ -21,12 +21,12 @@ class ParameterStorage:
 
     @property
     def size(self) -> int:
-        """Bytes that there are for the list."""
+        """Bytes available for the list."""
         return len(self._eeprom) - START
 
     @property
     def used(self) -> int:
-        """Bytes that the list takes."""
+        """Bytes used by the list."""
         return _HEAD.size + len(_records(self.load()))
 
     def load(self) -> dict[str, bytes]:
@@ -52,7 +52,7 @@ class ParameterStorage:
         return self._write(self.load() | dict(values))
 
     def clear(self, name: str) -> bool:
-        """Forget a value; False when there was none."""
+        """Delete a value; False when there was none."""
         values = self.load()
         return values.pop(name, None) is not None and self._write(values)
 
@@ -74,6 +74,6 @@ def _records(values: Mapping[str, bytes]) -> bytes:
 
 
 def _split(records: bytes) -> tuple[bytes, bytes]:
-    """Take the first counted string off."""
+    """Split off the first counted string."""
     end = 1 + (records[0] if records else 0)
     return records[1:end], records[end:]

@@ -1,8 +1,8 @@
-"""The telemetry of a flight: four fixed log blocks at 50 Hz, all with the same time stamp, while they are wanted.
+"""The telemetry of a flight: four fixed log blocks at 50 Hz, all with the same time stamp, while a client wants them.
 
-A fifth tells the excitation while there is one.
+A fifth carries the excitation while there is one.
 
-It ends with its partner, as log blocks do.
+The stream ends when its partner is gone, as log blocks do.
 """
 
 from collections.abc import Callable, Sequence

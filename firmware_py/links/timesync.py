@@ -1,9 +1,9 @@
 """How far a remote clock is ahead of ours, from exchanges of time stamps. Times are whole microseconds.
 
-We send our time, the other side returns it with its own. That instant lies somewhere in the round trip, so an exchange
+We send our time, the other side returns it with its own. The remote instant lies somewhere in the round trip, so an exchange
 knows the offset to plus or minus half of its round trip, and less well as it grows old, because clocks drift. Of the
-last exchanges the one that knows it best counts. When two exchanges contradict each other, the remote clock was set
-anew, and only the newer one counts.
+last exchanges the most certain one counts. When two exchanges contradict each other, the remote clock was set
+again, and only the newer one counts.
 """
 
 from collections import deque
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 WINDOW = 16  # exchanges
 DRIFT_PPM = 100  # of both clocks together: two crystals of 50 ppm
-PENDING = 4  # requests that may be on their way
-LONGEST_US = 200_000  # round trip; what takes longer says too little
-UNKNOWN_US = 100_000  # an offset that is known no better is not known
+PENDING = 4  # requests that may be unanswered
+LONGEST_US = 200_000  # round trip; a longer one is too uncertain
+UNKNOWN_US = 100_000  # an offset that is known no better counts as unknown
 SLACK_US = 1000  # some take their time stamps in whole milliseconds
 
 
@@ -26,7 +26,7 @@ class Exchange:
     half_us: int  # half of the round trip
 
     def uncertainty_us(self, now_us: int) -> int:
-        """How far the offset may be off by now; all exchanges age alike."""
+        """How wrong the offset may be by now; all exchanges age alike."""
         return self.half_us + (now_us - self.t_us) * DRIFT_PPM // 1_000_000
 
 
@@ -46,7 +46,7 @@ class RemoteClock:
         self._pending.append(now_us)
 
     def answer(self, now_us: int, sent_us: int, remote_us: int) -> bool:
-        """Take the answer to the request of `sent_us`; False when nobody asked, or when it took too long."""
+        """Take the answer to the request of `sent_us`; False when there was no such request, or when it took too long."""
         if sent_us not in self._pending:
             return False
         self._pending.remove(sent_us)
@@ -62,7 +62,7 @@ class RemoteClock:
         return True
 
     def offset_us(self, now_us: int) -> int | None:
-        """Return how far the remote clock is ahead; None when nobody knows."""
+        """Return how far the remote clock is ahead; None when it is not known."""
         best = self._best
         return None if best is None or best.uncertainty_us(now_us) > UNKNOWN_US else best.offset_us
 

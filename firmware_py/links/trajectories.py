@@ -2,7 +2,7 @@
 
 Type 0 are pieces of four polynomials (x, y, z, yaw, eight float32 each, ascending powers) and a duration [s]; type 1 is
 compressed: a start and pieces of Bezier points in mm and tenths of a degree, the last one with the duration 0. A path is
-read when it is started: what is written to the memory later does not change it. Facts: crazyflie-firmware 2a18fc29, cflib.
+read when it is started: later writes to the memory do not change it. Facts: crazyflie-firmware 2a18fc29, cflib.
 """
 
 import struct

@@ -1,1 +1,1 @@
-"""Logic of one's own in the flight core: a control law, an estimator. docs/own-logic.md shows how it is written."""
+"""The user's own logic in the flight core: a control law, an estimator. docs/howto/own-logic.md shows how it is written."""

@@ -1,4 +1,5 @@
-"""The entry module of a core with logic of one's own, as text: what `firmware_py/core/entry.py` is to the default core.
+"""The entry module of a core with the user's own logic, as text: it replaces `firmware_py/core/entry.py` of the default
+core.
 
 Each call takes the memory that it needs and no more; `Entry.calls` names it, in the order of the arguments.
 """
@@ -23,11 +24,8 @@ _closed = guard.closed
 _guard_control = guard.guard_control
 _guard_estimate = guard.guard_estimate
 '''
-PREDICTOR = {
-    "reset": "reset",
-    "file_pose": "pose_into_history",
-    "estimate": "estimate",
-}  # who is called by default
+# The predictor's kernels that are called by default.
+PREDICTOR = {"reset": "reset", "file_pose": "pose_into_history", "estimate": "estimate"}
 DOCS = {
     "reset": "Start the estimator.",
     "file_pose": "File the pose in the input under the instant at which it was true.",

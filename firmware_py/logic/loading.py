@@ -1,7 +1,7 @@
 """From the profile's `[logic]` to code that flies: the modules are read, checked, joined with the core and loaded.
 
-What is loaded is named by a hash of the text. So a module that was edited is never mistaken for what it was, neither in
-one process nor in what numba keeps on disk.
+What is loaded is named by a hash of the text. So an edited module is never mistaken for its earlier version, neither in
+one process nor in numba's cache on disk.
 """
 
 import difflib
@@ -35,7 +35,7 @@ class Loaded:
     entry: ModuleType
     calls: Mapping[str, tuple[str, ...]]
     translation: Translation
-    structs: Mapping[str, type[Struct]]  # of the blocks that come to the core's
+    structs: Mapping[str, type[Struct]]  # of the blocks that own logic adds to the core's
     files: Mapping[str, str]  # by plug point
 
     @property
@@ -67,7 +67,7 @@ class Logic:
 def load_logic(config: LogicConfig) -> Logic | None:
     """Return the logic of a profile, None when the default core flies.
 
-    Raises `LogicError` for a file or value that cannot be, `ExportError` for text outside the subset.
+    Raises `LogicError` for a file or value that cannot be used, `ExportError` for text outside the subset.
     """
     files = {point.name: getattr(config, point.name) for point in POINTS if getattr(config, point.name)}
     if not files:
@@ -143,7 +143,7 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
 
 
 def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
-    """Refuse names that clients could not tell apart."""
+    """Refuse names that clients could not distinguish."""
     for kind in ("parameters", "variables"):
         seen: dict[str, str] = {}
         for plug in plugs:
@@ -178,7 +178,7 @@ def _run(name: str, path: Path, text: str) -> ModuleType:
 
 
 def _written(folder: Path, name: str, text: str) -> Path:
-    """Write a text where compiled code of that folder is kept, or else where the user's is; return its path."""
+    """Write a text where compiled code of that folder is cached, or else in the user's cache; return its path."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     hashed = hashlib.sha256(str(folder).encode()).hexdigest()[:16]
     places = (folder / "__pycache__", home / "floaty" / hashed)
@@ -197,6 +197,6 @@ def _written(folder: Path, name: str, text: str) -> Path:
 
 
 def _shown(file: str) -> str:
-    """Return a file's path as a user reads it: from the working folder on, where that is shorter."""
+    """Return a file's path for the user: relative to the working folder where that is shorter."""
     path = Path(file)
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else file

@@ -1,4 +1,4 @@
-"""The plug points of the core, and what a module of the user's brings for them, read from its text.
+"""The plug points of the core, and what a user's module provides for them, read from its text.
 
 A hook is a kernel with a fixed name. It takes those of these arguments that it names:
 
@@ -31,7 +31,7 @@ CALLS: Mapping[str, tuple[str, ...]] = {  # the default core's entry points, and
 
 @dataclass(frozen=True, slots=True)
 class PlugPoint:
-    """A place for a module of the user's: its hooks with their results, and which arguments they may write."""
+    """A place for a user's module: its hooks with their results, and which arguments they may write."""
 
     name: str  # the key of the profile
     hooks: Mapping[str, Kind]
@@ -69,7 +69,7 @@ class OwnVariable:
 
 @dataclass(frozen=True, slots=True)
 class Plug:
-    """A module in its place."""
+    """A module at its plug point."""
 
     point: PlugPoint
     hooks: Mapping[str, tuple[str, ...]]  # the arguments of those that it has
@@ -83,7 +83,7 @@ class Plug:
 
 
 def read_plug(point: PlugPoint, module: Module) -> Plug:
-    """Return what a module brings. Raises `ExportError` with file, line and what is expected."""
+    """Return what a module provides. Raises `ExportError` with file, line and what is expected."""
     hooks: dict[str, tuple[str, ...]] = {}
     structs: dict[str, StructType] = {}
     kernels = [thing for thing in module.defined if isinstance(thing, Kernel)]

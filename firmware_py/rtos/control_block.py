@@ -50,15 +50,16 @@ class ControlBlock:
         self.ring = ring  # of all ready tasks of that priority
         self.ready_bit = 1 << priority
         self.base_priority = priority
-        self.event_priority = priority  # orders the waiters; a change does not move a task that waits already
+        # Orders the waiters; a change does not move a task that is waiting already.
+        self.event_priority = priority
         self.mutexes_held = 0
         self.place = SUSPENDED
         self.waiting_in: list[ControlBlock] | None = None  # waiters of a queue, or the pending-ready list
         self.notification = 0
         self.notify_waiting = False  # it waits for a notification, or has not run since that wait ended
-        self.work_left_us = 0  # what is left of the current `work`
-        self.work_us = 0  # all work so far, with what is left of the current one
-        # How it keeps up. An activation lasts from the instant at which the task becomes ready after a wait to its next
+        self.work_left_us = 0  # rest of the current `work`
+        self.work_us = 0  # all work so far, the rest of the current one included
+        # Timing. An activation lasts from the instant at which the task becomes ready after a wait to its next
         # wait; its response time is that duration, its start latency the part before it first runs.
         self.released_us = now_us
         self.fresh = True  # released, and has not run since

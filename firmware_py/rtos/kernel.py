@@ -1,4 +1,4 @@
-"""What tasks call, and where everything is made: tasks, queues, semaphores, mutexes, timers.
+"""The calls of tasks, and the creation of everything: tasks, queues, semaphores, mutexes, timers.
 
 Waiting and working calls are used with `yield from`. Times are ticks of 1 ms, except for `work`, which is microseconds.
 """
@@ -10,7 +10,7 @@ from typing import Any, TypeVarTuple
 
 from firmware_py.rtos.errors import KernelError
 from firmware_py.rtos.queue import Queue, T
-from firmware_py.rtos.scheduler import FOREVER, GO_ON, SWITCH, TICK_US, Scheduler, Trace
+from firmware_py.rtos.scheduler import GO_ON, SWITCH, TICK_US, Scheduler, Trace
 from firmware_py.rtos.semaphore import Mutex, Semaphore
 from firmware_py.rtos.task import Task
 from firmware_py.rtos.timer import SERVICE_PRIORITY, Callback, Timer, TimerService
@@ -101,9 +101,16 @@ class Kernel(Scheduler):
 
     def work(self, duration_us: int) -> Iterable[int]:
         """Takes processor time; others may run in between."""
-        if duration_us > 0:
+        if duration_us <= 0:
+            self.count_call()
+            return GO_ON
+        end_us = self.now_us + duration_us
+        if end_us >= self._next_tick_us or end_us > self._until_us or self._switch_pending:
             return (duration_us,)
-        self.count_call()
+        # Nothing can happen before the work is done: the clock moves, and the task goes on.
+        self.current.work_us += duration_us
+        self.now_us = end_us
+        self._calls = 0
         return GO_ON
 
     def task_yield(self) -> Iterable[int]:
@@ -145,7 +152,7 @@ class Kernel(Scheduler):
         else:
             self.check_may_wait()
             task.notify_waiting = True
-            self.block(None, FOREVER if timeout < 0 else self.tick_count + timeout)
+            self.block(None, self.deadline(timeout))
             if self.trace is not None:
                 self.record("NTAKE_BLOCK")
             yield 0

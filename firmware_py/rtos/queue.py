@@ -57,15 +57,11 @@ class Queue(Generic[T]):
         if timeout and kernel.suspended:
             kernel.check_may_wait()
         if len(items) >= self.length:
-            deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
+            deadline = kernel.deadline(timeout)
             while len(items) >= self.length:
-                if 0 <= deadline <= kernel.tick_count:
+                if not kernel.wait_in(self._senders, deadline, "Q_SEND", self.number):
                     self.dropped += 1
-                    kernel.failed("Q_SEND_FAIL", self.number)
                     return False
-                if kernel.trace is not None:
-                    kernel.record("Q_SEND_BLOCK", self.number)
-                kernel.block(self._senders, deadline)
                 yield 0
         if kernel.trace is not None:
             kernel.record("Q_SEND", self.number, len(items))
@@ -108,14 +104,10 @@ class Queue(Generic[T]):
         if items:
             kernel.count_call()
         else:
-            deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
+            deadline = kernel.deadline(timeout)
             while not items:
-                if 0 <= deadline <= kernel.tick_count:
-                    kernel.failed("Q_RECV_FAIL", self.number)
+                if not kernel.wait_in(self._receivers, deadline, "Q_RECV", self.number):
                     return None
-                if kernel.trace is not None:
-                    kernel.record("Q_RECV_BLOCK", self.number)
-                kernel.block(self._receivers, deadline)
                 yield 0
         if kernel.trace is not None:
             kernel.record("Q_RECV", self.number, len(items))

@@ -21,9 +21,8 @@ from firmware_py.rtos.errors import KernelError, StuckTaskError, TaskError
 SWITCH: Final = (0,)  # what a call returns for `yield from` when the processor may go to another task
 GO_ON: Final[tuple[int, ...]] = ()  # ... and when the caller just continues
 
-FOREVER: Final = (
-    -1
-)  # a timeout that never ends, FreeRTOS's portMAX_DELAY; any other timeout is a number of ticks
+# A timeout that never ends, FreeRTOS's portMAX_DELAY; any other timeout is a number of ticks.
+FOREVER: Final = -1
 
 TICK_US: Final = 1000
 MAX_PRIORITIES: Final = 7  # the Crazyflie's six, 0 to 5, and one above them for what stands for interrupts
@@ -32,7 +31,7 @@ MAX_PRIORITIES: Final = 7  # the Crazyflie's six, 0 to 5, and one above them for
 STUCK_CALLS: Final = 10_000
 _FOR_EVER_US: Final = 1 << 50
 
-# Whose code runs at the moment: whoever makes the tasks before the start, a task, or an interrupt between two runs.
+# Whose code runs at the moment: the creator of the tasks before the start, a task, or an interrupt between two runs.
 BEFORE_START: Final = 0
 IN_TASK: Final = 1
 IN_INTERRUPT: Final = 2
@@ -44,7 +43,7 @@ Trace = Callable[[int, str, str, int, int], None]
 class Scheduler:
     """The part of the kernel that decides who runs; `Kernel` adds what tasks call.
 
-    `run`, `advance` and `next_wake_us` are for the harness, all else for this package.
+    `run`, `advance` and `next_wake_us` are for the harness, everything else for this package.
     """
 
     def __init__(self, preemption: bool = True, trace: Trace | None = None) -> None:
@@ -54,7 +53,7 @@ class Scheduler:
         self.next_wake_us: int | None = None
         self.tick_count = 0  # up to date while tasks run
         self.rings: list[list[Any]] = [[None] for _ in range(MAX_PRIORITIES)]  # of tasks and the marker None
-        # Before the scheduler starts, whoever calls.
+        # Before the scheduler starts, the caller.
         self.current = ControlBlock("main", 0, _nothing(), self.rings[0], 0)
         self.task_woken = False  # whether the latest call from an interrupt woke a task above the running one
         self._idle = self.current
@@ -134,13 +133,7 @@ class Scheduler:
             else:
                 waiters.append(task)
             task.waiting_in = waiters
-        ring = task.ring
-        if ring[-1] is task:
-            ring.pop()
-        else:
-            ring.remove(task)
-        if len(ring) == 1:
-            self._ready_bits ^= task.ready_bit
+        self._leave_ring(task)
         if wake_tick < 0:
             task.place = SUSPENDED
         else:
@@ -155,8 +148,22 @@ class Scheduler:
         if response_us > task.deadline_us:
             task.deadline_misses += 1
 
+    def deadline(self, timeout: int) -> int:
+        """Returns the tick at which a wait of `timeout` ticks from now ends, or FOREVER."""
+        return FOREVER if timeout < 0 else self.tick_count + timeout
+
+    def wait_in(self, waiters: list[ControlBlock], deadline: int, call: str, number: int) -> bool:
+        """Blocks the running task among `waiters` of an object; False when the `deadline` of its `call` has come."""
+        if 0 <= deadline <= self.tick_count:
+            self.failed(call + "_FAIL", number)
+            return False
+        if self.trace is not None:
+            self.record(call + "_BLOCK", number)
+        self.block(waiters, deadline)
+        return True
+
     def check_may_wait(self) -> None:
-        """Raises KernelError if the running task would wait while nobody else may run."""
+        """Raises KernelError if the running task would wait while no other may run."""
         if self.suspended:
             raise KernelError(f"task {self.current.name} must not wait while the scheduler is suspended")
 
@@ -209,16 +216,19 @@ class Scheduler:
     def unlink(self, task: ControlBlock) -> None:
         """Removes the task from the ring or the delayed list."""
         if task.place == READY:
-            ring = task.ring
-            if ring[-1] is task:
-                ring.pop()
-            else:
-                ring.remove(task)
-            if len(ring) == 1:
-                self._ready_bits ^= task.ready_bit
+            self._leave_ring(task)
         elif task.place == DELAYED:
             place = self._delayed.index(task)
             del self._delayed[place], self._wake_ticks[place]
+
+    def _leave_ring(self, task: ControlBlock) -> None:
+        ring = task.ring
+        if ring[-1] is task:
+            ring.pop()
+        else:
+            ring.remove(task)
+        if len(ring) == 1:
+            self._ready_bits ^= task.ready_bit
 
     def wake_first(self, waiters: list[ControlBlock]) -> Iterable[int]:
         """Wakes the first of them; returns what the plain call that did it returns."""
@@ -235,7 +245,7 @@ class Scheduler:
         return GO_ON
 
     def misplaced(self, call: str) -> KernelError:
-        """What to raise for a call that is for interrupts and came from a task, or the other way round."""
+        """The error for a call for interrupts that came from a task, or vice versa."""
         if self.context == IN_TASK:
             return KernelError(f"{call} is for interrupts, and was called by task {self.current.name}")
         return KernelError(f"{call} is for tasks, and was called from an interrupt")
@@ -309,44 +319,26 @@ class Scheduler:
             self._switch_pending = True
 
     def _dispatch(self) -> None:
-        """Runs tasks at this instant until the running one has work to do, then works out `next_wake_us`."""
+        """Runs tasks from this instant on until the running one has work to do during which something may happen."""
         task = self.current
-        idle = self._idle
-        now_us = self.now_us
-        trace = self.trace
         switch = self._switch_pending and not self.suspended
         self._calls = 0
         self.context = IN_TASK
         if task.work_left_us:  # every interrupt ends the sleep of the idle task
-            task.work_left_us = 0 if task is idle else self._work_end_us - now_us
+            task.work_left_us = 0 if task is self._idle else self._work_end_us - self.now_us
         result: Any = 0
+        since_us, steps = self.now_us, 0
         try:
-            for _ in range(STUCK_CALLS):
+            while True:
                 if switch:
-                    self._switch_pending = False
-                    ring = self.rings[self._ready_bits.bit_length() - 1]
-                    if len(ring) == 2:
-                        if ring[1] is None:
-                            ring.reverse()
-                        task = ring[1]
-                        if task is idle and self.preemption:  # nobody to yield to: sleeps at once
-                            task.work_left_us = _FOR_EVER_US
-                            self._idle_slept = True
-                    else:
-                        ring.append(ring.pop(0))
-                        if ring[-1] is None:
-                            ring.append(ring.pop(0))
-                        task = ring[-1]
-                    self.current = task
-                    if trace is not None:
-                        trace(now_us, "IN", task.name, task.priority, 0)
-                    if task.fresh:
-                        task.fresh = False
-                        if now_us > task.released_us:
-                            latency_us = now_us - task.released_us
-                            task.latencies[latency_us] = task.latencies.get(latency_us, 0) + 1
+                    task = self._switch()
                 if task.work_left_us:
                     break
+                steps += 1
+                if steps > STUCK_CALLS:
+                    if self.now_us == since_us:
+                        raise StuckTaskError(task.name, since_us, f"{STUCK_CALLS} switches at one instant")
+                    since_us, steps = self.now_us, 0
                 try:
                     result = task.step(None)
                 except StopIteration:
@@ -360,24 +352,53 @@ class Scheduler:
                     switch = False
                 else:
                     switch = True
-            else:
-                raise StuckTaskError(task.name, now_us, f"{STUCK_CALLS} switches at one instant")
         except TaskError:
             raise
         except Exception as error:
             what = f"{type(error).__name__}: {error}"
             if not isinstance(result, int):
                 what = f"yielded a {type(result).__name__}; kernel calls need `yield from`"
-            raise TaskError(task.name, now_us, what) from error
+            raise TaskError(task.name, self.now_us, what) from error
         finally:
             self.leave_tasks()
+        self._set_next_wake(task)
+
+    def _switch(self) -> ControlBlock:
+        """Makes the next task of the highest ready ring the running one and returns it."""
+        self._switch_pending = False
+        ring = self.rings[self._ready_bits.bit_length() - 1]
+        task: ControlBlock
+        if len(ring) == 2:
+            if ring[1] is None:
+                ring.reverse()
+            task = ring[1]
+            if task is self._idle and self.preemption:  # no task to yield to: sleeps at once
+                task.work_left_us = _FOR_EVER_US
+                self._idle_slept = True
+        else:
+            ring.append(ring.pop(0))
+            if ring[-1] is None:
+                ring.append(ring.pop(0))
+            task = ring[-1]
+        self.current = task
+        if self.trace is not None:
+            self.record("IN", task.priority)
+        if task.fresh:
+            task.fresh = False
+            if self.now_us > task.released_us:
+                latency_us = self.now_us - task.released_us
+                task.latencies[latency_us] = task.latencies.get(latency_us, 0) + 1
+        return task
+
+    def _set_next_wake(self, task: ControlBlock) -> None:
+        """Works out when the running task's work ends or a tick may let another one run."""
         wake_us: int | None = None
         if self.trace is not None or (len(task.ring) > 2 and self.preemption):
             wake_us = self._next_tick_us
         elif self._wake_ticks and not self.suspended:
             wake_us = self._wake_ticks[0] * TICK_US
-        if task is not idle:
-            self._work_end_us = work_end_us = now_us + task.work_left_us
+        if task is not self._idle:
+            self._work_end_us = work_end_us = self.now_us + task.work_left_us
             if wake_us is None or work_end_us < wake_us:
                 wake_us = work_end_us
         self.next_wake_us = wake_us

@@ -38,14 +38,10 @@ class Semaphore:
         if self.count:
             kernel.count_call()
         else:
-            deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
+            deadline = kernel.deadline(timeout)
             while self.count == 0:
-                if 0 <= deadline <= kernel.tick_count:
-                    kernel.failed("Q_RECV_FAIL", self.number)
+                if not kernel.wait_in(self._takers, deadline, "Q_RECV", self.number):
                     return False
-                if kernel.trace is not None:
-                    kernel.record("Q_RECV_BLOCK", self.number)
-                kernel.block(self._takers, deadline)
                 yield 0
         if kernel.trace is not None:
             kernel.record("Q_RECV", self.number, self.count)
@@ -120,13 +116,13 @@ class Mutex:
             kernel.record("Q_SEND", self.number)
 
     def take(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """Becomes the holder, waiting up to `timeout` ticks while somebody else is; False when time ran out."""
+        """Becomes the holder, waiting up to `timeout` ticks while another task is; False when time ran out."""
         kernel = self._kernel
         if timeout and kernel.suspended:
             kernel.check_may_wait()
         kernel.count_call()
         task = kernel.current
-        deadline = FOREVER if timeout < 0 else kernel.tick_count + timeout
+        deadline = kernel.deadline(timeout)
         lent = False
         while (holder := self.holder) is not None:
             if 0 <= deadline <= kernel.tick_count:

@@ -1,7 +1,7 @@
-"""How the tasks kept up: run time, response time, start latency, deadlines.
+"""Timing of the tasks: run time, response time, start latency, deadlines.
 
 An activation of a task lasts from the instant at which it becomes ready after a wait to its next wait for anything. Its
-response time is that duration, its start latency the part before it first runs. The kernel counts in the tasks themselves.
+response time is that duration, its start latency the part before it first runs. The kernel keeps the counts in the tasks.
 """
 
 from __future__ import annotations
@@ -48,9 +48,8 @@ class TaskReport:
     activations: int  # those that are over
     worst_response_us: int
     worst_latency_us: int
-    latency_histogram: tuple[
-        int, ...
-    ]  # (12,) activations by start latency, class i is below LATENCY_BOUNDS_US[i]
+    # (12,) activations by start latency, class i is below LATENCY_BOUNDS_US[i].
+    latency_histogram: tuple[int, ...]
     deadline_us: int | None  # of the response time
     deadline_misses: int
 

@@ -4,7 +4,7 @@ The board keeps memory of its own for it, beside that which flies: the structs o
 the other in the order of `CoreBlocks.named`. A packet is one request of the host or one answer of the board, little-endian.
 Each begins with HEAD: the kind, the session, and the number of the request in it. An answer has the head of its request.
 
-    HELLO   ->                       a session begins, memory is zero; asked again, it is only answered
+    HELLO   ->                       a session begins, memory is zero; a repeated request is only answered
             <- ABOUT                 what answers
     WRITE   -> PLACE, bytes          into the memory
             <-
@@ -23,18 +23,22 @@ one is not answered: one before it was lost. A request that comes again is answe
 with the memory as it is then; of calls only the last one. So the host may send many at once and repeats those without an
 answer; it goes on behind a call when everything up to it has been answered.
 
-Hardware in the loop, on a channel of its own, without sessions or repetition. The board flies as always, but each
-millisecond with the gyro sample of the host that is next: SAMPLES, and SAMPLE up to four times. It takes the first one
-when `HIL_WAITING` samples wait. Where the next one is not there it takes the last one again (late); a gap in the numbers
-is filled (lost), what came before is left out (doubled), and of more than 32 that wait only the newest eight are taken.
-After each controller step it tells the host: LOOP. A second without samples ends the mode. With every change of the mode
-the gyro's zero is sought again and the estimator started.
+Hardware in the loop, on a channel of its own, without sessions. The board flies as always, but each millisecond with the
+gyro sample of the host that is next. SAMPLES begins a packet, with the first sample; behind it stand the differences of
+each further one to that before, in `width` bytes: 6, x y z as int16, modulo 65536, or 4, a word with ten bits each, x in
+the lowest ones, where all differences of the packet fit. The board takes the first sample when `HIL_WAITING` wait. Where
+the next one is not there, its flight stands still for up to `HIL_HOLD` steps (held), as it would without the interrupt of
+its own gyro; then it goes on with the last sample (late). Behind a gap in the numbers nothing is taken (lost) until the
+host repeats what is missing; what it has already is left out (doubled). After each controller step, and every ten steps of
+standing still, it sends LOOP to the host, in which `used` plus `waiting` is the number that it expects. A second without
+samples ends the mode. With every change of the mode the gyro's zero is determined again and the estimator restarted.
 """
 
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import pairwise, takewhile
 from typing import Any
 
 from firmware_py.wire import WireError
@@ -43,14 +47,16 @@ from firmware_py.wire.crtp import MAX_DATA
 PORT_CORE = 10
 CHANNEL_CALLS = 0
 CHANNEL_LOOP = 1
-VERSION = 1  # of this protocol
+VERSION = 2  # of this protocol
 NAME_SIZE = 8  # characters of a hash
 HIL_WAITING = 8  # samples of 1 ms
-SAMPLES_MAX = 4  # in a packet
+HIL_HOLD = 250  # steps of 1 ms
+NARROW, WIDE = 4, 6  # bytes of a difference between two samples
+NARROW_BITS = 10  # of an axis
 
 
 class Kind(IntEnum):
-    """What a request wants, and what it is answered with."""
+    """What a request asks for, and the kind of its answer."""
 
     HELLO = 0
     WRITE = 1
@@ -62,9 +68,9 @@ class Kind(IntEnum):
 
 
 class Refusal(IntEnum):
-    """Why a board does not do it."""
+    """Why a board refuses a request."""
 
-    NO_SESSION = 1  # it has rebooted, or somebody else has begun one
+    NO_SESSION = 1  # it has rebooted, or another host has begun one
     FLYING = 2
     OUTSIDE = 3  # of the memory, or no such call
 
@@ -95,7 +101,7 @@ class Layout:
 
     @property
     def struct(self) -> struct.Struct:
-        """What packs it."""
+        """The `struct` that packs it."""
         return struct.Struct("<" + "".join(code for _, code in self.fields))
 
 
@@ -126,25 +132,34 @@ HEALTH = Layout("Health", (
     ("m1", "H"), ("m2", "H"), ("m3", "H"), ("m4", "H"),  # timer counts of the servos
 ))  # fmt: skip
 MODE = Layout("Mode", (("mode", "B"),))
-SAMPLES = Layout("Samples", (("number", "H"),))  # of the first sample
-SAMPLE = Layout("Sample", (("x", "h"), ("y", "h"), ("z", "h")))  # [counts] of the gyro, sensor frame
+SAMPLES = Layout("Samples", (
+    ("number", "H"),  # of the first sample
+    ("width", "B"),  # [B] of a difference: NARROW or WIDE
+    ("x", "h"), ("y", "h"), ("z", "h"),  # [counts] of the gyro, sensor frame
+))  # fmt: skip
 LOOP = Layout("Loop", (
     ("used", "H"),  # number of the next sample, when the controller ran
     ("waiting", "B"),  # samples in the buffer then
     ("state", "B"),  # of the supervisor
     ("cause", "B"),
-    ("late", "H"), ("lost", "H"), ("doubled", "H"),
+    ("fresh", "B"),  # 1: the controller has just run; 0: told while the flight stands still
+    ("held", "H"), ("late", "H"), ("lost", "H"), ("doubled", "H"),
     ("m1", "H"), ("m2", "H"), ("m3", "H"), ("m4", "H"),  # timer counts that the controller puts out
     ("fused", "H"), ("refused", "H"),  # poses
     ("age", "H"),  # [0.1 ms] of the last one
 ))  # fmt: skip
-LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY, HEALTH, MODE, SAMPLES, SAMPLE, LOOP)
+LAYOUTS = (HEAD, ABOUT, PLACE, PLACE_SIZE, CALL, CALLED, WHY, HEALTH, MODE, SAMPLES, LOOP)
 
-_HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _HEALTH, _MODE, _SAMPLES, _SAMPLE, _LOOP = (
+_HEAD, _ABOUT, _PLACE, _PLACE_SIZE, _CALL, _CALLED, _WHY, _HEALTH, _MODE, _SAMPLES, _LOOP = (
     layout.struct for layout in LAYOUTS
 )
+_NARROW, _WIDE = struct.Struct("<I"), struct.Struct("<hhh")
 WRITE_MAX = MAX_DATA - _HEAD.size - _PLACE.size  # bytes in a packet
 READ_MAX = MAX_DATA - _HEAD.size
+_BEHIND_FIRST = {
+    width: (MAX_DATA - _SAMPLES.size) // width for width in (NARROW, WIDE)
+}  # samples in a packet
+SAMPLES_MAX = 1 + _BEHIND_FIRST[NARROW]  # in a packet, when the rate changes little
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +177,7 @@ class About:
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """What a call came to."""
+    """The result of a call."""
 
     answer: int
     cycles: int
@@ -205,7 +220,7 @@ class CoreAnswer:
         return Health(tuple(gyro), bool(calibrated), battery_mv, heap_free, (m1, m2, m3, m4))
 
     def refusal(self) -> int:
-        """Read why."""
+        """Read the reason of a refusal."""
         return int(_unpack(_WHY, self.body)[0])
 
 
@@ -241,12 +256,14 @@ def loop(mode: Hil) -> tuple[Kind, bytes]:
 
 @dataclass(frozen=True, slots=True)
 class Looped:
-    """What the board tells of itself in the loop."""
+    """What the board reports about itself in the loop."""
 
     used: int
     waiting: int
     state: int
     cause: int
+    fresh: bool
+    held: int
     late: int
     lost: int
     doubled: int
@@ -255,19 +272,48 @@ class Looped:
     refused: int
     age_us: int
 
+    @property
+    def received(self) -> int:
+        """Number of the sample that the board expects, modulo 65536."""
+        return (self.used + self.waiting) & 0xFFFF
 
-def encode_samples(number: int, samples: Sequence[Sequence[int]]) -> bytes:
-    """Return the data of a packet with up to `SAMPLES_MAX` gyro samples, of which the first has this number."""
-    return _SAMPLES.pack(number & 0xFFFF) + b"".join([_SAMPLE.pack(*sample) for sample in samples])
+
+def encode_samples(number: int, samples: Sequence[Sequence[int]]) -> tuple[bytes, int]:
+    """Return the data of a packet with the first of these gyro samples, and how many of them it holds.
+
+    `samples`: (n, 3) [counts], n > 0; the first one has this number. All are in it where the rate changes little.
+    """
+    differences = [
+        [(b - a + 0x8000 & 0xFFFF) - 0x8000 for a, b in zip(one, other, strict=True)]
+        for one, other in pairwise(samples[:SAMPLES_MAX])
+    ]
+    small = sum(1 for _ in takewhile(_fits, differences))
+    width = NARROW if small >= min(len(differences), _BEHIND_FIRST[WIDE]) else WIDE
+    behind = differences[: small if width == NARROW else _BEHIND_FIRST[WIDE]]
+    pack = _narrow if width == NARROW else _WIDE.pack
+    return _SAMPLES.pack(number & 0xFFFF, width, *samples[0]) + b"".join(
+        [pack(*step) for step in behind]
+    ), 1 + len(behind)
+
+
+def _fits(step: Sequence[int]) -> bool:
+    limit = 1 << NARROW_BITS - 1
+    return all(-limit <= axis < limit for axis in step)
+
+
+def _narrow(x: int, y: int, z: int) -> bytes:
+    mask = (1 << NARROW_BITS) - 1
+    return _NARROW.pack((x & mask) | (y & mask) << NARROW_BITS | (z & mask) << 2 * NARROW_BITS)
 
 
 def decode_looped(data: bytes) -> Looped:
-    """Read what the board tells; `WireError` when it is too short."""
+    """Read the board's report; `WireError` when it is too short."""
     *head, m1, m2, m3, m4, fused, refused, age = _unpack(_LOOP, data)
-    used, waiting, state, cause, late, lost, doubled = head
+    used, waiting, state, cause, fresh, held, late, lost, doubled = head
     return Looped(
-        used, waiting, state, cause, late, lost, doubled, (m1, m2, m3, m4), fused, refused, 100 * age
-    )
+        used, waiting, state, cause, bool(fresh), held, late, lost, doubled, (m1, m2, m3, m4), fused,
+        refused, 100 * age,
+    )  # fmt: skip
 
 
 def encode_request(kind: Kind, body: bytes, session: int, number: int) -> bytes:

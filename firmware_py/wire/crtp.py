@@ -29,19 +29,19 @@ PORT_LINK = 15
 
 MAX_LOG_VALUES = 26  # 30 less the block's id and the time stamp
 
-FAR = 1000.0  # [m] no tunnel is as large
+FAR = 1000.0  # [m] no tunnel is that large
 AGE_UNIT_US = 500
 AGE_MAX_CODE = 254  # and everything older: 127 ms
 AGE_UNKNOWN_CODE = 255
 
-_RESERVED_BITS = 0x0C  # set by cflib, ignored by everybody
+_RESERVED_BITS = 0x0C  # set by cflib, ignored by all receivers
 _POSE = struct.Struct("<B7f")
 _POSE_WITH_AGE = struct.Struct("<BB7fB")
 _LOG_HEAD = struct.Struct("<BBHB")
 _MIN_NORM2, _MAX_NORM2 = 0.9**2, 1.1**2
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Packet:
     """One CRTP packet: port 0..15, channel 0..3, 0..30 bytes of data."""
 
@@ -50,7 +50,7 @@ class Packet:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PoseMessage:
     """The body's pose in the goal frame as it was `age_us` before the message arrived."""
 
@@ -141,6 +141,6 @@ def check_pose(p_GB: tuple[float, float, float], q_GB: tuple[float, float, float
 
 
 def check_place(p: tuple[float, float, float]) -> None:
-    """Raise `WireError` for a position that is none. The comparisons are false for NaN, too."""
+    """Raise `WireError` for an impossible position. The comparisons are false for NaN, too."""
     if not all(abs(coordinate) <= FAR for coordinate in p):
         raise WireError(f"position {p} m: each coordinate must be within {FAR:g} m")

@@ -1,7 +1,7 @@
 """The commands of the high-level commander on port 8.
 
-A command is one byte, for most the groups that it is for, and its fields; short ones are filled with zeros, as the stock
-firmware's buffer is. Facts: crazyflie-firmware 2a18fc29, cflib 0.1.34.
+A command is one byte, mostly followed by the groups that it addresses, and its fields; short ones are padded with zeros, as
+the stock firmware's buffer is. Facts: crazyflie-firmware 2a18fc29, cflib 0.1.34.
 """
 
 import struct
@@ -108,7 +108,7 @@ _LAYOUTS = {
 
 
 def decode(data: bytes) -> tuple[Command, tuple[float, ...]]:
-    """The command and its fields as they travel; `WireError` for an unknown one or a number that is none."""
+    """The command and its fields as they travel; `WireError` for an unknown one or a number that is not finite."""
     try:
         command = Command(data[0])
     except (IndexError, ValueError):

@@ -1,4 +1,4 @@
-"""The other ways of sending a position or a pose: plain position, packed positions, packed poses.
+"""The other messages with a position or a pose: plain position, packed positions, packed poses.
 
 Packed items carry the last byte of the address of the robot that they are for; positions are int16 millimetres, the
 quaternion is "smallest three": the largest component is left out, the others take a sign and nine bits each.

@@ -4,7 +4,7 @@ Outside: north-east-down (NED) for the world, forward-right-down (FRD) for the b
 Inside: SI, W with z up, B forward-left-up. W and B turn into NED and FRD by half a turn about x, so a vector (x, y, z)
 becomes (x, -y, -z), a quaternion (w, x, y, z) becomes (w, x, -y, -z), and pitch and yaw change their signs.
 
-What goes down saturates where an integer is too narrow and never raises; what comes from outside raises `WireError`.
+Downlink values saturate where an integer is too narrow and never raise; bad input from outside raises `WireError`.
 """
 
 from collections.abc import Sequence
@@ -80,17 +80,8 @@ POSES = (
     MSG_VICON_POSITION_ESTIMATE,
     MSG_ODOMETRY,
 )
-MISSION_MESSAGES = (
-    37,
-    38,
-    39,
-    40,
-    41,
-    44,
-    45,
-    51,
-    73,
-)  # what is asked or told of missions, but for the list and its end
+# All messages about missions except the request for the list and its end.
+MISSION_MESSAGES = (37, 38, 39, 40, 41, 44, 45, 51, 73)
 
 FLIGHT_ARRAY = "floaty"
 FLIGHT_ARRAY_SIZE = sum(len(block.variables) for block in BLOCKS)  # without excitation
@@ -103,20 +94,11 @@ _IGNORE_REST = 0x038 | 0x1C0 | 0x800  # velocity, acceleration, yaw rate
 _IS_FORCE = 0x200
 _IGNORE_YAW = 0x400
 _MOCAP_NED = 14  # reserved today, but it is what MAVSDK sends
-_WORLD_FRAMES = (
-    dialect.MAV_FRAME_LOCAL_NED,
-    _MOCAP_NED,
-    dialect.MAV_FRAME_LOCAL_FRD,
-)  # x of W is north, or forward
+# With x of W as north, or as forward.
+_WORLD_FRAMES = (dialect.MAV_FRAME_LOCAL_NED, _MOCAP_NED, dialect.MAV_FRAME_LOCAL_FRD)
 _BODY_FRAME = dialect.MAV_FRAME_BODY_FRD
-_DIAGONAL = (
-    (0, 0.1),
-    (6, 0.1),
-    (11, 0.1),
-    (15, 0.2),
-    (18, 0.2),
-    (20, 0.2),
-)  # of a covariance: index, deviation [m, rad]
+# The diagonal of a covariance: index and greatest standard deviation [m, rad].
+_DIAGONAL = ((0, 0.1), (6, 0.1), (11, 0.1), (15, 0.2), (18, 0.2), (20, 0.2))
 _UNKNOWN = (nan, *(0.0,) * 20)  # covariance
 _FAILED = -1  # quality of odometry
 _STANDARD_GRAVITY = 9.80665  # [m/s^2 per g]
@@ -131,7 +113,8 @@ _SENSORS = (
     | dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
     | dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
 )
-_HEALTHY = _SENSORS | dialect.MAV_SYS_STATUS_GEOFENCE  # there is none, and MAVProxy would call it breached
+# A Floaty has no geofence, but MAVProxy would report it as breached otherwise.
+_HEALTHY = _SENSORS | dialect.MAV_SYS_STATUS_GEOFENCE
 _ESTIMATES = (
     dialect.ESTIMATOR_ATTITUDE
     | dialect.ESTIMATOR_VELOCITY_HORIZ
@@ -185,7 +168,7 @@ def pose(t_us: int, p_WB: Vector, q_WB: Quaternion) -> Message:
 
 
 def read_pose(message: Message) -> Pose:
-    """The pose in one of `POSES`; `WireError` also for one in other frames, or that its sender does not rely on."""
+    """The pose in one of `POSES`; `WireError` also for one in other frames, or that its sender declares unreliable."""
     number = message.get_msgId()
     if number == MSG_ODOMETRY:
         _check_odometry(message)
@@ -216,9 +199,9 @@ def _check_odometry(message: Message) -> None:
 
 
 def _check_covariance(covariance: Sequence[float]) -> None:
-    """Raise `WireError` for a pose that is said to be worse than any that the estimator may take for exact.
+    """Raise `WireError` for a pose whose stated variances are greater than the estimator may neglect.
 
-    NaN first, or zeros, which MAVLink 2 leaves away: nothing is said.
+    NaN first, or zeros, which MAVLink 2 omits: nothing is stated.
     """
     if isnan(covariance[0]):
         return
@@ -310,7 +293,7 @@ def home_position(t_us: int, p_WG: Vector) -> Message:
 
 
 def global_position(t_ms: int, p_WB: Vector, v_W: Vector, yaw: float, home_z: float) -> Message:
-    """Height, velocity and heading; latitude and longitude stay 0, because nobody knows them."""
+    """Height, velocity and heading; latitude and longitude stay 0, because they are not known."""
     vx, vy, vz = (_i16(100 * speed) for speed in turn(v_W))
     heading = round(100 * degrees(-yaw)) % 36_000
     return dialect.MAVLink_global_position_int_message(
@@ -363,13 +346,13 @@ def read_flight_array(message: Message) -> tuple[Sample, ...]:
 
 
 def read_sys_status(message: Message, timestamp_ms: int) -> tuple[Sample, ...]:
-    """The samples in a SYS_STATUS, which has no time of its own; NaN for a voltage that its board does not know."""
+    """The samples in a SYS_STATUS, which has no time of its own; NaN for a voltage that the board does not know."""
     voltage = nan if message.voltage_battery == _U16_MAX else 1e-3 * message.voltage_battery
     return Sample(BATTERY, timestamp_ms, (voltage,)), Sample(LOAD, timestamp_ms, (0.1 * message.load,))
 
 
 def _from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """The quaternion of zyx angles; NaN for angles that are no finite numbers."""
+    """The quaternion of zyx angles; NaN for angles that are not finite."""
     if not isfinite(roll + pitch + yaw):
         return (nan, nan, nan, nan)
     cr, sr, cp, sp = cos(roll / 2), sin(roll / 2), cos(pitch / 2), sin(pitch / 2)

@@ -1,4 +1,4 @@
-"""MAVLink 2 frames, sans I/O: bytes that arrive become messages, messages become bytes, counters tell what was lost.
+"""MAVLink 2 frames, sans I/O: bytes that arrive become messages, messages become bytes, counters report what was lost.
 
 The dialect is pymavlink's `common`: its classes hold the fields, their layout and the CRC seeds. Framing is our own,
 because pymavlink's parser drops whole supposed frames after a bad byte, lets one forged time stamp lock the true sender
@@ -6,10 +6,10 @@ out, and counts a reordered pair as 256 lost frames. Here
 
 - bytes that are no frame are skipped one at a time, so that no good frame behind them is lost;
 - half a frame waits for its rest until 100 ms of silence have passed (call `feed` with no data to let time pass); the
-  bytes are then looked through again;
+  - a signature is checked before anything is learnt from the frame; with a key, nothing unsigned is accepted.
 - a signature is checked before anything is learnt from the frame; with a key, nothing unsigned is accepted.
 
-Frames of MAVLink 1 are read, never written. Whose message it is for is the reader's business.
+Frames of MAVLink 1 are read, never written. The reader checks to whom a message is addressed.
 """
 
 import re
@@ -24,7 +24,7 @@ from firmware_py.wire.mavlink_signing import SIGNATURE_SIZE, Signing
 __all__ = ["SIGNATURE_SIZE", "FrameCounters", "FrameReceiver", "FrameSender", "Message", "Signing"]
 
 HALF_FRAME_US = 100_000  # silence after which half a frame is given up; 280 bytes last 49 ms at 57600 baud
-RESTART = 4  # so many late frames in sequence: their sender has begun anew
+RESTART = 4  # so many late frames in sequence: their sender has restarted
 
 _START_2 = b"\xfd"
 _START = re.compile(b"[\xfd\xfe]")  # of version 2 or 1
@@ -32,7 +32,8 @@ _HEAD_2 = struct.Struct("<xBBBBBBHB")  # without the magic byte
 _HEAD_1 = struct.Struct("<xBBBBB")
 _CRC_SIZE = 2
 _SIGNED = 1  # the only incompatibility flag that there is
-_INCOMPLETE, _NO_FRAME = 0, 1  # bytes to go on by
+# Results of looking at a supposed frame, beside its length.
+_INCOMPLETE, _NO_FRAME = 0, 1
 
 
 @dataclass(slots=True)
@@ -132,7 +133,7 @@ def _read_head(buffer: bytes, start: int) -> _Head:
 
 
 def _mark(message: Message, head: _Head, frame: bytes, crc: int) -> None:
-    """Tell the message where it came from, as pymavlink's own decoder does."""
+    """Note in the message where it came from, as pymavlink's own decoder does."""
     header = message.get_header()
     header.mlen, header.seq, header.srcSystem, header.srcComponent = (
         head.length,
@@ -151,13 +152,13 @@ class FrameReceiver:
         self.counters = FrameCounters()
         self._signing = signing
         self._held = b""  # half a frame
-        self._last_us = 0  # when bytes came last
+        self._last_us = 0  # when bytes were last received
         self._senders: dict[tuple[int, int], _Sequence] = {}
 
     def feed(self, now_us: int, data: bytes) -> list[Message]:
         """The messages that `data` completes, in order; empty data lets time pass."""
         silent = now_us - self._last_us > HALF_FRAME_US
-        stale = len(self._held) if silent else 0  # what starts before this byte waits no longer
+        stale = len(self._held) if silent else 0  # half frames that start before this byte are given up
         buffer = self._held + data
         if data:
             self._last_us = now_us
@@ -219,13 +220,14 @@ class FrameReceiver:
         return end - start
 
     def _refuse(self, signing: Signing, now_us: int, head: _Head, frame: bytes) -> int:
-        """How many bytes of a frame to pass over that is not signed, not genuine or not new; 0 to accept it."""
+        """How many bytes to skip of a frame that is not signed, not genuine or not new; 0 to accept it."""
         if not head.flags:
             self.counters.unsigned += 1
             return len(frame)
         if not signing.is_genuine(frame):
             self.counters.bad_signature += 1
-            return len(frame) - SIGNATURE_SIZE  # it may be cut off: what stands in its place is looked at
+            # The frame may be cut short, so the bytes in the signature's place are searched for frames.
+            return len(frame) - SIGNATURE_SIZE
         if not signing.is_new(now_us, head.system, head.component, frame):
             self.counters.replayed += 1
             return len(frame)
@@ -241,7 +243,7 @@ class FrameReceiver:
             sender.note(head.sequence, self.counters)
 
     def _note_unknown(self, head: _Head) -> None:
-        """Believe in a frame whose CRC nobody can check when it is the next one of a known sender."""
+        """Accept a frame whose CRC cannot be checked when it is the next one of a known sender."""
         sender = self._senders.get((head.system, head.component))
         if self._signing is None and sender is not None and head.sequence == (sender.newest + 1) & 0xFF:
             self.counters.unknown += 1

@@ -41,7 +41,7 @@ class Layout:
         return self.payload.pack(*flat)
 
     def unpack(self, payload: bytes) -> Message:
-        """The message; what is missing of the payload is zero, and what is too long belongs to a newer dialect."""
+        """The message; missing bytes of the payload are zero, and surplus ones belong to a newer dialect."""
         size = self.payload.size
         flat = self.payload.unpack(payload[:size].ljust(size, b"\0"))
         fields: tuple[Any, ...] | list[Any] = flat

@@ -22,7 +22,7 @@ class Command(IntEnum):
 
 
 class Result(IntEnum):
-    """MAV_RESULT: what becomes of a command."""
+    """MAV_RESULT: the outcome of a command."""
 
     ACCEPTED = 0
     TEMPORARILY_REJECTED = 1
@@ -32,11 +32,11 @@ class Result(IntEnum):
 
 
 class Unit(IntEnum):
-    """FAILURE_UNIT, those that a Floaty has."""
+    """FAILURE_UNIT, those of a Floaty."""
 
     GYRO = 0
     ACCELEROMETER = 1
-    POSES = 6  # SENSOR_VIO: position and attitude as somebody sees them
+    POSES = 6  # SENSOR_VIO: position and attitude from outside
     BATTERY = 100
     MOTOR = 101
     SERVO = 102

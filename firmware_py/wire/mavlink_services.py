@@ -1,4 +1,4 @@
-"""The messages of the standard's services: who is there, commands, parameters, clocks, texts, files.
+"""The messages of the standard's services: heartbeats, commands, parameters, clocks, texts, files.
 
 Nothing here has an axis; what flies is in `mavlink`, which offers these functions, too.
 """
@@ -18,6 +18,7 @@ PREFIXES = {  # of parameters, by group
     "RandConsts": "RND",
     "delayComp": "DLY",
     "kalman": "KAL",
+    "model": "MDL",
     "FloatyKalm": "FKL",
     "locSrv": "LOC",
     "stabilizer": "STAB",
@@ -73,7 +74,7 @@ def mavlink_name(name: str) -> str:
 
 
 def station_heartbeat() -> Message:
-    """A ground station is here."""
+    """The heartbeat of a ground station."""
     return dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, _VERSION
     )
@@ -86,19 +87,19 @@ def command(system: int, component: int, number: int, *params: float) -> Message
 
 
 def timesync(tc1_ns: int, ts1_ns: int) -> Message:
-    """A request (`tc1_ns` = 0) with the sender's clock, or the answer: own clock, and the request's returned."""
+    """A request (`tc1_ns` = 0) with the sender's clock, or the answer: own clock, and that of the request returned."""
     return dialect.MAVLink_timesync_message(tc1_ns, ts1_ns)
 
 
 def ping_answer(request: Message) -> Message:
-    """The answer to somebody's PING."""
+    """The answer to a PING."""
     return dialect.MAVLink_ping_message(
         request.time_usec, request.seq, request.get_srcSystem(), request.get_srcComponent()
     )
 
 
 def heartbeat(armed: bool, state: int) -> Message:
-    """The board is here; `armed`: the flaps are under control. `state` is the supervisor's, 0..3, and the custom mode."""
+    """The board's heartbeat; `armed`: flaps under control. `state` is that of the supervisor, 0..3, and the custom mode."""
     mode = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if armed:
         mode |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
@@ -115,12 +116,12 @@ def heartbeat(armed: bool, state: int) -> Message:
 
 
 def named_value(t_ms: int, name: str, value: float) -> Message:
-    """Any number; the name is cut at 10 characters."""
+    """A named number; the name is cut at 10 characters."""
     return dialect.MAVLink_named_value_float_message(u32(t_ms), _text(name, 10), value)
 
 
 def status_text(severity: int, text: str) -> Message:
-    """A line for people, cut at 50 characters; severity as in syslog, 0 emergency .. 7 debug."""
+    """A line for the operator, cut at 50 characters; severity as in syslog, 0 emergency .. 7 debug."""
     return dialect.MAVLink_statustext_message(severity, _text(text, 50))
 
 
@@ -177,7 +178,7 @@ def autopilot_version(version: tuple[int, int, int], revision: bytes, uid: int) 
 
 
 def protocol_version() -> Message:
-    """MAVLink 2, and versions that are read: 1 as well; which revisions of the standard these are, nobody here knows."""
+    """MAVLink 2, and the versions that are read: 1 as well; the revisions of the standard are not stated."""
     return ProtocolVersion(200, 100, 200, [0] * 8, [0] * 8)
 
 
@@ -187,7 +188,7 @@ def message_interval(number: int, interval_us: int) -> Message:
 
 
 def parameter_error(request: Message, name: str, index: int, error: int) -> Message:
-    """Why a request about a parameter comes to nothing: MAV_PARAM_ERROR 1 does not exist, 2 value out of range."""
+    """Why a request about a parameter fails: MAV_PARAM_ERROR 1 does not exist, 2 value out of range."""
     return dialect.MAVLink_param_error_message(
         request.get_srcSystem(), request.get_srcComponent(), _text(name, NAME_SIZE), index, error
     )
@@ -201,7 +202,7 @@ def no_mission(request: Message) -> Message:
 
 
 def refused_mission(request: Message) -> Message:
-    """The answer to whatever else is asked or told of missions."""
+    """The answer to every other message about missions."""
     return dialect.MAVLink_mission_ack_message(
         request.get_srcSystem(),
         request.get_srcComponent(),
@@ -221,7 +222,7 @@ def no_log_data(request: Message) -> Message:
 
 
 def extended_state(state: int) -> Message:
-    """Whether the robot is in the air, as far as the supervisor's state says: in failsafe nobody on board knows."""
+    """Whether the robot is in the air, as far as the supervisor's state says: in failsafe that is not known on board."""
     return dialect.MAVLink_extended_sys_state_message(
         dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED_OF_STATE[state]
     )

@@ -1,7 +1,7 @@
 """MAVLink 2 signatures: a shared key, and time stamps that only go up.
 
 A frame's signature is the sender's link id, a time stamp and six bytes of SHA-256 over key, frame, link id and stamp.
-Nothing is learnt from a frame before its signature is found genuine.
+Nothing in a frame is used before its signature is found genuine.
 """
 
 from hashlib import sha256

@@ -43,7 +43,7 @@ def encode_config(settings: RadioSettings) -> bytes:
 
 
 def decode_config(block: bytes) -> RadioSettings:
-    """The settings in a configuration block; `WireError` when it is none, or its sum is wrong."""
+    """The settings in a configuration block; `WireError` when it is malformed or its checksum is wrong."""
     if len(block) < CONFIG_SIZE or sum(block[: CONFIG_SIZE - 1]) & 0xFF != block[CONFIG_SIZE - 1]:
         raise WireError(f"configuration block {block[:CONFIG_SIZE].hex()}: wrong length or sum")
     magic, version, channel, data_rate, _, _, upper, lower = _CONFIG.unpack_from(block)

@@ -1,6 +1,6 @@
 """Parameters on the wire: the commands of the parameter port and "set by name".
 
-Channel 0 is the TOC, 1 reads, 2 writes, 3 does the rest. Set by name needs no TOC and works on every Crazyflie.
+Channel 0 is the TOC, 1 reads, 2 writes, 3 carries the other commands. Set by name needs no TOC and works on every Crazyflie.
 """
 
 import struct

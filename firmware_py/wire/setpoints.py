@@ -1,4 +1,4 @@
-"""Set-points on port 7 that say where to be: a position with a yaw, and the full state, of which the motion is left out.
+"""Set-points on port 7 that give a position: a position with a yaw, and the full state, whose motion is ignored.
 
 Facts: crazyflie-firmware 2a18fc29 (crtp_commander_generic.c), cflib 0.1.34.
 """

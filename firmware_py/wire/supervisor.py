@@ -22,5 +22,5 @@ class Cause(IntEnum):
     LOW_BATTERY = 4
     DISARMED = 5
     NO_CONTROL = 6  # of a real board: no controller step came, or another controller runs
-    CONTROLLER_NOT_FINITE = 7  # own logic put out NaN or infinity
+    CONTROLLER_NOT_FINITE = 7  # own logic returned NaN or infinity
     ESTIMATOR_NOT_FINITE = 8

@@ -24,7 +24,7 @@ SLOW_PERIOD_MS = 500
 TIMESTAMP_MASK = 0xFFFFFF  # of a sample: what a log data packet has room for
 
 
-Number = int | float  # what a log variable shows: whole where its type on the wire is
+Number = int | float  # the value of a log variable: an integer where its type on the wire is one
 
 STREAM = "telemetry.stream"  # uint8 parameter: 1 switches the stream on
 FIRST_ID = 0xF1
@@ -65,7 +65,7 @@ class Block:
         object.__setattr__(self, "is_scaled", any(item.scale is not None for item in self.variables))
 
     def pack(self, values: Sequence[Number]) -> bytes:
-        """The bytes of what the log variables show; integers wrap at their width."""
+        """The bytes of the log variables' values; integers wrap at their width."""
         if len(values) != len(self.variables):
             raise WireError(f"log block {self.id}: {len(values)} values for {len(self.variables)} variables")
         try:
@@ -83,7 +83,7 @@ class Block:
         return self.si_of(self.layout.unpack(packed))
 
     def si_of(self, values: Sequence[Number]) -> tuple[Number, ...]:
-        """The values of a sample, of what the log variables show."""
+        """The values of a sample from those of the log variables."""
         if not self.is_scaled:
             return tuple(values)
         return tuple(
@@ -92,7 +92,7 @@ class Block:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Sample:
     """The values of one block at one instant of the board's clock."""
 
@@ -134,10 +134,11 @@ BLOCKS = (
     ),
 )
 
-# Only while something is excited: other flights have nothing of it on their line.
+# Only while something is excited: other flights do not spend air time on it.
 EXCITATION = Block(FIRST_ID + 4, _variables("excite", "u1 u2 u3 u4", Scalar.F32, "rad"))
 ALL_BLOCKS = (*BLOCKS, EXCITATION)
-# Not of the stream: stations of real boards ask for them, one by one, for a Crazyflie knows no load. MAVLink: SYS_STATUS.
+# Not part of the stream: stations of real boards request them one by one, because a Crazyflie has no load variable. MAVLink:
+# SYS_STATUS.
 BATTERY = Block(FIRST_ID + 5, _variables("pm", "vbat", Scalar.F32, "V"))
 LOAD = Block(FIRST_ID + 6, _variables("system", "load", Scalar.F32, "%"))  # of the processor
 SLOW_BLOCKS = (BATTERY, LOAD)
@@ -146,7 +147,7 @@ _BLOCK_OF_ID = {block.id: block for block in ALL_BLOCKS}
 
 
 def encode_block(block: Block, timestamp_ms: int, values: Sequence[Number]) -> bytes:
-    """The complete packet with what the log variables of a block show; integers wrap at their width."""
+    """The complete packet with the values of a block's log variables; integers wrap at their width."""
     return encode_log_data(block.id, timestamp_ms, block.pack(values))
 
 

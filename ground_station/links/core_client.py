@@ -1,6 +1,7 @@
-"""The host's end of the core's port: sends the requests of a batch, repeats those that are not answered, in any loss.
+"""The host's end of the core's port: sends the requests of a batch, repeats those that are not answered, whatever is lost.
 
-`firmware_py.wire.core_port` has the rules by which a board executes each request once. Knows no link: `packets` carries.
+`firmware_py.wire.core_port` has the rules by which a board executes each request once. It knows no link: `packets` carries
+them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +25,7 @@ from ground_station.errors import LinkError
 
 Request = tuple[Kind, bytes]
 
-WINDOW = 4  # requests under way at once: a board's queue has room for 5 packets, and it reboots when that overflows
+WINDOW = 4  # requests in flight at once: a board's queue has room for 5 packets, and it reboots when that overflows
 FIRST_WAIT_S = 0.1  # for an answer, before requests are repeated
 LONGEST_WAIT_S = 0.4
 SILENCE_S = 3.0  # after which the board is given up
@@ -44,19 +45,27 @@ class Packets(Protocol):
         ...
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Return what comes next within that time, else None; raises `LinkError`."""
+        """Return the next packet within that time, else None; raises `LinkError`."""
         ...
 
-    def tell(self, packet: bytes) -> None:
-        """Send a whole packet of any port, behind what was told before, or drop it when the link is too slow for all."""
+    @property
+    def ready(self) -> bool:
+        """Whether nothing waits to be sent."""
         ...
 
-    def told(self) -> list[bytes]:
-        """Return the whole packets that came since the last call of this or `receive`; raises `LinkError`."""
+    def send_any(self, packet: bytes) -> None:
+        """Send a whole packet of any port; raises `LinkError`."""
+        ...
+
+    def received(self, timeout_s: float = 0.0) -> list[bytes]:
+        """Return the whole packets received since the last call of this or `receive`, or the first within that time.
+
+        Raises `LinkError`.
+        """
         ...
 
     def close(self) -> None:
-        """Give the link back."""
+        """Close the link."""
         ...
 
 
@@ -99,12 +108,12 @@ class CoreClient:
         return b"".join(answer.body for answer in self.execute(pieces))
 
     def close(self) -> None:
-        """Give the link back."""
+        """Close the link."""
         self.packets.close()
 
     def _exchange(self, requests: Sequence[Request]) -> list[CoreAnswer]:
         answers: dict[int, CoreAnswer] = {}
-        sent = begin = 0  # requests that were sent, and that were answered without a gap
+        sent = begin = 0  # requests sent, and those of them answered without a gap
         wait_s, silent_s = FIRST_WAIT_S, 0.0
         while begin < len(requests):
             for index in range(sent, min(begin + WINDOW, len(requests))):
@@ -132,7 +141,7 @@ class CoreClient:
         self.packets.send(encode_request(*request, self._session, self._number + index))
 
     def _receive(self, timeout_s: float, count: int) -> CoreAnswer | None:
-        """Return an answer to one of `count` requests; one to an earlier request is none."""
+        """Return an answer to one of `count` requests; answers to earlier requests are skipped."""
         for data in iter(lambda: self.packets.receive(timeout_s), None):
             try:
                 answer = decode_answer(data)

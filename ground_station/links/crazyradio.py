@@ -1,6 +1,6 @@
 """The back end for a real Crazyflie-class board over cflib: `radio://…` with a Crazyradio, or `udp://…`.
 
-Telemetry comes through log blocks that are created on connecting. Of the links the only one that knows cflib.
+Telemetry comes through log blocks that are created on connecting. The only link that knows cflib.
 """
 
 import logging
@@ -49,12 +49,12 @@ from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
 CFLIB_CLOSES_S = 3.0  # it may stay behind when the dongle was pulled
-CONSOLE_BYTES = 1000  # of a line without an end that are kept
+CONSOLE_BYTES = 1000  # that are kept of an unfinished line
 ECHO_PERIOD_US = 100_000  # between packets that the board sends back
-ECHO_APART_US = 3_000  # from the last correction, in whose way they would be
+ECHO_APART_US = 3_000  # from the last correction, which they would delay
 ECHOES = 30  # of which the median counts
 ECHO_HEADER = 0xF0  # port 15, channel 0
-ECHO = struct.Struct("<BQ")  # kind, own clock [us]; as long as cflib's own, which have kind 0
+ECHO = struct.Struct("<BQ")  # kind, own clock [us]; as long as cflib's own packets, which have kind 0
 OWN_ECHO = 1
 MIN_PROTOCOL = 4  # version from which the tables of contents are as read here
 NULL_HEADER, NULL_MASK = 0xF3, 0xF3
@@ -63,7 +63,7 @@ SUPERVISOR_STATE = "supervisor.state"
 
 
 class CrazyradioLink(LiveLink):
-    """One board; `latency_us` is that to the board, until half of the round trip of packets that it sends back is known."""
+    """One board; `latency_us` is assumed for the link until half the round trip of echoed packets is known."""
 
     def __init__(self, uri: str, latency_us: int) -> None:
         self._medium = uri.partition(":")[0]
@@ -71,14 +71,14 @@ class CrazyradioLink(LiveLink):
         self._round_trips_us: deque[int] = deque(maxlen=ECHOES)
         self._echo_us = 0  # when to ask for the next one
         self._sent_us = 0  # the last correction
-        self._cache = tempfile.mkdtemp(prefix="floaty-toc-")  # of the TOC, for connecting again
+        self._cache = tempfile.mkdtemp(prefix="floaty-toc-")  # of the TOC, for reconnecting
         weakref.finalize(self, shutil.rmtree, self._cache, ignore_errors=True)
         self._crazyflie: Crazyflie | None = None
         self._connected = threading.Event()
-        self._lost = ""  # what cflib says of it
-        self._console = b""  # what the board has printed of a line
+        self._lost = ""  # cflib's reason for it
+        self._console = b""  # the unfinished line that the board has printed
         self._blocks: dict[int, Block] = {}
-        self._telemetry_us = 0  # the last packet of a log block
+        self._telemetry_us = 0  # when the last packet of a log block arrived
         self._rate = 0.0  # of exchanges [1/s], 0 over UDP
         self._controls = CrtpControls(lambda data: self._do(partial(self._transmit, data)), self._parameters)
         quiet_cflib()
@@ -136,9 +136,8 @@ class CrazyradioLink(LiveLink):
         """Raise `LinkError` when the link is lost."""
         super().check()
         now_us = clock_us()
-        if (
-            self._blocks and now_us - self._telemetry_us > SILENCE_TIMEOUT_US
-        ):  # cflib does not notice a reboot
+        # cflib does not notice a reboot.
+        if self._blocks and now_us - self._telemetry_us > SILENCE_TIMEOUT_US:
             silence = seconds(SILENCE_TIMEOUT_US)
             raise LinkError(f"{self.uri}: lost: no telemetry for {silence}, it may have rebooted")
         self._ask_for_echo(now_us)
@@ -151,7 +150,7 @@ class CrazyradioLink(LiveLink):
             closing.join(CFLIB_CLOSES_S)
 
     def _create_blocks(self, crazyflie: Crazyflie) -> None:
-        """Start the log blocks of which the board has all variables."""
+        """Start the log blocks whose variables the board has."""
         crazyflie.add_port_callback(CRTPPort.LOGGING, self._on_log_packet)
         self._telemetry_us = clock_us()
         missing: list[str] = []
@@ -177,7 +176,7 @@ class CrazyradioLink(LiveLink):
             self._notices.append(f"the board has no {', '.join(missing)}: without these blocks of telemetry")
 
     def _parameters(self) -> dict[str, Entry]:
-        """Return the board's table of parameters, as cflib has fetched it, but those of types that Floaty has not."""
+        """Return the board's table of parameters, as cflib has fetched it, without those of types that Floaty lacks."""
         groups = {} if self._crazyflie is None else self._crazyflie.param.toc.toc
         scalars = {ParamTocElement.types[number][0]: scalar for number, scalar in PARAMETER_SCALARS.items()}
         return {
@@ -243,7 +242,7 @@ class CrazyradioLink(LiveLink):
         return (sample,)
 
     def _on_any_packet(self, packet: CRTPPacket) -> None:
-        if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even when nobody is behind it
+        if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even when no board is behind it
             self.heard_us = clock_us()
 
     def _on_log_packet(self, packet: CRTPPacket) -> None:
@@ -255,7 +254,7 @@ class CrazyradioLink(LiveLink):
         self._hear(bytes((packet.header,)) + bytes(packet.data))
 
     def _ask_for_echo(self, now_us: int) -> None:
-        """Let the board send a packet back, well apart from corrections: both would be slower."""
+        """Have the board echo a packet, well apart from corrections, which would delay both."""
         if now_us < self._echo_us or now_us - self._sent_us < ECHO_APART_US:
             return
         self._echo_us = now_us + ECHO_PERIOD_US
@@ -279,7 +278,7 @@ class CrazyradioLink(LiveLink):
         self._rate = float(rate)
 
     def summary(self) -> str:
-        """Return one line on how the link does."""
+        """Return one line on the state of the link."""
         radio = f"  quality {self.quality:.0f} %  {self._rate:.0f} exchanges/s" if self._rate else ""
         return f"corrections {self.sent} sent, {self.late} late{radio}"
 
@@ -293,6 +292,6 @@ def quiet_cflib() -> None:
 
 
 def _first_line(text: str) -> str:
-    """The sense of one of cflib's messages, which may carry a traceback."""
+    """The first line of one of cflib's messages, which may carry a traceback."""
     lines = text.strip().splitlines() or ["no reason given"]
     return lines[0].removeprefix("Couldn't load link driver: ")

@@ -36,7 +36,7 @@ from firmware_py.wire.platform import (
 from firmware_py.wire.scalars import Scalar
 from ground_station.controls import Action, ControlsError, Dialogue, Exchange, Request, Script, Settings
 
-PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `hear` wants
+PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `hear` takes
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class CrtpControls(Dialogue[Packet]):
         entry = self._find(name)
         reply = yield self._exchange_for(CHANNEL_READ, entry)
         if reply.data[2] != OK:
-            raise ControlsError(f"{name}: the board does not tell it: {reply.data[2]}")
+            raise ControlsError(f"{name}: the board does not report it: error {reply.data[2]}")
         return ((name, entry.scalar.unpack(reply.data[3 : 3 + entry.scalar.size])),)
 
     def _write(self, name: str, value: float) -> Script[Packet]:
@@ -107,7 +107,7 @@ class CrtpControls(Dialogue[Packet]):
         return ()
 
     def _arm(self) -> Script[Packet]:
-        """By Floaty's own parameters, where there are any: the Crazyflie firmware's arming does not concern the flaps."""
+        """Use Floaty's own parameters where they exist: the Crazyflie firmware's arming does not concern the flaps."""
         for name, value in (("floaty.stop", 0.0), ("floaty.armed", 1.0)):
             if name in self._table():
                 yield from self._write(name, value)
@@ -120,7 +120,7 @@ class CrtpControls(Dialogue[Packet]):
         return ()
 
     def _stop(self) -> Script[Packet]:
-        """Every Crazyflie knows the stop of the localisation port; newer ones tell that they are locked."""
+        """Every Crazyflie knows the stop of the localisation port; newer ones report that they are locked."""
         stop = Packet(PORT_LOCALISATION, CHANNEL_GENERIC, bytes((EMERGENCY_STOP,)))
         ask = Packet(PORT_SUPERVISOR, SUPERVISOR_INFO, bytes((GET_BITS,)))
 
@@ -129,8 +129,8 @@ class CrtpControls(Dialogue[Packet]):
             self._transmit(encode(ask))
 
         def take(got: Packet) -> Packet | None:
-            told = got.port == PORT_SUPERVISOR and got.data[:1] == bytes((REPLY | GET_BITS,))
-            return got if told and int.from_bytes(got.data[1:3], "little") & LOCKED else None
+            is_state = got.port == PORT_SUPERVISOR and got.data[:1] == bytes((REPLY | GET_BITS,))
+            return got if is_state and int.from_bytes(got.data[1:3], "little") & LOCKED else None
 
         yield Exchange(send, take)
         return ()
@@ -159,6 +159,6 @@ class CrtpControls(Dialogue[Packet]):
 
 
 def unknown(name: str, known: tuple[str, ...]) -> str:
-    """Return the line that says so, with the nearest name that there is."""
+    """Return the error line, with the nearest known name."""
     near = get_close_matches(name, (*known, *OF_PROFILE), 1, 0.5)
     return f"parameter {name}: the board has none{f'; did you mean {near[0]}?' if near else ''}"

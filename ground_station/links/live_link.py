@@ -1,7 +1,7 @@
-"""What all links to a board out there have in common; `crazyradio` and `mavlink_serial` are the back ends.
+"""What all links to a real board have in common; `crazyradio` and `mavlink_serial` are the back ends.
 
-The newest pose waits in a mailbox; one thread sends, so that nobody else waits for the line, and a pose that is too old by
-then stays here. Every wait has a limit, and everything that goes wrong is a `LinkError` of one line. A back end opens, sends
+The newest pose waits in a mailbox; one thread sends, so that nothing else waits for the line, and a pose that is too old by
+then is dropped. Every wait has a limit, and every failure is a `LinkError` of one line. A back end opens, sends
 and reads.
 """
 
@@ -22,12 +22,12 @@ from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
 ANSWER_TIMEOUT_US = 4_000_000  # without any answer while connecting
-CONNECT_TIMEOUT_US = 60_000_000  # in all; tables of contents are long and slow with losses
+CONNECT_TIMEOUT_US = 60_000_000  # in total; tables of contents are long and slow with losses
 SILENCE_TIMEOUT_US = 2_000_000  # connected: the slowest board is heard once per second
 MAX_AGE_US = 120_000  # of a pose on board, which could not use an older one
 POLL_S = 0.05  # between two looks at a board that connects
 CLOSE_TIMEOUT_S = 1.5
-PIECES = 2000  # that were read and wait for `received`
+PIECES = 2000  # that were read and wait in `received`
 
 Job = Callable[[], None]
 
@@ -36,21 +36,21 @@ class Sender:
     """A thread that does one job after the other."""
 
     def __init__(self) -> None:
-        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()  # few; of poses there is one
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()  # only a few; at most one pose
         self._thread = threading.Thread(target=self._run, name="sender", daemon=True)
         self._thread.start()
 
     def put(self, job: Job) -> None:
-        """Let a job be done when those before it are."""
+        """Queue a job behind those before it."""
         self._jobs.put(job)
 
     @property
     def waiting(self) -> int:
-        """How many jobs wait."""
+        """How many jobs are queued."""
         return self._jobs.qsize()
 
     def close(self) -> None:
-        """Let the thread end behind what waits; a job that hangs is left alone."""
+        """End the thread after the queued jobs; a job that hangs is left alone."""
         self._jobs.put(None)
         self._thread.join(CLOSE_TIMEOUT_S)
 
@@ -68,15 +68,14 @@ class LiveLink(ABC):
     def __init__(self, uri: str, latency: LinkLatency) -> None:
         self.uri = uri
         self.latency = latency
-        self.supervisor_state: int | None = None  # the board's last, None before it, and again from `mute` on
+        # The last state received from the board, None before it and again after `mute`.
+        self.supervisor_state: int | None = None
         self.sent = 0  # poses
-        self.late = (
-            0  # poses that a newer one replaced, or that were too old or unfit when they were to be sent
-        )
+        # Poses that a newer one replaced, or that were too old or unfit when they were to be sent.
+        self.late = 0
         self.heard_us = 0  # when the board was last heard; 0: not yet
-        self.quality = self.rssi = (
-            nan  # of a radio: 100 % without retries; how weak its signal is there [-dBm]
-        )
+        # Of a radio: link quality, 100 % without retries, and signal strength at the board [-dBm].
+        self.quality = self.rssi = nan
         self._notices: list[str] = []
         self._received: queue.Queue[tuple[int, bytes]] = queue.Queue(PIECES)
         self._mailbox: tuple[MocapFrame, Goal] | None = None
@@ -84,7 +83,7 @@ class LiveLink(ABC):
         self._lock = threading.Lock()  # around mailbox, mute and counters
         self._sender: Sender | None = None
 
-    # What a back end is
+    # What a back end implements
 
     @abstractmethod
     def _open(self) -> None:
@@ -96,7 +95,7 @@ class LiveLink(ABC):
 
     @abstractmethod
     def _why_no_connection(self, now_us: int, within: str) -> str:
-        """Return why the board has not connected `within` `ANSWER_TIMEOUT_US`; empty if it is still getting on."""
+        """Return why the board has not connected `within` `ANSWER_TIMEOUT_US`; empty if it is still making progress."""
 
     @abstractmethod
     def _send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
@@ -128,12 +127,12 @@ class LiveLink(ABC):
 
     @abstractmethod
     def summary(self) -> str:
-        """Return one line on how the link does."""
+        """Return one line on the state of the link."""
 
     # Connecting
 
     def open(self, give_up: Callable[[], bool]) -> None:
-        """Connect and start telemetry; raises `LinkError`, also when told to give up."""
+        """Connect and start telemetry; raises `LinkError`, also when `give_up` returns true."""
         self.heard_us = 0
         self._received = queue.Queue(PIECES)
         self._sender = Sender()
@@ -150,7 +149,7 @@ class LiveLink(ABC):
             self._muted = False
 
     def _why_hopeless(self, start_us: int, give_up: Callable[[], bool]) -> str:
-        """Return why to connect no longer, empty while there is hope."""
+        """Return why connecting has failed for good, empty while it may succeed."""
         now_us = clock_us()
         if give_up():
             return "stopped while connecting"
@@ -215,19 +214,19 @@ class LiveLink(ABC):
             self.sent += not late
 
     def _do(self, job: Job) -> None:
-        """Let the sender's thread do it."""
+        """Hand a job to the sender's thread."""
         if (sender := self._sender) is not None:
             sender.put(job)
 
     # Downlink
 
     def _hear(self, data: bytes) -> None:
-        """Keep what has just been read; the back end's reader calls this."""
-        with suppress(queue.Full):  # nobody looks any more
+        """Queue what has just been read; the back end's reader calls this."""
+        with suppress(queue.Full):  # the user no longer reads
             self._received.put_nowait((clock_us(), data))
 
     def received(self) -> list[tuple[int, bytes]]:
-        """Return what came since the last call, with the instants of its arrival [us, `clock_us`]."""
+        """Return what arrived since the last call, with the instants of arrival [us, `clock_us`]."""
         pieces: list[tuple[int, bytes]] = []
         with suppress(queue.Empty):
             while True:
@@ -241,5 +240,5 @@ class LiveLink(ABC):
 
 
 def seconds(duration_us: int) -> str:
-    """A limit as it is told to the user."""
+    """A time limit as text for the user."""
     return f"{duration_us * 1e-6:.0f} s"

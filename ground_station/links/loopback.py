@@ -11,7 +11,7 @@ from ground_station.trajectory import Goal
 
 
 class LoopbackLink:
-    """CRTP to a carrier in the same process. `latency_us` is what the carrier is expected to need."""
+    """CRTP to a carrier in the same process. `latency_us` is the latency expected of the carrier."""
 
     def __init__(self, transmit: Callable[[int, bytes], object], latency_us: int) -> None:
         self.latency = LinkLatency("radio", latency_us, measured=False)

@@ -1,11 +1,11 @@
 """A board over MAVLink, sans I/O: poses and goals go up, telemetry comes down, and the two clocks are compared.
 
-The pose goes up as it was seen, absolute and with its own time stamp; the goal goes apart from it, when it has changed
+The pose is sent as measured, absolute and with its own time stamp; the goal is sent separately, when it has changed
 and every half second, and the board forms the error. For its true age the board needs the station's clock, so its
 TIMESYNC requests are answered. Telemetry comes down in one array, relative to the goal as the board knows it; what the
-board sends in the standard's messages is for ground stations of others.
+board sends in the standard's messages is for other ground stations.
 
-Telemetry that comes at less than half of the rate it was asked for is asked for again: the request, or the board's memory
+Telemetry that arrives at less than half of the requested rate is requested again: the request, or the board's memory
 of it, was lost.
 """
 
@@ -27,7 +27,7 @@ NO_AUTOPILOT = 8  # in a heartbeat: a ground station's, or a camera's
 EVERYBODY = 0  # system to talk to until the board is known
 LOOK_PERIOD_US = 1_000_000
 REPEAT_GOAL_US = round(1e6 / STANDING_GOAL_HZ)
-TEXTS = 100  # that wait for somebody to read them
+TEXTS = 100  # that wait to be read
 SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # a command and its best result
 HEALTH = 3  # the block with the supervisor's state
 SUPERVISOR_STATE = [variable.name for variable in BLOCKS[HEALTH].variables].index("supervisor.state")
@@ -46,12 +46,12 @@ class MavlinkLinkConfig:
 
 @dataclass(frozen=True, slots=True)
 class LinkStatistics:
-    """What went over the link."""
+    """Counters of the link."""
 
     poses: int  # sent
     goals: int  # sent
     frames: int  # received
-    lost: int  # on the way here, by their sequence numbers
+    lost: int  # on the downlink, by their sequence numbers
     bad: int  # wrong CRC or signature
     round_trip_us: int | None  # of the last time request, None before
 
@@ -67,7 +67,8 @@ class MavlinkLink:
         self.budget = link_budget(config.baud, config.pose_hz, signing is not None)
         self.texts: deque[str] = deque(maxlen=TEXTS)  # the board's, and what it refused
         self.supervisor_state: int | None = None  # as last received
-        self.note_frame: Callable[[int, bytes], object] | None = None  # gets what passes, both ways
+        # Receives every frame, in both directions.
+        self.note_frame: Callable[[int, bytes], object] | None = None
         self.board: int | None = None  # its system id, None before the first heartbeat
         self.answered = False  # it has acknowledged a command
         self.heard_us = 0  # when its last frame came
@@ -81,12 +82,12 @@ class MavlinkLink:
         self._goal: Goal | None = None  # as last sent
         self._goal_us = 0
         self._asked = False
-        self._samples = 0  # of telemetry since the last look
+        self._samples = 0  # of telemetry since the last check
         self._timestamp_ms: int | None = None  # of the last
-        self._look_us = 0  # when to look after the link next
+        self._look_us = 0  # when to check the link next
         self.controls = MavlinkControls(self._send, lambda: self._addressee)
         self._time_request_ns = 0  # own clock in the last one
-        self._read_us = 0  # when what is being understood was read
+        self._read_us = 0  # when the bytes that are being decoded were read
         self._handlers: dict[int, Callable[[int, Message], Sequence[Sample]]] = {
             mavlink.MSG_HEARTBEAT: self._on_heartbeat,
             mavlink.MSG_TIMESYNC: self._on_timesync,
@@ -99,7 +100,7 @@ class MavlinkLink:
 
     @property
     def statistics(self) -> LinkStatistics:
-        """What went over the link so far."""
+        """The counters of the link so far."""
         c = self.counters
         bad = c.bad_crc + c.bad_signature + c.unsigned + c.replayed
         return LinkStatistics(self._poses, self._goals, c.frames, c.lost, bad, self._round_trip_us)
@@ -113,7 +114,7 @@ class MavlinkLink:
         self._look_after(now_us)
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Send the pose, after a goal that has changed; what can wait comes behind. `WireError` for an unfit pose."""
+        """Send the pose, after a goal that has changed; less urgent messages follow. `WireError` for an unfit pose."""
         pose = mavlink.pose(frame.t_us, frame.p_WB, frame.q_WB)
         since_us = now_us - self._goal_us
         if self._goal is None or (goal != self._goal and since_us >= self.budget.goal_period_us):
@@ -141,7 +142,7 @@ class MavlinkLink:
             self.note_frame(now_us, frame)
 
     def _look_after(self, now_us: int) -> None:
-        """Ask for the time, say that we are here, and ask for telemetry that is too slow."""
+        """Send a time request and a heartbeat, and request telemetry that is too slow."""
         self._look_us = now_us + LOOK_PERIOD_US
         self._time_request_ns = now_us * 1000
         self._send(now_us, mavlink.timesync(0, self._time_request_ns))
@@ -155,7 +156,7 @@ class MavlinkLink:
     # Downlink
 
     def receive(self, now_us: int, data: bytes, read_us: int | None = None) -> Sequence[Sample]:
-        """The telemetry in a piece of the stream of bytes that came at `now_us`, which may be empty; never raises.
+        """The telemetry in a piece of the stream of bytes that arrived at `now_us`, which may be empty; never raises.
 
         `read_us` is the present instant where it is a later one.
         """
@@ -186,7 +187,7 @@ class MavlinkLink:
     def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:
         if message.tc1 == 0:
             # The board takes our answer's time for the middle between its request and its receipt. So the middle
-            # between arrival and answer is said, as NTP has it: a late answer is less precise, but not wrong.
+            # between arrival and answer is stated, as in NTP: a late answer is less precise, but not wrong.
             middle_us = (now_us + self._read_us) // 2
             self._send(self._read_us, mavlink.timesync(middle_us * 1000, message.ts1))
         elif message.ts1 == self._time_request_ns:
@@ -213,12 +214,12 @@ class MavlinkLink:
         try:
             samples = mavlink.read_flight_array(message)
         except WireError:
-            return ()  # somebody's array of another name
+            return ()  # an array of another name
         self._samples += 1
         self._timestamp_ms = samples[0].timestamp_ms
         self.supervisor_state = int(samples[HEALTH].values[SUPERVISOR_STATE])
         return samples
 
     def _on_status(self, now_us: int, message: Message) -> Sequence[Sample]:
-        """Let it belong to the newest telemetry, once there is some."""
+        """Join it with the newest telemetry, once there is some."""
         return () if self._timestamp_ms is None else mavlink.read_sys_status(message, self._timestamp_ms)

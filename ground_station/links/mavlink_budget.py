@@ -11,14 +11,14 @@ from firmware_py.wire.mavlink_frames import SIGNATURE_SIZE, FrameSender, Message
 from ground_station.errors import LinkError
 
 BYTE_BITS = 10  # start, 8 data, stop
-UP_LIMIT = 0.9  # of the line: poses that wait get old
-DOWN_LIMIT = 0.8  # of the line: the rest is for parameters, texts and answers
+UP_LIMIT = 0.9  # of the line, so that poses do not wait
+DOWN_LIMIT = 0.8  # of the line; the rest is for parameters, texts and answers
 TELEMETRY_HZ = (50, 25, 20, 10, 4)
-STANDING_GOAL_HZ = 2.0  # how often a goal that stands is repeated
+STANDING_GOAL_HZ = 2.0  # how often an unchanged goal is repeated
 HOUSEKEEPING_HZ = 1.0  # of the station: heartbeat, time request
 BOARD_TIME_HZ = 2.0  # time requests of the board
 
-_U = (0.1, 0.2, 0.3)  # nothing that is zero on the wire, where trailing zeros are cut
+_U = (0.1, 0.2, 0.3)  # not zero, because trailing zeros are cut on the wire
 _Q = (0.5, 0.5, 0.5, 0.5)
 
 
@@ -26,7 +26,7 @@ _Q = (0.5, 0.5, 0.5, 0.5)
 class Budget:
     """How a line is used."""
 
-    up_load: float  # share of the line while the goal stands, 0..1
+    up_load: float  # share of the line while the goal does not move, 0..1
     down_load: float
     telemetry_hz: int
     goal_period_us: int  # between goals while the goal moves; 0: every pose may bring one

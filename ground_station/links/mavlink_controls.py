@@ -16,8 +16,8 @@ from ground_station.links.crtp_controls import unknown
 BOARD_COMPONENT = 1  # autopilot
 ARM, TERMINATE = 1, 1
 WARNING = 4  # MAV_SEVERITY
-REASON_US = 200_000  # after a refusal, in which the board may say why
-STOPPED = mavlink.mavlink_name("floaty.stop")  # a latch, which arming alone does not open
+REASON_US = 200_000  # after a refusal, in which the board may state the reason
+STOPPED = mavlink.mavlink_name("floaty.stop")  # a latch, which arming alone does not reset
 
 
 class MavlinkControls(Dialogue[Message]):
@@ -41,7 +41,7 @@ class MavlinkControls(Dialogue[Message]):
         return scripts[request.action]()
 
     def _list(self) -> Script[Message]:
-        """Ask for all, and one by one for those that do not come."""
+        """Request all, then one by one those that do not arrive."""
         found: dict[int, Message] = {}
 
         def take(message: Message) -> Message | None:

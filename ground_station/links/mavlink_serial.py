@@ -1,6 +1,6 @@
 """The back end for a board on a serial line: `mavlink:DEVICE[,BAUD]` with whatever pyserial can open, MAVLink on it.
 
-A thread reads and notes when; what was read is understood by who calls `receive`. The only file that knows pyserial.
+A thread reads and notes the time; whoever calls `receive` decodes. The only file that knows pyserial.
 """
 
 import os
@@ -33,7 +33,7 @@ _DEVICE = re.compile(r"(?:socket|rfc2217)://[^,]+:(\d{1,5})(?:[/?][^,]*)?|(?!.*:
 
 
 def parse_uri(uri: str, default_baud: int) -> tuple[str, int]:
-    """`(device, baud)` of `mavlink:DEVICE[,BAUD]`; `LinkError` for what cannot be one."""
+    """`(device, baud)` of `mavlink:DEVICE[,BAUD]`; `LinkError` for a malformed one."""
     device, comma, digits = uri.removeprefix(PREFIX).partition(",")
     match = _DEVICE.fullmatch(device) if uri.startswith(PREFIX) else None
     if match is None or int(match[1] or 1) not in range(1, 65536):
@@ -47,13 +47,14 @@ def parse_uri(uri: str, default_baud: int) -> tuple[str, int]:
 
 
 class _Port:
-    """An open port, until reading or writing fails or it is closed; `hear` gets what is read, in the reader's thread.
+    """An open port, until reading or writing fails or it is closed; `hear` is called with what is read, in the reader's
+    thread.
 
     Raises `OSError` or `ValueError` like pyserial.
     """
 
     def __init__(self, device: str, baud: int, hear: Callable[[bytes], None]) -> None:
-        self.failure = ""  # why it does not work any more
+        self.failure = ""  # why it no longer works
         self.bytes = 0  # received
         self._hear = hear
         self._closing = False
@@ -75,7 +76,7 @@ class _Port:
             self._guard(partial(self._serial.write, data))
 
     def close(self) -> None:
-        """Let the reader end, and close, within some seconds."""
+        """End the reader and close the port, within some seconds."""
         self._closing = True
         self._reader.join(CLOSE_TIMEOUT_S)
         with suppress(OSError):
@@ -101,7 +102,7 @@ class _Port:
 
 
 class MavlinkSerialLink(LiveLink):
-    """One board; `config.baud` is for URIs without one, `note_frame` gets what passes the line, both ways."""
+    """One board; `config.baud` is for URIs without one, `note_frame` receives every frame, in both directions."""
 
     def __init__(
         self,
@@ -146,7 +147,7 @@ class MavlinkSerialLink(LiveLink):
             hint = "" if self._config.signing_key else ": does it want signed frames (mavlink.signing_key)?"
             return f"system {self._link.board} answers no command {within}{hint}"
         if not count:
-            return f"no heartbeat {within}: nothing comes"
+            return f"no heartbeat {within}: no bytes arrive"
         if refused := seen.unsigned + seen.bad_signature + seen.replayed:
             return f"no heartbeat {within}: {refused} frames not signed with mavlink.signing_key"
         if not seen.frames:
@@ -210,7 +211,7 @@ class MavlinkSerialLink(LiveLink):
         return samples
 
     def summary(self) -> str:
-        """Return one line on how the link does."""
+        """Return one line on the state of the link."""
         link = self._link.statistics
         round_trip = "?" if link.round_trip_us is None else f"{link.round_trip_us / 1000:.1f}"
         return (
@@ -220,7 +221,7 @@ class MavlinkSerialLink(LiveLink):
 
 
 def reason(error: Exception) -> str:
-    """The sense of one of pyserial's messages."""
+    """The reason in one of pyserial's messages."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     text = str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,10 +1,9 @@
 """Single packets to and from a board, over whatever link cflib knows: radio, USB or UDP.
 
-No table of contents is fetched and nothing of the board's other services is used, so that it is ready at once.
+No table of contents is fetched and no other service of the board is used, so that it is ready at once.
 """
 
 import re
-from functools import partial
 
 import cflib.crtp
 from cflib.crtp.crtpstack import CRTPPacket
@@ -14,9 +13,7 @@ from firmware_py.wire.crtp import header
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
 from ground_station.links.crazyradio import URIS, quiet_cflib
-from ground_station.links.live_link import Sender
 
-TOLD_WAITING = 12  # packets; later than behind these nobody wants another one
 USB = r"usb://\d"
 HEADER = header(PORT_CORE, CHANNEL_CALLS)
 
@@ -32,7 +29,6 @@ class CflibPackets:
             cflib.crtp.init_drivers()
         self._uri = uri
         self._lost = ""
-        self._sender = Sender()
         try:
             self._driver = cflib.crtp.get_link_driver(uri, lambda statistics: None, self._lose)
         except Exception as error:  # cflib raises bare exceptions
@@ -46,7 +42,7 @@ class CflibPackets:
         self._check()
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Return what comes next on the port within that time, else None."""
+        """Return the next packet on the port within that time, else None."""
         end_us = clock_us() + round(timeout_s * 1e6)
         while True:
             left_s = (end_us - clock_us()) * 1e-6
@@ -57,22 +53,27 @@ class CflibPackets:
             if packet.port == PORT_CORE and packet.channel == CHANNEL_CALLS:
                 return bytes(packet.data)
 
-    def tell(self, packet: bytes) -> None:
-        """Send a whole packet of any port, behind what was told before, or drop it when the link is too slow for all."""
-        if self._sender.waiting < TOLD_WAITING:
-            self._sender.put(partial(self._driver.send_packet, CRTPPacket(packet[0], list(packet[1:]))))
+    @property
+    def ready(self) -> bool:
+        """Whether the radio has taken what was sent before; UDP and USB take everything at once."""
+        waiting = getattr(self._driver, "out_queue", None)
+        return waiting is None or waiting.empty()
 
-    def told(self) -> list[bytes]:
-        """Return the whole packets that came since the last call of this or `receive`."""
-        came = []
-        while (packet := self._driver.receive_packet(0)) is not None:
+    def send_any(self, packet: bytes) -> None:
+        """Send a whole packet of any port; waits until the link is ready."""
+        self._driver.send_packet(CRTPPacket(packet[0], list(packet[1:])))
+        self._check()
+
+    def received(self, timeout_s: float = 0.0) -> list[bytes]:
+        """Return the whole packets received since the last call of this or `receive`, or the first within that time."""
+        came: list[bytes] = []
+        while (packet := self._driver.receive_packet(0 if came else timeout_s)) is not None:
             came.append(bytes((packet.header,)) + bytes(packet.data))
         self._check()
         return came
 
     def close(self) -> None:
-        """Give the link back."""
-        self._sender.close()
+        """Close the link."""
         self._driver.close()
 
     def _lose(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Which back end a link's URI means: one table; each is imported when it is wanted, because its package is an extra."""
+"""Which back end serves a link's URI: one table; each is imported on demand, because its package is an extra."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from ground_station.links.live_link import LiveLink
 
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """What a profile says of links; each back end takes what concerns it."""
+    """A profile's settings of links; each back end takes those that concern it."""
 
     corrections_hz: float
     latency_us: int  # to the board, until it is measured
-    baud: int  # where the URI names none
+    baud: int  # for URIs that name none
     signing_key: bytes  # 32 bytes; empty: nothing is signed
-    note_frame: Callable[[int, bytes], object] | None = (
-        None  # gets the frames of MAVLink that pass, both ways
-    )
+    # Receives every MAVLink frame, in both directions.
+    note_frame: Callable[[int, bytes], object] | None = None
 
 
 def _crazyradio(uri: str, settings: LinkSettings) -> LiveLink:

@@ -1,4 +1,4 @@
-"""What `--mocap` says, on top of `[capture]` of the profile: SYSTEM[:HOST[:PORT]][,OPTION...] or replay:PATH."""
+"""The value of `--mocap`, which overrides `[capture]` of the profile: SYSTEM[:HOST[:PORT]][,OPTION...] or replay:PATH."""
 
 from pathlib import Path
 from typing import Any, get_args
@@ -18,12 +18,12 @@ REPLAY = "replay:"
 
 
 def find_source(text: str | None, capture: CaptureConfig) -> MocapSource:
-    """The source that `text` names, else the profile's, not open yet; `MocapError` for what is none."""
+    """The source that `text` names, else the profile's, not open yet; `MocapError` for a malformed one."""
     if text is not None and text.startswith(REPLAY):
         return ReplaySource(Path(text.removeprefix(REPLAY)))
     chosen = capture if text is None else override(text, capture)
     if chosen.system == "qualisys" and chosen.port is not None:
-        raise MocapError("qualisys: its client knows no port but 22222")
+        raise MocapError("qualisys: its client supports only port 22222")
     if chosen.system == "optitrack":
         return OptitrackSource(chosen)
     return MotioncaptureSource(chosen.system, settings_of(chosen), chosen)

@@ -1,4 +1,4 @@
-"""What the process around `motioncapture` says, one line of JSON each: the bodies of a frame, or why it ends.
+"""The output of the process around `motioncapture`, one line of JSON each: the bodies of a frame, or why it ends.
 
 [123456789, {"floaty": [x, y, z, qw, qx, qy, qz]}]      arrival [us, `clock_us`]; [m], axes of the system
 "no such computer"
@@ -26,12 +26,12 @@ def encode_arrival(arrival: Arrival) -> str:
 
 
 def encode_error(text: str) -> str:
-    """The line that says why no more will come."""
+    """The line that says why the stream ends."""
     return json.dumps(text) + "\n"
 
 
 def decode_line(line: bytes) -> Arrival | str:
-    """What a line says, a text if it is an error's; `MocapError` for what cannot be read."""
+    """The content of a line, a text if it is an error's; `MocapError` for a malformed one."""
     try:
         said = json.loads(line)
     except (ValueError, RecursionError):

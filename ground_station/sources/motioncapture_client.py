@@ -1,7 +1,8 @@
 """Vicon, Qualisys and VRPN, through the package `motioncapture` in a process of its own (`motioncapture_process`).
 
-That package hides the cameras' time stamps: the exposure is the arrival less `capture.latency_us`. Of VRPN it takes no more
-than 100 poses a second. A process that has ended, because nothing came or it was killed, is started again until frames come.
+That package hides the cameras' time stamps: the exposure is the arrival less `capture.latency_us`. From VRPN it takes no
+more than 100 poses a second. A process that has ended, because no frame arrived or it was killed, is started again until
+frames come.
 """
 
 import math
@@ -29,7 +30,7 @@ _MODULE = "ground_station.sources.motioncapture_process"
 
 
 def settings_of(capture: CaptureConfig) -> dict[str, str]:
-    """What `motioncapture.connect` is told."""
+    """The arguments of `motioncapture.connect`."""
     return {"hostname": capture.host if capture.port is None else f"{capture.host}:{capture.port}"}
 
 
@@ -46,7 +47,7 @@ class MotioncaptureSource:
         self._process: subprocess.Popen[bytes] | None = None
         self._restart_us = 0
         self._buffer = b""
-        self._lines: list[bytes] = []  # whole ones, the next last
+        self._lines: list[bytes] = []  # complete ones, the next one last
         self._pose: Body | None = None
         self._age_us = 0
         self._lost = 0  # frames without a pose
@@ -67,7 +68,7 @@ class MotioncaptureSource:
         )
 
     def _find(self) -> str:
-        """The name of the body; of several the wanted one is taken when it is seen, a single one after a while."""
+        """The name of the body; of several the wanted one is taken as soon as it is seen, a single one after a while."""
         names: dict[str, None] = {}
         self._start()
         now_us = clock_us()
@@ -108,7 +109,7 @@ class MotioncaptureSource:
         return notices
 
     def summary(self) -> str:
-        """A few words on how it does."""
+        """A few words on its state."""
         return f"mocap {self._age_us / 1000:.1f} ms old (assumed), {self._lost} lost, {self._malformed} malformed"
 
     def close(self) -> None:
@@ -122,10 +123,10 @@ class MotioncaptureSource:
         self._buffer, self._lines = b"", []
 
     def _on_arrival(self, arrival: Arrival, now_us: int) -> MocapFrame | None:
-        """The frame, None if it tells nothing of the body."""
+        """The frame, None if it does not contain the body."""
         body = arrival.bodies.get(self._body)
         if (body is None and self._system == "vrpn") or now_us - arrival.t_us > OLDEST_US:
-            return None  # VRPN tells each body's news apart
+            return None  # VRPN reports each body separately
         self._silence.on_frame(now_us)
         arrived_us = min(arrival.t_us, now_us)
         t_us = arrived_us - self._capture.latency_us
@@ -138,17 +139,18 @@ class MotioncaptureSource:
         return MocapFrame(t_us, p_WB, q_WB, valid=True, arrived_us=arrived_us)
 
     def _usable(self, body: Body) -> bool:
-        """Whether it is not the last pose again, which cameras never see."""
+        """Whether it differs from the last pose, as every measured pose does."""
         last, self._pose = self._pose, body
         return body != last
 
     def _start(self) -> None:
+        # In a session of its own, because Ctrl-C is for the station.
         self._process = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True
-        )  # a session of its own: Ctrl-C is for the station
+        )
 
     def _next(self, timeout_s: float) -> Arrival | str | None:
-        """What the process says next, None when nothing comes in time, it has ended, or it cannot be read."""
+        """The next line of the process, None when none arrives in time, it has ended, or the line cannot be read."""
         if not self._lines:
             self._read(timeout_s)
         if not self._lines:

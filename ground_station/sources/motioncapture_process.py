@@ -1,7 +1,7 @@
 """A process of its own for the package `motioncapture`: `python -m` this module SYSTEM KEY=VALUE...
 
-Its connect() holds the interpreter, neither that nor waitForNextFrame() ends without a server, and it prints as it likes.
-Here that does no harm: what is seen goes as lines (`capture_lines`) to what was standard output, and the kernel ends the
+Its connect() holds the interpreter, neither that nor waitForNextFrame() ends without a server, and it prints to standard
+output. Here that does no harm: frames go as lines (`capture_lines`) to what was standard output, and the kernel ends the
 process when nothing has come for `LIFE_S`, also when the station is no more.
 """
 
@@ -19,7 +19,7 @@ LIFE_S = 5
 
 
 def main(system: str, *settings: str) -> None:
-    """Stream the bodies of `system` until nobody reads, or nothing comes."""
+    """Stream the bodies of `system` until the reader is gone, or no frame arrives."""
     lines = os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
@@ -38,7 +38,7 @@ def _stream(lines: TextIO, system: str, settings: dict[str, str]) -> None:
 
     signal.alarm(LIFE_S)
     host, colon, port = settings["hostname"].partition(":")
-    settings["hostname"] = socket.gethostbyname(host) + colon + port  # it knows no names
+    settings["hostname"] = socket.gethostbyname(host) + colon + port  # it cannot resolve names
     capture = motioncapture.connect(system, settings)
     while True:
         capture.waitForNextFrame()
@@ -47,7 +47,7 @@ def _stream(lines: TextIO, system: str, settings: dict[str, str]) -> None:
         for name, body in capture.rigidBodies.items():
             q = body.rotation
             bodies[name] = (*body.position.tolist(), q.w, q.x, q.y, q.z)
-        if system == "vrpn" and not bodies:  # it has no frames: this is its poll, and nothing has come
+        if system == "vrpn" and not bodies:  # it has no frames: this was a poll without result
             continue
         signal.alarm(LIFE_S)
         lines.write(encode_arrival(Arrival(arrival_us, bodies)))

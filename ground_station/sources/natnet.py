@@ -1,8 +1,9 @@
-"""NatNet, the protocol of OptiTrack's Motive: what its packets say, versions 3.0 to 4.1, little endian.
+"""NatNet, the protocol of OptiTrack's Motive: its packets, versions 3.0 to 4.1, little endian.
 
 A packet is u16 message, u16 length of what follows, payload. Sans I/O; positions and rotations are those of Motive's
 axes, and a quaternion's order is x y z w on the wire, w x y z here. Skeletons, assets, force plates, devices and
-cameras are checked and passed over. `hil.servers.motive` writes what is read here. Layouts from the clients of links.md.
+cameras are checked and skipped. `hil.servers.motive` writes what is read here. Layouts: OptiTrack's
+NatNet SDK, PacketClient.
 """
 
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ _LABELLED_SIZE = 26  # id, position, size, parameters, residual
 
 
 class MessageId(IntEnum):
-    """What a packet is; clients send CONNECT, REQUEST, REQUEST_MODELDEF, KEEPALIVE, DISCONNECT and ECHO_REQUEST."""
+    """The type of a packet; clients send CONNECT, REQUEST, REQUEST_MODELDEF, KEEPALIVE, DISCONNECT and ECHO_REQUEST."""
 
     CONNECT = 0
     SERVER_INFO = 1
@@ -95,7 +96,7 @@ class BodyPose:
 
 @dataclass(frozen=True, slots=True)
 class LabelledMarker:
-    """A marker that the server told apart."""
+    """A marker that the server has identified."""
 
     id: int  # model << 16 | marker
     p: Vector  # [m] in Motive's axes
@@ -151,7 +152,7 @@ def packet(message: MessageId, payload: bytes = b"") -> bytes:
 
 
 def decode(data: bytes, version: Version) -> Message:
-    """What a packet says, in the layout of `version`; `MocapError` for what cannot be read."""
+    """The content of a packet, in the layout of `version`; `MocapError` for a malformed one."""
     if version not in VERSIONS:
         raise MocapError(f"NatNet {version[0]}.{version[1]}: only 3.0, 3.1, 4.0 and 4.1 can be read")
     reader = Reader(data, version)
@@ -288,4 +289,4 @@ def _pass_over(reader: Reader, kind: int) -> None:
             reader.text()
             reader.take(22)  # id, position, size, parameters
     else:
-        raise MocapError(f"NatNet model definition: {kind} is no kind of model")
+        raise MocapError(f"NatNet model definition: {kind} is not a kind of model")

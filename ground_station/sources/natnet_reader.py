@@ -18,7 +18,7 @@ _QUATERNION = struct.Struct("<4f")
 
 
 class Reader:
-    """Goes through a packet of `version`; whatever would lie beyond its end raises `MocapError`."""
+    """Goes through a packet of `version`; reading beyond its end raises `MocapError`."""
 
     def __init__(self, data: bytes, version: Version) -> None:
         self.version = version
@@ -80,16 +80,16 @@ class Reader:
         return raw.decode("utf-8", "replace")
 
     def texts(self) -> None:
-        """Pass over a count and as many texts."""
+        """Skip a count and as many texts."""
         for _ in range(self.count(1)):
             self.text()
 
     def count(self, size: int) -> int:
-        """The next count, of things of at least `size` bytes each."""
+        """The next count, of items of at least `size` bytes each."""
         count = self.u32()
         if count * size > self.left:
             raise MocapError(
-                f"NatNet packet of {len(self._data)} bytes: {count} things of {size} bytes at {self._at}"
+                f"NatNet packet of {len(self._data)} bytes: {count} items of {size} bytes at {self._at}"
             )
         return count
 

@@ -1,6 +1,6 @@
 """One rigid body out of a NatNet stream: packets and the time in, poses in the world and notices out. Sans I/O.
 
-A server that speaks a newer NatNet than can be read here is asked for the newest that can.
+A server with a newer NatNet than can be read here is asked for the newest readable version.
 """
 
 from dataclasses import dataclass
@@ -25,23 +25,21 @@ from ground_station.sources.natnet_reader import Quaternion, Vector, Version
 from ground_station.sources.server_clock import ServerClock
 from ground_station.sources.silence import Silence
 
-LATE_FRAMES = 100  # a number that lies further back is that of a server that began anew
+LATE_FRAMES = 100  # a number that lies further back is that of a server that has restarted
 FROZEN_FRAMES = 3  # with the very same pose: the server repeats what it saw last
-MISTIMED_FRAMES = (
-    1000  # one after the other: the server's clock was set. Those that waited in a socket are fewer
-)
+# So many in sequence mean that the server's clock was set; a socket's backlog is shorter.
+MISTIMED_FRAMES = 1000
 OLDEST_US = 1_000_000  # an exposure longer ago is of no use, or its time stamp is wrong
 CALL_PERIOD_US = 500_000
 MODELS_CHANGED = 2  # bit of a frame's parameters
-BITSTREAM = (
-    f"Bitstream,{VERSIONS[-1][0]}.{VERSIONS[-1][1]}"  # command that changes the version of what is sent
-)
+# The command that changes the protocol version of the stream.
+BITSTREAM = f"Bitstream,{VERSIONS[-1][0]}.{VERSIONS[-1][1]}"
 NOWHERE: tuple[Vector, Quaternion] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(slots=True)
 class StreamCounters:
-    """What came."""
+    """Counters of the stream."""
 
     frames: int = 0  # passed on
     lost: int = 0  # of these, without a pose
@@ -62,18 +60,18 @@ class NatnetStream:
         self.notices: list[str] = []
         self._name = name
         self._alignment = alignment
-        self._newer: ServerInfo | None = None  # asked for an older version
+        self._newer: ServerInfo | None = None  # which was asked for an older version
         self._clock = ServerClock(1)
         self._id: int | None = None
         self._number: int | None = None
         self._pose: BodyPose | None = None
         self._repeated = 0
-        self._mistimed = 0  # frames on end
+        self._mistimed = 0  # frames in sequence
         self._silence = Silence(self.notices)
         self._call_us = 0
 
     def on_packet(self, data: bytes, now_us: int) -> MocapFrame | None:
-        """Take a packet; the pose, if it is a new frame.
+        """Take a packet; return the pose if it is a new frame.
 
         `MocapError` when the server or its bodies are not those wanted; later, when they change, it is a notice.
         """
@@ -98,9 +96,9 @@ class NatnetStream:
         return None
 
     def call(self, now_us: int, packets_wait: bool) -> None:
-        """Keep the connection; to be called often. A server that is silent is asked who it is.
+        """Keep the connection alive; to be called often. A silent server is asked to identify itself.
 
-        It is not while packets wait: then it was us who did not listen.
+        Not while packets wait: then it was this program that did not read.
         """
         if now_us < self._call_us:
             return
@@ -114,7 +112,7 @@ class NatnetStream:
         self.outgoing.append(packet(MessageId.ECHO_REQUEST, now_us.to_bytes(8, "little")))
 
     def missing(self) -> str:
-        """What has not been heard of the server yet, before there are models."""
+        """What the server has not answered yet, before there are models."""
         if self._newer is not None:
             return str(_unreadable(self._newer))
         return "no NatNet server answers" if self.server is None else "the server names no bodies"
@@ -173,7 +171,7 @@ class NatnetStream:
             return MocapFrame(now_us, *NOWHERE, valid=False)
         received_us, sent_us = map(self._clock.to_station_us, (frame.received, frame.transmitted))
         p, q = self._alignment.to_world(pose.p, pose.q) if usable and pose is not None else NOWHERE
-        received_us = max(t_us, min(received_us, now_us))  # the clocks are not known that well
+        received_us = max(t_us, min(received_us, now_us))  # the clocks' offset is not known that well
         sent_us = max(received_us, min(sent_us, now_us))
         return MocapFrame(t_us, p, q, usable, received_us, sent_us, now_us)
 
@@ -193,7 +191,7 @@ class NatnetStream:
         return None
 
     def _usable(self, pose: BodyPose) -> bool:
-        """Whether it is tracked, and not the last one over and over."""
+        """Whether it is tracked, and not a repetition of the last pose."""
         last, self._pose = self._pose, pose
         same = last is not None and (last.p, last.q) == (pose.p, pose.q)
         self._repeated = self._repeated + 1 if same else 0

@@ -58,9 +58,9 @@ class OptitrackSource:
         if server.multicast:
             self._join(server.group, server.data_port)
         version = f"NatNet {stream.version[0]}.{stream.version[1]}"
-        way = "multicast" if server.multicast else "unicast"
+        transport = "multicast" if server.multicast else "unicast"
         stream.notices.append(
-            f"mocap {server.name} at {self._host}, {version}, {way}, {self._alignment.axes}"
+            f"mocap {server.name} at {self._host}, {version}, {transport}, {self._alignment.axes}"
         )
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
@@ -84,12 +84,12 @@ class OptitrackSource:
         return notices
 
     def summary(self) -> str:
-        """A few words on how it does."""
+        """A few words on its state."""
         counters = self._stream.counters
         return f"mocap {counters.lost} lost, {counters.dropped} dropped, {counters.malformed} malformed"
 
     def close(self) -> None:
-        """Take leave."""
+        """Disconnect."""
         for index, each in enumerate(self._sockets):
             if index == 0 and self._address:
                 with suppress(OSError):
@@ -101,7 +101,7 @@ class OptitrackSource:
         self._stream.call(now_us, packets_wait)
         outgoing, self._stream.outgoing = self._stream.outgoing, []
         for data in outgoing:
-            with suppress(OSError):  # no network: nothing will come, and that is told
+            with suppress(OSError):  # no network: no packet will arrive, and that is reported
                 self._sockets[0].sendto(data, (self._address, self._port))
 
     def _next_packet(self, timeout_s: float) -> bytes | None:
@@ -122,16 +122,15 @@ class OptitrackSource:
         self._sockets.append(added)
         added.setblocking(False)
         if port:
-            added.setsockopt(
-                socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
-            )  # others on this computer listen as well
+            # Other programs on this computer may listen on the same port.
+            added.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         added.bind(("", port))
         return added
 
     def _join(self, group: str, port: int) -> None:
         """Receive what is sent to the group, on the interface that leads to the server."""
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
-            way.connect((self._address, self._port))
-            interface = way.getsockname()[0]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((self._address, self._port))
+            interface = probe.getsockname()[0]
         membership = socket.inet_aton(group) + socket.inet_aton(interface)
         self._add_socket(port).setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)

@@ -29,7 +29,7 @@ class RecordingSource:
         self._file.write(",".join(COLUMNS) + "\n")
 
     def open(self) -> None:
-        """Connect again, and go on with the file; raises `MocapError`, `OSError`."""
+        """Connect again and continue the file; raises `MocapError`, `OSError`."""
         self._source.open()
         if self._file is None:
             self._file = self._path.open("a", encoding="utf-8", newline="\n")
@@ -50,7 +50,7 @@ class RecordingSource:
         return self._source.notices() + notices
 
     def summary(self) -> str:
-        """A few words on how it does."""
+        """A few words on its state."""
         return self._source.summary()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Frames out of a file, at the pace at which they came: a record of `floaty station --record`, or a flight's telemetry.
+"""Frames from a file, at the pace at which they arrived: a record of `floaty station --record`, or a flight's telemetry.
 
 Telemetry has only the frames that were the last ones when a row began, which arrived then at the latest.
 """
@@ -19,7 +19,7 @@ from ground_station.telemetry_log import POSE_COLUMNS, TELEMETRY, TIME_COLUMN
 TELEMETRY_COLUMNS = (TIME_COLUMN, *POSE_COLUMNS)
 TIME_MAX_US = 2**53
 
-Arrived = tuple[int, MocapFrame]  # when, what
+Arrived = tuple[int, MocapFrame]  # instant of arrival [us], frame
 
 
 class ReplaySource:
@@ -45,9 +45,8 @@ class ReplaySource:
     def receive(self, timeout_s: float) -> MocapFrame | None:
         """The next frame, None when none comes in time."""
         now_us = clock_us()
-        if (
-            self._shift_us is None and timeout_s > 0
-        ):  # who only looks whether something is there is not ready yet
+        # A caller that only polls is not ready yet, so the replay does not start.
+        if self._shift_us is None and timeout_s > 0:
             self._shift_us = now_us - self._frames[0][0]
         if self._shift_us is None or self.over:
             wait(timeout_s)
@@ -69,7 +68,7 @@ class ReplaySource:
         return notices
 
     def summary(self) -> str:
-        """A few words on how it does."""
+        """A few words on its state."""
         return f"mocap {self._next} of {len(self._frames)} replayed"
 
     def close(self) -> None:
@@ -107,7 +106,7 @@ def _frames(rows: "csv.DictReader[str]") -> Iterator[Arrived]:
     for row in rows:
         try:
             arrived = _recorded(row) if recorded else _telemetry(row)
-        except (TypeError, ValueError) as error:  # a cell that is missing, or no number
+        except (TypeError, ValueError) as error:  # a cell that is missing or not a number
             raise MocapError(f"line {rows.line_num}: {error}") from None
         if arrived is not None and (recorded or arrived[1].t_us != last_us):
             last_us = arrived[1].t_us
@@ -131,6 +130,6 @@ def _telemetry(row: dict[str, str]) -> Arrived | None:
 
 def _time(value: str | float) -> int:
     t_us = float(value)
-    if not abs(t_us) <= TIME_MAX_US:  # nor is NaN
-        raise ValueError(f"{value} us is no time")
+    if not abs(t_us) <= TIME_MAX_US:  # false for NaN, too
+        raise ValueError(f"{value} us is not a time")
     return round(t_us)

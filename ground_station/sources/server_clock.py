@@ -23,11 +23,11 @@ class ServerClock:
         self._limit(-math.inf, now_us - self._us(ticks), now_us)
 
     def answered(self, asked_us: int, ticks: int, now_us: int) -> None:
-        """What was asked at `asked_us` has been answered at `ticks`."""
+        """The request of `asked_us` has been answered at `ticks`."""
         self._limit(asked_us - self._us(ticks), now_us - self._us(ticks), now_us)
 
     def to_station_us(self, ticks: int) -> int:
-        """The instant by our clock; without answers, late by the shortest way of a message; call `sent` before."""
+        """The instant by our clock; without answers, late by the least latency of a message; call `sent` before."""
         offset = self._upper if self._lower == -math.inf else 0.5 * (self._lower + self._upper)
         return round(self._us(ticks) + offset)
 

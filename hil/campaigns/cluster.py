@@ -1,7 +1,8 @@
-"""Flights on Dask's workers: processes of this computer, or those of a scheduler that is there already.
+"""Flights on Dask's workers: processes of this computer, or those of an existing scheduler.
 
-A worker that dies is replaced and its flights are flown again. Which flight has killed it is not known when several wait
-there; so those are flown once more at the end, each alone, and only the one that kills its worker then becomes a row.
+A worker that dies is replaced and its flights are flown again. When several flights wait
+there, it is not known which one has killed it; so they are flown again at the end, each alone, and only one that kills its
+worker again becomes a row.
 """
 
 from __future__ import annotations
@@ -20,16 +21,22 @@ from hil.campaigns.flying import Campaign, Row, failed, fly_flight
 from hil.campaigns.sampling import draw
 from hil.errors import LabError
 
-LOOK_S = 0.2  # how soon Ctrl-C is seen
-PER_WORKER = 2  # flights there, one of which waits: none stands idle while a row travels
+LOOK_S = 0.2  # how often Ctrl-C is checked
+PER_WORKER = 2  # one flies and one waits, so that no worker is idle while a row is sent
 CONNECT_S = 30.0
+OF_OUR_OWN = {  # settings of the scheduler and the workers that are started here
+    "distributed.scheduler.allowed-failures": 0,
+    # What Dask keeps for its own debugging, 50 kB of each flight's specification among it: memory stays flat without.
+    "distributed.admin.low-level-log-length": 10,
+    "distributed.worker.profile.enabled": False,
+}
 FlyOne = Callable[[Campaign, int], Row]
 
 _ALONE = threading.Lock()  # one flight per process at a time: its time limit is the process'
 
 
 def fly_alone(campaign: Campaign, index: int, fly_one: FlyOne) -> Row:
-    """Fly in a worker; one that hangs where nothing can be asked of it ends the process."""
+    """Fly in a worker; a flight that hangs ends the process."""
     with _ALONE, open(os.devnull, "w") as nowhere:
         faulthandler.dump_traceback_later(2.0 * campaign.spec.limits.wall_s, exit=True, file=nowhere)
         try:
@@ -47,11 +54,10 @@ class Workers:
     def __init__(self, count: int, address: str = "") -> None:
         self.cluster: LocalCluster | None = None
         self._address = address
-        dask.config.set({"distributed.scheduler.allowed-failures": 0})  # of our own scheduler
+        dask.config.set(OF_OUR_OWN)
         for name in ("distributed", "distributed.nanny", "distributed.scheduler", "distributed.worker"):
-            logging.getLogger(name).setLevel(
-                logging.CRITICAL
-            )  # what concerns the user becomes a row or an error
+            # What concerns the user is reported in a row or as an error.
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             if address:
                 self.client = Client(address, timeout=CONNECT_S)
@@ -66,7 +72,7 @@ class Workers:
             raise LabError(f"--cluster {address or 'local'}: no workers ({error})") from None
 
     def close(self) -> None:
-        """End the workers that were begun here, and what they fly."""
+        """End the workers that were started here, and their flights."""
         self.client.close()
         if self.cluster is not None:
             self.cluster.close()
@@ -78,7 +84,7 @@ class Workers:
         indices: Iterator[int],
         fly_one: FlyOne = fly_flight,
     ) -> Generator[Row]:
-        """Yield the rows of flights as they come, until `stopped`. Raises `LabError` for a full disk or a lost cluster."""
+        """Yield the rows of flights as they arrive, until `stopped`. Raises `LabError` for a full disk or a lost cluster."""
         suspects: list[int] = []
         room = PER_WORKER * sum(self.client.nthreads().values())
         yield from self._fly(campaign, stopped, indices, fly_one, room, suspects)
@@ -88,7 +94,7 @@ class Workers:
         self, campaign: Campaign, stopped: Callable[[], bool], indices: Iterator[int], fly_one: FlyOne,
         room: int, suspects: list[int] | None,
     ) -> Generator[Row]:  # fmt: skip
-        """Fly with `room` flights under way; those of dead workers become suspects, and without such a list rows."""
+        """Fly `room` flights at a time; those of dead workers become suspects, or rows where there is no such list."""
         flying: dict[Future, int] = {}
         try:
             while not stopped():
@@ -101,7 +107,7 @@ class Workers:
                 except TimeoutError:
                     continue
                 except CancelledError:
-                    pass  # one of them is; which one is seen below
+                    pass  # one of them has finished; the loop below finds which
                 ended = [future for future in flying if future.status != "pending"]
                 for future in ended:
                     index = flying.pop(future)
@@ -119,10 +125,13 @@ class Workers:
             return row
         except LabError:
             raise
-        except (KilledWorker, CancelledError):  # the latter: it had ended, and its row died with the worker
+        # CancelledError: the flight had ended, and its row was lost with the worker.
+        except (KilledWorker, CancelledError):
             if self.client.status != "running":
                 where = self._address or "local"
-                raise LabError(f"--cluster {where}: lost; --resume goes on with what is there") from None
+                raise LabError(
+                    f"--cluster {where}: lost; --resume continues with the flights that are kept"
+                ) from None
         except Exception as error:
             return failed(draw(campaign.spec, index), f"{type(error).__name__}: {error}")
         if suspects is not None:

@@ -20,8 +20,10 @@ from hil.world.paper_table import PAPER_TABLE
 
 Value = bool | int | float | str
 Sampling = Literal["random", "sobol", "latin", "saltelli", "morris"]
-DESIGNS = ("saltelli", "morris")  # all their points together give the indices; they cannot stop early
+DESIGNS = ("saltelli", "morris")  # the indices need all their points, so they cannot stop early
 STOP = re.compile(r"failure rate known to (?:±|\+-)\s*(\d+(?:\.\d+)?)\s*%")
+# What pydantic calls the forms of a value, in the place of an error.
+FORM = re.compile(r"(float|Distribution)$|(tuple|literal|function-\w+)\[")
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -60,8 +62,8 @@ Number = float | Distribution
 class SampledFault(_Part):
     """A fault of every flight, or of a share of them."""
 
-    kind: str = Field(description="as `floaty list --faults` has it")
-    probability: float = Field(1.0, gt=0, le=1, description="that it happens in a flight")
+    kind: str = Field(description="as `floaty list --faults` shows it")
+    probability: float = Field(1.0, gt=0, le=1, description="that it occurs in a flight")
     start_s: Number = Field(description="after the release [s]")
     duration_s: Number | None = Field(None, description="[s]; default: the kind's")
     size: Number | None = Field(None, description="in the kind's unit; default: the kind's")
@@ -77,16 +79,16 @@ class TableConfig(_Part):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The constants, in the Table's order; z_vz is none that the plant lets vary."""
+        """The constants, in the Table's order; the plant does not vary z_vz."""
         known = get_args(ConstantName)
         chosen = known if self.constants == "all" else self.constants
         return tuple(name for name in PAPER_TABLE if name in chosen)
 
 
 class FlightLimits(_Part):
-    """When a flight is given up; it becomes a row with that as its error."""
+    """When a flight is aborted; it becomes a row with the limit as its error."""
 
-    wall_s: float = Field(120.0, gt=0, le=86_400, description="real time; the process is ended at twice that")
+    wall_s: float = Field(120.0, gt=0, le=86_400, description="real time; the process is ended at twice this")
     simulated_s: float = Field(3_600.0, gt=0, le=100_000, description="simulated time, from the boot on")
 
 
@@ -126,7 +128,7 @@ class Spec(_Part):
 
     @property
     def half_width(self) -> float | None:
-        """How well the failure rate shall be known; None: all flights are flown."""
+        """The half width of the failure rate's interval at which to stop; None: all flights are flown."""
         match = STOP.fullmatch(self.stop)
         return float(match[1]) / 100.0 if match else None
 
@@ -142,7 +144,7 @@ class Spec(_Part):
 
 
 def table_dimensions(table: TableConfig | None) -> list[tuple[str, Distribution]]:
-    """Return what of the profile varies as the Table allows, as factors on the tabulated values."""
+    """Return the constants that vary within the Table's uncertainty, as factors on the tabulated values."""
     found = []
     for name in table.names if table else ():
         value, error = PAPER_TABLE[name]
@@ -150,19 +152,21 @@ def table_dimensions(table: TableConfig | None) -> list[tuple[str, Distribution]
         varies = (
             Distribution(uniform=(1.0 - spread, 1.0 + spread))
             if table and table.distribution == "uniform"
-            else Distribution(normal=(1.0, spread, 0.0, 4.0))  # what the plant takes
+            else Distribution(normal=(1.0, spread, 0.0, 4.0))  # the range that the plant accepts
         )
         found.append((f"plant.constant_factors.{name}", varies))
     return found
 
 
 def read_spec(path: Path) -> Spec:
-    """Return the campaign of a file; files that it names begin at its folder. Raises `LabError` of one line."""
+    """Return the campaign of a file; paths in it are relative to its folder. Raises `LabError` of one line."""
     tree = read_toml("campaign", path)
     try:
         spec = Spec.model_validate(tree)
     except ValidationError as error:
-        raise LabError(f"campaign {path}: {_explain(error.errors()[0])}") from None
+        # A misspelt key explains a missing one, and the deepest complaint is about the form that the user chose.
+        found = min(error.errors(), key=lambda one: (one["type"] != "extra_forbidden", -len(one["loc"])))
+        raise LabError(f"campaign {path}: {_explain(found)}") from None
     folder = path.parent.resolve()
     return spec.model_copy(
         update={
@@ -174,13 +178,13 @@ def read_spec(path: Path) -> Spec:
 
 def _explain(detail: ErrorDetails) -> str:
     """Return what is wrong: the key, its value, what is allowed."""
-    names = [str(part) for part in detail["loc"] if part not in ("float", "Distribution", "Literal['all']")]
+    names = [str(part) for part in detail["loc"] if not FORM.match(str(part))]
     where, value = ".".join(names), detail["input"]
     if detail["type"] == "missing":
         return f"{where}: missing"
     if detail["type"] == "extra_forbidden":
         return f"{where} = {value!r}: unknown key; {hint(names[-1], _keys_of(names[:-1]))}"
-    message = detail["msg"].removeprefix("Value error, ")
+    message = detail["msg"].removeprefix("Value error, ").replace("valid tuple", "valid list")
     message = message[0].lower() + message[1:]
     return f"{where} = {value!r}: {message}" if where else message
 
@@ -196,5 +200,5 @@ def _keys_of(names: list[str]) -> list[str]:
 
 
 def spec_text(spec: Spec) -> dict[str, Any]:
-    """Return a campaign as what a JSON file holds."""
+    """Return a campaign as JSON values."""
     return spec.model_dump(mode="json", exclude_none=True)

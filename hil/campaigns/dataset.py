@@ -1,8 +1,8 @@
-"""A campaign's dataset: one row per flight, kept as it comes, whatever ends the program.
+"""A campaign's dataset: one row per flight, stored as it arrives, so that it survives whatever ends the program.
 
-`DIR/campaign.json` says what was begun. A row is first a line of `DIR/arriving.jsonl`; from time to time, and at the
-end, lines become files of `DIR/flights/`, a Parquet dataset, each written under another name and then renamed. Killed in
-between, at worst a row stands in both, which reading sees, or a line is torn, which is flown again.
+`DIR/campaign.json` describes the campaign. A row is first a line of `DIR/arriving.jsonl`; from time to time, and at the
+end, lines become files of `DIR/flights/`, a Parquet dataset, each written under another name and then renamed. After a kill
+in between, at worst a row is in both, which reading detects, or a line is incomplete, and its flight is flown again.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from hil.campaigns.flying import Campaign, Row
 from hil.config import load_config
 from hil.errors import LabError, writing
 from hil.experiments import find_experiment
+from hil.installation import commit, versions
 from hil.laboratory.metrics import METRICS
-from hil.laboratory.result import commit, versions
 
 ABOUT, ARRIVING, FLIGHTS = "campaign.json", "arriving.jsonl", "flights"
 WHOLE = "all.parquet"
@@ -34,7 +34,7 @@ ROWS_PER_FILE = 500
 
 
 class Dataset:
-    """What was flown so far; `add` keeps a row at once. Raises `LabError` when the disk does not take it."""
+    """The flights so far; `add` stores a row at once. Raises `LabError` when it cannot be written."""
 
     def __init__(self, folder: Path, campaign: Campaign, resume: bool) -> None:
         self.folder, self.schema = folder, schema_of(campaign)
@@ -45,7 +45,7 @@ class Dataset:
         self._pack()
 
     def add(self, row: Row) -> None:
-        """Keep a row."""
+        """Store a row."""
         with writing("--out", self.folder):
             if self._arriving is None:
                 self._arriving = (self.folder / ARRIVING).open("a", encoding="utf-8")
@@ -57,7 +57,7 @@ class Dataset:
             self._pack()
 
     def close(self, end: int | None = None) -> None:
-        """Make all rows one file in the order of the flights; those from `end` on are not of the campaign."""
+        """Make all rows one file in the order of the flights; those from `end` on do not belong to the campaign."""
         self._pack()
         if end is None:
             return
@@ -86,7 +86,7 @@ class Dataset:
         except json.JSONDecodeError as error:
             raise LabError(f"{path}: not JSON: {error}") from None
         if not resume:
-            raise LabError(f"--out {self.folder}: holds a campaign; --resume goes on with it")
+            raise LabError(f"--out {self.folder}: holds a campaign; --resume continues it")
         for name, value in now.items():
             if value != before.get(name):
                 raise LabError(
@@ -94,7 +94,7 @@ class Dataset:
                 )
 
     def _pack(self) -> None:
-        """Make a file of what has arrived."""
+        """Write the rows that have arrived into a file."""
         if self._arriving is not None:
             with writing("--out", self.folder):
                 self._arriving.close()
@@ -123,7 +123,7 @@ class Dataset:
 
 
 def read_flights(folder: Path, schema: pa.Schema, columns: list[str] | None = None) -> pa.Table:
-    """Return the rows of a campaign in the order of the flights, each once. Raises `LabError` for a file that is none."""
+    """Return the rows of a campaign in the order of the flights, each once. Raises `LabError` for another file."""
     wanted = schema if columns is None else pa.schema([schema.field(name) for name in columns])
     tables = [wanted.empty_table()]
     for file in sorted((folder / FLIGHTS).glob("*.parquet")):
@@ -138,7 +138,7 @@ def read_flights(folder: Path, schema: pa.Schema, columns: list[str] | None = No
 
 
 def about(campaign: Campaign) -> dict[str, Any]:
-    """Return what makes two campaigns the same: then their flights have the same numbers."""
+    """Return what identifies a campaign: if it is equal, flights of the same number are equal."""
     spec = campaign.spec
     return {
         "spec": spec_text(spec),
@@ -155,7 +155,7 @@ def _digest_of(profile: str) -> str:
 
 
 def _difference(name: str, before: Any, now: Any) -> str:
-    """Return what differs first, by its name."""
+    """Return the first difference, with its name."""
     if isinstance(before, dict) and isinstance(now, dict):
         key = next(key for key in [*now, *before] if now.get(key) != before.get(key))
         return _difference(f"{name}.{key}", before.get(key), now.get(key))
@@ -198,7 +198,7 @@ def _type_of(varies: Distribution) -> pa.DataType:
 
 
 def table_of(rows: Iterable[dict[str, Any]], schema: pa.Schema) -> pa.Table:
-    """Return rows as they stand in lines as a table."""
+    """Return rows, as read from lines, as a table."""
     flat = [
         {
             **row,
@@ -213,14 +213,14 @@ def table_of(rows: Iterable[dict[str, Any]], schema: pa.Schema) -> pa.Table:
         values = [row.get(field.name) for row in flat]
         if pa.types.is_string(field.type):
             values = [None if value is None else str(value) for value in values]
-        elif pa.types.is_floating(field.type):  # a flight that was not flown has no figures
+        elif pa.types.is_floating(field.type):  # a flight that was not flown has no metrics
             values = [math.nan if value is None else float(value) for value in values]
         columns.append(pa.array(values, field.type))
     return pa.table(columns, schema=schema)
 
 
 def _lines_of(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the complete lines; the last one is torn when the program died while it was written."""
+    """Yield the complete lines; the last one is incomplete when the program died while writing it."""
     if not path.is_file():
         return
     for line in path.read_text(encoding="utf-8").splitlines():

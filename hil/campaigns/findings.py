@@ -1,9 +1,9 @@
-"""What a campaign has found: failure rates with their intervals, distributions, what they hang on, the worst flights.
+"""What a campaign has found: failure rates with their intervals, distributions, what they depend on, the worst flights.
 
 Which sampling a measure of influence needs:
 
     PAWN            any: the median distance of the distributions inside and outside slices of an axis, 0..1
-    total Sobol     saltelli: the share of the variance that goes when the axis alone is fixed
+    total Sobol     saltelli: the share of the variance that vanishes when the axis alone is fixed
     mu* of Morris   morris: the mean change of the figure over one axis
     logistic map    any, with some failures and some flights that hold: log-odds of failing over the whole axis
 """
@@ -33,8 +33,8 @@ Array = NDArray[np.float64]
 WORST = 10
 SLICES = 10
 MAPPED_FROM = 5  # failures, and flights that hold
-KOLMOGOROV_MEDIAN = 0.828  # of the distance of a sample from its own distribution, times the root of its size
-PULL = 1.0  # of the logistic map towards no influence
+KOLMOGOROV_MEDIAN = 0.828  # median distance of a sample from its own distribution, times the root of its size
+PULL = 1.0  # weight of the prior that pulls the logistic map towards no influence
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +65,10 @@ class Limited:
     metric: Metric
     bound: float
     rate: Rate
-    values: Array  # of the flights that have the figure
+    values: Array  # of the flights that have the metric
 
     def quantile(self, share: float) -> str:
-        """Return a quantile as people read it, from good to bad."""
+        """Return a quantile as text, counted from good to bad."""
         if not len(self.values):
             return "–"
         share = share if self.metric.bound == "max" else 1.0 - share
@@ -77,12 +77,12 @@ class Limited:
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """How much a figure hangs on each axis."""
+    """How much a metric depends on each axis."""
 
     figure: str
     method: str
     by_axis: Mapping[str, float]
-    chance: float | None = None  # what an axis without any influence gets
+    chance: float | None = None  # the measure of an axis without any influence
 
     @property
     def ranked(self) -> list[tuple[str, float]]:
@@ -125,7 +125,7 @@ class Findings:
     """All that is in the report."""
 
     rate: Rate
-    errors: tuple[str, ...]  # of flights that did not come to an end, each text once with its count
+    errors: tuple[str, ...]  # of flights that did not end, each text once with its count
     limits: tuple[Limited, ...]
     influences: tuple[Influence, ...]
     failure_map: FailureMap | None
@@ -199,7 +199,7 @@ def _influences(
     spec: Spec, points: Array, which: NDArray[np.int64], flights: pa.Table, limits: tuple[Limited, ...],
     failed: NDArray[np.bool_],
 ) -> list[Influence]:  # fmt: skip
-    """Return the influence of the axes on failing, and on the figure of every limit."""
+    """Return the influence of the axes on failing, and on the metric of every limit."""
     names = [axis.name for axis in axes(spec)]
     figures = {"failing": failed.astype(float)} | {
         name: flights[f"metric.{name}"].to_numpy() for name in dict.fromkeys(one.name for one in limits)
@@ -214,7 +214,7 @@ def _influences(
         if len(names) < 2 or len(means) < 2 * SLICES or np.ptp(means) <= 1e-12 * np.abs(means).max():
             continue
         if spec.sampling in ("saltelli", "morris") and not there.all():
-            continue  # a design with holes says nothing
+            continue  # an incomplete design gives no indices
         method, indices, chance = _indices(spec, points[there], means)
         found.append(Influence(figure, method, dict(zip(names, map(float, indices), strict=True)), chance))
     return found
@@ -235,7 +235,7 @@ def _indices(spec: Spec, points: Array, means: Array) -> tuple[str, Array, float
 
 
 def _worst(spec: Spec, flights: pa.Table, limits: tuple[Limited, ...]) -> tuple[Worst, ...]:
-    """Return the flights that failed, the worst first: lost early, then far beyond a limit; errors are told apart."""
+    """Return the flights that failed, the worst first: lost early, then far beyond a limit; errors are listed separately."""
     bounds = {(one.experiment, one.profile, one.name): one for one in limits}
     failed = flights.filter(pc.and_(pc.invert(flights["passed"]), pc.not_equal(flights["outcome"], "error")))
     ranked = []
@@ -261,7 +261,7 @@ def _worst(spec: Spec, flights: pa.Table, limits: tuple[Limited, ...]) -> tuple[
 
 
 def _beyond(limit: Limited, value: float) -> float:
-    """Return by how much of it a value misses its limit."""
+    """Return by which share of the limit a value misses it."""
     if not np.isfinite(value):
         return float("inf")
     sign = 1.0 if limit.metric.bound == "max" else -1.0

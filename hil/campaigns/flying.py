@@ -1,6 +1,6 @@
-"""One flight of a campaign: from its number to its row; what a worker process executes.
+"""One flight of a campaign: from its number to its row, as a worker process executes it.
 
-A flight that cannot be flown, raises or takes too long is a row with its error. A disk that is full is none: it raises.
+A flight that cannot be flown, raises or takes too long becomes a row with its error. A full disk raises instead.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """What every worker gets: the spec, and which files its experiments are."""
+    """What every worker gets: the spec, and the source files of its experiments."""
 
     spec: Spec
     sources: tuple[Source | None, ...]  # of its experiments
@@ -40,7 +40,7 @@ class Campaign:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """How a flight went; equal for the same flight on every worker."""
+    """The result of a flight; equal for the same flight on every worker."""
 
     index: int
     experiment: str
@@ -50,10 +50,10 @@ class Row:
     faults: tuple[str, ...]
     parameters: Mapping[str, Value]
     outcome: str  # completed, lost or error
-    error: str  # why it was lost, or what went wrong
+    error: str  # why it was lost or failed
     passed: bool
-    hash: str  # empty: it did not come to an end
-    metrics: Mapping[str, float]  # none: it was not flown
+    hash: str  # empty: it did not end
+    metrics: Mapping[str, float]  # empty: it was not flown
     holds: Mapping[str, bool]  # by limit
 
 
@@ -70,7 +70,7 @@ def fly_flight(campaign: Campaign, index: int) -> Row:
     except LabError as error:
         return failed(drawn, str(error))
     if request.experiment.source != campaign.sources[which]:
-        raise LabError(f"experiment {drawn.experiment}: its file is not what it was when the campaign began")
+        raise LabError(f"experiment {drawn.experiment}: its file has changed since the campaign began")
     try:
         result = fly_within(request, campaign.spec)
     except OSError as error:
@@ -85,7 +85,7 @@ def fly_flight(campaign: Campaign, index: int) -> Row:
 
 
 def fly_within(request: Request, spec: Spec) -> Result:
-    """Fly within the campaign's limits, and leave no file. Real time counts from when all parts are loaded or compiled."""
+    """Fly within the campaign's limits without leaving files. Real time counts from the end of loading and compiling."""
     begun: list[float] = []
 
     def watch(now_us: int, flight: Flight) -> None:
@@ -112,7 +112,7 @@ def row_of(drawn: Draw, result: Result) -> Row:
 
 
 def failed(drawn: Draw, error: str) -> Row:
-    """Return the row of a flight that did not come to an end of its own."""
+    """Return the row of a flight that did not end by itself."""
     return Row(
         drawn.index, drawn.experiment, drawn.profile, drawn.seed, drawn.settings, drawn.faults, drawn.parameters,
         "error", error, False, "", {}, {},

@@ -1,4 +1,4 @@
-"""The report of a campaign: `report.html`, which needs nothing else, and `result.json` for programs."""
+"""The report of a campaign: `report.html`, which is self-contained, and `result.json` for programs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRID = 60
 
 
 def write_report(folder: Path, campaign: Campaign, complete: bool) -> tuple[Path, Findings]:
-    """Write report and result of what is in the dataset; return the report's path and what was found."""
+    """Write report and result of the dataset; return the report's path and the findings."""
     spec = campaign.spec
     findings = find(spec, read_flights(folder, schema_of(campaign)))
     histograms = [one for one in findings.limits if len(one.values) > 1]
@@ -71,7 +71,7 @@ def _histograms(limits: list[Limited]) -> Figure:
         scale, unit = SHOWN.get(one.metric.unit, (1.0, one.metric.unit))
         axes.hist(one.values * scale, bins=40, color=curves.BLUE)
         axes.axvline(one.bound * scale, color=curves.RED, linestyle="--")
-        axes.set_yscale("log")  # the few that fail are what is looked for
+        axes.set_yscale("log")  # so that the few failures are visible
         axes.set_xlabel(f"{one.name} [{unit}]" if unit else one.name)
         axes.set_title(f"{Path(one.experiment).name}, {Path(one.profile).name}", fontsize=8)
     for axes in grid[len(limits) :]:
@@ -80,7 +80,7 @@ def _histograms(limits: list[Limited]) -> Figure:
 
 
 def _map(found: FailureMap) -> Figure:
-    """Draw the two axes on which failing hangs most, the others at their centres, and the flights in them."""
+    """Draw the two axes on which failing depends most, the others at their centres, and the flights in them."""
     across, up = ([*np.argsort(-np.abs(found.weights)), 0])[:2]
     line = np.linspace(0.0, 1.0, GRID)
     points = np.full((GRID * GRID, len(found.axes)), 0.5)

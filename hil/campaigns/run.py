@@ -1,7 +1,7 @@
-"""Flying a campaign: which flights are left, when enough is known, and what stands so far.
+"""Flying a campaign: which flights are left, when enough is known, and the interim result.
 
-Who flies is handed in: `hil.campaigns.cluster` on Dask's workers. Rows come in any order; what is decided is decided on
-the flights in the order of their numbers, so it is the same for every number of workers.
+The function that flies is handed in: `hil.campaigns.cluster` uses Dask's workers. Rows arrive in any order; decisions are
+made on the flights in the order of their numbers, so it is the same for every number of workers.
 """
 
 from __future__ import annotations
@@ -16,25 +16,24 @@ from hil.campaigns.dataset import Dataset, read_flights
 from hil.campaigns.flying import Row
 
 CONFIDENCE = 0.95
-STOP_FROM = 30  # flights; of fewer an interval says little
+STOP_FROM = 30  # flights; from fewer the interval is too wide to stop
 
-Flyer = Callable[
-    [Iterator[int]], Generator[Row]
-]  # rows of these flights, in any order; ends early when interrupted
+# From numbers of flights to their rows, in any order; ends early when interrupted.
+Flyer = Callable[[Iterator[int]], Generator[Row]]
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What is known so far."""
+    """The interim result."""
 
     flown: int
     failed: int
     planned: int
-    complete: bool  # all flights are there that the campaign needs
+    complete: bool  # all flights that the campaign needs have been flown
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Where the failure rate lies with CONFIDENCE."""
+        """The interval of the failure rate with CONFIDENCE."""
         return interval(self.failed, self.flown)
 
 
@@ -51,7 +50,7 @@ class Progress:
 
     def __init__(self, spec: Spec) -> None:
         self._spec = spec
-        self._waiting: dict[int, bool] = {}  # flights whose predecessors are not all there
+        self._waiting: dict[int, bool] = {}  # flights of which some predecessors are missing
         self._flown = self._failed = self._known = self._failed_of_known = 0
         self.end: int | None = None
 
@@ -74,14 +73,14 @@ class Progress:
 
     @property
     def standing(self) -> Standing:
-        """What is known now."""
+        """The interim result now."""
         if self.end is None:
             return Standing(self._flown, self._failed, self._spec.flights, complete=False)
         return Standing(self.end, self._failed_of_known, self.end, complete=True)
 
 
 def conduct(spec: Spec, dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) -> Standing:
-    """Fly what is not yet in the dataset, until all is there, enough is known or the flyer ends."""
+    """Fly the flights missing in the dataset, until all are flown, enough is known or the flyer ends."""
     progress = Progress(spec)
     for row in read_flights(dataset.folder, dataset.schema, ["index", "passed"]).to_pylist():
         progress.add(row["index"], row["passed"])

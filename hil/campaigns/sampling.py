@@ -1,7 +1,8 @@
 """Flight number i as a pure function of (spec, i): its experiment, profile, seed, settings and faults.
 
 A campaign is a cube: one axis for every number that varies, 0..1. A sampling gives points of the cube, each axis has a
-distribution that makes a value of its coordinate. Values have nine digits, so that no processor's logarithm matters.
+distribution that turns its coordinate into a value. Values have nine digits, so that they do not depend on the processor's
+logarithm.
 
     random            points do not depend on one another; any number of flights
     sobol             fills the cube evenly at any number of flights, best at a power of two
@@ -35,7 +36,7 @@ _FAULT_PARTS = ("start_s", "duration_s", "size")
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """What flight `index` is."""
+    """The definition of flight `index`."""
 
     index: int
     point: int  # which of the sampling's
@@ -99,9 +100,10 @@ def _own_stream(seed: int, point: int, width: int) -> NDArray[np.float64]:
 
 def _sobol(width: int, seed: int, first: int, count: int) -> NDArray[np.float64]:
     sequence = qmc.Sobol(width, scramble=True, rng=np.random.default_rng(seed))
-    if first:  # scipy cannot go on by none
+    if first:  # scipy cannot skip 0 points
         sequence.fast_forward(first)
-    return np.concatenate([sequence.random(1) for _ in range(count)])  # at once it wants a power of two
+    # One by one, because for several at once it requires a power of two.
+    return np.concatenate([sequence.random(1) for _ in range(count)])
 
 
 @lru_cache(maxsize=8)
@@ -118,7 +120,7 @@ def _design(sampling: str, width: int, points: int, seed: int) -> NDArray[np.flo
 
 
 def problem(width: int) -> dict[str, Any]:
-    """Return what SALib calls a problem: the cube."""
+    """Return the cube as SALib's problem."""
     return {"num_vars": width, "names": [f"x{n}" for n in range(width)], "bounds": [[0.0, 1.0]] * width}
 
 
@@ -129,7 +131,7 @@ def check_design(spec: Spec) -> None:
     width = len(axes(spec))
     if width < 2:
         raise LabError(
-            f"sampling = {spec.sampling!r}: needs two numbers that vary at least; there are {width}"
+            f"sampling = {spec.sampling!r}: needs at least two numbers that vary; there are {width}"
         )
     step = (width + (2 if spec.sampling == "saltelli" else 1)) * spec.cells
     base, rest = divmod(spec.flights, step)
@@ -202,7 +204,7 @@ def _toml(value: Value) -> str:
 
 
 def request_of(spec: Spec, drawn: Draw, faults: tuple[Fault, ...] | None = None) -> Request:
-    """Return what is flown; `faults` instead of those drawn. Raises `LabError` for what cannot be flown."""
+    """Return the request of a flight; `faults` replace those drawn. Raises `LabError` for what cannot be flown."""
     return Request.of(
         find_experiment(drawn.experiment), drawn.profile, drawn.settings, drawn.seed, spec.duration_s, spec.link,
         tuple(map(parse, drawn.faults)) if faults is None else faults,
@@ -210,9 +212,9 @@ def request_of(spec: Spec, drawn: Draw, faults: tuple[Fault, ...] | None = None)
 
 
 def check_spec(spec: Spec) -> None:
-    """Raise `LabError` for what is found wrong before anything is flown: unknown names, values that nothing takes.
+    """Raise `LabError` for mistakes that can be found before flying: unknown names, values out of range.
 
-    Looked at are every experiment and profile, both ends of every axis, and all values of a choice.
+    Checked are every experiment and profile, both ends of every axis, and all values of a choice.
     """
     check_design(spec)
     width = len(axes(spec))
@@ -221,6 +223,6 @@ def check_spec(spec: Spec) -> None:
     for column, axis in enumerate(axes(spec)):
         count = len(axis.varies.choice) if axis.varies and axis.varies.choice else 1
         for share in (0.001, *((part + 0.5) / count for part in range(count)), 0.999):
-            shares = np.full(width, 0.001)  # every fault happens
+            shares = np.full(width, 0.001)  # so that every fault occurs
             shares[column] = share
             request_of(spec, draw_at(spec, shares, 0, 0, 0))

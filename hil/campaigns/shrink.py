@@ -1,8 +1,8 @@
 """A failing flight reduced to what it needs to fail: fewest faults and parameters, smallest sizes, shortest times.
 
-Every step is a flight. What is left out one at a time stays out when the flight fails without it; sizes and durations are
-halved towards harmless as often as it still fails. So nothing of the result can be left out alone; that no other
-combination were smaller is not said.
+Every step is a flight. Faults and parameters are left out one at a time and stay out when the flight still fails; sizes and
+durations are halved towards harmless as long as it still fails. So no single part of the result can be left out; a smaller
+combination may still exist.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHORTEST_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What is left of a flight."""
+    """The reduced faults and settings of a flight."""
 
     settings: tuple[str, ...]  # that were sampled
     faults: tuple[Fault, ...]
@@ -47,7 +47,7 @@ def shrink(trial: Trial, duration_s: float, fails: Fails) -> Trial:
 
 
 def _fewer(trial: Trial, fails: Fails) -> Trial:
-    """Leave out what can be left out, until nothing more can."""
+    """Leave out parts one at a time until every one is needed."""
     changed = True
     while changed:
         changed = False
@@ -60,7 +60,7 @@ def _fewer(trial: Trial, fails: Fails) -> Trial:
 
 def _one_less(trial: Trial) -> Iterator[Trial]:
     if trial.settings:
-        yield replace(trial, settings=())  # all at once: mostly none of them matters
+        yield replace(trial, settings=())  # all at once, because mostly none of them matters
     for n in range(len(trial.faults)):
         yield replace(trial, faults=trial.faults[:n] + trial.faults[n + 1 :])
     for n in range(len(trial.settings)) if len(trial.settings) > 1 else ():
@@ -86,7 +86,7 @@ def _shorter(trial: Trial, number: int, duration_s: float, fails: Fails) -> Tria
 def _halved(
     passing: float, failing: float, made: Callable[[float], Trial], fails: Fails, before: Trial | None = None
 ) -> Trial:
-    """Return the trial nearest to `passing` that fails; `before` when it is none but the whole."""
+    """Return the failing trial nearest to `passing`; `before` when no reduced one fails."""
     whole = failing
     for _ in range(HALVINGS):
         middle = float(f"{(passing + failing) / 2.0:.6g}")
@@ -102,19 +102,19 @@ def _with(trial: Trial, number: int, fault: Fault) -> Trial:
 
 
 def harmless(name: str) -> float | None:
-    """Return the size at which a kind of fault does nothing, or the mildest that it has; None: there is none to choose."""
+    """Return the size at which a kind of fault has no effect, or its mildest; None: there is no size to choose."""
     kind = KINDS[name]
     if not kind.sized:
         return None
     blend = kind.knobs[0].blend
     mildest = 1.0 if blend is times else math.inf if blend is min else 0.0
     if blend not in (times, min, max, add, either) and kind.low > 0.0:
-        return None  # a kind of one's own, whose direction nobody knows
+        return None  # a user's kind, whose harmless direction is unknown
     return min(max(mildest, kind.low), kind.high)
 
 
 class Reflight:
-    """Flies what is left of one flight of a campaign; `said` gets a line per flight."""
+    """Flies reduced versions of one flight of a campaign; `said` is called with a line per flight."""
 
     def __init__(self, spec: Spec, drawn: Draw, said: Callable[[str], None]) -> None:
         self._spec, self._drawn, self._said = spec, drawn, said
@@ -126,12 +126,12 @@ class Reflight:
         return Trial(self._drawn.settings[len(self._spec.settings) :], tuple(map(parse, self._drawn.faults)))
 
     def request(self, trial: Trial) -> Request:
-        """Return what is flown."""
+        """Return the request of a trial."""
         drawn = replace(self._drawn, settings=(*self._spec.settings, *trial.settings))
         return request_of(self._spec, drawn, trial.faults)
 
     def fails(self, trial: Trial) -> bool:
-        """Whether it fails, and ends as the whole does."""
+        """Whether it fails with the same outcome as the whole."""
         result = fly_within(self.request(trial), self._spec)
         self._outcome = self._outcome or result.outcome
         failed = not result.passed and result.outcome == self._outcome

@@ -1,4 +1,4 @@
-"""`floaty`: the commands together.
+"""`floaty`: the command group.
 
 Bad input ends in one line on standard error and exit code 2; a failed limit in 1; Ctrl-C in 130 with the log kept.
 """
@@ -7,7 +7,7 @@ import sys
 
 import click
 
-from firmware_py.fast import STALE, STATE
+from firmware_py.fast import STALE
 from hil.commands.campaign import campaign
 from hil.commands.compare import compare
 from hil.commands.deploy import board, deploy
@@ -23,11 +23,23 @@ from hil.commands.pictures import export, report, view
 from hil.commands.serve import serve
 from hil.commands.station import station
 from hil.errors import LabError
+from hil.installation import describe
+
+
+def _print_version(context: click.Context, option: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        click.echo(describe())
+        context.exit()
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(
-    package_name="floaty-hil", prog_name="floaty", message=f"%(prog)s, version %(version)s, {STATE}"
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=_print_version,
+    help="Show version, commit, packages and programs found, and exit.",
 )
 def app() -> None:
     """Floaty virtual laboratory: firmware, ground station and wind tunnel, joined by real bytes."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes here; default: one per core."
 )
 @click.option("--cluster", metavar="tcp://HOST:PORT", help="A Dask scheduler whose workers fly instead.")
-@click.option("--resume", is_flag=True, help="Go on with what is in DIR; flies nothing twice.")
+@click.option("--resume", is_flag=True, help="Continue the campaign in DIR; no flight is flown twice.")
 @click.option(
     "--shrink", type=click.IntRange(0), metavar="FLIGHT",
     help="Instead: reduce a failing flight to the fewest faults and the smallest sizes that still fail.",
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 def campaign(
     spec: Path, out: Path | None, workers: int | None, cluster: str | None, resume: bool, shrink: int | None
 ) -> int:
-    """Fly the campaign of SPEC, a TOML file, into a dataset, and report what breaks the robot (docs/campaigns.md).
+    """Fly the campaign of SPEC, a TOML file, into a dataset, and report what breaks the robot (docs/howto/campaigns.md).
 
-    Exit code 0: all was flown, whatever came of it; 2: bad input or a full disk, with what was flown kept; 130:
+    Exit code 0: all flights were flown, whatever their outcome; 2: bad input or a full disk, with the flights kept; 130:
     interrupted, likewise.
     """
     if workers and cluster:
@@ -99,7 +99,7 @@ def _fly(flown: Campaign, out: Path, workers: int | None, address: str, resume: 
     for one in findings.limits:
         console.print(f"  {one.name}: {one.rate}", soft_wrap=True)
     for text in findings.errors:
-        console.print(f"  without an end: {text}", soft_wrap=True, markup=False)
+        console.print(f"  did not end: {text}", soft_wrap=True, markup=False)
     for worst in findings.worst[:3]:
         console.print(f"  flight {worst.index}: {worst.command}", soft_wrap=True, markup=False)
     console.print(f"  {page}", soft_wrap=True)
@@ -134,14 +134,14 @@ def _shrink(spec: Spec, drawn: Draw) -> int:
     reflight = Reflight(spec, drawn, lambda text: notices.print(text, soft_wrap=True, markup=False))
     whole = reflight.request(reflight.whole)
     least = shrink(reflight.whole, whole.duration_s, reflight.fails)
-    console.print(f"flight {drawn.index} still fails as", soft_wrap=True)
+    console.print(f"flight {drawn.index} still fails with", soft_wrap=True)
     console.print(f"  {command_of(reflight.request(least))}", soft_wrap=True, markup=False)
     return 0
 
 
 @contextmanager
 def _quiet_interrupts() -> Iterator[None]:
-    """Let the processes that begin here leave Ctrl-C to this one."""
+    """Have the processes that are started here ignore Ctrl-C."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
@@ -151,7 +151,7 @@ def _quiet_interrupts() -> Iterator[None]:
 
 @contextmanager
 def _stops_noted(stops: list[int]) -> Iterator[None]:
-    """Note the signals that ask for an orderly end."""
+    """Record the signals that request an orderly end."""
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda received, _: stops.append(received)) for number in numbers]
     try:

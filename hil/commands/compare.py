@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from hil.commands.options import console
+from hil.commands.options import console, wide_console
 
 if TYPE_CHECKING:
     from hil.pictures.compare import Comparison
+    from hil.studies.two_boards import Seed
 
 folder_type = click.Path(path_type=Path)
 
@@ -26,15 +27,25 @@ folder_type = click.Path(path_type=Path)
 def compare(first: Path, second: Path, out: Path | None) -> int:
     """Compare one flight with another: first difference, metrics, settings, both in one plot.
 
+    Of flights that differ in their boards only: the first servo count that differs, and why. Of two folders of such runs
+    (`floaty fly EXPERIMENT --seeds N --board BOARD --out DIR`): a row per seed.
+
     Exit code 0: the logs are identical; 1: they differ; 2: bad input.
     """
     from hil.pictures.compare import compare as compare_runs
     from hil.pictures.compare import load_run, write_comparison
+    from hil.studies.two_boards import comparable, seeds_of, two_boards
 
+    if all(folder.is_dir() and not any(folder.glob("log.*")) for folder in (first, second)):
+        return _print_seeds(first, second, seeds_of(first, second))
     a, b = load_run(first), load_run(second)
     comparison = compare_runs(a, b)
-    page = write_comparison(out or second, a, b, comparison)
+    boards = two_boards(a, b) if comparable(a, b) else None
+    why = () if boards is None else (str(boards.first or "no servo count differs"), *boards.causes)
+    page = write_comparison(out or second, a, b, comparison, why)
     _print_comparison(first, second, comparison)
+    for line in why:
+        console.print(line, soft_wrap=True)
     console.print(f"  {page}", soft_wrap=True)
     return 0 if comparison.identical else 1
 
@@ -54,7 +65,7 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
     console.print(table)
     console.print(comparison.span, soft_wrap=True)
     if comparison.apart:
-        apart = Table(title="apart, at the same time since the release")
+        apart = Table(title="distance at the same time since the release")
         for heading in ("", "rms", "largest", "unit"):
             apart.add_column(heading, justify="right" if heading in ("rms", "largest") else "left")
         for one in comparison.apart:
@@ -73,3 +84,38 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
         console.print("identical")
     else:
         console.print("identical in the columns that both have")
+
+
+def _print_seeds(first: Path, second: Path, seeds: list["Seed"]) -> int:
+    """Print a row per seed; returns the exit code."""
+    from rich.table import Table
+
+    table = Table(title=f"{first} | {second}")
+    for heading in (
+        "seed",
+        "rms x y z [cm]",
+        "rms x y z [cm]",
+        "apart [mm]",
+        "poses",
+        "first servo count",
+        "why",
+    ):
+        table.add_column(heading, justify="right")
+    for one in seeds:
+        place = "equal" if one.first is None else f"{one.first.t_s:.3f} s {one.first.servo}"
+        table.add_row(
+            str(one.seed),
+            *(" ".join(f"{100 * value:.3f}" for value in rms) for rms in one.rms_m),
+            f"{1000 * one.apart_m:.2f}",
+            "{} | {}".format(*one.fused),
+            place,
+            "" if one.first is None else one.first.why,
+        )
+    wide_console(140).print(table)
+    worst = max(float(abs(b / a - 1).max()) for a, b in (one.rms_m for one in seeds))
+    apart = max(one.apart_m for one in seeds)
+    console.print(
+        f"{len(seeds)} seeds: rms errors within {100 * worst:.1f} % of the first's, bodies within {1000 * apart:.2f} mm",
+        soft_wrap=True,
+    )
+    return int(any(one.first is not None for one in seeds))

@@ -1,6 +1,7 @@
-"""`floaty deploy export | check | flash`: the flight core as C for a Crazyflie, proof that it is the one that flew.
+"""`floaty deploy export | check | flash`: the flight core as C for a Crazyflie, and the proof that it equals the one that
+flew.
 
-And `floaty board doctor`: what is connected, in a minute.
+And `floaty board doctor`: the state of what is connected, within a minute.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def deploy() -> None:
 )  # fmt: skip
 @click.option(
     "--source", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-    help="Check this floaty_core.c, as exported before, instead of what would be exported now.",
+    help="Check this floaty_core.c, which was exported before, instead of a fresh export.",
 )  # fmt: skip
 @click.option(
     "--elf", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
@@ -108,7 +109,7 @@ def check(
 
 @contextmanager
 def _progress(name: str) -> Iterator[Callable[[int, Flight], None]]:
-    """Show how far a flight is."""
+    """Show the progress of a flight."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
@@ -157,7 +158,7 @@ def _print_machine_code(code: MachineCode) -> None:
 
 
 def _print_measured(board: str, measured: Loads, counted: Loads) -> None:
-    """Print the cycles that a board has measured, beside those that the machine code was counted to take."""
+    """Print the cycles that a board has measured beside those counted for the machine code."""
     console.print(f"{board}: cycles per call, mean and worst, as measured on the board", soft_wrap=True)
     for name, load in measured.items():
         if load.calls == 0:
@@ -233,7 +234,7 @@ def flash(image: Path, uri: str) -> None:
 
 @click.group()
 def board() -> None:
-    """Look at a real board."""
+    """Inspect a real board."""
 
 
 @board.command()
@@ -241,9 +242,9 @@ def board() -> None:
 @profile_option
 @set_option
 def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
-    """Say what is at LINK (radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT), and whether it is as it should be.
+    """Report what is at LINK (radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT), and whether it is in order.
 
-    The board must not fly, and nothing moves. Exit code 0: all is well; 1: something is not; 2: nobody answers.
+    The board must not fly, and nothing moves. Exit code 0: all is well; 1: something is not; 2: no board answers.
     """
     from ground_station.errors import LinkError
     from hil.config import load_config

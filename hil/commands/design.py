@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hil.design.analysis import Analysis
     from hil.design.sweeps import Point
 
-SPEED_MAX = 60.0  # [m/s] that a profile may have
+SPEED_MAX = 60.0  # [m/s] the greatest that a profile allows
 write_option = click.option(
     "--write",
     "write_to",
@@ -98,7 +98,7 @@ def design(
     nargs=2,
     default=(8.0, 11.0),
     show_default=True,
-    help="Which robot could hold these speeds, and what would it cost?",
+    help="Which robot could hold these speeds, and at what cost?",
 )
 @write_option
 @out_option
@@ -127,7 +127,7 @@ def optimise(
         write_profile(
             best.point,
             write_to,
-            f"What floaty design optimise --figure {figure} --seed {seed} made of {profile}.",
+            f"What floaty design optimise --figure {figure} --seed {seed} derived from {profile}.",
         )
     named = {profile: found.reference, "best": best}
     marks = {name: tuple(search.places((one,), figure)[0].tolist()) for name, one in named.items()}
@@ -200,7 +200,7 @@ def show(found: "Analysis") -> None:
 
     for name, value in found.robot:
         console.print(f"{name:38} {value}", soft_wrap=True)
-    table = Table("input", "alone, inside the flaps' range", "linear, both ways about the hover")
+    table = Table("input", "alone, inside the flaps' range", "linear, in both directions about the hover")
     for row in found.inputs:
         table.add_row(*row)
     wide = wide_console()

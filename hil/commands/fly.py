@@ -56,14 +56,14 @@ SEEDS_MAX = 10_000
 @click.option(
     "--board", metavar="BOARD", default="python", show_default=True,
     help="What executes the flight core: python, c (its exported C) or cortex-m4 (its machine code, emulated); the image "
-    "of a Crazyflie's firmware, an ELF file, which flies whole; or a real board, which does not fly meanwhile: "
+    "of a Crazyflie's firmware, an ELF file, which flies whole; or a real board, which must not fly: "
     "radio://0/80/2M/E7E7E7E7E7, usb://0 or udp://HOST:PORT.",
 )  # fmt: skip
 @click.option(
     "--elf",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="With a .bin as --board: the ELF that it was made of.",
+    help="With a .bin as --board: the ELF that it was made from.",
 )
 @gdb_option
 @click.option(
@@ -106,7 +106,7 @@ def fly(
     if seeds > 1 and in_loop:
         raise LabError(f"--hil: --seeds {seeds}: a real board is in one flight at a time")
     if perfetto:
-        import hil.exports.perfetto  # noqa: F401 - says now, not after the flight, when its package is missing
+        import hil.exports.perfetto  # noqa: F401 - reports a missing package now, not after the flight
     from hil.laboratory.faults import parse
     from hil.laboratory.run import Request
 
@@ -116,7 +116,7 @@ def fly(
         for index in range(seeds)
     ]
     if gdb is not None and (seeds > 1 or not requests[0].is_image):
-        raise LabError(f"--gdb {gdb}: goes with one flight of an image as --board")
+        raise LabError(f"--gdb {gdb}: needs one flight with an image as --board")
     announce_compilation()
     if seeds > 1 and not requests[0].in_lockstep:
         raise LabError(f"--link {link}: --seeds is for flights in lockstep")
@@ -173,7 +173,7 @@ def _fly_one(
             write_perfetto(folder)
     print_result(result)
     if view is not None and view.address and notices.is_terminal:
-        notices.print("what was flown can be looked at until Ctrl-C")
+        notices.print("the flight can be viewed until Ctrl-C")
         view.stay()
     close_live(view, result)
     if result.stood_still_ms:

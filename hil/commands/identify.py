@@ -15,7 +15,7 @@ from hil.commands.options import (
     seed_option,
     wide_console,
 )
-from hil.errors import LabError, writing
+from hil.errors import LabError, require, writing
 
 if TYPE_CHECKING:
     from hil.design.loop import Margins
@@ -29,10 +29,10 @@ folder_type = click.Path(path_type=Path)
 @click.argument("runs", metavar="RUN...", type=folder_type, nargs=-1, required=True)
 @profile_option
 @click.option(
-    "--validate", type=folder_type, metavar="RUN", help="A flight that is not fitted, to be predicted."
+    "--validate", type=folder_type, metavar="RUN", help="A flight to be predicted, which is not fitted."
 )
 @click.option(
-    "--profile-out", type=folder_type, metavar="FILE.toml", help="A profile with what was identified."
+    "--profile-out", type=folder_type, metavar="FILE.toml", help="A profile with the identified constants."
 )
 @click.option(
     "--out",
@@ -47,12 +47,10 @@ def identify(
 ) -> int:
     """Identify the robot from RUNs: run folders, also of `floaty station`, or telemetry.csv files.
 
-    --profile says what a bare telemetry.csv was flown with, and what a written profile builds on. Exit code 0: at least one
+    --profile is that with which a bare telemetry.csv was flown, and the base of a written profile. Exit code 0: at least one
     constant is identified; 1: none; 2: bad input.
     """
-    from hil.identify import need_scipy
-
-    need_scipy()
+    require("floaty identify", "identify", "scipy")
     from hil.identify.identify import IDENTIFIED
     from hil.identify.identify import identify as identify_records
     from hil.identify.pages import write_pages
@@ -122,7 +120,7 @@ def _pair(pair: tuple[float, float]) -> str:
 )  # fmt: skip
 @click.option(
     "--robots", type=click.IntRange(0, 1000), default=100, show_default=True, metavar="N",
-    help="Drawn from the intervals of the model; all must be stable.",
+    help="Number of robots drawn from the intervals of the model; all must be stable.",
 )  # fmt: skip
 @seed_option
 @click.option("--board", metavar="BOARD", default="python", show_default=True, help="As for `floaty fly`.")
@@ -138,11 +136,9 @@ def tune(
     """Make gains of the paper's control law for the profile's model, and fly them in lockstep with the profile's plant.
 
     Exit code 0: the new gains hover no worse than the old ones, which are kept otherwise; 1: they do; 2: bad input, no
-    gains, or a robot lost on the way.
+    gains, or a lost robot.
     """
-    from hil.identify import need_scipy
-
-    need_scipy()
+    require("floaty tune", "identify", "scipy")
     from hil.config import load_config
     from hil.studies.tuning import Flights, fly_round, rounds, write_tuned
 
@@ -166,7 +162,7 @@ def tune(
     except LabError as error:
         if best is None:
             raise
-        notices.print(f"{error}; the best round before it counts", soft_wrap=True)
+        notices.print(f"{error}; the best earlier round counts", soft_wrap=True)
     assert best is not None
     if out is not None:
         write_tuned(out, profile, load_config(best.profile), "Model and gains by floaty tune.")
@@ -190,7 +186,7 @@ def _print_round(one: "Round") -> None:
     )
     edge = Table(
         "axis", "", "gain up", "gain down", "phase", "delay", "late poses", "peak of 1/(1+L)",
-        title="margins, broken between command and servo",
+        title="margins, with the loop opened between command and servo",
     )  # fmt: skip
     moved = Table(
         "axis", "old, predicted", "old, flown", "new, predicted", "new, flown", "worst robots, flown",

@@ -15,7 +15,7 @@ from hil.errors import LabError
 def list_experiments(file: Path | None, faults: bool) -> None:
     """List the experiments, the robustness studies and the profiles, or the kinds of faults.
 
-    Experiments of installed packages are among them, with their package; FILE.py: those of a file, and its faults.
+    Experiments of installed packages are included, with their package; FILE.py: those of a file, and its faults.
     """
     from hil.config import DEFAULT_PROFILE, profile_names
     from hil.experiments import EXPERIMENTS

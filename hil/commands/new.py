@@ -1,4 +1,4 @@
-"""`floaty new`: a small project for a control law of one's own, with profile, experiments and tests, ready to fly."""
+"""`floaty new`: a small project for the user's own control law, with profile, experiments and tests, ready to fly."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hil.commands.options import console
 from hil.errors import LabError
 
 TEMPLATES = Path(__file__).parent / "project"  # NAME.in
-NAMED = {"gitignore": ".gitignore"}  # what would act on the template itself
+NAMED = {"gitignore": ".gitignore"}  # files that would act on the template itself
 
 
 @click.command()
@@ -23,7 +23,7 @@ def new(folder: Path) -> None:
         raise LabError(f"new {folder}: a project's name, its folder's, has letters a to z or digits")
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise LabError(f"new {folder}: there is something already; choose a folder that is new or empty")
+            raise LabError(f"new {folder}: it exists and is not empty; choose a folder that is new or empty")
         for template in sorted(TEMPLATES.rglob("*.in")):
             place = template.relative_to(TEMPLATES).with_suffix("")
             path = folder / NAMED.get(str(place), place)
@@ -33,6 +33,6 @@ def new(folder: Path) -> None:
     except OSError as error:
         raise LabError(f"new {folder}: {error.strerror or error}") from None
     console.print(
-        f"cd {folder}; floaty fly hover --profile profile.toml; pytest; README.md says the rest",
+        f"cd {folder}; floaty fly hover --profile profile.toml; pytest; see README.md for more",
         soft_wrap=True, markup=False,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What several commands share: consoles, exit codes, options, and the word before a long compilation."""
+"""What several commands share: consoles, exit codes, options, and the notice before a long compilation."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ seed_option = click.option(
 )
 fault_option = click.option(
     "--fault", "fault_texts", multiple=True, metavar="KIND@START[:DURATION][=SIZE]",
-    help="Let something go wrong, START seconds after the release; repeatable. `floaty list --faults` has the kinds.",
+    help="Inject a fault START seconds after the release; repeatable. `floaty list --faults` lists the kinds.",
 )  # fmt: skip
 profile_option = click.option(
     "--profile",
@@ -69,7 +69,7 @@ gdb_option = click.option(
 
 
 def open_debugger(port: int | None, image: Path) -> GdbServer | None:
-    """Open the port that `--gdb` asks for; it says what to type when it waits, and ends with the command."""
+    """Open the port that `--gdb` asks for; it prints the command to type when it waits, and closes with this command."""
     if port is None:
         return None
     from hil.devices.stm32f405.gdb import GdbServer
@@ -81,7 +81,7 @@ def open_debugger(port: int | None, image: Path) -> GdbServer | None:
 
 
 def announce_compilation() -> None:
-    """Say that the first run compiles, because it takes a while."""
+    """Announce that the first run compiles, because that takes a while."""
     from firmware_py.compiling import is_kept
     from hil.world.motion import advance
 
@@ -90,7 +90,7 @@ def announce_compilation() -> None:
 
 
 def say(text: str) -> None:
-    """Print a line, at once: who reads it may be a program."""
+    """Print a line and flush it, because a program may read it."""
     print(text)
     sys.stdout.flush()
 
@@ -104,7 +104,7 @@ def stop_signals() -> list[int]:
 
 
 def open_live(target: str | None) -> LiveView | None:
-    """Open the picture that `--view` asks for; it ends with the command, however that ends."""
+    """Open the picture that `--view` asks for; it closes with the command, however that ends."""
     if target is None:
         return None
     from hil.live.feed import open_view
@@ -113,7 +113,7 @@ def open_live(target: str | None) -> LiveView | None:
 
 
 def close_live(view: LiveView | None, result: Result | None = None) -> None:
-    """Close the picture, and keep and say what it has missed of the flight."""
+    """Close the picture, and record and report the rows that it has missed."""
     if view is None:
         return
     from hil.laboratory.result import write_result
@@ -123,11 +123,11 @@ def close_live(view: LiveView | None, result: Result | None = None) -> None:
     if result is not None:
         write_result(replace(result, not_shown=missed))
     if missed:
-        say(missed_text(missed) + ("; the log has them all" if result is not None else ""))
+        say(missed_text(missed) + ("; the log contains them all" if result is not None else ""))
 
 
 def write_pictures(folder: Path, experiment: Experiment) -> None:
-    """Write recording and report; what cannot be written is said, for the log is there and can be shown later."""
+    """Write recording and report; a failure is only reported, because both can be written later from the log."""
     try:
         from hil.pictures.viewer import write_run_rrd
 

@@ -1,4 +1,4 @@
-"""`floaty paper | study | drag-model`: many flights and what they come to, and the mounted robot on the balance."""
+"""`floaty paper | study | drag-model`: many flights and their summary, and the mounted robot on the balance."""
 
 import math
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ seeds_option = click.option(
     show_default=True,
     help="Report and logs.",
 )
-@click.option("--only", metavar="PATTERN", help="Experiments, like hover or yaw-*, and nothing else.")
+@click.option("--only", metavar="PATTERN", help="Only these experiments, like hover or yaw-*.")
 @click.option("--no-studies", is_flag=True, help="Leave the robustness studies out.")
 def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
     """Fly the paper's experiments on both profiles, and the robustness studies; write one report.

@@ -35,7 +35,7 @@ def list_all(group: str, uri: str, profile: str, overrides: tuple[str, ...]) -> 
     (values,) = _ask(uri, profile, overrides, [Request(Action.LIST, group)])
     chosen = [(name, value) for name, value in values if name.lower().startswith(group.lower())]
     if not chosen:
-        raise LabError(f"{group}: no parameter of the board begins so")
+        raise LabError(f"{group}: no parameter of the board begins with that")
     for name, value in chosen:
         say(f"{name} {value:.7g}")
 
@@ -46,7 +46,7 @@ def list_all(group: str, uri: str, profile: str, overrides: tuple[str, ...]) -> 
 @profile_option
 @set_option
 def get(names: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ...]) -> None:
-    """Show what parameters are."""
+    """Show the values of parameters."""
     from firmware_py.wire.parameter_names import on_board
     from ground_station.controls import Action, Request
 
@@ -94,7 +94,7 @@ def _setting(text: str) -> tuple[str, float]:
 
 
 def _ask(uri: str, profile: str, overrides: tuple[str, ...], requests: list[Request]) -> list[Settings]:
-    """Connect, ask, disconnect; return the values of each answer. Raises `LabError` for the first that is refused."""
+    """Send requests over a link; return the values of each answer. Raises `LabError` for the first one refused."""
     from ground_station.errors import LinkError
     from ground_station.links.schemes import find_link
     from ground_station.program import ask

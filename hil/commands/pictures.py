@@ -1,4 +1,4 @@
-"""`floaty view | report | export`: what a run looks like, here and in the programs of others."""
+"""`floaty view | report | export`: the pictures of a run, and its export for other programs."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from hil.errors import LabError
 @click.option(
     "--at", "at_s", type=float, metavar="S", help="With the time at an instant, seconds from the release."
 )
-@click.option("--web", is_flag=True, help="In a browser; the links of the run's report lead there meanwhile.")
+@click.option("--web", is_flag=True, help="In a browser; meanwhile the links of the run's report lead there.")
 def view(run: Path, at_s: float | None, web: bool) -> None:
     """Open RUN, a run folder, in the rerun viewer."""
     from hil.live.recording import browse, show_at
@@ -47,7 +47,7 @@ def report(run: Path) -> None:
 def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool) -> None:
     """Write the log of RUN, a run folder, in other formats, beside it."""
     if not (as_csv or as_mcap or as_tlog):
-        raise LabError(f"export {run}: into what? --csv, --mcap, --tlog")
+        raise LabError(f"export {run}: no format given: --csv, --mcap, --tlog")
     if as_csv:
         from hil.exports.wide_csv import write_csv
 

@@ -1,4 +1,4 @@
-"""`floaty serve`: robots in virtual tunnels, with cameras and Motive, for any program that knows a Crazyflie or MAVLink."""
+"""`floaty serve`: robots in virtual tunnels, with cameras and Motive, for any program that speaks CRTP or MAVLink."""
 
 from __future__ import annotations
 
@@ -23,10 +23,14 @@ from hil.commands.options import (
     stop_signals,
     view_option,
 )
-from hil.errors import LabError
+from hil.errors import LabError, require
 
 if TYPE_CHECKING:
-    from hil.servers.motive import Up
+    from collections.abc import Sequence
+
+    from hil.servers.motive import Streaming, Up
+    from hil.servers.serial_server import Address
+    from hil.servers.server import Ends
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
@@ -47,7 +51,7 @@ BOARDS_MAX = 10
 @click.option(
     "--mavlink",
     metavar="END",
-    help="Lead out a serial line with MAVLink: pty, pty:PATH, udp[:[HOST:]PORT] (talks to a ground station that listens "
+    help="Open a serial line with MAVLink: pty, pty:PATH, udp[:[HOST:]PORT] (talks to a ground station that listens "
     "there), tcp[:[HOST:]PORT] (listens).",
 )
 @click.option(
@@ -74,7 +78,7 @@ BOARDS_MAX = 10
 )  # fmt: skip
 @click.option(
     "--up", type=click.Choice(["y", "z"]), default="y", show_default=True,
-    help="Which of the axes that Motive streams points up.",
+    help="Which axis of Motive's stream points up.",
 )  # fmt: skip
 @click.option("--multicast", is_flag=True, help="Motive sends frames to its group instead of to each client.")
 @click.option(
@@ -112,16 +116,17 @@ def serve(
 
     Without --udp, --radio or --mavlink the first board is on UDP. A robot is held until it flies: corrections come from
     clients or, with --station, from within. Motive calls the bodies floaty, floaty2, .... It tracks them
-    by eight markers each, which --set markers.enabled=false takes off: poses have noise of their own then.
+    by eight markers each; with --set markers.enabled=false poses have noise of their own instead.
 
     --view shows the first robot, with home as its goal.
 
-    While it runs, a line like push.y=2 or mocap.dropout:0.5 lets that fault act at once; help shows what else can be typed.
+    While it runs, a line like push.y=2 or mocap.dropout:0.5 injects that fault at once; help lists the other commands.
     """
     if udp is None and not radio and mavlink is None:
         udp = UDP_PORT
-    if udp is not None and udp + boards - 1 > 65535:
-        raise LabError(f"--udp {udp}: there are no {boards} ports from there on")
+    _check_options(udp, mavlink, baud, board, gdb, boards)
+    if mavlink is not None:
+        require(f"--mavlink {mavlink}", "mavlink", "pymavlink")
     from firmware_py.core_runner import PythonRunner
     from hil.config import load_config
     from hil.laboratory.fault_kinds import MARKERS_ON
@@ -132,37 +137,20 @@ def serve(
     from hil.servers.serial_server import parse_addresses
     from hil.servers.server import Server
 
-    if motive:
-        overrides = (MARKERS_ON, *overrides)
-    if baud is not None:
-        if mavlink is None:
-            raise LabError(f"--baud {baud}: there is no serial line without --mavlink")
-        overrides = (*overrides, f"serial.baud={baud}")
-    config = load_config(profile, overrides)
+    markers = (MARKERS_ON,) if motive else ()
+    line = (f"serial.baud={baud}",) if baud is not None else ()
+    config = load_config(profile, (*markers, *overrides, *line))
     ends = parse_addresses(mavlink, boards) if mavlink is not None else []
     faults = [parse(text) for text in fault_texts]
     check(faults, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
     announce_compilation()
-    if board is not None and ends:
-        raise LabError(f"--mavlink {mavlink}: {board} speaks CRTP over its radio, not MAVLink")
-    if gdb is not None and (board is None or boards > 1):
-        raise LabError(f"--gdb {gdb}: goes with one board and an image as --board")
     debugger = open_debugger(gdb, Path(board or ""))
     runner = PythonRunner if board is None else image_at(board, None, debugger)
     view = open_live(target)
     server = Server(config, boards, seed, say, bool(ends), faults, state, view, runner)
     try:
-        if radio:
-            address = server.ends.serve_radio(radio_port)
-            say(radio_hint(address, [robot.uri for robot in server.ends.robots]))
-        if udp is not None:
-            say(f"udp    {' '.join(server.ends.serve_udp(udp))}")
-        if ends:
-            say(f"mavlink {' '.join(server.ends.serve_mavlink(ends))}")
-        if motive:
-            port = server.ends.serve_motive(Streaming(natnet_port, NATNET[natnet], multicast, up)).port
-            options = (",multicast" if multicast else "") + (",z-up" if up == "z" else "")
-            say(f"motive optitrack:127.0.0.1:{port}{options}")
+        streaming = Streaming(natnet_port, NATNET[natnet], multicast, up) if motive else None
+        _open_ends(server.ends, udp, radio_port if radio else None, ends, streaming)
         if station:
             for robot in server.ends.robots:
                 robot.fly()
@@ -179,7 +167,41 @@ def serve(
     return 0
 
 
+def _check_options(
+    udp: int | None, mavlink: str | None, baud: int | None, board: str | None, gdb: int | None, boards: int
+) -> None:
+    """Raise `LabError` for options that contradict each other."""
+    if udp is not None and udp + boards - 1 > 65535:
+        raise LabError(f"--udp {udp}: there are no {boards} ports from there on")
+    if baud is not None and mavlink is None:
+        raise LabError(f"--baud {baud}: there is no serial line without --mavlink")
+    if board is not None and mavlink is not None:
+        raise LabError(f"--mavlink {mavlink}: {board} speaks CRTP over its radio, not MAVLink")
+    if gdb is not None and (board is None or boards > 1):
+        raise LabError(f"--gdb {gdb}: needs one board and an image as --board")
+
+
+def _open_ends(
+    ends: Ends,
+    udp: int | None,
+    radio_port: int | None,
+    serial: Sequence[Address],
+    streaming: Streaming | None,
+) -> None:
+    """Open what programs connect to, and say where it is."""
+    if radio_port is not None:
+        say(radio_hint(ends.serve_radio(radio_port), [robot.uri for robot in ends.robots]))
+    if udp is not None:
+        say(f"udp    {' '.join(ends.serve_udp(udp))}")
+    if serial:
+        say(f"mavlink {' '.join(ends.serve_mavlink(serial))}")
+    if streaming is not None:
+        port = ends.serve_motive(streaming).port
+        options = (",multicast" if streaming.multicast else "") + (",z-up" if streaming.up == "z" else "")
+        say(f"motive optitrack:127.0.0.1:{port}{options}")
+
+
 def radio_hint(address: str, uris: list[str]) -> str:
-    """Return what to type before a program's name so that it sees the dongle, and where the boards are."""
+    """Return the text to type before a program's name so that it finds the dongle, and the addresses of the boards."""
     folder = Path(__file__).parents[1] / "servers" / "dongle_site"
     return f"radio  {' '.join(uris)}\nuse    env PYTHONPATH={shlex.quote(str(folder))} FLOATY_DONGLE={address} PROGRAM"

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option(
     "--mocap", metavar="SYSTEM",
-    help="Where poses come from, on top of [capture] of the profile: optitrack:HOST[:PORT], also the Motive of `floaty "
+    help="The source of poses, which overrides [capture] of the profile: optitrack:HOST[:PORT], also the Motive of `floaty "
     "serve`, vicon:HOST[:PORT], qualisys:HOST, vrpn:HOST[:PORT], each with [,body=NAME] [,z-up|,y-up], optitrack with "
     "[,multicast]; or replay:PATH, a file of --record, a telemetry.csv or a run folder, whose end ends the flight.",
 )  # fmt: skip
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option(
     "--tlog", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-    help="Every frame of MAVLink that passes the link, as a telemetry log; for --link mavlink:….",
+    help="Every MAVLink frame of the link, as a telemetry log; for --link mavlink:….",
 )  # fmt: skip
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR",
@@ -86,9 +86,9 @@ def station(
 ) -> int:
     """Fly a board, real or virtual: poses in, poses or corrections out at 50 Hz, telemetry shown and logged.
 
-    Ctrl-C ends the flight: nothing more goes up, the board puts its flaps to hover, the link is closed.
+    Ctrl-C ends the flight: no more poses are sent, the board puts its flaps to hover, the link is closed.
 
-    While it flies, lines like goal 0.1 0 1.15, set controller.gain_y -2.0 or stop act at once; help shows what can be typed.
+    While it flies, lines like goal 0.1 0 1.15, set controller.gain_y -2.0 or stop act at once; help lists the commands.
 
     Exit code with --out: as `floaty fly`, by the limits of the trajectory's experiment on what the cameras saw.
     """
@@ -103,19 +103,13 @@ def station(
 
     config = load_config(profile, overrides)
     experiment = find_experiment(trajectory)
-    if out is not None and log is not None:
-        raise LabError(f"--log {log}: --out {out} has a telemetry.csv of its own")
-    for option, path in (("--log", log), ("--record", record), ("--tlog", tlog)):
-        if path is not None and not path.parent.is_dir():
-            raise LabError(f"{option} {path}: there is no folder {path.parent}")
-    if tlog is not None and not uri.startswith("mavlink:"):
-        raise LabError(f"--tlog {tlog}: --link {uri}: only mavlink:DEVICE[,BAUD] has frames of MAVLink")
+    _check_files(log, record, tlog, out, uri)
     view = open_live(target)
     flight = None
     if out is not None or view is not None:
         flight = RealFlight(out, experiment, config, profile, overrides, uri, say, onlooker=view)
 
-    def tell(text: str) -> None:
+    def report(text: str) -> None:
         say(text)
         if flight is not None:
             flight.note("station", text)
@@ -140,7 +134,7 @@ def station(
     hands = [steer] if flight is None else [steer, flight.turn]
     failure = ""
     try:
-        fly(settings_of(config), session, tell, run_until(lambda: bool(stops), duration), hands)
+        fly(settings_of(config), session, report, run_until(lambda: bool(stops), duration), hands)
     except (LinkError, MocapError, OSError, ImportError) as error:
         failure = why(error, uri)
     finally:
@@ -157,6 +151,19 @@ def station(
     return INTERRUPTED if result.outcome == "interrupted" else 1
 
 
+def _check_files(
+    log: Path | None, record: Path | None, tlog: Path | None, out: Path | None, uri: str
+) -> None:
+    """Raise `LabError` for files that cannot be written, or not with these options."""
+    if out is not None and log is not None:
+        raise LabError(f"--log {log}: --out {out} has a telemetry.csv of its own")
+    for option, path in (("--log", log), ("--record", record), ("--tlog", tlog)):
+        if path is not None and not path.parent.is_dir():
+            raise LabError(f"{option} {path}: there is no folder {path.parent}")
+    if tlog is not None and not uri.startswith("mavlink:"):
+        raise LabError(f"--tlog {tlog}: --link {uri}: only mavlink:DEVICE[,BAUD] has frames of MAVLink")
+
+
 def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
     from ground_station.controls import ControlsError
     from hil.experiments import find_experiment
@@ -168,7 +175,7 @@ def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
 
 
 def why(error: Exception, uri: str) -> str:
-    """Return the line that says why the station gave up."""
+    """Return the line with the reason why the station gave up."""
     from ground_station.errors import LinkError
 
     if isinstance(error, LinkError):
@@ -183,7 +190,7 @@ def why(error: Exception, uri: str) -> str:
 
 
 def settings_of(config: LabConfig) -> GroundSettings:
-    """Return what a profile says of the ground station."""
+    """Return the ground station's settings of a profile."""
     from ground_station.links.schemes import LinkSettings
     from ground_station.program import GroundSettings
 

@@ -1,4 +1,4 @@
-"""What `floaty fly` prints of its flights: one flight's verdicts, or a row per seed."""
+"""The output of `floaty fly`: one flight's verdicts, or a row per seed."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def print_seeds(rows: list[Result]) -> None:
 
 
 def print_result(result: Result) -> None:
-    """Print the verdicts of one flight and where to look."""
+    """Print the verdicts of one flight and the files."""
     from rich.table import Table
 
     from ground_station.latency import budget_line

@@ -1,6 +1,7 @@
 """What is connected, in plain words: firmware, app, link, memory, core, IMU and servos of a real board.
 
-Nothing moves, nothing is left behind: the core that is tried has memory of its own.
+Nothing moves. The core that is tried has memory of its own; for half a second the board is taken into the loop, behind which
+it seeks its gyro's zero anew.
 """
 
 from __future__ import annotations
@@ -16,7 +17,20 @@ from firmware_py.core_runner import CoreBlocks
 from firmware_py.export.profile_c import profile_hash
 from firmware_py.logic.loading import load_logic, translation_of
 from firmware_py.wire import crtp
-from firmware_py.wire.core_port import READ_MAX, WRITE_MAX, About, health, read, write
+from firmware_py.wire.core_port import (
+    CHANNEL_LOOP,
+    PORT_CORE,
+    READ_MAX,
+    WRITE_MAX,
+    About,
+    Hil,
+    Looped,
+    decode_looped,
+    health,
+    loop,
+    read,
+    write,
+)
 from firmware_py.wire.platform import PLATFORM_VERSION, VERSION_FIRMWARE
 from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us, wait
@@ -24,10 +38,14 @@ from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
 from hil.config import LabConfig
 from hil.devices.real_core import RealCore
+from hil.devices.sample_window import SampleWindow
 
 ROUND_TRIPS = 100
 BURST = 600  # packets
 LOOKS = 60  # at the gyro, with as many different samples
+LOOP_SAMPLES = 500  # of the gyro, which a board in the loop takes in as many milliseconds
+LOOP_TIMEOUT_US = 5_000_000
+LOOK_S = 0.001
 TICKS = 20  # of the core
 VERSION_TIMEOUT_S = 1.0
 STILL_COUNTS = 100.0  # standard deviation; that of the board's own search for the zero
@@ -54,15 +72,16 @@ def examine(client: CoreClient, config: LabConfig) -> Iterator[Finding]:
     yield _memory(client, about.size)
     yield from _health(client)
     yield _core(client, about, config)
+    yield _loop(client)
 
 
 def _firmware(client: CoreClient) -> Finding:
     """Ask the stock firmware's platform service."""
     ask = bytes((VERSION_FIRMWARE,))
-    client.packets.tell(crtp.encode(crtp.Packet(crtp.PORT_PLATFORM, PLATFORM_VERSION, ask)))
+    client.packets.send_any(crtp.encode(crtp.Packet(crtp.PORT_PLATFORM, PLATFORM_VERSION, ask)))
     end_us = clock_us() + round(VERSION_TIMEOUT_S * 1e6)
     while clock_us() < end_us:
-        for packet in map(crtp.decode, client.packets.told()):
+        for packet in map(crtp.decode, client.packets.received()):
             if (packet.port, packet.channel, packet.data[:1]) == (crtp.PORT_PLATFORM, PLATFORM_VERSION, ask):
                 return Finding("firmware", packet.data[1:].rstrip(b"\0").decode("ascii", "replace"))
         wait(0.005)
@@ -146,3 +165,32 @@ def _core(client: CoreClient, about: About, config: LabConfig) -> Finding:
         else f"OTHER bits than here in {core.unexpected} calls"
     )
     return Finding("computes", f"{verdict}; {times}", core.unexpected == 0)
+
+
+def _loop(client: CoreClient) -> Finding:
+    """Send samples as fast as a board in the loop takes them."""
+    client.execute([loop(Hil.STILL)])
+    window, told, start_us = SampleWindow(), None, clock_us()
+    while window.used < LOOP_SAMPLES and clock_us() - start_us < LOOP_TIMEOUT_US:
+        if not window.full:
+            window.put((0, 0, 0))
+        # Before the board tells anything it takes nothing.
+        while told and client.packets.ready and (data := window.packet(clock_us())) is not None:
+            client.packets.send_any(crtp.encode(crtp.Packet(PORT_CORE, CHANNEL_LOOP, data)))
+        told = _told(client, window) or told
+    rate = window.used / (clock_us() - start_us) * 1e6
+    client.execute([loop(Hil.OFF)])
+    if told is None:
+        return Finding("loop", "does not answer", good=False)
+    counts = f"{told.held} ms held, {told.lost} lost, {told.doubled} doubled"
+    return Finding("loop", f"carries {rate:.0f} samples/s of 1000: {counts}", window.used >= LOOP_SAMPLES)
+
+
+def _told(client: CoreClient, window: SampleWindow) -> Looped | None:
+    """Let the window hear what the board tells, of which the last is returned; a full one waits for it."""
+    told = None
+    for packet in map(crtp.decode, client.packets.received(LOOK_S if window.full else 0.0)):
+        if (packet.port, packet.channel) == (PORT_CORE, CHANNEL_LOOP):
+            told = decode_looped(packet.data)
+            window.hear(told, clock_us())
+    return told

@@ -1,1 +1,1 @@
-"""The robot as a design: its trim, its linear dynamics and authority, sweeps over its shape, and shapes that are better."""
+"""The robot as a design: its trim, its linear dynamics and authority, sweeps over its shape, and better shapes."""

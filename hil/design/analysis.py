@@ -1,4 +1,4 @@
-"""Everything that `floaty design` finds out of one robot, and the files that it becomes: pictures, table, page."""
+"""Everything that `floaty design` computes for one robot, and the files that it writes: pictures, table, page."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """What was found out."""
+    """The results."""
 
     point: Point
     robot: list[tuple[str, str]]
@@ -113,7 +113,7 @@ def analyse(point: Point) -> Analysis:
         ),
         picture(
             "attainable", "Attainable set",
-            "All combinations of openings inside the flaps' range; orange: those that carry just the weight. Cross: hover.",
+            "All combinations of openings inside the flaps' range; orange: lift equal to the weight. Cross: hover.",
             lambda: figures.reach(point, reached),
         ),
         picture(

@@ -1,6 +1,6 @@
-"""What the flaps can do: every input inside the flaps' range, singly and together.
+"""The authority of the flaps: every input inside the flaps' range, singly and together.
 
-The robot stands level in its updraft, so that each plate feels its vertical normal alone; all openings
+The robot is level in its updraft, so that each plate's force depends on its vertical normal alone; all openings
 at once are one array.
 """
 
@@ -20,14 +20,14 @@ from hil.world.geometry import axis_of, weigh
 from hil.world.motion import GRAVITY
 
 GRID = 11  # openings of each flap between its limits
-LEVEL_SHARE = 0.02  # of the weight: where the lift still holds the height
+LEVEL_SHARE = 0.02  # of the weight: within it the lift counts as holding the height
 QUANTITIES = ("roll", "pitch", "yaw", "lift")  # [rad/s2] three times, then in weights
 Wrenches = NDArray[np.float64]  # (N, 6) force [N] and torque [N m] in B
 
 
 @dataclass(frozen=True, slots=True)
 class Attainable:
-    """What all combinations of openings come to."""
+    """What all combinations of openings achieve."""
 
     all: NDArray[np.float64]  # (N, 4) in the order of QUANTITIES
     level: NDArray[np.float64]  # (M, 4) those whose lift is the weight
@@ -40,10 +40,8 @@ def wrenches(geometry: GeometryConfig, openings: NDArray[np.float64], pressure: 
     total[:, 2] = pressure * geometry.base_side**2
     for part in flap_plates(geometry):
         for flap, mirror in enumerate(MIRRORS):
-            c, s = (
-                np.cos(openings[:, flap])[:, None],
-                -np.sin(openings[:, flap])[:, None],
-            )  # as flap 2 is turned
+            # Cosine and sine in the sense of rotation of flap 2.
+            c, s = np.cos(openings[:, flap])[:, None], -np.sin(openings[:, flap])[:, None]
             n, r = (
                 mirror * ((axis @ v) * axis + c * (v - (axis @ v) * axis) + s * np.cross(axis, v))
                 for v in (part.normal, part.centre)
@@ -70,7 +68,7 @@ def _accelerations(
 
 
 def attainable(geometry: GeometryConfig, opening: float, low: float, high: float) -> Attainable:
-    """Return what the flaps can do between two openings [rad], at the hover with `opening`."""
+    """Return the accelerations that the flaps attain between two openings [rad], at the hover with `opening`."""
     grid = np.linspace(low, high, GRID)
     every = _accelerations(geometry, opening, np.array(list(product(grid, repeat=4))))
     level = every[np.abs(every[:, 3] - 1.0) < LEVEL_SHARE]
@@ -78,14 +76,14 @@ def attainable(geometry: GeometryConfig, opening: float, low: float, high: float
 
 
 def reach(opening: float, low: float, high: float) -> float:
-    """Return by how much [rad] every flap can turn both ways from the hover."""
+    """Return by how much [rad] every flap can turn in both directions from the hover."""
     return max(min(opening - low, high - opening), 0.0)
 
 
 def single(
     geometry: GeometryConfig, opening: float, low: float, high: float
 ) -> dict[str, tuple[float, float]]:
-    """Return the least and greatest of its own quantity that each input does alone inside the flaps' range."""
+    """Return the least and greatest of its own quantity that each input attains alone inside the flaps' range."""
     found = {}
     for index, name in enumerate(QUANTITIES):
         towards = SIGNS * MIX[:, index]  # of u on the openings: theta = SIGNS * opening
@@ -98,7 +96,7 @@ def single(
 
 
 def authority(linear: Linear, opening: float, low: float, high: float) -> dict[str, float]:
-    """Return what each input can do about the hover: |input constant| times the reach; [1/s2] of angles, [m/s2] of lift."""
+    """Return each input's authority about the hover: |input constant| times the reach; [1/s2] of angles, [m/s2] of lift."""
     f, far = linear.constants, reach(opening, low, high)
     return {
         "roll": abs(f.roll_u1) * far, "pitch": abs(f.pitch_u2) * far, "yaw": abs(f.yaw_u3) * far, "lift": abs(f.z_u4) * far,

@@ -1,4 +1,4 @@
-"""What the paper says of its design, beside what the plate model of a robot comes to; the reason where they differ.
+"""The paper's claims about its design beside the results of the plate model of a robot; the reason where they differ.
 
 Sections: "Embodied intelligence through design optimization" with Fig. robustness f and g; of the Supplement "Detailed
 derivation of scaling analysis", "Force analysis", "Torque analysis" and the Table of dynamics constants.
@@ -30,12 +30,12 @@ from hil.world.geometry import weigh
 from hil.world.paper_table import PAPER_TABLE
 
 AGREES, DIFFERS, NOTHING = "agrees", "differs", "no value"
-ROUGHLY = 0.15  # what "approximately" still covers
+ROUGHLY = 0.15  # relative deviation that "approximately" still covers
 
 DESIGN, SCALING = "Design optimization, Fig. robustness f, g", "Scaling analysis"
 FORCES, CONSTANTS = "Force and torque analysis", "Table of dynamics constants"
 
-# Why a constant of the Table differs: physics.md section 3
+# Why a constant of the Table differs: docs/explanation/plant.md, Where the paper contradicts itself
 RATES = (
     "Plates damp by 1 to 3 1/s; the Table's value is that of a loop closed by the firmware's own rate gain."
 )
@@ -59,7 +59,7 @@ class Claim:
     paper: str
     ours: str
     verdict: str
-    why: str = ""  # they differ, or how to read it
+    why: str = ""  # why they differ, or how to read it
 
 
 def _near(ours: float, paper: float) -> str:
@@ -71,7 +71,7 @@ def _holds(whether: bool) -> str:
 
 
 def text_of(poles: list[complex]) -> str:
-    """Return poles as people write them."""
+    """Return poles as text."""
     found = []
     for pole in poles:
         if pole.imag > 1e-9:
@@ -228,7 +228,7 @@ def _forces(point: Point, model_error: float) -> Iterator[Claim]:
 
 
 def robot_lines(point: Point) -> list[tuple[str, str]]:
-    """Return what the robot is, in words and figures."""
+    """Return a description of the robot, in words and figures."""
     weight, linear = weigh(point.geometry), point.linear
     ix, iy, iz = (1e3 * moment for moment in weight.inertia)
     low, high = updrafts(point, RESERVE)

@@ -78,7 +78,7 @@ def stability(point: Point, sweep: Stability) -> Figure:
     left.plot(0.0, 0.0, "o", color="black", clip_on=False)
     left.set_xlabel("kink [deg]")
     left.set_ylabel("centre of mass below the flaps [cm]")
-    figure.colorbar(surface, ax=left, label="f_αα [1/s²]: red falls over")
+    figure.colorbar(surface, ax=left, label="f_αα [1/s²]: red: falls over")
     middle.plot(kinks, sweep.along, color=BLUE)
     middle.axhline(0.0, color=GREY)
     middle.axvline(own, color="#ff5733", linestyle="--")
@@ -106,7 +106,7 @@ def stability(point: Point, sweep: Stability) -> Figure:
 
 
 def hover(point: Point, sweep: HoverAngles) -> Figure:
-    """Draw the input constants over the hover angle, each by its largest, and what "over all axes" makes of them."""
+    """Draw the input constants over the hover angle, each by its largest, and three readings of "over all axes"."""
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True)
     angles = np.degrees(OPENINGS)
@@ -130,7 +130,7 @@ def hover(point: Point, sweep: HoverAngles) -> Figure:
 
 
 def reach(point: Point, found: Attainable) -> Figure:
-    """Draw the attainable set, quantity against quantity; the inner one carries just the weight."""
+    """Draw the attainable set, quantity against quantity; the inner one has just the weight as its lift."""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     pairs = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
     for axes, (a, b) in zip(figure.subplots(2, 3).flat, pairs, strict=True):
@@ -183,11 +183,11 @@ def scale(laws: tuple[Law, ...]) -> Figure:
 def pareto(
     names: tuple[str, str], found: Points, front: Points, marks: dict[str, tuple[float, float]]
 ) -> Figure:
-    """Draw what an optimisation tried (N, 2), the front of what nothing beats (M, 2), and robots by name."""
+    """Draw what an optimisation tried (N, 2), the Pareto front (M, 2), and robots by name."""
     figure = Figure(figsize=(0.7 * WIDTH, 3.6), layout="constrained")
     axes = figure.subplots()
     axes.plot(*found.T, ".", color=GREY, markersize=2, alpha=0.5, label="tried")
-    axes.plot(*front.T, "-", color=BLUE, label="nothing beats both")
+    axes.plot(*front.T, "-", color=BLUE, label="Pareto front")
     for (name, place), colour in zip(marks.items(), (RED, GREEN, PINK), strict=False):
         axes.plot(*place, "*", color=colour, markersize=11, label=name)
     axes.set_xlabel(names[0])

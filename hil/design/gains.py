@@ -1,7 +1,7 @@
-"""A default design of the controller's gains for any robot: the least quadratic cost that the law's own gains can reach.
+"""A default design of the controller's gains for any robot: the least quadratic cost that the law's structure allows.
 
 Per axis the plate model stands behind the flaps' lag and one period of delay; the law feeds back position, velocity, angle
-and rate, not what the flaps have reached. Its gains minimise the stationary cost under gusts (static output feedback), with
+and rate, not the flap angles. Its gains minimise the stationary cost under gusts (static output feedback), with
 weights by Bryson's rule. `floaty design --write` puts them into a profile.
 """
 
@@ -26,20 +26,15 @@ except ImportError:
 
 PERIOD = 0.01  # [s] of the controller
 FLAP_RATE = 20.0  # [1/s] of the servos' lag; original firmware
-ALLOWED = {
-    "position": 0.06,
-    "velocity": 0.3,
-    "angle": radians(8.0),
-    "rate": 1.0,
-    "turn": radians(10.0),
-}  # [m, m/s, rad, ...]
+# The greatest deviation that Bryson's rule allows, in SI units.
+ALLOWED = {"position": 0.06, "velocity": 0.3, "angle": radians(8.0), "rate": 1.0, "turn": radians(10.0)}
 FLAPS_ALLOWED = radians(8.0)
 GUSTS = {"velocity": 0.01, "rate": 0.15}  # [m/s], [rad/s] per period: T0 on the paper's robot
 INTEGRAL = 1.0 / 3.0  # [1/s] gain_iz per gain_z, as in profiles/floaty.toml
 LOST = 1e9
 Matrix = NDArray[np.float64]
 
-# Gains by input: names in the profile, states of `Linear` behind them (None: the integral of the next), what each may be
+# Gains by input: names in the profile, states of `Linear` behind them (None: the integral of the next), their kinds of units
 LOOPS: tuple[tuple[tuple[str, ...], tuple[int | None, ...], tuple[str, ...]], ...] = (
     (("gain_y", "gain_vy", "gain_roll", "gain_p"), (None, 1, 3, 6), ("position", "velocity", "angle", "rate")),
     (("gain_x", "gain_vx", "gain_pitch", "gain_q"), (None, 0, 4, 7), ("position", "velocity", "angle", "rate")),
@@ -58,7 +53,7 @@ def gains_of(model: Linear) -> dict[str, float]:
 
 
 def _sampled(model: Linear, index: int, states: Sequence[int | None]) -> tuple[Matrix, Matrix]:
-    """Return one axis sampled: its states, what the flaps have reached, and the command that is under way."""
+    """Return one axis sampled: its states, the flap angle, and the command that is still delayed."""
     n = len(states)
     flow = np.zeros((n + 2, n + 2))  # the last one is the command, held
     for row, state in enumerate(states):
@@ -103,7 +98,7 @@ def _least_cost(A: Matrix, B: Matrix, kinds: Sequence[str], name: str) -> Matrix
 
     search = {"maxiter": 4000, "maxfev": 4000, "xatol": 1e-5, "fatol": 1e-9, "adaptive": True}
     best: Matrix = np.asarray(start)
-    for _ in range(2):  # from where the first ended, with a fresh simplex
+    for _ in range(2):  # the second from the end of the first, with a fresh simplex
         best = np.asarray(minimize(cost, best, method="Nelder-Mead", options=search).x)
     if cost(best) >= LOST * 0.9:
         raise LabError(

@@ -31,7 +31,7 @@ class Linear:
 
     @property
     def constants(self) -> Constants:
-        """The same by the paper's names."""
+        """The constants by the paper's names."""
         A, B = self.A, self.B
         chosen = {
             "roll_u1": B[6, 0], "roll_roll": A[6, 3], "roll_rate": A[6, 6], "y_u1": B[1, 0], "y_roll": A[1, 3],
@@ -50,7 +50,7 @@ class Linear:
     def steady(self, axis: str) -> float:
         """Return the sideways acceleration per input [m/s2] once the attitude has followed, in its usual direction.
 
-        Negative: the robot steers the other way round than the paper's; NaN for yaw and height.
+        Negative: the robot steers in the opposite direction to the paper's; NaN for yaw and height.
         """
         f = self.constants
         if axis == "pitch":

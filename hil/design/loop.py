@@ -1,4 +1,4 @@
-"""One axis of the whole loop, sampled every 10 ms: what the law's gains meet in flight, and how far they are from too much.
+"""One axis of the whole loop, sampled every 10 ms, with the margins of the law's gains.
 
 Plant (the linear model behind servo lag and delay), gyro (mean over a tick), poses (a horizon late), the board's stationary
 filter and predictor on the board's own model, the history of its commands, the gains. Poses of every second tick count as
@@ -52,7 +52,7 @@ class Axis:
 
     @property
     def main(self) -> str:
-        """What the axis is there to hold."""
+        """The state that the axis controls."""
         return self.states[0]
 
 
@@ -96,7 +96,7 @@ def dynamics(axis: Axis, robot: Robot) -> tuple[Matrix, Matrix]:
 
 
 def held(flow: Matrix, columns: Matrix, seconds: float) -> tuple[Matrix, Matrix]:
-    """Return the transition over a time, and what inputs held over it do."""
+    """Return the transition over a time, and the effect of inputs held over it."""
     n, m = columns.shape
     both = expm(np.block([[flow, columns], [np.zeros((m, n + m))]]) * seconds)
     return both[:n, :n], both[:n, n:]
@@ -104,24 +104,24 @@ def held(flow: Matrix, columns: Matrix, seconds: float) -> tuple[Matrix, Matrix]
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How old poses are, and what the board knows of it."""
+    """The age of poses, and what the board knows of it."""
 
     age_s: float
     horizon: int  # ticks that the filter runs behind and the predictor bridges
 
     @classmethod
     def of(cls, config: LabConfig, age_s: float) -> Timing:
-        """Return what the board of a profile makes of poses of an age."""
+        """Return the timing of a profile's board with poses of an age."""
         predictor = config.predictor
         if not predictor.enabled:
             return cls(age_s, 0)
         if predictor.age == "fixed":
             return cls(age_s, predictor.horizon)
         ticks = max(1, round(age_s / STEP_S))
-        return cls(ticks * STEP_S, ticks)  # what is left of a tick is bridged by the velocities
+        return cls(ticks * STEP_S, ticks)  # the fraction of a tick is bridged by the velocities
 
     def later(self, seconds: float) -> Timing:
-        """Return the same with poses that are older than they say."""
+        """Return the timing with poses that are older than they state."""
         return Timing(self.age_s + seconds, self.horizon)
 
 
@@ -134,9 +134,8 @@ def filter_gain(axis: Axis, config: LabConfig, Phi: Matrix) -> tuple[Matrix, Mat
         ANGLE: noise.process_attitude,
         RATE: noise.process_rate,
     }
-    Q = np.diag(
-        [*(process[state] for state in axis.states), noise.process_flap / 4]
-    )  # an input is a mean of four flaps
+    # An input is a mean of four flaps, so its variance is a quarter.
+    Q = np.diag([*(process[state] for state in axis.states), noise.process_flap / 4])
     measured = {
         RATE: noise.measured_rate,
         POSITION: 2 * noise.measured_position,
@@ -160,7 +159,7 @@ class Loop:
     Bv: Matrix  # (S, 1)
     Bu: Matrix  # (S, 1)
     Bw: Matrix  # (S, W) accelerations of the flow: of the velocity, of the rate, as the axis has them
-    N: Matrix  # (G, S) what each gain multiplies
+    N: Matrix  # (G, S) the quantity that each gain multiplies
     C: Matrix  # (n, S) true states
 
     def closed(self, gains: Matrix) -> Matrix:
@@ -199,7 +198,7 @@ FREQUENCIES = np.geomspace(LOWEST_HZ, HIGHEST_HZ, LINES)  # [Hz]
 
 
 class _Rows:
-    """Places of named pieces in one state."""
+    """Index ranges of named parts of one state vector."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self.places: dict[str, slice] = {}
@@ -209,17 +208,13 @@ class _Rows:
             self.size += size
 
     def pick(self, name: str) -> Matrix:
-        """Return the rows that pick a piece out of the state."""
+        """Return the rows that select a part of the state."""
         return np.eye(self.size)[self.places[name]]
 
 
 def build(axis: Axis, robot: Robot, config: LabConfig, timing: Timing) -> Loop:
     """Return the loop of an axis of a robot with a profile's model, estimator and predictor on board."""
-    flow, columns = dynamics(axis, robot)
-    delay = min(max(robot[DELAY], 0.0), STEP_S)
-    Phi, whole = held(flow, columns, STEP_S)
-    late, rest = held(flow, columns, STEP_S - delay)
-    before = late @ held(flow, columns, delay)[1][:, :1]
+    Phi, before, rest, whole = _robot_tick(axis, robot)
     Phi_b, column_b = held(*dynamics(axis, robot_of(config)), STEP_S)
     Gamma_b = column_b[:, :1]
     K, seen = filter_gain(axis, config, Phi_b)
@@ -227,34 +222,19 @@ def build(axis: Axis, robot: Robot, config: LabConfig, timing: Timing) -> Loop:
     n, h, integral = len(axis.states), timing.horizon, len(axis.gains) - len(axis.states)
     lag = timing.age_s / STEP_S
     poses = [row for row, state in enumerate(axis.states) if state in (POSITION, ANGLE)]
-    depth = max(h + 1, int(np.ceil(lag)) + 1)  # ticks of poses that are remembered, besides the present one
+    depth = max(h + 1, int(np.ceil(lag)) + 1)  # ticks of poses that are kept, besides the present one
     rows = _Rows(
         {"x": n + 1, "v": 1, "past": depth * len(poses), "u": h + 1, "filter": n + 1, "integral": integral}
     )
-    pick, size, width = rows.pick, rows.size, columns.shape[1] - 1
-    x, v, past, commands, xi = (pick(name) for name in ("x", "v", "past", "u", "filter"))
-
-    def shown(present: Matrix, older: Matrix, ticks: float) -> Matrix:
-        """Return the rows of position and angle as they were that many ticks ago."""
-        first, share = int(ticks), ticks - int(ticks)
-        history = np.concatenate([present, older]).reshape(-1, len(poses), older.shape[1])
-        mixed: Matrix = (1 - share) * history[first]
-        return mixed + share * history[first + 1] if share else mixed
-
-    turning = axis.states[poses[-1]] == ANGLE
-    rate = axis.states.index(RATE) if turning else -1
-    # The predictor: from the filter's state through the commands, rates from the gyro
-    z = xi
-    for step in range(h):
-        z = Phi_b @ z + Gamma_b @ commands[h - step - 1][None]
-        if turning:
-            z[rate] = (shown(x[poses], past, h - step - 1)[-1] - shown(x[poses], past, h - step)[-1]) / STEP_S
-    N = z[:n]
+    x, v, past, commands, xi = (rows.pick(name) for name in ("x", "v", "past", "u", "filter"))
+    rate = axis.states.index(RATE) if axis.states[poses[-1]] == ANGLE else None
+    N = _predicted(xi, commands, x[poses], past, rate, Phi_b, Gamma_b)[:n]
     if integral:
-        summed = pick("integral") - STEP_S * N[:1]
+        summed = rows.pick("integral") - STEP_S * N[:1]
         N = np.concatenate([N, -summed])
 
-    # The next state, first over (s, v, u, w), piece by piece
+    # The next state, first over (s, v, u, w), part by part
+    size, width = rows.size, whole.shape[1] - 1
     wide = np.zeros((size, size + 2 + width))
 
     def over(matrix: Matrix) -> Matrix:
@@ -268,11 +248,9 @@ def build(axis: Axis, robot: Robot, config: LabConfig, timing: Timing) -> Loop:
     commands_next[0, size + 1] = 1.0
     commands_next[1:] = over(commands[:-1])
     predicted = over(Phi_b @ xi) + Gamma_b @ commands_next[h][None]
-    pose = shown(x_next[poses], past_next, lag)
-    measured = pose
-    if turning:
-        gyro = (shown(x_next[poses], past_next, h)[-1] - shown(x_next[poses], past_next, h + 1)[-1]) / STEP_S
-        measured = np.concatenate([gyro[None], pose])
+    measured = _ago(x_next[poses], past_next, lag)
+    if rate is not None:
+        measured = np.concatenate([_gyro(x_next[poses], past_next, h)[None], measured])
     wide[rows.places["x"]] = x_next
     wide[rows.places["v"], size] = 1.0
     wide[rows.places["past"]] = past_next
@@ -280,26 +258,55 @@ def build(axis: Axis, robot: Robot, config: LabConfig, timing: Timing) -> Loop:
     wide[rows.places["filter"]] = predicted + K @ (measured - seen @ predicted)
     if integral:
         wide[rows.places["integral"]] = over(summed)
-    return Loop(
-        axis,
-        wide[:, :size],
-        wide[:, size : size + 1],
-        wide[:, size + 1 : size + 2],
-        wide[:, size + 2 :],
-        N,
-        x[:n],
-    )
+    s, command, flow = wide[:, :size], wide[:, size + 1 : size + 2], wide[:, size + 2 :]
+    return Loop(axis, s, wide[:, size : size + 1], command, flow, N, x[:n])
+
+
+def _robot_tick(axis: Axis, robot: Robot) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Return the robot's transition over a tick, and the effects of the input before and after its delay, and over all."""
+    flow, columns = dynamics(axis, robot)
+    delay = min(max(robot[DELAY], 0.0), STEP_S)
+    Phi, whole = held(flow, columns, STEP_S)
+    late, rest = held(flow, columns, STEP_S - delay)
+    return Phi, late @ held(flow, columns, delay)[1][:, :1], rest, whole
+
+
+def _predicted(
+    xi: Matrix, commands: Matrix, present: Matrix, past: Matrix, rate: int | None, Phi: Matrix, Gamma: Matrix
+) -> Matrix:
+    """Return the board's state brought to now: from the filter's state through the commands, rates from the gyro."""
+    z = xi
+    horizon = len(commands) - 1
+    for step in range(horizon):
+        z = Phi @ z + Gamma @ commands[horizon - step - 1][None]
+        if rate is not None:
+            z[rate] = _gyro(present, past, horizon - step - 1)
+    return z
+
+
+def _gyro(present: Matrix, past: Matrix, ticks: int) -> Matrix:
+    """Return the row of the mean rate over the tick that ended that many ticks ago."""
+    mean: Matrix = (_ago(present, past, ticks)[-1] - _ago(present, past, ticks + 1)[-1]) / STEP_S
+    return mean
+
+
+def _ago(present: Matrix, past: Matrix, ticks: float) -> Matrix:
+    """Return the rows of position and angle that many ticks ago."""
+    first, share = int(ticks), ticks - int(ticks)
+    history = np.concatenate([present, past]).reshape(-1, *present.shape)
+    mixed: Matrix = (1 - share) * history[first]
+    return mixed + share * history[first + 1] if share else mixed
 
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """How far a loop, broken before the servo, is from too much."""
+    """The stability margins of a loop that is opened before the servo."""
 
     stable: bool
     gain: float  # factor on the gain up to which it is stable, infinite without
-    least_gain: float  # factor below 1 down to which it is, 0 without
+    least_gain: float  # factor below 1 down to which it is stable, 0 without
     phase: float  # [rad]
-    delay: float  # [s] between command and servo, on top of what is there
+    delay: float  # [s] between command and servo, on top of the present delay
     peak: float  # of the sensitivity 1 / (1 + L)
 
 
@@ -333,7 +340,7 @@ def margins_of(w: Matrix, L: Complex) -> Margins:
 
 
 def _crossings(w: Matrix, values: Matrix) -> list[tuple[float, float, int]]:
-    """Return where values cross zero: frequency, share of the way to the next line, line."""
+    """Return where values cross zero: frequency, share of the distance to the next line, line."""
     places = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
     shares = values[places] / (values[places] - values[places + 1])
     return [
@@ -345,7 +352,7 @@ def _crossings(w: Matrix, values: Matrix) -> list[tuple[float, float, int]]:
 def pose_delay_margin(
     axis: Axis, robot: Robot, config: LabConfig, timing: Timing, gains: Matrix, most_s: float = 0.5
 ) -> float:
-    """Return by how much poses may be older than they say [s] before the loop is unstable; at most `most_s`."""
+    """Return by how much poses may be older than they state [s] before the loop is unstable; at most `most_s`."""
 
     def stable(seconds: float) -> bool:
         return build(axis, robot, config, timing.later(seconds)).radius(gains) < 1.0

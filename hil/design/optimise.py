@@ -1,8 +1,8 @@
 """Better shapes: kink, centre of mass, base plate and kinked strip that maximise a figure, at fixed span, mass and speed.
 
-The hover angle follows: at one mass, speed and drag coefficient it is what the flaps' area leaves. Every robot is passively
+The hover angle follows: mass, speed and drag coefficient leave one for each flap area. Every robot is passively
 stable in roll and pitch and steers sideways with one sign at openings up to `RESERVE` smaller and larger than the hover's: a
-robot like the paper's turns round there (its steady x per u2). All that was tried is kept, for the Pareto picture.
+robot like the paper's reverses its sign there (its steady x per u2). All shapes tried are kept, for the Pareto picture.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ except ImportError:
 
     raise LabError(f"floaty design optimise needs scipy: {install_command('design')}") from None
 
-BOUNDS = {  # shares of the footprint but for the kink
+BOUNDS = {  # shares of the footprint, except the kink
     "kink": (0.0, math.radians(80.0)), "height": (0.0, 0.5), "base": (0.15, 0.5), "strip": (0.02, 0.2),
 }  # fmt: skip
 POPULATION, GENERATIONS = 10, 25
-STEP = math.radians(3.0)  # of the openings at which a range of speeds is looked at
-BAD = -1.0  # of a robot that breaks a condition
+STEP = math.radians(3.0)  # between the openings at which a range of speeds is checked
+BAD = -1.0  # figure of a robot that violates a condition
 
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """A robot that was looked at."""
+    """A robot that was evaluated."""
 
     point: Point
     stiffness: float  # f_αα [1/s2]
     authority: float  # the least over the axes, as a share of the reference's
-    ratio: float  # greatest over least updraft that it holds; 0: not looked at
+    ratio: float  # greatest over least updraft that it holds; 0: not evaluated
 
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """What an optimisation found."""
+    """The result of an optimisation."""
 
     best: Tried
     reference: Tried
@@ -55,7 +55,7 @@ class Optimum:
 
 
 def held(point: Point) -> tuple[float, float]:
-    """Return the updrafts [m/s] around the hover that the robot holds: stable, steering, 8° of each flap left over."""
+    """Return the updrafts [m/s] around the hover that the robot holds: stable, steering, 8° of each flap in reserve."""
     openings = np.arange(point.low + RESERVE, point.high - RESERVE + 1e-9, STEP)
     good = [
         _flies(Point(point.geometry, point.coefficient, one, point.low, point.high))
@@ -154,7 +154,7 @@ def _look(point: Point, reference: Mapping[str, float], ratio: float) -> Tried:
 
 
 def front(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
-    """Return (M, 2) of stability -f_αα and figure: what no other robot beats in both."""
+    """Return (M, 2) of stability -f_αα and figure: robots that no other one beats in both."""
     found = sorted(places(tried, figure).tolist(), reverse=True)
     kept: list[list[float]] = []
     for place in found:
@@ -171,7 +171,7 @@ def places(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
 
 
 def exercise(optimum: Optimum, low: float, high: float) -> list[str]:
-    """Return which robot could hold updrafts from `low` to `high` [m/s], and what it would cost, in sentences."""
+    """Return, in sentences, which robot could hold updrafts from `low` to `high` [m/s], and at what cost."""
     lines = []
     for name, one in (("the robot as it is", optimum.reference), ("the best shape", optimum.best)):
         slow, fast = held(one.point)

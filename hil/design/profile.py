@@ -35,7 +35,7 @@ def profile_text(point: Point, gains: Mapping[str, float], about: str, length: f
 
 
 def _stated(geometry: GeometryConfig) -> dict[str, Any]:
-    """Return what a geometry has other than G0."""
+    """Return the values of a geometry that differ from G0."""
     own, usual = geometry.model_dump(), GeometryConfig().model_dump()
     return {key: value for key, value in own.items() if value != usual[key]}
 

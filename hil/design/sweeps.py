@@ -1,4 +1,4 @@
-"""Sweeps over the shape: where roll is stable, which hover angle leaves most authority, what size and mass change."""
+"""Sweeps over the shape: where roll is stable, which hover angle leaves most authority, the effect of size and mass."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HEIGHTS = np.arange(0.0, 0.1201, 0.015)  # [m] of the flap axes above the centre
 OPENINGS = np.radians(np.arange(10.0, 45.1, 0.5))
 FACTORS = np.array([0.5, 0.7, 1.0, 1.4, 2.0])  # on length or mass
 VISCOSITY = 1.81e-5  # [Pa s] of air at 15 deg C, dynamic
-NEAR_BEST = 0.95  # of the best: the range of hover angles that is as good
+NEAR_BEST = 0.95  # share of the best figure within which hover angles count as equally good
 Curve = NDArray[np.float64]
 
 
@@ -90,7 +90,7 @@ def _zero(of: Callable[[float], float], above: float, below: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class HoverAngles:
-    """Input constants over the hover angle, and what three readings of "authority over all axes" make of them."""
+    """Input constants over the hover angle, and three readings of "authority over all axes"."""
 
     constants: Mapping[str, Curve]  # by QUANTITIES, (OPENINGS,), signed
     criteria: Mapping[str, Curve]  # each as a share of its best
@@ -134,7 +134,7 @@ class Law:
 
 
 def scaling(point: Point) -> tuple[Law, ...]:
-    """Return what size and mass do at the same hover angle."""
+    """Return the effect of size and mass at the same hover angle."""
     sizes = [_at(point, scaled(point.geometry, factor, 1.0)) for factor in FACTORS.tolist()]
     masses = [_at(point, scaled(point.geometry, 1.0, factor)) for factor in FACTORS.tolist()]
 

@@ -1,6 +1,6 @@
-"""Hover angle and airspeed of a robot whose drag coefficient is known, and robots of another size, mass or balance.
+"""Hover angle and airspeed of a robot whose drag coefficient is known, and robots of another size, mass or centre of mass.
 
-The coefficient is that of the plates and stays when shape, mass or speed change: it is the profile's, which its design
+The coefficient is that of the plates and does not change with shape, mass or speed: it is the profile's, which its design
 airspeed and hover angle fix. Openings are flap angles, positive for every flap.
 """
 

@@ -1,8 +1,8 @@
-"""Gains of the law's own structure for one axis: least motion in the measured flow, inside the margins, for every robot.
+"""Gains of the law's own structure for one axis: least motion in the measured flow, within the margins, for every robot.
 
 The design model is `hil.design.loop`, with estimator, predictor, lag and delays inside. The search (Nelder-Mead) begins at
 the linear quadratic regulator of the axis and at the old gains, and adds the worst of the drawn robots to those that it
-looks at until no robot is worse. A robot that moves too much for the box or the flaps, or a loop without its margins, costs
+considers until no robot is worse. A robot that moves too much for the box or the flaps, or a loop without its margins, costs
 more than any motion.
 """
 
@@ -43,26 +43,26 @@ except ImportError:
 
 PEAK = 1.9  # of the sensitivity, for every robot: a gain margin of 2.1, a phase margin of 30 deg
 BOX_M = 0.10
-SIGMAS = 3.0  # that stay inside the box and off the flaps' limits
-UNITS = {POSITION: 0.02, VELOCITY: 0.3, ANGLE: radians(5.0), RATE: 2.0}  # what counts as one unit of motion
+SIGMAS = 3.0  # that stay inside the box and clear of the flaps' limits
+UNITS = {POSITION: 0.02, VELOCITY: 0.3, ANGLE: radians(5.0), RATE: 2.0}  # one unit of motion in the cost
 OF_FLAPS = 0.25  # share of a flap's range that one input may take, standard deviation
 ROUNDS = 3
-WORST = 2  # robots that a round adds
+WORST = 2  # robots added per round
 TOO_MUCH = 1e3
 INTEGRAL = 1.0 / 3.0  # [1/s] gain of the integral per gain, as in profiles/floaty.toml
-LEAST_GAIN, STEP = 0.02, 0.2  # of the search: what a gain is counted in at least, and its first steps
+LEAST_GAIN, STEP = 0.02, 0.2  # of the search: least scale of a gain, and the first step
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What gains of an axis are to do."""
+    """The requirements on the gains of an axis."""
 
     axis: Axis
     spectrum: Complex  # (L, W, W) of the flow's accelerations
     input: float  # [rad] that the robot needs at rest
     angle: float  # [rad] at which it rests
     flap_range: float  # [rad] from hover to the nearer limit
-    error_limit: float  # of the main state that the law feeds back
+    error_limit: float  # limit on the error of the main state that the law feeds back
     delay: float  # [s] that the margin must exceed
 
     def offset(self, gains: Matrix) -> float:
@@ -75,20 +75,20 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How far a robot moves, predicted."""
+    """The predicted motion of a robot."""
 
     main: float  # [m] or [rad] rms of the main state's error
     input: float  # [rad] rms of the input's variation
 
 
 def motion(loop: Loop, task: Task, gains: Matrix) -> Motion:
-    """Return what a stable loop makes of the flow."""
+    """Return the motion of a stable loop in the flow."""
     states, u = response_to(task.spectrum, loop, gains)
     return Motion(float(np.sqrt(states[0] + task.offset(gains) ** 2)), float(np.sqrt(u)))
 
 
 def cost(loop: Loop, task: Task, gains: Matrix) -> float:
-    """Return what a robot with gains costs: motion in units, and far more for what must not be."""
+    """Return the cost of a robot with gains: motion in units, and far more for violated conditions."""
     radius = loop.radius(gains)
     if radius >= 1.0:
         return TOO_MUCH * (1.0 + radius)
@@ -109,7 +109,7 @@ def cost(loop: Loop, task: Task, gains: Matrix) -> float:
 
 
 def regulator(axis: Axis, robot: Robot) -> Matrix:
-    """Return the gains of the linear quadratic regulator of the axis, without what it would feed back of the flaps."""
+    """Return the gains of the linear quadratic regulator of the axis, without its feedback of the flap angles."""
     Phi, Gamma = held(*dynamics(axis, robot), STEP_S)
     Q = np.diag([*(UNITS[state] ** -2 for state in axis.states), 0.0])
     R = np.array([[0.1**-2]])
@@ -127,7 +127,7 @@ def _whole(axis: Axis, gains: Matrix) -> Matrix:
 
 
 def design(task: Task, loops: Sequence[Loop], start: Sequence[Matrix]) -> Matrix:
-    """Return gains for the first of the loops that all others bear as well. Raises `LabError` when none are found."""
+    """Return gains for the first of the loops that suit all others as well. Raises `LabError` when none are found."""
     axis, looked_at = task.axis, [loops[0]]
     count = len(axis.states)
     scale = np.maximum(np.max(np.abs(start), axis=0)[:count], LEAST_GAIN)
@@ -137,7 +137,7 @@ def design(task: Task, loops: Sequence[Loop], start: Sequence[Matrix]) -> Matrix
         def dearest(x: Matrix) -> float:
             return max(cost(loop, task, _whole(axis, x * scale)) for loop in looked_at)  # noqa: B023
 
-        for _ in range(2):  # again with a fresh simplex
+        for _ in range(2):  # the second time with a fresh simplex
             x = best[:count] / scale
             options = {
                 "maxfev": 400, "xatol": 1e-3, "fatol": 1e-4, "adaptive": True,
@@ -154,6 +154,6 @@ def design(task: Task, loops: Sequence[Loop], start: Sequence[Matrix]) -> Matrix
     if costs.max() >= TOO_MUCH:
         raise LabError(
             f"no gains: {task.axis.name}: {int(np.sum(costs >= TOO_MUCH))} of {len(loops)} robots that the intervals allow "
-            "are unstable with the best that were found"
+            "are unstable with the best gains found"
         )
     return np.array([float(f"{gain:.4g}") for gain in best])

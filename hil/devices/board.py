@@ -38,15 +38,16 @@ class Processing(Protocol):
         ...
 
     def stop_before(self, us: int) -> None:
-        """Let it run no further than to the instant before that one."""
+        """Limit the run to the instants before this one."""
         ...
 
 
 class VirtualBoard:
     """Implements `firmware_py.board.Board`; `servo`, `radio`, `console` and `uart` are where the pins lead to.
 
-    Those are told the instant by the clock of the hardware. `run_on` tells whose time it is, and which hardware pins may set
-    going. `on_reset` and `on_failure` may be set later: by default a reset comes to nothing, and no part can be let fail.
+    They get instants by the clock of the hardware. `run_on` sets the processor whose time counts, and the hardware that pins
+    may trigger. `on_reset` and `on_failure` may be set later: by default a reset has no effect and no failure can be
+    injected.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class VirtualBoard:
         self._booted_us = 0
 
     def boot(self, now_us: int) -> None:
-        """Begin a processor's time at an instant of the hardware's; `run_on` follows when it has booted."""
+        """Start a processor's time at an instant of the hardware's; `run_on` follows when it has booted."""
         self._kernel, self._booted_us = None, now_us
 
     def run_on(self, kernel: Processing, events: EventQueue) -> None:
@@ -111,7 +112,7 @@ class VirtualBoard:
         return self._uart.read() if self._uart else b""
 
     def uart_write(self, data: bytes) -> bool:
-        """Hand bytes to the UART; where nothing is connected they are gone."""
+        """Hand bytes to the UART; where nothing is connected they are lost."""
         if self._uart is None:
             return True
         accepted = self._uart.write(self.now_us, data)
@@ -119,7 +120,7 @@ class VirtualBoard:
         return accepted
 
     def _let_hardware_go_first(self) -> None:
-        """Let the tasks run no further than to the instant before the hardware's next event."""
+        """Limit the tasks' run to the instants before the hardware's next event."""
         if self._kernel and self._events and self._events.next_us is not None:
             self._kernel.stop_before(self._events.next_us - self._booted_us)
 
@@ -128,12 +129,12 @@ class VirtualBoard:
         self._console(self.now_us, text)
 
     def reset(self) -> None:
-        """Let whoever boots the processor do so before its tasks go on."""
+        """Notify the owner, who reboots the processor before its tasks continue."""
         self.on_reset(self.now_us)
         self._let_hardware_go_first()
 
     def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
-        """Ask the world."""
+        """Pass a request for a failure to the world."""
         result = self.on_failure(self.now_us, unit, failing, instance)
         self._let_hardware_go_first()
         return result

@@ -2,7 +2,7 @@
 
 A page is loaded into a buffer in packets of up to 25 bytes, written to flash with one command, and can be read back.
 Writing replaces a page and takes no time. What is flashed is kept and can be compared; the emulated firmware is
-Python and starts whatever the flash holds. Facts: reference/crazyflie-clients-and-protocol.md 3.5 and Bitcraze's
+Python and starts whatever the flash holds. Facts: cflib's bootloader module and Bitcraze's
 two bootloaders.
 """
 
@@ -31,7 +31,7 @@ class Target:
     number: int
     buffer_pages: int
     flash_pages: int
-    first_page: int  # below it lies the bootloader
+    first_page: int  # the bootloader lies below it
     flash: bytearray = field(init=False, repr=False)
     buffer: bytearray = field(init=False, repr=False)
 
@@ -49,7 +49,7 @@ class Bootloader:
         self.malformed = 0
 
     def answer(self, packet: bytes) -> bytes | None:
-        """Return the answer to a packet, None when it asks for none; what cannot be read is counted."""
+        """Return the answer to a packet, None when it needs none; malformed packets are counted."""
         if len(packet) < 3 or packet[0] != HEADER or packet[1] not in (STM32, NRF51):
             return None
         target = self.stm32 if packet[1] == STM32 else self.nrf51

@@ -1,7 +1,7 @@
 """The motion capture cameras: noisy poses of the plant, late, sometimes missing or wrong.
 
-A pose is the truth with noise on it or, with `markers.enabled`, what eight markers make of it (`hil.devices.rigid_body`).
-Computes frames and when they arrive; the harness exposes at `period_us` and delivers.
+A pose is the truth with noise or, with `markers.enabled`, the fit to eight markers (`hil.devices.rigid_body`).
+It computes frames and their arrival; the harness exposes at `period_us` and delivers.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ HALF_TURN = (0.0, 0.0, 0.0, 1.0)  # about z, w x y z
 class VirtualMocap:
     """The cameras. Plain attributes that may change in flight:
 
-    `dropout`, `outlier` (0..1) share of frames; `wrong_by` [m] how far every position is off, in random directions;
+    `dropout`, `outlier` (0..1) share of frames; `wrong_by` [m] error of every position, in random directions;
     `swapped_by` [m] markers are swapped: poses turned by 180 degrees about z of B and shifted along its x; 0: they are not;
-    `more_latency_us` on top of the configured one. `sighting` is what the last exposure saw of the markers, None without.
+    `more_latency_us` on top of the configured one. `sighting` is the last exposure's view of the markers, None without
+    markers.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class VirtualMocap:
         self._config = config
         self._camera_us = max(0, config.latency_us - config.processing_us)
         self._rng = rng
-        # Streams of their own, so that faults leave the noise of the other frames as it was, and one another alone.
+        # Streams of their own, so that a fault changes neither the noise of the other frames nor the other faults.
         self._rng_outlier, self._rng_dropout, self._rng_wrong = rng.spawn(3)
         self._draws: list[list[float]] = []
         self.dropout = config.dropout
@@ -57,9 +58,9 @@ class VirtualMocap:
         self._arrival_us = 0  # of the last frame
 
     def expose(self, now_us: int, plant: Plant) -> tuple[MocapFrame, int]:
-        """Return what the cameras see of the plant as it is now, and when that is at the ground station.
+        """Return the frame of the plant as it is now, and its arrival at the ground station.
 
-        Frames do not overtake one another. Whatever is late is late in the cameras' computer, the network takes no time.
+        Frames do not overtake one another. All delay arises in the cameras' computer; the network takes no time.
         """
         latency_us = self._config.latency_us + round(self.more_latency_us)
         self._arrival_us = arrival_us = max(self._arrival_us, now_us + latency_us)
@@ -70,7 +71,7 @@ class VirtualMocap:
         return frame, arrival_us
 
     def _pose(self, plant: Plant) -> tuple[Vector, Quaternion] | None:
-        """Return the pose with all that is wrong with it, None when the body is not tracked."""
+        """Return the pose with its errors, None when the body is not tracked."""
         pose = self._noisy_pose(plant) if self.markers is None else self._solved_pose(self.markers, plant)
         outlier = self.outlier > 0.0 and self._rng_outlier.random() < self.outlier
         offset = _direction(self._rng_outlier) if outlier else NOWHERE
@@ -100,7 +101,7 @@ class VirtualMocap:
         return (px + s * x, py + s * y, pz + s * z), q_WB
 
     def _solved_pose(self, markers: VirtualMarkers, plant: Plant) -> tuple[Vector, Quaternion] | None:
-        """Return what the markers say, None when they do not say enough."""
+        """Return the pose fitted to the markers, None when too few are visible."""
         self.sighting = markers.look(plant.p_WB, plant.q_WB)
         return self.sighting.pose
 

@@ -11,7 +11,7 @@ MARKERS = 8  # on the robot
 
 
 class ImuConfig(BaseModel):
-    """What this specimen of the sensor does to the truth."""
+    """The errors of this specimen of the sensor."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -23,7 +23,7 @@ class ImuConfig(BaseModel):
         0.02 * math.sqrt(10),
         ge=0,
         le=5,
-        description="white, per sample [rad/s]: the mean of ten has 0.02; physics.md section 6",
+        description="white, per sample [rad/s]: the mean of ten has 0.02; assumed",
     )
     accel_noise: float = Field(
         0.05,
@@ -31,9 +31,7 @@ class ImuConfig(BaseModel):
         le=50,
         description="white, per sample [m/s2]; estimate; the filter does not use it",
     )
-    gyro_bias: float = Field(
-        0.003, ge=0, le=1, description="rms over specimens, per axis [rad/s]; physics.md section 6"
-    )
+    gyro_bias: float = Field(0.003, ge=0, le=1, description="rms over specimens, per axis [rad/s]; assumed")
     accel_bias: float = Field(
         0.2, ge=0, le=10, description="rms over specimens, per axis [m/s2]; estimate, 20 mg"
     )
@@ -62,34 +60,31 @@ class MocapConfig(BaseModel):
         le=1_000_000,
         description="of these, in the cameras' computer [us]: the rest is exposure and transfer; assumed",
     )
-    position_noise: float = Field(
-        0.0005, ge=0, le=0.1, description="white, per axis [m]; physics.md section 6"
-    )
-    rotation_noise: float = Field(
-        0.004, ge=0, le=0.5, description="white, per axis of B [rad]; physics.md section 6"
-    )
+    position_noise: float = Field(0.0005, ge=0, le=0.1, description="white, per axis [m]; assumed")
+    rotation_noise: float = Field(0.004, ge=0, le=0.5, description="white, per axis of B [rad]; assumed")
     dropout: Probability = Field(0.0, description="share of frames in which the body is not tracked")
     outlier: Probability = Field(
         0.0, description="share of frames with a wrong position, e.g. swapped markers"
     )
     outlier_size: float = Field(
-        0.3, gt=0, le=5, description="how far a wrong position lies off, random direction [m]; chosen"
+        0.3, gt=0, le=5, description="error of a wrong position, random direction [m]; chosen"
     )
 
 
 class MarkersConfig(BaseModel):
-    """Markers one by one, instead of the pose-level noise of `[mocap]`: slower, but what is lost is lost by geometry."""
+    """Markers one by one, instead of the pose-level noise of `[mocap]`: slower, but losses follow from geometry."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     enabled: bool = Field(
-        False, description="poses come from markers; `mocap.position_noise` and `rotation_noise` rest then"
+        False,
+        description="poses come from markers; `mocap.position_noise` and `rotation_noise` are then unused",
     )
     noise: float = Field(
         0.0011,
         ge=0,
         le=0.1,
-        description="of each marker, white, per axis [m]; makes the pose's of physics.md section 6",
+        description="of each marker, white, per axis [m]; makes the pose's of assumed",
     )
     cameras: int = Field(5, ge=2, le=64, description="evenly around the tunnel; paper, Motion capture system")
     camera_distance: float = Field(2.5, gt=0.5, le=20, description="from the tunnel's axis [m]; chosen")
@@ -110,7 +105,7 @@ class MarkersConfig(BaseModel):
         0.0, description="share of frames in which two markers, any two, have each other's label"
     )
     ghosts: int = Field(
-        0, ge=0, le=100, description="reflections near the robot that are no markers, per frame"
+        0, ge=0, le=100, description="reflections near the robot that are not markers, per frame"
     )
 
     @model_validator(mode="after")
@@ -167,7 +162,7 @@ class RadioConfig(BaseModel):
         0,
         ge=0,
         le=1_000_000,
-        description="delay of every answer on its way to the host, uniform from 0 [us]; a fault",
+        description="delay of every answer on the way to the host, uniform from 0 [us]; a fault",
     )
 
 
@@ -180,7 +175,7 @@ class SerialConfig(BaseModel):
         921_600,
         ge=9600,
         le=3_000_000,
-        description="bits on the line, 10 per byte [1/s]; as PX4's companion ports",
+        description="bits on the line, 10 per byte [1/s]; as on PX4's companion ports",
     )
     receive_buffer: int = Field(
         512, ge=128, le=65_536, description="of the board, between interrupt and reader [bytes]; choice"
@@ -199,7 +194,7 @@ class SerialConfig(BaseModel):
         1000,
         ge=0,
         le=100_000,
-        description="between program and line, each way [us]; latency timer of FTDI adapters with low_latency",
+        description="between program and line, in each direction [us]; latency timer of FTDI adapters with low_latency",
     )
     uplink_bit_error_rate: float = Field(0.0, ge=0, le=1, description="wrong bits to the board [1]; a fault")
     downlink_bit_error_rate: float = Field(

@@ -1,7 +1,7 @@
-"""A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, boards that may hear it.
+"""A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, boards within reach.
 
-Here the host is real software, so every exchange happens, empty polls included. What happens to one on the air is
-`hil.devices.shockburst`. With acknowledgements switched off a packet is sent once and the host reads nothing. What goes to
+Here the host is real software, so every exchange happens, empty polls included. Losses on the air are in
+`hil.devices.shockburst`. With acknowledgements switched off a packet is sent once and the host reads nothing. A packet to
 the address of all boards reaches every board on that channel, and none of them answers.
 """
 
@@ -20,7 +20,7 @@ Answer = Callable[[int, bytes], None]  # (now_us, what the host reads from the d
 SET_CHANNEL, SET_ADDRESS, SET_RATE, SET_RETRIES, SET_ACKS = 0x01, 0x02, 0x03, 0x06, 0x10  # vendor requests
 ACKNOWLEDGED = 0x01  # status byte; retries are in its upper half
 NOT_ACKNOWLEDGED = b"\x00"
-NOWHERE = Air(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # to a board that is not there
+NOWHERE = Air(1.0, 1.0, 0.0, 0.0, 0.0, 0.0)  # to an absent board
 
 
 class VirtualDongle:

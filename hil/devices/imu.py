@@ -10,10 +10,11 @@ import math
 
 import numpy as np
 
+from firmware_py.board import ImuCounts
 from firmware_py.elementary import tan
 from hil.devices import imu_counts as at
 from hil.devices.config import ImuConfig
-from hil.devices.imu_counts import COS, SIN, Counts, View, channels
+from hil.devices.imu_counts import COS, SIN, View, channels
 from hil.errors import LabError
 from hil.world.motion import GRAVITY
 from hil.world.noise import normal
@@ -36,7 +37,7 @@ def low_pass(bandwidth: float) -> tuple[float, float, float]:
 class VirtualImu:
     """One specimen of the sensor: its biases are drawn from `rng` when it is made.
 
-    `noise_scale`, `rate_bias` (p, q, r [rad/s] in B), `rate_range` [rad/s] and `frozen` are as they were last set.
+    `noise_scale`, `rate_bias` (p, q, r [rad/s] in B), `rate_range` [rad/s] and `frozen` hold the values last set.
     """
 
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
@@ -54,7 +55,7 @@ class VirtualImu:
         self.set_noise_scale(1.0)
         self.set_rate_bias(0.0, 0.0, 0.0)
 
-    def sample(self, plant: Plant) -> Counts:
+    def sample(self, plant: Plant) -> ImuCounts:
         """Return gyro x y z and accelerometer x y z counts, in S, of the plant as it is now."""
         if not self._draws:
             self._draws = list(normal(self._rng, (NOISE_ROWS, 6)))
@@ -73,7 +74,7 @@ class VirtualImu:
         self._rows[:3, at.FAULT_BIAS] = COS * p + SIN * q, COS * q - SIN * p, r
 
     def set_rate_range(self, rate: float) -> None:
-        """Let the gyro saturate at +-`rate` [rad/s, about the axes of S] or, if that is less, at its full scale."""
+        """Make the gyro saturate at +-`rate` [rad/s, about the axes of S] or, if that is less, at its full scale."""
         self.rate_range = rate
         self._rows[:3, at.RANGE] = min(max(round(rate * GYRO_COUNTS), 1), COUNTS)
 

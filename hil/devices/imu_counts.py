@@ -1,4 +1,4 @@
-"""What a BMI088 makes of rates and specific force: filtered, disturbed and rounded to int16 counts; compiled.
+"""The BMI088's measurement of rates and specific force: filtered, disturbed and rounded to int16 counts; compiled.
 
 Sensor frame S is B turned about z, as the chip is soldered on the original board; counts come in S.
 """
@@ -10,17 +10,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.board import ImuCounts
 from firmware_py.elementary import cos, sin
 from hil.world import layout as at
 from hil.world.compiled import compiled
 
 S_AZIMUTH = -math.pi / 4  # [rad] of S's x axis in B: then p = (gx + gy)/sqrt2, q = (gy - gx)/sqrt2, r = gz
 
-Counts = tuple[int, int, int, int, int, int]
 View = NDArray[np.float64]
 
 
-# Where things lie in the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
+# Layout of the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
 NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, FIELDS = range(13)
 COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)
 
@@ -38,7 +38,7 @@ def channel(row: View, truth: float, draw: float) -> int:
 
 
 @compiled
-def channels(rows: View, truth: View, draws: View) -> Counts:
+def channels(rows: View, truth: View, draws: View) -> ImuCounts:
     """Turn rates and specific force of the plant's array, in B, into S and then into counts."""
     ox, oy, fx, fy = (
         truth[at.OMEGA],

@@ -1,9 +1,9 @@
 """Eight reflective markers on the robot, and which of them the cameras around the tunnel see.
 
-Where the markers of the real robot sit is published nowhere; here they sit on what is rigid, which the flaps are not: four
-on the flap axes, which stay where they are when the flaps turn, two on posts over the base plate, two on the frame below.
+The places of the real robot's markers are not published; here they sit on rigid parts, which excludes the flaps: four
+on the flap axes, which do not move when the flaps turn, two on posts over the base plate, two on the frame below.
 No two arms are alike, so that no other assignment of labels fits (the closest misses by 19 mm, test_markers.py), any
-three markers are far from one line, and they spread far enough for both noise figures of physics.md to come out of one:
+three markers are far from one line, and they spread far enough for both noise figures of `[mocap]` to come out of one:
 1.1 mm per marker and axis makes 0.4 mm and 0.004 rad of the pose. `hil.devices.rigid_body` makes points and poses of
 what is seen.
 """
@@ -25,7 +25,7 @@ from hil.world.geometry import weigh
 
 COUNT = MARKERS
 DIAMETER = 0.014  # [m]; chosen, a common size
-TRUNK_RADIUS = 0.03  # [m] of what hangs around the centre of mass: batteries and boards; chosen
+TRUNK_RADIUS = 0.03  # [m] of the parts around the centre of mass: batteries and boards; chosen
 TRUNK_AREA = TRUNK_RADIUS * TRUNK_RADIUS  # [m2]
 
 Points = NDArray[np.float64]
@@ -35,13 +35,13 @@ NO_POINTS: Points = np.zeros((0, 3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting:
-    """What was seen of one robot's markers in one exposure; row k belongs to label k + 1."""
+    """The view of one robot's markers in one exposure; row k belongs to label k + 1."""
 
-    points: Points  # (8, 3) [m] in W; of labels that are not seen: where the body that was fitted has them
+    points: Points  # (8, 3) [m] in W; of labels that are not seen: their places on the fitted body
     seen: Mask  # (8,)
-    residuals: Points  # (8,) [m] distance from the body that was fitted; 0 where nothing is seen or fitted
+    residuals: Points  # (8,) [m] distance from the fitted body; 0 where nothing is seen or fitted
     ghosts: Points  # (N, 3) [m] in W
-    error: float  # [m] mean residual of what is seen
+    error: float  # [m] mean residual of the markers seen
     pose: tuple[Vector, Quaternion] | None  # p_WB [m], q_WB w x y z; None: not tracked
 
     @property
@@ -74,9 +74,9 @@ def marker_places(geometry: GeometryConfig, ground: GroundConfig) -> Points:
 
 
 class Cameras:
-    """Where the cameras stand, and what the robot itself hides from them.
+    """The cameras' places, and what the robot itself hides from them.
 
-    Base plate and flaps are one flat square for that, whatever the flaps do; what hangs below them is a ball around the
+    Base plate and flaps are one flat square for that, whatever the flap angles; the parts below them are a ball around the
     centre of mass. A marker is placed when enough cameras have it in sight.
     """
 
@@ -111,7 +111,7 @@ class Cameras:
         return np.asarray((over * camera_over < 0.0) & (x < reach) & (y < reach))
 
     def _behind_trunk(self, p_BC: Points) -> Mask:
-        """Which rays, marker by camera, pass through the ball on their way to the camera, which is outside."""
+        """Which rays, marker by camera, pass through the ball towards the camera, which is outside."""
         along = product(self._places, p_BC.T) - self._squares  # marker times ray
         rays = (p_BC**2).sum(axis=1) - self._squares - 2.0 * along  # squared lengths
         return np.asarray((along < 0.0) & (self._squares * rays - along**2 < TRUNK_AREA * rays))

@@ -1,10 +1,10 @@
 """The board's radio chip, which is also the master of its power: safelink on the wire, power switch, reset.
 
 Every packet heard is acknowledged with the head of a queue of 8. Safelink's counters stand in the headers' two spare bits:
-a packet that repeats the last one is not passed on again, and an answer is repeated until the host's says that it arrived.
-With nothing else to say the firmware acknowledges with its signal strength, the bootloader with nothing at all.
-The firmware also hears what is sent to all boards on its channel, which nobody acknowledges.
-Facts: Bitcraze's nRF51 firmware and bootloader, reference/crazyflie-clients-and-protocol.md 3.3 and 3.5.
+a packet that repeats the last one is not passed on again, and an answer is repeated until the host's counter confirms it.
+With an empty queue the firmware acknowledges with its signal strength, the bootloader with an empty packet.
+The firmware also receives packets to all boards on its channel, which are not acknowledged.
+Facts: Bitcraze's nRF51 crazyflie2-nrf-firmware and crazyflie2-nrf-bootloader.
 """
 
 import struct
@@ -26,11 +26,8 @@ RADIO = 3  # type of the packets that set channel, data rate and power of the ra
 RESET_DELAY_US = 100_000
 RETUNE_DELAY_US = 1_000  # the answer leaves first
 BROADCAST = bytes.fromhex("FFE7E7E7E7")  # address of all boards
-RATES = (
-    250_000,
-    1_000_000,
-    2_000_000,
-)  # [bit/s] by number, in vendor requests, commands and the configuration block
+# [bit/s] by number, in vendor requests, commands and the configuration block.
+RATES = (250_000, 1_000_000, 2_000_000)
 
 ALL_OFF, SYSTEM_OFF, SYSTEM_ON, BATTERY, RESET, RESET_INIT = 0x01, 0x02, 0x03, 0x04, 0xF0, 0xFF
 SET_CHANNEL, SET_RATE = 1, 2  # commands of the type RADIO; that for the power changes nothing here
@@ -38,7 +35,7 @@ SET_CHANNEL, SET_RATE = 1, 2  # commands of the type RADIO; that for the power c
 
 @dataclass(frozen=True, slots=True)
 class RadioSettings:
-    """What two radios must have in common to hear each other."""
+    """The settings that two radios must share to hear each other."""
 
     channel: int  # 0..125, 2400 MHz + channel
     bits_per_second: int
@@ -46,7 +43,7 @@ class RadioSettings:
 
 
 class Power(Enum):
-    """Which parts of the board run what."""
+    """Which parts of the board are powered, and what runs."""
 
     OFF = auto()
     RADIO_ONLY = auto()  # the STM32 is off
@@ -71,7 +68,7 @@ class Processor(Protocol):
         ...
 
     def greet(self, now_us: int) -> None:
-        """Notice that a new client is on the radio."""
+        """Note that a new client is on the radio."""
         ...
 
     def received(self, now_us: int, data: bytes, broadcast: bool) -> None:
@@ -79,14 +76,14 @@ class Processor(Protocol):
         ...
 
     def polled(self, now_us: int) -> None:
-        """Notice an empty packet from the radio."""
+        """Note an empty packet from the radio."""
         ...
 
 
 class Nrf51:
     """One board's radio chip; `settings` are those of its firmware, `chip` the 6 bytes of its factory address.
 
-    `air` is what happens to packets between it and whoever talks to it.
+    `air` has the losses of packets between it and its partner.
     """
 
     def __init__(
@@ -113,7 +110,7 @@ class Nrf51:
         self._forget()
 
     def _forget(self) -> None:
-        """Lose what was in memory."""
+        """Clear the memory."""
         self._end = BoardEnd(self._capacity)
         self._service = b""
         self._answer = b""  # sent last, to be repeated
@@ -127,7 +124,7 @@ class Nrf51:
         return settings == (self._bootloader_settings if booting else self.settings)
 
     def hears_all(self, settings: RadioSettings) -> bool:
-        """Whether a packet sent with these settings reaches this board among all others."""
+        """Whether a packet to all boards sent with these settings reaches this board."""
         own = self.settings
         firmware = self.power in (Power.RADIO_ONLY, Power.RUNNING)
         return firmware and settings == RadioSettings(own.channel, own.bits_per_second, BROADCAST)
@@ -170,7 +167,7 @@ class Nrf51:
             self._take(now_us, data, broadcast=True)
 
     def _take(self, now_us: int, data: bytes, broadcast: bool) -> None:
-        """Do what a packet of the firmware is for."""
+        """Execute a packet of the firmware."""
         if _kind(data) == RADIO and len(data) > 3:
             self._events.at(now_us + RETUNE_DELAY_US, partial(self._retune, data[2], data[3]))
         elif len(data) > 1 or data[0] & NULL_MASK != NULL:
@@ -179,7 +176,7 @@ class Nrf51:
             self._processor.polled(now_us)
 
     def _retune(self, command: int, value: int, now_us: int) -> None:
-        """Set the radio until the next start of the processor, which sets it to what its EEPROM says."""
+        """Set the radio until the next start of the processor, which sets it to the values in its EEPROM."""
         own = self.settings
         if command == SET_CHANNEL:
             self.settings = RadioSettings(value, own.bits_per_second, own.address)
@@ -187,7 +184,7 @@ class Nrf51:
             self.settings = RadioSettings(own.channel, RATES[value], own.address)
 
     def _next_answer(self, now_us: int) -> bytes:
-        """Return what comes after the answer that has arrived."""
+        """Return the answer after the one that has arrived."""
         end = self._end
         end.confirm()
         if self._service:
@@ -267,5 +264,5 @@ class Nrf51:
 
 
 def _kind(data: bytes) -> int | None:
-    """Return the type of a packet to the radio chip, None of one to the processor."""
+    """Return the type of a packet to the radio chip, None for one to the processor."""
     return data[1] if len(data) > 1 and data[0] & NULL_MASK == NULL else None

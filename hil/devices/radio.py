@@ -1,8 +1,8 @@
 """The Crazyradio between ground station and board in lockstep: a modelled host, which polls without pause.
 
-One exchange carries at most one packet each way: the host hands a packet (or an empty poll) to the dongle over USB, and
-the board's answer goes back to it. What the dongle repeats in vain the host repeats with the same contents; safelink's
-counters make that exactly once and in order. What happens on the air is `hil.devices.shockburst`.
+One exchange carries at most one packet in each direction: the host hands a packet (or an empty poll) to the dongle over USB,
+and the board's answer goes back to it. A packet that the dongle repeats in vain is repeated by the host with the same
+contents; safelink's counters make delivery exactly once and in order. Losses on the air are in `hil.devices.shockburst`.
 
 Exchanges that carry something are events. The empty polls in between are not: when something is ready, the
 poll that it meets is computed (the first of the pause) or drawn (any later one: the host's jitter has made
@@ -40,12 +40,12 @@ from hil.events import EventQueue
 Receiver = Callable[[int, bytes], object]  # (now_us, packet)
 
 POLL_BYTES: Final = 1  # an empty poll is one header byte
-EMPTY_ACK_BYTES: Final = 3  # with nothing else to say the nRF51 reports its signal strength
+EMPTY_ACK_BYTES: Final = 3  # with an empty queue the nRF51 reports its signal strength
 
 
 @dataclass(slots=True)
 class DirectionCounters:
-    """Packets of one direction. Sent packets are delivered, waiting, under way, or (uplink) dropped."""
+    """Packets of one direction. Sent packets are delivered, waiting, in progress, or (uplink) dropped."""
 
     sent: int = 0  # accepted
     dropped: int = 0  # uplink: the oldest was dropped; downlink: the newest was refused
@@ -63,11 +63,11 @@ class DirectionCounters:
 
 
 def _nobody_asks(now_us: int) -> None:
-    """Let a poll pass: its host is no dongle."""
+    """Ignore a poll: its host is not a dongle."""
 
 
 class VirtualRadio:
-    """Carries packets of 1..32 bytes both ways through `medium`; `connect` it before use."""
+    """Carries packets of 1..32 bytes in both directions through `medium`; `connect` it before use."""
 
     def __init__(
         self,
@@ -88,14 +88,14 @@ class VirtualRadio:
         self._rng = rng
         self._uniforms: list[float] = []
         self._transmitter = Transmitter(config, events, self._uniform)
-        self.air = self._transmitter.counters  # of the exchanges that are simulated
+        self.air = self._transmitter.counters  # of the simulated exchanges
         self._board = BoardEnd(config.downlink_queue, safelink=True)
         self._up_queue: deque[Waiting] = deque()
-        self._busy = False  # an exchange is planned or under way
+        self._busy = False  # an exchange is planned or in progress
         self._idle_since_us = 0
         self._counter = 0  # safelink's, of the packets to the board
         self._uploading: Waiting | None = None  # kept until it is answered
-        self._answer_size: int | None = None  # of the exchange under way, once the board has heard it
+        self._answer_size: int | None = None  # of the exchange in progress, once the board has heard it
 
     def connect(
         self, on_board: Receiver, on_ground: Receiver, on_poll: Callable[[int], object] = _nobody_asks
@@ -141,7 +141,7 @@ class VirtualRadio:
     # The host: when the next exchange begins, and with what.
 
     def _wake_for_uplink(self, now_us: int) -> None:
-        """A packet may be ready at the host; on an idle link it follows the empty poll under way."""
+        """A packet may be ready at the host; on an idle link it follows the empty poll in progress."""
         if not self._busy and self._up_queue and self._up_queue[0].ready_us <= now_us:
             _, end_us, answered = self._poll_at(now_us)
             self._plan(end_us, answered, now_us)
@@ -161,7 +161,7 @@ class VirtualRadio:
         self._exchange(now_us)
 
     def _poll_at(self, t_us: int) -> tuple[int, int, bool]:
-        """The empty poll under way at `t_us` on an idle link: its begin, its end, whether it is answered."""
+        """The empty poll in progress at `t_us` on an idle link: its start, its end, whether it is answered."""
         config = self._config
         host_us = 2 * config.usb_us + config.usb_jitter_us // 2
         length_us = host_us + exchange_us(POLL_BYTES, EMPTY_ACK_BYTES, config.bits_per_second)
@@ -211,7 +211,7 @@ class VirtualRadio:
             return
         self._counter ^= 1
         self._uploading = None
-        received = self._board.confirm()  # the next poll would say it, which may not be simulated
+        received = self._board.confirm()  # the next poll would confirm it, which may not be simulated
         if self._board.queue or (self._up_queue and self._up_queue[0].ready_us <= now_us):
             self._begin(now_us)
         else:
@@ -236,7 +236,7 @@ class VirtualRadio:
 def _polls_met(
     lost: float, length_us: int, host_us: int, again_us: int
 ) -> tuple[tuple[int, ...], tuple[float, ...], float]:
-    """Lengths [us] of polls by number of repetitions, and how likely one meets them: by frequency and by length."""
+    """Lengths [us] of polls by number of repetitions, and the chance to meet them: by frequency and by length."""
     lengths = (
         *(length_us + tries * again_us for tries in range(RETRIES + 1)),
         host_us + (RETRIES + 1) * again_us,

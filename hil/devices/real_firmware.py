@@ -5,16 +5,19 @@ supervisor, its servo counts, and some counters. What the core estimates is not 
 Corrections go to the board as in a real flight. Between the instant that the board's gyro shows and the one at which its
 flaps act lie the way of the samples to the board, their wait there, and the way of the counts back: the loop's own delay,
 which is measured. A pose tells an age that contains the link's way, as every pose does, half of what is no wait.
+
+The plant follows the board: when the board is late the plant waits, and when a sample is late the flight on board stands
+still. So a link that is too slow makes the flight slower than real time, and its delay no longer than the window of samples
+(`hil.devices.sample_window`).
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import nan
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -26,22 +29,22 @@ from firmware_py.wire.core_port import (
     CHANNEL_LOOP,
     HIL_WAITING,
     PORT_CORE,
-    SAMPLES_MAX,
     Hil,
     Looped,
     decode_looped,
-    encode_samples,
     loop,
 )
 from firmware_py.wire.crtp import Packet, decode_ext_pose, encode_ext_pose
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
+from hil.devices.sample_window import SampleWindow
 from hil.errors import LabError
 
 SAMPLE_US = 1000
 SILENCE_US = 1_000_000
-BATCH_US = (SAMPLES_MAX - 1) * SAMPLE_US // 2  # that a sample waits on the mean for its packet
+LATE_MAX_US = 10_000  # that the plant makes up for behind a wait, so that samples are on their way at once
+LOOK_S = 0.001  # between two looks at the link, while the plant waits
 SLEW_US = 25  # by which time is moved, a hundred times a second, for each sample that too many wait on board
 SLEW_MAX_US = 1000
 KEPT = 50  # of what the board told, half a second: what the loop adds is their mean
@@ -75,16 +78,29 @@ class _Clock:
         """Nothing: what a board's tasks do is not told."""
 
 
+class Wall(Protocol):
+    """The wall clock, and how simulated time lies on it."""
+
+    def wall_us(self) -> int:
+        """Return what the wall clock shows."""
+        ...
+
+    def late_us(self, now_us: int) -> int:
+        """Return by how much an instant of simulated time is over."""
+        ...
+
+    def shift(self, by_us: int) -> None:
+        """Let simulated time be later by that, or earlier."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class RealBoard:
-    """A board that is to fly in the loop; `moving`: its servos move as well.
-
-    `slew` lets simulated time be later by microseconds, or earlier.
-    """
+    """A board that is to fly in the loop; `moving`: its servos move as well."""
 
     client: CoreClient
     moving: bool
-    slew: Callable[[int], None]
+    wall: Wall
 
 
 class RealFirmware:
@@ -102,6 +118,7 @@ class RealFirmware:
         self.told: Looped | None = None  # by the board, last
         self.delay_us = 0  # from a sample to the counts that came of it, lately
         self.added_us = 0  # the link's way, which corrections tell on top of their age
+        self.stood_us = 0  # how long simulated time stood still in all, because the board was late
         self.signals: Any = SimpleNamespace(
             estimate=np.full(16, nan, np.float32), counters=np.zeros(len(COUNTERS), np.int32),
             u=np.full(4, nan, np.float32), flap=np.full(4, nan, np.float32), count=np.zeros(4, np.int32),
@@ -109,10 +126,10 @@ class RealFirmware:
         )  # fmt: skip
         self._board = board
         self._client = real.client
-        self._slew = real.slew
+        self._wall = real.wall
         self._mode = Hil.MOVING if real.moving else Hil.STILL
-        self._samples: list[Sequence[int]] = []
-        self._count = 0  # samples so far
+        self._window = SampleWindow()
+        self._correction: bytes | None = None  # that waits for the link
         self._heard_us = 0
         self._delays: deque[tuple[int, int]] = deque(maxlen=KEPT)  # whole, and what of it waited in buffers
         self._about = real.client.begin()
@@ -121,17 +138,21 @@ class RealFirmware:
         return f"{self._client.name}: core {self._about.core}, profile {self._about.profile}, in the loop"
 
     def imu_ready(self) -> None:
-        """The virtual IMU has a sample: hand it on, and take what the board has told."""
-        if self._count == 0:  # what compiles has been compiled: from now on samples come
+        """The virtual IMU has a sample: hand it on, take what the board has told, and wait for it when it is late."""
+        if self._window.count == 0:  # what compiles has been compiled: from now on samples come
             self._client.execute([loop(self._mode)])
-        self._samples.append(self._board.read_imu()[:3])
-        self._count += 1
-        if len(self._samples) == SAMPLES_MAX:
-            data = encode_samples(self._count - SAMPLES_MAX, self._samples)
-            self._client.packets.tell(crtp.encode(Packet(PORT_CORE, CHANNEL_LOOP, data)))
-            self._samples.clear()
-        for raw in self._client.packets.told():
-            self._hear(raw)
+        self._window.put(self._board.read_imu()[:3])
+        self._exchange()
+        if not self._window.full:
+            return
+        start_us = self._wall.wall_us()
+        while self._window.full:
+            self._exchange(LOOK_S)
+            if self._wall.wall_us() - start_us > SILENCE_US:
+                raise self._silent()
+        too_late_us = max(0, self._wall.late_us(self.kernel.now_us) - LATE_MAX_US)
+        self.stood_us += too_late_us
+        self._wall.shift(too_late_us)
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
         """Hand a correction on, with the age that it has for this board; nothing else is for it."""
@@ -141,10 +162,11 @@ class RealFirmware:
         try:
             pose = decode_ext_pose(packet.data)
         except WireError:
-            self._client.packets.tell(data)
+            self._client.packets.send_any(data)
             return
         age_us = None if pose.age_us is None else pose.age_us + self.added_us
-        self._client.packets.tell(encode_ext_pose(pose.p_GB, pose.q_GB, age_us))
+        self._correction = encode_ext_pose(pose.p_GB, pose.q_GB, age_us)
+        self._send()
 
     def radio_polled(self) -> None:
         """Nothing: the board's own radio is polled."""
@@ -155,7 +177,7 @@ class RealFirmware:
     def check_watchdog(self) -> None:
         """Raise `LinkError` when the board has told nothing for too long."""
         if self.kernel.now_us - self._heard_us > SILENCE_US:
-            raise LinkError(f"{self._client.name}: silent for {SILENCE_US * 1e-6:.0f} s")
+            raise self._silent()
 
     def add_thief(self) -> Thief:
         """Refuse: there is no task here that could take processor time."""
@@ -164,6 +186,23 @@ class RealFirmware:
     def leave(self) -> None:
         """Let the board go back to its own gyro."""
         self._client.execute([loop(Hil.OFF)])
+
+    def _silent(self) -> LinkError:
+        return LinkError(f"{self._client.name}: silent for {SILENCE_US * 1e-6:.0f} s")
+
+    def _exchange(self, timeout_s: float = 0.0) -> None:
+        """Take what the board tells, within a time, and send what the link and the board have room for."""
+        for raw in self._client.packets.received(timeout_s):
+            self._hear(raw)
+        self._send()
+
+    def _send(self) -> None:
+        packets = self._client.packets
+        if packets.ready and self._correction is not None:  # first: there are few of them
+            packets.send_any(self._correction)
+            self._correction = None
+        if packets.ready and (data := self._window.packet(self._wall.wall_us())) is not None:
+            packets.send_any(crtp.encode(Packet(PORT_CORE, CHANNEL_LOOP, data)))
 
     def _hear(self, raw: bytes) -> None:
         packet = crtp.decode(raw)
@@ -179,14 +218,15 @@ class RealFirmware:
         counters[COUNTERS.index("pose_age_us")] = told.age_us
         self.signals.count[:] = told.counts
         self._board.write_compare(told.counts)
-        if told.used:
+        if self._window.hear(told, self._wall.wall_us()) and told.fresh:
             self._measure(told)
 
     def _measure(self, told: Looped) -> None:
         """Take in how old the sample was from which these counts came, and keep as many waiting as the board wants."""
-        delay = (self._count - told.used) & 0xFFFF
-        self._delays.append((delay * SAMPLE_US, told.waiting * SAMPLE_US + BATCH_US))
+        window = self._window
+        batch_us = (window.batch - 1) * SAMPLE_US // 2  # that a sample waits on the mean for its packet
+        self._delays.append(((window.count - window.used) * SAMPLE_US, told.waiting * SAMPLE_US + batch_us))
         total_us, waited_us = (sum(values) // len(self._delays) for values in zip(*self._delays, strict=True))
         self.delay_us, self.added_us = total_us, max(0, total_us - waited_us) // 2
         surplus_us = SLEW_US * (told.waiting - HIL_WAITING)
-        self._slew(max(-SLEW_MAX_US, min(SLEW_MAX_US, surplus_us)))
+        self._wall.shift(max(-SLEW_MAX_US, min(SLEW_MAX_US, surplus_us)))

@@ -1,6 +1,6 @@
 """From the markers of one exposure to the pose of the body: noise, wrong labels, ghosts, and the best fit.
 
-Exchanging two labels leaves the fitted pose as it is or turns it by 180 degrees, and shows
+Exchanging two labels leaves the fitted pose unchanged or turns it by 180 degrees, and shows
 in the mean error; a body that fits badly is not tracked, as in Motive.
 """
 
@@ -20,18 +20,18 @@ from hil.world.fixed_order import eigen, product
 from hil.world.noise import normal
 
 NOISE_ROWS = 512  # exposures of noise drawn at once
-SPREAD = 0.01  # [m] root of the squares across the best line through markers; below, they count as collinear
-WORST_PAIR = (0, 2)  # rows: of the pairs whose exchange turns the body over, the one that fits best
+SPREAD = 0.01  # [m] root of the sum of squared distances from the best line through markers; below, they count as collinear
+WORST_PAIR = (0, 2)  # rows: of the pairs whose exchange turns the body by 180 deg, the one that fits best
 GHOST_REACH = 0.3  # [m] from the body, along each axis; chosen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The body laid through points."""
+    """The body fitted to points."""
 
     p_WB: Vector  # [m]
     q_WB: Quaternion  # w x y z
-    points: Points  # (8, 3) [m] in W: where it has its markers
+    points: Points  # (8, 3) [m] in W: the places of its markers
 
 
 class RigidBody:
@@ -39,7 +39,7 @@ class RigidBody:
 
     def __init__(self, places: Points) -> None:
         self._places = places
-        # By what is seen: centre (3,) and the places around it; None where these lie on a line.
+        # By the markers seen: centre (3,) and the places around it; None where these are collinear.
         self._parts: dict[bytes, tuple[Points, Points] | None] = {}
 
     def fit(self, points: Points, seen: Mask) -> Fit | None:
@@ -115,7 +115,7 @@ class VirtualMarkers:
         self.ghosts = float(config.ghosts)
 
     def look(self, p_WB: Points, q_WB: Points) -> Sighting:
-        """Return what is seen of a robot at a pose: (3,) [m], (4,) w x y z."""
+        """Return the sighting of a robot at a pose: (3,) [m], (4,) w x y z."""
         w, x, y, z = q_WB.tolist()
         R_WB = rotation_matrix((w, x, y, z))
         seen = self._cameras.see(p_WB, R_WB)
@@ -135,8 +135,8 @@ class VirtualMarkers:
         fit = self._body.fit(points, seen) if count >= self._config.min_markers else None
         if fit is None:
             return Sighting(points, seen, np.zeros(COUNT), ghosts, 0.0, None)
-        off = points - fit.points
-        residuals = np.sqrt((off * off).sum(axis=1)) * seen
+        errors = points - fit.points
+        residuals = np.sqrt((errors * errors).sum(axis=1)) * seen
         error = math.fsum(residuals) / count
         pose = (fit.p_WB, fit.q_WB) if error <= self._config.max_error else None
         return Sighting(np.where(seen[:, None], points, fit.points), seen, residuals, ghosts, error, pose)
@@ -150,7 +150,7 @@ class VirtualMarkers:
         return np.asarray(self.noise_scale * self._draws[self._row - 1])
 
     def _labels(self) -> NDArray[np.intp] | None:
-        """Return which marker each label is on, (8,) rows; None where each is on its own."""
+        """Return which marker each label is on, (8,) rows; None where all are correct."""
         wrong = self._config.mislabelled
         mislabelled = wrong > 0.0 and self._rng_labels.random() < wrong
         if not (mislabelled or self.swapped):

@@ -2,8 +2,8 @@
 
 `Transmitter` is the dongle's radio: it repeats a packet until it hears the answer. `BoardEnd` is what the board's radio
 chip has to keep for that: its queue, and safelink's counters, one bit per direction, which make every packet arrive once.
-Who polls stands elsewhere: `hil.devices.radio` models a host and leaves out empty polls, a dongle has a real one.
-Figures: Crazyradio, nRF24L01+, Bitcraze's nRF51 firmware, reference/crazyflie-clients-and-protocol.md part 3. Radios that
+The polling host is elsewhere: `hil.devices.radio` models one and skips empty polls, a dongle has a real one.
+Figures: Crazyradio, nRF24L01+, Bitcraze's nRF51 firmware and its documentation. Radios that
 send at the same time do not disturb each other.
 """
 
@@ -33,7 +33,7 @@ def air_us(size: int, bits_per_second: int) -> int:
 
 
 def exchange_us(up_size: int, down_size: int, bits_per_second: int) -> int:
-    """A packet and its answer, with both turn-rounds, without USB."""
+    """Duration of a packet and its answer, with both turn-rounds, without USB."""
     return 2 * TURN_ROUND_US + air_us(up_size, bits_per_second) + air_us(down_size, bits_per_second)
 
 
@@ -57,7 +57,7 @@ def packet_loss(loss: float, bit_error_rate: float, size: int) -> float:
 
 @dataclass(slots=True)
 class Air:
-    """What the air does to packets of one board, whoever talks to it; faults change it in flight."""
+    """Losses and delays of one board's packets on the air; faults change them in flight."""
 
     uplink_loss: float  # per try, 0..1
     downlink_loss: float
@@ -68,7 +68,7 @@ class Air:
 
     @classmethod
     def of(cls, config: RadioConfig) -> Air:
-        """Return what the profile says."""
+        """Return the values of the profile."""
         return cls(*(getattr(config, field.name) for field in fields(cls)))
 
     def lost_up(self, size: int) -> float:
@@ -82,7 +82,7 @@ class Air:
 
 @dataclass(slots=True)
 class AirCounters:
-    """Exchanges that happened."""
+    """Counters of exchanges."""
 
     exchanges: int = 0
     retried: int = 0  # repetitions by the dongle
@@ -115,7 +115,7 @@ class Transmitter:
         self._uniform = uniform
 
     def send(self, start_us: int, exchange: Exchange) -> None:
-        """Take a packet from the host at `start_us`; 1 + `retries` tries at most follow, each there and back."""
+        """Take a packet from the host at `start_us`; 1 + `retries` tries at most follow, each in both directions."""
         self.counters.exchanges += 1
         size, rate, usb_us = exchange.size, exchange.bits_per_second, self._config.usb_us
         next_us = again_us(size, rate)
@@ -129,7 +129,7 @@ class Transmitter:
         self._give_up(exchange, given_up_us)
 
     def _heard(self, exchange: Exchange, first: int, given_up_us: int, now_us: int) -> None:
-        """The board hears the packet and answers; what becomes of that and of all further tries is drawn at once."""
+        """The board hears the packet and answers; the outcome of that and of all further tries is drawn at once."""
         ack_size = exchange.hear(now_us)
         if ack_size is None:
             self._give_up(exchange, given_up_us)
@@ -172,9 +172,9 @@ class Waiting:
 
 
 class BoardEnd:
-    """The board's half of an exchange: what it has heard already, and what it has to say.
+    """The board's half of an exchange: what it has received already, and what it has to send.
 
-    The head of the queue stays there until the answer that carries it has arrived, and takes its place of `capacity`.
+    The head of the queue stays there until the answer that carries it has arrived, and counts towards `capacity`.
     """
 
     def __init__(self, capacity: int, safelink: bool = False) -> None:

@@ -2,9 +2,9 @@
 
 A byte takes 10 bits on the line (8N1), without flow control. At either end a receiver gathers bytes and hands them
 over as one chunk: when it has `interrupt_threshold` of them, or when the line has been silent for a byte's time. On
-board a chunk waits in the receive buffer for whoever `read`s after the interrupt; what finds no room is lost (overrun).
-At the ground an adapter on USB stands between the line and the program, one latency each way. Wrong bits are data
-bits; a wrong start or stop bit, which garbles the byte as well, is not modelled apart. Events are planned per chunk.
+board a chunk waits in the receive buffer until `read` after the interrupt; bytes that find no room are lost (overrun).
+At the ground an adapter on USB stands between the line and the program, one latency in each direction. Wrong bits are data
+bits; a wrong start or stop bit, which garbles the byte as well, is not modelled separately. Events are planned per chunk.
 """
 
 from collections.abc import Callable
@@ -27,10 +27,10 @@ Arrived = Callable[[bytes, int, int], None]  # (chunk, sent_us, now_us)
 
 @dataclass(slots=True)
 class LineCounters:
-    """Bytes of one direction. Sent bytes are delivered, overrun, cut, or under way; dropped ones were never sent."""
+    """Bytes of one direction. Sent bytes are delivered, overrun, cut, or in transit; dropped ones were never sent."""
 
     sent_bytes: int = 0  # taken from the sender
-    dropped_bytes: int = 0  # found no room at the sender
+    dropped_bytes: int = 0  # no room at the sender
     delivered_bytes: int = 0
     overrun_bytes: int = 0  # found no room on board
     cut_bytes: int = 0  # the cable was out
@@ -65,7 +65,7 @@ class _Line:
         self._arrived = arrived
         self._rng = rng
         self._free_ticks = 0  # end of the last byte
-        self._gathered = b""  # what the silence after the last byte hands over
+        self._gathered = b""  # bytes that the silence after the last byte hands over
         self._silence = 0  # its number: a later byte makes it void
         self._rate = 0.0  # of wrong bits
         self._good_bits = 0  # before the next wrong one
@@ -102,7 +102,7 @@ class _Line:
             self._arrived(chunk, sent_us, now_us)
 
     def spoil(self, data: bytes, rate: float) -> bytes:
-        """Return the data with its wrong bits; the way from one to the next is drawn."""
+        """Return the data with its wrong bits; the distance between them is drawn."""
         if rate != self._rate:
             self._rate = rate
             self._good_bits = self._draw() if rate else 0
@@ -118,14 +118,14 @@ class _Line:
         return bytes(spoilt)
 
     def _draw(self) -> int:
-        """Return how many bits are good before a wrong one: the geometric distribution, inverted."""
+        """Return the number of good bits before a wrong one: the geometric distribution, inverted."""
         if self._rate == 1.0:
             return 0
         return int(min(log_1p(-self._rng.random()) / log_1p(-self._rate), NEVER))
 
 
 class VirtualSerial:
-    """Carries bytes both ways; `connect` it before use.
+    """Carries bytes in both directions; `connect` it before use.
 
     Plain attributes that may be changed in flight: `connected` (the cable), `uplink_bit_error_rate`,
     `downlink_bit_error_rate` (0..1).
@@ -149,7 +149,7 @@ class VirtualSerial:
         self._on_ground = on_ground
 
     def uplink(self, now_us: int, data: bytes) -> None:
-        """Take bytes for the board; what finds no room at the host is dropped."""
+        """Take bytes for the board; bytes that find no room at the host are dropped."""
         self._events.at(now_us + self._config.host_latency_us, partial(self._start_up, data, now_us))
 
     def _start_up(self, data: bytes, sent_us: int, now_us: int) -> None:

@@ -39,9 +39,9 @@ __all__ = ["EXPERIMENTS", "Experiment", "find_again", "find_experiment"]
 
 
 def find_experiment(name: str) -> Experiment:
-    """Return an experiment: by its name, one that ships or that an installed package has, or FILE.py:NAME.
+    """Return an experiment: by its name, if it ships or an installed package has it, or as FILE.py:NAME.
 
-    Raises `LabError` for one that is not there, with the nearest name.
+    Raises `LabError` for an unknown one, with the nearest name.
     """
     if name in EXPERIMENTS:
         return EXPERIMENTS[name]
@@ -55,7 +55,7 @@ def find_experiment(name: str) -> Experiment:
 
 
 def find_again(name: str, source: Source | None) -> Experiment | None:
-    """Return the experiment that a run has flown; None when it is not known here, or not any more what it was."""
+    """Return the experiment that a run has flown; None when it is unknown here or has changed."""
     if source is None:
         return EXPERIMENTS.get(name)
     try:

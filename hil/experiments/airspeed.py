@@ -1,9 +1,9 @@
 """Airspeeds: the paper's 8 to 11 m/s, the hover angle adapted to each, and what this plant's lift allows.
 
 By the Table the lift at speed V and opening theta is m g (V/10)^2 (1 + (2.3/g) (25 deg - theta)): closing a flap further
-gives little more, opening it takes little away. Attitude control takes up to 8 degrees of the opening (95 % of the hover's
+gives little more, opening it costs little. Attitude control takes up to 8 degrees of the opening (95 % of the hover's
 time), so that the flaps can carry the robot between -3 and 44 degrees: 9.5 to 10.4 m/s. Outside it sinks or rises; 8 m/s
-would take 56 % more lift than at 10 m/s, and a flat plate of Floaty's size has 18 % more. Every speed is flown with the
+would need 56 % more lift than at 10 m/s, and a flat plate of Floaty's size has 18 % more. Every speed is flown with the
 flaps opened through zero.
 """
 
@@ -29,7 +29,7 @@ FOR_ATTITUDE = radians(8.0)  # [rad] of the opening
 
 
 def hover_angle(speed: float) -> float:
-    """Return the opening [rad] at which the lift is the weight at `speed` [m/s], whether or not flaps can have it."""
+    """Return the opening [rad] at which the lift is the weight at `speed` [m/s], even outside the flaps' range."""
     return DESIGN_ANGLE - ((DESIGN_SPEED / speed) ** 2 - 1.0) / LIFT_PER_RAD
 
 
@@ -43,11 +43,11 @@ def attainable() -> tuple[float, float]:
 
 
 def holding(speed: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return the mean error in height over the second half, and whether that is what the lift says."""
+    """Return the mean error in height over the second half, and whether that agrees with the lift model."""
     low, high = attainable()
     times, height = column(flight, "t"), position_error(flight)[:, 2]
-    off = float(abs(height[times >= times.mean()].mean()))
-    return {"height_off": off, "as_computed": float((off <= BOX) == (low <= speed <= high))}
+    error = float(abs(height[times >= times.mean()].mean()))
+    return {"height_off": error, "as_computed": float((error <= BOX) == (low <= speed <= high))}
 
 
 def airspeed(speed: float) -> Experiment:
@@ -60,7 +60,7 @@ def airspeed(speed: float) -> Experiment:
     outcome = "carried" if carried else "beyond the flaps"
     return Experiment(
         name=f"airspeed-{speed:g}",
-        summary=f"hover at {speed:g} m/s: takes flaps at {degrees(wanted):.0f} deg, {outcome} (paper: 8 to 11 m/s)",
+        summary=f"hover at {speed:g} m/s: needs flaps at {degrees(wanted):.0f} deg, {outcome} (paper: 8 to 11 m/s)",
         duration_s=10.0,
         limits=limits,
         settings=(

@@ -1,8 +1,8 @@
-"""Identification: flights whose logs `floaty identify` makes constants of.
+"""Identification: flights from whose logs `floaty identify` estimates constants.
 
 The excitation is a parameter of the board, which the operator switches on over the link once the robot hovers. How strong
 it is and which band it has are settings, like `--set excitation.u1=0.08 --set excitation.high=6`. The amplitudes here keep
-the default robot inside its 20 cm box. The paper's way needs two flights with different gains and no excitation at all;
+the default robot inside its 20 cm box. The paper's method needs two flights with different gains and no excitation at all;
 its gains on roll are those of its Methods, -0.2 and -0.15.
 """
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
 
 BEGIN_US = 2_000_000  # the robot has come to rest after its release
-PERIODS = 8  # of 20 s, after 2 s in which the answer settles
+PERIODS = 8  # of 20 s, after 2 s in which the response settles
 DURATION_S = 2.0 + 2.0 + 20.0 * PERIODS + 1.0
 LIMITS = {"lost": 0.0}
-ALONE = {"u1": 0.05, "u2": 0.08, "u3": 0.06, "u4": 0.10}  # [rad] rms; more is not linear any more
+ALONE = {"u1": 0.05, "u2": 0.08, "u3": 0.06, "u4": 0.10}  # [rad] rms; larger ones are no longer linear
 TOGETHER = {"u1": 0.04, "u2": 0.06, "u3": 0.05, "u4": 0.08}
 
 
 def excite(flight: Flight) -> None:
-    """Plan that the operator switches the excitation on."""
+    """Plan the operator's command that switches the excitation on."""
     flight.events.at(flight.release_us + BEGIN_US, partial(_switch_on, flight))
 
 
@@ -56,7 +56,7 @@ def preliminary(number: int, gain_roll: float, gain_pitch: float) -> Experiment:
     """Return the paper's flight with one of its two preliminary controllers."""
     return Experiment(
         name=f"two-controllers-{number}",
-        summary=f"hover with attitude gains {gain_roll:g} and {gain_pitch:g}, undisturbed but by the flow (paper's Methods)",
+        summary=f"hover with attitude gains {gain_roll:g} and {gain_pitch:g}, disturbed only by the flow (paper's Methods)",
         duration_s=42.0,
         limits=LIMITS,
         settings=(f"controller.gain_roll={gain_roll}", f"controller.gain_pitch={gain_pitch}"),

@@ -1,7 +1,7 @@
-"""What the experiments measure beside the errors of every flight: steps, sines, recoveries; truth against goal.
+"""What the experiments measure besides the errors of every flight: steps, sines, recoveries; truth against goal.
 
-Every function takes the rows after the release, of a flight that may have ended early; what cannot be told is NaN, which
-no limit accepts. The names of the results are those of `hil.laboratory.metrics.METRICS`.
+Every function takes the rows after the release, of a flight that may have ended early; what cannot be determined is NaN,
+which no limit accepts. The names of the results are those of `hil.laboratory.metrics.METRICS`.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from firmware_py.geometry import euler_zyx_of
 from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import BOX, body, column, position_error
 
-BAND = 0.05  # of a step: settled; physics.md section 8
+BAND = 0.05  # of a step: settled; a choice, the paper names no band
 RISEN = 0.90  # of a step
-TOLD_S = 0.5  # after a step: over a real link the goal's clock runs ahead, so that one more may begin before the end
-HOLD_S = 3.0  # before the next step: there the robot holds still
-CALM_S = 0.5  # before the next disturbance: by then the robot is back
-BLOWN_S = 5.0  # before the wind ends: by then the robot leans into it
+JUDGED_S = 0.5  # after a step: over a real link the goal's clock runs ahead, so that one more may begin before the end
+HOLD_S = 3.0  # before the next step: the robot is at rest by then
+CALM_S = 0.5  # before the next disturbance: the robot has recovered by then
+BLOWN_S = 5.0  # before the wind ends: the robot leans into it by then
 ROW_S = 0.01
 Signal = NDArray[np.float64]  # (N,), one value per row
 
@@ -81,7 +81,7 @@ def y_steps(flight: pa.Table) -> Mapping[str, float]:
     """Return the slowest rise, the largest overshoot and the error at rest of a flight with steps in y."""
     times, (y, goal) = seconds(flight), axis_and_goal("y", flight)
     jumps = np.flatnonzero(np.diff(goal)) + 1
-    if len(jumps) and times[-1] - times[jumps[-1]] < TOLD_S:
+    if len(jumps) and times[-1] - times[jumps[-1]] < JUDGED_S:
         times, y, goal, jumps = times[: jumps[-1]], y[: jumps[-1]], goal[: jumps[-1]], jumps[:-1]
     found = steps(times, y, goal)
     if not found:
@@ -122,7 +122,7 @@ def height_sine(frequency_hz: float, flight: pa.Table) -> Mapping[str, float]:
 
 
 def recoveries(faults: tuple[Fault, ...], duration_s: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return what became of the robot after each disturbance, until the next one or the end of the flight."""
+    """Return how the robot recovered after each disturbance, until the next one or the end of the flight."""
     times, error = seconds(flight), np.abs(position_error(flight)).max(axis=1)
     starts = [fault.start_s for fault in faults]
     recovered, slowest = 0, 0.0
@@ -143,7 +143,7 @@ def recoveries(faults: tuple[Fault, ...], duration_s: float, flight: pa.Table) -
 
 
 def leaning(axis: int, end_s: float, flight: pa.Table) -> Mapping[str, float]:
-    """Return how far off the robot stands, on axis 0..2, in a wind that ends at `end_s`."""
+    """Return the robot's offset from its goal, on axis 0..2, in a wind that ends at `end_s`."""
     times = seconds(flight)
     rows = (times >= end_s - BLOWN_S) & (times < end_s)
     if times[-1] < end_s - ROW_S:

@@ -1,7 +1,7 @@
 """Overload: a task above all others takes more and more of the processor while the robot hovers.
 
-The thief's share of every tick rises from 0 to 100 % in steps of 5 % and 1.5 s. Its load is what makes the estimator, and
-then the controller, miss their deadlines (the end of the tick in which they became ready); what the hover makes of it is
+The thief's share of every tick rises from 0 to 100 % in steps of 5 % and 1.5 s. Its load makes the estimator, and
+then the controller, miss their deadlines (the end of the tick in which they became ready); the effect on the hover is
 in the position error. Losing the robot at full load is no failure of the experiment: the limits say up to which load
 the flight has to hold.
 """
@@ -31,7 +31,7 @@ ROWS_PER_SECOND = 100  # of the log
 
 
 def with_a_thief(robot: Robot) -> None:
-    """Let the thief be on board, taking nothing."""
+    """Create the thief on board, with a share of 0."""
     robot.thief.share = 0.0
 
 
@@ -56,7 +56,7 @@ def thief_load(flight: pa.Table) -> NDArray[np.float64]:
 
 
 def loads_that_hurt(flight: pa.Table) -> Mapping[str, float]:
-    """Return the loads at which tasks are late first, infinity when they never are, and the last step inside the box."""
+    """Return the loads at which tasks are first late, infinity when they never are, and the last step inside the box."""
     load, error = thief_load(flight), np.abs(position_error(flight))
 
     def first(wrong: Any) -> float:

@@ -1,6 +1,6 @@
-"""Experiments of one's own: in a Python file, as FILE.py:NAME, or in an installed package, as an entry point.
+"""The user's own experiments: in a Python file, as FILE.py:NAME, or in an installed package, as an entry point.
 
-A file is executed once for every content that it has. What stands beside it can be imported. Every error in it is one
+A file is executed once per content. Modules beside it can be imported. Every error in it is one
 line that names file and line.
 """
 
@@ -16,11 +16,11 @@ from hil.errors import LabError, blame, hint
 from hil.laboratory.experiment import Experiment, Source
 
 GROUP = "floaty.experiments"
-_LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of what was executed
+_LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of the executed text
 
 
 def in_file(reference: str) -> Experiment:
-    """Return the experiment of FILE.py:NAME, or the only one of FILE.py. Raises `LabError` where there is none."""
+    """Return the experiment of FILE.py:NAME, or the only one of FILE.py. Raises `LabError` when there is none."""
     text, _, name = reference.rpartition(":") if ".py:" in reference else (reference, "", "")
     found = in_whole_file(Path(text))
     if not name and len(found) == 1:
@@ -60,7 +60,7 @@ def load_file(path: Path) -> tuple[ModuleType, str]:
     module.__file__ = str(place)
     if str(place.parent) not in sys.path:
         sys.path.append(str(place.parent))
-    sys.modules[name] = module  # what is pickled refers to it
+    sys.modules[name] = module  # pickled objects refer to it
     try:
         exec(compile(content, place, "exec"), vars(module))
     except Exception as error:
@@ -80,7 +80,7 @@ def package_of(entry: EntryPoint) -> str:
 
 
 def in_package(entry: EntryPoint) -> Experiment:
-    """Return the experiment of an entry point. Raises `LabError` when it cannot be loaded or is none."""
+    """Return the experiment of an entry point. Raises `LabError` when it cannot be loaded or is not an experiment."""
     what = f"experiment {entry.name} of {package_of(entry)}"
     try:
         found = entry.load()

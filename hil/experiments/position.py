@@ -1,7 +1,7 @@
 """Position: the paper's sine in height, 20 cm at 0.05 Hz, and square in y, 10 cm to either side.
 
 The square's period is that of the author's ground station, 10 s; the amplitude is the flow's: beyond 20 cm from its axis
-no hover lasts (paper, Horizontal tracking performance).
+hovering is not stable (paper, Horizontal tracking performance).
 """
 
 from functools import partial
@@ -10,7 +10,7 @@ from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
 from hil.experiments.measures import height_sine, y_steps
 from hil.laboratory.experiment import Experiment
 
-BEGIN_S = 1.0  # the robot has come to rest after its release
+BEGIN_S = 1.0  # the robot is at rest after its release
 HEIGHT_HZ, SQUARE_HZ = 0.05, 0.1
 
 

@@ -1,4 +1,4 @@
-"""Power: what the robot draws in hover, how long its battery lasts, and how that compares (paper, figure robustness a, b).
+"""Power: the power drawn in hover, the battery life, and a comparison (paper, figure robustness a, b).
 
 `endurance` hovers until the battery is empty: the supervisor's failsafe for a low battery is its stated end. `power` hovers
 for a minute and computes the rest from the mean power and the same model of the battery.
@@ -49,7 +49,7 @@ def power(flight: pa.Table) -> dict[str, float]:
 
 
 def estimate(flight: pa.Table) -> Mapping[str, float]:
-    """Return power, and the minutes for which the model of the battery can give it."""
+    """Return power, and the minutes for which the battery model can supply it."""
     values, config = power(flight), _configuration(flight)
     empty_V = 1e-3 * config["supervisor"]["low_battery_mv"]
     battery = BatteryConfig.model_validate(config["battery"])
@@ -82,7 +82,7 @@ POWER = Experiment(
 )
 ENDURANCE = Experiment(
     name="endurance",
-    summary="hover until the battery is empty and the supervisor says so (paper: 33 min)",
+    summary="hover until the supervisor reports the battery empty (paper: 33 min)",
     duration_s=LONGEST_S,
     limits=LIMITS,
     script=end_with_the_battery,

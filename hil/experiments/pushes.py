@@ -1,7 +1,8 @@
 """Pushes: forces and torques of a tenth of a second from every side, one after the other (paper, figure robustness c).
 
-Their sizes are those that the default profile takes (physics.md section 8, where x takes 1 N; at 1 N the robot may need
-more than the 4 s to climb back, because attitude goes before height). The last ones are the hardest for the author's gains.
+Their sizes are those that the default profile withstands (x withstands 1 N; at 1 N the robot may
+need more than the 4 s to climb back, because attitude takes precedence over height). The last ones are the hardest for the
+author's gains.
 """
 
 from functools import partial

@@ -1,8 +1,8 @@
 """Specific power of hovering vehicles by the paper's method (Supplement, "Estimation and calculation of specific power").
 
-Drones: energy of the battery over the longest flight that the maker promises. Helicopters: the share of their rated power
-that the paper takes for a hover, 75-90 % with pistons and 60-75 % with turbines; the middle of the range is the value.
-The two quadcopters that the authors flew: what they measured. Floaty is not in here: its power comes from a flight's log.
+Drones: energy of the battery over the longest flight that the maker states. Helicopters: the share of their rated power
+that the paper assumes for a hover, 75-90 % with pistons and 60-75 % with turbines; the middle of the range is the value.
+The two quadcopters that the authors flew: their measurements. Floaty is not included: its power comes from a flight's log.
 """
 
 from __future__ import annotations
@@ -62,7 +62,6 @@ VEHICLES = (
     _helicopter("Robinson R22", 622, 124, PISTON),  # derated; maximum continuous
     _helicopter("Bell 206B", 1451, 317, TURBINE),  # limit of the transmission
     _helicopter("Airbus H125", 2250, 847, TURBINE),  # take-off rating
-    _helicopter(
-        "Sikorsky UH-60M", 9979, 2 * 2000, TURBINE
-    ),  # ten-minute rating of the T700-GE-701D: an upper bound
+    # Ten-minute rating of the T700-GE-701D: an upper bound.
+    _helicopter("Sikorsky UH-60M", 9979, 2 * 2000, TURBINE),
 )

@@ -1,4 +1,4 @@
-"""Take-off and landing by the speed of the tunnel, as from the original operator's menu, but without an operator.
+"""Take-off and landing by the speed of the tunnel, as in the original operator's menu, but without an operator.
 
 The robot stands on the net in still air, its flaps at the hover angle. The fans run up to the take-off speed, the controller
 is switched on (a request to arm, over the radio), the robot lifts off; flight speed, then landing speed: it sinks onto
@@ -6,7 +6,7 @@ the net; controller and fans off. The goal is the hover point all the time.
 
 Order and times are the menu's, the speeds are not: it has 75 to 80 % of the flight speed for take-off and landing, where
 this plant has 0.6 to 0.7 times its weight of lift. Here the flow gains 5 % per metre towards the net; with flat flaps the
-robot lifts off from 90 % on and stays at the hover point from 95 % on (physics.md section 8).
+robot lifts off from 90 % on and stays at the hover point from 95 % on.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
 
 TAKE_OFF, FLIGHT, LANDING = 0.93, 1.0, 0.88  # of the flight speed
-STANDING_Z = 0.049  # [m] of the centre of mass: feet, less what they sink in
-CLEAR = 0.02  # [m] off the net
+STANDING_Z = 0.049  # [m] of the centre of mass: the feet's height less how far they sink in
+CLEAR = 0.02  # [m] above the net
 
 # After the release [s]; waits and stages as in the menu
 SPIN_UP = 1.0
@@ -43,7 +43,7 @@ BOOTED_US = 500_000
 
 
 def operate(flight: Flight) -> None:
-    """Plan what the operator does."""
+    """Plan the operator's actions."""
     flight.robot.plant.tunnel.set_fan_factor(0.0)
     release_us = flight.release_us
     flight.events.at(max(BOOTED_US, flight.now_us), partial(_switch, flight, False))
@@ -86,17 +86,17 @@ def _setter(flight: Flight, factor: float) -> Callable[[int], None]:
 
 
 def measure(flight: pa.Table) -> Mapping[str, float]:
-    """Return when it lifted off and was in the box, and how it touched down; NaN for what did not happen."""
+    """Return when it lifted off and was in the box, and how it touched down; NaN for events that did not occur."""
     times = column(flight, "t") * 1e-6
     times = times - times[0]
     x, y, z, climb = body(flight, "x", "y", "z", "vz").T
-    off = np.asarray(z > STANDING_Z + CLEAR)
+    airborne = np.asarray(z > STANDING_Z + CLEAR)
     values = dict.fromkeys(
         ("lift_off", "reached_box", "touch_down_speed", "landed_off_axis", "hover_in_box"), float("nan")
     )
-    if not off.any():
+    if not airborne.any():
         return values
-    first = int(np.argmax(off))
+    first = int(np.argmax(airborne))
     values["lift_off"] = float(times[first]) - CONTROLLER_ON
     inside = np.asarray((np.abs(position_error(flight)) <= BOX).all(axis=1))
     hovering = (times >= FLIGHT_FROM) & (times < LANDING_FROM)
@@ -104,7 +104,7 @@ def measure(flight: pa.Table) -> Mapping[str, float]:
         entered = int(np.argmax(inside & hovering))
         values["reached_box"] = float(times[entered]) - FLIGHT_FROM
         values["hover_in_box"] = float(inside[entered:][hovering[entered:]].mean())
-    down = np.flatnonzero((times > LANDING_FROM) & ~off)
+    down = np.flatnonzero((times > LANDING_FROM) & ~airborne)
     if len(down):
         touched = int(down[0])
         before = slice(max(touched - 10, 0), touched + 1)  # 0.1 s

@@ -1,9 +1,9 @@
 """Yaw: the paper's steps up to 110 degrees, settled in less than 0.5 s, and sines of 90 degrees up to 0.15 Hz.
 
-The step asks for more than the flaps give between 0 and 52 degrees: the time-optimal bound there is 0.47 s (physics.md
-section 8). Opened through zero, to -11 degrees, they give more torque, and the step settles in time; its gains are a little
-lower, so that yaw neither creeps up the last five per cent nor swings back out of them. `yaw-step-0` is the same step with
-all as in the profile.
+The step asks for more than the flaps give between 0 and 52 degrees: the time-optimal bound there is 0.47 s. Opened through
+zero, to -11 degrees, they give more torque, and the step settles in time; its gains are a little lower, so that yaw
+neither creeps up the last five per cent nor swings back out of them. `yaw-step-0` is the same step with the values of the
+profile.
 
 A step above the estimator's gate (28 degrees) counts from its second pose on, 20 ms later: settling includes that.
 """
@@ -19,8 +19,8 @@ from hil.laboratory.experiment import Experiment
 BEGIN_S = 1.0  # the robot has come to rest after its release
 STEP = radians(110.0)  # paper, Yaw tracking performance
 SWING = radians(90.0)  # paper, likewise
-LATE_S = 0.22  # 0.17 s is flown: 40 ms of pose, 50 ms of flaps, the gains
-ROUGH = radians(1.0)  # of yaw in the turbulence, generously
+LATE_S = 0.22  # measured 0.17 s: 40 ms of pose latency, 50 ms of flaps, the gains
+ROUGH = radians(1.0)  # of yaw in the turbulence, with a margin
 OPENED = "allocation.opening_min=-0.192"  # -11 deg
 
 
@@ -30,7 +30,7 @@ def step_yaw(home: Goal, release_us: int) -> Trajectory:
 
 
 def swing_yaw(frequency_hz: float, home: Goal, release_us: int) -> Trajectory:
-    """Turn to and fro by 90 degrees."""
+    """Turn back and forth by 90 degrees."""
     return Offsets(home, release_us + round(BEGIN_S * 1e6), yaw=Sine(SWING, frequency_hz))
 
 
@@ -46,7 +46,7 @@ YAW_STEP = Experiment(
 )
 YAW_STEP_0 = Experiment(
     name="yaw-step-0",
-    summary="the same turn as the profile has it, flaps 0..52 deg",
+    summary="the same turn with the profile's flap range, 0..52 deg",
     duration_s=5.0,
     limits={"lost": 0.0, "settle": 0.65, "overshoot": 0.05, "max_x": 0.06, "max_y": 0.06},
     trajectory=step_yaw,
@@ -61,7 +61,7 @@ def follow_sine(frequency_hz: float, periods: int, more: Mapping[str, float]) ->
     limits = {"lost": 0.0, "gain": 0.97, "lag": lag, "rms_yaw": SWING / sqrt(2.0) * lag + ROUGH}
     return Experiment(
         name=f"yaw-sine-{frequency_hz:.2f}",
-        summary=f"turn to and fro by 90 deg at {frequency_hz:.2f} Hz (paper: follows up to 0.15 Hz, > 80 deg/s)",
+        summary=f"turn back and forth by 90 deg at {frequency_hz:.2f} Hz (paper: follows up to 0.15 Hz, > 80 deg/s)",
         duration_s=BEGIN_S + periods / frequency_hz,
         limits={**limits, "max_x": 0.10, "max_y": 0.06, **more},
         trajectory=partial(swing_yaw, frequency_hz),

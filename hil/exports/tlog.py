@@ -1,10 +1,10 @@
 """A flight as a telemetry log of MAVLink, which ground stations and pymavlink open: each frame after its time.
 
-Made from the flight log, whatever link was flown: what the board would say of its estimate (HEARTBEAT, ATTITUDE,
+Made from the flight log, whatever link was flown: the board's messages about its estimate (HEARTBEAT, ATTITUDE,
 LOCAL_POSITION_NED, SERVO_OUTPUT_RAW, BATTERY_STATUS, STATUSTEXT), from system 255 the goal when it changes
 (SET_POSITION_TARGET_LOCAL_NED) and the true pose, in a real flight the cameras' (ATT_POS_MOCAP). Times count from the
 start of the log, in microseconds; STATUSTEXT "released" is the release. The log has the estimate relative to the
-goal, of which the board hears some 30 ms late: for so long after a jump of the goal the estimate here is away by that
+goal, which reaches the board some 30 ms late: for that long after a jump of the goal the estimate here is wrong by that
 jump.
 """
 
@@ -33,7 +33,7 @@ BOARD, STATION = (1, 1), (255, 190)  # system and component
 INFO = 6  # severity of a text
 SLOW = 100  # rows between heartbeats, and between voltages: 1 Hz
 ROWS = 2  # between motions: 50 Hz, MAVLink's usual best
-Said = tuple[int, tuple[int, int], Any]  # time [us], who, message
+Said = tuple[int, tuple[int, int], Any]  # time [us], sender, message
 
 
 def write_tlog(folder: Path) -> Path:
@@ -62,11 +62,11 @@ def _flown(log: pa.Table) -> Iterator[Said]:
             for name in ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
         ),
     ).tolist()
-    told = None
+    sent_goal = None
     for row, us in enumerate(columns["t"]):
-        if goal[row] != told:
-            told = goal[row]
-            yield us, STATION, mavlink.target(us // 1000, tuple(told[:3]), told[3])
+        if goal[row] != sent_goal:
+            sent_goal = goal[row]
+            yield us, STATION, mavlink.target(us // 1000, tuple(sent_goal[:3]), sent_goal[3])
         if row % SLOW == 0:
             state = columns["supervisor.state"][row]
             yield us, BOARD, mavlink.heartbeat(state == State.FLYING, state)
@@ -81,7 +81,7 @@ def _flown(log: pa.Table) -> Iterator[Said]:
 
 
 def _estimated(ms: int, goal: list[float], estimate: list[float]) -> Iterator[Any]:
-    """Yield the estimate, which the log has in the goal frame, as the board says it: in the world."""
+    """Yield the estimate, which the log has in the goal frame, as the board reports it, in the world."""
     goal_x, goal_y, goal_z, goal_yaw = goal
     x, y, z, vx, vy, vz, roll, pitch, yaw, *rates = estimate
     q_WG = yaw_quaternion(goal_yaw)

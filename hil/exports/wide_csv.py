@@ -1,6 +1,6 @@
 """A flight log as one wide CSV file: a row per 10 ms, a column per quantity, each with its unit in the header.
 
-The first column is the time from the release. Frames stand in `log.parquet`, in each column's metadata.
+The first column is the time from the release. Frames are in `log.parquet`, in each column's metadata.
 """
 
 from pathlib import Path

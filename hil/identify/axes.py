@@ -1,12 +1,12 @@
-"""The four decoupled axes of the linear model: which constants each has, and what its log must show.
+"""The four decoupled axes of the linear model: which constants each has, and what its log must contain.
 
     flap' = (u(t - delay) - flap) / lag
     roll:  p' = a flap + b p + c roll + d vy      y:  vy' = e flap + h roll + g vy + k p
            (pitch and x alike)
     yaw:   r' = a flap + b r                      z:  vz' = a flap + g vz
 
-Symbols of the paper's Methods; names are those of a profile's [model], but for k: flaps above the centre of mass push
-sideways when the robot turns, which neither the Table nor the model on board has.
+Symbols of the paper's Methods; names are those of a profile's [model], except k: flaps above the centre of mass push
+sideways when the robot turns, which neither the Table nor the model on board contains.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from hil.identify.record import Array
 from hil.identify.spectra import Complex
 
 LAG, DELAY = "lag", "delay"  # [s]
-TICK_S = 0.01  # inputs hold over it
+TICK_S = 0.01  # over which inputs are held
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One input and what answers to it. `outputs` count the signals of `hil.identify.spectra.period_spectra`."""
+    """One input and its outputs. `outputs` index the signals of `hil.identify.spectra.period_spectra`."""
 
     name: str
     input: int
@@ -60,18 +60,18 @@ UNITS = {name: unit for axis in AXES for name, unit in zip(axis.constants, axis.
 
 
 def flap_response(w: Array, lag: float, delay: float) -> Complex:
-    """Return what a flap makes of its input, held over ticks."""
+    """Return the frequency response of a flap to its input, held over ticks."""
     held = np.sinc(w * TICK_S / (2 * np.pi))
     response: Complex = held * np.exp(-1j * w * delay) / (1 + 1j * w * lag)
     return response
 
 
 def response(axis: Axis, values: Mapping[str, float], w: Array, pose_late: float = 0.0) -> Complex:
-    """Return the outputs per input on the lines, (L, outputs); poses come `pose_late` [s] after their stamps."""
+    """Return the outputs per input on the lines, (L, outputs); poses are `pose_late` [s] later than their stamps."""
     s = 1j * w
     f = flap_response(w, values[LAG], values[DELAY])
     late = np.exp(-s * pose_late)
-    averaged = np.sinc(w * TICK_S / (2 * np.pi))  # the gyro's mean over a tick; its delay counts to `delay`
+    averaged = np.sinc(w * TICK_S / (2 * np.pi))  # the gyro's mean over a tick; its delay is part of `delay`
     k = [values[name] for name in axis.constants]
     if len(k) == 8:
         a, b, c, d, e, h, g, of_rate = k

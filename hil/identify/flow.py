@@ -1,7 +1,7 @@
-"""What the flow does to a robot, out of a hover's telemetry: the accelerations that its model does not explain.
+"""The flow's effect on a robot, from a hover's telemetry: the accelerations that its model does not explain.
 
 With them the design predicts how far another controller lets the robot move. The inputs are those that the flaps really
-took, so that limits, limit cycles and excitations are no disturbance. The noise of the cameras counts to the flow.
+took, so that limits, limit cycles and excitations do not count as disturbance. The cameras' noise counts as flow.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ PLACES = {0: (1, 3), 1: (0, 4), 2: (5, 5), 3: (2, 2)}  # of an input's position 
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """What acts on an axis in a hover, and what it needs at rest."""
+    """The disturbance of an axis in a hover, and its mean input and angle."""
 
     spectrum: Complex  # (L, W, W) on FREQUENCIES, per Hz: of the velocity, of the rate, as the axis has them
     input: float  # [rad] mean
-    angle: float  # [rad] mean; 0 for an axis without one
+    angle: float  # [rad] mean; 0 for an axis without an angle
 
 
 def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
-    """Return what acted on an axis of a robot. Raises `LabError` for less than two windows of flight."""
+    """Return the disturbance of an axis of a robot. Raises `LabError` for less than two windows of flight."""
     step = record.period_s
     grid = np.arange(max(record.t[0], record.pose_t[0]) + BEGIN_S, min(record.t[-1], record.pose_t[-1]), step)
     size = round(WINDOW_S / step)
@@ -53,7 +53,7 @@ def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
     if len(starts) < 2:
         raise LabError(
             f"{record.name}: {len(grid) * step:.1f} s of flight: {1.5 * WINDOW_S:g} s after the first {BEGIN_S:g} s are "
-            "needed for what the flow does"
+            "needed to estimate the flow"
         )
     place, angle = PLACES[axis.input]
     u = np.interp(grid, record.t, record.u[:, axis.input])
@@ -68,7 +68,7 @@ def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
         return np.asarray(np.fft.rfft(cut, axis=1)[:, 1 : 1 + len(w)])
 
     s: Complex = 1j * w
-    shown: Complex = np.exp(s * LATE_S)  # by how much poses come after their stamps
+    shown: Complex = np.exp(s * LATE_S)  # by how much poses are later than their stamps
     of: dict[str, Complex] = {
         POSITION: spectra(poses[0]) / shown,
         ANGLE: spectra(poses[1]) / shown,
@@ -91,7 +91,7 @@ def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
 
 
 def _on_lines(hertz: Array, each: Complex) -> Complex:
-    """Return spectra on FREQUENCIES; beyond both ends the last ones."""
+    """Return spectra on FREQUENCIES; the end values beyond both ends."""
     flat = each.reshape(len(hertz), -1)
     at: Sequence[Complex] = [
         np.interp(FREQUENCIES, hertz, column.real) + 1j * np.interp(FREQUENCIES, hertz, column.imag)

@@ -1,8 +1,8 @@
-"""`floaty identify`: what a set of flights says of every constant, by three methods, and what may be believed.
+"""`floaty identify`: estimates of every constant from a set of flights, by three methods, and how reliable they are.
 
 Flights with an excitation go to the instrumental variables and the joint fit, pairs without one and with different gains to
 the paper's method. A constant is `identified` when the joint fit's 95 % interval is narrow and the linear model explains the
-log, `weak` when its sign and size are known, else `not identifiable`; then its number is no more than where the fit stopped.
+log, `weak` when its sign and size are known, else `not identifiable`; then its number is only where the fit stopped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ NUISANCES = ("y_rate", "x_rate")  # in no profile
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """One constant: (value, half width of its 95 % interval) by method; NaN where a method says nothing."""
+    """One constant: (value, half width of its 95 % interval) by method; NaN where a method gives none."""
 
     name: str
     unit: str
@@ -48,18 +48,18 @@ class Constant:
 
     @property
     def contains_truth(self) -> bool:
-        """Whether the joint interval holds the truth."""
+        """Whether the joint interval contains the truth."""
         return abs(self.joint[0] - self.truth) <= self.joint[1]
 
 
 @dataclass(frozen=True, slots=True)
 class Identification:
-    """All that is known of a robot."""
+    """The estimated constants of a robot."""
 
     constants: tuple[Constant, ...]
     excited: tuple[Excited, ...]
     estimate: Estimate  # of the joint fit
-    records: tuple[Record, ...]  # with an excitation, as `excited` counts them
+    records: tuple[Record, ...]  # with an excitation, in the order that `excited` refers to
     free: tuple[Record, ...]  # without
 
     def constant(self, name: str) -> Constant:
@@ -68,7 +68,7 @@ class Identification:
 
 
 def identify(records: Sequence[Record]) -> Identification:
-    """Return what the flights say. Raises `LabError` for logs from which nothing can be told."""
+    """Return the identification from flights. Raises `LabError` for logs that determine no constant."""
     for record in records:
         if record.lost_rows > LOST:
             raise LabError(
@@ -81,7 +81,7 @@ def identify(records: Sequence[Record]) -> Identification:
         names = ", ".join(record.name for record in records)
         raise LabError(
             f"{names}: no excitation, and no two flights with different attitude gains: from the flow's disturbance alone "
-            "no constant can be told; fly identify, or identify-u1 to identify-u4"
+            "no constant can be identified; fly identify, or identify-u1 to identify-u4"
         )
     excited = tuple(excited_axes(rich))
     lag = 1.0 / (rich or free)[0].config.model.flap_rate
@@ -121,12 +121,12 @@ def _verdict(
     if value != value:
         return UNKNOWN, "its axis is not excited"
     if name == DELAY:
-        return WEAK, "held near what the firmware's timing makes of it"
+        return WEAK, "held near the value that follows from the firmware's timing"
     worst = max(record.saturated for record in records)
     if worst > SATURATED:
         return (
             UNKNOWN,
-            f"flaps stand at their limits in {worst:.0%} of a log's rows: the answer is not linear",
+            f"flaps are at their limits in {worst:.0%} of a log's rows: the response is not linear",
         )
     if fitted.misfit > EXPLAINED:
         return UNKNOWN, f"the linear model misses the log by {fitted.misfit**0.5:.1f} times its scatter"

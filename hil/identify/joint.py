@@ -1,12 +1,12 @@
 """The two estimates that use the excitation: instrumental variables, and the joint fit of all axes.
 
 Both take the cross spectra with the excitation (`hil.identify.spectra`), which the disturbance does not bias, and weight
-each line by the covariance that the disturbance really has there, not that of white noise.
+each line by the covariance that the disturbance has there, not that of white noise.
 
-Instrumental variables: the axes' equations are linear in their constants; lag and delay are taken from the profile, and how
-uncertain those are is part of the intervals. Joint fit: all axes at once with one servo lag and one delay, by the errors
-of the predicted outputs (`scipy.optimize.least_squares`), begun at the former. Where the errors are larger than the scatter
-of the periods explains, model errors are: the intervals grow with them.
+Instrumental variables: the axes' equations are linear in their constants; lag and delay are taken from the profile, and
+their uncertainty is part of the intervals. Joint fit: all axes at once with one servo lag and one delay, by the errors of
+the predicted outputs (`scipy.optimize.least_squares`), started from the former. Where the errors are larger than the scatter
+of the periods explains, they are model errors: the intervals grow with them.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ CONFIDENCE = 0.95
 LAG_SPREAD = 0.2  # of the profile's lag, standard deviation
 # Half a tick of holding, the PWM period, computing, half the gyro's mean.
 DELAY_S, DELAY_SPREAD_S = 0.013, 0.003
-LATE_S, LATE_SPREAD_S = -0.008, 0.003  # of a pose against the gyro: half its mean, and telemetry's way down
+# Lateness of a pose against the gyro: half its mean, and the telemetry's latency.
+LATE_S, LATE_SPREAD_S = -0.008, 0.003
 ROUNDS = 6
 # How far curvature moves a constant at the amplitudes of the experiments, standard deviation over its value; when several
-# inputs are excited at once, products of three of them fall on lines.
+# inputs are excited at once, products of three of them lie on lines.
 CURVED, CURVED_TOGETHER = 0.04, 0.12
 ALIKE = 4  # lines over which the model's errors may be alike
 RATE, ANGLE, PLACE = 1, 2, 3  # places of an axis' outputs in its spectra
@@ -37,11 +38,11 @@ RATE, ANGLE, PLACE = 1, 2, 3  # places of an axis' outputs in its spectra
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Values and their 95 % intervals by name, with what they were made of."""
+    """Values and their 95 % intervals by name, with the inputs of the fit."""
 
     values: Mapping[str, float]
     errors: Mapping[str, float]  # half widths of the intervals
-    misfit: float  # of the errors, over what the scatter explains; 1: the model explains all
+    misfit: float  # of the errors, over the scatter; 1: the model explains all
     late: tuple[float, ...] = ()  # [s] of the poses' stamps, by record
     covariance: Array | None = None  # of the values, in their order
 
@@ -56,7 +57,7 @@ class Excited:
 
 
 def excited_axes(records: Sequence[Record]) -> list[Excited]:
-    """Return what is excited in which record. Raises `LabError` for a record that cannot be used."""
+    """Return the axes that are excited, by record. Raises `LabError` for a record that cannot be used."""
     found = []
     for number, record in enumerate(records):
         periods = period_spectra(record)
@@ -67,7 +68,7 @@ def excited_axes(records: Sequence[Record]) -> list[Excited]:
 
 
 def pose_lateness(excited: Sequence[Excited], record: int) -> float:
-    """Return by how much poses come after their stamps [s]: the gyro's angle against the cameras'."""
+    """Return by how much poses are later than their stamps [s]: the gyro's angle against the cameras'."""
     above = below = 0.0
     for one in excited:
         if one.record != record or len(one.axis.outputs) < 2:
@@ -106,9 +107,8 @@ def instrumental(excited: Sequence[Excited], lag: float) -> Estimate:
     return Estimate(values, errors, max(misfits, default=float("nan")))
 
 
-Rows = tuple[
-    Complex, Complex
-]  # (L, S), (L, n, S): left side and regressors as combinations of the spectra's signals
+# Shapes (L, S) and (L, n, S): left side and regressors as combinations of the spectra's signals.
+Rows = tuple[Complex, Complex]
 
 
 def _equations(axis: Axis):  # type: ignore[no-untyped-def]
@@ -231,8 +231,8 @@ def joint(
 
 
 def _meat(excited: Sequence[Excited], errors: Array, J: Array) -> Array:
-    """Return the information matrix with what each output's errors really are: larger than the scatter, and alike from line
-    to line, where the linear model is not all there is.
+    """Return the information matrix with each output's actual errors: larger than the scatter, and correlated from line
+    to line, where the linear model does not explain everything.
     """
     weights = np.ones(len(errors))
     place = 0

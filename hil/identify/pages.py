@@ -1,8 +1,8 @@
 """The page and the pictures of an identification.
 
 For each excited axis: measured and fitted frequency response with the coherence, the errors over the scatter with their
-autocorrelation from line to line, and the answer over one period, measured, simulated from the input and predicted row by
-row, on a flight that was not fitted where there is one. For the paper's method the one picture that explains what it finds.
+autocorrelation from line to line, and the response over one period, measured, simulated from the input and predicted row by
+row, on a flight that was not fitted where there is one. For the paper's method one picture that explains its result.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def write_pages(out: Path, found: Identification, held_out: Record | None) -> Pa
     """Write the pictures and `identify.html`; return its path. Raises `LabError` for a useless held out flight."""
     new = [] if held_out is None else excited_axes([held_out])
     if held_out is not None and not any(one.axis is fitted.axis for one in new for fitted in found.excited):
-        raise LabError(f"--validate {held_out.name}: no input is excited in it that the fit knows")
+        raise LabError(f"--validate {held_out.name}: it excites no input of the fit")
     figures = []
     for axis in dict.fromkeys(one.axis for one in found.excited):
         fitted = [one for one in found.excited if one.axis is axis]
@@ -52,7 +52,10 @@ def write_pages(out: Path, found: Identification, held_out: Record | None) -> Pa
         picture = png(lambda: _identity(found.free))
         (out / "identify_paper.png").write_bytes(picture)
         figures.append(
-            {"title": "why the paper's equations tell nothing of the robot", "image": data_uri(picture)}
+            {
+                "title": "why the paper's equations contain no information about the robot",
+                "image": data_uri(picture),
+            }
         )
     rows = [
         {
@@ -77,7 +80,7 @@ def _pair(pair: tuple[float, float]) -> str:
 def _axis(
     found: Identification, fitted: list[Excited], held_out: list[Excited], records: tuple[Record, ...]
 ) -> Figure:
-    """Draw one axis; `records` are those that the shown answer counts."""
+    """Draw one axis; `records` are those of the shown response."""
     axis = fitted[0].axis
     values = found.estimate.values
     figure = Figure(figsize=(WIDTH, 8.0), layout="constrained")
@@ -130,10 +133,10 @@ def _axis(
 
 
 def _one_step(axes: Axes, record: Record, seen: Excited, values: Mapping[str, float], late: float) -> None:
-    """Draw what the model expects of the next row, each time."""
+    """Draw the model's prediction of each next row."""
     name = seen.axis.name
     t, measured, predicted = one_step(record, seen.axis.input, values, late)
-    left = np.std((measured - predicted)[len(t) // 10 :])  # when the filter has settled
+    left = np.std((measured - predicted)[len(t) // 10 :])  # after the filter has settled
     t -= t[0]
     axes.plot(t, measured, ".", markersize=3, color=curves.RED)
     axes.plot(t, predicted, color=curves.BLUE, label=f"predicted {1e3 * record.period_s:.0f} ms before")
@@ -147,7 +150,7 @@ def _one_step(axes: Axes, record: Record, seen: Excited, values: Mapping[str, fl
 
 
 def _identity(records: tuple[Record, ...]) -> Figure:
-    """Draw, bin by bin, what eq. (roll_dynamics_sys_of_equations) is fitted to."""
+    """Draw, bin by bin, the data to which eq. (roll_dynamics_sys_of_equations) is fitted."""
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     panels = figure.subplots(1, min(2, len(records)), squeeze=False)[0]
     for axes, record in zip(panels, records, strict=False):
@@ -160,7 +163,7 @@ def _identity(records: tuple[Record, ...]) -> Figure:
             markersize=2,
             label="every bin",
         )
-        axes.plot(np.sort(loop.w**2), -np.sort(loop.w**2), color="black", label="−ω², whatever flies")
+        axes.plot(np.sort(loop.w**2), -np.sort(loop.w**2), color="black", label="−ω², for any robot")
         axes.axhline(
             loop.starred[1],
             color=curves.BLUE,

@@ -1,7 +1,7 @@
-"""One-step prediction: what the identified model, in the board's stationary filter, expects of the next sample.
+"""One-step prediction: what the identified model, in the board's stationary filter, predicts for the next sample.
 
-A simulation from the input alone forgets what the flow did; a prediction is corrected by every sample, so that what is left
-are the flow's accelerations of one step, the noise of the sensors, and what the model has wrong. A step is from one row of
+A simulation from the input alone ignores the flow; a prediction is corrected by every sample, so that the errors
+are the flow's accelerations of one step, the noise of the sensors, and the errors of the model. A step is from one row of
 the telemetry to the next.
 """
 
@@ -20,10 +20,10 @@ from hil.identify.record import Array, Record
 def one_step(
     record: Record, input: int, values: Mapping[str, float], late: float
 ) -> tuple[Array, Array, Array]:
-    """Return instants t (N,) [s], what was measured, and what was predicted a step before, (N,) each.
+    """Return instants t (N,) [s], the measured values, and those predicted a step before, (N,) each.
 
     The signal is the axis' angular rate [rad/s] in B, of u4 the height [m] in W, without their means. `values` are those of
-    `hil.identify.joint`; poses come `late` [s] after their stamps.
+    `hil.identify.joint`; poses are `late` [s] later than their stamps.
     """
     axis, step = AXES[input], record.period_s
     flow, columns = dynamics(axis, {**values, "flap_rate": 1 / values[LAG]})
@@ -37,7 +37,7 @@ def one_step(
     ]
     turn = [np.interp(t, record.t, record.rates[:, input])] if RATE in axis.states else []
     measured = np.stack([*turn, *shown], axis=1)
-    # What acts on the mean until the next step; `delay` counts the half tick by which an input that is held is late.
+    # The mean effect until the next step; `delay` counts the half tick by which an input that is held is late.
     u = np.interp(t - values[DELAY] + step / 2, record.t, record.u[:, input])
     measured -= measured.mean(axis=0)
     u -= u.mean()

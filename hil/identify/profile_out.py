@@ -1,8 +1,8 @@
-"""A profile of what was identified, on top of another: model, servo lag, trim, with the uncertainty as comments, and as a
-file beside it for `floaty tune`.
+"""A profile with the identified constants, based on another one: model, servo lag, trim, with the uncertainty as comments,
+and as a file beside it for `floaty tune`.
 
-What was not identified keeps the value that it has there unless the flights contradict it, and the others are fitted once
-more with it: so the profile's model answers as the robot did even where single constants cannot be told apart.
+Other constants keep their values of that profile unless the flights contradict them, and the identified ones are fitted once
+more with these: so the profile's model responds as the robot did even where single constants cannot be separated.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from hil.identify.robots import write_known
 from hil.world.body import MIX
 from hil.world.servos import WORDS_PER_RADIAN
 
-TRIM_LEAST = 0.005  # [rad] mean input that is worth a trim
+TRIM_LEAST = 0.005  # [rad] least mean input for which a trim is written
 
 
 def refit(found: Identification, model: ModelConfig) -> Estimate:
-    """Return the joint fit with the constants that nobody knows at a model's values."""
+    """Return the joint fit with the unidentified constants at a model's values."""
     fixed = {name: getattr(model, name) for name in kept(found, model)}
     excited_constants = {name for one in found.excited for name in one.axis.constants}
     start = {
@@ -40,7 +40,7 @@ def refit(found: Identification, model: ModelConfig) -> Estimate:
 
 
 def kept(found: Identification, model: ModelConfig) -> list[str]:
-    """Return the constants that are not identifiable from these flights, and may as well be what a model has."""
+    """Return the constants that are not identifiable from these flights, and agree with a model's values."""
     return [
         one.name
         for one in found.constants
@@ -53,7 +53,7 @@ def kept(found: Identification, model: ModelConfig) -> list[str]:
 def write_profile(path: Path, profile: str, found: Identification) -> None:
     """Write the profile. Raises `LabError` when nothing was identified, or it cannot be written."""
     if not any(constant.verdict != UNKNOWN and constant.name != DELAY for constant in found.constants):
-        raise LabError(f"--profile-out {path}: nothing was identified that a profile could hold")
+        raise LabError(f"--profile-out {path}: nothing was identified that belongs in a profile")
     model = load_config(profile).model
     fitted = refit(found, model)
     lines = [
@@ -72,15 +72,15 @@ def write_profile(path: Path, profile: str, found: Identification) -> None:
     if names := kept(found, model):
         lines.append(f"# as in {profile}, not identifiable from these flights: {', '.join(names)}")
     lag = found.constant(LAG)
-    told = f"lag {1e3 * lag.joint[0]:.1f} ± {1e3 * lag.joint[1]:.1f} ms, {lag.verdict}"
-    lines.append(f"{f'flap_rate = {1 / fitted.values[LAG]:.4g}':26}# {told}")
+    verdict = f"lag {1e3 * lag.joint[0]:.1f} ± {1e3 * lag.joint[1]:.1f} ms, {lag.verdict}"
+    lines.append(f"{f'flap_rate = {1 / fitted.values[LAG]:.4g}':26}# {verdict}")
     lines.append(
-        f"# input to gyro {1e3 * fitted.values[DELAY]:.1f} ms, of which the firmware's own timing makes 13"
+        f"# input to gyro {1e3 * fitted.values[DELAY]:.1f} ms, of which the firmware's own timing takes 13"
     )
     lines += ["", *_trim(found)]
     with writing("--profile-out", path):
         path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
-    config = load_config(str(path))  # what cannot fly is an error here, not at the next flight
+    config = load_config(str(path))  # an invalid profile is an error here, not at the next flight
     with writing("--profile-out", path):
         write_known(path, config, found, fitted.values[DELAY])
 

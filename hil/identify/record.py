@@ -1,8 +1,8 @@
-"""What a flight's log says for identification: inputs, excitation, gyro rates and poses, each with its instants.
+"""A flight's log for identification: inputs, excitation, gyro rates and poses, each with its instants.
 
 The log is the ground station's `telemetry.csv`, alone or in a run folder, of a simulated or a real flight. Times are those
 of the board's clock; a pose's instant comes from the ground's clock, which runs `clock_s` ahead. What remains between the
-two, the telemetry's way down, is a few milliseconds and is found from the data (`hil.identify.spectra`).
+two, the telemetry's latency, is a few milliseconds and is estimated from the data (`hil.identify.spectra`).
 """
 
 from __future__ import annotations
@@ -27,12 +27,8 @@ Array = NDArray[np.float64]
 BOARD_COLUMN = "board.t [ms]"
 INPUTS = tuple(f"controller.u{i} [rad]" for i in range(1, 5))
 EXCITATIONS = tuple(f"excite.u{i} [rad]" for i in range(1, 5))
-KEPT = (
-    "log.parquet",
-    "telemetry.csv",
-    "events.jsonl",
-    "result.json",
-)  # of a run folder: what is read, and its story
+# The files of a run folder that are read or that tell its history.
+KEPT = ("log.parquet", "telemetry.csv", "events.jsonl", "result.json")
 RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch", "yaw"))
 WRAP_MS = 1 << 24  # of the board's time stamps
 SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 closes
@@ -40,18 +36,18 @@ SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 c
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One flight under control. Rows of `t` (N,) and of `pose_t` (M,) are not the same instants."""
+    """One flight under control. Rows of `t` (N,) and of `pose_t` (M,) are at different instants."""
 
     name: str
     t: Array  # (N,) [s] board's clock
-    u: Array  # (N, 4) [rad] what the flaps were commanded, after their limits
+    u: Array  # (N, 4) [rad] the commanded inputs, after the flaps' limits
     excitation: Array  # (N, 4) [rad] NaN-free; zero where none was reported
     rates: Array  # (N, 3) [rad/s] gyro, B
     pose_t: Array  # (M,) [s] board's clock, when the cameras exposed
     pose: Array  # (M, 6) x y z [m], roll pitch yaw [rad], W
-    saturated: float  # share of the rows in which a flap stood at its limit
+    saturated: float  # share of the rows in which a flap was at its limit
     lost_rows: float  # share of the rows that are missing
-    config: LabConfig  # what flew: gains and limits
+    config: LabConfig  # the profile that flew: gains and limits
     simulated: bool  # its plant is known
 
     @property
@@ -98,13 +94,12 @@ def load_record(path: Path, profile: str) -> Record:
 
 
 def _read(file: Path) -> dict[str, Array]:
-    """Return the columns by their titles; excitation that is not there is zero."""
+    """Return the columns by their titles; a missing excitation is zero."""
     with file.open(encoding="utf-8", newline="") as lines:
         rows = list(csv.reader(lines))
     titles = rows[0] if rows else []
-    whole = [
-        row for row in rows[1:] if len(row) == len(titles)
-    ]  # a flight that was cut off ends in half a row
+    # The record of a killed process may end in half a row.
+    whole = [row for row in rows[1:] if len(row) == len(titles)]
     try:
         table = np.array(whole, float).reshape(len(whole), len(titles))
     except ValueError as error:
@@ -137,7 +132,7 @@ def _flown_with(folder: Path) -> tuple[LabConfig, bool, float]:
 
 
 def _limited(u: Array, config: LabConfig) -> tuple[Array, float]:
-    """Return the inputs that the limited flaps make, and how often a flap was limited: what `allocate` does on board."""
+    """Return the inputs that the limited flaps produce, and how often a flap was limited, like `allocate` on board."""
     allocation = config.allocation
     opening = allocation.hover_angle + u @ SHARES
     inside = np.clip(opening, allocation.opening_min, allocation.opening_max)

@@ -1,7 +1,7 @@
 """How well a profile's model is known: `floaty identify` writes it beside the profile, `floaty tune` draws robots from it.
 
 `mine.json` belongs to `mine.toml`: the model that was identified with it, and the covariance of its constants, lag and delay
-as the reported intervals have it. A profile without one counts every constant as known to `UNKNOWN_SHARE`.
+as in the reported intervals. A profile without one counts every constant as known to `UNKNOWN_SHARE`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hil.identify.identify import NUISANCES, Identification
 from hil.identify.record import Array
 from hil.identify.two_controllers import SIGMAS
 
-UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, of a constant of which nothing is said
+UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, of a constant of unknown uncertainty
 FLAP_RATE = "flap_rate"
 
 
@@ -38,12 +38,12 @@ class Known(BaseModel):
 
 
 def beside(profile: str) -> Path:
-    """Return where the file of a profile stands."""
+    """Return the path of the file beside a profile."""
     return Path(profile).with_suffix(".json")
 
 
 def write_known(path: Path, config: LabConfig, found: Identification, delay_s: float) -> None:
-    """Write what an identification knows beside the profile `path` that it wrote, which reads as `config`."""
+    """Write an identification's uncertainty beside the profile `path` that it wrote, which reads as `config`."""
     estimate = found.estimate
     assert estimate.covariance is not None
     names = list(estimate.values)
@@ -62,7 +62,7 @@ def write_known(path: Path, config: LabConfig, found: Identification, delay_s: f
 
 @dataclass(frozen=True, slots=True)
 class Robots:
-    """The robot that a profile describes, and those that it may be as well."""
+    """The robot that a profile describes, and others within its uncertainty."""
 
     nominal: dict[str, float]
     drawn: tuple[dict[str, float], ...]
@@ -70,7 +70,7 @@ class Robots:
 
 
 def robots_of(profile: str, config: LabConfig, count: int) -> Robots:
-    """Return a profile's robot and `count` drawn from its intervals. Raises `LabError` for a file that is none."""
+    """Return a profile's robot and `count` drawn from its intervals. Raises `LabError` for a malformed file."""
     file = beside(profile)
     known = _read(file) if profile.endswith(".toml") and file.is_file() else None
     if known is not None and known.values != config.model.model_dump():
@@ -112,7 +112,7 @@ def _draw(
     places = [name for name in names if name in nominal or name in (LAG, INPUT_TO_GYRO)]
     chosen = [names.index(name) for name in places]
     own = covariance[np.ix_(chosen, chosen)]
-    root = np.linalg.svd(own)  # semidefinite is enough
+    root = np.linalg.svd(own)  # works for semidefinite matrices, too
     columns = root.U * np.sqrt(root.S)
     size = 1 << (count - 1).bit_length()
     steps = qmc.MultivariateNormalQMC(

@@ -1,9 +1,9 @@
-"""Spectra on the lines of the excitation, period by period: what answers to it, and how far each period scatters.
+"""Spectra on the lines of the excitation, period by period: the responses, and how far each period scatters.
 
 In every period of 20 s sines and cosines of all excited lines are fitted to the samples that there are, so that rows may be
-missing and the rate may be any that the lines need. The mean over the periods is the cross spectrum with the excitation;
-what scatters about it is disturbance of whatever colour, and its covariance, line by line and between the signals, is that
-of the mean.
+missing and the rate may be any that suffices for the lines. The mean over the periods is the cross spectrum with the
+excitation; the scatter about it is disturbance of any colour, and gives the covariance, line by line and between the
+signals, of the mean.
 """
 
 from __future__ import annotations
@@ -22,27 +22,24 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 PERIOD_S, SPACING_HZ = 20.0, 0.05  # firmware_py/core/excitation.py
 SETTLING_S = 2.0  # left out after the excitation begins
 LEAST_PERIODS = 4
-LINE = 0.1  # of the strongest line: weaker ones are none
-NOT_LINEAR = (
-    0.03  # of an answer: what curvature, dead band and couplings make of it, which no average takes away
-)
-NEIGHBOURS = 4  # lines to either side that tell the disturbance of a line
+LINE = 0.1  # of the strongest line: weaker ones do not count
+# Share of a response that curvature, dead band and couplings cause, and that averaging does not reduce.
+NOT_LINEAR = 0.03
+NEIGHBOURS = 4  # lines to either side that give the disturbance of a line
 LEAST_SAMPLES = 1.5  # per unknown of the fit
 PURE = 0.05  # share of the excitation that may differ from period to period
-POWERS = {
-    **dict.fromkeys(range(8, 11), 1),
-    **dict.fromkeys(range(11, 17), 2),
-}  # of w, from a signal to an acceleration
+# The power of w that turns a signal into an acceleration.
+POWERS = {**dict.fromkeys(range(8, 11), 1), **dict.fromkeys(range(11, 17), 2)}
 
 
 @dataclass(frozen=True, slots=True)
 class Spectra:
-    """What an input and its answers are on the input's lines; the last axis of `Z` counts input, then outputs."""
+    """An input and its responses on the input's lines; the last axis of `Z` counts input, then outputs."""
 
     w: Array  # (L,) [rad/s]
     Z: Complex  # (L, S) mean over the periods, per excitation
     C: Complex  # (L, S, S) covariance of that mean
-    excitation: Complex  # (L,) what Z is per [rad]
+    excitation: Complex  # (L,) that Z refers to [rad]
     periods: int
     coherence: Array  # (L, S) of each signal with the excitation, over single periods
 
@@ -52,7 +49,7 @@ def windows(record: Record) -> list[float]:
     excited = np.any(record.excitation != 0.0, axis=1)
     if not excited.any():
         raise LabError(
-            f"{record.name}: no excitation in it: from the flow's disturbance alone no constant can be told; "
+            f"{record.name}: no excitation in it: from the flow's disturbance alone no constant can be identified; "
             "fly `identify`"
         )
     start, end = record.t[excited][0] + SETTLING_S, record.t[excited][-1]
@@ -109,7 +106,7 @@ def period_spectra(record: Record) -> tuple[list[NDArray[np.int_]], Array, Compl
     starts = windows(record)
     own = excited_lines(record, starts)
     excited = np.concatenate(own)
-    lines = np.arange(1, 1 + excited.max(initial=0))  # those between tell the disturbance
+    lines = np.arange(1, 1 + excited.max(initial=0))  # those in between give the disturbance
     if not len(lines):
         raise LabError(
             f"{record.name}: rows of {record.period_s * 1e3:.0f} ms are too far apart for the excitation's lines"
@@ -128,8 +125,8 @@ def period_spectra(record: Record) -> tuple[list[NDArray[np.int_]], Array, Compl
     astray = float(np.sqrt(np.mean(np.abs(r - r.mean(axis=0)) ** 2) / np.mean(np.abs(r) ** 2)))
     if astray > PURE:
         raise LabError(
-            f"{record.name}: the logged excitation does not repeat every {PERIOD_S:g} s, {astray:.0%} of it differ: are the "
-            "time stamps right?"
+            f"{record.name}: the logged excitation does not repeat every {PERIOD_S:g} s, {astray:.0%} of it differs: are "
+            "the time stamps right?"
         )
     return own, w, P
 
@@ -147,13 +144,11 @@ def spectra_of(
     r = P[:, :, axis][:, chosen]
     every = P[:, :, columns]
     scatter = every - every.mean(axis=0)
-    flat = w_all[:, None] ** np.array(
-        [POWERS.get(signal, 0) for signal in columns]
-    )  # accelerations: no steep slopes
+    # As accelerations the spectra have no steep slopes.
+    flat = w_all[:, None] ** np.array([POWERS.get(signal, 0) for signal in columns])
     scatter = scatter * flat
-    each = np.einsum("pls,plt->lst", scatter, scatter.conj()) / (
-        count - 1
-    )  # of a single period, at every line
+    # The covariance of a single period, at every line.
+    each = np.einsum("pls,plt->lst", scatter, scatter.conj()) / (count - 1)
     covariance = np.empty((chosen.sum(), len(columns), len(columns)), complex)
     places = np.flatnonzero(chosen)
     for row, place in enumerate(places):

@@ -1,7 +1,7 @@
-"""The paper's way, as its Methods print it: two flights with different controllers, nothing but the flow's disturbance.
+"""The paper's method, as its Methods print it: two flights with different controllers, nothing but the flow's disturbance.
 
 Of each flight the closed loop's constants by eq. (roll_dynamics_sys_of_equations): jw A' = [A' A Y'] [b* c* d*], least
-squares over the low frequencies of windows of 4 s, as the author's script does it. From the two by eq.
+squares over the low frequencies of windows of 4 s, as in the author's script. From the two by eq.
 (roll_dynamics_input_const): a = (c1* - c2*) / (c1 - c2) with the controllers' own c, then b, c and d.
 
 It does not recover a known plant. A' is the derivative of the same A, so that jw A' = -w^2 A holds in every bin whatever the
@@ -38,7 +38,7 @@ AXES = {
 
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
-    """What one flight's spectra make of eq. (roll_dynamics_sys_of_equations)."""
+    """The estimate from one flight's spectra by eq. (roll_dynamics_sys_of_equations)."""
 
     starred: Array  # (3,) b*, c*, d*
     errors: Array  # (3,) standard

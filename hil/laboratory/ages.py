@@ -1,8 +1,8 @@
-"""Where the age of a flight's poses came from, out of what its ground station wrote: `telemetry.csv`.
+"""The latency budget of a flight's poses, from its ground station's record `telemetry.csv`.
 
-Of a radio in lockstep the station knows no more than what is usual; there its share comes from the flight log.
+For a radio in lockstep the station knows only a typical latency; there it is taken from the flight log.
 
-In the log of a real flight a row is written with the newest pose that there was, which is some 40 ms old; what the cameras
+In the log of a real flight a row is written with the newest pose available, which is some 40 ms old; what the cameras
 saw at the row's own instant comes with a later row. `at_exposure` puts it in when the log is read from its stream: between
 the two exposures around the instant, and NaN where those are too far apart, or the second one never came.
 """
@@ -18,19 +18,18 @@ from ground_station.latency import STAGES, Row, Stage, budget_of
 from ground_station.telemetry_log import AGE_COLUMNS, GOAL_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.laboratory.metrics import column, is_real
 
-STATION_CLOCK = (
-    "station.clock"  # column of the log: the clock of the computer, by which a station stamps its record
-)
+# Column of the log: the computer's clock, which stamps a station's record.
+STATION_CLOCK = "station.clock"
 STATION_START = b"station_start_us"  # in the metadata of a real flight's log: that clock when its time began
 
-EXPOSED = "cameras.exposed"  # column: when the row's pose was true, by the time of the log [us]
-GAP_US = 100_000  # between two exposures, beyond which nobody knows where the robot was
+EXPOSED = "cameras.exposed"  # column: exposure of the row's pose, in the log's time [us]
+GAP_US = 100_000  # between two exposures, beyond which the pose in between is unknown
 ROTATION = ("cameras.qw", "cameras.qx", "cameras.qy", "cameras.qz")
 
 
-def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
+def ages_of(reported: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
     """The budget of a flight over `link`; empty when no telemetry came."""
-    rows: list[Row] = list(zip(*(_us(told_ages, stage) for stage in STAGES), strict=True))
+    rows: list[Row] = list(zip(*(_us(reported, stage) for stage in STAGES), strict=True))
     radio_us = _on_air(log) if link == "radio" else np.empty(0)
     if rows and len(radio_us):
         rows = [
@@ -40,10 +39,10 @@ def ages_of(told_ages: pa.Table, log: pa.Table, link: str) -> tuple[Stage, ...]:
     return budget_of(rows, "serial" if medium == "mavlink" else medium)
 
 
-def told(folder: Path) -> pa.Table:
-    """What the station said of the poses that it sent: `t` [us] by its clock, and each stage [ms].
+def reported_ages(folder: Path) -> pa.Table:
+    """The ages of sent poses as the station reported them: `t` [us] by its clock, and each stage [ms].
 
-    A stage of which it does not know is NaN. The last line of the file may be cut.
+    An unknown stage is NaN. The last line of the file may be cut.
     """
     times = _read(folder / TELEMETRY, (TIME_COLUMN, *AGE_COLUMNS))
     times = times[~np.isnan(times[:, -1])]
@@ -51,12 +50,12 @@ def told(folder: Path) -> pa.Table:
     return pa.table(dict(zip(("t", *STAGES), times.T, strict=True)))
 
 
-def told_in_time_of(log: pa.Table, folder: Path) -> pa.Table:
-    """What `told` says, with `t` [us] in the log's time instead of the station's, and the log's metadata.
+def ages_in_time_of(log: pa.Table, folder: Path) -> pa.Table:
+    """The ages that the station reported, with `t` [us] in the log's time instead of the station's, and the log's metadata.
 
-    Nothing for a real flight whose log does not know when it began by the station's clock, as those of before did not.
+    Empty for a real flight whose log lacks the station's clock at its start, as older logs do.
     """
-    table, metadata = told(folder), log.schema.metadata or {}
+    table, metadata = reported_ages(folder), log.schema.metadata or {}
     if STATION_START in metadata:
         start_us = int(metadata[STATION_START])
         table = table.set_column(0, "t", pa.array(column(table, "t") - start_us))
@@ -69,7 +68,7 @@ def told_in_time_of(log: pa.Table, folder: Path) -> pa.Table:
 
 
 def goals_sent(telemetry: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-    """When the station recorded which goal: (N,) [us] by its clock, (N, 4) x, y, z [m] and yaw [rad] in W; None: never."""
+    """The recorded goals of the station: times (N,) [us] by its clock, (N, 4) x, y, z [m] and yaw [rad] in W; None: none."""
     rows = _read(telemetry, (TIME_COLUMN, *GOAL_COLUMNS))
     if not len(rows):
         return None
@@ -77,7 +76,7 @@ def goals_sent(telemetry: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 def with_goals_sent(telemetry: Path, log: pa.Table) -> pa.Table:
-    """Return a flight log with the goals that the station really sent, by its own record."""
+    """Return a flight log with the goals that the station actually sent, from its own record."""
     sent = goals_sent(telemetry)
     if sent is None:
         return log
@@ -100,17 +99,17 @@ def _read(telemetry: Path, titles: tuple[str, ...]) -> NDArray[np.float64]:
     parse = csv.ParseOptions(invalid_row_handler=lambda row: "skip")
     try:
         table = csv.read_csv(telemetry, parse_options=parse, convert_options=convert)
-    except (FileNotFoundError, pa.ArrowInvalid):  # nothing came, not even a whole line
+    except (FileNotFoundError, pa.ArrowInvalid):  # no telemetry, not even a complete line
         return np.empty((0, len(titles)))
     return np.column_stack([table.column(title).to_numpy() for title in titles])
 
 
-def _us(told_ages: pa.Table, stage: str) -> list[float]:
-    return [1e3 * age for age in told_ages.column(stage).to_pylist()]
+def _us(reported: pa.Table, stage: str) -> list[float]:
+    return [1e3 * age for age in reported.column(stage).to_pylist()]
 
 
 def _on_air(log: pa.Table) -> NDArray[np.float64]:
-    """The time of each uplink packet from sender to board [us], as far as a radio was simulated."""
+    """The time of each uplink packet from sender to board [us], if a radio was simulated."""
     if "link.retried" not in log.column_names or log.num_rows < 2:
         return np.empty(0)
     delivered, sum_us = np.diff(column(log, "link.up_delivered", "link.up_latency_sum"), axis=0).T
@@ -119,7 +118,7 @@ def _on_air(log: pa.Table) -> NDArray[np.float64]:
 
 
 def at_exposure(log: pa.Table) -> pa.Table:
-    """Return a log whose cameras' columns belong to the instants of their rows; one without cameras as it is."""
+    """Return a log whose cameras' columns belong to the instants of their rows; one without cameras unchanged."""
     if EXPOSED not in log.column_names:
         return log
     names = [name for name in log.column_names if name.startswith("cameras.") and name != EXPOSED]

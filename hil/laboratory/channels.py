@@ -1,7 +1,7 @@
 """What a flight log holds: names, units, frames and where each value comes from.
 
-Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, like in the filter's state. Of a real flight
-there is what its ground station knows, NaN before that is anything: `station_channels`.
+Counters are cumulative. `estimate.flap_*` are deviations from the hover angle, like in the filter's state. The log of a real
+flight has what its ground station knows, NaN before the first value: `station_channels`.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,6 +32,47 @@ AGE_UNIT_US = 100  # of locSrv.age
 
 def quantity(prefix: str, names: str, unit: str = "", frame: str = "") -> Quantity:
     return Quantity(tuple(f"{prefix}.{name}" for name in names.split()), unit, frame)
+
+
+FLAPS = "flap_1 flap_2 flap_3 flap_4"
+PLATES = " ".join(f"{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz")
+STATES = (quantity("flight", "free"), quantity("supervisor", "state"))
+TRUTH = (
+    quantity("truth", "x y z", "m", "W"),
+    quantity("truth", "vx vy vz", "m/s", "W"),
+    quantity("truth", "qw qx qy qz", "", "W"),
+    quantity("truth", "p q r", "rad/s", "B"),
+    quantity("truth", FLAPS, "rad", "B"),
+)
+GOAL = (quantity("goal", "x y z", "m", "W"), quantity("goal", "yaw", "rad", "W"))
+ESTIMATE = (
+    quantity("estimate", "x y z", "m", "G"),
+    quantity("estimate", "vx vy vz", "m/s", "G"),
+    quantity("estimate", "roll pitch yaw", "rad", "G"),
+    quantity("estimate", "p q r", "rad/s", "B"),
+)
+INPUTS = quantity("control", "u1 u2 u3 u4", "rad")
+MOTORS = quantity("motor", "m1 m2 m3 m4", "counts")
+CAMERAS = (
+    quantity("cameras", "exposed", "us"),
+    quantity("cameras", "x y z", "m", "W"),
+    quantity("cameras", "qw qx qy qz", "", "W"),
+    quantity("cameras", "vx vy vz", "m/s", "W"),
+    quantity("cameras", "p q r", "rad/s", "B"),
+)
+TELEMETRY = (
+    *ESTIMATE,
+    quantity("telemetry", FLAPS, "rad", "B"),
+    MOTORS,
+    INPUTS,
+    quantity("estimator", "pose_age_us", "us"),
+    quantity("estimator", "poses rejected"),
+)
+STATION = (
+    quantity("link", "sent late"),
+    quantity("station", "frames unusable samples malformed"),
+    quantity("link", "latency", "us"),
+)
 
 
 def radio_channel(radio: VirtualRadio) -> Channel:
@@ -65,13 +106,23 @@ def loop_channel(firmware: RealFirmware) -> Channel:
     """Return what the loop through a real board costs and counts."""
 
     def read() -> tuple[int, ...]:
-        told = firmware.told
-        counted = (0, 0, 0, 0) if told is None else (told.waiting, told.late, told.lost, told.doubled)
-        return (firmware.delay_us, firmware.added_us, *counted)
+        last = firmware.told
+        counted = (0,) * 5 if last is None else (last.waiting, last.held, last.late, last.lost, last.doubled)
+        return (firmware.delay_us, firmware.added_us, firmware.stood_us, *counted)
 
     return Channel(
-        "int32", read, (quantity("loop", "delay added", "us"), quantity("loop", "waiting late lost doubled"))
+        "int32",
+        read,
+        (
+            quantity("loop", "delay added stood", "us"),
+            quantity("loop", "waiting held late lost doubled"),
+        ),
     )
+
+
+def clock_channel(image: ImageFirmware) -> Channel:
+    """Return the time of an image's own clock; a read while its timer carries may be 65 ms short."""
+    return Channel("int64", lambda: (image.clock_us,), (quantity("clock", "board_us", "us"),))
 
 
 def tracker_channel(tracker: Tracker) -> Channel:
@@ -131,15 +182,33 @@ def _view(array: Any) -> Callable[[], Any]:
 
 def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]:
     """Return the channels of any flight; the first column, `t`, is the recorder's own."""
-    plant, board, firmware = robot.plant, robot.board, robot.firmware
-    signals, queue = firmware.signals, firmware.measurements
-    kernel: Any = firmware.kernel  # ours or an image's, whose tasks have names and run times alike
-    tasks = tuple(kernel.tasks)
-    timed = [task for task in tasks if task.name in DEADLINES_US]
+    plant, board, signals = robot.plant, robot.board, robot.firmware.signals
+    counters = (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us"))
+    return (
+        Channel("int8", lambda: (robot.free, signals.supervisor.state), STATES),
+        Channel("float64", _view(plant.state), TRUTH),
+        Channel("float32", _view(plant.plate_forces_W.reshape(15)), (quantity("force", PLATES, "N", "W"),)),
+        Channel("float32", _view(plant.flow_W), (quantity("flow", "x y z", "m/s", "W"),)),
+        Channel("float64", lambda: _coordinates(trajectory.at(board.now_us)), GOAL),
+        Channel("float32", _view(signals.estimate), (*ESTIMATE, quantity("estimate", FLAPS, "rad", "B"))),
+        Channel("float32", _view(signals.u), (INPUTS,)),
+        Channel("float32", _view(signals.flap), (quantity("control", FLAPS, "rad", "B"),)),
+        Channel("int32", _view(signals.count), (MOTORS,)),
+        Channel("int16", lambda: board.imu, (quantity("imu", "gx gy gz ax ay az", "counts", "S"),)),
+        Channel("int32", _view(signals.counters), counters),
+        *_scheduler_channels(robot.firmware),
+    )
 
-    def goal() -> tuple[float, ...]:
-        at = trajectory.at(board.now_us)
-        return (*at.p_WG, at.yaw)
+
+def _coordinates(goal: Goal) -> tuple[float, ...]:
+    return (*goal.p_WG, goal.yaw)
+
+
+def _scheduler_channels(firmware: Firmware | ImageFirmware | RealFirmware) -> tuple[Channel, ...]:
+    """Return what the scheduler counts; a real board does not report what its tasks do."""
+    kernel: Any = firmware.kernel  # ours or an image's, whose tasks have names and run times alike
+    queue, tasks = firmware.measurements, tuple(kernel.tasks)
+    timed = [task for task in tasks if task.name in DEADLINES_US]
 
     def counts() -> tuple[int, ...]:
         return (
@@ -147,65 +216,16 @@ def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]
             *[task.deadline_misses for task in timed], *kernel.run_times_us()[: len(tasks)],
         )  # fmt: skip
 
-    scheduler = () if not tasks else (  # a real board does not tell what its tasks do
-        Channel(
-            "int64", counts, (
-                quantity("rtos", "measurements_high_water measurements_dropped"),
-                quantity("late", " ".join(task.name for task in timed)),
-                Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),
-            ),
-        ),
-    )  # fmt: skip
-    flaps = "flap_1 flap_2 flap_3 flap_4"
-    forces = " ".join(
-        f"{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz"
+    quantities = (
+        quantity("rtos", "measurements_high_water measurements_dropped"),
+        quantity("late", " ".join(task.name for task in timed)),
+        Quantity(tuple(f"cpu.{task.name}" for task in tasks), "us"),
     )
-    return (
-        Channel(
-            "int8",
-            lambda: (robot.free, signals.supervisor.state),
-            (quantity("flight", "free"), quantity("supervisor", "state")),
-        ),
-        Channel(
-            "float64",
-            _view(plant.state),
-            (
-                quantity("truth", "x y z", "m", "W"),
-                quantity("truth", "vx vy vz", "m/s", "W"),
-                quantity("truth", "qw qx qy qz", "", "W"),
-                quantity("truth", "p q r", "rad/s", "B"),
-                quantity("truth", flaps, "rad", "B"),
-            ),
-        ),
-        Channel("float32", _view(plant.plate_forces_W.reshape(15)), (quantity("force", forces, "N", "W"),)),
-        Channel("float32", _view(plant.flow_W), (quantity("flow", "x y z", "m/s", "W"),)),
-        Channel("float64", goal, (quantity("goal", "x y z", "m", "W"), quantity("goal", "yaw", "rad", "W"))),
-        Channel(
-            "float32",
-            _view(signals.estimate),
-            (
-                quantity("estimate", "x y z", "m", "G"),
-                quantity("estimate", "vx vy vz", "m/s", "G"),
-                quantity("estimate", "roll pitch yaw", "rad", "G"),
-                quantity("estimate", "p q r", "rad/s", "B"),
-                quantity("estimate", flaps, "rad", "B"),
-            ),
-        ),
-        Channel("float32", _view(signals.u), (quantity("control", "u1 u2 u3 u4", "rad"),)),
-        Channel("float32", _view(signals.flap), (quantity("control", flaps, "rad", "B"),)),
-        Channel("int32", _view(signals.count), (quantity("motor", "m1 m2 m3 m4", "counts"),)),
-        Channel("int16", lambda: board.imu, (quantity("imu", "gx gy gz ax ay az", "counts", "S"),)),
-        Channel(
-            "int32",
-            _view(signals.counters),
-            (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us")),
-        ),
-        *scheduler,
-    )
+    return (Channel("int64", counts, quantities),) if tasks else ()
 
 
 class Unwrapped:
-    """A counter of 16 bits that goes on where they end; from its first value on, which is NaN before."""
+    """A 16-bit counter without wrapping, counted from its first value on; NaN before."""
 
     def __init__(self) -> None:
         self._last = self._total = nan
@@ -217,94 +237,68 @@ class Unwrapped:
         return self._total
 
 
-def station_channels(
-    cockpit: Cockpit, free: Callable[[], bool], goal: Callable[[], Goal], start_us: int
-) -> tuple[Channel, ...]:
-    """Return the channels of a flight that only its ground station sees; `start_us` is when the log's time began."""
-    link, ground = cockpit.link, cockpit.ground
-    count_poses, count_rejected = Unwrapped(), Unwrapped()
+class StationView:
+    """What a ground station knows now, as rows of a log; `start_us` is when the log's time began."""
 
-    def states() -> tuple[float, ...]:
-        state = link.supervisor_state
-        return (free(), UNKNOWN_STATE if state is None else state)
+    def __init__(self, cockpit: Cockpit, start_us: int) -> None:
+        self._link, self._ground, self._start_us = cockpit.link, cockpit.ground, start_us
+        self._poses, self._rejected = Unwrapped(), Unwrapped()
 
-    def cameras() -> tuple[float, ...]:
-        frame, track = ground.frame, ground.track
+    def state(self) -> int:
+        """The supervisor's state."""
+        state = self._link.supervisor_state
+        return UNKNOWN_STATE if state is None else state
+
+    def cameras(self) -> tuple[float, ...]:
+        """CAMERAS, with the velocities of the tracker."""
+        frame, track = self._ground.frame, self._ground.track
         if frame is None:
             return (nan,) * 14
         motion = (nan,) * 6 if track is None else (*track.v_WB, *track.w_B)
-        return (frame.t_us - start_us, *frame.p_WB, *frame.q_WB, *motion)
+        return (frame.t_us - self._start_us, *frame.p_WB, *frame.q_WB, *motion)
 
-    def where_to() -> tuple[float, ...]:
-        at = goal()
-        return (*at.p_WG, at.yaw)
-
-    def telemetry() -> tuple[float, ...]:
-        samples = [ground.telemetry.get(block.id) for block in BLOCKS]
+    def telemetry(self) -> tuple[float, ...]:
+        """TELEMETRY, when there is a sample of every block."""
+        samples = [self._ground.telemetry.get(block.id) for block in BLOCKS]
         if None in samples:
             return (nan,) * 27
         motion, attitude, flaps, health = (sample.values for sample in samples if sample is not None)
         *inputs, _, age, poses, rejected = health
-        told = (AGE_UNIT_US * age, count_poses(poses), count_rejected(rejected))
-        return (*motion, *attitude, *flaps, *inputs, *told)
+        counted = (AGE_UNIT_US * age, self._poses(poses), self._rejected(rejected))
+        return (*motion, *attitude, *flaps, *inputs, *counted)
 
-    def slow() -> tuple[float, ...]:
-        samples = [ground.telemetry.get(block.id) for block in SLOW_BLOCKS]
+    def slow(self) -> tuple[float, ...]:
+        """Battery and load."""
+        samples = [self._ground.telemetry.get(block.id) for block in SLOW_BLOCKS]
         return tuple(nan if sample is None else sample.values[0] for sample in samples)
 
-    def counts() -> tuple[float, ...]:
-        counters = ground.counters
+    def counts(self) -> tuple[float, ...]:
+        """STATION."""
+        link, counters = self._link, self._ground.counters
         return (
             link.sent, link.late, counters.frames, counters.invalid, counters.samples, counters.malformed,
             link.latency.us,
         )  # fmt: skip
 
-    def air() -> tuple[float, ...]:
-        return (link.quality, link.rssi)
+    def air(self) -> tuple[float, ...]:
+        """Quality and signal strength of the radio."""
+        return (self._link.quality, self._link.rssi)
 
+
+def station_channels(
+    cockpit: Cockpit, free: Callable[[], bool], goal: Callable[[], Goal], start_us: int
+) -> tuple[Channel, ...]:
+    """Return the channels of a flight that only its ground station sees; `start_us` is when the log's time began."""
+    view, ground = StationView(cockpit, start_us), cockpit.ground
     tracker = () if ground.tracker is None else (tracker_channel(ground.tracker),)
     return (
-        Channel("int8", states, (quantity("flight", "free"), quantity("supervisor", "state"))),
-        Channel(
-            "float64",
-            cameras,
-            (
-                quantity("cameras", "exposed", "us"),
-                quantity("cameras", "x y z", "m", "W"),
-                quantity("cameras", "qw qx qy qz", "", "W"),
-                quantity("cameras", "vx vy vz", "m/s", "W"),
-                quantity("cameras", "p q r", "rad/s", "B"),
-            ),
-        ),
-        Channel(
-            "float64", where_to, (quantity("goal", "x y z", "m", "W"), quantity("goal", "yaw", "rad", "W"))
-        ),
-        Channel(
-            "float64",
-            telemetry,
-            (
-                quantity("estimate", "x y z", "m", "G"),
-                quantity("estimate", "vx vy vz", "m/s", "G"),
-                quantity("estimate", "roll pitch yaw", "rad", "G"),
-                quantity("estimate", "p q r", "rad/s", "B"),
-                quantity("telemetry", "flap_1 flap_2 flap_3 flap_4", "rad", "B"),
-                quantity("motor", "m1 m2 m3 m4", "counts"),
-                quantity("control", "u1 u2 u3 u4", "rad"),
-                quantity("estimator", "pose_age_us", "us"),
-                quantity("estimator", "poses rejected"),
-            ),
-        ),
-        Channel(
-            "int64",
-            counts,
-            (
-                quantity("link", "sent late"),
-                quantity("station", "frames unusable samples malformed"),
-                quantity("link", "latency", "us"),
-            ),
-        ),
-        Channel("float32", slow, (quantity("battery", "voltage", "V"), quantity("board", "load", "%"))),
-        Channel("float32", air, (quantity("link", "quality", "%"), quantity("link", "rssi", "-dBm"))),
+        Channel("int8", lambda: (free(), view.state()), STATES),
+        Channel("float64", view.cameras, CAMERAS),
+        Channel("float64", lambda: _coordinates(goal()), GOAL),
+        Channel("float64", view.telemetry, TELEMETRY),
+        Channel("int64", view.counts, STATION),
+        Channel("float32", view.slow, (quantity("battery", "voltage", "V"), quantity("board", "load", "%"))),
+        Channel("float32", view.air, (quantity("link", "quality", "%"), quantity("link", "rssi", "-dBm"))),
         Channel("float64", ground.budget.last, (quantity("age", " ".join(STAGES), "us"),)),
         *tracker,
     )

@@ -1,4 +1,4 @@
-"""What an experiment is: a trajectory for the ground station, what happens on the way, and limits on metrics."""
+"""An experiment: a trajectory for the ground station, planned events, and limits on metrics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hil.laboratory.robot import Robot
 
 
-LOOK_US = 20_000  # how often a goal goes up
+LOOK_US = 20_000  # how often a goal is sent
 NAME = re.compile(r"\w[\w.-]*")
 
 
@@ -34,19 +34,19 @@ def need_nothing(robot: Robot) -> None:
 
 
 def leave_alone(flight: Flight) -> None:
-    """Let nothing happen."""
+    """Plan no events."""
 
 
 def nothing(flight: pa.Table) -> Mapping[str, float]:
-    """Measure no more than every flight."""
+    """Measure no additional metrics."""
     return {}
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where an experiment stands that does not ship."""
+    """The source of an experiment that does not ship."""
 
-    reference: str  # what `floaty fly` takes: FILE.py:NAME, or the name of an entry point
+    reference: str  # as `floaty fly` accepts it: FILE.py:NAME, or the name of an entry point
     sha256: str  # of its file
     package: str = ""  # and version, of one that is installed
 
@@ -56,9 +56,9 @@ class Experiment:
     """One experiment; `limits` maps names of `hil.laboratory.metrics.METRICS` or of its own `metrics` to bounds in that
     metric's unit.
 
-    `script` is called once with the flight, at the release or before it, and plans what shall happen as events. Everything
-    in here can be pickled: flights are flown in parallel processes. Raises `LabError` for a name, a duration or a metric
-    that cannot be.
+    `script` is called once with the flight, at the release or before it, and plans events. Everything
+    in here can be pickled, because flights are flown in parallel processes. Raises `LabError` for an invalid name, duration
+    or metric.
     """
 
     name: str
@@ -66,19 +66,17 @@ class Experiment:
     duration_s: float  # of free flight, after the release
     limits: Mapping[str, float]  # of the default profile; another one has its own in [limits.NAME]
     trajectory: Callable[[Goal, int], Trajectory] = stay  # (home, release instant [us])
-    prepare: Callable[[Robot], None] = need_nothing  # lets be there from the start what the script will need
+    prepare: Callable[[Robot], None] = need_nothing  # creates from the start what the script will need
     script: Callable[[Flight], None] = leave_alone
     settings: tuple[str, ...] = ()  # "section.key=value", on top of the profile
     faults: tuple[Fault, ...] = ()  # those of the command line come on top
-    measure: Callable[[pa.Table], Mapping[str, float]] = (
-        nothing  # its own metrics, from the rows after the release
-    )
-    metrics: Mapping[str, Metric] = field(default_factory=dict)  # what `measure` brings beyond METRICS
+    # Computes the experiment's own metrics from the rows after the release.
+    measure: Callable[[pa.Table], Mapping[str, float]] = nothing
+    metrics: Mapping[str, Metric] = field(default_factory=dict)  # what `measure` returns beyond METRICS
     pictures: tuple[str, ...] = ()  # names of its own, first in the report; `hil.pictures.gallery` has them
-    draw: Callable[[pa.Table], Any] | None = (
-        None  # one more picture: a matplotlib Figure of the rows after the release
-    )
-    source: Source | None = None  # None: it ships, or stands in no file
+    # Draws one more picture, a matplotlib Figure, from the rows after the release.
+    draw: Callable[[pa.Table], Any] | None = None
+    source: Source | None = None  # None: it ships, or is in no file
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -95,11 +93,11 @@ class Experiment:
 
     @property
     def reference(self) -> str:
-        """What `floaty fly` and `floaty station --trajectory` call it."""
+        """Its name for `floaty fly` and `floaty station --trajectory`."""
         return self.source.reference if self.source else self.name
 
     def measured(self, flight: pa.Table) -> Mapping[str, float]:
-        """Return its own metrics, from the rows after the release. Raises `LabError` for what is none."""
+        """Return its own metrics, from the rows after the release. Raises `LabError` for invalid ones."""
         try:
             values = {name: float(value) for name, value in self.measure(flight).items()}
         except Exception as error:

@@ -1,7 +1,7 @@
-"""What can go wrong in a flight: for every kind of fault the knob of the world that it turns, its size, and its outcome.
+"""What can go wrong in a flight: for every kind of fault the value of the world that it changes, its size, and its outcome.
 
-A size is written as people say it (deg, ms); `scale` brings it to SI. Several faults may turn one knob at once: its value
-is then what it was before the first of them, blended with the size of each.
+A size is written in customary units (deg, ms); `scale` converts it to SI. Several faults may turn one knob at once: its
+value is then what it was before the first of them, blended with the size of each.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Outcome = Literal["holds", "degrades", "failsafe", "lost", ""]
 OCCLUSION_RADIUS = 0.3  # [m] around the axis: the robot is inside the shadow wherever it is in its box
-PUSH_S = 0.1  # physics.md section 8, and the sizes of pushes and shadow
+PUSH_S = 0.1  # and the sizes of pushes and shadow: what the default profile takes
 MARKERS_ON = "markers.enabled=true"
 GLIMPSE_S = 0.3  # shorter than the supervisor's patience of 0.5 s
 
@@ -33,7 +33,7 @@ Blend = Callable[[float, float], float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knob:
-    """One number of the world. To `read` it builds whatever it needs; `blend` takes its value and a fault's size."""
+    """One number of the world. `read` creates whatever it needs; `blend` takes its value and a fault's size."""
 
     read: Read
     turn: Turn
@@ -42,15 +42,15 @@ class Knob:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of fault. `low` and `high` bound its size; where they are the same, there is nothing to choose.
+    """A kind of fault. `low` and `high` bound its size; where they are the same, the size is fixed.
 
-    `outcome` is that of the hover with the default profile, for the default size and duration, 6 s after the begin:
+    `outcome` is that of the hover with the default profile, for the default size and duration, 6 s after it begins:
 
         holds     all limits of the hover hold
         degrades  a limit fails, the robot flies on
         failsafe  the supervisor opens the loop, the robot flies on
         lost      the flight ends there
-        (empty)   not stated: a kind of one's own
+        (empty)   not stated: a user's own kind
     """
 
     meaning: str
@@ -72,17 +72,17 @@ class Kind:
 
     @property
     def needs(self) -> str:
-        """What the flight must have for it, as options of `floaty fly`; empty: nothing special."""
+        """The requirements on the flight, as options of `floaty fly`; empty: none."""
         return f"--link {self.link}" if self.link else f"--set {MARKERS_ON}" if self.markers else ""
 
 
 def add(value: float, size: float) -> float:
-    """Both act."""
+    """Add up."""
     return value + size
 
 
 def times(value: float, size: float) -> float:
-    """One factor after the other."""
+    """Multiply the factors."""
     return value * size
 
 
@@ -101,12 +101,12 @@ def knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
 
 
 def _uart(robot: Robot) -> VirtualSerial:
-    assert robot.uart is not None  # the kind's link says so
+    assert robot.uart is not None  # given by the kind's link
     return robot.uart
 
 
 def _of_robot(robot: Robot) -> VirtualMarkers:
-    assert robot.mocap.markers is not None  # the kind says so
+    assert robot.mocap.markers is not None  # required by the kind
     return robot.mocap.markers
 
 
@@ -119,7 +119,7 @@ def _mocap(name: str, blend: Blend) -> Knob:
 
 
 def _air(robot: Robot) -> Air:
-    assert robot.air is not None  # the kind's link says so
+    assert robot.air is not None  # given by the kind's link
     return robot.air
 
 
@@ -215,7 +215,7 @@ KINDS: dict[str, Kind] = {
         (_mocap("dropout", either),), "holds", duration_s=GLIMPSE_S,
     ),
     "mocap.outlier": Kind(
-        "every frame is this far off, each in a direction of its own", "m", 0.3, 0.0, 5.0,
+        "every position is wrong by this distance, each in its own random direction", "m", 0.3, 0.0, 5.0,
         (_mocap("wrong_by", max),), "holds", duration_s=GLIMPSE_S,
     ),
     "mocap.swap": Kind(
@@ -231,7 +231,7 @@ KINDS: dict[str, Kind] = {
         _markers("hidden", max), "holds", markers=True,
     ),
     "marker.swap": Kind(
-        "markers 1 and 3 have each other's label: a pose turned over, or none where it is seen to fit badly",
+        "markers 1 and 3 have each other's label: the pose is turned over, or missing where the fit is found bad",
         "", 1.0, 1.0, 1.0, _markers("swapped", max), "holds", duration_s=GLIMPSE_S, markers=True,
     ),
     "marker.noise": Kind(
@@ -239,11 +239,11 @@ KINDS: dict[str, Kind] = {
         _markers("noise_scale", times), "holds", markers=True,
     ),
     "marker.ghosts": Kind(
-        "this many reflections more, which are no markers", "", 5.0, 0.0, 50.0,
+        "this many additional reflections, which are not markers", "", 5.0, 0.0, 50.0,
         _markers("ghosts", add), "holds", markers=True,
     ),
     "radio.loss": Kind(
-        "packets lost on the air, per try, both ways", "", 0.5, 0.0, 1.0,
+        "packets lost on the air, per try, in both directions", "", 0.5, 0.0, 1.0,
         (UPLINK_LOSS, DOWNLINK_LOSS), "holds", link="radio",
     ),
     "radio.uplink_loss": Kind(
@@ -253,7 +253,7 @@ KINDS: dict[str, Kind] = {
         "answers of the board lost on the air, per try", "", 0.5, 0.0, 1.0, (DOWNLINK_LOSS,), "holds", link="radio"
     ),
     "radio.bit_errors": Kind(
-        "wrong bits on the air, both ways; one of them costs the packet", "", 1e-3, 0.0, 0.5, RADIO_BITS, "holds",
+        "wrong bits on the air, in both directions; one of them loses the packet", "", 1e-3, 0.0, 0.5, RADIO_BITS, "holds",
         link="radio",
     ),
     "radio.jitter": Kind(
@@ -261,11 +261,11 @@ KINDS: dict[str, Kind] = {
         (_radio("uplink_jitter_us", add),), "holds", MS, link="radio",
     ),
     "radio.cut": Kind(
-        "nothing passes, either way", "", 1.0, 1.0, 1.0, (UPLINK_LOSS, DOWNLINK_LOSS), "holds",
+        "nothing passes, in either direction", "", 1.0, 1.0, 1.0, (UPLINK_LOSS, DOWNLINK_LOSS), "holds",
         duration_s=GLIMPSE_S, link="radio",
     ),
     "serial.bit_errors": Kind(
-        "wrong bits on the line, both ways", "", 1e-4, 0.0, 0.5, SERIAL_BITS, "holds", link="mavlink"
+        "wrong bits on the line, in both directions", "", 1e-4, 0.0, 0.5, SERIAL_BITS, "holds", link="mavlink"
     ),
     "serial.cut": Kind(
         "the cable is out", "", 0.0, 0.0, 0.0, (CABLE,), "holds", duration_s=GLIMPSE_S, link="mavlink"
@@ -285,7 +285,7 @@ KINDS: dict[str, Kind] = {
     "imu.freeze": Kind("the IMU repeats its last sample", "", 1.0, 1.0, 1.0, (FREEZE,), "holds", duration_s=GLIMPSE_S),
     **{
         f"servo.stuck.{number}": Kind(
-            f"flap {number} stays where it is", "", 0.0, 0.0, 0.0, (PACES[number - 1],), "degrades"
+            f"flap {number} is stuck", "", 0.0, 0.0, 0.0, (PACES[number - 1],), "degrades"
         )
         for number in (1, 2, 3, 4)
     },
@@ -297,7 +297,7 @@ KINDS: dict[str, Kind] = {
     },
     **{
         f"servo.trim.{number}": Kind(
-            f"flap {number} stands this far from its command", "deg", 5.0, -45.0, 45.0, (_trim(number - 1),), "holds",
+            f"flap {number} deviates this far from its command", "deg", 5.0, -45.0, 45.0, (_trim(number - 1),), "holds",
             DEG,
         )
         for number in (1, 2, 3, 4)
@@ -332,7 +332,7 @@ SHIPPED = frozenset(KINDS)
 
 
 def declare(name: str, kind: Kind) -> Kind:
-    """Make a kind of fault of one's own known by a name, from now on. Raises `LabError` for a name that is not free."""
+    """Register the user's own kind of fault under a name. Raises `LabError` for a name that is taken."""
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise LabError(f"fault kind {name!r}: a name has letters, digits, dots, hyphens and underscores")
     if name in SHIPPED:

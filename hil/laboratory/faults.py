@@ -63,7 +63,7 @@ class Span:
 
 
 def parse(text: str) -> Fault:
-    """Return the fault that a text means; what it leaves out is the kind's default. Raises `LabError`."""
+    """Return the fault that a text means; omitted parts have the kind's defaults. Raises `LabError`."""
     match = SHAPE.fullmatch(text.strip())
     if match is None:
         raise LabError(f"fault {text!r}: expected KIND@START[:DURATION][=SIZE], like mocap.dropout@10:0.5")
@@ -80,7 +80,7 @@ def parse(text: str) -> Fault:
 
 
 def check(faults: Iterable[Fault], duration_s: float, link: str, markers: bool) -> None:
-    """Raise `LabError` when a fault begins after the flight, or acts on a link or on markers that the flight has not."""
+    """Raise `LabError` when a fault begins after the flight, or acts on a link or on markers that the flight lacks."""
     for fault in faults:
         if fault.start_s >= duration_s:
             raise LabError(
@@ -111,18 +111,18 @@ def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
 
 
 class Switchboard:
-    """Turns the knobs of one robot as faults begin and end; nobody else may turn a knob while a fault does.
+    """Sets the knobs of one robot as faults begin and end; nothing else may set a knob while a fault does.
 
-    `active` has the faults in force, and changes as time goes on.
+    `active` has the faults in force, and changes with time.
     """
 
     def __init__(self, robot: Robot) -> None:
         self.active: list[Fault] = []
         self._robot = robot
-        self._before: dict[Knob, float] = {}  # of the knobs that are turned
+        self._before: dict[Knob, float] = {}  # values before the faults
 
     def prepare(self, faults: Iterable[Fault]) -> None:
-        """Let everything be there from the start that faults will need."""
+        """Create from the start whatever faults will need."""
         for fault in faults:
             kind = KINDS[fault.kind]
             if not why_not(kind, self._robot):
@@ -130,7 +130,7 @@ class Switchboard:
                     knob.read(self._robot)
 
     def plan(self, faults: Iterable[Fault], release_us: int, end_us: int) -> None:
-        """Plan begin and end of faults that begin before `end_us`; those that do not concern the robot are left out."""
+        """Plan begin and end of faults that begin before `end_us`; those that cannot act on the robot are skipped."""
         for span in spans(faults, release_us):
             if why_not(KINDS[span.fault.kind], self._robot) or span.begin_us >= end_us:
                 continue
@@ -139,7 +139,7 @@ class Switchboard:
                 self._robot.events.at(int(span.end_us), partial(self.end, span.fault))
 
     def act(self, fault: Fault, now_us: int) -> None:
-        """Let a fault begin now, whatever its start says. Raises `LabError` for one that cannot act on this robot."""
+        """Begin a fault now, whatever its start. Raises `LabError` for one that cannot act on this robot."""
         if reason := why_not(KINDS[fault.kind], self._robot):
             raise LabError(f"fault {fault.kind}: {reason}")
         self.begin(fault, now_us)
@@ -147,12 +147,12 @@ class Switchboard:
             self._robot.events.at(now_us + round(fault.duration_s * 1e6), partial(self.end, fault))
 
     def begin(self, fault: Fault, now_us: int) -> None:
-        """Turn the knobs of a fault."""
+        """Set the knobs of a fault."""
         self._robot.say("lab", f"fault {fault} begins")
         self._switch(fault, [*self.active, fault], now_us)
 
     def end(self, fault: Fault, now_us: int) -> None:
-        """Turn them back, if the fault is still in force."""
+        """Reset the knobs, if the fault is still in force."""
         if fault not in self.active:
             return
         self._robot.say("lab", f"fault {fault} ends")
@@ -161,7 +161,7 @@ class Switchboard:
         self._switch(fault, remaining, now_us)
 
     def _switch(self, fault: Fault, active: list[Fault], now_us: int) -> None:
-        """Turn the knobs of `fault` to what the active faults make of them."""
+        """Set the knobs of `fault` to the blend of the active faults."""
         robot = self._robot
         robot.plant.advance(now_us)
         self.active[:] = active
@@ -188,11 +188,11 @@ def why_not(kind: Kind, robot: Robot) -> str:
 
 def _kind(name: str, text: str) -> Kind:
     if name not in KINDS:
-        near = hint(name, KINDS, "floaty list --faults shows them all")
+        near = hint(name, KINDS, "floaty list --faults lists them all")
         raise LabError(f"fault {text!r}: unknown kind {name!r}; {near}")
     return KINDS[name]
 
 
 def _number(value: float) -> str:
-    """Return a number that reads back as the same."""
+    """Return a number as text that reads back equal."""
     return repr(float(value)).removesuffix(".0")

@@ -1,7 +1,7 @@
 """One flight of one robot: an experiment's script and faults, what is recorded and noted, how it ends.
 
-How the robot is talked to is its line's matter: `hil.laboratory.lockstep` models link and ground station on the same time
-line, `hil.laboratory.linked` leads the robot out to a ground station in a process of its own.
+The line connects the robot to the ground: `hil.laboratory.lockstep` models link and ground station on the same time
+line, `hil.laboratory.linked` connects the robot to a ground station in a process of its own.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from hil.devices.stm32f405.firmware import ImageFirmware
 from hil.events import EventQueue
 from hil.laboratory.channels import (
     battery_channel,
+    clock_channel,
     excitation_channel,
     fault_channel,
     flight_channels,
@@ -53,15 +54,15 @@ class Outcome:
 class Line(Protocol):
     """What is between the robot and the ground, both ends included."""
 
-    record: Path | None  # of the ground station, where that alone knows which goals it sent
+    record: Path | None  # of the ground station, where only that knows the goals it sent
 
     @property
     def trajectory(self) -> Trajectory:
-        """What the ground station flies."""
+        """The trajectory that the ground station flies."""
         ...
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
-        """What there is to record: of the line itself, and of the ground station."""
+        """The channels to record: of the line itself, and of the ground station."""
         ...
 
     def command(self, now_us: int, packet: bytes) -> None:
@@ -69,24 +70,24 @@ class Line(Protocol):
         ...
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
-        """What it has to say since the last time: (source, text)."""
+        """Return the messages since the last call: (source, text)."""
         ...
 
     def finish(self, lab: Laboratory) -> None:
-        """Let the ground station leave in order; the flight is over."""
+        """Let the ground station end in an orderly manner after the flight."""
         ...
 
     def close(self) -> None:
-        """Give everything back."""
+        """Release all resources."""
         ...
 
 
 class Programme(Protocol):
-    """What a flight needs of an experiment."""
+    """The part of an experiment that a flight needs."""
 
     @property
     def reference(self) -> str:
-        """What `floaty station --trajectory` calls it."""
+        """Its name for `floaty station --trajectory`."""
         ...
 
     @property
@@ -101,12 +102,12 @@ class Programme(Protocol):
 
     @property
     def prepare(self) -> Callable[[Robot], None]:
-        """Lets be there from the start what the script will need."""
+        """Creates from the start what the script will need."""
         ...
 
     @property
     def script(self) -> Callable[[Flight], None]:
-        """Plans what shall happen."""
+        """Plans the events."""
         ...
 
 
@@ -133,15 +134,15 @@ class Flight:
         trace_all: bool = False,
     ) -> None:
         self.config = config
-        self.closing = ExitStack()  # what ends with it
+        self.closing = ExitStack()  # what is closed with it
         self.experiment = experiment
         self.faults = (*experiment.faults, *faults)
         self.streams = Streams.of_seed(seed)
         self.lab = Laboratory(clock)
         self.recorder: Recorder | None = None
-        self._early: list[tuple[str, str]] = []  # what was said before there was one
+        self._early: list[tuple[str, str]] = []  # messages from before there was a recorder
         self.lost: str | None = None
-        self.logic_failed: str | None = None  # what own logic did, and when
+        self.logic_failed: str | None = None  # how own logic failed, and when
         self.over = False
         self._duration_us = round(duration_s * 1e6)
         self._trace_all = trace_all
@@ -158,7 +159,7 @@ class Flight:
 
     @property
     def events(self) -> EventQueue:
-        """What hardware does next."""
+        """The queue of hardware events."""
         return self.lab.events
 
     @property
@@ -188,7 +189,7 @@ class Flight:
         self.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._record)
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return what there is to record."""
+        """Return the channels to record."""
         robot = self.robot
         channels = flight_channels(robot, self.line.trajectory)
         markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
@@ -198,6 +199,8 @@ class Flight:
         own = logic_channels(robot.firmware)
         if isinstance(robot.firmware, RealFirmware):
             own = (*own, loop_channel(robot.firmware))
+        if isinstance(robot.firmware, ImageFirmware) and robot.firmware.has_clock:
+            own = (*own, clock_channel(robot.firmware))
         battery = battery_channel(robot.battery)
         return (*channels, *line, battery, *tracker, *markers, *faults, *excited, *own)
 
@@ -211,9 +214,6 @@ class Flight:
         except KeyboardInterrupt:
             interrupted = True
             self.note("lab", "interrupted by the user")
-        firmware = self.robot.firmware
-        if isinstance(firmware, ImageFirmware) and (left := firmware.memory_left()):
-            self.note("board", left)
         outcome = Outcome(self.now_us, self.lost, interrupted)
         self.over = True
         self.line.finish(self.lab)
@@ -244,7 +244,7 @@ class Flight:
             self.note("lab", f"lost: {lost}")
 
     def _watch_logic(self, now_us: int) -> None:
-        """Keep which module of the user's first put out NaN or infinity."""
+        """Note which of the user's modules first returned NaN or infinity."""
         cause = self.robot.firmware.signals.supervisor.cause
         if self.logic_failed is None and cause in NOT_FINITE:
             what = cause.name.lower().replace("_", " ")
@@ -252,7 +252,7 @@ class Flight:
             self.note("lab", self.logic_failed)
 
     def _note_drops(self, now_us: int) -> None:
-        """Say which queue drops, once per second at most."""
+        """Report which queue drops, at most once per second."""
         for queue in self.robot.firmware.kernel.queues:
             if queue.dropped > self._drops_noted.get(queue.name, 0) and now_us >= self._next_drop_note_us:
                 self.note("board", f"queue {queue.name} is full: {queue.dropped} dropped so far")
@@ -260,18 +260,18 @@ class Flight:
                 self._next_drop_note_us = now_us + DROP_NOTE_PERIOD_US
 
     def note(self, source: str, text: str) -> None:
-        """Put a line into the event log."""
+        """Write a line into the event log."""
         if self.recorder is not None:
             self.recorder.note(self.now_us, source, text)
         else:
             self._early.append((source, text))
 
     def write_schedule(self, folder: Path) -> None:
-        """Write what was traced of the scheduler."""
+        """Write the scheduler's trace."""
         self.schedule.end(self.now_us)
         self.schedule.write(folder)
 
     def close(self) -> None:
-        """Close what the flight itself opened."""
+        """Close the resources that the flight itself opened."""
         with self.closing:
             self.line.close()

@@ -1,6 +1,6 @@
-"""The time line on which robots, cameras, lines and stations live: hardware events own time, then firmware runs.
+"""The common time line of robots, cameras, lines and stations: hardware events own time, then firmware runs.
 
-Without a wall clock the firmware runs by itself up to the next thing that hardware does. With one, every instant waits
+Without a wall clock the firmware runs by itself up to the next hardware event. With one, every instant waits
 for its turn, and bytes from outside arrive in between.
 """
 
@@ -29,7 +29,7 @@ class Laboratory:
         self.robots: list[Robot] = []
         self.now_us = 0
         self.end_us = NEVER_US
-        self._alone = False  # one robot and no wall clock: nobody takes turns with it
+        self._alone = False  # one robot and no wall clock: no turns to take
 
     def run(self, progress: Progress | None = None) -> None:
         """Go from one instant at which anything happens to the next, until `end_us`; may be called again."""
@@ -60,7 +60,7 @@ class Laboratory:
                 else:
                     robot.run(max(wake_us, min(now_us, other_us) - 1))
                     if other_us < now_us or (events.next_us is not None and events.next_us < now_us):
-                        return  # another one comes first, or a task has set hardware going that acts earlier
+                        return  # another robot comes first, or a task has triggered hardware that acts earlier
         if clock.paced:
             now_us = clock.wait_until(now_us)
         for robot in self.robots:
@@ -77,7 +77,7 @@ class Laboratory:
         return end_us if next_us is None or next_us > end_us else next_us
 
     def _run_firmware(self) -> None:
-        """Run the firmware of this instant; one that is alone goes on up to the next thing that hardware does."""
+        """Run the firmware of this instant; a single robot's goes on up to the next hardware event."""
         if self._alone:
             self.robots[0].run(self.now_us, self._next_event_us() - 1)
         else:

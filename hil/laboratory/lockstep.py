@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 from firmware_py.core_runner import PythonRunner
-from firmware_py.extras import install_command
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation, Link
@@ -16,8 +16,9 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
-from hil.devices.radio import VirtualRadio
-from hil.errors import LabError
+from hil.devices.radio import Receiver, VirtualRadio
+from hil.devices.stm32f405.firmware import ImageFirmware
+from hil.devices.stm32f405.settings import ImageSettings
 from hil.laboratory.channels import radio_channel, tracker_channel
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.faults import Fault
@@ -27,11 +28,11 @@ from hil.laboratory.recorder import Channel
 from hil.laboratory.robot import Executor
 
 RADIO, MAVLINK = "radio", "mavlink"
-LOCKSTEP = (RADIO, MAVLINK)  # links that are simulated whole
+LOCKSTEP = (RADIO, MAVLINK)  # links that are fully simulated
 
 
 class ModelledLine:
-    """`hil.laboratory.flight.Line` for the modelled links; `station`, `tracker` and `radio` may be looked at."""
+    """`hil.laboratory.flight.Line` for the modelled links; `station`, `tracker` and `radio` may be read."""
 
     def __init__(self, flight: Flight, link: str, telemetry_path: Path | None) -> None:
         config, robot = flight.config, flight.robot
@@ -51,26 +52,39 @@ class ModelledLine:
         self.station = GroundStation(
             self._link, self.trajectory, self._telemetry, config.station, self.tracker
         )
-        self.radio.connect(robot.packet_received, self.station.on_packet, robot.polled)
+        on_ground: Receiver = self.station.on_packet
+        if isinstance(robot.firmware, ImageFirmware):
+            on_ground = self._set_up(flight, robot.firmware)
+        self.radio.connect(robot.packet_received, on_ground, robot.polled)
         if robot.uart is not None:
             robot.uart.connect(robot.uart_ready, self.station.on_packet)
         robot.seen_by(lambda frame, now_us, _: self.station.on_frame(frame, now_us))
 
+    def _set_up(self, flight: Flight, image: ImageFirmware) -> Receiver:
+        """Let the settings of the flight reach the image; returns what takes packets from the board."""
+        say = partial(flight.note, "lab")
+        settings = ImageSettings(
+            image.parameters, image.differences, flight.config, flight.events, self.radio.uplink, say
+        )
+        flight.events.at(0, settings.begin)
+
+        def on_ground(now_us: int, data: bytes) -> None:
+            self.station.on_packet(now_us, data)
+            settings.hear(now_us, data)
+
+        return on_ground
+
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
-        """What line and tracker count."""
+        """The counters of line and tracker."""
         return (self._channel,), (tracker_channel(self.tracker),) if self.tracker else ()
 
     def _radio(self, config: LabConfig) -> tuple[Link, Channel]:
         return LoopbackLink(self.radio.uplink, config.station.link_latency_us), radio_channel(self.radio)
 
     def _serial(self, flight: Flight, telemetry_path: Path | None) -> tuple[Link, Channel]:
-        """Return the station's end of the serial line, whose packages are an extra."""
-        try:
-            from hil.laboratory.serial_line import link_of, serial_channel
-        except ImportError as error:
-            raise LabError(
-                f"--link mavlink needs pymavlink ({error}): {install_command('mavlink')}"
-            ) from None
+        """Return the station's end of the serial line, whose package is an extra."""
+        from hil.laboratory.serial_line import link_of, serial_channel
+
         uart = self._robot.uart
         assert uart is not None
         link = link_of(flight.config, uart)
@@ -85,14 +99,14 @@ class ModelledLine:
         self.radio.uplink(now_us, packet)
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
-        """What the station says."""
+        """The station's messages."""
         return [("station", line) for line in self.station.notices()]
 
     def finish(self, lab: Laboratory) -> None:
         """Nothing: the station ends with its time line."""
 
     def close(self) -> None:
-        """Close what the station wrote."""
+        """Close the station's files."""
         with ExitStack() as closing:  # all of them, even on a full disk
             for written in (self._telemetry, self._frames):
                 if written is not None:

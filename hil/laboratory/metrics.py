@@ -1,6 +1,6 @@
-"""From a flight log to figures and verdicts, after the release: from the truth, never from the estimate.
+"""From a flight log to metrics and verdicts, after the release: from the truth, never from the estimate.
 
-In a real flight, whose truth nobody knows, from what the cameras saw; rows without a pose do not count.
+In a real flight, whose truth is unknown, from the cameras' poses; rows without a pose do not count.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ class Metric:
     meaning: str
 
     def show(self, value: float) -> str:
-        """Return a value as people read it."""
+        """Return a value as text with its unit."""
         return show(value, self.unit)
 
 
@@ -42,7 +42,7 @@ SHOWN = {
 
 
 def show(value: float, unit: str) -> str:
-    """Return a value as people read it: lengths in cm, angles in deg, shares in percent; infinity is never."""
+    """Return a value as text: lengths in cm, angles in deg, shares in percent; infinity is never."""
     if np.isposinf(value):
         return "never"
     scale, shown = SHOWN.get(unit, (1.0, unit))
@@ -66,7 +66,7 @@ METRICS: Mapping[str, Metric] = {
     "y_over_x": Metric("", "min", "rms of y over rms of x"),
     "settle": Metric("s", "max", "from a step of the goal until the error stays within 5 % of it"),
     "rise": Metric("s", "max", "from a step of the goal to 90 % of it, the slowest"),
-    "overshoot": Metric("share", "max", "largest way beyond a step of the goal, of the step"),
+    "overshoot": Metric("share", "max", "largest excess over a step of the goal, as a share of the step"),
     "hold_rms": Metric("m", "max", "root mean square of the y error in the last 3 s before a step"),
     "peak_rate": Metric("rad/s", "min", "largest yaw rate"),
     "gain": Metric("", "min", "amplitude of the sine flown over that of the goal"),
@@ -94,11 +94,15 @@ METRICS: Mapping[str, Metric] = {
         "s", "max", "mean time from a gyro sample to the flaps that it moved, of a board in the loop"
     ),
     "loop_added": Metric(
-        "s", "max", "mean age that the link to a board in the loop adds to poses, and that they tell"
+        "s", "max", "mean age that the link to a board in the loop adds to poses, and that they report"
     ),
-    "samples_late": Metric("", "max", "milliseconds for which a board in the loop had no gyro sample"),
-    "samples_lost": Metric("", "max", "gyro samples that never came"),
-    "samples_doubled": Metric("", "max", "gyro samples that came again, or too late"),
+    "loop_stood": Metric(
+        "s", "max", "how long simulated time stood still because a board in the loop was late"
+    ),
+    "samples_held": Metric("", "max", "milliseconds for which a board in the loop waited for a gyro sample"),
+    "samples_late": Metric("", "max", "milliseconds for which it flew on without a gyro sample"),
+    "samples_lost": Metric("", "max", "gyro samples that were lost on the link and sent again"),
+    "samples_doubled": Metric("", "max", "gyro samples that it received twice"),
     "estimator_late_from": Metric("share", "min", "thief's load at which KALMAN first misses a deadline"),
     "controller_late_from": Metric(
         "share", "min", "thief's load at which STABILIZER first misses a deadline"
@@ -109,7 +113,7 @@ METRICS: Mapping[str, Metric] = {
     "power": Metric("W", "max", "mean power from the battery"),
     "specific_power": Metric("W/kg", "max", "that power over the robot's mass"),
     "endurance": Metric("min", "min", "flight until the supervisor finds the battery empty"),
-    "lift_off": Metric("s", "max", "from the controller's start until the robot is 2 cm off the net"),
+    "lift_off": Metric("s", "max", "from the controller's start until the robot is 2 cm above the net"),
     "reached_box": Metric(
         "s", "max", "from the start of the flight speed until the robot is in the 20 cm box"
     ),
@@ -152,18 +156,18 @@ def column(table: pa.Table, *names: str) -> NDArray[np.float64]:
 
 
 def is_real(table: pa.Table) -> bool:
-    """Whether a log is that of a real flight, or of one that looks like it from the ground."""
+    """Whether a log is of a real flight, or of one that only its ground station recorded."""
     return "cameras.x" in table.column_names
 
 
 def body(table: pa.Table, *names: str) -> NDArray[np.float64]:
-    """Return columns of the body's motion, like `column`: the truth, or in a real flight what the cameras saw."""
+    """Return columns of the body's motion, like `column`: the truth, or in a real flight the cameras' poses."""
     source = "cameras" if is_real(table) else "truth"
     return column(table, *(f"{source}.{name}" for name in names))
 
 
 def known(table: pa.Table) -> pa.Table:
-    """Return the rows that have a pose and an estimate; of a real flight the cameras or the board may not tell them."""
+    """Return the rows that have a pose and an estimate; in a real flight the cameras or the board may not report them."""
     if not is_real(table):
         return table
     return table.filter(np.isfinite(column(table, "cameras.x") + column(table, "estimate.x")))
@@ -188,7 +192,15 @@ def attitude_error(table: pa.Table) -> NDArray[np.float64]:
 
 def free_flight(table: pa.Table) -> pa.Table:
     """Return the rows after the release; of a real flight, those in which the cameras saw the robot."""
-    return table.filter(_free(table) & (_seen(table) if is_real(table) else True))
+    return _rows(table, _free(table) & (_seen(table) if is_real(table) else True))
+
+
+def _rows(table: pa.Table, chosen: NDArray[np.bool_]) -> pa.Table:
+    """Return the rows that are chosen; when they stand together, as they mostly do, without a copy of an hour's flight."""
+    numbers = np.flatnonzero(chosen)
+    if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers):
+        return table.slice(int(numbers[0]), len(numbers))
+    return table.filter(chosen)
 
 
 def _free(table: pa.Table) -> NDArray[np.bool_]:
@@ -201,14 +213,14 @@ def _seen(table: pa.Table) -> NDArray[np.bool_]:
 
 def _unseen(table: pa.Table) -> float:
     """Return how long [s] the cameras did not see the robot between the release and their last pose of it."""
-    free = table.filter(_free(table))
+    free = _rows(table, _free(table))
     last = np.flatnonzero(_seen(free))[-1]
     times = column(free, "t")[: last + 1]
     return float((~_seen(free))[: last + 1].mean() * (times[-1] - times[0]) * 1e-6)
 
 
 def measure(table: pa.Table, lost: bool) -> dict[str, float]:
-    """Return every metric of METRICS; NaN where the flight was too short to tell."""
+    """Return every metric of METRICS; NaN where the flight was too short."""
     flight = free_flight(table)
     values = dict.fromkeys(METRICS, float("nan"))
     values["lost"] = float(lost)
@@ -237,7 +249,8 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
         values["loop_delay"], values["loop_added"] = (
             column(flight, "loop.delay", "loop.added").mean(axis=0) * 1e-6
         )
-        for name in ("late", "lost", "doubled"):
+        values["loop_stood"] = float(column(flight, "loop.stood")[-1]) * 1e-6
+        for name in ("held", "late", "lost", "doubled"):
             values[f"samples_{name}"] = float(column(flight, f"loop.{name}")[-1])
     if is_real(table):
         values["poses_refused"] = float(column(flight, "estimator.rejected")[-1])
@@ -252,7 +265,7 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
 
 def _mean_age(flight: pa.Table) -> float:
     ages = column(flight, "estimator.pose_age_us")
-    ages = ages[np.isfinite(ages)]  # a real board has not told it before its first telemetry
+    ages = ages[np.isfinite(ages)]  # a real board has not reported it before its first telemetry
     return float(ages.mean()) * 1e-6 if len(ages) else np.nan
 
 
@@ -270,7 +283,7 @@ def judge(
 
 
 def check_limits(limits: Mapping[str, float], own: Mapping[str, Metric]) -> None:
-    """Raise `LabError` for a limit on something that neither METRICS nor an experiment's own metrics have."""
+    """Raise `LabError` for a limit on a metric that neither METRICS nor the experiment has."""
     known = [*own, *METRICS]
     for name in limits:
         if name not in known:

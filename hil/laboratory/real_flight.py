@@ -21,13 +21,14 @@ from ground_station.program import Cockpit
 from ground_station.telemetry_log import TELEMETRY
 from hil.config import LabConfig
 from hil.errors import LabError, writing
-from hil.laboratory.ages import STATION_START, ages_of, told
+from hil.installation import commit, versions
+from hil.laboratory.ages import STATION_START, ages_of, reported_ages
 from hil.laboratory.channels import station_channels
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import RECORD_PERIOD_US
 from hil.laboratory.metrics import check_limits, free_flight, judge, measure
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
-from hil.laboratory.result import REAL, Origin, Outcome, Result, commit, versions, write_result
+from hil.laboratory.result import REAL, Origin, Outcome, Result, write_result
 from hil.world.config import LimitsConfig
 
 
@@ -188,7 +189,7 @@ class RealFlight:
             tasks=(),
             queues=(),
             usage=None,
-            ages=ages_of(told(folder), log, self._origin.link),
+            ages=ages_of(reported_ages(folder), log, self._origin.link),
             hash=digest,
             real_time_factor=nan,
             stood_still_ms=nan,

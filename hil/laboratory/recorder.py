@@ -1,4 +1,4 @@
-"""The flight log: one row per 10 ms, written while the flight goes on, so that a crash keeps what was flown.
+"""The flight log: one row per 10 ms, written during the flight, so that a crash keeps the rows before it.
 
 During the flight the rows go to `log.arrows` (an Arrow stream, one batch per second); closing turns it into `log.parquet`.
 Texts (console, supervisor, causes) go to `events.jsonl`, line by line. Each column carries `unit` and `frame` in its
@@ -10,8 +10,9 @@ import json
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import IO, Any, Protocol
@@ -26,8 +27,8 @@ from hil.errors import LabError
 from hil.laboratory.ages import at_exposure
 
 if "pandas" not in sys.modules:
-    # The first array imports pandas, to know its types, which takes a second or so, in mid-flight. Shown one that it takes
-    # for too old, Arrow does without, until somebody calls `to_pandas`.
+    # The first array imports pandas, to know its types, which takes a second or so in mid-flight. If pandas seems
+    # too old, Arrow does without it, until `to_pandas` is called.
     sys.modules["pandas"] = ModuleType("pandas")
     sys.modules["pandas"].__version__ = "0"  # type: ignore[attr-defined]
     with warnings.catch_warnings(action="ignore"):
@@ -35,8 +36,9 @@ if "pandas" not in sys.modules:
     del sys.modules["pandas"]
 
 ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to disk
-ROWS_SHOWN = 20  # together, to who looks on: five times a second
-OPERATOR = "operator"  # source of the events that somebody has brought about at the terminal
+BATCHES_PER_PIECE = 160  # of a long flight's log, written and read at once
+ROWS_SHOWN = 20  # given to the onlooker together: five times a second
+OPERATOR = "operator"  # source of the events that an operator caused at the terminal
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
 
@@ -52,7 +54,7 @@ class Quantity:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """What is read together: `read` returns the values of all the quantities' columns in order (or one number)."""
+    """Columns that are read together: `read` returns the values of all the quantities' columns in order (or one number)."""
 
     dtype: str
     read: Callable[[], Any]
@@ -60,7 +62,7 @@ class Channel:
 
 
 class Onlooker(Protocol):
-    """Who looks on while a flight is recorded. Neither call waits for anything, or raises."""
+    """Watches a flight while it is recorded. Neither call blocks or raises."""
 
     def rows(self, batch: pa.RecordBatch) -> None:
         """Take the next rows; the schema of all of them is that of the log."""
@@ -72,7 +74,7 @@ class Onlooker(Protocol):
 
 
 class Recorder:
-    """Writes one flight into its run folder, and shows it to who looks on; without a folder nothing is kept."""
+    """Writes one flight into its run folder, and passes it to an onlooker; without a folder nothing is stored."""
 
     def __init__(
         self,
@@ -124,7 +126,7 @@ class Recorder:
         ]
 
     def note(self, now_us: int, source: str, text: str) -> None:
-        """Add a line of text to the log, on disk at once."""
+        """Add a line of text to the log, written to disk at once."""
         if self._onlooker is not None:
             self._onlooker.note(now_us, source, text)
         if self._events is not None:
@@ -134,7 +136,7 @@ class Recorder:
     def close(self, correct: Callable[[pa.Table], pa.Table] | None = None) -> str:
         """Finish the files; returns the SHA-256 over times, names and values of all columns as they were recorded.
 
-        `correct` may put in what became known only after the flight.
+        `correct` may add what became known only after the flight.
         """
         with ExitStack() as closing:  # all of them, even on a full disk
             for written in (self._file, self._stream, self._events):
@@ -168,28 +170,28 @@ class Recorder:
         return columns
 
     def _batch(self, columns: list[NDArray[Any]]) -> pa.RecordBatch:
-        return pa.record_batch([_array(values) for values in columns], schema=self._schema)
-
-
-def _array(values: NDArray[Any]) -> pa.Array:
-    """Return an array of Arrow over values; not by `pa.array`, which imports modules in mid-flight."""
-    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
+        # Not by `pa.array`, which imports modules in mid-flight.
+        arrays = [
+            pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(values)])
+            for values, kind in zip(columns, self._schema.types, strict=True)
+        ]
+        return pa.record_batch(arrays, schema=self._schema)
 
 
 def finish_log(
     folder: Path, release_us: int | None = None, correct: Callable[[pa.Table], pa.Table] | None = None
 ) -> None:
-    """Turn what the stream holds into `log.parquet`, even when the flight ended in the middle of a batch."""
-    stream = folder / STREAM
-    table = _read_stream(stream)
+    """Convert the stream into `log.parquet`, even when the flight ended in the middle of a batch."""
+    stream, partial = folder / STREAM, folder / (PARQUET + ".partial")
+    pieces = _read_stream(stream)
     if correct is not None:
-        table = correct(table)
-    if release_us is not None:
-        table = table.replace_schema_metadata(
-            {**(table.schema.metadata or {}), RELEASE_US: str(release_us).encode()}
-        )
-    partial = folder / (PARQUET + ".partial")
-    pa.parquet.write_table(table, partial, compression="zstd", use_dictionary=False)
+        pieces = iter([correct(pa.concat_tables(pieces))])
+    first = next(pieces)
+    more = {} if release_us is None else {RELEASE_US: str(release_us).encode()}
+    schema = _with_metadata(first, more).schema
+    with pa.parquet.ParquetWriter(partial, schema, compression="zstd", use_dictionary=False) as writer:
+        for table in chain([first], pieces):
+            writer.write_table(table)
     partial.replace(folder / PARQUET)
     stream.unlink()
 
@@ -201,16 +203,19 @@ def load_log(folder: Path) -> pa.Table:
     """
     if (folder / PARQUET).is_file():
         try:
-            return pa.parquet.read_table(folder / PARQUET)
+            with pa.parquet.ParquetFile(folder / PARQUET, pre_buffer=False) as file:
+                count = file.num_row_groups
+                pieces = [file.read_row_group(number, use_threads=False) for number in range(count)]
+                return pa.concat_tables([file.schema_arrow.empty_table(), *pieces])
         except (pa.ArrowInvalid, OSError) as error:
             raise LabError(f"{folder / PARQUET}: not a flight log ({error})") from None
     if (folder / STREAM).is_file():
-        return _read_stream(folder / STREAM)
+        return pa.concat_tables(_read_stream(folder / STREAM))
     raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
 
 
 def release_of(metadata: Mapping[bytes, bytes] | None) -> int:
-    """Return when the robot of a log was released [us], or when it was to be; 0 of a log that says neither."""
+    """Return when the robot of a log was released [us], or when that was planned; 0 for a log with neither."""
     known = metadata or {}
     if RELEASE_US in known:
         return int(known[RELEASE_US])
@@ -233,25 +238,30 @@ def _complete_lines(path: Path) -> Iterator[dict[str, Any]]:
             return
 
 
+def _with_metadata(table: pa.Table, more: Mapping[bytes, bytes]) -> pa.Table:
+    return table.replace_schema_metadata({**(table.schema.metadata or {}), **more})
+
+
 def _with_release(table: pa.Table) -> pa.Table:
     """Return the log of a real flight with its release, which was not known when the stream began."""
-    if "cameras.x" not in table.column_names:
-        return table
     free = np.flatnonzero(table.column("flight.free").to_numpy())
     first_us = table.column("t")[int(free[0]) if len(free) else 0].as_py() if table.num_rows else 0
-    return table.replace_schema_metadata(
-        {**(table.schema.metadata or {}), RELEASE_US: str(first_us).encode()}
-    )
+    return _with_metadata(table, {RELEASE_US: str(first_us).encode()})
 
 
-def _read_stream(path: Path) -> pa.Table:
+def _read_stream(path: Path) -> Iterator[pa.Table]:
+    """Yield the log in pieces, at least one; that of a real flight in one piece, which its corrections need."""
     try:
         with pa.ipc.open_stream(str(path)) as reader:
             schema, batches = reader.schema, []
-            while True:
-                try:
+            real = "cameras.x" in schema.names
+            with suppress(StopIteration, pa.ArrowInvalid, OSError):  # the end, or where a process died
+                while True:
                     batches.append(reader.read_next_batch())
-                except (StopIteration, pa.ArrowInvalid, OSError):
-                    return _with_release(at_exposure(pa.Table.from_batches(batches, schema)))
+                    if len(batches) == BATCHES_PER_PIECE and not real:
+                        yield pa.Table.from_batches(batches, schema)
+                        batches = []
     except pa.ArrowInvalid as error:
         raise LabError(f"{path}: not a flight log ({error})") from error
+    table = pa.Table.from_batches(batches, schema)
+    yield _with_release(at_exposure(table)) if real else table

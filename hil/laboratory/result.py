@@ -1,16 +1,13 @@
-"""What is known of a run: where it comes from and how it went; `result.json`, written once and read back as the same type.
+"""The result of a run: its origin and outcome; `result.json`, written once and read back as the same type.
 
 A number that a flight does not have is NaN here and null in the file. Of a run whose process was killed, which left no
-`result.json`, the log tells the origin and the metrics.
+`result.json`, origin and metrics come from the log.
 """
 
 import json
 import math
-import platform
-import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,15 +25,14 @@ RESULT = "result.json"
 REAL = "real"  # the board of a flight that only its ground station saw
 
 Outcome = Literal["completed", "lost", "interrupted", "error"]
-AsText = BeforeValidator(
-    lambda value: json.loads(value) if isinstance(value, str) else value
-)  # in a log's schema
+# In a log's schema values are JSON text.
+AsText = BeforeValidator(lambda value: json.loads(value) if isinstance(value, str) else value)
 OrNone = BeforeValidator(lambda value: None if value == "null" else value)  # likewise
 
 
 @dataclass(frozen=True, slots=True)
 class QueueReport:
-    """How full a queue became."""
+    """The greatest length of a queue, and its drops."""
 
     name: str
     length: int
@@ -45,8 +41,20 @@ class QueueReport:
 
 
 @dataclass(frozen=True, slots=True)
+class ImageReport:
+    """What an image left unused at the end of its flight, and how often it began anew."""
+
+    sha256: str  # of what is in flash
+    stack_free_bytes: Mapping[str, int]  # of each task, never used since its creation
+    heap_free_bytes: int | None  # None: it has no heap of FreeRTOS
+    heap_least_free_bytes: int | None  # when it was fullest
+    watchdog_resets: int
+    software_resets: int
+
+
+@dataclass(frozen=True, slots=True)
 class Origin:
-    """What was flown, by which program; it stands in the log's schema, too."""
+    """What was flown, by which program; also stored in the log's schema."""
 
     experiment: str
     profile: str
@@ -56,7 +64,7 @@ class Origin:
     link: str
     board: str
     faults: Annotated[tuple[str, ...], AsText]  # the experiment's own and those on top
-    versions: Annotated[Mapping[str, str], AsText]  # of what computed the flight
+    versions: Annotated[Mapping[str, str], AsText]  # of the packages that computed the flight
     commit: str
     source: Annotated[Source | None, AsText]  # of an experiment that does not ship
     logic: str  # hash of the user's modules in the core, empty without
@@ -67,13 +75,13 @@ class Origin:
 
     @property
     def title(self) -> str:
-        """What a page or a table is headed."""
+        """The heading of a page or a table."""
         return (
             f"{self.experiment}, real flight" if self.seed is None else f"{self.experiment}, seed {self.seed}"
         )
 
     def metadata(self) -> dict[str, str]:
-        """Return it as a log's schema holds it."""
+        """Return it as text for a log's schema."""
         values = _ORIGIN.dump_python(self, mode="json")
         return {
             name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()
@@ -82,27 +90,28 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class Result(Origin):
-    """How a run went."""
+    """The outcome of a run."""
 
     outcome: Outcome
     cause: str | None
     metrics: Mapping[str, Figure]
-    own_metrics: Mapping[str, Metric]  # what the experiment's own ones are
+    own_metrics: Mapping[str, Metric]  # the definitions of the experiment's own metrics
     verdicts: tuple[Verdict, ...]
     tasks: tuple[TaskReport, ...]
     queues: tuple[QueueReport, ...]
     usage: Usage | None  # of the board, where it was measured
-    ages: tuple[Stage, ...]  # where the age of the poses came from
+    ages: tuple[Stage, ...]  # the latency budget of the poses
     hash: str  # empty: the process was killed
     real_time_factor: Figure
     stood_still_ms: Figure  # simulated time, while the machine was too slow for a paced flight
-    folder: Annotated[Path, Field(exclude=True)] = Path()  # where it lies
+    folder: Annotated[Path, Field(exclude=True)] = Path()  # its run folder
+    image: ImageReport | None = None  # of a board that executes an image
     not_shown: int | None = None  # rows of the log that the live viewer did not take; null without one
 
     @computed_field  # type: ignore[prop-decorator]
     @property
     def passed(self) -> bool:
-        """Whether the flight came to an end of its own, which may be a crash, and every limit holds."""
+        """Whether the flight ended by itself, which may be a crash, and every limit holds."""
         return self.outcome in ("completed", "lost") and all(verdict.holds for verdict in self.verdicts)
 
 
@@ -140,34 +149,10 @@ def _of_killed(folder: Path) -> Result:
 
 
 def _first_of(error: ValidationError) -> str:
-    """Return what is wrong first: which value, and what is expected."""
+    """Return the first error: the value, and what is expected."""
     detail = error.errors()[0]
     name, message = ".".join(map(str, detail["loc"])), detail["msg"]
     if detail["type"] == "missing":
         return f"{name} is missing: it was written by another version; fly again"
     value = f"{name} = {detail['input']!r}: " if name else ""
     return f"{value}{message[0].lower()}{message[1:]}"
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what computes a flight."""
-    found = {"python": platform.python_version()}
-    for name in ("floaty-hil", "numpy", "numba", "pyarrow"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-def commit() -> str:
-    """Return the git commit of the sources, with `+` when they were changed; empty outside a clone."""
-    source = Path(__file__).parent
-    try:
-        described = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty=+"],
-            cwd=source, capture_output=True, text=True, timeout=10, check=True,
-        )  # fmt: skip
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return described.stdout.strip()

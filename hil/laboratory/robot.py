@@ -1,7 +1,7 @@
 """One Floaty in its tunnel: plant, battery, IMU, the cameras that see it, and a board whose firmware boots and reboots.
 
-All instants are the laboratory's, but those of the firmware, which counts from its boot. Where the board's radio packets
-go and what stands at the other end of its UART is handed in.
+All instants are the laboratory's, except those of the firmware, which counts from its boot. The destination of the board's
+radio packets and the other end of its UART are handed in.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from firmware_py.config import parameters_of
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from firmware_py.firmware import Firmware
 from firmware_py.thief import Thief
@@ -33,14 +32,13 @@ from hil.world.battery import Battery
 from hil.world.plant import Plant
 
 IMU_PERIOD_US = 1_000
-BENCH_NOISE = (
-    0.05  # of that in flight, before the fans run: the stock firmware wants less than 100 counts squared
-)
+# Share of the noise in flight before the fans run; the stock firmware requires less than 100 counts squared.
+BENCH_NOISE = 0.05
 MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms before its step
 
-See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, what was seen of the markers)
+See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, sighting of the markers)
 Say = Callable[[str, str], None]  # (source, text)
-Executor = RunnerFactory | ChipImage | RealBoard  # of the flight core, or of all that is flashed
+Executor = RunnerFactory | ChipImage | RealBoard  # of the flight core, or of the whole image
 SendPacket = Callable[[int, bytes], bool]  # (now_us, packet): False when it has to wait
 
 
@@ -62,11 +60,11 @@ class Streams:
 
 
 class Robot:
-    """Built at rest in its holder at home, with the firmware running; `watch` sets IMU and cameras going.
+    """Built at rest in its holder at home, with the firmware running; `watch` starts IMU and cameras.
 
-    `air` (of its radio) and `uart` are what faults of its lines turn, None for a line that it has not. `firmware` is that
-    of the present boot; `wire_us` is how long packets take from its radio chip to it, or back, where it does not count that
-    itself; `restart` is what a reset of its processor comes to, and may be replaced.
+    `air` (of its radio) and `uart` are changed by faults of its lines, None for a line that it lacks. `firmware` is that
+    of the present boot; `wire_us` is how long packets take from its radio chip to it, or back, where it does not simulate
+    that itself; `restart` is called on a reset of its processor, and may be replaced.
     """
 
     def __init__(
@@ -101,7 +99,7 @@ class Robot:
         self.send_packet: SendPacket = _nobody_listens
         self._runner = runner
         self.wire_us: Callable[[bytes], int] = _no_time if isinstance(runner, ChipImage) else syslink_us
-        self.polled_by_host = False  # by one that is real: empty polls need no model
+        self.polled_by_host = False  # a real host polls, so empty polls need no model
         self.executes_image = isinstance(runner, ChipImage)
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
@@ -112,11 +110,11 @@ class Robot:
         self.board.battery_mv = self.battery.millivolts
 
     def boot(self, now_us: int) -> None:
-        """Start the firmware; its clock begins here. EEPROM and deck memory are as they were left."""
+        """Start the firmware; its clock begins here. EEPROM and deck memory keep their content."""
         self.booted_us = now_us
         self.powered = True
         if self.uart is not None:
-            self.uart.read()  # a booted processor begins with an empty buffer
+            self.uart.read()  # a booted processor starts with an empty buffer
         self.board.boot(now_us)
         self.firmware = self._firmware(now_us)
         self.board.run_on(self.firmware.kernel, self.events)
@@ -125,36 +123,32 @@ class Robot:
             self._thief.share = share
 
     def _firmware(self, now_us: int) -> Firmware | ImageFirmware | RealFirmware:
-        """Return the firmware of a new boot; an image gets power some time before the laboratory's time begins."""
+        """Return the firmware of a new boot; an image is powered some time before the laboratory's time begins."""
         if isinstance(self._runner, RealBoard):
             return RealFirmware(self._runner, self.board)
         if not isinstance(self._runner, ChipImage):
             return Firmware(self.config, self.board, mavlink=self.uart is not None, runner=self._runner)
-        specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is that of any other board
+        specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is the same for every board
         specimen.set_noise_scale(BENCH_NOISE)
         rest = None if now_us else lambda: specimen.sample(self.plant)
-        firmware = ImageFirmware(self._runner, self.board, rest, polls=not self.polled_by_host)
-        if rest is not None:
-            for text in firmware.differences(parameters_of(self.config).memory):
-                self.say("lab", f"the image flies with its own {text}")
-        return firmware
+        return ImageFirmware(self._runner, self.board, rest, polls=not self.polled_by_host)
 
     def cut_power(self) -> None:
         """Stop the firmware: the servos keep their last pulse."""
         self.powered = False
 
     def watch(self, start_us: int) -> None:
-        """Set IMU and cameras going, for ever."""
+        """Start IMU and cameras, which run for ever."""
         self.events.every(IMU_PERIOD_US, start_us + IMU_PERIOD_US, self._sample)
         self.events.every(self.config.mocap.period_us, start_us + MOCAP_PHASE_US, self._expose)
 
     def seen_by(self, see: See) -> None:
-        """Hand every frame of the cameras to `see` when their computer has it."""
+        """Pass every frame of the cameras to `see` when their computer has it."""
         self._seen_by.append(see)
 
     @property
     def thief(self) -> Thief:
-        """A task on the board above all others, there from the first use on; it takes nothing until told to."""
+        """The thief task on the board, created on first use; it takes nothing until its share is set."""
         if self._thief is None:
             self._thief = self.firmware.add_thief()
         return self._thief
@@ -182,12 +176,12 @@ class Robot:
     # Body
 
     def release(self) -> None:
-        """Let go of the body."""
+        """Release the body."""
         self.plant.release()
         self.free = True
 
     def put_back(self, now_us: int) -> None:
-        """Put the body into the holder, as at the start; flaps, air and faults stay."""
+        """Put the body into the holder, as at the start; flaps, air and faults are unchanged."""
         self.plant.advance(now_us)
         self.plant.put_back(self.start_W)
         self.free = False

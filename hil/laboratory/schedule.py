@@ -1,6 +1,6 @@
 """Which task ran when: the kernel's trace of a window of the flight, as `schedule.parquet`.
 
-Columns: `us` (instant), `event` and `who` (the words of tests/vectors/README.md), `a`, `b`. Without further wish the window
+Columns: `us` (instant), `event` and `who` (the words of tests/vectors/README.md), `a`, `b`. By default the window
 is the 50 ms after the release, enough for a picture; `floaty fly --perfetto` traces the whole flight.
 """
 
@@ -23,7 +23,7 @@ SCHEMA = pa.schema(
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A task had the processor."""
+    """An interval in which a task had the processor."""
 
     task: str
     start_us: int
@@ -65,7 +65,7 @@ def load_schedule(folder: Path) -> pa.Table:
 
 
 def runs(schedule: pa.Table) -> Iterator[Run]:
-    """Yield who had the processor from when to when, the idle task included, instants of no length left out."""
+    """Yield the intervals in which tasks had the processor, the idle task included, without those of no length."""
     events, times, names = (schedule.column(name).to_pylist() for name in ("event", "us", "who"))
     task, start_us = "", 0
     for event, us, who in zip(events, times, names, strict=True):

@@ -1,4 +1,4 @@
-"""The serial line of a flight in lockstep, with MAVLink on it: the station's end, the board's UART, and what is logged."""
+"""The serial line of a flight in lockstep, with MAVLink on it: the station's end, the board's UART, logged counters."""
 
 from firmware_py.firmware import Firmware
 from ground_station.errors import LinkError
@@ -27,7 +27,7 @@ def link_of(config: LabConfig, line: VirtualSerial) -> MavlinkLink:
 def serial_channel(
     uart: VirtualSerial, firmware: Firmware | ImageFirmware | RealFirmware, link: MavlinkLink | None
 ) -> Channel:
-    """Return what a serial line counts; without a `link` the station's frames are unknown and stay 0.
+    """Return the counters of a serial line; without a `link` the station's frames are unknown and stay 0.
 
     `link.*` counts pieces of the stream, `serial.*` bytes, bits and frames.
     """

@@ -1,9 +1,9 @@
-"""Rows and texts of a flight on their way to a picture that is made of them while it flies.
+"""Sends rows and texts of a flight to a live picture of it.
 
-The picture has a process of its own (`hil.live.picture`), at a lower priority. What goes there waits in a bounded queue
+The picture has a process of its own (`hil.live.picture`), at a lower priority. Data for it wait in a bounded queue
 for the thread that writes it into a pipe: an Arrow stream, whose batches carry texts and the board's parameters as metadata.
-Back come lines: how many rows were taken, and what somebody has typed there. So a picture that is slow, stands still, is
-closed or never comes up holds nobody: what it does not take is dropped and counted.
+Lines come back: how many rows were taken, and what was typed there. So a picture that is slow, hangs, is
+closed or never opens delays nothing: what it does not take is dropped and counted.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ import pyarrow as pa
 
 from hil.errors import LabError
 
-START_TIMEOUT_S = 30.0  # for the picture to come up, after which nobody waits for it
-CATCH_UP_S = 10.0  # for it to show the rest, at the end
-PIPE_BREAKS_S = 1.0  # for a thread that writes to notice that nobody reads any more
+START_TIMEOUT_S = 30.0  # for the picture to open, after which it is not waited for
+CATCH_UP_S = 10.0  # for it to show the rest at the end
+PIPE_BREAKS_S = 1.0  # for a writing thread to notice that the reader is gone
 QUEUE_PIECES = 300  # as the recorder shows them: a minute of flight
-TOGETHER = 100  # pieces that are written as one, when that many wait
-LINES = 1000  # that were typed there and nobody has fetched; texts before the first row
+TOGETHER = 100  # pieces that are written as one batch, when that many wait
+LINES = 1000  # typed lines that wait to be fetched; texts before the first row
 EVENTS, PARAMETERS = b"events", b"parameters"  # metadata of a batch
-READY, FAILED, TAKEN, TYPED = "ready", "failed", "taken", "typed"  # first words of the lines that come back
+READY, FAILED, TAKEN, TYPED = "ready", "failed", "taken", "typed"  # first words of the returned lines
 
 T = TypeVar("T")
 Piece = tuple[pa.RecordBatch, list[dict[str, Any]]]
 
 
 class Feed:
-    """Hands pieces to a sink in a thread of its own; when the sink is slow, the oldest waiting ones are dropped."""
+    """Passes pieces to a sink in a thread of its own; when the sink is slow, the oldest waiting ones are dropped."""
 
     def __init__(self, sink: Callable[[list[Piece]], None], capacity: int = QUEUE_PIECES) -> None:
         self._sink = sink
@@ -73,9 +73,9 @@ class Feed:
 
 
 class LiveView:
-    """`hil.laboratory.recorder.Onlooker` of a picture in another process; `command` starts that.
+    """`hil.laboratory.recorder.Onlooker` of a picture in another process, which `command` starts.
 
-    `say` gets lines for the user. Raises `LabError` when the picture says that it cannot come up; one that says nothing is
+    `say` gets lines for the user. Raises `LabError` when the picture reports that it cannot open; a silent one is
     not waited for.
     """
 
@@ -86,12 +86,12 @@ class LiveView:
         self.address = ""  # of a picture that is served until it ends
         self._texts: deque[dict[str, Any]] = deque(maxlen=LINES)
         self._typed: deque[str] = deque(maxlen=LINES)
-        self._parameters: deque[tuple[str, float]] = deque()  # that the picture does not know yet
+        self._parameters: deque[tuple[str, float]] = deque()  # not yet sent to the picture
         self._schema: pa.Schema | None = None
         self._stream: Any = None
         self._failure = ""
         self._is_late = False
-        self._up = threading.Event()  # it has said whether it comes up, or it has ended
+        self._up = threading.Event()  # set when it has reported whether it opens, or has ended
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True
         )  # fmt: skip
@@ -102,7 +102,7 @@ class LiveView:
         self._feed = Feed(self._write)
         if not self._up.wait(start_timeout_s):
             self._is_late = True
-            say(f"the viewer has not come up within {start_timeout_s:g} s; nobody waits for it any longer")
+            say(f"the viewer has not opened within {start_timeout_s:g} s; the flight goes on without waiting")
         elif self._failure:
             self._end()
             raise LabError(self._failure)
@@ -119,10 +119,10 @@ class LiveView:
         """Keep a text for the next rows."""
         self._texts.append({"t_us": t_us, "source": source, "text": text})
 
-    # Parameters of the board, which some pictures show and let people change
+    # Parameters of the board, which some pictures show and can change
 
     def know(self, values: Sequence[tuple[str, float]]) -> None:
-        """Tell values of the board's parameters with the next rows."""
+        """Send values of the board's parameters with the next rows."""
         self._parameters.extend(values)
 
     def lines(self) -> list[str]:
@@ -132,13 +132,13 @@ class LiveView:
     # The end
 
     def stay(self) -> None:
-        """Wait until the picture ends by itself, or Ctrl-C."""
+        """Wait until the picture ends or Ctrl-C is pressed."""
         self._flush()
         with suppress(KeyboardInterrupt):
             self._process.wait()
 
     def close(self, catch_up_s: float = CATCH_UP_S) -> int:
-        """Let the picture catch up for a while and end; returns how many rows it has not taken. May be called again."""
+        """Let the picture catch up for a while and end; returns how many rows it did not take. May be called again."""
         self._flush()
         if self._is_late and not self.taken:
             catch_up_s = 0.0
@@ -163,7 +163,7 @@ class LiveView:
         self._process.wait()
         self._answers.join()
         if self._feed.close(PIPE_BREAKS_S):
-            self._close_pipe()  # else somebody whom the picture has started holds its other end
+            self._close_pipe()  # otherwise a process that the picture started holds its other end
         assert self._process.stdout is not None
         self._process.stdout.close()
 
@@ -175,7 +175,7 @@ class LiveView:
     # Threads
 
     def _write(self, pieces: list[Piece]) -> None:
-        """Write pieces into the pipe, in the feed's thread. `OSError`: nobody reads there any more."""
+        """Write pieces into the pipe, in the feed's thread. `OSError`: the reader is gone."""
         batches = [batch for batch, _ in pieces]
         if self._stream is None:
             self._stream = pa.ipc.new_stream(self._process.stdin, batches[0].schema)
@@ -206,20 +206,20 @@ class LiveView:
             elif word == TYPED:
                 self._typed.append(text)
         if not self._up.is_set():
-            self._failure = self._failure or "the viewer's process ended without a word"
+            self._failure = self._failure or "the viewer's process ended without a message"
             self._up.set()
 
 
 def _all(waiting: deque[T], most: int = LINES) -> list[T]:
-    """Take what waits; another thread may add to it meanwhile."""
+    """Take the waiting items; another thread may add to them meanwhile."""
     return [waiting.popleft() for _ in range(min(len(waiting), most))]
 
 
 def open_view(target: str, say: Callable[[str], None]) -> LiveView:
-    """Return the picture that `--view` means by a target. Raises `LabError` when there is no such one, or it cannot open."""
+    """Return the picture for a target of `--view`. Raises `LabError` for an unknown one, or one that cannot open."""
     return LiveView([sys.executable, "-m", "hil.live.picture", target], say)
 
 
 def missed_text(rows: int) -> str:
-    """Return how the user is told of rows that a picture has missed."""
+    """Return the notice about rows that a picture has missed."""
     return f"the live viewer did not take {rows} rows of the flight"

@@ -54,7 +54,7 @@ class FoxgloveScreen(ServerListener):
     def on_set_parameters(
         self, client: Client, parameters: list[Parameter], request_id: str | None = None
     ) -> list[Parameter]:
-        """Ask the operator to change parameters; returns what they still are."""
+        """Pass changes of parameters to the operator; returns the present values."""
         for parameter in parameters:
             value = parameter.get_value()
             if isinstance(value, int | float) and parameter.name in self._values:

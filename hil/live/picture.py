@@ -1,6 +1,6 @@
 """The process that shows a flight while it happens: `python -m hil.live.picture TARGET`, fed by `hil.live.feed`.
 
-A TARGET is `window` (rerun's viewer), `web` (the same in a browser), `connect:HOST:PORT` (one that is open somewhere) or
+A TARGET is `window` (rerun's viewer), `web` (the same in a browser), `connect:HOST:PORT` (a viewer that is already open) or
 `foxglove` (a WebSocket server for Foxglove). Rows come in at standard input, lines go out at standard output.
 """
 
@@ -19,14 +19,14 @@ import pyarrow as pa
 from hil.errors import LabError
 from hil.live.feed import EVENTS, FAILED, PARAMETERS, READY, TAKEN, TYPED
 
-NICE = 5  # behind everything that flies
+NICE = 5  # lower priority than everything that flies
 Say = Callable[[str, str], None]  # (first word, text)
 
 
 class Screen(Protocol):
     """Where a flight is shown."""
 
-    address: str  # for the user, who must be told where to look; empty if not
+    address: str  # the address to show to the user; empty if it is not needed
 
     def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         """Show the next rows, and texts up to them."""
@@ -53,7 +53,7 @@ def open_screen(target: str, typed: Callable[[str], None]) -> Screen:
 
 
 def run(target: str, rows: IO[bytes], say: Say) -> None:
-    """Show what comes until it ends."""
+    """Show what arrives until the stream ends."""
     screen = open_screen(target, lambda line: say(TYPED, line))
     say(READY, screen.address)
     taken = 0
@@ -78,7 +78,7 @@ def main() -> int:
     with suppress(OSError):
         os.nice(NICE)
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever libraries print
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # captures what libraries print
 
     def say(word: str, text: str) -> None:
         with suppress(OSError):
@@ -89,7 +89,7 @@ def main() -> int:
     except LabError as error:
         say(FAILED, str(error))
         return 1
-    except Exception as error:  # whatever it is, the flight goes on and is told
+    except Exception as error:  # the flight goes on after any error, which is reported
         say(FAILED, f"{type(error).__name__}: {error}")
         return 1
     return 0

@@ -19,14 +19,14 @@ ROUTE = re.compile(r"/(\w+)/(-?\d+(?:\.\d+)?)")
 
 def show_at(run: Path, at_s: float) -> None:
     """Show the recording of a run folder until the window is closed. Raises `LabError` when no window opens."""
-    recording = Recording(run)  # it has to live as long as the window
+    recording = Recording(run)  # it has to exist as long as the window
     show(recording.at(at_s), "--new")
 
 
 def browse(run: Path, at_s: float, say: Callable[[str], None]) -> None:
     """Serve the recording of a run folder to browsers, and the links of its report, until Ctrl-C.
 
-    Raises `LabError` when the links' port is taken, or no viewer comes up.
+    Raises `LabError` when the links' port is taken, or no viewer opens.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # the viewer ends with this process
     recording = Recording(run)
@@ -70,16 +70,16 @@ class _Visit(BaseHTTPRequestHandler):
             self.send_header("Location", self.server.page_at(float(found[2])))
             self.end_headers()
         elif self.path == f"/{REPORT}" and report.is_file():
-            self._tell(HTTPStatus.OK, "text/html", report.read_bytes())
+            self._respond(HTTPStatus.OK, "text/html", report.read_bytes())
         else:
             text = f"Here is {self.server.run}; for another flight: floaty view RUN --web with its folder.\n"
-            self._tell(HTTPStatus.NOT_FOUND, "text/plain", text.encode())
+            self._respond(HTTPStatus.NOT_FOUND, "text/plain", text.encode())
 
-    def _tell(self, status: HTTPStatus, kind: str, content: bytes) -> None:
+    def _respond(self, status: HTTPStatus, kind: str, content: bytes) -> None:
         self.send_response(status)
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
         self.end_headers()
         self.wfile.write(content)
 
     def log_message(self, format: str, *arguments: object) -> None:
-        """Nothing: who looks need not be told that he looks."""
+        """Log nothing: visits need no messages."""

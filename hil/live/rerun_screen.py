@@ -1,4 +1,4 @@
-"""A flight in rerun's viewer while it happens: in its window, in a browser, or in a viewer that is open somewhere."""
+"""A flight in rerun's viewer while it happens: in its window, in a browser, or in a viewer that is already open."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class RerunScreen:
     """`hil.live.picture.Screen` of the targets `window`, `web` and `connect:HOST:PORT`."""
 
     def __init__(self, target: str) -> None:
-        """Open it. Raises `LabError` when there is no such target, or no viewer comes up."""
+        """Open it. Raises `LabError` for an unknown target, or when no viewer opens."""
         self.address = ""
         self._server: subprocess.Popen[bytes] | None = None
         if target == "window":
@@ -37,7 +37,7 @@ class RerunScreen:
         """Nothing: rerun has no parameters; their changes are texts."""
 
     def close(self) -> None:
-        """Let the viewer have the rest; the browser keeps what it has, the window stays."""
+        """Send the rest to the viewer; the browser keeps what it has, the window stays."""
         self._picture.close()
         if self._server is not None:
             end(self._server)

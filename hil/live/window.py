@@ -1,6 +1,6 @@
 """The processes of rerun's own viewers: the window, and the server of the one in the browser.
 
-Both are reachable from this computer only and send no usage statistics; `hil.pictures.viewer` knows what they are sent.
+Both are reachable from this computer only and send no usage statistics; `hil.pictures.viewer` sends them data.
 """
 
 import os
@@ -20,24 +20,23 @@ LOOPBACK = "127.0.0.1"
 PORT = 9876  # rerun's own: a window that is already open takes the next flight, too
 WEB_PORT = 9090  # likewise, of the page
 START_TIMEOUT_S, POLL_S = 20.0, 0.05
-SETTLE_S = 1.0  # it listens first and looks for a display then
-SERVER_MEMORY = "500MB"  # of what a browser that comes late is still shown
-_RERUN = (
-    "import sys; from rerun_cli.__main__ import main; sys.exit(main())"  # `-m rerun_cli` loses the exit code
-)
+SETTLE_S = 1.0  # it listens first and opens the display afterwards
+SERVER_MEMORY = "500MB"  # of data that a browser which connects late is still shown
+# `-m rerun_cli` loses the exit code.
+_RERUN = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 COMMAND = (sys.executable, "-c", _RERUN, "--bind", LOOPBACK)
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 
 
 def address_of(host: str, port: int) -> str:
-    """Return what rerun calls a viewer that takes flights there."""
+    """Return rerun's address of a viewer that receives flights there."""
     return f"rerun+http://{host}:{port}/proxy"
 
 
 def open_window() -> str:
     """Start the viewer, unless one is open, and return its address; it outlives this process.
 
-    Raises `LabError` when it does not come up.
+    Raises `LabError` when it does not open.
     """
     address = address_of(LOOPBACK, PORT)
     if not is_open(LOOPBACK, PORT):
@@ -47,9 +46,10 @@ def open_window() -> str:
 
 
 def serve_web() -> "tuple[str, str, subprocess.Popen[bytes]]":
-    """Serve the viewer to browsers; return the page's address, where flights are taken, and the process to be ended.
+    """Serve the viewer to browsers; return the page's address, the address that receives flights, and the process to be
+    ended.
 
-    Raises `LabError` when it does not come up.
+    Raises `LabError` when it does not open.
     """
     port, web_port = free_port(PORT), free_port(WEB_PORT)
     address = address_of(LOOPBACK, port)
@@ -61,16 +61,17 @@ def serve_web() -> "tuple[str, str, subprocess.Popen[bytes]]":
 
 
 def serve_viewer(address: str) -> "tuple[int, subprocess.Popen[bytes]]":
-    """Serve the viewer to browsers for what others serve at an address; return the page's port and the process to be ended.
+    """Serve the viewer to browsers for data that are served at an address; return the page's port and the process to be
+    ended.
 
-    Raises `LabError` when it does not come up.
+    Raises `LabError` when it does not open.
     """
     web_port = free_port(WEB_PORT)
     return web_port, _start(["--serve-web", "--web-viewer-port", str(web_port), address], web_port)
 
 
 def page_of(web_port: int, address: str) -> str:
-    """Return the page that shows what is at an address."""
+    """Return the page that shows the data at an address."""
     return f"http://{LOOPBACK}:{web_port}/?url={quote(address, safe=':/')}"
 
 
@@ -86,7 +87,7 @@ def show(what: str, *options: str) -> None:
 
 
 def is_open(host: str, port: int) -> bool:
-    """Whether somebody listens at a TCP port."""
+    """Whether a program listens at a TCP port."""
     try:
         socket.create_connection((host, port), timeout=1.0).close()
     except OSError:
@@ -95,7 +96,7 @@ def is_open(host: str, port: int) -> bool:
 
 
 def free_port(wanted: int) -> int:
-    """Return a TCP port of this computer that is free, the wanted one if it is."""
+    """Return a free TCP port of this computer, the wanted one if it is free."""
     for port in (wanted, 0):
         try:
             with socket.create_server((LOOPBACK, port)) as server:
@@ -106,7 +107,7 @@ def free_port(wanted: int) -> int:
 
 
 def _start(arguments: Sequence[str], port: int) -> "subprocess.Popen[bytes]":
-    """Start a viewer that listens at a port. Raises `LabError` when it does not come up."""
+    """Start a viewer that listens at a port. Raises `LabError` when it does not open."""
     with tempfile.TemporaryFile() as messages:
         viewer = subprocess.Popen(
             [*COMMAND, *arguments], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=messages,
@@ -122,11 +123,11 @@ def _start(arguments: Sequence[str], port: int) -> "subprocess.Popen[bytes]":
                     return viewer
         else:
             end(viewer)
-        raise LabError(f"the viewer does not come up ({_last_line(messages)})")
+        raise LabError(f"the viewer does not open ({_last_line(messages)})")
 
 
 def end(viewer: "subprocess.Popen[bytes]") -> None:
-    """End a viewer, which is a process below the one that was started."""
+    """End a viewer, which is a child of the process that was started."""
     with suppress(ProcessLookupError):
         os.killpg(viewer.pid, signal.SIGKILL)
     viewer.wait()

@@ -1,1 +1,1 @@
-"""From a run folder to something to look at: report, figures, scene, exports; reads logs, knows no flight."""
+"""From a run folder to pictures: report, figures, scene, exports; reads logs only."""

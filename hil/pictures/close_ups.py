@@ -12,13 +12,13 @@ from hil.pictures.pages import Shown
 from hil.pictures.panels import Marks, Plot, Spell, panel
 
 BEFORE_S, AFTER_S = 0.5, 1.0  # of a fault
-FAULT_S = 2.0  # of a longer fault, its beginning
+FAULT_S = 2.0  # shown of the beginning of a longer fault
 LAST_S = 3.0  # before a loss
 
 
 @dataclass(frozen=True, slots=True)
 class CloseUp:
-    """What it shows, and from when to when [s]."""
+    """A close-up, with its begin and end [s]."""
 
     figure: Shown
     at_s: float

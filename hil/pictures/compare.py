@@ -1,8 +1,8 @@
-"""One flight against another: where their logs first differ, their metrics side by side, what was configured otherwise.
+"""One flight against another: where their logs first differ, their metrics side by side, differences in the configuration.
 
 Logs are compared bit for bit, row by row, in the columns that both have; a NaN equals a NaN. Flights that are not released
-at the same instant of their logs, real ones and those over a real link, share no rows: there it is how far they are apart,
-by the time since the release, that says what the model does not know.
+at the same instant of their logs, real ones and those over a real link, share no rows: there their distance
+over the time since the release shows what the model does not contain.
 """
 
 import json
@@ -28,19 +28,11 @@ from hil.pictures.panels import Panel, Plot, Series
 from hil.pictures.trials import DARK
 
 ROW_S = 0.01
-AROUND_US = 1_000_000  # shown before and after what is judged of a real flight
+AROUND_US = 1_000_000  # shown before and after the judged part of a real flight
 PICTURE, PAGE = "compare.png", "compare.html"
 PAIR = (DARK, curves.ORANGE)
-SETTINGS = (
-    "experiment",
-    "profile",
-    "seed",
-    "duration_s",
-    "link",
-    "board",
-    "outcome",
-    "commit",
-)  # of a result
+# The keys of a result that describe its settings.
+SETTINGS = ("experiment", "profile", "seed", "duration_s", "link", "board", "outcome", "commit")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +45,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The first place at which two logs differ; a value is None where that log has ended."""
+    """The first position at which two logs differ; a value is None where that log has ended."""
 
     row: int
     t_s: float  # from the release
@@ -67,7 +59,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class MetricPair:
-    """A metric of both flights, in the unit that people read."""
+    """A metric of both flights, in the displayed unit."""
 
     name: str
     unit: str
@@ -81,7 +73,7 @@ class MetricPair:
 
 @dataclass(frozen=True, slots=True)
 class Apart:
-    """How far two flights are from each other at the same time since the release."""
+    """The distance of two flights at the same time since the release."""
 
     name: str
     unit: str
@@ -91,17 +83,15 @@ class Apart:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What two runs have and have not in common."""
+    """The differences between two runs."""
 
     first: Difference | None  # None: identical
-    missing: tuple[
-        tuple[str, ...], tuple[str, ...]
-    ]  # columns of the other one that the first, the second lacks
+    # Columns that only the second flight has, and that only the first has.
+    missing: tuple[tuple[str, ...], tuple[str, ...]]
     span: str  # of the metrics
     metrics: tuple[MetricPair, ...]
-    apart: tuple[
-        Apart, ...
-    ]  # with a real flight among them, or one over a real link, if they have time in common
+    # For flights of which one is real or over a real link, if they have time in common.
+    apart: tuple[Apart, ...]
     one_is_real: bool  # and the other is not
     settings: tuple[tuple[str, str, str], ...]  # name, first, second: those that differ
 
@@ -112,7 +102,7 @@ class Comparison:
 
 
 def load_run(folder: Path) -> Run:
-    """Return what a run folder holds. Raises `LabError` when it cannot be read."""
+    """Return the log and result of a run folder. Raises `LabError` when it cannot be read."""
     run = Run(load_log(folder), read_result(folder))
     if "flight.free" not in run.log.column_names:
         raise LabError(f"{folder}: its log is not that of a flight")
@@ -138,8 +128,11 @@ def compare(a: Run, b: Run) -> Comparison:
     )
 
 
-def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Path:
-    """Write `compare.png` and `compare.html` into a folder; returns the page. Raises `LabError`."""
+def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison, why: Sequence[str] = ()) -> Path:
+    """Write `compare.png` and `compare.html` into a folder; returns the page. Raises `LabError`.
+
+    `why` are lines on what makes them differ.
+    """
     logs, names = (_judged(a.log), _judged(b.log)), (str(a.result.folder), str(b.result.folder))
     plot = pair(logs, names)
     figure = Shown(
@@ -153,7 +146,7 @@ def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison) -> Pa
         folder.mkdir(parents=True, exist_ok=True)
         (folder / PICTURE).write_bytes(png(lambda: plot))
         return write_page(
-            folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, figure=figure,
+            folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, why=why, figure=figure,
             zoomable=zoomable([figure]),
         )  # fmt: skip
 
@@ -174,7 +167,7 @@ def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Plot:
 
 
 def _judged(log: pa.Table) -> pa.Table:
-    """Return what a picture shows of a flight; a real one may have gone on for long after what was judged."""
+    """Return the part of a flight that a picture shows; a real one may have gone on long after the judged part."""
     free = free_flight(log)
     if not is_real(log) or free.num_rows == 0:
         return log
@@ -219,9 +212,8 @@ def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Differenc
 
 
 def _flown_s(run: Run) -> float:
-    flown = (
-        free_flight(run.log) if is_real(run.log) else run.log
-    )  # a real one may go on after what was judged
+    # A real flight may go on after the part that was judged.
+    flown = free_flight(run.log) if is_real(run.log) else run.log
     return float(since_release(flown).max(initial=0.0))
 
 

@@ -1,6 +1,7 @@
-"""What is plotted of a flight, for the viewer and the report alike: curves from log rows, in units for the eye.
+"""The curves of a flight for viewer and report, from log rows, in customary units.
 
-Lengths in cm, angles in degrees, times in ms. Colours are those of Okabe and Ito, told apart with every colour vision.
+Lengths in cm, angles in degrees, times in ms. Colours are those of Okabe and Ito, which are distinguishable with every kind
+of colour vision.
 """
 
 import json
@@ -36,7 +37,7 @@ IN_ITS_PLACE = {  # over MAVLink
 STAGE_COLOURS = dict(zip(STAGES, SERIES_COLOURS, strict=False))  # of a pose's age
 
 NEAR_CM, ATTITUDE_DEG = 6.0, 20.0  # paper, Hover_figure: errors below 6 cm most of the time, below 20 degrees
-MARKS = b"marks"  # in the metadata of a log that is drawn
+MARKS = b"marks"  # key in the metadata of a log that is drawn
 TICK_MS = 10.0  # of the estimator's horizon
 
 Read = Callable[[pa.Table], NDArray[np.float64]]
@@ -68,20 +69,20 @@ def since_release(log: pa.Table) -> NDArray[np.float64]:
 
 
 def task_colour(name: str) -> str:
-    """Return the one colour of a task in every figure; grey of one that is not the firmware's."""
+    """Return the one colour of a task in every figure; grey for one that is not the firmware's."""
     return TASK_COLOURS.get(IN_ITS_PLACE.get(name, name), GREY)
 
 
 def since_fusion(rows: pa.Table) -> NDArray[np.float64]:
-    """Return the time since a pose was fused last [ms], as the log's rows show it, (N, 1); NaN before the first."""
+    """Return the time since a pose was last fused [ms], by the log's rows, (N, 1); NaN before the first."""
     times, fused = column(rows, "t"), column(rows, "estimator.fused")
     latest = np.maximum.accumulate(np.where(np.diff(fused, prepend=0.0) > 0, times, -np.inf))
     return np.asarray(np.where(np.isfinite(latest), 1e-3 * (times - latest), np.nan)[:, None])
 
 
 def row_of_last_fusion(rows: pa.Table) -> pa.Table:
-    """Return the row that showed the pose that was fused last; no row before the first."""
-    if "estimator.fused" not in rows.column_names:  # a real board does not tell it
+    """Return the row of the last fused pose; no row before the first."""
+    if "estimator.fused" not in rows.column_names:  # a real board does not report it
         return rows.slice(0, 0)
     fusions = np.flatnonzero(np.diff(column(rows, "estimator.fused"), prepend=0.0) > 0)
     return rows.take(fusions[-1:])
@@ -96,7 +97,7 @@ def _four(prefix: str) -> tuple[str, ...]:
 
 
 def _flaps(rows: pa.Table) -> NDArray[np.float64]:
-    """Return the true angles of the flaps [deg], or those that a real board believes."""
+    """Return the true angles of the flaps [deg], or a real board's estimates."""
     return np.degrees(column(rows, *_four("telemetry.flap_" if is_real(rows) else "truth.flap_")))
 
 
@@ -151,17 +152,18 @@ QUEUE = Curves(
     lambda rows: column(rows, "rtos.measurements_high_water", "rtos.measurements_dropped"),
     needs="rtos.measurements_dropped",
 )  # fmt: skip
+# The states of firmware_py.wire.supervisor.State, and one for a board that has not reported its state.
 SUPERVISOR = States(
     "supervisor.state",
     ("calibrating", "waiting", "flying", "failsafe", "unknown"),
     (ORANGE, SKY, GREEN, RED, GREY),
-)  # firmware_py.wire.supervisor.State, and that of a board that has not told it
+)
 RELEASE = States("flight.free", ("held", "free"), (GREY, BLUE))
-JUDGED = States("flight.free", ("not judged", "judged"), (GREY, BLUE))  # of a real flight
+JUDGED = States("flight.free", ("not judged", "judged"), (GREY, BLUE))  # for a real flight
 
 
 def lanes_of(names: Iterable[str]) -> dict[str, States]:
-    """Return the states that are shown of a flight whose log has columns of these names."""
+    """Return the states to show for a flight whose log has columns of these names."""
     free = {"flight": JUDGED} if "cameras.x" in names else {"robot": RELEASE}
     return {"supervisor": SUPERVISOR, **free}
 
@@ -179,7 +181,7 @@ def processor(names: Iterable[str]) -> Curves:
 
 
 def own_logic(rows: pa.Table) -> list[Curves]:
-    """Return what logic of the user's own has logged, a set of curves for each unit."""
+    """Return what the user's own logic has logged, a set of curves for each unit."""
     by_unit: dict[str, list[str]] = {}
     for field in rows.schema:
         if field.name.startswith("logic."):
@@ -199,7 +201,7 @@ def _columns(names: tuple[str, ...], rows: pa.Table) -> NDArray[np.float64]:
 
 
 def latency(rows: pa.Table) -> NDArray[np.float64]:
-    """Return the mean time in the air, up and down [ms], of the packets between rows: (N - 1, 2); NaN where none came."""
+    """Return the mean time in the air, up and down [ms], of the packets between rows: (N - 1, 2); NaN where none arrived."""
     total = np.diff(column(rows, "link.up_latency_sum", "link.down_latency_sum"), axis=0)
     arrived = np.diff(column(rows, "link.up_delivered", "link.down_delivered"), axis=0)
     return np.asarray(1e-3 * total / np.where(arrived > 0, arrived, np.nan))
@@ -212,18 +214,18 @@ def line_load(rows: pa.Table) -> NDArray[np.float64]:
 
 
 def changes(rows: pa.Table, states: States) -> tuple[NDArray[np.float64], list[str]]:
-    """Return when [us] which state began; the first row begins one."""
+    """Return the instants [us] and names of new states; the first row begins one."""
     codes = column(rows, states.column).astype(np.int64)
     begins = np.flatnonzero(np.diff(codes, prepend=-1)) if len(codes) else np.empty(0, np.int64)
     return column(rows, "t")[begins], [states.names[code] for code in codes[begins]]
 
 
 def with_marks(log: pa.Table, events: Iterable[Mapping[str, Any]]) -> pa.Table:
-    """Return a log whose figures show what an operator did."""
+    """Return a log whose figures mark an operator's actions."""
     marks = [(event["t_us"], event["text"]) for event in events if event["source"] == OPERATOR]
     return log.replace_schema_metadata({**(log.schema.metadata or {}), MARKS: json.dumps(marks).encode()})
 
 
 def marks_of(log: pa.Table) -> list[tuple[float, str]]:
-    """Return when [us] an operator did what, of a log `with_marks`."""
+    """Return the operator's actions and their instants [us] in a log `with_marks`."""
     return [(t_us, text) for t_us, text in json.loads((log.schema.metadata or {}).get(MARKS, b"[]"))]

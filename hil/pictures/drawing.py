@@ -1,7 +1,7 @@
-"""How every figure becomes a PNG: its size, its style, and panels as matplotlib draws them. matplotlib is loaded here.
+"""Draws figures as PNG: size, style, and panels in matplotlib, which is loaded here.
 
 Grey: the robot was still held; red: a fault was in force; pink: failsafe; yellow strip at the bottom: a flap at its limit;
-dotted blue: an operator did something; black: the flight was lost.
+dotted blue: an operator's action; black: the flight was lost.
 """
 
 import io
@@ -26,7 +26,7 @@ STYLE: Any = {
     "axes.grid": True,
     "axes.spines.right": False,
     "axes.spines.top": False,
-    "agg.path.chunksize": 10_000,  # a long flight's noise overflows the renderer otherwise
+    "agg.path.chunksize": 10_000,  # otherwise a long flight's noise overflows the renderer
     "font.size": 8.5,
     "grid.alpha": 0.3,
     "legend.fontsize": 8.0,
@@ -36,7 +36,7 @@ STYLE: Any = {
 
 
 def drawn(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> Plot | bytes:
-    """Return what `draw` makes of flight logs, or of a schedule: panels, or the PNG of a figure."""
+    """Return what `draw` returns for flight logs or a schedule: panels, or the PNG of a figure."""
     with matplotlib.rc_context(STYLE):
         made = draw(*flights)
         return made if isinstance(made, Plot) else _png(made)
@@ -101,7 +101,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
 
 
 def draw_marks(axes: Sequence[Axes], marks: Marks) -> None:
-    """Shade and mark what happened; the first axes name it. The time axis is zero at the release."""
+    """Shade and mark the events; the first axes name them. The time axis is zero at the release."""
     for spell in marks.spells:
         high = STRIP if spell.kind == "flap limit" else 1.0
         alpha = 0.9 if spell.kind == "flap limit" else SHADE

@@ -1,7 +1,7 @@
 """The figures of a flight, after the paper's figure Hover_figure; also of a flight that was lost or never began.
 
 Axes carry cm, degrees, ms and seconds from the release. Over time they are panels, which a page can zoom; what has no time
-axis, or 20 ms of one, is drawn by matplotlib.
+axis, or one of 20 ms, is drawn by matplotlib.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ import pyarrow as pa
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ground_station.latency import STAGES, stages_told
+from ground_station.latency import STAGES, reported_stages
 from hil.laboratory.metrics import BOX, free_flight
 from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
@@ -24,13 +24,13 @@ from hil.pictures.panels import INK, Panel, Plot, Series, lanes, panel
 from hil.pictures.picture import Picture
 
 TENTH, SECOND = 10, 100  # rows
-BUSY_PERCENT = 0.02  # of the processor, that makes a task worth a colour
+BUSY_PERCENT = 0.02  # of the processor, above which a task gets a colour
 SCHEDULE_US = 20_000  # of the scheduler's picture
 BOX_CM = 100 * BOX
 
 
 def track(rows: pa.Table) -> Figure:
-    """Draw the way around the target: in space, from above, from the side."""
+    """Draw the path around the target: in space, from above, from the side."""
     points = curves.POSITION.read(free_flight(rows))
     x, y, z = points.T
     figure = Figure(figsize=(WIDTH, 3.3), layout="constrained")
@@ -76,7 +76,7 @@ def errors(rows: pa.Table) -> Plot:
 
 
 def flaps(rows: pa.Table) -> Plot:
-    """What the flaps were told and what they did; of a real board, what it believes that they did."""
+    """The commanded and the actual flap angles; of a real board, its estimate of the actual ones."""
     times, angles = since_release(rows), curves.FLAPS.read(rows)
     commanded = curves.FLAPS_COMMAND.needs in rows.column_names
     commands = curves.FLAPS_COMMAND.read(rows) if commanded else None
@@ -89,7 +89,7 @@ def flaps(rows: pa.Table) -> Plot:
 
 
 def age(rows: pa.Table) -> Plot:
-    """How old poses are when the estimator takes them, and for how long there were none, where that is told."""
+    """How old poses are when the estimator takes them, and for how long there were none, where that is reported."""
     plots = [plot for plot in (curves.AGE, curves.HORIZON) if plot.needs in rows.column_names]
     series = [line for plot in plots for line in panel(plot, rows, "").series]
     panels = [Panel("on board [ms]", tuple(series))]
@@ -98,11 +98,13 @@ def age(rows: pa.Table) -> Plot:
     return Plot(tuple(panels))
 
 
-def way(told: pa.Table) -> Plot:
-    """Where the poses of `ages.told_in_time_of` spent their time, stage on stage."""
-    columns = {name: told.column(name).to_numpy() for name in STAGES}
-    times = since_release(told)
-    stages = [Series(name, curves.STAGE_COLOURS[name], times, columns[name]) for name in stages_told(columns)]
+def latency_budget(ages: pa.Table) -> Plot:
+    """Where the poses of `ages.ages_in_time_of` spent their time, stage on stage."""
+    columns = {name: ages.column(name).to_numpy() for name in STAGES}
+    times = since_release(ages)
+    stages = [
+        Series(name, curves.STAGE_COLOURS[name], times, columns[name]) for name in reported_stages(columns)
+    ]
     return Plot((Panel("age [ms]", tuple(stages), height=1.8, stacked=True, least=0.0),))
 
 
@@ -117,7 +119,7 @@ def radio(rows: pa.Table) -> Plot:
 
 
 def serial_line(rows: pa.Table) -> Plot:
-    """The load of the line, the time on it and what was lost or spoilt."""
+    """The load of the line, the time on it and what was lost or damaged."""
     load = _up_and_down(rows, TENTH, curves.line_load, "load of the line [%]")
     return Plot(
         (
@@ -131,7 +133,7 @@ def serial_line(rows: pa.Table) -> Plot:
 def _up_and_down(
     rows: pa.Table, step: int, read: Callable[[pa.Table], NDArray[np.float64]], label: str
 ) -> Panel:
-    """What `read` makes of every `step`-th row, for both directions of the link."""
+    """The curves of `read` on every `step`-th row, for both directions of the link."""
     thinned = rows.take(np.arange(0, rows.num_rows, step))
     times, values = since_release(thinned)[1:], read(thinned)
     return Panel(
@@ -144,13 +146,13 @@ def _up_and_down(
 
 
 def station(rows: pa.Table) -> Plot:
-    """What a real link and its ground station could not use, battery and load where the board tells them, the states."""
-    told = [
+    """What a real link and its station could not use, battery and load where the board reports them, the states."""
+    health = [
         panel(plot, rows, label, height=1.2)
         for plot, label in ((monitor.BATTERY, "battery"), (monitor.LOAD, "processor"))
         if plot.needs in rows.column_names and np.isfinite(plot.read(rows)).any()
     ]
-    return Plot((panel(curves.STATION, rows, "not used"), *told, _states(rows)))
+    return Plot((panel(curves.STATION, rows, "not used"), *health, _states(rows)))
 
 
 def board(rows: pa.Table) -> Plot:
@@ -171,16 +173,16 @@ def board(rows: pa.Table) -> Plot:
 def _states(rows: pa.Table) -> Panel:
     """The states of supervisor and robot, or real flight, as bars."""
     release_us, end_s = release_of(rows.schema.metadata), since_release(rows)[-1:]
-    told = []
+    rows_of_bars = []
     for lane, states in reversed(curves.lanes_of(rows.column_names).items()):
         begins, names = curves.changes(rows, states)
         colours = dict(zip(states.names, states.colours, strict=True))
-        told.append((lane, 1e-6 * (begins - release_us), names, colours))
-    return Panel("states", height=0.8, bars=lanes(told, float(end_s[0]) if len(end_s) else 0.0))
+        rows_of_bars.append((lane, 1e-6 * (begins - release_us), names, colours))
+    return Panel("states", height=0.8, bars=lanes(rows_of_bars, float(end_s[0]) if len(end_s) else 0.0))
 
 
 def estimate(rows: pa.Table) -> Plot:
-    """What the estimator believed, less what was, in the goal frame."""
+    """The estimate less the truth, in the goal frame."""
     return Plot(
         (
             panel(curves.POSITION_MISS, rows, "position", height=1.8),
@@ -190,7 +192,7 @@ def estimate(rows: pa.Table) -> Plot:
 
 
 def own_logic(rows: pa.Table) -> Plot:
-    """What logic of the user's own logs, one axis for each unit."""
+    """What the user's own logic logs, one axis for each unit."""
     return Plot(tuple(panel(plot, rows, "own logic") for plot in curves.own_logic(rows)))
 
 
@@ -231,14 +233,13 @@ PICTURES = (
     ),
     Picture(
         "Flaps",
-        "True angle of each flap and the angle that the controller asked for; of a real board, the angle that its "
-        "estimator has.",
+        "True angle of each flap and the commanded angle; of a real board, the angle that its estimator has.",
         flaps,
     ),
     Picture(
         "Age",
         "Age of the pose when the estimator takes it, and the horizon of its predictor (0: it is switched off); "
-        "time since the last fused pose, which grows while none comes or each is refused (a real board tells only the age).",
+        "time since the last fused pose, which grows while none comes or each is refused (a real board has the age only).",
         age,
     ),
     Picture(
@@ -265,20 +266,20 @@ PICTURES = (
     Picture(
         "Station",
         "Poses that were late or could not be used, telemetry that could not be read, since the start; the board's battery "
-        "and load, if it tells them; states of the supervisor and of the flight.",
+        "and load, if it reports them; states of the supervisor and of the flight.",
         station,
         needs="link.late",
     ),
     Picture(
         "Estimate",
-        "What the estimator believed, less the truth, in the goal frame; of a real flight, less what the cameras saw.",
+        "Estimate less truth, in the goal frame; of a real flight, estimate less the cameras' poses.",
         estimate,
     ),
 )
 OWN_LOGIC = Picture("Own logic", "What the modules of `[logic]` log of their memory.", own_logic)
-WAY = Picture(
-    "Way of the poses",
-    "Where poses spent their time from the exposure to the board, as the ground station told each that it sent.",
-    way,
+LATENCY_BUDGET = Picture(
+    "Latency budget",
+    "Where poses spent their time from the exposure to the board, as the ground station reported for each that it sent.",
+    latency_budget,
 )
 SCHEDULE = Picture("Scheduler", "Which task had the processor, for 20 ms.", schedule)

@@ -32,7 +32,7 @@ GALLERY: dict[str, Picture] = {
 
 
 def pictures_of(experiment: Experiment) -> tuple[Picture, ...]:
-    """Return the pictures of an experiment's own. Raises `LabError` for a name that is none."""
+    """Return an experiment's own pictures. Raises `LabError` for an unknown name."""
     if unknown := [name for name in experiment.pictures if name not in GALLERY]:
         raise LabError(
             f"experiment {experiment.name}: picture {unknown[0]!r}: there are {', '.join(GALLERY)}"
@@ -45,7 +45,7 @@ def pictures_of(experiment: Experiment) -> tuple[Picture, ...]:
 
 
 def _draw(experiment: Experiment, log: pa.Table) -> Figure:
-    """Let an experiment draw. Raises `LabError` for what it does wrong."""
+    """Call an experiment's own `draw`. Raises `LabError` for its errors."""
     assert experiment.draw is not None
     try:
         figure: Figure = experiment.draw(free_flight(log))

@@ -1,7 +1,7 @@
 """Links from a report into the recording of its flight.
 
-A page that is opened from disk can start no viewer, and in a browser rerun's viewer takes recordings from a server only. So
-the links lead to this computer, where `floaty view RUN --web` answers them, for the run that they belong to.
+A page that is opened from disk cannot start a viewer, and in a browser rerun's viewer takes recordings from a server only.
+So the links lead to this computer, where `floaty view RUN --web` answers them, for the run that they belong to.
 """
 
 from hil.laboratory.result import Result
@@ -10,7 +10,7 @@ HOST, PORT = "127.0.0.1", 9877  # beside rerun's own 9876
 
 
 def key_of(result: Result) -> str:
-    """Return what tells the links of one flight from those of others."""
+    """Return the key that distinguishes the links of one flight from those of others."""
     return (result.hash or "unfinished")[:16]
 
 

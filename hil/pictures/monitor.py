@@ -1,4 +1,4 @@
-"""What a person watches while a robot flies, for the viewer: rates of the link, the way of the poses by stage, marks.
+"""The viewer's curves for monitoring a flight: rates of the link, the latency budget of poses, marks.
 
 Rates are per second, over the second before. Marks are instants at which something was refused.
 """
@@ -18,7 +18,7 @@ ROWS_OF_A_SECOND = 100
 
 
 def _stages(rows: pa.Table) -> NDArray[np.float64]:
-    """Return the ages of the newest pose behind each stage [ms], (N, 5); NaN where that is not told."""
+    """Return the ages of the newest pose behind each stage [ms], (N, 5); NaN where that is not reported."""
     camera, processing, mocap, station, link = column(
         rows, "age.camera", "age.processing", "age.mocap", "age.station", "age.link"
     ).T
@@ -44,7 +44,7 @@ AIR = Curves(
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Counters of which the viewer shows how fast they count."""
+    """Counters whose rates the viewer shows."""
 
     names: tuple[str, ...]
     colours: tuple[str, ...]
@@ -60,7 +60,8 @@ RATES: Mapping[str, Rates] = {
         ("link.sent", "station.frames", "station.samples"),
     ),
 }  # fmt: skip
-REFUSALS: Mapping[str, tuple[str, ...]] = {  # what a mark is called: counters, those of them that the log has
+# The name of a mark, and its counters, of which the log may lack some.
+REFUSALS: Mapping[str, tuple[str, ...]] = {
     "pose refused on board": (
         "estimator.refused",
         "estimator.too_old",
@@ -80,7 +81,7 @@ MARK_COLOURS = {
 
 
 def rates(rows: pa.Table, names: tuple[str, ...], at: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return how fast counters count [1/s] at rows `at`, over the second before or what there is of it; (len(at), names)."""
+    """Return the rates of counters [1/s] at rows `at`, over the second before or its recorded part; (len(at), names)."""
     times, counts = column(rows, "t"), column(rows, *names).reshape(-1, len(names))
     since = np.searchsorted(times, times[at] - SECOND_US)
     passed = 1e-6 * (times[at] - times[since])[:, None]
@@ -88,7 +89,7 @@ def rates(rows: pa.Table, names: tuple[str, ...], at: NDArray[np.int64]) -> NDAr
 
 
 def refused(rows: pa.Table, names: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return at which rows but the first any of some counters is larger than in the row before."""
+    """Return the rows, except the first, at which any of some counters is larger than in the row before."""
     known = [name for name in names if name in rows.column_names]
     if not known:
         return np.empty(0, np.int64)

@@ -1,8 +1,8 @@
-"""Pages: HTML files that need nothing else, from the templates beside this file; their figures, zoomable or as PNG.
+"""Pages: self-contained HTML files from the templates beside this file; their figures, zoomable or as PNG.
 
-What can be zoomed are panels as data for `templates/figures.js`, drawn by uPlot (MIT licence; in the Python package
-youplot), whose script stands once in a file. A panel's curves are thinned to the lowest and highest values of some 1500
-stretches, which is more than a screen shows at once.
+Zoomable panels are data for `templates/figures.js`, drawn by uPlot (MIT licence; in the Python package
+youplot), whose script is embedded once per file. A panel's curves are thinned to the lowest and highest values of some 1500
+intervals, which is more than a screen shows at once.
 """
 
 import base64
@@ -55,7 +55,7 @@ def data_uri(png: bytes) -> str:
 
 
 def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> Shown:
-    """Return a picture of flights as a page shows it."""
+    """Return a picture of flights for a page."""
     from hil.pictures.drawing import drawn
 
     name = picture.title.lower().replace(" ", "-")
@@ -66,7 +66,7 @@ def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> Shown:
 
 
 def zoomable(shown: Iterable[Shown]) -> dict[str, Any]:
-    """Return what `figures.html.j2` embeds: uPlot, and the plots among the figures as JSON can carry them."""
+    """Return what `figures.html.j2` embeds: uPlot, and the plots among the figures as JSON values."""
     plots = [(one, one.plot) for one in shown if one.plot is not None]
     marks = list({id(one.marks): one.marks for one, _ in plots}.values())
     places = [id(one) for one in marks]
@@ -124,7 +124,7 @@ def _table(times: Signal, curves: list[Signal]) -> list[str]:
 
 
 def thinned(curves: list[Signal], stretches: int) -> NDArray[np.intp]:
-    """Return the rows that keep the lowest and highest value of every curve in every stretch, and the first NaN of each."""
+    """Return the rows with the lowest and highest value of every curve in every interval, and the first NaN of each."""
     count = len(curves[0])
     if count <= 2 * len(curves) * stretches:
         return np.arange(count)
@@ -134,7 +134,7 @@ def thinned(curves: list[Signal], stretches: int) -> NDArray[np.intp]:
     for curve in curves:
         gaps = np.isnan(curve)
         for order in (curve, -curve):
-            # of each stretch the first row in the order of its values
+            # for each interval the first row in the order of its values
             ranked = np.lexsort((np.where(gaps, np.inf, order), stretch_of))
             kept.append(ranked[edges])
         kept.append(np.flatnonzero(np.diff(gaps, prepend=False)))

@@ -1,4 +1,4 @@
-"""What a figure over time consists of, and what is marked in it; as values, drawn by `drawing` and, zoomable, in `pages`.
+"""The parts of a figure over time, and its marks; as values, drawn by `drawing` and, zoomable, in `pages`.
 
 Times are seconds from the release.
 """
@@ -19,7 +19,7 @@ from hil.pictures.curves import GREY, Curves, marks_of, since_release
 
 Signal = NDArray[np.float64]  # (N,)
 ROUNDING = 1e-6  # [rad] float32 of a command at its limit
-TOGETHER_S = 0.1  # a flap that leaves its limit for less is drawn as if it had stayed
+TOGETHER_S = 0.1  # a flap that leaves its limit for less is drawn as staying there
 INK = "black"  # of the page: in dark mode it is white
 
 
@@ -65,12 +65,12 @@ class Plot:
     """Panels one above the other that share their time axis."""
 
     panels: tuple[Panel, ...]
-    window_s: tuple[float, float] | None = None  # shown, of a flight that is longer; None: all
+    window_s: tuple[float, float] | None = None  # the part shown of a longer flight; None: all
 
 
 @dataclass(frozen=True, slots=True)
 class Spell:
-    """A stretch of a flight that every figure shades."""
+    """An interval of a flight that every figure shades."""
 
     kind: str  # held, fault, failsafe, flap limit
     begin_s: float
@@ -89,14 +89,14 @@ class Instant:
 
 @dataclass(frozen=True, slots=True)
 class Marks:
-    """What every figure of a flight marks."""
+    """The marks of every figure of a flight."""
 
     spells: tuple[Spell, ...] = ()
     instants: tuple[Instant, ...] = ()
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """What there is, without repetition."""
+        """The kinds of marks, without repetition."""
         return tuple(
             dict.fromkeys([*(one.kind for one in self.spells), *(one.kind for one in self.instants)])
         )
@@ -113,7 +113,7 @@ def panel(curves: Curves, rows: pa.Table, label: str, **look: float | tuple[floa
 
 
 def marks_of_flight(log: pa.Table, lost: str | None = None) -> Marks:
-    """Return what is marked in every figure of a flight; `lost`: why it was lost, where it was."""
+    """Return the marks for every figure of a flight; `lost`: why it was lost, if it was."""
     times = since_release(log)
     if len(times) == 0:
         return Marks()
@@ -149,7 +149,7 @@ def _spells(kind: str, times: Signal, acts: NDArray[np.bool_], text: str = "") -
 def saturated(flight: pa.Table) -> Iterator[tuple[int, NDArray[np.bool_]]]:
     """Yield the flaps whose commands reach an end of their range, and the rows in which they do."""
     limits = json.loads((flight.schema.metadata or {}).get(b"config", b"{}")).get("allocation")
-    # a real board does not tell its commands
+    # a real board does not report its commands
     if limits is None or "control.flap_1" not in flight.column_names:
         return
     for flap, sign in ((1, 1), (2, -1), (3, 1), (4, -1)):
@@ -162,7 +162,7 @@ def saturated(flight: pa.Table) -> Iterator[tuple[int, NDArray[np.bool_]]]:
 
 
 def lanes(states: Iterable[tuple[str, Signal, list[str], dict[str, str]]], end_s: float) -> tuple[Bar, ...]:
-    """Return the bars of lanes: name, when [s] which state began, the colours of the states."""
+    """Return the bars of lanes, each given as name, begins of its states [s], their names and colours."""
     bars = []
     for lane, begins, names, colours in states:
         edges = [*begins.tolist(), end_s]

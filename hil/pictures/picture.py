@@ -1,4 +1,4 @@
-"""What a picture of the report is; drawing itself is loaded when the first one is drawn."""
+"""A picture of the report; drawing code is loaded when the first one is drawn."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure of the report. An experiment's own takes several flights, the trials, and brings out the first."""
+    """A figure of the report. An experiment's own takes several flights, the trials, and emphasises the first."""
 
     title: str
     caption: str
     draw: Callable[..., Plot | Figure]  # of the log of a flight, of several, or of a schedule
-    needs: str = "t"  # a column without which there is nothing to draw
+    needs: str = "t"  # the column that it needs
 
     def png(self, *flights: pa.Table) -> bytes:
         """Return the figure, marked as the first flight was."""

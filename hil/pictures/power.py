@@ -22,7 +22,7 @@ KIND_COLOURS = {"quadcopter": curves.SKY, "drone": curves.BLUE, "helicopter": cu
 
 
 def compare(*flights: pa.Table) -> Figure:
-    """Draw specific power as bars, and power over mass, with Floaty as it flew in red."""
+    """Draw specific power as bars, and power over mass, with this flight's Floaty in red."""
     means = [power(free_flight(flight)) for flight in flights]
     mean, specific = (
         float(np.mean([values[name] for values in means])) for name in ("power", "specific_power")
@@ -31,7 +31,7 @@ def compare(*flights: pa.Table) -> Figure:
 
 
 def _beside_others(power: float, mass: float) -> Figure:
-    """Draw it with `power` [W] and `mass` [kg] of Floaty."""
+    """Draw the comparison with `power` [W] and `mass` [kg] of Floaty."""
     figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
     bars, scatter = figure.subplots(1, 2, width_ratios=(1.15, 1))
     names = ["Floaty", *(vehicle.name for vehicle in VEHICLES)]

@@ -1,4 +1,4 @@
-"""The report of a flight: `report.html` in its run folder, one file that needs nothing else.
+"""The report of a flight: `report.html` in its run folder, one self-contained file.
 
 From `result.json`, `log.parquet` and `events.jsonl`; a flight that was lost, interrupted or killed has a report as well.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
 from hil.experiments import find_again
-from hil.laboratory.ages import told_in_time_of
+from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, spans_of
@@ -21,7 +21,7 @@ from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.close_ups import close_ups
 from hil.pictures.curves import own_logic, with_marks
-from hil.pictures.figures import OWN_LOGIC, PICTURES, SCHEDULE, WAY
+from hil.pictures.figures import LATENCY_BUDGET, OWN_LOGIC, PICTURES, SCHEDULE
 from hil.pictures.gallery import pictures_of
 from hil.pictures.links import link_to
 from hil.pictures.pages import draw, write_page, zoomable
@@ -58,18 +58,18 @@ class FaultRow:
 def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     """Write `report.html` into a run folder and return its path. Raises `LabError` when the folder holds no log.
 
-    `experiment` is what was flown; without it, it is looked for where the run says.
+    `experiment` is the one flown; by default it is found from the run's reference.
     """
     result, events = read_result(folder), load_events(folder)
     log = with_marks(load_log(folder), events)
     experiment = experiment or find_again(result.experiment, result.source)
     own = pictures_of(experiment) if experiment else ()
-    told, schedule = told_in_time_of(log, folder), load_schedule(folder)
+    ages, schedule = ages_in_time_of(log, folder), load_schedule(folder)
     of_log = [*own, *PICTURES, *([OWN_LOGIC] if own_logic(log) else [])]
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
     figures = [draw(picture, marks, log) for picture in of_log if picture.needs in log.column_names]
-    if told.num_rows:
-        figures.append(draw(WAY, marks, told))
+    if ages.num_rows:
+        figures.append(draw(LATENCY_BUDGET, marks, ages))
     if schedule.num_rows:
         figures.append(draw(SCHEDULE, marks, schedule.replace_schema_metadata(log.schema.metadata)))
     close = close_ups(log, marks)

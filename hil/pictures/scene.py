@@ -1,8 +1,8 @@
-"""The shape of what is drawn: the robot's plates as triangles, and where the drag acts.
+"""The shapes in the scene: the robot's plates as triangles, and the points where drag acts.
 
 Lengths in m, angles in rad. A flap is drawn in its own frame F, which has its origin on the body's z axis where the flap
 axes meet and is parallel to B when the flap angle is 0; the flap turns about its axis, outwards, by its signed angle.
-Nothing here knows the viewer.
+Nothing here depends on the viewer.
 """
 
 from dataclasses import dataclass

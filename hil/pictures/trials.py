@@ -34,17 +34,18 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
 
+# Colours of the paper's figure experiments_fig: all trials, one of them, the target.
 LIGHT, DARK, WANTED = (
     "#9dbac6",
     "#1381b2",
     "#d04030",
-)  # the paper's figure experiments_fig: trials, one of them, target
+)
 HEIGHT = 2.6  # [in] of one axis
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """What goes on a vertical axis: (value, goal) of a flight, (N,) each, in the unit of the label."""
+    """A quantity on a vertical axis: (value, goal) of a flight, (N,) each, in the unit of the label."""
 
     label: str
     read: Callable[[pa.Table], tuple[Signal, Signal]]
@@ -61,7 +62,7 @@ def centimetres(axis: str, flight: pa.Table) -> tuple[Signal, Signal]:
 
 
 def openings(flight: pa.Table) -> tuple[Signal, Signal]:
-    """Return mean opening of the four flaps, and what the controller asked for, over a tenth of a second [deg]."""
+    """Return the mean opening of the four flaps, and the commanded one, over a tenth of a second [deg]."""
     signs = np.array([1.0, -1.0, 1.0, -1.0])
     value, command = (
         np.degrees(column(flight, *(f"{kind}.flap_{flap}" for flap in (1, 2, 3, 4))) @ signs / 4)
@@ -189,7 +190,7 @@ def overload(rows: pa.Table, *trials: pa.Table) -> Figure:
 
 YAW_STEP = Picture(
     "Step in yaw",
-    "Yaw and its target, as in the paper's figure of tracking, a; and the height that it costs.",
+    "Yaw and its target, as in the paper's figure of tracking, a; and the loss of height.",
     partial(follow, (YAW, Z), (0.5, 4.0)),
 )
 YAW_SINE = Picture(
@@ -210,7 +211,7 @@ Y_SQUARE = Picture(
 SIDE_WIND = Picture(
     "Side wind",
     "Position, W, while a fan beside the tunnel blows (red, darker with every step of its speed), as in the paper's "
-    "figure of robustness, e; the height that leaning costs.",
+    "figure of robustness, e; the loss of height from leaning.",
     partial(follow, (X, Y, Z), (0.0, 60.0)),
 )
 DISTURBED = Picture(
@@ -220,7 +221,7 @@ DISTURBED = Picture(
 )
 AIRSPEED = Picture(
     "Airspeed",
-    "Height, and the mean opening of the flaps (target: what the controller asks for), over 0.1 s.",
+    "Height, and the mean opening of the flaps (target: the commanded one), over 0.1 s.",
     partial(follow, (Z, OPENING), (0.0, 60.0)),
     needs="control.flap_1",
 )
@@ -233,7 +234,7 @@ TAKE_OFF_LANDING = Picture(
 OVERLOAD = Picture(
     "Overload",
     "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
-    "Dashed: the 20 cm box. A task that starves completes nothing, late or not.",
+    "Dashed: the 20 cm box. A starved task completes no activation, late or not.",
     overload,
     needs="cpu.THIEF",
 )

@@ -1,7 +1,7 @@
 """The flight in the rerun viewer: as the file `flight.rrd`, or while it happens; one scene for simulated and real flights.
 
 `Stage` turns rows of the flight log into entities below `/world` (3-D; metres, W), `/plot` (`curves` and `monitor`),
-`/state` and `/text`, on one timeline: `from_release`, or `from_start` while nobody knows when the release will be. The only
+`/state` and `/text`, on one timeline: `from_release`, or `from_start` while the release is not known. The only
 file that knows rerun, which comes with the extra `view`: without it, importing this file raises `LabError`.
 """
 
@@ -23,7 +23,7 @@ from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from ground_station.latency import STAGES
 from hil.devices.markers import DIAMETER, marker_places
 from hil.errors import LabError
-from hil.laboratory.ages import told_in_time_of
+from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import BOX, body, column, is_real
 from hil.laboratory.recorder import OPERATOR, RELEASE_US, load_events, load_log, release_of
@@ -45,21 +45,22 @@ except ImportError as error:
 RECORDING = "flight.rrd"
 APPLICATION = "floaty"
 FROM_RELEASE, FROM_START = "from_release", "from_start"  # timelines
-FOLLOWED_S = 20.0  # of a live flight that its curves show
-CATCH_UP_S = 5.0  # for the viewer, at the end of a live flight
+FOLLOWED_S = 20.0  # shown by the curves of a live flight
+CATCH_UP_S = 5.0  # granted to the viewer at the end of a live flight
 
 METRES_PER_NEWTON = 0.15  # length of the drag arrows, and of pushes
-SECONDS_OF_FLOW = 0.02  # length of the flow's arrow: the way of the air in that time
+SECONDS_OF_FLOW = 0.02  # length of the flow's arrow: the distance that the air moves in that time
 SECONDS_OF_WIND = 0.1  # likewise of its sideways part, which is small
-PUSH_SHOWN_US = 500_000  # at least: a push is over before anybody has seen it
+PUSH_SHOWN_US = 500_000  # at least, because a push is too short to be seen
 TRAIL_S = 4.0
 NOZZLE_RADIUS = 0.6  # [m] paper, Experimental platform: 1.2 m wide
-NOZZLE_TOP = 1.8  # [m] where the picture of the tunnel ends
-FLOW_RADIUS = 0.2  # [m] physics.md section 6: effective cylinder
+NOZZLE_TOP = 1.8  # [m] where the drawing of the tunnel ends
+FLOW_RADIUS = 0.2  # [m] docs/explanation/plant.md, Tunnel
 AXIS = 0.08  # [m] length of drawn axes
 MARKERS_SEEN = "markers.visible"
 SEEN, HIDDEN = 0xFFFFFFFF, 0xFF3030FF  # colours of markers
-SLOW = 10  # rows between samples of what changes slowly: 10 Hz
+ROWS_AT_ONCE = 10_000  # of a long flight
+SLOW = 10  # rows between samples of slow quantities: 10 Hz
 
 PLOTS: Mapping[str, Curves] = {
     "position/error": curves.POSITION,
@@ -79,13 +80,14 @@ PLOTS: Mapping[str, Curves] = {
     "link/air": monitor.AIR,
     "battery": monitor.BATTERY,
     "queue": curves.QUEUE,
-    "processor/all": monitor.LOAD,  # a real board's; a simulated one's is task by task
+    "processor/all": monitor.LOAD,  # of a real board; a simulated one's is by task
 }
 PALE = "flaps/command"
-LIMITS = {  # they also keep the axes' ticks apart
+LIMITS = {  # they also keep the axes' scales fixed
     "position/limit": curves.NEAR_CM, "position/box": 100 * BOX, "attitude/limit": curves.ATTITUDE_DEG,
 }  # fmt: skip
-VIEWS = (  # title and origin of what is plotted; the first two stand alone, the rest are tabs
+# Title and origin of each plot; the first two have their own place, the rest are tabs.
+VIEWS = (
     ("Position error [cm]", "position"),
     ("Attitude error [deg]", "attitude"),
     ("Flap angles, commands pale; colours of the scene [deg]", "flaps"),
@@ -104,16 +106,16 @@ FAULT = re.compile(r"fault (\S+) (begins|ends)")  # texts of the laboratory
 LEGEND = """
 | drawn | what |
 |---|---|
-| plates, flaps 1 to 4 | the robot as it is, of a real flight as the cameras saw it; flaps in the colours of their curves |
-| white outline | where the board believes it is |
+| plates, flaps 1 to 4 | the true robot, of a real flight by the cameras; flaps in the colours of their curves |
+| white outline | the board's estimate |
 | red box and cross | 20 cm around the goal |
-| white line | the way of the last 4 s |
+| white line | the path of the last 4 s |
 | yellow arrows | drag of the plates, 15 cm per newton |
-| blue arrow | the air's way in 0.02 s; pale: its sideways part in 0.1 s |
+| blue arrow | the air's movement in 0.02 s; pale: its sideways part in 0.1 s |
 | pink arrow | a push, 15 cm per newton, shown for half a second at least |
 | grey line, grid | tether, net |
 | red, green, blue axes | x, y, z of W at the exit, and of the body |
-| points on the zero line | poses refused, faults, what an operator did |
+| points on the zero line | poses refused, faults, an operator's actions |
 """
 
 
@@ -126,10 +128,10 @@ def timeline_of(metadata: Mapping[bytes, bytes] | None) -> tuple[str, int]:
 
 
 class Stage:
-    """Puts the rows of one flight, in the order of time, onto a rerun recording."""
+    """Writes the rows of one flight, in the order of time, to a rerun recording."""
 
     def __init__(self, recording: rr.RecordingStream, schema: pa.Schema) -> None:
-        """Put up what does not move; `schema` is the log's, its metadata holds the configuration."""
+        """Log everything static; `schema` is the log's, its metadata holds the configuration."""
         metadata = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
         config = json.loads(metadata.get("config", "{}"))
         self._recording = recording
@@ -137,7 +139,7 @@ class Stage:
         plant = {
             key: value for key, value in config.get("plant", {}).items() if key in PlantConfig.model_fields
         }
-        self._plant = PlantConfig.model_validate(plant)  # logs from before [geometry] had the shape in it
+        self._plant = PlantConfig.model_validate(plant)  # older logs have the shape in [plant]
         self._tunnel = TunnelConfig.model_validate(config.get("tunnel", {}))
         self._flap_axes = scene.flap_axes(self._geometry)
         self._plots = {path: plot for path, plot in PLOTS.items() if plot.needs in schema.names}
@@ -147,9 +149,9 @@ class Stage:
         self._refusals = {
             name: columns for name, columns in REFUSALS.items() if set(columns) & set(schema.names)
         }
-        self._faults: list[str] = []  # kinds of those in force
+        self._faults: list[str] = []  # kinds of the faults in force
         self._past = schema.empty_table()  # the rows of the last second
-        self._slow = schema.empty_table()  # the last row that was a sample of what changes slowly
+        self._slow = schema.empty_table()  # the last row that was a sample of slow quantities
         self._count = 0  # rows so far
         self._fusion = schema.empty_table()  # the row of the last fused pose
         self._timeline, self._zero_us = timeline_of(schema.metadata)
@@ -168,7 +170,7 @@ class Stage:
         self._recording.log("legend", rr.TextDocument(LEGEND, media_type=rr.MediaType.MARKDOWN), static=True)
 
     def add_rows(self, rows: pa.Table) -> None:
-        """Put up some rows of the log, the next in time."""
+        """Log the next rows in time."""
         if rows.num_rows == 0:
             return
         past = pa.concat_tables([self._past, rows])
@@ -194,7 +196,7 @@ class Stage:
         self._past = past.slice(max(0, past.num_rows - monitor.ROWS_OF_A_SECOND))
 
     def _add_slow(self, past: pa.Table, at: NDArray[np.int64]) -> None:
-        """Put up what changes slowly, of rows `at`, with those of a second before them."""
+        """Log slow quantities of rows `at`, with those of a second before them."""
         if len(at) == 0:
             return
         chosen = past.take(at)
@@ -222,14 +224,14 @@ class Stage:
         self._send("world/tether", times, rr.LineStrips3D.columns(strips=lines))
 
     def _add_trail(self, joined: pa.Table) -> None:
-        """Draw the way from each row to the next where the robot was seen in both."""
+        """Draw the path from each row to the next where the robot was seen in both."""
         track = body(joined, "x", "y", "z")
         steps = np.stack((track[:-1], track[1:]), axis=1).astype(np.float32)
         seen = np.isfinite(steps).all(axis=(1, 2))
         self._send("world/trail", column(joined, "t")[1:][seen], rr.LineStrips3D.columns(strips=steps[seen]))
 
     def add_schedule(self, schedule: pa.Table) -> None:
-        """Put up which task had the processor, a lane per task."""
+        """Log which task had the processor, a lane per task."""
         stretches = list(islice(runs(schedule), STRETCHES_SHOWN))
         for name in sorted({run.task for run in stretches} - {"IDLE"}):
             mine = [run for run in stretches if run.task == name]
@@ -242,7 +244,7 @@ class Stage:
             self._send(f"state/task/{name}", times, rr.StateChange.columns(state=states))
 
     def add_ages(self, ages: pa.Table) -> None:
-        """Put up the stages of the poses' age, by the station's own record: `t` [us] and each of `STAGES` [us]."""
+        """Log the stages of the poses' age, from the station's own record: `t` [us] and each of `STAGES` [us]."""
         table = ages.rename_columns(["t", *(f"age.{stage}" for stage in STAGES)])
         path = "age/stages"
         if path in self._plots or table.num_rows == 0:  # they are in the log
@@ -252,7 +254,7 @@ class Stage:
         self._send(f"plot/{path}", column(table, "t"), rr.Scalars.columns(scalars=values))
 
     def add_events(self, events: Iterable[Mapping[str, Any]]) -> None:
-        """Put up texts: `t_us`, `source`, `text`, and what they say of faults and of an operator."""
+        """Log texts: `t_us`, `source`, `text`, and the faults and actions of an operator in them."""
         for event in events:
             t_us, source, text = event["t_us"], event["source"], event["text"]
             self._at(t_us)
@@ -263,7 +265,7 @@ class Stage:
                 self._add_fault(t_us, found[1], begins=found[2] == "begins")
 
     def _add_fault(self, t_us: int, fault: str, begins: bool) -> None:
-        """Put up that a fault begins or ends: in the lane of faults, as a mark, a push as an arrow."""
+        """Log the begin or end of a fault: in the lane of faults, as a mark, a push as an arrow."""
         kind = fault.partition("@")[0]
         if begins:
             self._faults.append(kind)
@@ -323,10 +325,10 @@ class Stage:
             "world/goal", times, goal, np.array([yaw_quaternion(yaw) for yaw in column(rows, "goal.yaw")])
         )
         pose = column(rows, *(f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")))
-        told = np.isfinite(pose).all(axis=1)  # a real board has told it
-        q_GE = [from_euler_zyx(*angles) for angles in pose[told, 3:].tolist()]
-        self._place("world/goal/estimate", times[told], pose[told, :3], np.array(q_GE).reshape(-1, 4))
-        if is_real(rows):  # there are no arrows
+        known = np.isfinite(pose).all(axis=1)  # a real board may not have reported it yet
+        q_GE = [from_euler_zyx(*angles) for angles in pose[known, 3:].tolist()]
+        self._place("world/goal/estimate", times[known], pose[known, :3], np.array(q_GE).reshape(-1, 4))
+        if is_real(rows):  # no forces are known
             return
 
         parts = ("base", "flap1", "flap2", "flap3", "flap4")
@@ -336,13 +338,15 @@ class Stage:
         arrows = rr.Arrows3D.columns(vectors=drag, origins=origins)
         self._send("world/drag", times, arrows.partition(np.full(len(times), len(parts))))
         flow = column(rows, "flow.x", "flow.y", "flow.z")
-        way = SECONDS_OF_FLOW * flow
-        self._send("world/flow", times, rr.Arrows3D.columns(vectors=way, origins=p_WB - way - (0, 0, 0.1)))
+        shift = SECONDS_OF_FLOW * flow
+        self._send(
+            "world/flow", times, rr.Arrows3D.columns(vectors=shift, origins=p_WB - shift - (0, 0, 0.1))
+        )
         wind = SECONDS_OF_WIND * flow * (1.0, 1.0, 0.0)
         self._send("world/wind", times, rr.Arrows3D.columns(vectors=wind, origins=p_WB - wind))
 
     def _colour_markers(self, rows: pa.Table, fresh: int) -> None:
-        """Colour the markers where they come into sight or go, from row `fresh` on."""
+        """Colour the markers where they appear or vanish, from row `fresh` on."""
         bits = column(rows, MARKERS_SEEN).astype(np.int64)
         changed = np.flatnonzero(np.diff(bits, prepend=-1))
         changed = changed[changed >= fresh]
@@ -359,7 +363,7 @@ class Stage:
     def _place(
         self, path: str, times: NDArray[np.float64], p: NDArray[np.float64], q: NDArray[np.float64]
     ) -> None:
-        """Send poses, q as w x y z; where they are not known, the last one stays."""
+        """Send poses, q as w x y z; where they are unknown, the last one stays."""
         known = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
         xyzw = np.roll(q[known], -1, axis=1)
         self._send(path, times[known], rr.Transform3D.columns(translation=p[known], quaternion=xyzw))
@@ -471,9 +475,9 @@ def _rgba_array(colours: Iterable[str], opacity: int = 255) -> NDArray[np.uint32
 
 
 def blueprint(schema: pa.Schema, live: bool = False) -> rrb.Blueprint:
-    """Return how the window is divided: the scene and the states on the left, the curves on the right.
+    """Return the layout of the window: the scene and the states on the left, the curves on the right.
 
-    A live flight is followed, with the curves of its last seconds, until somebody pauses or zooms.
+    A live flight is followed, with the curves of its last seconds, until the user pauses or zooms.
     """
     timeline, _ = timeline_of(schema.metadata)
     now = rrb.TimeRangeBoundary.cursor_relative()
@@ -546,7 +550,9 @@ def write_rrd(
     recording = rr.RecordingStream(APPLICATION)
     recording.save(partial, default_blueprint=blueprint(table.schema))
     stage = Stage(recording, table.schema)
-    stage.add_rows(table)
+    for first in range(0, table.num_rows, ROWS_AT_ONCE):
+        stage.add_rows(table.slice(first, ROWS_AT_ONCE))
+        recording.flush()
     stage.add_events(events)
     stage.add_schedule(schedule)
     if ages is not None:
@@ -558,12 +564,12 @@ def write_rrd(
 def write_run_rrd(folder: Path) -> Path:
     """Write `flight.rrd` of a run folder from its log. Raises `LabError` when there is none."""
     path, log = folder / RECORDING, load_log(folder)
-    write_rrd(log, load_events(folder), load_schedule(folder), path, told_in_time_of(log, folder))
+    write_rrd(log, load_events(folder), load_schedule(folder), path, ages_in_time_of(log, folder))
     return path
 
 
 def recording_of(folder: Path) -> Path:
-    """Return the recording of a run folder, written now if it is not there. Raises `LabError` when there is no log."""
+    """Return the recording of a run folder, which is written if it is missing. Raises `LabError` when there is no log."""
     path = folder / RECORDING
     return path if path.is_file() else write_run_rrd(folder)
 
@@ -577,7 +583,7 @@ class Recording:
         schema = load_log(folder).schema
         self._timeline, _ = timeline_of(schema.metadata)
         self._server = rr.server.Server(host=HOST, datasets={APPLICATION: [path]})
-        # rerun's own client wants a query engine, of which nothing is needed here
+        # rerun's own client requires a query engine that is not needed here
         (inner,) = CatalogClientInternal(self._server.url()).datasets(False)
         dataset = rr.catalog.DatasetEntry(inner)
         with TemporaryDirectory() as kept:
@@ -609,6 +615,6 @@ class LivePicture:
         self._stage.add_events(events)
 
     def close(self) -> None:
-        """Let the viewer have what is on its way."""
+        """Flush the data that are still queued for the viewer."""
         with suppress(RuntimeError):  # a viewer that was closed, or is stuck
             self._recording.flush(timeout_sec=CATCH_UP_S)

@@ -6,7 +6,6 @@ and the modelled radio with its faults are those of a flight in lockstep, behind
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import cast
@@ -15,7 +14,7 @@ from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
 from hil.clock import Clock, Paced
 from hil.devices.real_core import is_link, open_real_core
-from hil.devices.real_firmware import RealBoard, RealFirmware
+from hil.devices.real_firmware import RealBoard, RealFirmware, Wall
 from hil.errors import LabError
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import RADIO, ModelledLine
@@ -35,7 +34,7 @@ def in_the_loop(moving: bool) -> MakeFlight:
         paced = Paced()
         with ExitStack() as stack:
             client = open_real_core(request.board, "--board", stack)
-            flight = flight_in_the_loop(request, client, paced, paced.shift, moving, telemetry)
+            flight = flight_in_the_loop(request, client, paced, paced, moving, telemetry)
             stack.callback(_leave, flight)
             flight.closing = stack.pop_all()
         return flight
@@ -44,10 +43,10 @@ def in_the_loop(moving: bool) -> MakeFlight:
 
 
 def flight_in_the_loop(
-    request: Request, client: CoreClient, clock: Clock, slew: Callable[[int], None], moving: bool = False,
+    request: Request, client: CoreClient, clock: Clock, wall: Wall, moving: bool = False,
     telemetry: Path | None = None,
 ) -> Flight:  # fmt: skip
-    """Return a flight on the clock that `slew` moves. Raises `LabError` when there is no board."""
+    """Return a flight on a clock that follows the wall. Raises `LabError` when there is no board."""
 
     held = max(request.config.flight.release_us, HOLD_US)
     start = request.config.flight.model_copy(update={"release_us": held})
@@ -55,7 +54,7 @@ def flight_in_the_loop(
     try:
         flight = Flight(
             config, request.experiment, request.duration_s, request.seed, clock, True, False, request.faults,
-            RealBoard(client, moving, slew),
+            RealBoard(client, moving, wall),
         )  # fmt: skip
     except LinkError as error:
         raise LabError(f"--board {error}") from None

@@ -14,9 +14,12 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from firmware_py.core_runner import PythonRunner
 from ground_station.links.frame_log import FRAME_LOG
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock, Paced
+from hil.devices.stm32f405.firmware import ImageFirmware
+from hil.devices.stm32f405.settings import to_set
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.ages import STATION_CLOCK
@@ -24,7 +27,7 @@ from hil.laboratory.channels import radio_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
 from hil.laboratory.recorder import Channel, Quantity
-from hil.laboratory.run import Request
+from hil.laboratory.run import Request, image_at
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.holder import HOLD_US, Holder
 from hil.servers.motive import Streaming
@@ -78,7 +81,15 @@ class StationProcess:
             *(("--tlog", str(telemetry.with_name(FRAME_LOG))) if uri.startswith(SERIAL) else ()), *arguments, *ALIGNED,
         ]  # fmt: skip
         self._output = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - closed with the line
+        self._typed = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - likewise
         self._station: subprocess.Popen[bytes] | None = None
+        image = flight.robot.firmware
+        if isinstance(
+            image, ImageFirmware
+        ):  # what the laboratory's own board has from the profile, an operator sets
+            lines = [f"set {name} {value!r}\n" for name, value in to_set(image.parameters, flight.config)]
+            self._typed.write("".join(lines).encode())
+            self._typed.flush()
 
     def _serve(self, uri: str, baud: int) -> tuple[str, dict[str, str]]:
         """Open the side of the board that a URI means; returns the station's URI and what its environment needs."""
@@ -141,8 +152,9 @@ class StationProcess:
     def _running_station(self) -> subprocess.Popen[bytes]:
         """Return the station's process; it starts when the laboratory already runs, which may take a while to compile."""
         if self._station is None:
+            self._typed.seek(0)
             self._station = subprocess.Popen(
-                self._command, env={**os.environ, **self._environment}, stdin=subprocess.DEVNULL, stdout=self._output,
+                self._command, env={**os.environ, **self._environment}, stdin=self._typed, stdout=self._output,
                 stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
         return self._station
@@ -187,6 +199,7 @@ class StationProcess:
         """Close what was opened."""
         self._kill()
         self._output.close()
+        self._typed.close()
         self._ends.close()
 
 
@@ -209,6 +222,7 @@ def linked_flight(request: Request, telemetry: Path, clock: Clock | None, trace_
     flight = Flight(
         request.config, request.experiment, request.duration_s, request.seed, Paced(), radio=True,
         mavlink=request.link.startswith(SERIAL), faults=request.faults, trace_all=trace_all,
+        runner=image_at(request.board, request.elf) if request.is_image else PythonRunner,
     )  # fmt: skip
     arguments = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
     line = StationProcess(flight, request.link, request.seed, telemetry, arguments)

@@ -18,7 +18,7 @@ from ground_station.trajectory import Goal, Hold
 from hil.clock import Readers
 from hil.devices.nrf51 import RATES, Nrf51, RadioSettings
 from hil.devices.radio import VirtualRadio
-from hil.devices.stm32f405.firmware import POLL_PERIOD_US
+from hil.devices.stm32f405.firmware import POLL_PERIOD_US, ImageFirmware
 from hil.errors import LabError
 from hil.laboratory.robot import Robot
 from hil.servers.board_files import BoardFiles
@@ -80,6 +80,8 @@ class ServedRobot:
         if self._files is not None:
             self._files.load()
         self.start(0)
+        if isinstance(robot.firmware, ImageFirmware) and (stays := robot.firmware.differences(config)):
+            say(f"the image has its own {stays}")
 
     @property
     def uri(self) -> str:

@@ -1,8 +1,8 @@
-"""The robustness studies beyond the paper, as data: what is made worse, for whom, and what is expected to come of it.
+"""The robustness studies beyond the paper, as data: what is made worse, for which variants, and the expected outcome.
 
 A study flies its experiment for every variant, size and seed. Faults begin 2 s after the release and last to the end
-unless the study says otherwise. What is expected was measured over at least 5 seeds and stated with a step to spare; for
-latency and jitter other seeds were flown as well.
+unless the study says otherwise. Expectations were measured over at least 5 seeds and are stated with one step of reserve;
+for latency and jitter other seeds were flown as well.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PROFILES = (DEFAULT_PROFILE, AS_FLOWN)
 AIR_US = 2_000  # what radio, USB and the wait for the next step add to the cameras' latency
 NO_TRACKER = ("tracker.enabled=false",)
 NO_PREDICTOR, FIXED_PREDICTOR = ("predictor.enabled=false",), ("predictor.age=fixed",)
-# Gains between the author's and the profile's, whose need of the predictor shows best (physics.md section 8).
+# Gains between the author's and the profile's, which show best when the predictor is needed.
 MID = (
     "controller.gain_y=-2.5",
     "controller.gain_vy=-0.8",
@@ -92,7 +92,7 @@ def _models(profile: str, expected: Expected) -> tuple[Variant, ...]:
 _ALL = (
     Study(
         "latency",
-        "Does the robot survive late poses, and what does the predictor on board make of them?",
+        "Does the robot survive late poses, and how much does the predictor on board help?",
         "latency from exposure to estimator", "ms", (0, 20, 40, 60, 80, 100, 120),
         (
             Variant("floaty, measured age", _latency, Expected(holds_to=80, flies_to=120)),
@@ -142,16 +142,16 @@ _ALL = (
         remark="After 0.5 s without a pose the supervisor sets the flaps to hover; the next pose ends that.",
     ),
     Study(
-        "outliers", "How many frames may lie 30 cm off?", "frames with a wrong position", "%", (0, 5, 10, 20, 30, 50),
+        "outliers", "How many frames may be wrong by 30 cm?", "frames with a wrong position", "%", (0, 5, 10, 20, 30, 50),
         (
             *_both(_outliers, Expected(holds_to=30, flies_to=50), Expected(holds_to=5, flies_to=50)),
             Variant("floaty, no tracker", _outliers, Expected(holds_to=5, flies_to=50), settings=NO_TRACKER),
         ),
         remark="The ground station's tracker refuses wrong poses. Without it the estimator's gate refuses one; two in a row "
-        "that agree it believes, which is what degrades.",
+        "that agree it accepts, which degrades the flight.",
     ),
     Study(
-        "swap", "How long may the cameras take the markers for one another?", "pose turned by 180 deg for", "s",
+        "swap", "How long may the cameras confuse the markers?", "pose turned by 180 deg for", "s",
         (0, 0.02, 0.1, 0.2, 0.3, 0.4, 0.6),
         (
             *_both(_spell("mocap.swap"), Expected(holds_to=0.2, flies_to=0.4), Expected(holds_to=0.02, flies_to=0.2)),
@@ -159,8 +159,8 @@ _ALL = (
                 "floaty, no tracker", _spell("mocap.swap"), Expected(holds_to=0.02, flies_to=0.4), settings=NO_TRACKER
             ),
         ),
-        remark="The tracker believes agreeing wrong poses after 0.4 s, before the board's failsafe, the board's gate from "
-        "the second on: then the robot turns and pushes the wrong way.",
+        remark="The tracker accepts agreeing wrong poses after 0.4 s, before the board's failsafe, the board's gate from "
+        "the second on: then the robot turns and pushes in the wrong direction.",
     ),
     Study(
         "gyro-bias", "How far may the gyro drift after its calibration?", "bias", "deg/s", (0, 1, 2, 5, 10, 20, 50, 100),
@@ -184,7 +184,7 @@ _ALL = (
     Study(
         "servo-stuck", "How long may a servo stick?", "servo 1 stuck for", "s", (0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2),
         _both(_spell("servo.stuck.1"), Expected(holds_to=0.2, flies_to=0.8), Expected(holds_to=0.2, flies_to=0.8)),
-        remark="The flap stays where it happens to be: some seeds have luck.",
+        remark="The flap sticks at an arbitrary angle, which is harmless for some seeds.",
     ),
     Study(
         "servo-slow", "How slow may a servo be?", "pace of servo 1", "%", (100, 70, 50, 30, 20, 10),
@@ -194,11 +194,11 @@ _ALL = (
         ),
     ),
     Study(
-        "servo-trim", "How wrongly may a servo be mounted?", "servo 1 off by", "deg", (0, 2, 4, 6, 8, 10, 15),
+        "servo-trim", "How wrongly may a servo be mounted?", "error of servo 1", "deg", (0, 2, 4, 6, 8, 10, 15),
         _both(
             _fault("servo.trim.1", 0), Expected(holds_to=4, flies_to=15), Expected(holds_to=6, flies_to=15)
         ),
-        remark="The author's limits are wider: they allow for the swinging of the hover in y.",
+        remark="The author's limits are wider: they allow for the oscillation of the hover in y.",
     ),
     Study(
         "model-error", "How wrong may the model on board be?", "error of the constants", "%", (0, 10, 30),
@@ -215,7 +215,7 @@ _ALL = (
             _fault("battery.sag", 0), Expected(holds_to=0.5, failsafe_from=1.0), Expected(holds_to=0.5, failsafe_from=1.0)
         ),
         12.0,
-        remark="Below 3.2 V for 5 s the supervisor ends the flight: the flaps stay at hover, and the robot drifts off.",
+        remark="Below 3.2 V for 5 s the supervisor ends the flight: the flaps stay at hover, and the robot drifts away.",
     ),
 )  # fmt: skip
 STUDIES = {study.name: study for study in (*_ALL, *DESIGN_STUDIES)}

@@ -27,7 +27,7 @@ def _point(profile: str) -> Point:
 
 
 def _updraft(profile: str) -> Callable[[float], Change]:
-    """Return the change that makes an updraft of each speed [m/s], with the hover angle adapted as far as the flaps go."""
+    """Return the change that makes an updraft of each speed [m/s], with the hover angle adapted within the flaps' range."""
 
     def change(speed: float) -> Change:
         point = _point(profile)
@@ -53,13 +53,13 @@ UPDRAFTS = Study(
         Variant(BEST, _updraft(BEST), Expected(flies_to=10.5, lost_from=9), BEST),
     ),
     6.0,
-    remark="The hover angle is adapted to each speed. Where the flaps close below 22 degrees the paper's robot turns round "
+    remark="The hover angle is adapted to each speed. Where the flaps close below 22 degrees the paper's robot reverses "
     "in x: its steady x per u2 changes sign.",
 )  # fmt: skip
 PUSHES = Study(
-    "design-pushes", "Which pushes do the designs take?", "roll torque for 0.1 s", "N m", (0, 0.02, 0.04, 0.06, 0.08),
+    "design-pushes", "Which pushes do the designs withstand?", "roll torque for 0.1 s", "N m", (0, 0.02, 0.04, 0.06, 0.08),
     tuple(Variant(name, _push, Expected(flies_to=0.04), name) for name in (FLAT, PAPER, BEST)),
     6.0,
     remark="By isolated plates roll is damped by 1 to 2 1/s alone, twenty times less than by the Table: pushes that the "
-    "default profile takes are too much for all three.",
+    "default profile withstands are too much for all three.",
 )  # fmt: skip

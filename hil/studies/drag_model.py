@@ -3,7 +3,7 @@
 The model is the paper's simplified one ("Force analysis"): base and flaps as isolated flat plates in a uniform flow, pushed
 along their normals. What is measured is the plant, clamped level at the hover point of the tunnel, with its profile and
 its gusts, through a force sensor, for 10 s at each angle: means and standard deviations. The plant's plates are isolated
-too, so what the paper sees at extreme angles, flaps in each other's wake, is not to be found here.
+too, so what the paper sees at extreme angles, flaps in each other's wake, does not occur here.
 
 Torques are about the centre of mass. Two sweeps as in the paper's figure drag_model_evaluation: (a) flaps 2 and 3 turned by
 the same angle in opposite directions, (b) flaps 1 and 3 in the same direction; the others stay at the hover angle.
@@ -37,14 +37,8 @@ Wrench = NDArray[np.float64]  # (6,): force [N] and torque [N m] in B
 ANGLES_DEG = tuple(range(-60, 65, 5))
 SECONDS = 10  # per angle; paper
 SAMPLES = 1_000_000 // STEP_US * SECONDS  # paper: 35000; here on the grid of the truth
-SENSOR_NOISE = (
-    0.01,
-    0.01,
-    0.02,
-    0.00025,
-    0.00025,
-    0.00025,
-)  # N, N m: resolution of an ATI mini40; assumed white
+# [N, N m] resolution of an ATI mini40; assumed white.
+SENSOR_NOISE = (0.01, 0.01, 0.02, 0.00025, 0.00025, 0.00025)
 QUANTITIES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 
 
@@ -109,7 +103,7 @@ class SimplifiedModel:
         return total
 
     def _push(self, area: float, normal: NDArray[np.float64], centre: NDArray[np.float64]) -> Wrench:
-        """Return what the flow does to one plate (eq. flaps_drag_force_simplified, drag_torque_equation)."""
+        """Return force and torque of the flow on one plate (eq. flaps_drag_force_simplified, drag_torque_equation)."""
         across = self._airspeed * normal[2]
         force = self._pressure * area * across * abs(across) * normal
         return np.concatenate([force, np.cross(centre, force)])
@@ -131,7 +125,7 @@ def measure(config: LabConfig, seed: int) -> Iterator[Row]:
         plant = Plant(geometry, body, config.tunnel, config.actuators, streams.gusts)
         plant.hold()
         for servo in range(4):
-            plant.set_servo_fault(servo, speed=0.0)  # the flaps stay where they are put
+            plant.set_servo_fault(servo, speed=0.0)  # the flaps stay at the set angles
         for index, (sweep, angle_deg) in enumerate(product(SWEEPS, ANGLES_DEG)):
             flaps = SIGNS * body.hover_angle
             sweep.turn(flaps, math.radians(angle_deg))
@@ -142,7 +136,7 @@ def measure(config: LabConfig, seed: int) -> Iterator[Row]:
 
 
 def _measure(plant: Plant, flaps: NDArray[np.float64], start_us: int) -> NDArray[np.float64]:
-    """Return what the flow does to the clamped robot, (SAMPLES, 6), every millisecond after `start_us`."""
+    """Return force and torque of the flow on the clamped robot, (SAMPLES, 6), every millisecond after `start_us`."""
     plant.place(plant.p_WB.tolist(), plant.q_WB.tolist(), flaps=flaps.tolist())
     samples = np.empty((SAMPLES, 6))
     for index in range(SAMPLES):

@@ -1,6 +1,6 @@
 """Flying the whole paper: every row's experiment on both profiles with several seeds, and the studies.
 
-Flights of rows keep their logs in `OUT/EXPERIMENT-PROFILE-SEED`, those of studies leave nothing but their result.
+Flights of rows keep their logs in `OUT/EXPERIMENT-PROFILE-SEED`, those of studies leave only their result.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ KEPT = ("log.parquet", "events.jsonl", "result.json")
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """A metric over the seeds, in the unit that people read; flights without the figure are left out."""
+    """A metric over the seeds, in the displayed unit; flights without a value are left out."""
 
     unit: str
     count: int
@@ -66,12 +66,12 @@ class Trials:
 
     @property
     def passed(self) -> int:
-        """How many held every limit."""
+        """The number of flights that held every limit."""
         return sum(result.passed for result in self.results)
 
     @property
     def holds(self) -> bool:
-        """Whether all did."""
+        """Whether all flights did."""
         return self.passed == len(self.results) > 0
 
     @property
@@ -84,7 +84,7 @@ class Trials:
 
     @property
     def lost(self) -> int:
-        """How many were lost."""
+        """The number of lost flights."""
         return sum(result.outcome == "lost" for result in self.results)
 
     def missed(self, row: Row, metric: str) -> str:
@@ -106,7 +106,7 @@ class Trials:
 
 @dataclass(frozen=True, slots=True)
 class Paper:
-    """All that was flown."""
+    """All flights."""
 
     rows: tuple[tuple[str, Row, tuple[Trials, ...]], ...]  # experiment, row, per profile
     studies: tuple[StudyResult, ...]
@@ -114,7 +114,7 @@ class Paper:
 
     @property
     def misses(self) -> list[tuple[Row, str, list[str]]]:
-        """Rows and profiles that miss a value of the paper, or hold not every limit, and what."""
+        """Rows and profiles that miss a value of the paper or fail a limit, with the reasons."""
         found = []
         for _, row, both in self.rows:
             for trials in both:
@@ -126,7 +126,7 @@ class Paper:
 
     @property
     def values_missed(self) -> int:
-        """How many values of the paper are missed, over both profiles."""
+        """The number of values of the paper that are missed, over both profiles."""
         return sum(
             bool(trials.missed(row, metric))
             for _, row, both in self.rows
@@ -136,12 +136,12 @@ class Paper:
 
     @property
     def surprises(self) -> int:
-        """How many expectations of the studies did not come true."""
+        """The number of expectations of the studies that were not met."""
         return sum(len(result.surprises(curve)) for result in self.studies for curve in result.curves)
 
     @property
     def holds(self) -> bool:
-        """Whether all was flown and all limits hold for the default profile; what else was flown shows what it shows."""
+        """Whether all flights were flown and all limits hold for the default profile; other profiles are not judged."""
         return not self.interrupted and self.limits_hold
 
     @property
@@ -199,7 +199,7 @@ def fly_paper(
 
 
 def _key(request: Request) -> Hashable:
-    """Return what makes a flight the same flight: studies share the healthy ones."""
+    """Return the key of equal flights: studies share those without a fault."""
     return (
         request.experiment.name, request.profile, request.overrides, request.faults, request.seed, request.duration_s
     )  # fmt: skip

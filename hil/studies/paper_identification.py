@@ -30,7 +30,7 @@ TITLES = {
 }
 WHY = (
     "The paper's c* give a = 230 and c = -14, not -16. Its equations find neither here: the angular acceleration in them is "
-    "the derivative of the same spectrum: jωȦ = -ω²A whatever flies. So c* is a mean of -ω², and b* is near 0."
+    "the derivative of the same spectrum: jωȦ = -ω²A for any robot. So c* is a mean of -ω², and b* is near 0."
 )
 
 
@@ -39,7 +39,7 @@ COLUMNS = ("constant", "paper", "its arithmetic", "truth", "its method here", "i
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """One row: what everybody makes of it, as text; empty for nothing."""
+    """One row: the estimates by method, as text; empty for none."""
 
     title: str
     paper: str

@@ -1,4 +1,4 @@
-"""The report of the paper: `report.html` with its pages for people, `result.json` for programs.
+"""The report of the paper: `report.html` with its pages for readers, `result.json` for programs.
 
 `report.html` has the table and the contents, `EXPERIMENT.html` the figures of one experiment as in the paper (every trial
 light, the one with the median error dark), `drag-model.html` and `studies.html` the rest.
@@ -18,9 +18,10 @@ from hil.config import load_config
 from hil.design.analysis import Analysis
 from hil.design.analysis import write as write_design
 from hil.experiments import EXPERIMENTS
+from hil.installation import commit, versions
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
-from hil.laboratory.result import RESULT, commit, versions
+from hil.laboratory.result import RESULT
 from hil.pictures.figures import PICTURES
 from hil.pictures.gallery import pictures_of
 from hil.pictures.pages import Shown, data_uri, draw, write_page, zoomable
@@ -34,11 +35,8 @@ from hil.studies.study_figures import picture
 from hil.studies.study_run import StudyResult
 
 REPORT = "report.html"
-DRAG_MODEL, STUDIES, DESIGN = (
-    "drag-model",
-    "studies",
-    "design/design",
-)  # names of pages beside those of the experiments
+# Names of the pages beside those of the experiments.
+DRAG_MODEL, STUDIES, DESIGN = "drag-model", "studies", "design/design"
 OPERATIONAL_DEG = 50  # flap angles of flight, in the steps of the test
 OF_EVERY_FLIGHT = PICTURES[:2]  # for an experiment without pictures of its own
 

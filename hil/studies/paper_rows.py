@@ -1,7 +1,7 @@
-"""The paper's results that a laboratory without hardware can reproduce: what the paper says, where, and what we measure.
+"""The paper's results that a laboratory without hardware can reproduce: the paper's claim, its place, and our measurement.
 
-One row per experiment. Verdicts come from the limits of the experiments, which say what this plant does; beside
-them stands by how much a row misses the paper's value, and why. physics.md, named there, specifies the plant.
+One row per experiment. Verdicts come from the limits of the experiments, which state the behaviour of this plant; beside
+them stands by how much a row misses the paper's value, and why. docs/explanation/plant.md describes the plant.
 """
 
 from collections.abc import Mapping
@@ -13,9 +13,9 @@ from hil.experiments.identification import IDENTIFICATION
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What the paper says of a metric."""
+    """The paper's claim about a metric."""
 
-    text: str = ""  # empty: nothing
+    text: str = ""  # empty: no claim
     bound: float | None = None  # in the metric's unit; the mean over the seeds reaches it or misses it
 
 
@@ -27,7 +27,7 @@ class Row:
     claim: str  # the paper's, in short
     place: str  # in the paper
     claims: Mapping[str, Claim]  # by metric, in the order of the table
-    why: str = ""  # it misses the paper's value, when it does
+    why: str = ""  # why it misses the paper's value, if it does
     note: str = ""  # how to read ours
 
 
@@ -45,13 +45,13 @@ ENERGY, ROBUST = "Energy efficiency, Fig. robustness a, b", "Robustness, Fig. ro
 
 NO_DAMPING = (
     "The author's gains leave the y loop of this plant at +0.26 ± 4.9i (constants of the Table, 50 ms of flap lag): a limit "
-    "cycle of 0.8 Hz. A disturbance on top of it leaves the flaps no lift for the height, and the robot falls or leaves the "
-    "flow (physics.md section 8)."
+    "cycle of 0.8 Hz. An additional disturbance leaves the flaps no lift for the height, and the robot falls or leaves the "
+    "flow."
 )
 LIFT = (
     "By the Table's z constant the flaps, with 8° kept for attitude, carry 0.34 kg at 9.5 to 10.4 m/s. At 8 m/s the robot "
     "needs 56 % more lift than the hover at 10 m/s and 25° leaves in reserve: flat plates of its size have 18 %. Mass, "
-    "speed, hover angle and z constant of the paper do not fit 8 to 11 m/s together (physics.md section 8)."
+    "speed, hover angle and z constant of the paper do not fit 8 to 11 m/s together."
 )
 
 
@@ -103,7 +103,7 @@ ROWS: Mapping[str, Row] = {
         "Yaw step of 110°, flaps 0..52°", "settles in less than 0.5 s; steps up to 110°", YAW,
         {"settle": Claim("< 0.5 s", 0.5), "overshoot": SILENT, "peak_rate": SILENT, "max_z": SILENT},
         "The firmware's range of the flaps allows ±25° about hover: with 110 rad/s² per rad and a damping of 7.7 1/s even "
-        "the best switching needs 0.47 s to 5 % (physics.md section 8). The paper names neither range nor band.",
+        "the best switching needs 0.47 s to 5 %. The paper names neither range nor band.",
     ),
     "yaw-sine-0.02": _sine("0.02"),
     "yaw-sine-0.05": _sine("0.05"),
@@ -114,7 +114,7 @@ ROWS: Mapping[str, Row] = {
         {"gain": ABOUT_ONE, "lag": SILENT, "rms_z": SILENT, "rms_x": SILENT, "rms_y": SILENT},
     ),
     "y-square": Row(
-        "Square of ±10 cm in y", "follows; ±10 cm is what the flow's diameter allows", LATERAL,
+        "Square of ±10 cm in y", "follows; the flow's diameter allows ±10 cm", LATERAL,
         {"rise": SILENT, "overshoot": SILENT, "hold_rms": SILENT, "lost": NEVER_LOST}, NO_DAMPING,
     ),
     "pushes": Row(
@@ -126,7 +126,7 @@ ROWS: Mapping[str, Row] = {
     "side-wind-3": _side_wind(3),
     "side-wind-4": _side_wind(
         4,
-        why="The flaps that lean the robot into the wind lack for lift between 0 and 52°: about every second is lost.",
+        why="Between 0 and 52° the flaps that lean the robot into the wind are missing for lift: about half are lost.",
     ),
     "side-wind-4-open": _side_wind(
         4, ", flaps -11..52°", note="Opened through zero, with a hover angle of 15°, the flaps have more lift in reserve."
@@ -142,7 +142,7 @@ ROWS: Mapping[str, Row] = {
     ),
     **{f"airspeed-{speed}": _airspeed(speed) for speed in ("8", "8.5", "9", "9.5", "9.75", "10", "10.25", "10.5", "11")},
     "power": Row(
-        "Power of the hover, and what two 250 mAh cells make of it", "about 33 min, 3.4 W, 10 W/kg", ENERGY,
+        "Power of the hover, and the endurance with two 250 mAh cells", "about 33 min, 3.4 W, 10 W/kg", ENERGY,
         {"power": Claim("3.4 W"), "specific_power": Claim("10 W/kg", 10.05), "endurance": Claim("33 min", 33.0)},
         note="The servos' two constants are calibrated on the paper's one figure: agreement of the hover is no test of the "
         "model, the differences between flights are.",

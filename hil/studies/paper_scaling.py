@@ -1,7 +1,7 @@
-"""Agility against size, out of flights: the paper's robot, half and twice as long, each in its own updraft.
+"""Agility against size, from flights: the paper's robot, half and twice as long, each in its own updraft.
 
 The masses go with the cube of the length, so that the updraft goes with its root (eq. airflow_proportionality). All three
-fly an excitation of u3 and one of u1, and `floaty identify` finds from the telemetry alone what an input accelerates.
+fly an excitation of u3 and one of u1, and `floaty identify` finds from the telemetry alone the acceleration per input.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from hil.studies.sweep import Job, fly_all
 
 PROFILES = ("design-half", "design-paper", "design-double")
 FLIGHTS = {"yaw_u3": "identify-u3", "roll_u1": "identify-u1"}
-# [rad] rms, half of what the default robot bears: the smallest one drifts by 20 cm with it.
+# [rad] rms, half of what the default robot withstands, because the smallest one drifts by 20 cm with it.
 AMPLITUDES = {"identify-u3": 0.03, "identify-u1": 0.025}
 DURATION_S = 105.0  # five periods
-PAPER, NEAR = -1.0, 0.15  # exponent over the length, and what "goes with" covers
+PAPER, NEAR = -1.0, 0.15  # exponent over the length, and the deviation that "goes with" allows
 AGAINST = "At the same hover angle; with servos that are as slow at every size."
 
 
@@ -59,11 +59,11 @@ def fly_scaling(out: Path, notices: Console) -> list[Claim]:
         (exponent, _), covariance = np.polyfit(
             np.log(length), np.log(values), 1, w=values / halves, cov="unscaled"
         )
-        told = ", ".join(f"{value:.0f} ± {half:.0f}" for value, half in zip(values, halves, strict=True))
+        listed = ", ".join(f"{value:.0f} ± {half:.0f}" for value, half in zip(values, halves, strict=True))
         claims.append(
             Claim(
                 f"{constant.split('_')[0]} acceleration per input over l, flown and identified", SCALING,
-                f"exponent {PAPER:g}", f"{exponent:.2f} ± {np.sqrt(covariance[0, 0]):.2f} ({told} 1/s²)",
+                f"exponent {PAPER:g}", f"{exponent:.2f} ± {np.sqrt(covariance[0, 0]):.2f} ({listed} 1/s²)",
                 AGREES if abs(exponent - PAPER) < NEAR else DIFFERS, AGAINST,
             )
         )  # fmt: skip

@@ -1,6 +1,6 @@
-"""What a robustness study is: one axis of sizes, several variants, and what is expected of each.
+"""A robustness study: one axis of sizes, several variants, and the expected outcome of each.
 
-Sizes go from harmless to harmful, in the order in which they stand; "up to" and "from" mean that order.
+Sizes go from harmless to harmful, in the order in which they are listed; "up to" and "from" mean that order.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from hil.config import DEFAULT_PROFILE
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a size means: settings `section.key=value` and faults, as on the command line."""
+    """The change for a size: settings `section.key=value` and faults, as on the command line."""
 
     settings: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()
@@ -19,17 +19,16 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What is expected of a variant, by size; None: nothing is said."""
+    """The expected outcome of a variant, by size; None: not stated."""
 
     holds_to: float | None = None  # every seed holds the experiment's limits up to this size
     flies_to: float | None = None  # no seed is lost up to this size
-    failsafe_from: float | None = (
-        None  # the supervisor opens the loop, or the robot is lost, from this size on
-    )
+    # The size from which on the supervisor opens the loop or the robot is lost.
+    failsafe_from: float | None = None
     lost_from: float | None = None  # every seed is lost from this size on
 
     def text(self, unit: str) -> str:
-        """Return it as a sentence."""
+        """Return the expectation as a sentence."""
         parts = (
             ("holds the limits up to", self.holds_to),
             ("is not lost up to", self.flies_to),

@@ -1,4 +1,4 @@
-"""What became of a study: the outcome of every flight and cell, and whether it is what was expected."""
+"""The result of a study: the outcome of every flight and cell, and whether it was expected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HOLDS, FAILSAFE, LOST = (OUTCOMES.index(name) for name in ("holds", "failsafe", 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """What became of one variant at one size, seed by seed."""
+    """The outcome of one variant at one size, seed by seed."""
 
     size: float
     outcomes: tuple[str, ...]
@@ -27,7 +27,7 @@ class Cell:
 
     @property
     def ranks(self) -> list[int]:
-        """Places in OUTCOMES, from good to bad."""
+        """Indices in OUTCOMES, from good to bad."""
         return sorted(OUTCOMES.index(outcome) for outcome in self.outcomes)
 
     @property
@@ -37,7 +37,7 @@ class Cell:
 
     @property
     def text(self) -> str:
-        """How many seeds had which outcome."""
+        """The number of seeds by outcome."""
         return ", ".join(f"{self.outcomes.count(name)} {name}" for name in OUTCOMES if name in self.outcomes)
 
 
@@ -57,7 +57,7 @@ class StudyResult:
     curves: tuple[Curve, ...]
 
     def surprises(self, curve: Curve) -> list[str]:
-        """Return the cells of a curve that are not what was expected of its variant."""
+        """Return the cells of a curve that differ from the expectation of its variant."""
         found = []
         for cell in curve.cells:
             if not all(self._bounds(curve.variant.expected, cell)):
@@ -77,7 +77,7 @@ class StudyResult:
 
     @property
     def holds(self) -> bool:
-        """Whether everything came as expected, and all of it was flown."""
+        """Whether every outcome was expected and every flight was flown."""
         return len(self.curves) == len(self.study.variants) and all(
             len(curve.cells) == len(self.study.sizes) and not self.surprises(curve) for curve in self.curves
         )
@@ -99,7 +99,7 @@ def flights_of(study: Study, seeds: int) -> Iterator[tuple[Variant, float, Reque
 
 
 def outcome_of(result: Result) -> str:
-    """Return what a flight comes to, one of OUTCOMES.
+    """Return the outcome of a flight, one of OUTCOMES.
 
     lost: it ended as a crash; failsafe: the supervisor opened the loop for a while; degrades: a limit fails.
     """
@@ -111,7 +111,7 @@ def outcome_of(result: Result) -> str:
 
 
 def summarise(study: Study, flown: list[tuple[Variant, float, Result]]) -> StudyResult:
-    """Return what became of a study from those of its flights that were flown."""
+    """Return the result of a study from the flights that were flown."""
     curves = []
     for variant in study.variants:
         cells = []

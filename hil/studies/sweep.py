@@ -23,7 +23,7 @@ from hil.laboratory.run import Request, fly, prepare
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A flight, its folder, and what of it is kept: None for everything, no name for nothing, not even the folder."""
+    """A flight, its folder, and which of its files are kept: None for all, an empty tuple for none, not even the folder."""
 
     request: Request
     folder: Path
@@ -33,7 +33,7 @@ class Job:
 def fly_all(jobs: Sequence[Job], notices: Console) -> tuple[list[Result], bool]:
     """Fly every job; return the results in the order of the jobs, and whether Ctrl-C ended it early.
 
-    After Ctrl-C the flights in the air land first: every complete flight is among the results.
+    After Ctrl-C the running flights are completed first: every complete flight is among the results.
     """
     columns = (
         TextColumn("{task.description}"),
@@ -60,7 +60,7 @@ def fly_all(jobs: Sequence[Job], notices: Console) -> tuple[list[Result], bool]:
 
 
 class _Packer(pickle.Pickler):
-    """Packs an experiment of one's own as the place where it stands: it may have functions without a name."""
+    """Packs a user's experiment as a reference to its source, because it may contain lambdas."""
 
     def persistent_id(self, value: Any) -> Source | None:
         return value.source if isinstance(value, Experiment) else None

@@ -1,7 +1,7 @@
-"""`floaty tune`: a hover tells what the flow does, the design makes gains, hovers show them, of the worst robots as well.
+"""`floaty tune`: a hover measures the flow, the design computes gains, and hovers test them, also on the worst robots.
 
 A round of `--repeat` begins one step earlier: it flies the excitations and identifies the model. All of it takes telemetry
-and a link alone, the truth of the plant is used to fly other robots and for nothing else.
+and a link alone; the plant's truth is used only to fly other robots.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ BETTER = 0.95  # of the last round's rms, or it is the last
 
 @dataclass(frozen=True, slots=True)
 class Flights:
-    """How flights are made: the same of all."""
+    """The settings that all flights share."""
 
     seed: int
     board: str
@@ -62,7 +62,7 @@ class Flights:
     notices: Console
 
     def hover(self, name: str, profile: str, *others: tuple[str, ...]) -> list[Result]:
-        """Fly a hover of a profile's robot, and of others that settings make of it. Raises `LabError` for an error."""
+        """Fly a hover of a profile's robot, and of robots that differ by settings. Raises `LabError` for an error."""
         experiment = find_experiment("hover")
         return self._fly(
             Job(
@@ -104,20 +104,20 @@ class TunedAxis:
     old_margins: Margins
     margins: Margins
     least: Margins  # of all robots
-    late: float  # [s] by which poses may be older than they say, the robot's
+    late: float  # [s] by which poses may be older than they state, for the robot
     least_late: float  # of the worst robots
     old_motion: Motion | None  # None: not stable by the model
     motion: Motion
 
     @property
     def metric(self) -> str:
-        """What its motion is called in a flight's result, empty for yaw, which has none."""
+        """The metric of its motion in a flight's result, empty for yaw, which has none."""
         return {0: "rms_y", 1: "rms_x", 3: "rms_z"}.get(self.axis.input, "")
 
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """What came of it."""
+    """The result of tuning."""
 
     axes: tuple[TunedAxis, ...]
     robots: Robots
@@ -133,7 +133,7 @@ class Tuned:
 
 
 def tune(profile: str, flights: Flights, count: int) -> Tuned:
-    """Return gains for a profile's robot and `count` that its intervals allow. Raises `LabError` when there are none."""
+    """Return gains for a profile's robot and `count` others within its intervals. Raises `LabError` when there are none."""
     config = load_config(profile)
     if config.logic.controller:
         raise LabError(
@@ -143,7 +143,7 @@ def tune(profile: str, flights: Flights, count: int) -> Tuned:
     (before,) = flights.hover("before", profile)
     if before.outcome == "lost":
         raise LabError(
-            f"{profile}: its own gains lose the robot ({before.cause}): no hover to tell what the flow does"
+            f"{profile}: its own gains lose the robot ({before.cause}): no hover to measure the flow with"
         )
     pose = before.ages[0]
     age_s, jitter_s = 1e-6 * pose.mean_us, 1e-6 * (pose.p99_us - pose.mean_us)
@@ -165,12 +165,12 @@ def tune(profile: str, flights: Flights, count: int) -> Tuned:
 
 
 def refuse_late(axes: Sequence[TunedAxis], jitter_s: float) -> None:
-    """Raise `LabError` for loops that bear less delay than the link has."""
+    """Raise `LabError` for loops that tolerate less delay than the link has."""
     for one in axes:
         least = min(one.least.delay, one.least_late)
         if least < jitter_s:
             raise LabError(
-                f"refused: {one.axis.name} bears {1e3 * least:.1f} ms of delay, and poses come up to "
+                f"refused: {one.axis.name} tolerates {1e3 * least:.1f} ms of delay, and poses arrive up to "
                 f"{1e3 * jitter_s:.1f} ms later than on the mean"
             )
 
@@ -215,7 +215,7 @@ def _with_gains(config: LabConfig, axes: Sequence[TunedAxis]) -> LabConfig:
 
 
 def write_tuned(path: Path, base: str, config: LabConfig, about: str) -> None:
-    """Write a profile on top of another with what `config` has otherwise: model, trim, gains."""
+    """Write a profile based on another one, with the values of `config` that differ: model, trim, gains."""
     old = load_config(base)
     lines = [f"# {about}", f'base = "{base_name(base)}"']
     for section in ("model", "servo", "controller"):
@@ -233,7 +233,7 @@ def write_tuned(path: Path, base: str, config: LabConfig, about: str) -> None:
 
 
 def worst_settings(tuned: Tuned, config: LabConfig) -> list[tuple[str, ...]]:
-    """Return the settings that make the plant the worst of the drawn robots, as far as the plant can be them."""
+    """Return the settings that make the plant the worst of the drawn robots, as far as the plant can represent them."""
     if config.plant.variant == "plate":
         return []
     plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
@@ -264,7 +264,7 @@ def rms(result: Result) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """One round: tuned gains and what they flew like, the profile's robot first, then the worst."""
+    """One round: tuned gains and their flights, the profile's robot first, then the worst."""
 
     tuned: Tuned
     flown: tuple[Result, ...]
@@ -278,7 +278,7 @@ class Round:
 
     @property
     def rms(self) -> float:
-        """Of the better gains, the profile's robot."""
+        """The rms of the better gains, for the profile's robot."""
         return min(rms(self.flown[0]), rms(self.tuned.before))
 
     @property
@@ -299,7 +299,7 @@ def fly_round(profile: str, flights: Flights, count: int) -> Round:
 def rounds(profile: str, flights: Flights, count: int, most: int) -> Iterator[Round]:
     """Yield rounds of excitation, identification and tuning, `most` of them or until one is no better than the last.
 
-    Raises `LabError` when a robot is lost on the way, or nothing is identified.
+    Raises `LabError` when a robot is lost, or nothing is identified.
     """
     last = float("inf")
     for number in range(1, most + 1):

@@ -1,6 +1,7 @@
-"""Tests of one's own logic with pytest: the fixture `floaty`, a board without a world, and faults and ways for Hypothesis.
+"""Tests of the user's own logic with pytest: the fixture `floaty`, a board without a world, and faults and paths for
+Hypothesis.
 
-`docs/testing.md` shows all of it. pytest finds the plugin by itself; `faults` and `trajectories` need Hypothesis and are
+`docs/howto/tests.md` shows all of it. pytest finds the plugin by itself; `faults` and `trajectories` need Hypothesis and are
 loaded when they are first used.
 """
 

@@ -1,4 +1,4 @@
-"""A board without a world: the firmware alone, fed by hand, in simulated time, which passes only in `run` and `expect`."""
+"""A board without a world: the firmware alone, in simulated time, which passes only in `run` and `expect`."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Vector = tuple[float, float, float]
 
 
 class UnmetExpectation(AssertionError):  # noqa: N818 - pytest shows the name
-    """The board did not say in time what it should have said."""
+    """The board did not print an expected line in time."""
 
 
 class SerialPins:
-    """A serial line without a line: what is received is there at once, what is sent is kept."""
+    """A serial line without delay: received bytes are available at once, sent ones are stored."""
 
     overruns = 0
 
@@ -44,15 +44,15 @@ class SerialPins:
         return data
 
     def write(self, now_us: int, data: bytes) -> bool:
-        """Keep what the firmware sends."""
+        """Store what the firmware sends."""
         self._sent.append((now_us, data))
         return True
 
 
 class BareBoard:
-    """A booted board. It stands still and level until `feed_imu` says otherwise.
+    """A booted board. It is at rest and level until `feed_imu` is called.
 
-    `sent` holds what it sent, each with its instant [us]; `console` what it said; `counts` the servo timers' compare
+    `sent` holds what it sent, each with its instant [us]; `console` its lines; `counts` the servo timers' compare
     counts. With `serial` it speaks MAVLink over its UART: `receive` and `sent` are the bytes there.
     """
 
@@ -79,7 +79,7 @@ class BareBoard:
         f_B: Vector = (0.0, 0.0, GRAVITY),
         counts: ImuCounts | None = None,
     ) -> None:
-        """Let the IMU measure this from now on: rates [rad/s] and specific force [m/s2], both in B, or counts."""
+        """Set what the IMU measures from now on: rates [rad/s] and specific force [m/s2], both in B, or counts."""
         (p, q, r), (fx, fy, fz) = omega_B, f_B
         rates = (COS * p + SIN * q, COS * q - SIN * p, r)
         forces = (COS * fx + SIN * fy, COS * fy - SIN * fx, fz)
@@ -89,7 +89,7 @@ class BareBoard:
         )  # fmt: skip
 
     def receive(self, packet: bytes, every_ms: float = 0.0) -> None:
-        """Let a packet arrive now, and again every `every_ms` until `hush`: CRTP from the radio, MAVLink from the UART."""
+        """Deliver a packet now, and again every `every_ms` until `hush`: CRTP from the radio, MAVLink from the UART."""
         if not every_ms:
             self._arrive(packet)
             return
@@ -103,17 +103,17 @@ class BareBoard:
         again(self.now_us)
 
     def hush(self) -> None:
-        """Let nothing more arrive of what was repeated."""
+        """Stop all repeated packets."""
         self._repeats += 1
 
     def run(self, ms: float) -> None:
-        """Let time pass."""
+        """Advance time."""
         self._run_until(self.now_us + round(ms * 1e3))
 
     def expect(self, text: str, within_ms: float) -> str:
-        """Let time pass until the board says a line with `text` in it, and return the line.
+        """Advance time until the board prints a line that contains `text`, and return the line.
 
-        Lines up to the one that was expected last do not count. Raises `UnmetExpectation`.
+        Lines up to the one matched last do not count. Raises `UnmetExpectation`.
         """
         __tracebackhide__ = True
         begin_us, first = self.now_us, self._heard
@@ -127,7 +127,7 @@ class BareBoard:
             if self.now_us >= end_us:
                 said = "".join(f"\n  {line}" for line in self.console[first:]) or " nothing"
                 raise UnmetExpectation(
-                    f"{text!r} was not said within {within_ms:g} ms from {begin_us / 1000:g} ms on; the board said:{said}"
+                    f"{text!r} not printed within {within_ms:g} ms from {begin_us / 1000:g} ms on; the board printed:{said}"
                 )
             self._run_until(min(self.now_us + IMU_PERIOD_US, end_us))
 
@@ -140,7 +140,7 @@ class BareBoard:
 
     @property
     def tasks(self) -> Mapping[str, TaskReport]:
-        """How the tasks kept up, by name: run time, response, missed deadlines."""
+        """The tasks' timing, by name: run time, response, missed deadlines."""
         return {report.name: report for report in self.firmware.statistics.reports()}
 
     @property

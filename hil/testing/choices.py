@@ -1,4 +1,4 @@
-"""On what a test flies: seeds, boards and profiles of its mark or of the command line; and whether they can be had."""
+"""Seeds, boards and profiles of a test, from its mark or the command line; and whether they are available."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hil.errors import LabError, hint
 from hil.laboratory.lockstep import LOCKSTEP, RADIO
 from hil.laboratory.run import BUILD
 
-PACKAGES = {"mavlink": "pymavlink", "radio": "cflib"}  # capabilities that a package gives
+PACKAGES = {"mavlink": "pymavlink", "radio": "cflib"}  # capabilities that a package provides
 LOCKSTEP_ONLY = "lockstep"
 CAPABILITIES = (*BOARDS, *PACKAGES, LOCKSTEP_ONLY)
 WORDS = ("seeds", "boards", "profiles", "needs")
@@ -25,7 +25,7 @@ WORDS = ("seeds", "boards", "profiles", "needs")
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What one test flies on."""
+    """The seed, board and profile of one test."""
 
     seed: int = 1
     board: str = PYTHON
@@ -35,7 +35,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What the command line says; empty: nothing."""
+    """The options of the command line; empty: not given."""
 
     seeds: int = 0
     boards: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """What `@pytest.mark.floaty` says of a test. Raises `LabError` for what it cannot say."""
+    """The arguments of `@pytest.mark.floaty`. Raises `LabError` for invalid ones."""
 
     seeds: tuple[int, ...] = ()
     boards: tuple[str, ...] = ()
@@ -75,7 +75,7 @@ class Marked:
 
 
 def choices_of(marked: Marked, wanted: Wanted) -> list[Choice]:
-    """Return what a test flies on: the command line goes before the mark, and a board that it needs is its board."""
+    """Return the choices of a test: the command line overrides the mark, and a board that it needs is its board."""
     needed = tuple(board for board in marked.needs if board in BOARDS)
     seeds = tuple(range(1, wanted.seeds + 1)) or marked.seeds or (1,)
     boards = wanted.boards or marked.boards or needed or (PYTHON,)
@@ -86,7 +86,7 @@ def choices_of(marked: Marked, wanted: Wanted) -> list[Choice]:
 
 
 def name_of(choice: Choice, choices: Sequence[Choice]) -> str:
-    """Return what tells a choice from the others in a test's name."""
+    """Return the text that distinguishes a choice in a test's name."""
     parts = {
         choice.profile: len({one.profile for one in choices}),
         choice.board: len({one.board for one in choices}),
@@ -112,11 +112,11 @@ def why_not(choice: Choice, needs: Iterable[str]) -> str:
 
 @cache
 def why_no_board(board: str) -> str:
-    """Return why a board cannot be had on this machine, empty when it can."""
+    """Return why a board is not available on this machine, empty when it is."""
     try:
         runner_of(board, BUILD, LogicConfig())
     except ExportError as error:
-        return f"board {board} cannot be had here: {error}"
+        return f"board {board} is not available here: {error}"
     return ""
 
 

@@ -1,4 +1,4 @@
-"""What a test has in its hands as `floaty`: flights into folders of the test's own, and boards without a world."""
+"""The fixture `floaty`: flights into folders of the test's own, and boards without a world."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Flown:
 
 @dataclass(slots=True)
 class Item:
-    """One test: what it flies on, where, and what it has flown."""
+    """One test: its choice, folder and flights."""
 
     name: str  # pytest's
     folder: Path
@@ -48,10 +48,10 @@ class Item:
 
 
 class Flights:
-    """The fixture `floaty`. `seed`, `profile` and `target`, the board, are those on which the test flies."""
+    """The fixture `floaty`. `seed`, `profile` and `target`, the board, are those of the test."""
 
     def __init__(self, home: Path, folder: Path) -> None:
-        self.home = home  # pytest's root folder: paths of profiles and experiments begin there
+        self.home = home  # pytest's root folder: paths of profiles and experiments are relative to it
         self._folder = folder  # of all tests' runs
         self._item: Item | None = None
 
@@ -63,7 +63,7 @@ class Flights:
 
     @property
     def choice(self) -> Choice:
-        """On what the present test flies."""
+        """The choice of the present test."""
         assert self._item is not None
         return self._item.choice
 
@@ -83,10 +83,10 @@ class Flights:
         return self.choice.board
 
     def fly(self, experiment: Experiment | str = "hover", **options: Unpack[Options]) -> Run:
-        """Fly once; what an option does not say is as the test's mark and the command line have it.
+        """Fly once; defaults of options come from the test's mark and the command line.
 
-        Options are those of `hil.fly`. A failed limit is no error: the test asks `passed`, `metrics`, `verdicts`. Skips the
-        test when a board cannot be had here. Raises `LabError` for bad input.
+        Options are those of `hil.fly`. A failed limit is no error: the test reads `passed`, `metrics`, `verdicts`. Skips the
+        test when a board is not available here. Raises `LabError` for bad input.
         """
         item, choice = self._item, self.choice
         assert item is not None
@@ -108,7 +108,7 @@ class Flights:
     ) -> BareBoard:
         """Boot a board without a world. With `link="mavlink"` it speaks MAVLink over its UART.
 
-        Skips the test when the board cannot be had here. Raises `LabError` for bad input.
+        Skips the test when the board is not available here. Raises `LabError` for bad input.
         """
         if link not in (RADIO, MAVLINK):
             raise LabError(f"board: link {link!r}: expected {RADIO} or {MAVLINK}")
@@ -121,7 +121,7 @@ class Flights:
             pytest.skip(f"floaty: {reason}")
 
     def _placed(self, name: str) -> str:
-        """Return a path from the root folder on as it is found from everywhere; another name as it is."""
+        """Return a path relative to the root folder as an absolute one; another name unchanged."""
         path, end, variable = name.partition(".py:") if ".py:" in name else (name, "", "")
         placed = self.home / (path + end.rstrip(":"))
         is_path = placed.suffix in (".py", ".toml") and placed.is_file()
@@ -129,7 +129,7 @@ class Flights:
 
 
 def folder_of(name: str) -> str:
-    """Return a test's name as that of a folder, which no other test has."""
+    """Return a folder name for a test, which no other test has."""
     plain = re.sub(r"[^\w.-]+", "-", name).strip("-")
     if len(plain) <= NAME_MAX and plain == name:
         return plain
@@ -141,8 +141,8 @@ def shown_of(item: Item) -> list[Flown]:
     return item.flown if len(item.flown) <= SHOWN else item.flown[-1:]
 
 
-def told(item: Item, kept: bool, options: str) -> str:
-    """Return what a failure shows of a test's flights; `options` are those of pytest that choose what it flies on."""
+def text_of(item: Item, kept: bool, options: str) -> str:
+    """Return the text that a failure shows about a test's flights; `options` are those of pytest that chose the flights."""
     texts = []
     for one in shown_of(item):
         request, result = one.request, one.run.result
@@ -164,7 +164,7 @@ def told(item: Item, kept: bool, options: str) -> str:
 
 
 def properties_of(item: Item) -> list[tuple[str, str]]:
-    """Return what a JUnit file says of a test's flights: hash, command, and every metric that has a value, in its unit."""
+    """Return a test's properties for a JUnit file: hash, command, and every metric that has a value, in its unit."""
     found = []
     shown = shown_of(item)
     for one in shown:
@@ -191,7 +191,7 @@ def draw(item: Item) -> None:
 
 
 def trim(item: Item, keep: bool) -> None:
-    """Forget the flights of a test that is over, and remove those that a failure would not show."""
+    """Drop the flights of a finished test, and remove those that a failure would not show."""
     shown = {one.number for one in shown_of(item)}
     for one in item.flown:
         if not keep and one.number not in shown:

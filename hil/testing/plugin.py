@@ -1,7 +1,7 @@
-"""The pytest plugin: options, the mark `floaty`, the fixture `floaty`, and what a failed flight shows.
+"""The pytest plugin: options, the mark `floaty`, the fixture `floaty`, and the report of a failed flight.
 
-The fixture lives as long as the session, because Hypothesis calls a test many times with one fixture; which test flies is
-told before each one. Nothing of the laboratory is loaded before a test asks for it.
+The fixture lives as long as the session, because Hypothesis calls a test many times with one fixture; before each test it is
+switched to it. Nothing of the laboratory is loaded before a test requests it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FLIGHTS = pytest.StashKey["Flights"]()
 ITEM = pytest.StashKey["Item"]()
 ALL = pytest.StashKey[list["Item"]]()  # of this process
 MARK = (
-    "floaty(seeds=20, boards=[...], profiles=[...], needs=...): what the fixture `floaty` flies on. seeds: how many, or "
+    "floaty(seeds=20, boards=[...], profiles=[...], needs=...): choices of the fixture `floaty`. seeds: how many, or "
     "which; boards: of python, c, cortex-m4; needs: boards, mavlink, radio or lockstep, without which the test is skipped."
 )
 
@@ -35,14 +35,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("floaty", "flights in the Floaty virtual laboratory")
     group.addoption(
         "--floaty-board", action="append", default=[], metavar="BOARD[,BOARD]",
-        help="what executes the flight core: python, c, cortex-m4; goes before the marks",
+        help="what executes the flight core: python, c, cortex-m4; overrides the marks",
     )  # fmt: skip
     group.addoption(
         "--floaty-profile", action="append", default=[], metavar="NAME|FILE[,…]",
-        help="profiles to fly on; goes before the marks",
+        help="profiles to fly on; overrides the marks",
     )  # fmt: skip
     group.addoption(
-        "--floaty-seeds", type=int, default=0, metavar="N", help="fly seeds 1 to N; goes before the marks"
+        "--floaty-seeds", type=int, default=0, metavar="N", help="fly seeds 1 to N; overrides the marks"
     )
     group.addoption(
         "--floaty-keep", choices=KEEP, default="failed",
@@ -52,20 +52,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--floaty-link", default="radio", metavar="LINK",
         help="radio or mavlink: in lockstep [radio]; radio://…, udp://… or mavlink:pty: over a real link, in real time",
     )  # fmt: skip
-    parser.addini(
-        "floaty_profile", "the profile on which tests fly that say no other, a name or a path", default=""
-    )
+    parser.addini("floaty_profile", "the default profile of tests, a name or a path", default="")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the mark known, and refuse what cannot be."""
+    """Register the mark, and refuse invalid options."""
     config.addinivalue_line("markers", MARK)
     config.stash[ALL] = []
     if config.getoption("floaty_seeds") < 0:
         raise pytest.UsageError(f"--floaty-seeds {config.getoption('floaty_seeds')}: expected 1 or more")
     if ":" in config.getoption("floaty_link") and getattr(config.option, "numprocesses", None):
         raise pytest.UsageError(
-            f"--floaty-link {config.getoption('floaty_link')}: flights in real time fly one at a time; leave -n away"
+            f"--floaty-link {config.getoption('floaty_link')}: flights in real time fly one at a time; omit -n"
         )
 
 
@@ -89,7 +87,7 @@ def floaty(pytestconfig: pytest.Config) -> Flights:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Tell who flies from now on; skip what cannot be flown here."""
+    """Switch the fixture to the test; skip tests that cannot fly here."""
     if "floaty" not in getattr(item, "fixturenames", ()):
         return
     from hil.testing.choices import choices_of, why_not
@@ -108,11 +106,11 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Show a failed test's flights, and write down those of every test."""
+    """Show a failed test's flights, and record those of every test."""
     flown = item.stash.get(ITEM, None)
     if flown is None or not flown.flown:
         return (yield)
-    from hil.testing.flights import draw, properties_of, told, trim
+    from hil.testing.flights import draw, properties_of, text_of, trim
 
     if call.when == "call":
         item.user_properties.extend(properties_of(flown))
@@ -122,24 +120,24 @@ def pytest_runtest_makereport(
         if keep != "none" and not flown.failed:
             draw(flown)
         flown.failed = True
-        report.sections.append(("floaty flights", told(flown, keep != "none", _options(item.config))))
+        report.sections.append(("floaty flights", text_of(flown, keep != "none", _options(item.config))))
     if call.when == "teardown":
         trim(flown, keep == "all")
     return report
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Remove the run folders that nobody wants; until now a fixture of a longer life may have looked at them."""
+    """Remove the run folders that are not kept; until now a longer-lived fixture may have read them."""
     keep = session.config.getoption("floaty_keep")
     for flown in session.config.stash[ALL]:
         if not (keep == "all" or (keep == "failed" and flown.failed)):
             shutil.rmtree(flown.folder, ignore_errors=True)
-    with suppress(OSError):  # one that holds something stays
+    with suppress(OSError):  # a folder that is not empty stays
         (session.config.rootpath / FOLDER).rmdir()
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Say what was not flown, also without -rs."""
+    """Report what was not flown, also without -rs."""
     reasons: dict[str, int] = {}
     for report in terminalreporter.stats.get("skipped", []):
         text = str(report.longrepr[2]) if isinstance(report.longrepr, tuple) else str(report.longrepr)
@@ -157,7 +155,7 @@ def _flights(config: pytest.Config) -> Flights:
 
 
 def _marked(item: pytest.Item) -> Marked:
-    """Return what the nearest mark says."""
+    """Return the arguments of the nearest mark."""
     from hil.errors import LabError
     from hil.testing.choices import Marked
 
@@ -176,7 +174,7 @@ def _marked(item: pytest.Item) -> Marked:
 
 
 def _wanted(config: pytest.Config) -> Wanted:
-    """Return what the command line and pytest's configuration say."""
+    """Return the options of the command line and pytest's configuration."""
     from firmware_py.export.boards import BOARDS
     from hil.config import DEFAULT_PROFILE
     from hil.testing.choices import Wanted
@@ -196,7 +194,7 @@ def _split(values: list[str]) -> tuple[str, ...]:
 
 
 def _options(config: pytest.Config) -> str:
-    """Return the options that choose what a test flies on, as they were given."""
+    """Return the given options that choose seeds, boards and profiles."""
     words = [
         f"--floaty-{name}={value}"
         for name in ("board", "profile")

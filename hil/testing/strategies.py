@@ -1,4 +1,4 @@
-"""Faults and trajectories for Hypothesis, on grids on which "smaller" is what an engineer means by it.
+"""Faults and trajectories for Hypothesis, on grids on which "smaller" means simpler for an engineer.
 
 A failing flight shrinks to the first kind of fault that fails, to the size nearest to no fault at all, and to the earliest
 begin; a trajectory to the fewest goals nearest to home.
@@ -51,7 +51,7 @@ def _of_kind(
 
 @dataclass(frozen=True, slots=True)
 class Waypoints:
-    """A function of time for `Along`: goals from home, W, each held for `every_s`, the last to the end."""
+    """A function of time for `Along`: goals relative to home, W, each held for `every_s`, the last to the end."""
 
     every_s: float
     goals: tuple[tuple[float, float, float, float], ...]  # x, y, z [m], yaw [rad]
@@ -84,7 +84,7 @@ def _grid(low: float, high: float) -> SearchStrategy[float]:
 
 
 def _sizes(kind: Kind, within: tuple[float, float] | None) -> SearchStrategy[float]:
-    """Return the sizes of a kind, counted from the one that is no fault."""
+    """Return the sizes of a kind, counted from the harmless one."""
     if not kind.sized:
         return st.just(kind.size)
     none, step = _no_fault(kind), _round_step((kind.high - kind.low) / GRID)
@@ -97,7 +97,7 @@ def _sizes(kind: Kind, within: tuple[float, float] | None) -> SearchStrategy[flo
 
 
 def _no_fault(kind: Kind) -> float:
-    """Return the size that changes nothing, or the bound nearest to it."""
+    """Return the size without effect, or the bound nearest to it."""
     blend = kind.knobs[0].blend
     neutral = 1.0 if blend is times else kind.high if blend is min else 0.0
     return min(max(neutral, kind.low), kind.high)

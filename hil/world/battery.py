@@ -1,4 +1,4 @@
-"""The battery: what the robot draws, what is left, and the voltage under that load.
+"""The battery: the power drawn, the remaining charge, and the voltage under load.
 
 The cells are alike and in series. Voltages are those of one cell; the board measures the mean of its cells.
 """
@@ -40,11 +40,11 @@ class Battery:
 
     @property
     def millivolts(self) -> int:
-        """What the board measures: one cell [mV]."""
+        """The voltage that the board measures, of one cell [mV]."""
         return round(1000.0 * self.voltage)
 
     def draw(self, now_us: int, flap_travel: float) -> None:
-        """Take what was needed until now; `flap_travel` [rad] is what all flaps have turned since the start."""
+        """Draw the energy used until now; `flap_travel` [rad] is the total travel of all flaps since the start."""
         duration = 1e-6 * (now_us - self._time_us)
         if duration > 0.0:
             turned, self._time_us, self._travel = flap_travel - self._travel, now_us, flap_travel
@@ -59,7 +59,7 @@ class Battery:
         self.charge = max(self.charge - current * duration / self._config.capacity, 0.0)
 
     def _loaded(self) -> float:
-        """Return the voltage V at which V (OCV - V) / R is the power of a cell; half of OCV when it cannot give that."""
+        """Return the voltage V at which V (OCV - V) / R is the power of a cell; half of OCV when it cannot supply that."""
         open_circuit = open_circuit_voltage(self.charge)
         per_cell = self.power / self._config.cells
         return 0.5 * (
@@ -69,7 +69,7 @@ class Battery:
 
 
 def endurance(config: BatteryConfig, power: float, empty_V: float, step: float = 1.0) -> float:
-    """Return for how long [s] the battery gives `power` [W] until a cell falls below `empty_V`; inf for no power."""
+    """Return for how long [s] the battery supplies `power` [W] until a cell falls below `empty_V`; inf for no power."""
     if power <= 0.0:
         return math.inf
     battery = Battery(config)

@@ -1,7 +1,7 @@
 """Nine plates and their places, from the geometry to the kernel's constants.
 
 A flap is a flat part and a strip bent up along one edge. It turns about an axis through the body's z axis. n and r of a part
-are A + B cos phi + C sin phi (Rodrigues), written down for flap 2 in the quadrant (+,+); the others are mirror images.
+are A + B cos phi + C sin phi (Rodrigues), stated for flap 2 in the quadrant (+,+); the others are mirror images.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ MIRRORS = np.array([[1, -1, 1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1]], float)  # s
 SIGNS = np.array([1, -1, 1, -1], float)  # of the flap angles at hover (paper, eq. input_signals)
 MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)  # the same equation
 
-AIR_DENSITY = 1.225  # [kg/m3] section 3
-DRAG_COEFFICIENTS = (0.1, 3.0)  # of what still passes for a plate
+AIR_DENSITY = 1.225  # [kg/m3] of the standard atmosphere at sea level
+DRAG_COEFFICIENTS = (0.1, 3.0)  # plausible for a plate
 
 
 def _turning(vector: NDArray[np.float64], axis: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -60,14 +60,13 @@ def _outlined(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64]
 
 
 def _quadrant(geometry: GeometryConfig) -> list[tuple[float, NDArray[np.float64]]]:
-    """Return the same of a quadrant without the base plate's corner; on these sums rest the bits of every flight of G0."""
+    """Return area and centre for a quadrant without the base plate's corner; all bits of G0's flights rest on these sums."""
     side, corner = geometry.footprint / 2, geometry.base_side / 2
     width, kink = geometry.strip_width, geometry.kink_angle
     quadrant, strip = side * side - corner * corner, width * side
     flat = quadrant - strip
-    moment = (
-        side * side * side - corner * corner * corner
-    ) / 2  # of the quadrant without its corner, about either side
+    # First moment of the quadrant without its corner, about either side.
+    moment = (side * side * side - corner * corner * corner) / 2
     flat_centre = np.array([moment - strip * side / 2, moment - strip * (side - width / 2), 0.0]) / flat
     strip_centre = np.array([side / 2, side - width + width / 2 * cos(kink), width / 2 * sin(kink)])
     order = [1, 0, 2] if geometry.kink_side == "x" else [0, 1, 2]
@@ -96,7 +95,7 @@ def check_hover(geometry: GeometryConfig, plant: PlantConfig) -> None:
     if not low <= found <= high:
         angle = math.degrees(plant.hover_angle)
         raise LabError(
-            f"geometry: no lift for a hover at {plant.airspeed:g} m/s and {angle:.0f} deg: takes a drag coefficient of "
+            f"geometry: no lift for a hover at {plant.airspeed:g} m/s and {angle:.0f} deg: needs a drag coefficient of "
             f"{found:.1f}: outside {low}..{high:g}, flat plates have 1 to 2"
         )
 

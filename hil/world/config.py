@@ -1,6 +1,6 @@
 """The robot as it really is in this world: body, tether, limits, servos. Every default names its source.
 
-Section numbers without a name are those of physics.md, the specification of the plant; "paper" is the Floaty paper.
+"paper" is the Floaty paper, "assumed" has no source; docs/explanation/plant.md says what follows from the choices.
 """
 
 from __future__ import annotations
@@ -66,11 +66,9 @@ class LimitsConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    radius: float = Field(
-        0.45, gt=0, le=0.6, description="from the tunnel's axis [m]; half the flow is left (section 6)"
-    )
+    radius: float = Field(0.45, gt=0, le=0.6, description="from the tunnel's axis [m]; half the flow is left")
     below: float = Field(
-        0.8, gt=0, le=1.2, description="below the hover point [m]; section 8 has recoveries from 0.65"
+        0.8, gt=0, le=1.2, description="below the hover point [m]; assumed: recoveries from 0.65 were flown"
     )
     above: float = Field(
         0.85, gt=0, le=5, description="above the hover point [m]; paper: cameras see 2 m over the tunnel"
@@ -92,8 +90,8 @@ class MassConfig(BaseModel):
 
 
 class GeometryConfig(BaseModel):
-    """The robot's shape and masses: G0 of section 3. What is said of a flap holds for flap 2, in the quadrant (+,+) of B, at
-    flap angle 0; the other three are its mirror images.
+    """The robot's shape and masses: that of docs/explanation/plant.md. Statements about a
+    flap hold for flap 2, in the quadrant (+,+) of B, at flap angle 0; the other three are its mirror images.
 
     Mass and centre of mass follow from `flap_mass` and `masses`, the moments of inertia too where none are given.
     """
@@ -109,13 +107,13 @@ class GeometryConfig(BaseModel):
     outline: Annotated[tuple[tuple[float, float], ...], Field(max_length=12)] = Field(
         (),
         description="corners of the unfolded flap in turn, a convex trapezoid or the like [m]; "
-        "without: its quadrant of the footprint less the base plate; section 3",
+        "without: its quadrant of the footprint less the base plate; paper, Setup specifications",
     )
     strip_width: float = Field(
         0.0198,
         gt=0,
         le=0.5,
-        description="width of the kinked strip at the flap's outer edge [m]; section 3, tuned",
+        description="width of the kinked strip at the flap's outer edge [m]; tuned to the Table's roll stiffness",
     )
     kink_angle: float = Field(
         math.radians(42.5), ge=0, le=math.pi / 2, description="upward bend of the strip [rad]; paper"
@@ -130,27 +128,30 @@ class GeometryConfig(BaseModel):
         description="of the flap's axis from x [rad]; original firmware",
     )
     dihedral: float = Field(
-        0.0, ge=-1.2, le=1.2, description="by which axis and flap rise outwards [rad]; section 2: horizontal"
+        0.0,
+        ge=-1.2,
+        le=1.2,
+        description="by which axis and flap rise outwards [rad]; paper, Supplement: horizontal",
     )
     flow_point: float = Field(
-        0.0627, gt=0, le=0.5, description="|x| = |y| where a flap's flow is taken [m]; section 3"
+        0.0627, gt=0, le=0.5, description="|x| = |y| where a flap's flow is taken [m]; assumed"
     )
     flap_mass: float = Field(
         0.025, gt=0, le=2, description="of each flap, even over its surface [kg]; paper, Setup specifications"
     )
     masses: tuple[MassConfig, ...] = Field(
         (MassConfig(mass=0.240, place=(0.0, 0.0, -0.0991666667), size=(0.0636, 0.0636, 0.0809)),),
-        description="all the rest; paper: 0.340 kg, centre of mass 7 cm below the flaps; size: mass budget of section 3",
+        description="all the rest; paper: 0.340 kg, centre of mass 7 cm below the flaps; size: from the budget of masses",
     )
     inertia: tuple[Positive, Positive, Positive] | Literal["masses"] = Field(
         (1.30e-3, 1.30e-3, 1.47e-3),
-        description="about x, y, z of B [kg m2]; section 3, tuned to the paper's roll and yaw; 'masses': what follows from "
+        description="about x, y, z of B [kg m2]; tuned to the paper's roll and yaw; 'masses': computed from "
         "them (1.40e-3, 1.40e-3, 1.15e-3)",
     )
 
 
 class PlantConfig(BaseModel):
-    """The geometry's plates in the flow, corrected to a set of identified constants (section 4).
+    """The geometry's plates in the flow, corrected to a set of identified constants (docs/explanation/plant.md, Correction).
 
     The drag coefficient is not a free constant: it is trimmed so that the robot hovers at `airspeed` and `hover_angle`
     (of G0 C_D = 1.353 at 1.225 kg/m3). Model errors are the factors, true over design: they act after the trim.
@@ -160,7 +161,7 @@ class PlantConfig(BaseModel):
 
     variant: Variant = Field(
         "methods",
-        description="plate: isolated plates; else their linearisation is corrected to the paper's Table; section 1",
+        description="plate: isolated plates; else their linearisation is corrected to the paper's Table",
     )
     airspeed: float = Field(
         10.0, gt=1, le=60, description="design airspeed of the hover [m/s]; paper, Setup specifications"
@@ -181,7 +182,7 @@ class PlantConfig(BaseModel):
     @model_validator(mode="after")
     def _factors_act(self) -> PlantConfig:
         if self.variant == "plate" and self.constant_factors:
-            raise ValueError("constant_factors act on corrected variants only, not on 'plate'")
+            raise ValueError("constant_factors act only on corrected variants, not on 'plate'")
         return self
 
 
@@ -202,9 +203,12 @@ class ServoConfig(BaseModel):
     tau: float = Field(
         0.050, gt=0.001, le=0.5, description="first-order lag [s]; original firmware, flapTimeConst = 20 1/s"
     )
-    rate_limit: float = Field(10.5, gt=0, le=100, description="[rad/s]; section 6, assumed: 0.1 s for 60 deg")
+    rate_limit: float = Field(10.5, gt=0, le=100, description="[rad/s]; assumed: 0.1 s for 60 deg")
     dead_band: float = Field(
-        math.radians(0.1), ge=0, le=0.1, description="error that moves nothing [rad]; section 6, assumed"
+        math.radians(0.1),
+        ge=0,
+        le=0.1,
+        description="error below which the servo does not move [rad]; assumed",
     )
     trim_error: Four = Field(
         (0.0, 0.0, 0.0, 0.0), description="wrong mounting: flap angle minus intended angle [rad]"
@@ -218,7 +222,7 @@ class ServoConfig(BaseModel):
 
 
 class TunnelConfig(BaseModel):
-    """The flow of one flight; physics.md section 6 is the source where none is named."""
+    """The flow of one flight; where no source is named it is a choice (docs/explanation/plant.md, Tunnel)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -243,10 +247,10 @@ class TunnelConfig(BaseModel):
 
 
 class BatteryConfig(BaseModel):
-    """Two small lithium polymer cells, and what empties them.
+    """Two small lithium polymer cells, and their loads.
 
     The paper gives 0.925 Wh per cell (3.7 V) and 7.6 V for both (3.8 V each). Both are true of one cell here: 3.80 V is the
-    mean open-circuit voltage, and 0.925 Wh is what is left of 0.951 Wh at the paper's 3.4 W.
+    mean open-circuit voltage, and 0.925 Wh of 0.951 Wh are usable at the paper's 3.4 W.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -263,11 +267,11 @@ class BatteryConfig(BaseModel):
         0.3, ge=0, le=50, description="board and inertial sensors [W]; paper, Energy efficiency"
     )
     servo_power: float = Field(
-        0.50, ge=0, le=10, description="of each servo at rest, holding [W]; physics.md section 10, calibrated"
+        0.50, ge=0, le=10, description="of each servo at rest, holding [W]; calibrated on the paper's 3.4 W"
     )
     servo_energy: float = Field(
         0.33,
         ge=0,
         le=10,
-        description="of each servo per angle turned [J/rad]; physics.md section 10, calibrated",
+        description="of each servo per angle turned [J/rad]; calibrated on the paper's 3.4 W",
     )

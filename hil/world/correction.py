@@ -1,4 +1,4 @@
-"""Trim, linearisation and the identified correction of the plate model (physics.md sections 3 and 4).
+"""Trim, linearisation and the identified correction of the plate model (docs/explanation/plant.md).
 
 Everything that depends on the plate model (trim, its own constants L, its lift ratio l) is computed here once from the
 compiled model itself; only the target constants T are typed, with their source.
@@ -40,7 +40,7 @@ class Constants:
     yaw_u3: float
     yaw_rate: float
     z_u4: float
-    # Couplings that the Table omits or that no variant changes; they follow from the others (section 3, identities)
+    # Couplings that the Table omits or that no variant changes; they follow from the others (any flat plates)
     z_vz: float = math.nan
     y_vy: float = math.nan
     x_vx: float = math.nan
@@ -49,7 +49,7 @@ class Constants:
 
 
 TABLE = Constants(**{name: value for name, (value, _) in PAPER_TABLE.items()})
-# [1/s2] paper, Methods: contradicts the Table's +1100; section 5 decides for it
+# [1/s2] paper, Methods: contradicts the Table's +1100; tests/hil/test_paper.py decides for it
 PITCH_INPUT_METHODS = -1066.0
 
 LIFT_SAMPLES = np.linspace(-LIFT_U4_MAX, LIFT_U4_MAX, 45)  # [rad] u4 at which l is fitted, every 0.025
@@ -110,7 +110,7 @@ def linearise(s: State, speed: float) -> Constants:
 
 
 def target_constants(config: PlantConfig, plate: Constants) -> Constants:
-    """Return what the linearisation of the configured variant shall be; `plate` are the plate model's own constants."""
+    """Return the target constants of the configured variant; `plate` are the plate model's own constants."""
     changes: dict[str, Any] = {}
     if config.variant.startswith("methods"):
         changes["pitch_u2"] = PITCH_INPUT_METHODS

@@ -1,7 +1,8 @@
-"""The shape of flap 2 and what the robot weighs: from the profile's numbers to surfaces, mass, centre of mass and inertia.
+"""The shape of flap 2 and the robot's mass properties: from the profile's numbers to surfaces, mass, centre of mass and
+inertia.
 
 Frames: F has its origin on the body's z axis where the flap axes meet, and is parallel to B. Flap 2 lies in the quadrant
-(+,+) of F when its angle is 0; the others are mirror images. A geometry that cannot be is refused here, in one line.
+(+,+) of F when its angle is 0; the others are mirror images. An impossible geometry is refused here, in one line.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Points = NDArray[np.float64]
 Corner = tuple[float, float]
 
 HEIGHT_MAX = 0.5  # [m] of the flap axes above the centre of mass
-SLACK = 1e-9  # [m, m2] of what only touches
+SLACK = 1e-9  # [m, m2] tolerance for parts that only touch
 PRODUCT_MAX = 0.01  # of inertia, as a share of the least moment: the plant's axes are the principal ones
 
 
@@ -31,12 +32,12 @@ class Surface:
     """A part of flap 2: convex, its corners in turn, (N, 3) [m] in F."""
 
     corners: Points
-    unfolded: Points  # the same before the strip was bent
+    unfolded: Points  # the corners before the strip was bent
 
 
 @dataclass(frozen=True, slots=True)
 class Weight:
-    """What the masses come to."""
+    """Mass, centre of mass and inertia."""
 
     mass: float  # [kg]
     axis_height: float  # [m] of the flap axes above the centre of mass
@@ -74,7 +75,7 @@ def axis_of(geometry: GeometryConfig) -> Points:
 
 
 def raised(vectors: Points, geometry: GeometryConfig) -> Points:
-    """Return vectors (..., 3) of a flap without dihedral as they are with it."""
+    """Return vectors (..., 3) of a flap without dihedral turned by the dihedral."""
     level, up = _level_axis(geometry), np.array([0.0, 0.0, 1.0])
     c, s = cos(geometry.dihedral), sin(geometry.dihedral)
     along = (vectors * level).sum(axis=-1)[..., None]
@@ -170,7 +171,7 @@ def _points(geometry: GeometryConfig) -> list[tuple[float, Points, Points]]:
 
 
 def check(geometry: GeometryConfig) -> None:
-    """Raise `LabError` for a robot that cannot be."""
+    """Raise `LabError` for an impossible robot."""
     side, corner = geometry.footprint / 2, geometry.base_side / 2
     if corner >= side:
         raise LabError(

@@ -16,7 +16,7 @@ CREEP = 0.02  # [m/s] below this speed friction fades
 
 @compiled
 def stand(s: State) -> None:
-    """Write what the net does to the body: GROUND, force [N] in W and torque [N m] in B."""
+    """Write force and torque of the net on the body: GROUND, force [N] in W and torque [N m] in B."""
     g, r = at.GROUND, at.R
     for i in range(6):
         s[g + i] = 0.0

@@ -1,6 +1,6 @@
-"""Where each quantity of the plant lies in its one flat float64 array.
+"""The layout of the plant's single flat float64 array.
 
-One array is the whole plant: state, what was computed from it, inputs that may change during a flight, and constants.
+One array is the whole plant: state, values computed from it, inputs that may change during a flight, and constants.
 A compiled kernel call then costs one argument, and truth is read through numpy views. Units are SI; frames are in the
 names or comments: W world (z up), B body (x forward, y left, z up, at the centre of mass).
 Flaps count 0..3 here, at the quadrants (+,-), (+,+), (-,+), (-,-) of B; plate 2i is the flat part of flap i, 2i+1 its kink.
@@ -41,7 +41,7 @@ PLATE_FORCES = _take(15)  # [N] base and four flaps as isolated plates, in W
 # Computed from all that by `evaluate`
 ACC = _take(3)  # [m/s2] of the centre of mass, in W, gravity included
 ALPHA = _take(3)  # [rad/s2] in B
-SPECIFIC_FORCE = _take(3)  # [m/s2] what an accelerometer at the centre of mass feels, in B
+SPECIFIC_FORCE = _take(3)  # [m/s2] as measured by an accelerometer at the centre of mass, in B
 PULL = _take(3)  # [N] of the tether, in W
 GROUND = _take(6)  # force [N] of the net, in W, and its torque [N m], in B
 

@@ -45,7 +45,7 @@ def evaluate(s: State) -> None:
     pull(s)
     stand(s)
     r, f, g, m = at.R, at.DRAG, at.GROUND, s[at.MASS]
-    if s[at.HELD] != 0.0:  # the clamp carries what is missing
+    if s[at.HELD] != 0.0:  # the clamp supplies the missing force
         s[at.ACC] = s[at.ACC + 1] = s[at.ACC + 2] = 0.0
     else:
         for i in range(3):
@@ -106,7 +106,7 @@ def drive_servos(s: State, start_us: float, end_us: float) -> None:
 
 @compiled
 def rotate(s: State, qw: float, qx: float, qy: float, qz: float, duration: float) -> None:
-    """Set Q to q + duration/2 q (0, omega), of unit length; the rate is the one that stands in Q and OMEGA."""
+    """Set Q to q + duration/2 q (0, omega), of unit length; for the rate in OMEGA."""
     half = 0.5 * duration
     aw, ax, ay, az = s[at.Q], s[at.Q + 1], s[at.Q + 2], s[at.Q + 3]
     ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
@@ -120,7 +120,7 @@ def rotate(s: State, qw: float, qx: float, qy: float, qz: float, duration: float
 
 @compiled
 def watch(s: State) -> None:
-    """Note the first reason for which the flight is over."""
+    """Note the first reason why the flight is over."""
     x, y, z = s[at.P], s[at.P + 1], s[at.P + 2] - s[at.HOVER_HEIGHT]
     radius = math.sqrt(x * x + y * y)
     cos_tilt = s[at.R + 8]
@@ -157,9 +157,8 @@ def step(s: State, draws: NDArray[np.float64]) -> None:
     vx, vy, vz = s[at.V], s[at.V + 1], s[at.V + 2]
     qw, qx, qy, qz = s[at.Q], s[at.Q + 1], s[at.Q + 2], s[at.Q + 3]
     ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
-    for part in range(
-        2
-    ):  # to the middle with the rates of the start, then to the end with those of the middle
+    # To the middle with the rates at the start, then to the end with those at the middle.
+    for part in range(2):
         h = 0.5 * STEP if part == 0 else STEP
         s[at.P], s[at.P + 1], s[at.P + 2] = px + h * s[at.V], py + h * s[at.V + 1], pz + h * s[at.V + 2]
         s[at.V], s[at.V + 1], s[at.V + 2] = vx + h * s[at.ACC], vy + h * s[at.ACC + 1], vz + h * s[at.ACC + 2]

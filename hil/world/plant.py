@@ -1,7 +1,7 @@
 """The robot in the tunnel, as the harness sees it: time passes, pulses arrive, truth can be read.
 
 The truth lives on a grid of whole milliseconds from time 0: `advance(now_us)` does every step that ends at or before
-`now_us`. The same generator and the same calls give the same bits however the way to an instant is cut into calls.
+`now_us`. The same generator and the same calls give the same bits however the time to an instant is divided into calls.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Plant:
         truth (layout.SIZE,) everything; state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
         p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
         wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
-        servo_trim (4,) [rad] and servo_speed (4,), pushes (6,) force [N, W] and torque [N m, B]: as they were last set;
+        servo_trim (4,) [rad] and servo_speed (4,), pushes (6,) force [N, W] and torque [N m, B]: the values last set;
         specific_force_B (3,) at the centre of mass; flow_W (3,) air there; plate_forces_W (5, 3) base and four flaps as
         isolated plates (without the identified correction, so they do not add up to the whole force).
     """
@@ -124,7 +124,7 @@ class Plant:
         omega_B: Vector = (0.0, 0.0, 0.0),
         flaps: Vector | None = None,
     ) -> None:
-        """Put the body into a state; `q_WB` is normalised, `flaps` None leaves them as they are. Raises LabError."""
+        """Set the state of the body; `q_WB` is normalised, `flaps` None leaves them as they are. Raises LabError."""
         s = self._s
         length = math.sqrt(math.fsum(component * component for component in q_WB))
         if not (
@@ -144,7 +144,7 @@ class Plant:
             self._draws = normal(self._rng, self._draws.shape)
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
-        """Take over what the four timer registers hold; it reaches the servos at the next PWM period."""
+        """Take the counts of the four timer registers; they reach the servos at the next PWM period."""
         counts = tuple(counts)
         if counts == self._counts:
             return
@@ -158,27 +158,27 @@ class Plant:
 
     @property
     def lost(self) -> str | None:
-        """The first reason for which the flight is over; None while it flies."""
+        """The first reason why the flight is over; None while it flies."""
         cause = int(self._s[at.LOST])
         if cause == 0:
             return None
         return LOSS_TEXTS[cause].format(self._s[at.LOST_VALUE])
 
     def hold(self) -> None:
-        """Clamp the body where it is, at rest; flaps, air and sensors go on."""
+        """Clamp the body where it is, at rest; flaps, air and sensors continue."""
         s = self._s
         s[at.HELD] = 1.0
         s[at.V : at.V + 3] = s[at.OMEGA : at.OMEGA + 3] = 0.0
         evaluate(s)
 
     def put_back(self, p_WB: Vector) -> None:
-        """Clamp the body upright at a place, as if nothing had happened; the flaps stay as they are."""
+        """Clamp the body upright at a place, with all causes of a loss cleared; the flaps stay as they are."""
         self._s[at.LOST] = 0.0
         self.place(p_WB, (1.0, 0.0, 0.0, 0.0))
         self.hold()
 
     def release(self) -> None:
-        """Let go."""
+        """Release the body."""
         self._s[at.HELD] = 0.0
         evaluate(self._s)
 
@@ -187,12 +187,12 @@ class Plant:
         self._s[at.PUSH : at.PUSH + 3], self._s[at.PUSH_TORQUE : at.PUSH_TORQUE + 3] = force_W, torque_B
 
     def set_servo_fault(self, servo: int, trim_error: float = 0.0, speed: float = 1.0) -> None:
-        """Mount servo 0..3 `trim_error` [rad] off and run it at `speed` times its pace, 0: stuck; defaults heal it."""
+        """Mount servo 0..3 with an error [rad] and run it at `speed` times its pace, 0: stuck; the defaults restore it."""
         self._s[at.SERVO_TRIM + servo], self._s[at.SERVO_SPEED + servo] = trim_error, speed
 
     @property
     def flap_travel(self) -> float:
-        """By how much all flaps together have turned since the start [rad]."""
+        """The total travel of all flaps since the start [rad]."""
         return float(self._s[at.TRAVEL])
 
     def linearise(self) -> Constants:

@@ -1,7 +1,7 @@
-"""What the flow does to the body: air at five points, nine plates, identified correction; compiled.
+"""The flow's force and torque on the body: air at five points, nine plates, identified correction; compiled.
 
-Plates (paper, "Force analysis"): F_k = 1/2 rho C_D A_k (w_k.n_k)|w_k.n_k| n_k with the wind w_k that plate k feels.
-The correction of physics.md section 4 then scales and adds so that the linearisation equals a chosen set of constants.
+Plates (paper, "Force analysis"): F_k = 1/2 rho C_D A_k (w_k.n_k)|w_k.n_k| n_k with the wind w_k at plate k.
+The correction (docs/explanation/plant.md) then scales and adds so that the linearisation equals a chosen set of constants.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from hil.world import layout as at
 from hil.world.compiled import compiled
 from hil.world.fixed_order import sine_ahead
 
-TILT_MAX = tan(
-    math.radians(35.0)
-)  # slope of the wind beyond which identified stiffness does not grow; section 4
+# Slope of the wind beyond which identified stiffness does not grow.
+TILT_MAX = tan(math.radians(35.0))
 LIFT_U4_MAX = 0.55  # [rad] the lift ratio l(u4) is fitted for |u4| up to here
 UPFLOW_MIN = 0.1  # [m/s] keeps the slope of the wind finite when the air stands still
 
@@ -60,7 +59,7 @@ def upflow(s: State, x: float, y: float) -> float:
 
 @compiled
 def blow(s: State) -> None:
-    """Write the air at the centre of mass (FLOW, W) and the wind that the body feels there (WIND, B)."""
+    """Write the air at the centre of mass (FLOW, W) and the wind relative to the body there (WIND, B)."""
     x, y = s[at.P], s[at.P + 1]
     spread = (x * x + y * y) / (s[at.GUST_RADIUS] * s[at.GUST_RADIUS])
     s[at.ROUGHNESS] = s[at.FAN] * s[at.GUST_SCALE] * min(1.0 + spread * spread, s[at.GUST_GROWTH_MAX])
@@ -138,7 +137,7 @@ def press(s: State) -> None:
 
 @compiled
 def correct(s: State) -> None:
-    """Scale and add to DRAG so that the model's linearisation is the identified one (physics.md section 4)."""
+    """Scale and add to DRAG so that the model's linearisation is the identified one (docs/explanation/plant.md)."""
     wx, wy, wz = s[at.WIND], s[at.WIND + 1], s[at.WIND + 2]
     q = (wx * wx + wy * wy + wz * wz) / (s[at.AIRSPEED] * s[at.AIRSPEED])
     root_q = math.sqrt(q)

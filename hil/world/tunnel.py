@@ -1,4 +1,4 @@
-"""The wind tunnel: mean profile, gusts, side wind, fans, a blocked patch; constants, and what may change in flight.
+"""The wind tunnel: mean profile, gusts, side wind, fans, a blocked patch; constants, and values that may change in flight.
 
 The air is computed inside the plant's kernel (`hil.world.plates`); `Tunnel` writes that kernel's inputs. World frame: z
 up, origin in the middle of the tunnel's exit, hover point `hover_height` above it.
@@ -14,7 +14,7 @@ from hil.errors import LabError
 from hil.world import layout as at
 from hil.world.config import TunnelConfig
 
-# physics.md section 6. Rows as in layout.GUSTS: time constant [s]; then rms [m/s] per level.
+# docs/explanation/plant.md, Tunnel. Rows as in layout.GUSTS: time constant [s]; then rms [m/s] per level.
 GUST_TAU = (0.015, 0.015, 0.015, 0.4, 0.4, 0.4, *4 * (0.010,), *4 * (0.15,))
 GUST_RMS = {
     "none": 14 * (0.0,),
@@ -28,7 +28,7 @@ GUST_GROWTH_MAX = 6.0  # ... up to this
 class Tunnel:
     """The knobs of the tunnel during a flight; a change acts from the next millisecond on.
 
-    `fan_factor`, `gust_scale`, `side_wind` (x, y, z) and `shadow` (the share that is blocked) are as they were last set.
+    `fan_factor`, `gust_scale`, `side_wind` (x, y, z) and `shadow` (the share that is blocked) hold the values last set.
     """
 
     def __init__(self, config: TunnelConfig, state: NDArray[np.float64]) -> None:
@@ -60,7 +60,7 @@ class Tunnel:
         self._s[at.SIDE_WIND : at.SIDE_WIND + 3] = self.side_wind = wind
 
     def block(self, x: float, y: float, radius: float, depth: float) -> None:
-        """Take the share `depth` of the flow away around (x, y) [m, W], half of it at `radius` [m]; depth 0 clears."""
+        """Remove the share `depth` of the flow around (x, y) [m, W], half of it at `radius` [m]; depth 0 clears."""
         self._s[at.OCCLUSION : at.OCCLUSION + 4] = (
             _inside("occlusion x", x, -2.0, 2.0),
             _inside("occlusion y", y, -2.0, 2.0),

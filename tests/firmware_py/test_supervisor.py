@@ -161,7 +161,7 @@ def fell_silent(supervisor: Supervisor) -> None:
 
 def was_held_at_its_bounds(supervisor: Supervisor) -> None:
     for now_us in range(5_000_000, 6_000_000, 10_000):
-        supervisor._estimator.bounded += 1
+        supervisor.bounds.estimator.bounded += 1
         supervisor.mode(now_us)
 
 
@@ -179,8 +179,8 @@ EVENTS = pytest.mark.parametrize(
         (Supervisor.emergency_stop, Cause.EMERGENCY_STOP, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
         (ran_down, Cause.LOW_BATTERY, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
         (lambda supervisor: supervisor.arm(False), Cause.DISARMED, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
-        (lambda s: s.see_logic(1, 0), Cause.CONTROLLER_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
-        (lambda s: s.see_logic(1, 1), Cause.ESTIMATOR_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (lambda s: s.logic.see(1, 0), Cause.CONTROLLER_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (lambda s: s.logic.see(1, 1), Cause.ESTIMATOR_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
     ],
 )
 

@@ -463,6 +463,43 @@ void Reset_Handler(void) {
   rest();
 }
 
+/* Tables of contents as those of a Crazyflie lie in flash. */
+enum { U8 = 0x08, U16 = 0x09, F32 = 0x06, READ_ONLY = 0x40, LOG_U32 = 3, BY_FUNCTION = 0x40, BEGIN = 0x81, END = 0x80 };
+
+static float gain = 1.5f;
+static uint16_t timeout = 500;
+static uint8_t revision = 7;
+
+static void *asked(void) {
+  return &gain;
+}
+
+struct log_s {
+  uint8_t type;
+  const char *name;
+  const volatile void *address;
+};
+
+struct param_s {
+  uint8_t type, extended_type;
+  const char *name;
+  void *address;
+  void (*callback)(void);
+  void *(*getter)(void);
+};
+
+__attribute__((section(".log_table"), used)) static const struct log_s log_table[] = {
+    {BEGIN, "queue", 0},          {LOG_U32, "taken", &samples_taken}, {LOG_U32 | BY_FUNCTION, "asked", &samples_taken},
+    {LOG_U32, "lost", &samples_lost}, {END, "queue", 0},
+};
+
+__attribute__((section(".param_table"), used)) static const struct param_s param_table[] = {
+    {BEGIN, 0, "test", 0, 0, 0},         {F32, 0, "gain", &gain, 0, 0},
+    {U8 | READ_ONLY, 0, "revision", &revision, 0, 0}, {END, 0, "test", 0, 0, 0},
+    {BEGIN, 0, "wait", 0, 0, 0},         {U8, 0, "asked", 0, 0, asked},
+    {U16, 0, "timeout", &timeout, 0, 0}, {END, 0, "wait", 0, 0, 0},
+};
+
 void Stuck_Handler(void) {
   for (;;) {
   }

@@ -162,7 +162,9 @@ def test_refused_frames_are_not_sent_and_the_next_good_one_takes_their_place():
     bench.frames(200, p=lambda number: (0.001 * number + 0.5 * (number in (99, 100, 101)), 0.0, 1.15))
     assert bench.numbers() == [2, *range(4, 100, 4), 102, *range(104, 200, 4)]
     assert bench.station.counters.invalid == 5
-    assert bench.station.notices() == ["motion capture: 3 poses refused, up to 0.50 m and 0 deg off"]
+    assert bench.station.notices() == [
+        "motion capture: 3 poses refused, up to 0.50 m and 0 deg from the prediction"
+    ]
 
 
 def test_the_goal_of_the_moment_counts_not_that_of_the_exposure():

@@ -384,7 +384,7 @@ def test_the_budget_of_the_downlink_is_what_the_board_sends(baud):
 
 
 def test_at_57600_baud_the_loads_are_those_of_frames_counted_by_hand():
-    # Frame sizes as measured with pymavlink (reference/links.md): pose 48, goal 65, heartbeat 21, time 28, of which the
+    # Frame sizes as measured with pymavlink: pose 48, goal 65, heartbeat 21, time 28, of which the
     # last is zero for two years; below: array 144, attitude 40, position 40.
     budget = link_budget(57_600, 50.0)
     assert budget.up_load * 5760 == 50 * 48 + 2 * 65 + 21 + 3 * 27

@@ -105,7 +105,7 @@ def test_the_length_in_the_header_and_the_version_must_be_right() -> None:
 
 
 def test_a_count_of_more_than_there_is_is_refused_at_once() -> None:
-    with pytest.raises(MocapError, match="4294967295 things of 5 bytes"):
+    with pytest.raises(MocapError, match="4294967295 items of 5 bytes"):
         decode(packets.packet(7, bytes(4) + b"\xff" * 4 + bytes(40)), (3, 0))
 
 

@@ -162,8 +162,8 @@ GOOD = "1,2,3,4,5,1,0,0,0,1\n"
     ("", "no frames"),
     ("1,2\n", "line 2: "),
     ("1,2,3,4,five,1,0,0,0,1\n", "line 2: could not convert string to float: 'five'"),
-    (GOOD + "1,inf,3,4,5,1,0,0,0,1\n", "line 3: inf us is no time"),
-    ("1e300,2,3,4,5,1,0,0,0,1\n", "line 2: 1e300 us is no time"),
+    (GOOD + "1,inf,3,4,5,1,0,0,0,1\n", "line 3: inf us is not a time"),
+    ("1e300,2,3,4,5,1,0,0,0,1\n", "line 2: 1e300 us is not a time"),
     (GOOD + GOOD.replace("1", "0", 1), "frames go back in time, from 1 to 0 us"),
 ])  # fmt: skip
 def test_a_bad_record_is_one_line(tmp_path: Path, rows: str, message: str) -> None:

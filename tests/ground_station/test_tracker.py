@@ -175,7 +175,7 @@ def test_the_attitude_is_of_unit_length_from_the_first_pose_on_and_however_long_
         assert np.linalg.norm(one.pose[1]) == pytest.approx(1.0, abs=1e-12)
         q = Rotation.from_euler("z", 0.02 * number).as_quat(scalar_first=True)
         one.predict(1, widen=True)
-        _, _, theta = one.off((0.0, 0.0, 0.0), tuple(q))
+        _, _, theta = one.deviation((0.0, 0.0, 0.0), tuple(q))
         one.update((0.0, 0.0, 0.0), theta)
 
 
@@ -201,7 +201,7 @@ def test_distances_are_distributed_as_chi2_when_the_robot_moves_as_assumed() -> 
     for number in range(5000):
         seen = noisy(rng, number, p)
         one.predict(1, widen=True)
-        distance2, _, theta = one.off(seen.p_WB, seen.q_WB)
+        distance2, _, theta = one.deviation(seen.p_WB, seen.q_WB)
         distances.append(distance2 / one.variances[0])
         one.update(seen.p_WB, theta)
         a = rng.normal(0.0, CONFIG.acceleration, 3)
@@ -259,7 +259,7 @@ def test_the_exact_opposite_attitude_is_refused(w: float) -> None:
     assert tracker.take(frame(3, q=(w, 1.0, 0.0, 0.0))).quality is Quality.REFUSED
     after = [frame(number) for number in range(4, 110)]
     assert [line for _, line in told(tracker, after)] == [
-        "motion capture: 1 pose refused, up to 0.00 m and 180 deg off"
+        "motion capture: 1 pose refused, up to 0.00 m and 180 deg from the prediction"
     ]
 
 
@@ -386,7 +386,7 @@ def told(tracker: Tracker, frames: list[MocapFrame]) -> list[tuple[int, str]]:
     return lines
 
 
-def test_one_line_tells_of_refused_poses() -> None:
+def test_one_line_reports_refused_poses() -> None:
     rng = np.random.default_rng(2)
     wrong = {120, 121, 122}
     frames = [
@@ -400,18 +400,21 @@ def test_one_line_tells_of_refused_poses() -> None:
     ]
     lines = told(tracking(), frames)
     assert lines == [
-        (120 * PERIOD_US + 500_000, "motion capture: 3 poses refused, up to 0.50 m and 180 deg off")
+        (
+            120 * PERIOD_US + 500_000,
+            "motion capture: 3 poses refused, up to 0.50 m and 180 deg from the prediction",
+        )
     ]
 
 
-def test_a_track_that_is_lost_and_begun_anew_is_told() -> None:
+def test_a_track_that_is_lost_and_begun_again_is_reported() -> None:
     rng = np.random.default_rng(2)
     blind = [replace(noisy(rng, n), valid=False) for n in range(100, 400)]
     back = [noisy(rng, n) for n in range(400, 600)]
     lines = told(tracking(), blind + back)
     assert [line for _, line in lines] == [
         "motion capture: track lost",
-        "motion capture: track begun anew after 1.5 s",
+        "motion capture: track begun again after 1.5 s",
     ]
 
 

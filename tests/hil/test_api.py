@@ -1,4 +1,4 @@
-"""The laboratory from Python: what docs/python-api.md shows, and what else a program may rely on."""
+"""The laboratory from Python: what docs/howto/python.md shows, and what else a program may rely on."""
 
 import json
 import math
@@ -17,16 +17,15 @@ from hil.laboratory.fault_kinds import KINDS
 from support.command import floaty
 from support.examples import run_examples
 
-PAGE = Path(hil.__file__).parent.parent / "docs" / "python-api.md"
+PAGE = Path(hil.__file__).parent.parent / "docs" / "howto" / "python.md"
 SHORT = 0.3  # [s]
 
 
 @pytest.fixture(autouse=True)
 def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(
-        KINDS, "mocap.slow", KINDS["push.y"]
-    )  # a page's own kind, which it replaces, ends with the test
+    # A page's own kind, which it replaces, ends with the test.
+    monkeypatch.setitem(KINDS, "mocap.slow", KINDS["push.y"])
 
 
 @pytest.mark.long

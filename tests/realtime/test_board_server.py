@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 import cflib.crtp
 import pytest
@@ -65,60 +66,59 @@ def test_scanning_finds_the_board(served: Served) -> None:
 
 
 def test_a_client_does_what_clients_do(uri: str, cache: Path) -> None:
-    client = CflibClient(uri, cache).ready()
-    cf = client.cf
-    assert cf.platform.get_protocol_version() == 12
+    with CflibClient(uri, cache) as client:
+        cf = client.cf
+        assert cf.platform.get_protocol_version() == 12
 
-    rows = client.rows(100, 10, "stateEstimate.x", "pm.vbat", "motor.m1")
-    steps = [later[0] - earlier[0] for earlier, later in pairwise(rows)]
-    assert steps == [10] * 99
-    assert all(3.6 < values["pm.vbat"] < 4.2 for _, values in rows)
+        rows = client.rows(100, 10, "stateEstimate.x", "pm.vbat", "motor.m1")
+        steps = [later[0] - earlier[0] for earlier, later in pairwise(rows)]
+        assert steps == [10] * 99
+        assert all(3.6 < values["pm.vbat"] < 4.2 for _, values in rows)
 
-    assert client.set("extCtrl.z_P", 2.5) == 2.5
-    assert client.set("extCtrl.z_P", 99) == 2.5  # outside its range
-    assert client.set("extCtrl.z_P", 3.0) == 3.0
+        assert client.set("extCtrl.z_P", 2.5) == 2.5
+        assert client.set("extCtrl.z_P", 99) == 2.5  # outside its range
+        assert client.set("extCtrl.z_P", 3.0) == 3.0
 
-    assert client.answer(app_echo, cf, bytes(range(30))) == (bytes(range(30)),)
+        assert client.answer(app_echo, cf, bytes(range(30))) == (bytes(range(30)),)
 
-    (tester,) = cf.mem.get_mems(MemoryElement.TYPE_MEMORY_TESTER)
-    client.answer(tester.read_data, 5, 500)
-    assert tester.readValidationSuccess
-    client.answer(tester.write_data, 5, 500)
-    (eeprom,) = cf.mem.get_mems(MemoryElement.TYPE_I2C)
-    client.answer(eeprom.update)
-    assert (eeprom.valid, eeprom.elements["radio_address"]) == (True, 0xE7E7E7E7E7)
-    client.close()
+        (tester,) = cf.mem.get_mems(MemoryElement.TYPE_MEMORY_TESTER)
+        client.answer(tester.read_data, 5, 500)
+        assert tester.readValidationSuccess
+        client.answer(tester.write_data, 5, 500)
+        (eeprom,) = cf.mem.get_mems(MemoryElement.TYPE_I2C)
+        client.answer(eeprom.update)
+        assert (eeprom.valid, eeprom.elements["radio_address"]) == (True, 0xE7E7E7E7E7)
 
 
 @pytest.mark.parametrize("packed", [False, True], ids=["extpose", "packed"])
 def test_poses_are_flown_and_their_end_is_announced(uri: str, cache: Path, packed: bool) -> None:
-    client = CflibClient(uri, cache).ready()
-    goal, stop = (0.01, -0.02, 0.03), threading.Event()
+    with CflibClient(uri, cache) as client:
+        goal, stop = (0.01, -0.02, 0.03), threading.Event()
 
-    def send() -> None:
-        while not stop.wait(0.02):
-            if packed:
-                packet = CRTPPacket()
-                packet.set_header(CRTPPort.LOCALIZATION, 1)
-                mm = (round(1000 * value) for value in goal)
-                packet.data = struct.pack("<BBhhhI", 9, 0xE7, *mm, compress_quaternion((0, 0, 0, 1)))
-                client.cf.send_packet(packet)
-            else:
-                client.cf.extpos.send_extpose(*goal, 0, 0, 0, 1)
+        def send() -> None:
+            while not stop.wait(0.02):
+                if packed:
+                    packet = CRTPPacket()
+                    packet.set_header(CRTPPort.LOCALIZATION, 1)
+                    mm = (round(1000 * value) for value in goal)
+                    packet.data = struct.pack("<BBhhhI", 9, 0xE7, *mm, compress_quaternion((0, 0, 0, 1)))
+                    client.cf.send_packet(packet)
+                else:
+                    client.cf.extpos.send_extpose(*goal, 0, 0, 0, 1)
 
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "locSrv.poses")
-        rows = [values for _, values in client.rows(100, 10, *names)]
-    finally:
-        stop.set()
-        sender.join()
-    assert [rows[-1][name] for name in names[:3]] == pytest.approx(goal, abs=0.01)
-    assert 25 <= rows[-1]["locSrv.poses"] - rows[0]["locSrv.poses"] <= 50
-    assert client.heard("supervisor: failsafe, silence\n")
-    assert "supervisor: flying\n" in client.console
-    client.close()
+        sender = threading.Thread(target=send)
+        sender.start()
+        try:
+            names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "locSrv.poses")
+            rows = [values for _, values in client.rows(100, 10, *names)]
+        finally:
+            stop.set()
+            sender.join()
+        # The board lies still while its flaps fly it: its model moves the estimate about the poses by a centimetre or two.
+        assert [median(row[name] for row in rows) for name in names[:3]] == pytest.approx(goal, abs=0.01)
+        assert 25 <= rows[-1]["locSrv.poses"] - rows[0]["locSrv.poses"] <= 50
+        assert client.heard("supervisor: failsafe, silence\n")
+        assert "supervisor: flying\n" in client.console
 
 
 def app_echo(cf: Crazyflie, data: bytes, callback: Callable[[bytes], None]) -> None:
@@ -128,20 +128,18 @@ def app_echo(cf: Crazyflie, data: bytes, callback: Callable[[bytes], None]) -> N
 
 def test_a_stored_parameter_survives_a_reboot_by_radio(served: Served, cache: Path) -> None:
     uri = served.radio_uris[0]
-    client = CflibClient(uri, cache).ready()
-    client.set("extCtrl.vz_P", 0.75)
-    client.set("extCtrl.yaw_P", 0.75)
-    assert client.answer(client.cf.param.persistent_store, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
-    client.close()
+    with CflibClient(uri, cache) as client:
+        client.set("extCtrl.vz_P", 0.75)
+        client.set("extCtrl.yaw_P", 0.75)
+        assert client.answer(client.cf.param.persistent_store, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
     switch = PowerSwitch(uri)
     switch.stm_power_down()
     switch.stm_power_up()
     switch.close()
-    again = CflibClient(uri, cache).ready()
-    assert again.cf.param.get_value("extCtrl.vz_P") == "0.75"
-    assert float(again.cf.param.get_value("extCtrl.yaw_P")) != 0.75
-    assert again.answer(again.cf.param.persistent_clear, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
-    again.close()
+    with CflibClient(uri, cache) as again:
+        assert again.cf.param.get_value("extCtrl.vz_P") == "0.75"
+        assert float(again.cf.param.get_value("extCtrl.yaw_P")) != 0.75
+        assert again.answer(again.cf.param.persistent_clear, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
 
 
 def test_flashing_is_byte_identical_and_the_board_comes_back(

@@ -34,9 +34,8 @@ def test_the_goal_moves_when_the_board_flies_and_the_flight_is_judged_by_what_th
     times, goal = column(log, "t") * 1e-6, column(log, "goal.yaw")
     released = times[np.argmax(column(log, "flight.free"))]
     (stepped,) = times[1:][np.diff(goal) != 0.0]
-    assert (
-        0.5 < stepped - released < 1.3
-    )  # 1 s after the trajectory's begin, which the station sees by telemetry
+    # 1 s after the trajectory's begin, which the station sees by telemetry.
+    assert 0.5 < stepped - released < 1.3
     assert goal[-1] == pytest.approx(np.radians(110.0))
 
 

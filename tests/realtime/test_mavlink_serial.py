@@ -174,7 +174,7 @@ def link_to(peer: Peer, key: str = "") -> MavlinkSerialLink:
 
 def test_a_line_on_which_nothing_comes_is_given_up_after_four_seconds(peers: Callable[..., Peer]) -> None:
     peer = peers(silent)
-    refused(peer.uri, f"{peer.uri}: no heartbeat within 4 s: nothing comes")
+    refused(peer.uri, f"{peer.uri}: no heartbeat within 4 s: no bytes arrive")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,8 @@
 
     python -m support.app_board LIBRARY [SECTION.KEY=VALUE ...]
 
-What stands between the app and the sockets is what `floaty serve` has. `board()` starts it.
+What stands between the app and the sockets is what `floaty serve` has. Says in a line what state the app is in when that
+changes. `board()` starts it.
 """
 
 import os
@@ -16,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from firmware_py.board import EEPROM_SIZE
+from firmware_py.wire.supervisor import Cause, State
 from hil.clock import Paced
 from hil.config import LabConfig, load_config
 from hil.devices.shockburst import Air, syslink_us
@@ -36,7 +38,7 @@ TRANSMIT_PERIOD_US = 1000  # in which the firmware tries again when its radio ch
 class AppRobot:
     """What `ServedRobot` and `Laboratory` need of a robot, with the app in it and nothing around it."""
 
-    uart = None
+    uart = firmware = None
     polled_by_host = executes_image = False
     wire_us = staticmethod(syslink_us)
     next_wake_us = None
@@ -47,6 +49,7 @@ class AppRobot:
         self.powered = False
         self._library, self._folder = library, folder
         self._boots = self._booted_us = 0
+        self._state = ""
         self._waiting: deque[bytes] = deque()
         events.every(STEP_US, STEP_US, self._step)
 
@@ -78,6 +81,11 @@ class AppRobot:
     def _step(self, now_us: int) -> None:
         if self.powered:
             self.app.step((now_us - self._booted_us) // STEP_US)
+            supervisor = self.app.supervisor
+            state = f"state {State(supervisor.state).name} {Cause(supervisor.cause).name}"
+            if state != self._state:
+                print(state, flush=True)
+            self._state = state
             self._transmit(now_us)
 
     def _transmit(self, now_us: int) -> None:

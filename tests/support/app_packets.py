@@ -11,6 +11,8 @@ from support.crazyflie_app import App
 class AppPackets:
     """`ground_station.links.core_client.Packets`; each way loses, doubles and overtakes with chance `mess`."""
 
+    ready = True
+
     def __init__(self, app: App, mess: float = 0.0) -> None:
         self.app = app
         self.mess = mess
@@ -32,10 +34,10 @@ class AppPackets:
     def receive(self, timeout_s: float) -> bytes | None:
         return self._down.popleft() if self._down and not self.silent else None
 
-    def tell(self, packet: bytes) -> None:
+    def send_any(self, packet: bytes) -> None:
         self.app.radio(packet[1:], packet[0] >> 4, packet[0] & 3)
 
-    def told(self) -> list[bytes]:
+    def received(self, timeout_s: float = 0.0) -> list[bytes]:
         return self.services
 
     def close(self) -> None:

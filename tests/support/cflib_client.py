@@ -32,6 +32,12 @@ class CflibClient:
         assert self.problem == ""
         return self
 
+    def __enter__(self) -> Self:
+        return self.ready()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def _fail(self, text: str) -> None:
         self.problem = text
         self.connected.set()

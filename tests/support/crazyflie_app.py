@@ -105,9 +105,8 @@ def build_app(
         text = source.read_text()
         assert plant[1] in text
         source.write_text(text.replace(plant[1], plant[2], 1))
-    compiler = min(
-        compilers(), key=lambda one: one.name == "zig"
-    )  # the system's, if there is one: it is faster
+    # The system's, if there is one: it is faster.
+    compiler = min(compilers(), key=lambda one: one.name == "zig")
     sources = sorted((folder / "src").glob("*.c"))
     library = folder / "app.so"
     flags = (

@@ -98,9 +98,8 @@ class UdpClient(_Datagrams):
         super().__init__()
         host, port = open_end.end.master.split(":")[1:]
         self._socket.bind((host, int(port)))
-        while not select.select([self._socket], (), (), 0.01)[
-            0
-        ]:  # the first call may be told that nobody listened
+        # The first call may be told that nobody listened.
+        while not select.select([self._socket], (), (), 0.01)[0]:
             open_end.end.send(self.CALL)
         self.peer = self._socket.recvfrom(100)[1]
 

@@ -1,4 +1,4 @@
-"""NatNet packets written field by field from the layouts of `links.md`, apart from the laboratory's own encoder."""
+"""NatNet packets written field by field from the layouts of OptiTrack's SDK, apart from the laboratory's own encoder."""
 
 import struct
 

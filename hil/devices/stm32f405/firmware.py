@@ -18,16 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.board import Board, ImuCounts
+from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.signals import CONTROL, COUNTERS, ESTIMATOR
 from firmware_py.wire.supervisor import Cause, State
 from hil.devices.stm32f405 import syslink
 from hil.devices.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why, build_machine
 from hil.devices.stm32f405.crash import CrashReports
 from hil.devices.stm32f405.crazyflie import RADIO_BUSY, SYSLINK_USART, CrazyflieBoard
-from hil.devices.stm32f405.freertos import HEAP
+from hil.devices.stm32f405.freertos import HEAP, HEAP_LEAST
 from hil.devices.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.devices.stm32f405.image import Image
-from hil.devices.stm32f405.log_table import LogVariable, log_table
+from hil.devices.stm32f405.log_table import LogVariable, log_table, parameter_table
 from hil.devices.stm32f405.processor import ImageStatistics, Processor
 from hil.errors import LabError
 
@@ -38,6 +39,8 @@ BATTERY_PERIOD_US = 100_000
 POLL_PERIOD_US = 2_000  # of an idle radio link: the nRF51 hands every packet on, also empty ones
 IMU_PERIOD_US = 1_000
 CONSOLE, CONSOLE_MASK = 0x00, 0xF3
+CLOCK_HIGH, TIM7_COUNT = "usecTimerHighCount", 0x4000_1424  # of the firmware's usec_time.c
+OWN_LOGIC = "floaty_guard"  # there is one in images with logic of the user's own
 SERVOS = ((4, 2), (2, 0), (2, 1), (4, 3))  # M1 to M4: TIM5_CH3, TIM3_CH1, TIM3_CH2, TIM5_CH4, counted from 0
 
 
@@ -118,12 +121,13 @@ class ImageFirmware:
         self._line = b""
         self._counts: tuple[int, ...] = ()
         self._unknown = 0
+        self.resets = {WATCHDOG: 0, SOFTWARE: 0}  # by cause, since power-on
         self.kernel.every(BATTERY_PERIOD_US, self._report_battery)
         if polls:
             self.kernel.every(POLL_PERIOD_US, lambda now_us: self.radio_polled())
         table = {variable.name: variable for variable in log_table(image, self.chip)}
         self.variables = [v for v in table.values() if v.name.startswith("excite.")]
-        self.parameters: tuple[Any, ...] = ()
+        self.parameters = parameter_table(image, self.chip)
         self.measurements = NoQueue()
         self.signals = self._signals(table)
         self.statistics = ImageStatistics(self.kernel)
@@ -136,16 +140,21 @@ class ImageFirmware:
             self.parts.sample(rest())
         self.kernel.begin(WARM_UP_US)
 
-    def differences(self, parameters: NDArray[Any]) -> list[str]:
-        """Return in which constants of the core an image with the app differs from a profile's `parameters`, (1,)."""
+    def differences(self, config: FirmwareConfig) -> str:
+        """Return in what the core of an image with the app differs from a profile, in one line; empty if in nothing."""
         if not self.image.has("floaty_parameters"):
-            return []
+            return ""
+        parameters = parameters_of(config).memory
         built = self._struct("floaty_parameters", parameters.dtype)
-        return [
+        found = [
             f"{name} = {built[name][0].tolist()}, in the profile {parameters[name][0].tolist()}"
             for name in parameters.dtype.names or ()
             if not np.array_equal(built[name], parameters[name])
         ]
+        own = bool(config.logic.controller or config.logic.estimator)
+        if own != self.image.has(OWN_LOGIC):
+            found.append("control law, the profile has " + ("one of the user's" if own else "the core's"))
+        return "; ".join(found)
 
     # Interrupts and time
 
@@ -176,14 +185,33 @@ class ImageFirmware:
             )
         self._unknown = state.unknown_count
 
-    def memory_left(self) -> str:
-        """Return in words what of stacks and heap was never used; empty for an image without FreeRTOS."""
+    def stacks_left(self) -> dict[str, int]:
+        """Return how many bytes of each task's stack were never used; nothing for an image without FreeRTOS."""
         kernel = self.kernel.kernel
-        if kernel is None or not kernel.running:
-            return ""
-        stacks = ", ".join(f"{task.name} {task.stack_free_bytes}" for task in kernel.tasks())
-        heap = f"; free in the heap: {kernel.heap_free_bytes}" if self.image.has(HEAP) else ""
-        return f"bytes never used of stacks: {stacks}{heap}"
+        return {
+            task.name: task.stack_free_bytes
+            for task in (() if kernel is None or not kernel.running else kernel.tasks())
+        }
+
+    @property
+    def clock_us(self) -> int:
+        """Return the microseconds of the firmware's own clock, a 16-bit timer and how often it has overflowed."""
+        high = self.chip.read(self.image.symbol(CLOCK_HIGH).address, 4)
+        return (int.from_bytes(high, "little") << 16) + int.from_bytes(
+            self.chip.read(TIM7_COUNT, 4), "little"
+        )
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether it has the Crazyflie's."""
+        return self.image.has(CLOCK_HIGH)
+
+    def heap_left(self) -> tuple[int | None, int | None]:
+        """Return the free bytes of the heap, now and at its fullest; None where FreeRTOS keeps none."""
+        kernel = self.kernel.kernel
+        if kernel is None or not (self.image.has(HEAP) and self.image.has(HEAP_LEAST)):
+            return None, None
+        return kernel.heap_free_bytes, kernel.heap_least_free_bytes
 
     def add_thief(self) -> Any:
         """Raise `LabError`: nobody can add a task to an image."""
@@ -213,6 +241,7 @@ class ImageFirmware:
             self._reset(SOFTWARE)
 
     def _reset(self, cause: int) -> None:
+        self.resets[cause] += 1
         self.chip.reset(cause)
         self.chip.breakpoints |= self._crashes.addresses
 

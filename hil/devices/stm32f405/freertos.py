@@ -17,7 +17,7 @@ UNUSED = 0xA5  # what a stack is filled with
 WAITING_FOR_NOTIFICATION = 1
 STACK_CHUNK, MOST_TASKS = 64, 256
 SWITCH = "vTaskSwitchContext"
-HEAP = "xFreeBytesRemaining"  # of heap_4
+HEAP, HEAP_LEAST = "xFreeBytesRemaining", "xMinimumEverFreeBytesRemaining"  # of heap_4
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +57,11 @@ class FreeRtos:
     def heap_free_bytes(self) -> int:
         """Return what heap_4 has left."""
         return self._word(self._image.symbol(HEAP).address)
+
+    @property
+    def heap_least_free_bytes(self) -> int:
+        """Return what it had left when it was fullest."""
+        return self._word(self._image.symbol(HEAP_LEAST).address)
 
     def current(self) -> TaskView:
         """Return the task that has the processor. Raises `LabError` before the first one has it."""

@@ -16,6 +16,7 @@ from hil.devices.stm32f405.image import Image
 from hil.events import EventQueue
 
 NEVER_US = 1 << 62
+SLICE_US = 100  # as short as a millisecond's work wants it, and no more than the wall clock's own jitter
 RUNNING_TASK = "pxCurrentTCB"
 
 
@@ -67,9 +68,13 @@ class Processor:
 
     @property
     def next_wake_us(self) -> int:
-        """The next instant at which the chip acts without the outside."""
+        """The next instant at which the chip is to run on without the outside; a busy one runs in slices.
+
+        A flight in lockstep runs it from event to event and does not ask. Where many take turns, or the wall clock has its
+        turn, what it sends within a slice counts as sent at the slice's end.
+        """
         own_us = NEVER_US if self._own.next_us is None else self._own.next_us - self.ahead_us
-        state, ready_us = self.chip.state, self.chip.now_us - self.ahead_us + 1
+        state, ready_us = self.chip.state, self.chip.now_us - self.ahead_us + SLICE_US
         if state.asleep or state.locked:
             ready_us = -(-int(state.next_due) // CYCLES_PER_US) - self.ahead_us
         return min(own_us, ready_us)

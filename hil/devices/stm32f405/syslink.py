@@ -1,6 +1,6 @@
 """Syslink, the serial protocol between nRF51 and STM32: two start bytes, type, length, data, two sums (Fletcher's).
 
-Facts: Bitcraze's syslink documentation, reference/crazyflie-clients-and-protocol.md part 3.
+Facts: Bitcraze's syslink documentation and syslink.h of its firmware.
 """
 
 from collections.abc import Iterator

@@ -92,7 +92,7 @@ def allocate(u: tuple[float, ...], loop: Loop | None = None) -> Loop:
 def height_range(
     u: object, hover: float = HOVER, least: float = 0.0, most: float = 0.9
 ) -> tuple[float, float]:
-    """Return the u4 between which no flap saturates (physics.md section 7); low > high when there is none."""
+    """Return the u4 between which no flap saturates; low > high when there is none."""
     d = SIGNS * (MIX[:, :3] @ np.asarray(u, float)[:3])
     return hover + d.max() - most, hover + d.min() - least
 

@@ -1,6 +1,6 @@
 """The core's Kalman filter against filterpy on a recorded flight, and laws that it keeps whatever it is fed.
 
-The reference is written from the paper's constants and physics.md section 7: the model as a matrix, filterpy's filter in
+The reference is written from the paper's constants and the filter's definition: the model as a matrix, filterpy's filter in
 float64, joint instead of scalar updates, the poses sorted by the instant at which they were true.
 """
 
@@ -662,9 +662,8 @@ def test_senseless_parameter_moves_no_servo_out_of_range_and_does_no_lasting_har
         feed(core, 2, (0.1, 0, 0), quaternion(yaw=0.1))
         core.fly()
         assert 21_000 <= core.control.fields.count.min() <= core.control.fields.count.max() <= 42_000, tick
-        assert np.isfinite(core.now).all() or name.startswith(
-            "bound_"
-        )  # a bound that is no number bounds nothing
+        # A bound that is no number bounds nothing.
+        assert np.isfinite(core.now).all() or name.startswith("bound_")
     core.parameters.memory[name] = sane
     feed(core, 60, (0.1, 0, 0))
     core.fly()

@@ -80,9 +80,8 @@ def test_plain_python_gives_the_bits_of_the_compiled_core_in_every_tick() -> Non
     assert len(set(compiled)) == TICKS + 1
     differing = [tick for tick in range(TICKS) if compiled[tick] != plain[tick]]
     assert not differing, f"first at tick {differing[0]}"
-    assert "': 0" not in compiled[TICKS], compiled[
-        TICKS
-    ]  # every counter moved: the stream reaches every branch
+    # Every counter moved: the stream reaches every branch.
+    assert "': 0" not in compiled[TICKS], compiled[TICKS]
     assert compiled == plain
 
 

@@ -260,9 +260,8 @@ def test_the_core_leaves_room_on_the_board(image: Image) -> None:
     assert usage.ram_bytes == sum(map(len, memory(blocks))) < 8_192
     assert 0 < usage.stack_bytes < 1_024
     assert usage.entries["estimate"].calls == usage.entries["control"].calls == 50
-    assert (
-        usage.entries["estimate"].worst_us + usage.entries["control"].worst_us < 1_000
-    )  # a tenth of the tick
+    # A tenth of the tick.
+    assert usage.entries["estimate"].worst_us + usage.entries["control"].worst_us < 1_000
     assert 0 < usage.entries["estimate"].mean_us < usage.entries["estimate"].worst_us
 
 

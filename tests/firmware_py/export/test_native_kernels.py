@@ -25,11 +25,8 @@ SHAPES = {"x": 16, "dx": 16, "first": 16, "other": 16, "command": (32, 4), "P": 
 RANGES = {"flap": (0, 4), "state": (0, 16), "row": (0, 32), "offset": (0, 13), "turns": (-637, 638),
           "quarters": (0, 2), "word": (0, 65536), "ticks": (-(2**31), 2**31), "first": (0, 504), "last": (-1, 500),
           "tick": (0, 2000)}  # fmt: skip
-INSIDE_1000 = {
-    "maths_quarter_turns",
-    "excitation_line_above",
-    "excitation_chirp",
-}  # kernels whose callers clamp the argument
+# Kernels whose callers clamp the argument.
+INSIDE_1000 = {"maths_quarter_turns", "excitation_line_above", "excitation_chirp"}
 SCALARS = {np.float32: ctypes.c_float, np.int32: ctypes.c_int32, Integer: ctypes.c_int32, bool: ctypes.c_bool,
            None: None}  # fmt: skip
 C = translate()

@@ -218,9 +218,8 @@ def test_the_stream_is_byte_for_byte_what_the_same_log_blocks_give(client: CrtpC
 def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_firmware_shows_them(
     client: CrtpClient,
 ) -> None:
-    qx, qy, qz, qw = (
-        Rotation.from_euler("ZYX", (15, 10, 5), degrees=True).as_quat().tolist()
-    )  # the nose is down
+    # The nose is down.
+    qx, qy, qz, qw = Rotation.from_euler("ZYX", (15, 10, 5), degrees=True).as_quat().tolist()
     data = crtp.encode_ext_pose((0.0, 0.0, 0.0), (qw, qx, qy, qz), 40_000)
     client.events.at(605_000, lambda now_us: client.firmware.radio_received(data))
     client.run(650_000)

@@ -266,9 +266,8 @@ def test_older_commands_and_those_with_a_velocity_fly_the_same_paths(absolute: F
     assert absolute.state == "FLYING"
     absolute.wait(0.1)
     assert absolute.state == "WAITING"
-    assert (
-        order(9, "Bf?f?f", 0, 0.2, True, 0.0, True, 0.0) == 0
-    )  # take-off with the default velocity, 0.5 m/s
+    # Take-off with the default velocity, 0.5 m/s.
+    assert order(9, "Bf?f?f", 0, 0.2, True, 0.0, True, 0.0) == 0
     absolute.wait(0.6)
     assert absolute.goal()[2] == pytest.approx(1.6)
     assert order(2, "Bff", 0, 1.0, 0.1) == 0  # land

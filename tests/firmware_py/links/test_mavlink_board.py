@@ -164,9 +164,8 @@ def test_the_age_of_a_pose_is_true_whatever_the_stations_clock_shows(ahead_us: i
     client.poses(200_000, 4_500_000, lag_us=35_000)
     client.run(4_500_000)
     assert len(client.of("TIMESYNC")) >= 12
-    assert client.firmware.signals.counters[-1] == pytest.approx(
-        35_000, abs=20_000
-    )  # at the estimator's tick
+    # At the estimator's tick.
+    assert client.firmware.signals.counters[-1] == pytest.approx(35_000, abs=20_000)
     _, *ages_ms = [m.value for m in client.of("NAMED_VALUE_FLOAT") if m.name == "age_ms"]
     assert ages_ms == pytest.approx([35.0] * 3, abs=1.0)  # the clocks that agree are found to agree at last
 
@@ -204,9 +203,8 @@ def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us
         events.at(now_us + 20_000, pose)
 
     line.connect(lambda now_us: firmware.uart_ready(), on_ground)
-    request = station.command_long_encode(
-        1, 1, 511, 0, 350, interval_us, 0, 0, 0, 0, 0
-    )  # as our own station does
+    # As our own station does.
+    request = station.command_long_encode(1, 1, 511, 0, 350, interval_us, 0, 0, 0, 0, 0)
     line.uplink(0, request.pack(station))
     events.at(103_700, pose)
     now_us = 0
@@ -772,9 +770,8 @@ def test_the_boards_own_frames_are_ignored_when_they_come_back(client: MavlinkCl
 
 
 def test_half_a_frame_does_not_hold_back_the_last_command(client: MavlinkClient) -> None:
-    client.receive(
-        bytes.fromhex("fd fc 00 00 00 ff be 5e 01 00")
-    )  # so a DEBUG_FLOAT_ARRAY of 264 bytes begins
+    # So a DEBUG_FLOAT_ARRAY of 264 bytes begins.
+    client.receive(bytes.fromhex("fd fc 00 00 00 ff be 5e 01 00"))
     assert client.command(400, 0) == []
     client.run(client.now_us + 160_000)
     assert [message.command for message in client.of("COMMAND_ACK")] == [400]

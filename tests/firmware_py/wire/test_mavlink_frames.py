@@ -126,9 +126,8 @@ def test_trailing_zeros_are_cut_and_come_back(number: int, kind: Any) -> None:
 
 @pytest.mark.parametrize("key", [None, KEY], ids=["unsigned", "signed"])
 def test_frames_count_themselves_and_carry_pymavlinks_signature(key: bytes | None) -> None:
-    messages = conversation(
-        np.random.default_rng(1), 300
-    )  # more than 256, two in each unit of the time stamp
+    # More than 256, two in each unit of the time stamp.
+    messages = conversation(np.random.default_rng(1), 300)
     sender = FrameSender(7, 9, Signing(key, link_id=3, start=STAMP) if key else None)
     mine = [sender.encode(5 * i, message) for i, message in enumerate(messages)]
     assert mine == golden(peer(key, link_id=3), messages)

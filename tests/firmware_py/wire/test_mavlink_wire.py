@@ -277,9 +277,8 @@ def test_servo_counts_become_microseconds() -> None:
 def test_heartbeat_tells_state_and_arming(state: int, status: str) -> None:
     for armed in (False, True):
         message = over_the_wire(mavlink.heartbeat(armed, state))
-        assert (
-            message.autopilot == dialect.MAV_AUTOPILOT_GENERIC
-        )  # with INVALID no client takes us for a vehicle
+        # With INVALID no client takes us for a vehicle.
+        assert message.autopilot == dialect.MAV_AUTOPILOT_GENERIC
         assert message.custom_mode == state
         assert message.system_status == getattr(dialect, f"MAV_STATE_{status}")
         assert bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED) == armed
@@ -402,9 +401,8 @@ def test_nothing_that_goes_down_raises(n: int, m: int, a: float, b: float, text:
 
 def test_parameter_names_are_unique_and_fit() -> None:
     names = list(CrtpClient().toc(PARAM))
-    ours = names[
-        : names.index("activeMarker.back")
-    ]  # the stock names behind it are for Crazyflie clients only
+    # The stock names behind it are for Crazyflie clients only.
+    ours = names[: names.index("activeMarker.back")]
     names = [mavlink.mavlink_name(name) for name in ours]
     assert len(set(names)) == len(ours) > 60
     for name in names:

@@ -168,7 +168,7 @@ def test_no_room_for_a_flight_s_own_files_ends_the_campaign_and_is_no_row() -> N
 def test_a_folder_is_not_mistaken_for_another_campaign(tmp_path: Path) -> None:
     spec = spec_of()
     flown_into(tmp_path / "out", spec, limited(workers(spec, 1), 3))
-    with pytest.raises(LabError, match="holds a campaign; --resume goes on with it"):
+    with pytest.raises(LabError, match="holds a campaign; --resume continues it"):
         flown_into(tmp_path / "out", spec, workers(spec, 1))
     with pytest.raises(LabError, match=r"--resume: spec\.seed was 1 and is 9: choose another --out"):
         flown_into(tmp_path / "out", spec_of(seed=9), workers(spec, 1), resume=True)

@@ -15,13 +15,8 @@ from hil.errors import LabError
 from hil.world.paper_table import PAPER_TABLE
 from support.campaigns import spec_of
 
-SAMPLINGS = {
-    "random": 40,
-    "sobol": 40,
-    "latin": 40,
-    "saltelli": 40,
-    "morris": 40,
-}  # 3 axes: 8 (3+2), 10 (3+1)
+# 3 axes: 8 (3+2), 10 (3+1).
+SAMPLINGS = {"random": 40, "sobol": 40, "latin": 40, "saltelli": 40, "morris": 40}
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)

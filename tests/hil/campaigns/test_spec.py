@@ -50,7 +50,13 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
             HOVER + '[parameters]\n"plant.variant" = { choice = ["methods", "bent"] }',
             "plant.variant = 'bent'",
         ),
-        (HOVER + '[table]\nconstants = ["roll_u9"]', "table.constants"),
+        (HOVER + '[table]\nconstants = ["roll_u9"]', "table.constants.0 = 'roll_u9': input should be"),
+        ('experiments = ["hover"]\nfligths = 3', "fligths = 3: unknown key; did you mean flights?"),
+        ('experiments = "hover"\nflights = 3', "experiments = 'hover': input should be a valid list"),
+        (
+            HOVER + '[[faults]]\nkind = "push.y"\nstart_s = { uniform = [1.0] }',
+            "faults.0.start_s.uniform.1: missing",
+        ),
         (
             HOVER + '[table]\n[parameters]\n"plant.constant_factors.roll_u1" = { uniform = [1, 2] }',
             "in [table]",
@@ -60,7 +66,7 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
         (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 99', "the flight ends 30 s after the release"),
         (HOVER + '[[faults]]\nkind = "push.y"\nstart_s = 1\nprobability = 2', "faults.0.probability = 2"),
         (HOVER + "[limits]\nwall_s = 0", "limits.wall_s = 0: input should be greater than 0"),
-        (HOVER + 'sampling = "saltelli"', "needs two numbers that vary at least; there are 0"),
+        (HOVER + 'sampling = "saltelli"', "needs at least two numbers that vary; there are 0"),
         (HOVER + 'sampling = "saltelli"\n[table]', "with 13 numbers that vary needs 60 or 120"),
         (HOVER + 'sampling = "morris"\n[table]', "with 13 numbers that vary needs 56 or 70"),
         (

@@ -1,5 +1,6 @@
 """Flights on Dask's processes: the same rows as without them, whatever becomes of a worker."""
 
+import gc
 import os
 import signal
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from distributed import LocalCluster
+from distributed.worker_state_machine import StateMachineEvent
 
 from hil.campaigns.cluster import FlyOne, Workers
 from hil.campaigns.config import Spec
@@ -82,6 +84,16 @@ def test_a_worker_killed_from_outside_costs_no_flight(crew: Workers) -> None:
     assert {row.outcome for row in rows} == {"completed"}
 
 
+def events_in_memory() -> int:
+    gc.collect()
+    return sum(isinstance(thing, StateMachineEvent) for thing in gc.get_objects())
+
+
+def test_workers_keep_no_history_of_the_flights_that_they_have_flown(crew: Workers) -> None:
+    rows_of(crew, spec_of(flights=100), planted)
+    assert max(crew.client.run(events_in_memory).values()) < 30
+
+
 def test_an_interrupt_ends_it_with_what_is_there(crew: Workers) -> None:
     stops: list[int] = []
     rows = []
@@ -131,4 +143,4 @@ def test_the_command_flies_reports_and_resumes(
     assert floaty(monkeypatch, "campaign", "tiny.toml", "--resume", "--cluster", "tcp://127.0.0.1:9") == 0
     assert (out / "flights" / "all.parquet").read_bytes() == before, "nothing was left to fly"
     assert floaty(monkeypatch, "campaign", "tiny.toml") == 2
-    assert "--resume goes on with it" in capsys.readouterr().err
+    assert "--resume continues it" in capsys.readouterr().err

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from firmware_py.extras import install_command
 from hil.errors import LabError
 from hil.laboratory.recorder import load_log
 from hil.live.window import DISPLAYS
@@ -74,8 +75,8 @@ def test_a_failed_limit_is_exit_code_one(
         (["param", "set", "a=b", "--link", "udp://127.0.0.1:1"], "a=b: expected NAME=VALUE"),
         (["param", "list", "--link", "usb://1"], "usb://1: expected radio://"),
         (["fly", "hover", "--seeds", "2", "--perfetto"], "--seeds 2"),
-        (["fly", "hover", "--gdb", "3333"], "--gdb 3333: goes with one flight of an image as --board"),
-        (["serve", "--gdb", "3333"], "--gdb 3333: goes with one board and an image as --board"),
+        (["fly", "hover", "--gdb", "3333"], "--gdb 3333: needs one flight with an image as --board"),
+        (["serve", "--gdb", "3333"], "--gdb 3333: needs one board and an image as --board"),
         (["fly", "hover", "--bogus"], "No such option"),
         (["fly"], "Missing argument"),
         (["report", "nowhere"], "nowhere"),
@@ -169,6 +170,41 @@ def test_a_killed_flight_can_still_be_reported(monkeypatch: pytest.MonkeyPatch, 
     assert not Path("run/log.parquet").exists()
     assert load_log(tmp_path / "run").num_rows >= 100
     assert floaty(monkeypatch, "report", "run") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module", "extra"),
+    [
+        (["fly", "hover", "--link", "mavlink"], "pymavlink", "mavlink"),
+        (["fly", "hover", "--link", "mavlink:pty"], "pymavlink", "mavlink"),
+        (["fly", "hover", "--link", "mavlink:pty"], "serial", "mavlink"),
+        (["fly", "hover", "--link", "radio://0/80/2M/E7E7E7E7E7"], "cflib", "radio"),
+        (["fly", "hover", "--link", "udp://127.0.0.1:19850"], "cflib", "radio"),
+        (["fly", "hover", "--board", "radio://0/80/2M/E7E7E7E7E7"], "cflib", "radio"),
+        (["fly", "hover", "--board", "cortex-m4"], "unicorn", "deploy"),
+        (["fly", "hover", "--board", "cortex-m4"], "elftools", "deploy"),
+        (["fly", "hover", "--board", "cortex-m4"], "ziglang", "deploy"),
+        (["fly", "hover", "--board", __file__], "unicorn", "deploy"),
+        (["serve", "--mavlink", "pty"], "pymavlink", "mavlink"),
+        (["identify", "runs/hover-1"], "scipy", "identify"),
+        (["tune"], "scipy", "identify"),
+    ],
+)
+def test_a_missing_package_is_one_line_before_anything_is_flown_or_deleted(
+    arguments: list[str],
+    module: str,
+    extra: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    Path("runs/hover-1").mkdir(parents=True)
+    Path("runs/hover-1/log.parquet").write_bytes(b"an older flight")
+    monkeypatch.setitem(sys.modules, module, None)
+    assert floaty(monkeypatch, *arguments) == 2
+    said = capsys.readouterr().err
+    assert said.endswith(f": {module} is missing: {install_command(extra)}\n")
+    assert said.count("\n") == 1
+    assert Path("runs/hover-1/log.parquet").is_file()
 
 
 @pytest.mark.long

@@ -1,9 +1,6 @@
 """`floaty new`: what it makes flies and tests at once, in the clone and where the package is installed as a wheel."""
 
-import os
-import subprocess
 import sys
-import sysconfig
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,6 +11,7 @@ from hil.experiments import find_experiment
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import read_result
 from support.command import floaty
+from support.installed_wheel import install, run
 
 ROOT = Path(hil.__file__).parent.parent
 FILES = [
@@ -66,8 +64,8 @@ def test_the_present_folder_becomes_a_project_of_its_name(
 @pytest.mark.parametrize(
     ("folder", "told"),
     [
-        ("taken", "floaty: new taken: there is something already; choose a folder that is new or empty\n"),
-        ("file", "floaty: new file: there is something already; choose a folder that is new or empty\n"),
+        ("taken", "floaty: new taken: it exists and is not empty; choose a folder that is new or empty\n"),
+        ("file", "floaty: new file: it exists and is not empty; choose a folder that is new or empty\n"),
         ("---", "floaty: new ---: a project's name, its folder's, has letters a to z or digits\n"),
         ("file/law", "floaty: new file/law: Not a directory\n"),
     ],
@@ -103,46 +101,14 @@ def test_a_project_flies_and_its_tests_pass(
     pytester.runpytest_inprocess().assert_outcomes(passed=4)
 
 
-def run(folder: Path, *command: str | Path) -> str:
-    """Run a command as a user of the wheel would, and return what it prints."""
-    environment = {
-        name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PYTEST"))
-    }
-    ran = subprocess.run(
-        list(map(str, command)), cwd=folder, env=environment, capture_output=True, text=True, timeout=500
-    )
-    assert ran.returncode == 0, ran.stdout[-4000:] + ran.stderr[-4000:]
-    return ran.stdout
-
-
 @pytest.mark.long
 def test_a_project_outside_the_clone_flies_tests_checks_and_exports_with_the_wheel(tmp_path: Path) -> None:
     run(ROOT, sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
     (wheel,) = tmp_path.glob("floaty_hil-*.whl")
-    run(tmp_path, sys.executable, "-m", "venv", "--without-pip", "site")
-    python = tmp_path / "site" / "bin" / "python"
-    run(
-        tmp_path,
-        sys.executable,
-        "-m",
-        "pip",
-        "--python",
-        python,
-        "install",
-        "--quiet",
-        "--no-index",
-        "--no-deps",
-        wheel,
-    )
-    purelib = Path(
-        run(tmp_path, python, "-c", "import sysconfig; print(sysconfig.get_paths()['purelib'])").strip()
-    )
-    (purelib / "dependencies.pth").write_text(
-        sysconfig.get_paths()["purelib"]
-    )  # theirs alone: no .pth is read there
-    assert run(tmp_path, python, "-c", "import hil; print(hil.__file__)").startswith(str(purelib))
+    programs, packages = install(wheel, tmp_path)
+    python, command = programs / "python", programs / "floaty"
+    assert run(tmp_path, python, "-c", "import hil; print(hil.__file__)").stdout.startswith(str(packages))
 
-    command = tmp_path / "site" / "bin" / "floaty"
     run(tmp_path, command, "new", "law")
     project = tmp_path / "law"
     run(project, command, "fly", "hover", "--profile", "profile.toml", "--duration", "5")
@@ -164,7 +130,7 @@ def test_a_project_outside_the_clone_flies_tests_checks_and_exports_with_the_whe
         "0.5",
         "--targets",
         "c-O2",
-    )
+    ).stdout
     assert "no bit differs" in checked
     run(project, command, "deploy", "export", "app", "--profile", "profile.toml")
     assert any("integral" in path.read_text() for path in (project / "app").rglob("*.c"))

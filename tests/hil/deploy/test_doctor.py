@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from firmware_py.wire.core_port import Hil
 from firmware_py.wire.supervisor import State
 from ground_station.links import packets
 from support.app_packets import AppPackets
@@ -22,6 +23,22 @@ class Board(AppPackets):
         super().__init__(app)
         self.noise, self.zero = 3.0, 8.0
         self.services = [VERSION]
+        self.deaf = False  # to samples
+        self._steps = 0
+
+    def send_any(self, packet: bytes) -> None:
+        if not self.deaf:
+            super().send_any(packet)
+
+    def received(self, timeout_s: float = 0.0) -> list[bytes]:
+        """What came; a millisecond of the board passes when somebody waits."""
+        came, self.services = self.services, []
+        if timeout_s > 0.0:
+            self._steps += 1
+            self.app.step(self._steps)
+        while packet := self.app.sent():
+            came.append(packet)
+        return came
 
     def send(self, data: bytes) -> None:
         self.app.gyro[:] = [int(count) for count in self._rng.normal(self.zero, self.noise, 3)]
@@ -47,14 +64,13 @@ def findings(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
     return {line[2:12].strip(): line[:2].strip() + line[12:] for line in lines}
 
 
-def test_a_board_that_is_well_is_described_and_left_as_it_was(
+def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(
     board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flies = board.app.estimator()
     board.app.cycles.value = 5000
     assert floaty(monkeypatch, "board", "doctor", URI) == 0
     found = findings(capsys)
-    subjects = "firmware core profile state link memory battery RAM gyro servos computes"
+    subjects = "firmware core profile state link memory battery RAM gyro servos computes loop"
     assert " ".join(found) == subjects
     assert found["firmware"] == "2026.08 +2"
     assert found["core"].endswith("as here")
@@ -69,7 +85,10 @@ def test_a_board_that_is_well_is_described_and_left_as_it_was(
         == "pulses of " + " ".join(f"{count / 21:.0f}" for count in board.app.counts()) + " us"
     )
     assert found["computes"] == "the same bits as here; estimate 5000 cycles, control 5000, at 168 MHz"
-    assert board.app.estimator() == flies
+    assert found["loop"].endswith(" samples/s of 1000: 10 ms held, 0 lost, 0 doubled")
+    assert board.app.c.floaty_hil_mode() == Hil.STILL
+    board.app.step(1000)
+    assert board.app.c.floaty_hil_mode() == Hil.OFF
     assert board.closed == 1
 
 
@@ -114,6 +133,15 @@ def test_what_is_not_well_is_marked_and_is_exit_code_one(
     assert [text for text in found.values() if text.startswith("!")] == [found[subject]]
 
 
+def test_a_board_that_gets_no_samples_is_told_after_a_time(
+    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    board.deaf = True
+    monkeypatch.setattr("hil.deploy.doctor.LOOP_TIMEOUT_US", 50_000)
+    assert floaty(monkeypatch, "board", "doctor", URI) == 1
+    assert findings(capsys)["loop"].startswith("!carries 0 samples/s of 1000: ")
+
+
 def test_a_board_in_someones_hand_moves_and_is_well(
     board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -149,3 +177,10 @@ def test_a_board_that_flies_or_says_nothing_is_left_alone_in_one_line(
     board.app.supervisor.state, board.silent = state, silent
     assert floaty(monkeypatch, "board", "doctor", URI) == 2
     assert f"floaty: {URI}: {said}" in capsys.readouterr().err
+
+
+def test_a_cable_without_a_board_is_told_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert floaty(monkeypatch, "board", "doctor", "usb://0") == 2
+    assert capsys.readouterr().err == "floaty: LINK usb://0: Could not open usb://0\n"

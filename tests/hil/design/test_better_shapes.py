@@ -31,9 +31,8 @@ from support.command import floaty
 CONFIG = load_config()
 PAPER = Point(CONFIG.geometry, coefficient_of(CONFIG), math.radians(28.0), 0.0, 0.9)
 DESIGNS = ("design-flat", "design-paper", "design-best")
-MIX = np.array(
-    [[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float
-)  # paper, eq. (input_signals)
+# Paper, eq. (input_signals).
+MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)
 
 
 def point_of(profile: str) -> Point:

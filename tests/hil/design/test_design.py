@@ -33,7 +33,7 @@ HOME = (0.0, 0.0, UNIFORM.hover_height)
 # Paper, eq. (input_signals): flap angles per u1..u4
 MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)
 SIGNS = np.array([1.0, -1.0, 1.0, -1.0])
-# physics.md section 3, column "plate G0"
+# By a prototype of the isolated plates, apart from this code
 PRINTED = {
     "roll_u1": 188.6, "roll_roll": -15.97, "roll_rate": -1.64, "y_u1": -3.55, "y_roll": -7.64, "pitch_u2": 78.7,
     "pitch_pitch": -119, "pitch_rate": -3.2, "x_u2": -3.87, "x_pitch": 8.09, "yaw_u3": 110.0, "yaw_rate": -0.46,
@@ -159,9 +159,8 @@ def test_inputs_alone_end_at_the_flaps_limits() -> None:
 
     alone = single(G0, HOVER, 0.0, 0.9)
     assert alone["lift"][0] == pytest.approx(at(*4 * (0.9,))[3])
-    assert alone["lift"][1] == pytest.approx(
-        at(*4 * (math.radians(3.6),))[3], rel=1e-3
-    )  # bent strips lie level then
+    # Bent strips lie level then.
+    assert alone["lift"][1] == pytest.approx(at(*4 * (math.radians(3.6),))[3], rel=1e-3)
     closed, opened = 0.0, 2 * HOVER
     # the supplement's Delta: u1 opens flap 1 and 4, u3 closes 1 and 3
     assert alone["roll"][1] == pytest.approx(at(opened, closed, closed, opened)[0])
@@ -187,7 +186,7 @@ def test_roll_becomes_stable_where_the_specification_says_and_best_hover_angles_
     assert stable.along[0] == pytest.approx(56.5, abs=0.05)
     angles = sweeps.hover_angles(PAPER)
     best = [math.degrees(angles.best(name)[0]) for name in angles.criteria]
-    assert best[:2] == pytest.approx([25.0, 26.0], abs=0.75)  # section 3, "theta_H 20-25 deg optimal"
+    assert best[:2] == pytest.approx([25.0, 26.0], abs=0.75)  # paper: 20 to 25 deg is best
     assert np.interp(math.radians(17.5), sweeps.OPENINGS, angles.constants["pitch"]) == pytest.approx(
         0, abs=6
     )

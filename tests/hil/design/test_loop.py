@@ -111,7 +111,7 @@ def test_the_y_loop_of_the_authors_gains_has_the_pole_that_the_specification_pri
     axis = AXES[0]
     poles = np.linalg.eigvals(build(axis, robot_of(config), config, NOW).closed(gains_in(config, axis)))
     slowest = np.log(poles[np.argmax(np.abs(poles))]) / STEP_S
-    assert slowest.real == pytest.approx(0.26, abs=0.03)  # physics.md section 8: +0.26 +- 4.9i
+    assert slowest.real == pytest.approx(0.26, abs=0.03)  # a prototype apart from this code has +0.26 +- 4.9i
     assert abs(slowest.imag) == pytest.approx(4.9, abs=0.05)
 
 

@@ -116,7 +116,7 @@ def test_noisy_points_give_the_pose_of_scipys_kabsch(
 
 
 def test_the_noise_of_the_pose_is_that_of_the_specification() -> None:
-    """physics.md section 6 says 0.5 mm and 0.004 rad; what least squares makes of 1.1 mm is known in closed form."""
+    """`[mocap]` says 0.5 mm and 0.004 rad; what least squares makes of 1.1 mm is known in closed form."""
     turn = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
     here, q_WB = markers(), turn.as_quat(scalar_first=True)
     seen = [here.look(HOME, q_WB) for _ in range(2000)]

@@ -5,6 +5,7 @@ from itertools import pairwise
 import pytest
 
 from hil.devices.stm32f405.chip import Why
+from hil.devices.stm32f405.processor import Processor
 from support.stm32_machine import FirmwareOnChip
 
 MS = 1000
@@ -106,3 +107,15 @@ def test_a_step_into_an_interrupt_ends_in_front_of_its_handler() -> None:
     chip.step()
     assert chip.register("pc") - handler in (2, 4)
     assert chip.state.instructions > instructions
+
+
+def test_a_busy_chip_wants_its_turn_ten_times_a_millisecond() -> None:
+    machine = FirmwareOnChip()
+    processor = Processor(machine.chip, machine.image, lambda why: None)
+    processor.run(20_000)
+    turns = 0
+    while processor.now_us < 30_000:
+        assert not machine.chip.state.asleep  # two of its tasks never wait
+        processor.run(processor.next_wake_us)
+        turns += 1
+    assert turns <= 101

@@ -11,6 +11,7 @@ from hil.devices.stm32f405.chip import Why
 from hil.devices.stm32f405.crash import CrashReports
 from hil.devices.stm32f405.freertos import FreeRtos
 from hil.devices.stm32f405.image import Image
+from hil.devices.stm32f405.log_table import log_table, parameter_table
 from hil.errors import LabError
 from support.stm32_firmware import SOURCES
 from support.stm32_machine import FirmwareOnChip
@@ -206,3 +207,20 @@ def test_a_real_crazyflie_image_is_read() -> None:
     assert kernel.tick_count == 0
     assert image.place(image.symbol("assertFail").address).startswith("assertFail (cfassert.c:")
     assert kernel.heap_free_bytes == 0
+
+
+@COMPILERS
+def test_log_variables_and_parameters_are_read_from_the_images_own_tables(compiler: str) -> None:
+    machine = FirmwareOnChip(compiler)
+    run_to_end(machine, 5)
+    log = {variable.name: variable for variable in log_table(machine.image, machine.chip)}
+    assert list(log) == ["queue.taken", "queue.lost"]  # not what a function would have to be called for
+    machine.poke("samples_lost", 42)
+    assert log["queue.lost"].read() == 42
+    table = parameter_table(machine.image, machine.chip)
+    found = {name: (one.number, one.scalar.name, one.writable, one.read()) for name, one in table.items()}
+    assert found == {
+        "test.gain": (0, "F32", True, 1.5),
+        "test.revision": (1, "U8", False, 7),
+        "wait.timeout": (3, "U16", True, 500),
+    }

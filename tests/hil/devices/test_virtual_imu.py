@@ -39,7 +39,7 @@ def settled(imu: VirtualImu, plant: Plant) -> tuple[int, ...]:
 
 
 def test_original_firmware_reads_body_rates_and_forces_from_the_counts() -> None:
-    """original-firmware.md (c): p = .7071 (gx + gy), q = .7071 (gy - gx), r = gz; on (1, 2, 3)."""
+    """The author's firmware: p = .7071 (gx + gy), q = .7071 (gy - gx), r = gz; on (1, 2, 3)."""
     plant = make_plant()
     tilt = Rotation.from_euler("ZYX", [0.3, -0.5, 0.7])
     plant.place(HOME, tilt.as_quat(scalar_first=True), omega_B=(1, 2, 3))

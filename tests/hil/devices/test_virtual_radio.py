@@ -280,9 +280,8 @@ def test_ground_station_expects_the_latency_that_this_link_has():
     bench.telemetry_every(20_000, 12_000, burst=4)
     bench.events.run(61_000_000)
     mean_us = bench.radio.up.latency_sum_us / bench.radio.up.delivered
-    assert StationConfig().link_latency_us == pytest.approx(
-        mean_us, abs=250
-    )  # half a unit of the age on the wire
+    # Half a unit of the age on the wire.
+    assert StationConfig().link_latency_us == pytest.approx(mean_us, abs=250)
 
 
 @pytest.mark.parametrize("size", [0, 33])

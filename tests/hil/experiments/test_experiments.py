@@ -157,7 +157,7 @@ def test_at_its_hover_angle_the_plant_carries_itself(speed: float) -> None:
 
 def test_no_flap_angle_carries_the_plant_at_eight_metres_per_second() -> None:
     assert max(lift(8.0, opening, "plate") for opening in np.linspace(-0.2, 0.9, 23)) < 0.8
-    assert lift(10.0, 0.0, "plate") == pytest.approx(1.18, abs=0.01)  # physics.md section 8
+    assert lift(10.0, 0.0, "plate") == pytest.approx(1.18, abs=0.01)  # a prototype apart from this code
     low, high = attainable()
     assert 9.4 < low < 9.5 < 10.25 < high < 10.5
 

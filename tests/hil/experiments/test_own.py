@@ -227,7 +227,7 @@ def test_an_own_kind_of_fault_acts_is_listed_and_shown(
     Path("mine.py").unlink()
     write_report(Path("runs/mine-1"))
     assert (
-        "it is gone or has changed since, so its own picture and its own kinds of faults are missing here"
+        "it is missing or has changed since, so its own picture and its own kinds of faults are missing here"
         in Path("runs/mine-1/report.html").read_text("utf-8")
     )
 

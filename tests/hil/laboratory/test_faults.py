@@ -159,7 +159,7 @@ def _mean_of(name: str, scale: float = 1.0) -> Seen:
 
 
 def _gyro(rows: pa.Table) -> NDArray[np.float64]:
-    """What the gyro says less the truth, p q r [deg/s]; S lies as in original-firmware.md (c)."""
+    """What the gyro says less the truth, p q r [deg/s]; S lies as the author's firmware mounts it."""
     gx, gy, gz = (GYRO_LSB * column(rows, f"imu.{name}") for name in ("gx", "gy", "gz"))
     told = np.stack((0.7071 * (gx + gy), 0.7071 * (gy - gx), gz), axis=1)
     return np.asarray(told - np.degrees(column(rows, "truth.p", "truth.q", "truth.r")))
@@ -256,8 +256,8 @@ class Sign:
 
 
 NONE = (-0.5, 0.5)
-WHITE = math.degrees(0.02) * math.sqrt(10)  # [deg/s] of one gyro sample, physics.md section 6
-MASS, INERTIA = 0.340, (1.30e-3, 1.30e-3, 1.47e-3)  # physics.md section 3
+WHITE = math.degrees(0.02) * math.sqrt(10)  # [deg/s] of one gyro sample, see [imu]
+MASS, INERTIA = 0.340, (1.30e-3, 1.30e-3, 1.47e-3)  # docs/explanation/plant.md, Plates
 FIRST = (-0.005, 0.015)  # the first 10 ms
 SIGNS = [
     Sign("mocap.dropout", _grown("link.up_sent"), (0, 0), (38, 41)),
@@ -316,13 +316,8 @@ def rows_between(table: pa.Table, begin_s: float, end_s: float) -> pa.Table:
     return table.filter((times >= begin_s) & (times < end_s))
 
 
-QUICK_SIGNS = (
-    "mocap.dropout",
-    "serial.cut",
-    "imu.bias.p",
-    "push.y=-1",
-    "cpu.load",
-)  # the others are in the long tier
+# The others are in the long tier.
+QUICK_SIGNS = ("mocap.dropout", "serial.cut", "imu.bias.p", "push.y=-1", "cpu.load")
 
 
 @pytest.mark.parametrize(
@@ -493,7 +488,7 @@ LONGER = {
     "imu.noise@1=100": "degrades",
     "servo.slow.1@1=0.2": "holds",
     "wind.fan@1=0.9": "lost",
-    "wind.side_x@1=1": "lost",  # physics.md section 8
+    "wind.side_x@1=1": "lost",  # the x axis is the weak one
     "push.x@1=2": "lost",
     "cpu.load@1=0.6": "holds",
     "cpu.load@1=0.95": "lost",
@@ -511,12 +506,8 @@ STATED = {
 }
 
 
-QUICK = (
-    "mocap.outlier@1",
-    "radio.cut@1:0.7",
-    "servo.stuck.1@1",
-    "push.y@1",
-)  # the others are in the long tier
+# The others are in the long tier.
+QUICK = ("mocap.outlier@1", "radio.cut@1:0.7", "servo.stuck.1@1", "push.y@1")
 FLIGHTS = [
     pytest.param(text, seed, marks=() if text in QUICK and seed == 1 else pytest.mark.long)
     for text in STATED

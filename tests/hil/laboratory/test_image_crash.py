@@ -1,4 +1,4 @@
-"""What an image dies of in flight, and what it left of its memory, stands in the events: of the tests' own firmware."""
+"""What an image dies of stands in the events, what it left of its memory in the result: of the tests' own firmware."""
 
 import re
 from pathlib import Path
@@ -12,14 +12,16 @@ from hil.devices.stm32f405 import firmware
 from hil.experiments import find_experiment
 from hil.laboratory.flight import Flight
 from hil.laboratory.recorder import load_events
+from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import Request, fly, lockstep, prepare
+from hil.pictures.report import write_report
 from support.stm32_firmware import build
 
 NOTHING, BUS_FAULT, _, ASSERTION, HUNGRY_WATCHDOG = range(5)
 
 
-def said(folder: Path, planted: int, duration_s: float, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What stands in the events of a flight in which something goes wrong from its beginning on."""
+def flown(folder: Path, planted: int, duration_s: float, monkeypatch: pytest.MonkeyPatch) -> Result:
+    """A flight in which something goes wrong from its beginning on."""
     elf = build()
     monkeypatch.setattr(firmware, "WARM_UP_US", 20_000)
     request = Request.of(
@@ -36,8 +38,11 @@ def said(folder: Path, planted: int, duration_s: float, monkeypatch: pytest.Monk
         return flight
 
     prepare(folder / "run")
-    fly(request, folder / "run", flight_of=made)
-    return [event["text"] for event in load_events(folder / "run")]
+    return fly(request, folder / "run", flight_of=made)
+
+
+def said(result: Result) -> list[str]:
+    return [event["text"] for event in load_events(result.folder)]
 
 
 @pytest.mark.long
@@ -55,21 +60,35 @@ def said(folder: Path, planted: int, duration_s: float, monkeypatch: pytest.Monk
 def test_what_an_image_dies_of_is_an_event(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, planted: int, expected: str
 ) -> None:
-    texts = said(tmp_path, planted, 0.3, monkeypatch)
+    result = flown(tmp_path, planted, 0.3, monkeypatch)
+    texts = said(result)
     assert any(re.match(expected, text) for text in texts), texts
     # It is told once per reset, though the fault's handler is a loop of one instruction.
     resets = sum("reset" in text for text in texts)
     assert sum(text.startswith(("HardFault", "assertion")) for text in texts) <= resets + 1
     if planted == ASSERTION:
         assert "reset by software" in texts
+    assert result.image is not None
+    counted = result.image.software_resets, result.image.watchdog_resets
+    by_watchdog = sum(text.startswith("watchdog reset") for text in texts)
+    assert counted == (texts.count("reset by software"), by_watchdog)
+    assert by_watchdog > 0 if planted == HUNGRY_WATCHDOG else sum(counted) > 0 or planted == BUS_FAULT
 
 
 @pytest.mark.long
-def test_a_flight_ends_with_what_was_never_used_of_the_stacks(
+def test_the_report_has_what_was_never_used_of_the_stacks_and_how_often_the_image_began_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    texts = said(tmp_path, NOTHING, 0.1, monkeypatch)
-    assert re.fullmatch(
-        r"bytes never used of stacks: FILTER \d+, FROZEN \d+, REPORT \d+, SPIN-0 \d+, SPIN-1 \d+, IDLE \d+",
-        texts[-1],
-    )
+    result = flown(tmp_path, ASSERTION, 0.3, monkeypatch)
+    assert read_result(result.folder).image == result.image
+    image = result.image
+    assert image is not None
+    assert list(image.stack_free_bytes) == ["FILTER", "FROZEN", "REPORT", "SPIN-0", "SPIN-1", "IDLE"]
+    assert all(0 < free < 1024 for free in image.stack_free_bytes.values())
+    assert image.heap_free_bytes is None  # it has none
+    page = write_report(result.folder).read_text(encoding="utf-8")
+    stacks = page[page.index('<table id="stacks">') :]
+    for name, free in image.stack_free_bytes.items():
+        assert f'<tr><td>{name}</td><td class="number">{free}</td></tr>' in stacks
+    assert f"<td>0 by the watchdog, {image.software_resets} by the firmware itself</td>" in page
+    assert f"--board {result.board}" in page[page.index('<dl id="story">') : page.index("</dl>")]

@@ -15,6 +15,8 @@ from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import load_schedule, runs
+from hil.pictures.compare import load_run
+from hil.studies.two_boards import two_boards
 
 ELF = os.environ.get("FLOATY_CF2_ELF", "")
 flies = pytest.mark.skipif(
@@ -50,9 +52,8 @@ def test_the_image_hovers_within_all_limits_and_twice_alike(tmp_path: Path) -> N
 def test_the_image_falls_into_its_failsafe_when_poses_stop_and_recovers(tmp_path: Path) -> None:
     result = flown(tmp_path, 4.0, "radio.cut@1:1.5")
     assert result.outcome == "completed"
-    assert (
-        0.8 < result.metrics["failsafe"] < 1.2
-    )  # from 0.5 s after the last pose to the first one afterwards
+    # From 0.5 s after the last pose to the first one afterwards.
+    assert 0.8 < result.metrics["failsafe"] < 1.2
     assert "FLOATY: supervisor: flying" in said(tmp_path)
 
 
@@ -67,6 +68,34 @@ def test_the_image_answers_a_push_as_the_python_board_does(tmp_path: Path) -> No
         for board in ("binary", "python")
     ]
     assert ages[0] == pytest.approx(ages[1], abs=10_000)
+
+
+@pytest.mark.long
+@flies
+def test_what_sets_the_image_apart_from_the_python_board_is_measured(tmp_path: Path) -> None:
+    for name, board in (("python", "python"), ("binary", ELF)):
+        flown(tmp_path / name, 1.0, board=board)
+    found = two_boards(*(load_run(tmp_path / name) for name in ("python", "binary")))
+    assert found.first is not None
+    assert found.first.why == "boot time"
+    assert [cause.split(":")[0] for cause in found.causes] == [
+        "boot time", "sensor start", "task phases", "radio", "long microsecond",
+    ]  # fmt: skip
+    assert found.causes[-1].endswith("lasts 1.0000 | 1.0119 us")  # 85 cycles of 84 MHz
+
+
+@pytest.mark.long
+@flies
+def test_an_experiments_settings_reach_the_image_before_its_release(tmp_path: Path) -> None:
+    prepare(tmp_path)
+    request = Request.of(find_experiment("yaw-step"), board=ELF)
+    result = fly(request, tmp_path)
+    assert result.passed, [verdict for verdict in result.verdicts if not verdict.passed]
+    events = load_events(tmp_path)
+    (told,) = (event for event in events if event["text"].startswith("set over the radio: "))
+    assert "RandConsts.openMin -0.192" in told["text"]
+    assert told["t_us"] < request.config.flight.release_us
+    assert not any("keeps its own" in event["text"] for event in events)
 
 
 def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks(
@@ -107,9 +136,15 @@ def test_what_is_no_image_is_refused_in_one_line(tmp_path: Path, board: str, tex
     assert "\n" not in str(refused.value)
 
 
-def test_an_image_has_no_serial_line_for_mavlink() -> None:
+@pytest.mark.parametrize("link", ["mavlink", "mavlink:pty", "mavlink:/tmp/uart"])
+def test_an_image_has_no_serial_line_for_mavlink(link: str) -> None:
     with pytest.raises(LabError, match="speaks CRTP over its radio, not MAVLink"):
-        Request.of(HOVER, link="mavlink", board=str(Path(__file__)))
+        Request.of(HOVER, link=link, board=str(Path(__file__)))
+
+
+@pytest.mark.parametrize("link", ["radio://0/80/2M/E7E7E7E7E7", "udp://127.0.0.1:19850"])
+def test_an_image_is_reached_over_radio_and_udp(link: str) -> None:
+    assert not Request.of(HOVER, link=link, board=str(Path(__file__))).in_lockstep
 
 
 def test_an_elf_beside_another_board_is_refused() -> None:

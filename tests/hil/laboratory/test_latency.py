@@ -21,14 +21,14 @@ from ground_station.latency import (
     LinkLatency,
     budget_line,
     budget_of,
+    reported_stages,
     row_of,
-    stages_told,
 )
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
-from hil.laboratory.ages import STATION_CLOCK, ages_of, told, with_goals_sent
+from hil.laboratory.ages import STATION_CLOCK, ages_of, reported_ages, with_goals_sent
 from hil.laboratory.lockstep import MAVLINK, RADIO, lockstep_flight
 from hil.laboratory.recorder import load_log
 from hil.laboratory.run import Request, fly, prepare
@@ -77,7 +77,7 @@ def test_the_line_says_what_is_assumed_and_nothing_that_was_not_told() -> None:
 @pytest.mark.parametrize("untold", [(), *STAGES[:3], STAGES[:2], STAGES[:3]])
 def test_where_a_stage_of_the_cameras_was_not_told_they_are_one_stage(untold: tuple[str, ...] | str) -> None:
     columns = {stage: [1.0, math.nan if stage in untold else 2.0] for stage in STAGES}
-    assert stages_told(columns) == ((*STAGES[:3], *STAGES[4:]) if untold == () else STAGES[3:])
+    assert reported_stages(columns) == ((*STAGES[:3], *STAGES[4:]) if untold == () else STAGES[3:])
 
 
 def test_the_budget_forgets_what_is_long_ago() -> None:
@@ -145,9 +145,9 @@ def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:
     telemetry, log = tmp_path / "run" / "telemetry.csv", load_log(tmp_path / "run")
     text = telemetry.read_text()
     telemetry.write_text(text[: len(text) - 30])
-    assert budget_line(ages_of(told(telemetry.parent), log, RADIO)) == budget_line(result.ages)
+    assert budget_line(ages_of(reported_ages(telemetry.parent), log, RADIO)) == budget_line(result.ages)
     telemetry.write_text(text.splitlines(keepends=True)[0])
-    assert ages_of(told(telemetry.parent), log, RADIO) == ()
+    assert ages_of(reported_ages(telemetry.parent), log, RADIO) == ()
 
 
 @pytest.mark.realtime

@@ -41,7 +41,7 @@ def test_modules_that_compute_what_the_core_does_make_the_same_flight(tmp_path: 
 
 @pytest.mark.long
 def test_the_law_in_the_documentation_flies(tmp_path: Path) -> None:
-    text = (ROOT / "docs" / "own-logic.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "howto" / "own-logic.md").read_text(encoding="utf-8")
     law = dedent(text.split("## A control law")[1].split("\n`control_law`")[0])
     own = go(tmp_path / "own", make_project(tmp_path, law, "", "gain_z = 4.0"), 0.5)
     assert own.passed

@@ -29,7 +29,7 @@ from hil.experiments import EXPERIMENTS
 from hil.exports.mcap import write_mcap
 from hil.exports.tlog import write_tlog
 from hil.exports.wide_csv import write_csv
-from hil.laboratory.ages import told, told_in_time_of
+from hil.laboratory.ages import ages_in_time_of, reported_ages
 from hil.laboratory.channels import Unwrapped
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import body, free_flight, known, measure
@@ -178,7 +178,7 @@ def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Pa
     drawn = [picture.title for picture in PICTURES if picture.needs in load_log(folder).column_names]
     assert drawn == ["Track", "Errors", "Flaps", "Age", "Station", "Estimate"]
     shown = [name for name, plot in page.plots.items() if not plot["alone"]]
-    assert len(page.pictures) + len(shown) == 1 + len(drawn) + 1  # its own, and the way of the poses
+    assert len(page.pictures) + len(shown) == 1 + len(drawn) + 1  # its own, and the latency budget
 
 
 def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[Path, Path]) -> None:
@@ -383,13 +383,13 @@ def test_what_the_station_recorded_stands_in_the_time_of_the_log(
     bench.fly(1.0)
     bench.result()
     log = load_log(tmp_path / "run")
-    ages, by_the_station = told_in_time_of(log, tmp_path / "run"), told(tmp_path / "run")
+    ages, by_the_station = ages_in_time_of(log, tmp_path / "run"), reported_ages(tmp_path / "run")
     assert ages.num_rows > 100
     assert ages.column("t").to_pylist() == [
         t_us - 7_000_000 for t_us in by_the_station.column("t").to_pylist()
     ]
     old = log.replace_schema_metadata({})
-    assert told_in_time_of(old, tmp_path / "run").num_rows == 0
+    assert ages_in_time_of(old, tmp_path / "run").num_rows == 0
 
 
 def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_path: Path) -> None:

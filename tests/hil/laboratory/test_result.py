@@ -22,7 +22,7 @@ from support.command import floaty
 KEYS = """
     experiment profile overrides seed duration_s link board faults source logic outcome cause metrics
     own_metrics verdicts passed tasks queues usage ages hash versions commit real_time_factor
-    stood_still_ms not_shown
+    stood_still_ms image not_shown
 """.split()  # noqa: SIM905  of result.json, which programs of users read
 
 
@@ -55,9 +55,8 @@ def test_a_result_is_read_back_as_it_was_written(result: Result) -> None:
     write_result(result)
     read = read_result(result.folder)
     metrics = {"rms_x": 0.01, "settle": math.nan, "rise": math.inf, "lap": 9.5}
-    assert repr(read) == repr(
-        replace(result, metrics=metrics)
-    )  # a NaN does not equal a NaN, but is written alike
+    # A NaN does not equal a NaN, but is written alike.
+    assert repr(read) == repr(replace(result, metrics=metrics))
 
 
 def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_number(result: Result) -> None:

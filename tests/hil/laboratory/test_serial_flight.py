@@ -49,9 +49,8 @@ def test_hover_holds_its_limits_at_every_baud_rate(tmp_path: Path, baud: int) ->
     assert column(log, "serial.up_bad")[-1] == 0
     seconds = result.metrics["flown"]
     sent = np.diff(column(log, "serial.up_bytes")[[100, -1]])[0]
-    assert result.metrics["line_up"] == pytest.approx(
-        10 * sent / baud / seconds, rel=0.05
-    )  # 10 bits per byte
+    # 10 bits per byte.
+    assert result.metrics["line_up"] == pytest.approx(10 * sent / baud / seconds, rel=0.05)
 
 
 def test_the_budget_is_stated_before_take_off(tmp_path: Path) -> None:

@@ -68,13 +68,13 @@ def test_what_does_not_fit_into_the_queue_is_dropped_and_counted() -> None:
 def test_a_picture_that_says_nothing_is_not_waited_for() -> None:
     said: list[str] = []
     view = LiveView(picture(pictures.NEVER_COMES_UP), said.append, start_timeout_s=0.01)
-    assert said == ["the viewer has not come up within 0.01 s; nobody waits for it any longer"]
+    assert said == ["the viewer has not opened within 0.01 s; the flight goes on without waiting"]
     view.rows(rows(0, 20))
     assert view.close() == 20
 
 
 @pytest.mark.parametrize(
-    ("program", "why"), [(pictures.FAILS, "no such screen"), (pictures.DIES, "ended without a word")]
+    ("program", "why"), [(pictures.FAILS, "no such screen"), (pictures.DIES, "ended without a message")]
 )
 def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight(program: str, why: str) -> None:
     with pytest.raises(LabError, match=why):

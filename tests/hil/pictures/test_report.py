@@ -1,4 +1,4 @@
-"""The report: one self-contained page that tells every metric, for every way in which a flight can end."""
+"""The report: one self-contained page with every metric, for every outcome of a flight."""
 
 import dataclasses
 import functools
@@ -28,7 +28,7 @@ from hil.laboratory.result import read_result, write_result
 from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import load_schedule
 from hil.pictures import curves
-from hil.pictures.figures import PICTURES, way
+from hil.pictures.figures import PICTURES, latency_budget
 from hil.pictures.links import link_to
 from hil.pictures.pages import library, thinned
 from hil.pictures.report import metric_rows, write_report
@@ -41,7 +41,7 @@ def report(folder: Path) -> Page:
     drawn = [
         picture for picture in hil.pictures.report.PICTURES if picture.needs in load_log(folder).column_names
     ]
-    others = [table for table in (ages.told(folder), load_schedule(folder)) if table.num_rows]
+    others = [table for table in (ages.reported_ages(folder), load_schedule(folder)) if table.num_rows]
     close_ups = [name for name in page.plots if name.startswith("close-up")]
     assert len(page.pictures) + len(page.plots) - len(close_ups) == len(drawn) + len(others)
     assert page.places == list(page.plots)
@@ -100,22 +100,22 @@ def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_way_of_the_poses_adds_up_to_their_age_and_survives_a_cut_file(folder: Path) -> None:
-    told = ages.told(folder)
-    stage = {name: told.column(name).to_numpy() for name in STAGES}
-    assert told.num_rows > 100
+def test_the_latency_budget_adds_up_to_their_age_and_survives_a_cut_file(folder: Path) -> None:
+    reported = ages.reported_ages(folder)
+    stage = {name: reported.column(name).to_numpy() for name in STAGES}
+    assert reported.num_rows > 100
     apart = stage["camera"] + stage["processing"] + stage["network"]
     assert apart == pytest.approx(stage["mocap"], abs=1e-3)
-    (panel,) = way(told).panels
+    (panel,) = latency_budget(reported).panels
     assert panel.stacked
     top = sum(line.values for line in panel.series)
     assert top == pytest.approx(apart + stage["station"] + stage["link"])
     file = folder / TELEMETRY
     file.write_bytes(file.read_bytes()[:-40])
-    assert ages.told(folder).num_rows in (told.num_rows, told.num_rows - 1)
+    assert ages.reported_ages(folder).num_rows in (reported.num_rows, reported.num_rows - 1)
     for rest in (b"", b"board.t [ms],gr"):
         file.write_bytes(rest)
-        assert ages.told(folder).num_rows == 0
+        assert ages.reported_ages(folder).num_rows == 0
     report(folder)
 
 
@@ -218,6 +218,7 @@ def test_the_report_begins_with_what_was_asked_for_what_failed_and_what_happened
     assert page.index('<dl id="story">') < page.index('<table id="metrics">')
     assert "--set a.b=c" in story
     assert "--fault push.y@0.3=2" in story
+    assert "--board" not in story  # it was the laboratory's own
     assert story.count(">fails<") == 2
     told = [(moment.t_s, moment.text) for moment in story_of(changed, lost)]
     assert [(pytest.approx(t_s, abs=2e-3), text) for t_s, text in told] == [

@@ -30,7 +30,7 @@ def robot(kink: float) -> tuple[GeometryConfig, PlantConfig]:
 
 
 def by_the_paper(flaps: NDArray[np.float64], kink: float, drag_coefficient: float) -> NDArray[np.float64]:
-    """Force and torque by eq. flaps_drag_force and drag_torque_equation, geometry by physics.md section 3."""
+    """Force and torque by eq. flaps_drag_force and drag_torque_equation, geometry by docs/explanation/plant.md."""
     plates = [(0.0064, np.array([0.0, 0.0, 1.0]), AXES)]
     fold = 0.115 - 0.0198
     for azimuth, flap in zip(AZIMUTHS, flaps, strict=True):

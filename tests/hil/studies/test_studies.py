@@ -131,7 +131,7 @@ def test_the_typical_outcome_is_the_median_and_the_worse_of_two() -> None:
 
 @pytest.mark.long
 def test_the_predictors_cliff(tmp_path: Path) -> None:
-    """The author's gains at 40 ms: lost without the predictor, not with it (physics.md section 8: 20 of 20, 0)."""
+    """The author's gains at 40 ms: lost without the predictor, not with it (a prototype: 20 of 20, 0)."""
     study = STUDIES["latency"]
     cells = {
         (variant.name, request.seed): outcome_of(

@@ -54,7 +54,8 @@ def test_a_loop_that_bears_less_delay_than_the_link_has_is_refused_with_both_num
     least = min(one.least.delay, one.least_late)
     refuse_late([one], 0.99 * least)
     with pytest.raises(
-        LabError, match=f"roll, y bears {1e3 * least:.1f} ms of delay, and poses come up to 100.0 ms later"
+        LabError,
+        match=f"roll, y tolerates {1e3 * least:.1f} ms of delay, and poses arrive up to 100.0 ms later",
     ):
         refuse_late([one], 0.1)
 

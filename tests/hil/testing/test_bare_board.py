@@ -42,13 +42,13 @@ def test_a_line_counts_once_and_those_before_it_not_at_all(board: BareBoard) -> 
     board.expect("supervisor: waiting", within_ms=1000)
     with pytest.raises(UnmetExpectation) as error:
         board.expect("gyro zero", within_ms=20)
-    assert str(error.value).startswith("'gyro zero' was not said within 20 ms from ")
-    assert str(error.value).endswith("the board said: nothing")
+    assert str(error.value).startswith("'gyro zero' not printed within 20 ms from ")
+    assert str(error.value).endswith("the board printed: nothing")
 
 
 def test_what_was_said_instead_is_shown(board: BareBoard) -> None:
     with pytest.raises(
-        UnmetExpectation, match=r"from 0 ms on; the board said:\n  imu: gyro zero found.*\n  super"
+        UnmetExpectation, match=r"from 0 ms on; the board printed:\n  imu: gyro zero found.*\n  super"
     ):
         board.expect("flying", within_ms=1000)
     assert board.now_us == 1_000_000

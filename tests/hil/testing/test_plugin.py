@@ -20,7 +20,7 @@ from hil.testing.flights import folder_of
 from support.command import floaty
 from support.examples import FILE, blocks
 
-PAGE = Path(hil.__file__).parent.parent / "docs" / "testing.md"
+PAGE = Path(hil.__file__).parent.parent / "docs" / "howto" / "tests.md"
 FLY = "def test_it(floaty):\n    assert floaty.fly(duration_s=0.3).passed\n"
 # A flight that fails its limits, by a profile whose limit nothing holds.
 FAIL = """
@@ -276,8 +276,8 @@ def test_a_board_that_cannot_be_had_is_skipped_and_the_summary_says_so(
     result.assert_outcomes(passed=1, skipped=3)
     result.stdout.fnmatch_lines(
         [
-            "floaty: 2 not flown: board c cannot be had here: no C compiler on this machine",
-            "floaty: 1 not flown: board cortex-m4 cannot be had here: no C compiler on this machine",
+            "floaty: 2 not flown: board c is not available here: no C compiler on this machine",
+            "floaty: 1 not flown: board cortex-m4 is not available here: no C compiler on this machine",
         ]
     )
 
@@ -335,7 +335,7 @@ def test_a_wrong_mark_fails_the_collection_in_one_line(pytester: pytest.Pytester
         (["--floaty-board=arm"], "--floaty-board arm: expected python, c, cortex-m4"),
         (["--floaty-seeds=-1"], "--floaty-seeds -1: expected 1 or more"),
         (["--floaty-keep=some"], "invalid choice: 'some'"),
-        (["--floaty-link=udp://127.0.0.1:1", "-n2"], "flights in real time fly one at a time; leave -n away"),
+        (["--floaty-link=udp://127.0.0.1:1", "-n2"], "flights in real time fly one at a time; omit -n"),
     ],
 )
 def test_an_option_that_cannot_be_is_refused_before_any_test(

@@ -67,7 +67,7 @@ def test_a_way_holds_every_goal_as_long_as_it_says_and_the_last_to_the_end() -> 
 
 def test_a_failing_way_shrinks_to_one_goal_on_one_axis() -> None:
     def fails(way: Along) -> bool:
-        return any(abs(goal[1]) > 0.025 for goal in way.way.goals)  # type: ignore[attr-defined]
+        return any(abs(goal[1]) > 0.025 for goal in way.path.goals)  # type: ignore[attr-defined]
 
     found = find(trajectories(), fails, settings=QUICK)
     assert found == Along(Waypoints(1.0, ((0.0, 0.03, 0.0, 0.0),)))

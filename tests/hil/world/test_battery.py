@@ -85,7 +85,7 @@ def test_draw_is_the_power_model_of_the_paper_and_the_servos() -> None:
     for row in range(1, 101):
         battery.draw(row * 10_000, 4 * 0.8 * row * 0.01)  # every flap turns at 0.8 rad/s
         assert battery.power == pytest.approx(0.3 + 4 * (0.50 + 0.33 * 0.8))
-    # physics.md section 10: hover with the author's gains, 3.28 W and 33.8 min of 1.85 Wh
+    # By a prototype apart from this code: hover with the author's gains, 3.28 W and 33.8 min of 1.85 Wh
     assert endurance(CONFIG, 3.28, 3.2) / 60 == pytest.approx(33.8, rel=0.03)
 
 

@@ -27,7 +27,7 @@ def plant_of(geometry: GeometryConfig) -> Plant:
 def test_g0_weighs_what_the_specification_prints() -> None:
     g0 = weigh(GeometryConfig())
     assert (g0.mass, g0.axis_height, g0.inertia) == (0.340, 0.07, (1.30e-3, 1.30e-3, 1.47e-3))
-    budget = weigh(GeometryConfig(inertia="masses"))  # section 3: "mass budget gives 1.40, 1.40, 1.15"
+    budget = weigh(GeometryConfig(inertia="masses"))  # docs/explanation/plant.md: the budget of masses
     assert budget.inertia == pytest.approx((1.40e-3, 1.40e-3, 1.15e-3), rel=0.006)
 
 

@@ -22,7 +22,7 @@ HOME = (0.0, 0.0, CALM.hover_height)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 VARIANTS = ("plate", "methods", "table", "methods_open", "table_open")
 
-# Paper, Table of dynamics constants, and the same constants of isolated plates as physics.md section 3 prints them
+# Paper, Table of dynamics constants, and the same constants of isolated plates as a prototype apart from this code has them
 TABLE = {
     "roll_u1": 230, "roll_roll": -16, "roll_rate": -40, "y_u1": -4.8, "y_roll": -6.5,
     "pitch_u2": 1100, "pitch_pitch": -1560, "pitch_rate": -29, "x_u2": -0.8, "x_pitch": 2.5,
@@ -100,7 +100,7 @@ def test_hover_carries_the_weight_without_torque(variant: str) -> None:
 def test_identified_stiffness_grows_with_the_slope_of_the_wind_up_to_35_degrees(
     tilt: float, felt: float
 ) -> None:
-    """At hover flaps the correction of section 4 is the tilt term alone: q (T - L) tan(slope of the wind)."""
+    """At hover flaps the correction is the tilt term alone: q (T - L) tan(slope of the wind)."""
     slope = math.tan(math.radians(felt))
     plants = [
         make(TunnelConfig(turbulence="none", profile_radius=5.0), variant=v) for v in ("methods", "plate")
@@ -115,11 +115,8 @@ def test_identified_stiffness_grows_with_the_slope_of_the_wind_up_to_35_degrees(
 
 def test_flap_forces_at_hover_are_those_of_the_specification_and_mirror_images() -> None:
     plant = make(TunnelConfig(turbulence="none", profile_radius=5.0))
-    x, y, z = (
-        -0.226,
-        -0.130,
-        0.701,
-    )  # [N] physics.md section 3, flap 1; the others by the supplement's sign table
+    # [N] by that prototype, flap 1; the others by the supplement's sign table.
+    x, y, z = (-0.226, -0.130, 0.701)
     expected = [[x, y, z], [x, -y, z], [-x, -y, z], [-x, y, z]]
     assert plant.plate_forces_W[1:] == pytest.approx(np.array(expected), abs=1e-3)
     assert plant.plate_forces_W[0] == pytest.approx([0, 0, 0.159 * 0.34 * 9.81], abs=3e-3)
@@ -368,7 +365,7 @@ SHIFTS = np.array([-3600, -5000, -9000, 6200])
 
 
 def test_published_gains_on_the_true_state_hold_the_hover() -> None:
-    """Close the loop as physics.md section 7 says (gains `tuned`), through counts, in its turbulence T0."""
+    """Close the loop with the tuned gains, through counts, in its turbulence T0."""
     plant = make(TunnelConfig())
     worst, integral = 0.0, 0.0
     for now_us in range(0, 20_000_000, 10_000):

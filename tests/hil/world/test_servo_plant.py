@@ -40,9 +40,8 @@ def test_counts_of_the_original_board_give_its_angles() -> None:
     for row in ROWS:
         for i, angle in enumerate(commanded_angles(row["counts"], ServoConfig().zero_offset, 4 * [9.0])):
             if 0 < row["words"][i] < 65535:
-                assert angle == pytest.approx(
-                    row["flaps_rad"][i], abs=1.5e-4
-                )  # the board cuts one word and one count
+                # The board cuts one word and one count.
+                assert angle == pytest.approx(row["flaps_rad"][i], abs=1.5e-4)
                 checked += 1
     assert checked > 800
 

@@ -9,7 +9,8 @@
  * what it computes in the laboratory, bit for bit, from the same counts, poses and instants.
  *
  * Time: what is decided by time counts ticks, which nobody can set. How long a pose waited is measured in microseconds,
- * by a clock that the parameter usec.reset sets to zero.
+ * by a clock that the parameter usec.reset sets to zero. With hardware in the loop, neither counts while a sample of the
+ * host is missing: floaty_hil.h.
  *
  * What receives poses and requests, and talks on the console, is floaty_task.c.
  */
@@ -68,6 +69,7 @@ static bool gyro_found;
 static FloatyGoal goal;  /* of absolute poses */
 static FloatyGoal frame; /* that the estimate is in: the last pose's goal; W itself for corrections */
 static volatile TickType_t controlled_tick;
+static bool holding; /* in this step the flight stands still */
 
 /* In ordinary memory: the macros of static_mem.h would put it into CCM, which is full. */
 static StaticQueue_t pose_queue_buffer;
@@ -103,12 +105,17 @@ void floaty_queue_pose(const FloatyPose *pose) {
   }
 }
 
-/* Only the stabilizer task asks. The sum of differences does not run back when the tick count passes 2^32. */
+int64_t floaty_pose_clock_us(void) {
+  return (int64_t)usecTimestamp() - (int64_t)floaty_hil_held() * STEP_US;
+}
+
+/* Only the stabilizer task asks. The sum of differences does not run back when the tick count passes 2^32; by a tick it
+ * does where two steps fall into one and the flight stands still. */
 static int64_t loop_us(void) {
   static TickType_t last;
   static int64_t us;
-  const TickType_t tick = xTaskGetTickCount();
-  us += (int64_t)(TickType_t)(tick - last) * STEP_US;
+  const TickType_t tick = xTaskGetTickCount() - floaty_hil_held();
+  us += (int64_t)(int32_t)(tick - last) * STEP_US;
   last = tick;
   return us;
 }
@@ -123,7 +130,7 @@ static bool asked(volatile bool *request) {
 
 static void hand_pose_to_core(FloatyPose *pose, stabilizerStep_t step) {
   /* Negative only when usec.reset has been written since the pose came: then as if it came now. */
-  const int64_t since_us = (int64_t)usecTimestamp() - pose->arrival_us;
+  const int64_t since_us = floaty_pose_clock_us() - pose->arrival_us;
   const int64_t waited_us = since_us > 0 ? since_us : 0;
   if (floaty_absolute) {
     floaty_goal_see(&goal, pose);
@@ -156,13 +163,9 @@ void floaty_gyro(int32_t counts[3]) {
 }
 
 static void take_measurements(stabilizerStep_t step) {
-  measurement_t measurement;
   FloatyPose pose;
   int32_t counts[3];
 
-  while (estimatorDequeue(&measurement)) {
-    /* Gyro and accelerometer as the firmware filters them, and whatever a deck measures: not needed here. */
-  }
   floaty_gyro(counts);
   floaty_hil_sample(counts);
   for (int axis = 0; axis < 3; axis++) {
@@ -265,12 +268,21 @@ static void begin_afresh(void) {
 }
 
 void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
+  measurement_t measurement;
+  while (estimatorDequeue(&measurement)) {
+    /* Gyro and accelerometer as the firmware filters them, and whatever a deck measures: not needed here. */
+  }
   if (!gyro_found) {
     return; /* without a gyro Floaty stays calibrating, flaps at hover */
   }
   if (floaty_hil_switched()) {
     begin_afresh();
   }
+  holding = floaty_hil_holds();
+  if (holding) {
+    return;
+  }
+  const stabilizerStep_t step = stabilizerStep - floaty_hil_held();
   if (asked(&floaty_requests.reset)) {
     call_reset();
   }
@@ -279,8 +291,8 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
      * that the robot flies; else it would disarm and stop its commander 30 s after arming. */
     motorsSetRatio(MOTOR_M4, 1);
   }
-  take_measurements(stabilizerStep);
-  if (stabilizerStep % STEPS != ESTIMATOR_PHASE) {
+  take_measurements(step);
+  if (step % STEPS != ESTIMATOR_PHASE) {
     return;
   }
   call_estimate();
@@ -325,7 +337,9 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
   if (floaty_observed.setpoint == FLOATY_SETPOINT_POSITION) {
     floaty_goal_move(&goal, setpoint);
   }
-  if (stabilizerStep % STEPS == CONTROL_PHASE) {
+  if (holding) {
+    controlled_tick = xTaskGetTickCount(); /* nothing is wrong with the loop */
+  } else if ((stabilizerStep - floaty_hil_held()) % STEPS == CONTROL_PHASE) {
     call_guard();
     floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
     if (floaty_input.mode == MODE_MANUAL && !crtpIsConnected()) {
@@ -335,7 +349,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     if (floaty_hil_mode() != FLOATY_HIL_STILL) {
       floaty_servos_write(floaty_control.count);
     }
-    floaty_hil_tell();
+    floaty_hil_tell(true);
     controlled_tick = xTaskGetTickCount();
   }
   if (stabilizerStep % BATTERY_STEPS == 0) {

@@ -46,6 +46,9 @@ void floaty_begin(void);
 /* floaty_app.c: the raw counts of the board's own gyro, zero where there is none that is known. */
 void floaty_gyro(int32_t counts[3]);
 
+/* floaty_app.c: the clock by which poses arrive [us]. */
+int64_t floaty_pose_clock_us(void);
+
 /* floaty_app.c: hands a pose to the stabilizer task; when the queue is full the oldest one goes. */
 void floaty_queue_pose(const FloatyPose *pose);
 

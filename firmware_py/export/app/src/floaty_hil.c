@@ -10,12 +10,13 @@
 #include "floaty_app.h"
 #include "floaty_wire.h"
 
-#define BUFFER 64       /* samples; a power of two, of which 65536 is a multiple */
-#define WAITING_MAX 32 /* samples: more would only make the loop slower */
+#define AXES 3
+#define BUFFER 64         /* samples; a power of two, of which 65536 is a multiple, and more than a host lets be under way */
 #define SILENT_STEPS 1000 /* without a sample the mode ends */
+#define TELL_STEPS 10     /* while the flight stands still */
 
 typedef struct {
-  int16_t counts[3];
+  int16_t counts[AXES];
 } Sample;
 
 static volatile uint8_t wanted;
@@ -24,9 +25,11 @@ static Sample buffer[BUFFER];
 static volatile uint16_t received; /* number of the next sample to come */
 static volatile uint16_t used;     /* number of the next one to take */
 static volatile uint16_t lost, doubled;
-static Sample newest;              /* that came */
+static uint16_t gap;               /* `received` when the last sample came that was not the next one */
 static Sample taken;               /* last */
-static uint16_t late;              /* steps for which no sample was there */
+static uint16_t late;              /* steps that took the last sample again */
+static volatile uint32_t held;     /* steps in which the flight stood still, ever */
+static uint32_t held_before;       /* this mode */
 static uint16_t silent_steps;
 static volatile bool begun;        /* a first sample has come */
 static bool running;               /* samples are taken */
@@ -40,9 +43,46 @@ uint8_t floaty_hil_mode(void) {
   return mode;
 }
 
-static void put(const Sample *sample) {
+uint32_t floaty_hil_held(void) {
+  return held;
+}
+
+/* What is not the next sample is not taken: the host sends what is missing, and all behind it, again. */
+static bool put(uint16_t number, const Sample *sample) {
+  const int16_t ahead = (int16_t)(number - received);
+  if (ahead < 0) {
+    doubled += 1;
+    return true;
+  }
+  if (ahead > 0 || (uint16_t)(received - used) >= BUFFER) {
+    if (gap != received) {
+      lost += (uint16_t)ahead;
+      gap = received;
+    }
+    return false;
+  }
   buffer[received % BUFFER] = *sample;
   received += 1;
+  return true;
+}
+
+/* From a sample to the next one. */
+static void go_on(Sample *sample, const uint8_t *step, uint8_t width) {
+  Sample difference;
+  if (width == FLOATY_WIDE) {
+    memcpy(&difference, step, sizeof difference);
+  } else {
+    uint32_t word;
+    memcpy(&word, step, sizeof word);
+    for (int axis = 0; axis < AXES; axis++, word >>= FLOATY_NARROW_BITS) {
+      const int32_t bits = (int32_t)(word & ((1U << FLOATY_NARROW_BITS) - 1U));
+      const int32_t sign = 1 << (FLOATY_NARROW_BITS - 1);
+      difference.counts[axis] = (int16_t)((bits ^ sign) - sign);
+    }
+  }
+  for (int axis = 0; axis < AXES; axis++) {
+    sample->counts[axis] = (int16_t)(sample->counts[axis] + difference.counts[axis]);
+  }
 }
 
 void floaty_hil_receive(const CRTPPacket *packet) {
@@ -51,27 +91,20 @@ void floaty_hil_receive(const CRTPPacket *packet) {
     return;
   }
   memcpy(&head, packet->data, sizeof head);
+  if (head.width != FLOATY_NARROW && head.width != FLOATY_WIDE) {
+    return;
+  }
   if (!begun) {
     received = used = head.number;
+    gap = (uint16_t)(received - 1);
     begun = true;
   }
-  const uint32_t count = (packet->size - sizeof head) / sizeof(Sample);
-  for (uint32_t i = 0; i < count; i++) {
-    int16_t ahead = (int16_t)(head.number + i - received);
-    if (ahead < 0) {
-      doubled += 1;
-      continue;
-    }
-    lost += (uint16_t)ahead;
-    if (ahead > BUFFER) {
-      received += (uint16_t)(ahead - BUFFER);
-      ahead = BUFFER;
-    }
-    for (; ahead > 0; ahead--) {
-      put(&newest); /* time goes on without it */
-    }
-    memcpy(&newest, packet->data + sizeof head + i * sizeof newest, sizeof newest);
-    put(&newest);
+  Sample sample = {{head.x, head.y, head.z}};
+  const uint8_t *step = packet->data + sizeof head;
+  const uint8_t *end = packet->data + packet->size;
+  for (uint16_t number = head.number; put(number, &sample) && step + head.width <= end; number++) {
+    go_on(&sample, step, head.width);
+    step += head.width;
   }
 }
 
@@ -83,10 +116,31 @@ bool floaty_hil_switched(void) {
     return false;
   }
   received = used = lost = doubled = late = silent_steps = 0;
-  memset(&newest, 0, sizeof newest);
+  held_before = held;
   memset(&taken, 0, sizeof taken);
   running = begun = false;
   mode = wanted;
+  return true;
+}
+
+bool floaty_hil_holds(void) {
+  const uint16_t waiting = (uint16_t)(received - used);
+  if (mode == FLOATY_HIL_OFF) {
+    return false;
+  }
+  running = running || waiting >= FLOATY_HIL_WAITING;
+  if (running && waiting > 0) {
+    silent_steps = 0;
+    return false;
+  }
+  silent_steps += 1;
+  if (running && silent_steps > FLOATY_HIL_HOLD) {
+    return false;
+  }
+  held += 1;
+  if (silent_steps % TELL_STEPS == 0) {
+    floaty_hil_tell(false);
+  }
   return true;
 }
 
@@ -94,27 +148,18 @@ void floaty_hil_sample(int32_t counts[3]) {
   if (mode == FLOATY_HIL_OFF) {
     return;
   }
-  uint16_t waiting = (uint16_t)(received - used);
-  if (waiting > WAITING_MAX) { /* the newest ones count */
-    lost += (uint16_t)(waiting - FLOATY_HIL_WAITING);
-    waiting = FLOATY_HIL_WAITING;
-    used = (uint16_t)(received - waiting);
-  }
-  running = running || waiting >= FLOATY_HIL_WAITING;
-  silent_steps += 1;
-  if (running && waiting > 0) {
+  if (silent_steps == 0) {
     taken = buffer[used % BUFFER];
     used += 1;
-    silent_steps = 0;
-  } else if (running) {
+  } else {
     late += 1;
   }
-  for (int axis = 0; axis < 3; axis++) {
+  for (int axis = 0; axis < AXES; axis++) {
     counts[axis] = taken.counts[axis];
   }
 }
 
-void floaty_hil_tell(void) {
+void floaty_hil_tell(bool fresh) {
   CRTPPacket packet;
   if (mode == FLOATY_HIL_OFF) {
     return;
@@ -124,6 +169,8 @@ void floaty_hil_tell(void) {
       .waiting = (uint8_t)(received - used),
       .state = floaty_supervisor.state,
       .cause = floaty_supervisor.cause,
+      .fresh = fresh,
+      .held = (uint16_t)(held - held_before),
       .late = late,
       .lost = lost,
       .doubled = doubled,

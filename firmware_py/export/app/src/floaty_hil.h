@@ -22,8 +22,14 @@ void floaty_hil_receive(const CRTPPacket *packet);
 /* The stabilizer task, once per step: whether the mode has just changed, and everything begins afresh. */
 bool floaty_hil_switched(void);
 
-/* The stabilizer task, once per step: puts the host's sample in place of the sensor's, if the mode says so. */
+/* The stabilizer task, once per step: whether the flight stands still in it, because the host's next sample is not there. */
+bool floaty_hil_holds(void);
+
+/* Any task: for how many steps the flight has stood still since the start. They count neither as steps nor as time. */
+uint32_t floaty_hil_held(void);
+
+/* The stabilizer task, once per step of the flight: puts the host's sample in place of the sensor's, if the mode says so. */
 void floaty_hil_sample(int32_t counts[3]);
 
-/* The stabilizer task, after a controller step: tells the host. */
-void floaty_hil_tell(void);
+/* The stabilizer task: tells the host; `fresh`: the controller has just run. */
+void floaty_hil_tell(bool fresh);

@@ -23,7 +23,6 @@
 #include "param.h"
 #include "param_task.h"
 #include "system.h"
-#include "usec_time.h"
 #include "watchdog.h"
 
 #include "floaty_port.h"
@@ -43,7 +42,7 @@ static StaticTask_t task;
 
 static void receive_pose(const uint8_t *data, uint32_t length) {
   FloatyPose pose;
-  if (floaty_pose_decode(data, length, (int64_t)usecTimestamp(), &pose)) {
+  if (floaty_pose_decode(data, length, floaty_pose_clock_us(), &pose)) {
     floaty_queue_pose(&pose);
   } else {
     floaty_observed.malformed += 1;

@@ -1,0 +1,100 @@
+"""What is installed here: version, commit, compiled modules, packages of the extras, and programs that are called or
+recommended.
+
+A clone asks git for its commit. A wheel or an sdist has it in a file, which `tools/build_hook.py` puts there: git would
+report the repository in which the package happens to be installed.
+"""
+
+import platform
+import re
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from firmware_py.extras import PROJECT, packages_of_extras
+from firmware_py.fast import STATE
+
+COMMIT = Path(__file__).parent / "commit.txt"
+ROOT = Path(__file__).parent.parent
+COMPUTING = ("numpy", "numba", "pyarrow")  # the packages on whose versions the bits of a flight could depend
+DEVELOPMENT = ("fast", "bench", "docs", "test", "clients")  # extras of the Makefile: no command asks for them
+# Git reports the commit, the C compilers build `--board c`, the last two serve exported and emulated images.
+PROGRAMS = ("git", "gcc", "clang", "arm-none-eabi-gcc", "gdb-multiarch")
+PROGRAM_TIMEOUT_S = 2.0
+
+
+def commit() -> str:
+    """Return the git commit of the sources, with `+` when they were changed; empty when nothing knows it."""
+    if COMMIT.is_file():
+        return COMMIT.read_text(encoding="utf-8").strip()
+    if not (ROOT / ".git").exists():
+        return ""
+    return _output(
+        "git",
+        "-C",
+        str(ROOT),
+        "describe",
+        "--always",
+        "--abbrev=12",
+        "--exclude=*",
+        "--dirty=+",
+        timeout_s=10.0,
+    )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the packages that compute a flight."""
+    return {"python": platform.python_version()} | {name: _version(name) for name in (PROJECT, *COMPUTING)}
+
+
+def describe() -> str:
+    """Return the lines of `floaty --version`; the first one is `floaty, version VERSION, STATE` in every release."""
+    rows = list(_rows())
+    width = max(len(name) for name, _ in rows)
+    lines = [f"{name:{width}}  {text}" for name, text in rows]
+    return "\n".join((f"floaty, version {_version(PROJECT)}, {STATE}", *lines))
+
+
+def _rows() -> Iterator[tuple[str, str]]:
+    yield "commit", commit() or "unknown"
+    yield "python", platform.python_version()
+    yield "packages", _found(COMPUTING)
+    for extra, packages in packages_of_extras().items():
+        if extra not in DEVELOPMENT:
+            yield (
+                f"extra {extra}",
+                _found(re.split(r"[^\w.-]", package, maxsplit=1)[0] for package in packages),
+            )
+    for program in PROGRAMS:
+        yield f"program {program}", _version_of_program(program)
+
+
+def _found(packages: Iterable[str]) -> str:
+    return ", ".join(f"{package} {_version(package)}" for package in packages)
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _version_of_program(name: str) -> str:
+    """Return what a program calls its version, without what stands in brackets: the packager's."""
+    if shutil.which(name) is None:
+        return "not found"
+    first_line = _output(name, "--version", timeout_s=PROGRAM_TIMEOUT_S).partition("\n")[0]
+    number = re.search(r"\d+(\.\d+)+", re.sub(r"\(.*?\)", "", first_line))
+    return number[0] if number else "found, of unknown version"
+
+
+def _output(*command: str, timeout_s: float) -> str:
+    """Return what a program prints; empty when it is missing, fails or takes longer."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout.strip()

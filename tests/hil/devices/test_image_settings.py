@@ -1,0 +1,113 @@
+"""Settings reach a board over the radio: told a profile's values, it is as if it was flashed with that profile."""
+
+import random
+import struct
+from collections.abc import Callable
+
+import pytest
+
+from firmware_py.config import parameters_of
+from firmware_py.links.parameters import TYPE_READ_ONLY
+from firmware_py.wire.scalars import PARAMETER_SCALARS
+from hil.config import LabConfig, load_config
+from hil.devices.stm32f405.log_table import ImageParameter
+from hil.devices.stm32f405.settings import ImageSettings
+from support.crtp_client import CrtpClient
+
+OTHER = (
+    "allocation.opening_min=-0.192", "controller.limit_u3=0.6", "controller.gain_yaw=1.0", "model.yaw_u3=90.5",
+    "estimator.gate_sigma=7", "predictor.default_age_us=41500", "servo.trim=[10,-20,30,-40]",
+    "supervisor.pose_timeout_us=700000",
+)  # fmt: skip
+
+
+class Told(CrtpClient):
+    """A board that is told the settings of `config`; what `lossy` says is lost both ways."""
+
+    def __init__(self, config: LabConfig, lossy: Callable[[], bool] = lambda: False) -> None:
+        super().__init__()
+        self.constants = self.firmware._core.parameters
+        self.said: list[str] = []
+        self.lossy = lossy
+        values = {parameter.name: parameter for parameter in self.firmware.parameters}
+        table = {
+            name: ImageParameter(
+                number, PARAMETER_SCALARS[kind & 0x0F], not kind & TYPE_READ_ONLY, values[name].read
+            )
+            for name, (number, kind) in self.toc(2).items()
+        }
+        self.sent.clear()
+        self.writes_up = 0
+        self.settings = ImageSettings(
+            table, self.differences, config, self.events, self._up, self.said.append
+        )
+        self.settings.begin(self.now_us)
+
+    def differences(self, config: LabConfig) -> str:
+        here, there = self.constants.memory, parameters_of(config).memory
+        return ", ".join(name for name in here.dtype.names if (here[name] != there[name]).any())
+
+    def _up(self, now_us: int, data: bytes) -> None:
+        self.writes_up += 1
+        if not self.lossy():
+            self.firmware.radio_received(data)
+
+    def listen(self, duration_us: int) -> None:
+        end_us = self.now_us + duration_us
+        while self.now_us < end_us:
+            self.run(self.now_us + 1000)
+            for _, data in self.sent:
+                if not self.lossy():
+                    self.settings.hear(self.now_us, data)
+            self.sent.clear()
+
+
+def test_a_board_that_is_told_a_profile_has_its_constants_bit_for_bit() -> None:
+    config = load_config("floaty", list(OTHER))
+    board = Told(config)
+    assert board.constants.bytes() != parameters_of(config).bytes()
+    board.listen(100_000)
+    assert board.constants.bytes() == parameters_of(config).bytes()
+    assert board.firmware.signals.supervisor.pose_timeout_us == 700_000
+    assert board.writes_up == len(OTHER) + 3  # one packet each, four for the trims
+    (said,) = board.said
+    assert said.startswith("set over the radio: ")
+    assert "RandConsts.openMin -0.192" in said
+
+
+def test_every_profile_can_be_told_but_for_laws_of_its_own() -> None:
+    for profile in ("as-flown", "cad", "design-best", "design-half"):
+        config = load_config(profile)
+        board = Told(config)
+        board.listen(400_000)
+        assert board.constants.bytes() == parameters_of(config).bytes(), profile
+
+
+def test_settings_arrive_over_a_link_that_loses_a_third() -> None:
+    config = load_config("floaty", list(OTHER))
+    dice = random.Random(3)
+    board = Told(config, lambda: dice.random() < 1 / 3)
+    board.listen(3_000_000)
+    assert board.constants.bytes() == parameters_of(config).bytes()
+
+
+def test_a_board_that_is_as_the_profile_says_is_told_nothing() -> None:
+    board = Told(load_config())
+    board.listen(50_000)
+    assert board.writes_up == 0
+    assert board.said == []
+
+
+def test_what_no_parameter_sets_is_said_in_one_line() -> None:
+    board = Told(load_config("floaty", ["predictor.age=fixed", "controller.limit_u3=0.6"]))
+    board.listen(50_000)
+    assert board.said == ["set over the radio: extCtrl.limU3 0.6", "the image keeps its own age_measured"]
+
+
+@pytest.mark.parametrize("packet", [b"\x2e", struct.pack("<BHf", 0x2E, 9999, 1.0), b"\x3c hello"])
+def test_packets_that_answer_nothing_change_nothing(packet: bytes) -> None:
+    board = Told(load_config("floaty", ["controller.limit_u3=0.6"]))
+    board.settings.hear(board.now_us, packet)
+    assert board.said == []
+    board.listen(50_000)
+    assert board.constants.fields.limit_u3 == pytest.approx(0.6)

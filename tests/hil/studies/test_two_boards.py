@@ -1,0 +1,166 @@
+"""Why two boards fly one seed differently: what was put into a log as a difference is told, with its size."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+
+from hil.errors import LabError
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.result import read_result, write_result
+from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.schedule import SCHEMA
+from hil.pictures.compare import Run, load_run
+from hil.studies.two_boards import CLOCK, RATES, comparable, seeds_of, two_boards
+from support.command import floaty
+
+Columns = dict[str, NDArray[np.generic]]
+RELEASE, FLOWN = 100, 30  # rows
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("boards") / "hover-1"
+    prepare(folder)
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=FLOWN / 100), folder)
+    return folder
+
+
+def other(flown: Path, folder: Path, change: Callable[[Columns], None], board: str = "cf2.elf") -> Run:
+    """The same flight by a board whose log is changed."""
+    shutil.copytree(flown, folder)
+    log = load_run(folder).log
+    columns = {name: log.column(name).to_numpy().copy() for name in log.column_names}
+    change(columns)
+    pq.write_table(pa.table(columns).replace_schema_metadata(log.schema.metadata), folder / "log.parquet")
+    write_result(replace(read_result(folder), board=board))
+    return load_run(folder)
+
+
+def bumped(columns: Columns) -> None:
+    """From the sample after the release on the counts are others, and so is what the gyro then sees."""
+    columns["motor.m3"][RELEASE + 1 :] += 1
+    columns["imu.gx"][RELEASE + 2 :] += 1
+
+
+def test_a_board_that_closes_its_loop_earlier_differs_by_its_boot_time(flown: Path, tmp_path: Path) -> None:
+    def change(columns: Columns) -> None:
+        state = columns["supervisor.state"]
+        begin = int(np.argmax(state == 2))
+        state[begin - 4 : begin] = 2
+        columns["motor.m2"][begin - 4] += 7
+        columns["cpu.IDLE"] += 3_100_000
+
+    a, b = load_run(flown), other(flown, tmp_path / "b", change)
+    begin = int(np.argmax(a.log.column("supervisor.state").to_numpy() == 2))
+    found = two_boards(a, b)
+    assert found.first is not None
+    assert (found.first.row, found.first.servo, found.first.why) == (begin - 4, "motor.m2", "boot time")
+    assert found.first.counts[1] - found.first.counts[0] == 7
+    (cause,) = found.causes
+    assert cause.startswith("boot time: the loops are closed at ")
+    assert "0.000 | 3.100 s when the record began" in cause
+
+
+def test_another_gyro_zero_is_measured_before_the_flights_part(flown: Path, tmp_path: Path) -> None:
+    def change(columns: Columns) -> None:
+        bumped(columns)
+        for name, offset in zip(RATES, (-4e-4, 1e-4, 0.0), strict=True):
+            columns[name] += np.float32(offset)
+            columns[name][RELEASE + 2 :] += np.float32(0.5)  # what comes of the other counts is no cause
+
+    found = two_boards(load_run(flown), other(flown, tmp_path / "b", change))
+    assert found.first is not None
+    assert (found.first.row, found.first.why) == (RELEASE + 1, "sensor start")
+    assert any("-0.400 +0.100 +0.000 mrad/s (p q r)" in cause for cause in found.causes)
+
+
+def test_an_estimator_that_begins_later_differs_by_its_phase(flown: Path, tmp_path: Path) -> None:
+    def change(columns: Columns) -> None:
+        bumped(columns)
+        columns["estimator.pose_age_us"][columns["estimator.fused"] > 0] += 500
+
+    b = other(flown, tmp_path / "b", change)
+    rows = [(10_000 * step + 3_000 + us, event, who, 0, 0) for step in range(5) for us, event, who in
+            ((0, "IN", "STABILIZE"), (700, "IN", "IDLE"))]  # fmt: skip
+    columns = [
+        pa.array(values, field.type) for values, field in zip(zip(*rows, strict=True), SCHEMA, strict=True)
+    ]
+    pq.write_table(pa.table(columns, schema=SCHEMA), b.result.folder / "schedule.parquet")
+    found = two_boards(load_run(flown), b)
+    assert found.first is not None
+    assert found.first.why == "task phases"
+    (cause,) = (cause for cause in found.causes if cause.startswith("task phases"))
+    assert "| 3000 us into its ten ms" in cause
+    first, second = (float(text) for text in cause.split("takes poses ")[1].split(" ms")[0].split(" | "))
+    assert second - first == pytest.approx(0.5, abs=0.011)
+
+
+def test_a_clock_with_long_microseconds_is_measured_through_its_carries(flown: Path, tmp_path: Path) -> None:
+    def change(columns: Columns) -> None:
+        bumped(columns)
+        columns[CLOCK] = (3_100_000 + columns["t"] * 84 / 85).astype(np.int64)
+        columns[CLOCK][40] -= 1 << 16  # read while the timer carried
+
+    found = two_boards(load_run(flown), other(flown, tmp_path / "b", change))
+    assert found.first is not None
+    assert found.first.why == "long microsecond"
+    assert found.causes == ("long microsecond: a microsecond of the boards' clocks lasts 1.0000 | 1.0119 us",)
+
+
+def test_what_no_known_cause_explains_is_said_so(flown: Path, tmp_path: Path) -> None:
+    found = two_boards(load_run(flown), other(flown, tmp_path / "b", bumped))
+    assert found.first is not None
+    assert found.first.why == "none of the known causes"
+    assert found.causes == ()
+
+
+def test_boards_with_the_same_counts_need_no_cause(flown: Path, tmp_path: Path) -> None:
+    found = two_boards(load_run(flown), other(flown, tmp_path / "b", lambda columns: None, "c"))
+    assert (found.first, found.causes) == (None, ())
+
+
+def test_only_flights_of_two_boards_that_were_asked_for_alike_are_comparable(
+    flown: Path, tmp_path: Path
+) -> None:
+    a = load_run(flown)
+    b = other(flown, tmp_path / "b", lambda columns: None)
+    assert comparable(a, b)
+    assert not comparable(a, a)
+    for change in ({"seed": 2}, {"seed": None}, {"overrides": ("a.b=1",)}, {"faults": ("push.y@1=1",)}):
+        assert not comparable(a, Run(b.log, replace(b.result, **change)))  # type: ignore[arg-type]
+
+
+@pytest.mark.long
+def test_two_folders_of_runs_are_a_row_per_seed(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+    for seed in (10, 2):
+        shutil.copytree(flown, tmp_path / "first" / f"hover-{seed}")
+        other(flown, tmp_path / "second" / f"hover-{seed}", bumped)
+        for name in ("first", "second"):
+            folder = tmp_path / name / f"hover-{seed}"
+            write_result(replace(read_result(folder), seed=seed))
+    shutil.copytree(flown, tmp_path / "first" / "hover-3")  # has no partner
+    found = seeds_of(tmp_path / "first", tmp_path / "second")
+    assert [one.seed for one in found] == [2, 10]
+    assert all(one.first is not None and one.first.row == RELEASE + 1 for one in found)
+    assert all(one.apart_m == 0 and one.fused[0] == one.fused[1] for one in found)
+    assert floaty(monkeypatch, "compare", tmp_path / "first", tmp_path / "second") == 1
+    assert "2 seeds: rms errors within 0.0 % of the first's, bodies within 0.00 mm" in capsys.readouterr().out
+    with pytest.raises(LabError, match="neither two runs nor folders with runs of the same names"):
+        seeds_of(tmp_path / "first", flown.parent)
+    shutil.copytree(flown, tmp_path / "alone")
+    write_result(replace(read_result(tmp_path / "alone"), seed=2))
+    assert floaty(monkeypatch, "compare", tmp_path / "alone", tmp_path / "second" / "hover-2") == 1
+    assert "first servo count: row 101" in capsys.readouterr().out
+    page = (tmp_path / "second" / "hover-2" / "compare.html").read_text(encoding="utf-8")
+    assert "<li>first servo count: row 101" in page

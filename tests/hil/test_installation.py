@@ -1,0 +1,92 @@
+"""`floaty --version`: version, commit, packages and programs, whatever is missing."""
+
+import re
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from firmware_py import extras
+from firmware_py.fast import STATE
+from hil import installation
+from hil.installation import commit, describe
+
+Program = Callable[[str, str], None]
+
+
+@pytest.fixture
+def program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Program:
+    """Writes a shell script of a name; no other program is found."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+
+    def write(name: str, script: str) -> None:
+        (tmp_path / name).write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / name).chmod(0o755)
+
+    return write
+
+
+def rows() -> dict[str, str]:
+    _, *lines = describe().splitlines()
+    return dict(re.split(" {2,}", line, maxsplit=1) for line in lines)
+
+
+def test_the_first_line_is_for_programs_and_the_others_are_aligned(program: Program) -> None:
+    first, *others = describe().splitlines()
+    assert first == f"floaty, version {version('floaty-hil')}, {STATE}"
+    assert len({len(row[0]) for line in others if (row := re.match(r"\w+( [\w-]+)? {2,}", line))}) == 1
+
+
+def test_without_git_and_tools_it_says_so(program: Program) -> None:
+    found = rows()
+    assert found["commit"] == "unknown"
+    assert {name: text for name, text in found.items() if name.startswith("program")} == {
+        f"program {name}": "not found"
+        for name in ("git", "gcc", "clang", "arm-none-eabi-gcc", "gdb-multiarch")
+    }
+
+
+def test_a_program_reports_its_own_version_and_not_its_packagers(program: Program) -> None:
+    program("gcc", "echo 'gcc (Debian 12.2.0-14+deb12u1) 12.3.1'; echo 'Copyright (C) 2022.1'")
+    program("clang", "echo 'Apple clang version 15.0.4 (clang-1500.3.9.4)'")
+    program("git", "echo no number")
+    program("gdb-multiarch", "exit 3")
+    found = rows()
+    assert (found["program gcc"], found["program clang"]) == ("12.3.1", "15.0.4")
+    assert found["program git"] == found["program gdb-multiarch"] == "found, of unknown version"
+
+
+def test_a_program_that_does_not_answer_is_left(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(installation, "PROGRAM_TIMEOUT_S", 0.05)
+    program("gcc", "while :; do :; done")
+    assert rows()["program gcc"] == "found, of unknown version"
+
+
+def test_a_missing_package_of_an_extra_is_named(program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+    requirements = [
+        "numpy>=2.0",
+        "no-such-radio[usb]>=0.1; extra == 'radio'",
+        "numpy>=2; extra == 'radio'",
+        "ruff; extra == 'test'",
+    ]
+    monkeypatch.setattr(extras, "requires", lambda project: requirements)
+    found = rows()
+    assert found["extra radio"] == f"no-such-radio not installed, numpy {version('numpy')}"
+    assert "extra test" not in found
+
+
+def test_a_package_reports_the_commit_that_it_was_built_from(
+    program: Program, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "commit.txt").write_text("0123456789ab\n")
+    monkeypatch.setattr(installation, "COMMIT", tmp_path / "commit.txt")
+    assert commit() == "0123456789ab"
+
+
+def test_the_commit_of_a_repository_around_the_package_is_not_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert re.fullmatch(r"[0-9a-f]{12}\+?", commit())
+    monkeypatch.setattr(installation, "ROOT", installation.ROOT / "hil")
+    assert commit() == ""

@@ -1,0 +1,193 @@
+"""Make the documentation's pictures anew: python tools/pictures.py [NAME.png ...]; all of them without a name.
+
+Each is made from a flight that is flown for it. Needs chromium for the report, rerun and Xvfb for the scenes, and a
+cfclient (FLOATY_CFCLIENT names the Python that has it) for its window; what is missing is said, and the picture stays as
+it is. Exit code 1: a picture could not be made.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from PIL import Image
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+BIN = Path(sys.executable).parent
+SERVED = "udp://127.0.0.1:19850"
+CFCLIENT = os.environ.get("FLOATY_CFCLIENT", "")
+# Opens cfclient's window off screen, connects it, and keeps what it shows.
+WINDOW = """
+import os, sys
+sys.argv = ["cfclient"]
+import cfclient.gui as gui
+from PyQt6.QtCore import QTimer
+from PyQt6.QtWidgets import QApplication
+import cfclient.ui.main as main
+show = main.MainUI.show
+def shown(window):
+    show(window)
+    window.resize(1400, 900)
+    QTimer.singleShot(2000, lambda: window.cf.open_link(os.environ["LINK"]))
+    QTimer.singleShot(15000, lambda: (window.grab().save(os.environ["OUT"]), os._exit(0)))
+main.MainUI.show = shown
+gui.main()
+"""
+
+
+class MissingError(Exception):
+    """A program that makes a picture is not there."""
+
+
+def floaty(*arguments: str) -> None:
+    """Fly; a limit that fails is no error here."""
+    ran = subprocess.run([BIN / "floaty", *arguments], stdout=subprocess.DEVNULL)
+    if ran.returncode > 1:
+        raise RuntimeError(f"floaty {' '.join(arguments)}: exit code {ran.returncode}")
+
+
+def program(*names: str) -> str:
+    """Return the first of these programs that is installed."""
+    for name in names:
+        if found := shutil.which(name):
+            return found
+    raise MissingError(f"{' or '.join(names)} is not installed")
+
+
+def scene(run: Path, at_s: float, out: Path) -> None:
+    """Write what rerun's viewer shows of a run at an instant."""
+    from hil.pictures.viewer import Recording
+
+    recording = Recording(run)
+    # The mouse pointer stands in the middle of the screen: below the window, where it lights nothing up.
+    command = [
+        program("xvfb-run"),
+        "-a",
+        "-s",
+        "-screen 0 3200x4400x24",
+        str(BIN / "rerun"),
+        recording.at(at_s),
+    ]
+    subprocess.run(
+        [*command, "--port", "0", "--screenshot-to", str(out), "--window-size", "1600x1000"],
+        check=True, stderr=subprocess.DEVNULL, timeout=180,
+    )  # fmt: skip
+    with Image.open(out) as picture:
+        picture.convert("RGB").resize((1600, 1000), Image.Resampling.LANCZOS).save(out, optimize=True)
+
+
+def hover(out: Path) -> None:
+    floaty(
+        "fly",
+        "hover",
+        "--duration",
+        "10",
+        "--fault",
+        "push.y@4=1.5",
+        "--fault",
+        "mocap.dropout@7.5=1",
+        "--out",
+        "run",
+    )
+    scene(Path("run"), 4.35, out)
+
+
+def markers(out: Path) -> None:
+    hidden = ("--set", "markers.enabled=true", "--fault", "marker.hidden@1=2")
+    floaty("fly", "hover", "--duration", "3", *hidden, "--out", "run")
+    scene(Path("run"), 2.0, out)
+    with Image.open(out) as picture:
+        picture.crop((0, 64, 890, 736)).save(out, optimize=True)
+
+
+def report(out: Path) -> None:
+    faults = ("--fault", "push.y@2=2", "--fault", "mocap.dropout@4:0.6")
+    floaty("fly", "hover", "--duration", "6", *faults, "--out", "run")
+    page = (Path("run") / "report.html").resolve().as_uri()
+    subprocess.run(
+        [
+            program("chromium", "chromium-browser", "google-chrome"), "--headless", "--no-sandbox", "--hide-scrollbars",
+            "--window-size=1000,2480", "--virtual-time-budget=8000", f"--screenshot={out}", page,
+        ],
+        check=True, stderr=subprocess.DEVNULL, timeout=120,
+    )  # fmt: skip
+
+
+def latency(out: Path) -> None:
+    floaty("study", "latency", "--out", "study")
+    shutil.copy(next(Path("study").rglob("study-latency.png")), out)
+
+
+def real_flight(out: Path) -> None:
+    """Fly a served robot with the ground station of real flights, and show what that has recorded."""
+    with served():
+        floaty("station", "--link", SERVED, "--duration", "10", "--out", "run")
+    scene(Path("run"), 4.0, out)
+
+
+def cfclient(out: Path) -> None:
+    if not CFCLIENT:
+        raise MissingError("FLOATY_CFCLIENT does not name a Python with cfclient")
+    with served("--station"):
+        environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen", "LINK": SERVED, "OUT": str(out)}
+        subprocess.run(
+            [CFCLIENT, "-c", WINDOW], env=environment, check=True, stderr=subprocess.DEVNULL, timeout=120
+        )
+
+
+class served:  # noqa: N801 - read as a word: with served()
+    """A robot that `floaty serve` flies while the block runs."""
+
+    def __init__(self, *options: str) -> None:
+        self._command = [BIN / "floaty", "serve", *options]
+
+    def __enter__(self) -> None:
+        self._server = subprocess.Popen(self._command, stdout=subprocess.DEVNULL)
+        time.sleep(5.0)  # until it listens
+
+    def __exit__(self, *failure: object) -> None:
+        self._server.terminate()
+        self._server.wait()
+
+
+PICTURES: dict[str, Callable[[Path], None]] = {
+    "hover-rerun.png": hover,
+    "markers.png": markers,
+    "report.png": report,
+    "latency-study.png": latency,
+    "real-flight-rerun.png": real_flight,
+    "cfclient.png": cfclient,
+}
+
+
+def main(names: list[str]) -> int:
+    if unknown := set(names) - PICTURES.keys():
+        print(
+            f"pictures: {', '.join(sorted(unknown))}: unknown; there are {', '.join(PICTURES)}",
+            file=sys.stderr,
+        )
+        return 2
+    failed = False
+    for name in names or PICTURES:
+        with TemporaryDirectory() as folder:
+            os.chdir(folder)
+            new = Path(folder) / name
+            try:
+                PICTURES[name](new)
+                shutil.copy(new, DOCS / name)
+                print(f"{name}  made")
+            except (MissingError, RuntimeError, OSError, subprocess.SubprocessError) as error:
+                print(f"{name}  stays as it is: {error}", file=sys.stderr)
+                failed = True
+            finally:
+                os.chdir(ROOT)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
