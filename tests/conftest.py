@@ -25,6 +25,8 @@ if "FLOATY_FUZZ" not in os.environ:
 REALTIME = Path(__file__).parent / "realtime"
 STANDSTILL_MS = 100  # of the test's own process, which no real-time test need survive
 METER_PERIOD_S = 0.005
+STEADY_MS, STEADY_S = 20, 5.0  # a machine runs steadily when a busy process misses no longer time for so long
+PATIENCE_S = 600.0  # that the tests of one session wait for a steady machine, together
 
 
 class InconclusiveError(Exception):
@@ -50,6 +52,29 @@ class StallMeter(threading.Thread):
 METER = StallMeter()
 
 
+class SteadyMachine:
+    """Waits, before a test that was inconclusive is repeated, until this machine runs steadily again."""
+
+    def __init__(self) -> None:
+        self.doubtful = False
+        self._left_s = PATIENCE_S
+
+    def wait(self) -> None:
+        """Wait if a test was inconclusive; not longer than there is patience."""
+        before_s = start_s = steady_since_s = time.monotonic()
+        while self.doubtful and before_s - start_s < self._left_s:
+            now_s = time.monotonic()
+            if 1000 * (now_s - before_s) > STEADY_MS:
+                steady_since_s = now_s
+            self.doubtful = now_s - steady_since_s < STEADY_S
+            before_s = now_s
+        self.doubtful = False
+        self._left_s -= before_s - start_s
+
+
+MACHINE = SteadyMachine()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what stands in `tests/realtime/`."""
     for item in items:
@@ -71,6 +96,7 @@ def pytest_xdist_auto_num_workers() -> int:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup(item: pytest.Item) -> Iterator[Any]:
     """Judge a fixture that fails."""
+    MACHINE.wait()
     return (yield from judged(item))
 
 
@@ -99,5 +125,6 @@ def judged(item: pytest.Item) -> Iterator[Any]:
             text = (
                 f"the machine stood still for {METER.longest_ms:.0f} ms, its servers for {served_ms:.0f} ms"
             )
+            MACHINE.doubtful = True
             raise InconclusiveError(f"{text}: {type(error).__name__}: {error}") from error
         raise

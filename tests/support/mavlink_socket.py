@@ -36,7 +36,6 @@ class MavlinkSocket:
         self.codec.robust_parsing = True
         self.received: list[Any] = []
         self._seen = 0  # of these, by `wait`
-        self.bytes_received = 0
 
     def write(self, data: bytes) -> None:
         """What the codec calls to send."""
@@ -56,7 +55,6 @@ class MavlinkSocket:
         else:
             data, self._peer = self._socket.recvfrom(65536)
         assert data, "the board has closed the line"
-        self.bytes_received += len(data)
         self.received += [
             message for message in self.codec.parse_buffer(data) or () if message.get_msgId() >= 0
         ]
