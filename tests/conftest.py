@@ -7,6 +7,7 @@ Property tests try the same examples on every machine, and look for new ones wit
 
 import gc
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -73,6 +74,11 @@ class SteadyMachine:
 
 
 MACHINE = SteadyMachine()
+
+
+def pytest_configure() -> None:
+    """Let Ctrl-C reach the programs under test when these tests run in the background of a shell, which ignores it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

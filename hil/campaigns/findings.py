@@ -86,8 +86,9 @@ class Influence:
 
     @property
     def ranked(self) -> list[tuple[str, float]]:
-        """Axes, the strongest first."""
-        return sorted(self.by_axis.items(), key=lambda item: -abs(item[1]))
+        """Axes above chance, the strongest first."""
+        above = [item for item in self.by_axis.items() if abs(item[1]) > (self.chance or 0.0)]
+        return sorted(above, key=lambda item: -abs(item[1]))
 
 
 @dataclass(frozen=True, slots=True)

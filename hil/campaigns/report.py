@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,8 @@ IN_A_ROW = 3
 GRID = 60
 
 
-def write_report(folder: Path, campaign: Campaign, complete: bool) -> tuple[Path, Findings]:
-    """Write report and result of the dataset; return the report's path and the findings."""
+def write_report(folder: Path, file: Path, campaign: Campaign, complete: bool) -> tuple[Path, Findings]:
+    """Write report and result of the dataset of a spec's file; return the report's path and the findings."""
     spec = campaign.spec
     findings = find(spec, read_flights(folder, schema_of(campaign)))
     histograms = [one for one in findings.limits if len(one.values) > 1]
@@ -33,7 +34,7 @@ def write_report(folder: Path, campaign: Campaign, complete: bool) -> tuple[Path
         folder / REPORT, "campaign.html.j2", spec=spec, found=findings, complete=complete,
         histograms=data_uri(png(lambda: _histograms(histograms))) if histograms else "",
         failure_map=data_uri(png(lambda: _map(mapped))) if mapped is not None else "",
-        folder=folder, begun=about(campaign)["commit"],
+        file=quote(str(file)), begun=about(campaign)["commit"],
     )  # fmt: skip
     text = json.dumps(_content(spec, findings, complete), indent=2)
     (folder / RESULT).write_text(text + "\n", encoding="utf-8")
@@ -56,7 +57,7 @@ def _content(spec: Spec, found: Findings, complete: bool) -> dict[str, Any]:
             for one in found.limits
         ],
         "influences": [
-            {"figure": one.figure, "method": one.method, "chance": one.chance, "by_axis": dict(one.ranked)}
+            {"figure": one.figure, "method": one.method, "chance": one.chance, "by_axis": dict(one.by_axis)}
             for one in found.influences
         ],
         "worst": [{"index": one.index, "why": one.why, "command": one.command} for one in found.worst],
@@ -74,6 +75,8 @@ def _histograms(limits: list[Limited]) -> Figure:
         axes.set_yscale("log")  # so that the few failures are visible
         axes.set_xlabel(f"{one.name} [{unit}]" if unit else one.name)
         axes.set_title(f"{Path(one.experiment).name}, {Path(one.profile).name}", fontsize=8)
+    for axes in grid[::IN_A_ROW]:
+        axes.set_ylabel("flights")
     for axes in grid[len(limits) :]:
         axes.set_visible(False)
     return figure

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from hil.commands.options import INTERRUPTED, announce_compilation, console, notices
-from hil.errors import LabError
+from hil.errors import LabError, require
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -46,13 +46,7 @@ def campaign(
     """
     if workers and cluster:
         raise LabError(f"--workers {workers}: not together with --cluster {cluster}")
-    try:
-        import hil.campaigns.cluster
-        import hil.campaigns.report  # noqa: F401
-    except ImportError as error:
-        from firmware_py.extras import install_command
-
-        raise LabError(f"floaty campaign needs {error.name}: {install_command('campaign')}") from None
+    require("floaty campaign", "campaign", "distributed", "SALib", "scipy")
     from hil.campaigns.config import read_spec
     from hil.campaigns.flying import Campaign
     from hil.campaigns.sampling import check_spec, draw
@@ -64,12 +58,11 @@ def campaign(
             raise LabError(f"--shrink {shrink}: the campaign has flights 0..{read.flights - 1}")
         announce_compilation()
         return _shrink(read, draw(read, shrink))
-    return _fly(
-        Campaign.of(read), out or Path("runs") / f"campaign-{spec.stem}", workers, cluster or "", resume
-    )
+    out = out or Path("runs") / f"campaign-{spec.stem}"
+    return _fly(spec, Campaign.of(read), out, workers, cluster or "", resume)
 
 
-def _fly(flown: Campaign, out: Path, workers: int | None, address: str, resume: bool) -> int:
+def _fly(file: Path, flown: Campaign, out: Path, workers: int | None, address: str, resume: bool) -> int:
     from hil.campaigns.cluster import Workers
     from hil.campaigns.dataset import Dataset
     from hil.campaigns.report import write_report
@@ -94,7 +87,7 @@ def _fly(flown: Campaign, out: Path, workers: int | None, address: str, resume: 
 
     with _progress() as show:
         standing = conduct(flown.spec, dataset, flyer, show)
-    page, findings = write_report(out, flown, standing.complete)
+    page, findings = write_report(out, file, flown, standing.complete)
     console.print(f"failed: {findings.rate}", soft_wrap=True)
     for one in findings.limits:
         console.print(f"  {one.name}: {one.rate}", soft_wrap=True)

@@ -1,6 +1,5 @@
 """What a campaign's file may say: the example loads, every mistake is one line with what, value and what is allowed."""
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -123,9 +122,8 @@ def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
 def test_a_missing_extra_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delitem(sys.modules, "hil.campaigns.cluster", raising=False)
-    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setattr("hil.errors.find_spec", lambda name: None)
     assert floaty(monkeypatch, "campaign", EXAMPLE) == 2
     told = capsys.readouterr().err
-    assert "floaty campaign needs distributed: " in told
+    assert "floaty campaign: distributed is missing: " in told
     assert "pip install 'dask[distributed]" in told
