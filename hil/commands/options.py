@@ -127,13 +127,13 @@ def close_live(view: LiveView | None, result: Result | None = None) -> None:
 
 
 def write_pictures(folder: Path, experiment: Experiment) -> None:
-    """Write recording and report; a failure is only reported, because both can be written later from the log."""
+    """Write report and recording; without rerun only the report, because the recording can be written later from the log."""
+    from hil.pictures.report import write_report
+
+    write_report(folder, experiment)
     try:
         from hil.pictures.viewer import write_run_rrd
 
         write_run_rrd(folder)
     except LabError as error:
         notices.print(f"floaty: no recording: {error}", soft_wrap=True)
-    from hil.pictures.report import write_report
-
-    write_report(folder, experiment)

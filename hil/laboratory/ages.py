@@ -7,6 +7,8 @@ saw at the row's own instant comes with a later row. `at_exposure` puts it in wh
 the two exposures around the instant, and NaN where those are too far apart, or the second one never came.
 """
 
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -50,21 +52,23 @@ def reported_ages(folder: Path) -> pa.Table:
     return pa.table(dict(zip(("t", *STAGES), times.T, strict=True)))
 
 
-def ages_in_time_of(log: pa.Table, folder: Path) -> pa.Table:
-    """The ages that the station reported, with `t` [us] in the log's time instead of the station's, and the log's metadata.
+def ages_in_time_of(log: Iterator[pa.Table], folder: Path) -> pa.Table:
+    """The ages that the station reported, with `t` [us] in the time of the log, which comes in pieces, and its metadata.
 
     Empty for a real flight whose log lacks the station's clock at its start, as older logs do.
     """
-    table, metadata = reported_ages(folder), log.schema.metadata or {}
+    table, begin = reported_ages(folder), next(log)
+    metadata = begin.schema.metadata or {}
     if STATION_START in metadata:
         start_us = int(metadata[STATION_START])
         table = table.set_column(0, "t", pa.array(column(table, "t") - start_us))
-    elif is_real(log):
+    elif is_real(begin):
         table = table.slice(0, 0)
-    elif STATION_CLOCK in log.column_names:
-        times_us = np.interp(column(table, "t"), column(log, STATION_CLOCK), column(log, "t"))
+    elif STATION_CLOCK in begin.column_names:
+        clocks = np.concatenate([column(piece, "t", STATION_CLOCK) for piece in chain([begin], log)])
+        times_us = np.interp(column(table, "t"), clocks[:, 1], clocks[:, 0])
         table = table.set_column(0, "t", pa.array(times_us))
-    return table.replace_schema_metadata(log.schema.metadata)
+    return table.replace_schema_metadata(begin.schema.metadata)
 
 
 def goals_sent(telemetry: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:

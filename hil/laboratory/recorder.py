@@ -201,17 +201,24 @@ def load_log(folder: Path) -> pa.Table:
 
     Raises `LabError` when the folder holds no log that can be read.
     """
+    return pa.concat_tables(log_pieces(folder))
+
+
+def log_pieces(folder: Path) -> Iterator[pa.Table]:
+    """Yield the log in the order of time, at least one piece, each of a quarter of an hour or less; else like `load_log`."""
+    pa.default_memory_pool().release_unused()  # what was done with a long log before has left hundreds of megabytes
     if (folder / PARQUET).is_file():
         try:
             with pa.parquet.ParquetFile(folder / PARQUET, pre_buffer=False) as file:
-                count = file.num_row_groups
-                pieces = [file.read_row_group(number, use_threads=False) for number in range(count)]
-                return pa.concat_tables([file.schema_arrow.empty_table(), *pieces])
+                yield file.schema_arrow.empty_table()
+                for number in range(file.num_row_groups):
+                    yield file.read_row_group(number, use_threads=False)
         except (pa.ArrowInvalid, OSError) as error:
             raise LabError(f"{folder / PARQUET}: not a flight log ({error})") from None
-    if (folder / STREAM).is_file():
-        return pa.concat_tables(_read_stream(folder / STREAM))
-    raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
+    elif (folder / STREAM).is_file():
+        yield from _read_stream(folder / STREAM)
+    else:
+        raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
 
 
 def release_of(metadata: Mapping[bytes, bytes] | None) -> int:

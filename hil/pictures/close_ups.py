@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from hil.pictures import curves
 from hil.pictures.curves import since_release
-from hil.pictures.pages import Shown
+from hil.pictures.pages import Shown, embedded
 from hil.pictures.panels import Marks, Plot, Spell, panel
 
 BEFORE_S, AFTER_S = 0.5, 1.0  # of a fault
@@ -33,7 +33,7 @@ def close_ups(log: pa.Table, marks: Marks) -> list[CloseUp]:
     for title, at_s, begin_s, end_s in _windows(marks):
         rows = log.filter((times >= begin_s) & (times <= end_s))
         if rows.num_rows > 1:
-            plot = _plot(rows, (begin_s, end_s))
+            plot = embedded(_plot(rows, (begin_s, end_s)))
             figure = Shown(f"close-up-{len(shown) + 1}", title, "", plot=plot, alone=True, marks=marks)
             shown.append(CloseUp(figure, at_s, begin_s, end_s))
     return shown

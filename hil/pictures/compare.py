@@ -23,7 +23,7 @@ from hil.laboratory.result import Result, read_result
 from hil.pictures import curves
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import png
-from hil.pictures.pages import Shown, write_page, zoomable
+from hil.pictures.pages import Shown, embedded, write_page, zoomable
 from hil.pictures.panels import Panel, Plot, Series
 from hil.pictures.trials import DARK
 
@@ -140,7 +140,7 @@ def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison, why: 
         "Both flights",
         f"Position and attitude against the goal and the flap angles over time. Blue: {names[0]}; orange: {names[1]}. "
         "Times count from the release of each.",
-        plot=plot,
+        plot=embedded(plot),
     )
     with writing("--out", folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -38,7 +38,7 @@ class Shown:
     title: str
     caption: str
     source: str = ""
-    plot: Plot | None = None
+    plot: dict[str, Any] | None = None  # by `embedded`
     alone: bool = False  # a plot with a window of time of its own
     marks: Marks = NOTHING
 
@@ -61,7 +61,7 @@ def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> Shown:
     name = picture.title.lower().replace(" ", "-")
     shown = drawn(picture.draw, *flights)
     if isinstance(shown, Plot):
-        return Shown(name, picture.title, picture.caption, plot=shown, marks=marks)
+        return Shown(name, picture.title, picture.caption, plot=embedded(shown), marks=marks)
     return Shown(name, picture.title, picture.caption, data_uri(shown))
 
 
@@ -78,9 +78,9 @@ def zoomable(shown: Iterable[Shown]) -> dict[str, Any]:
                 {
                     "place": one.name,
                     "alone": one.alone,
-                    "window": plot.window_s if one.alone else None,
+                    "window": plot["window"] if one.alone else None,
                     "marks": places.index(id(one.marks)),
-                    "panels": [_panel(panel) for panel in plot.panels],
+                    "panels": plot["panels"],
                 }
                 for one, plot in plots
             ],
@@ -91,6 +91,11 @@ def zoomable(shown: Iterable[Shown]) -> dict[str, Any]:
 def library() -> dict[str, str]:
     """Return uPlot's script and style, for a page to embed once."""
     return {"script": uplot_js(), "style": uplot_css()}
+
+
+def embedded(plot: Plot) -> dict[str, Any]:
+    """Return a plot as JSON values, its curves thinned: those of an hour would fill the memory."""
+    return {"window": plot.window_s, "panels": [_panel(panel) for panel in plot.panels]}
 
 
 def _panel(panel: Panel) -> dict[str, Any]:

@@ -64,7 +64,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     log = with_marks(load_log(folder), events)
     experiment = experiment or find_again(result.experiment, result.source)
     own = pictures_of(experiment) if experiment else ()
-    ages, schedule = ages_in_time_of(log, folder), load_schedule(folder)
+    ages, schedule = ages_in_time_of(iter([log]), folder), load_schedule(folder)
     of_log = [*own, *PICTURES, *([OWN_LOGIC] if own_logic(log) else [])]
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
     figures = [draw(picture, marks, log) for picture in of_log if picture.needs in log.column_names]

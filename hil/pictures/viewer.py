@@ -7,9 +7,9 @@ file that knows rerun, which comes with the extra `view`: without it, importing 
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,7 +26,7 @@ from hil.errors import LabError
 from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import BOX, body, column, is_real
-from hil.laboratory.recorder import OPERATOR, RELEASE_US, load_events, load_log, release_of
+from hil.laboratory.recorder import OPERATOR, RELEASE_US, load_events, log_pieces, release_of
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures import curves, monitor, scene
 from hil.pictures.curves import Curves
@@ -539,20 +539,22 @@ def _is_known(path: str, schema: pa.Schema) -> bool:
 
 
 def write_rrd(
-    table: pa.Table,
+    pieces: Iterator[pa.Table],
     events: Iterable[Mapping[str, Any]],
     schedule: pa.Table,
     path: Path,
     ages: pa.Table | None = None,
 ) -> None:
-    """Write a flight log (metadata in its schema), its texts, schedule and ages of poses as a rerun file."""
+    """Write a flight log (in pieces, metadata in their schema), its texts, schedule and ages of poses as a rerun file."""
     partial = path.with_name(path.name + ".partial")
     recording = rr.RecordingStream(APPLICATION)
-    recording.save(partial, default_blueprint=blueprint(table.schema))
-    stage = Stage(recording, table.schema)
-    for first in range(0, table.num_rows, ROWS_AT_ONCE):
-        stage.add_rows(table.slice(first, ROWS_AT_ONCE))
-        recording.flush()
+    begin = next(pieces)
+    recording.save(partial, default_blueprint=blueprint(begin.schema))
+    stage = Stage(recording, begin.schema)
+    for piece in chain([begin], pieces):
+        for first in range(0, piece.num_rows, ROWS_AT_ONCE):
+            stage.add_rows(piece.slice(first, ROWS_AT_ONCE))
+            recording.flush()
     stage.add_events(events)
     stage.add_schedule(schedule)
     if ages is not None:
@@ -563,8 +565,8 @@ def write_rrd(
 
 def write_run_rrd(folder: Path) -> Path:
     """Write `flight.rrd` of a run folder from its log. Raises `LabError` when there is none."""
-    path, log = folder / RECORDING, load_log(folder)
-    write_rrd(log, load_events(folder), load_schedule(folder), path, ages_in_time_of(log, folder))
+    path, ages = folder / RECORDING, ages_in_time_of(log_pieces(folder), folder)
+    write_rrd(log_pieces(folder), load_events(folder), load_schedule(folder), path, ages)
     return path
 
 
@@ -580,7 +582,7 @@ class Recording:
     def __init__(self, folder: Path) -> None:
         """Raises `LabError` when there is no log."""
         path = recording_of(folder)
-        schema = load_log(folder).schema
+        schema = next(log_pieces(folder)).schema
         self._timeline, _ = timeline_of(schema.metadata)
         self._server = rr.server.Server(host=HOST, datasets={APPLICATION: [path]})
         # rerun's own client requires a query engine that is not needed here

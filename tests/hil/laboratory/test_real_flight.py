@@ -383,13 +383,13 @@ def test_what_the_station_recorded_stands_in_the_time_of_the_log(
     bench.fly(1.0)
     bench.result()
     log = load_log(tmp_path / "run")
-    ages, by_the_station = ages_in_time_of(log, tmp_path / "run"), reported_ages(tmp_path / "run")
+    ages, by_the_station = ages_in_time_of(iter([log]), tmp_path / "run"), reported_ages(tmp_path / "run")
     assert ages.num_rows > 100
     assert ages.column("t").to_pylist() == [
         t_us - 7_000_000 for t_us in by_the_station.column("t").to_pylist()
     ]
     old = log.replace_schema_metadata({})
-    assert ages_in_time_of(old, tmp_path / "run").num_rows == 0
+    assert ages_in_time_of(iter([old]), tmp_path / "run").num_rows == 0
 
 
 def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_path: Path) -> None:

@@ -182,7 +182,7 @@ def test_a_live_flight_sends_what_the_file_holds(folder: Path, tmp_path: Path) -
 
 
 def test_an_empty_log_has_a_recording(folder: Path, tmp_path: Path) -> None:
-    viewer.write_rrd(load_log(folder).slice(0, 0), [], SCHEMA.empty_table(), tmp_path / "empty.rrd")
+    viewer.write_rrd(iter([load_log(folder).slice(0, 0)]), [], SCHEMA.empty_table(), tmp_path / "empty.rrd")
     assert rows_by_entity(tmp_path / "empty.rrd")["/world/robot/plates/flap_1"] == 1  # its mesh
 
 
@@ -292,7 +292,7 @@ def test_states_have_the_supervisors_names() -> None:
 
 
 def staged(path: Path, table: pa.Table, events: list[dict] | None = None) -> Path:
-    viewer.write_rrd(table, events or [], SCHEMA.empty_table(), path)
+    viewer.write_rrd(iter([table]), events or [], SCHEMA.empty_table(), path)
     return path
 
 
