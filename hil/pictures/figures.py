@@ -24,6 +24,7 @@ from hil.pictures.panels import INK, Panel, Plot, Series, lanes, panel
 from hil.pictures.picture import Picture
 
 TENTH, SECOND = 10, 100  # rows
+DRAWN = 50_000  # rows at most of a path, which matplotlib holds several times over
 BUSY_PERCENT = 0.02  # of the processor, above which a task gets a colour
 SCHEDULE_US = 20_000  # of the scheduler's picture
 BOX_CM = 100 * BOX
@@ -32,6 +33,7 @@ BOX_CM = 100 * BOX
 def track(rows: pa.Table) -> Figure:
     """Draw the path around the target: in space, from above, from the side."""
     points = curves.POSITION.read(free_flight(rows))
+    points = points[:: len(points) // DRAWN + 1]
     x, y, z = points.T
     figure = Figure(figsize=(WIDTH, 3.3), layout="constrained")
     grid = figure.add_gridspec(1, 3, width_ratios=(1.3, 1, 1), wspace=0.12)
