@@ -5,7 +5,8 @@ Which sampling a measure of influence needs:
     PAWN            any: the median distance of the distributions inside and outside slices of an axis, 0..1
     total Sobol     saltelli: the share of the variance that vanishes when the axis alone is fixed
     mu* of Morris   morris: the mean change of the figure over one axis
-    logistic map    any, with some failures and some flights that hold: log-odds of failing over the whole axis
+    logistic map    any, with some failures and some flights that hold: log-odds of failing over the whole axis, or from
+                    without a fault to with it
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from scipy.special import expit
 from hil.api import command_of
 from hil.campaigns.config import Spec
 from hil.campaigns.run import interval
-from hil.campaigns.sampling import LEVELS, axes, draw, points_of, problem, request_of
+from hil.campaigns.sampling import LEVELS, Axis, as_flown, axes, draw, points_of, problem, request_of
 from hil.errors import LabError
 from hil.laboratory.metrics import METRICS, Metric
 
@@ -95,8 +96,8 @@ class Influence:
 class FailureMap:
     """A logistic map from the cube to the chance of failing."""
 
-    axes: tuple[str, ...]
-    points: Array  # (N, D) 0..1
+    axes: tuple[Axis, ...]
+    points: Array  # (N, D) 0..1, as flown
     failed: NDArray[np.bool_]  # (N,)
     weights: Array  # (D,) log-odds from one end of the axis to the other
     offset: float  # log-odds at the cube's centre
@@ -108,7 +109,8 @@ class FailureMap:
     @property
     def influence(self) -> Influence:
         """The weights by axis."""
-        return Influence("failing", "logistic map", dict(zip(self.axes, self.weights.tolist(), strict=True)))
+        by_axis = {axis.name: float(weight) for axis, weight in zip(self.axes, self.weights, strict=True)}
+        return Influence("failing", "logistic map", by_axis)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +141,7 @@ def find(spec: Spec, flights: pa.Table) -> Findings:
     limits = _limits(spec, flights)
     points = points_of(spec)
     which = flights["index"].to_numpy() // spec.cells
-    mapped = _failure_map(spec, points[which], ~passed)
+    mapped = _failure_map(spec, as_flown(spec, points)[which], ~passed)
     influences = [*_influences(spec, points, which, flights, limits, ~passed)]
     if mapped is not None:
         influences.insert(0, mapped.influence)
@@ -179,8 +181,8 @@ def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
 
 
 def _failure_map(spec: Spec, points: Array, failed: NDArray[np.bool_]) -> FailureMap | None:
-    names = tuple(axis.name for axis in axes(spec))
-    if not names or min(failed.sum(), (~failed).sum()) < MAPPED_FROM:
+    known = axes(spec)
+    if not known or min(failed.sum(), (~failed).sum()) < MAPPED_FROM:
         return None
     sign = np.where(failed, 1.0, -1.0)
     centred = points - 0.5
@@ -192,8 +194,8 @@ def _failure_map(spec: Spec, points: Array, failed: NDArray[np.bool_]) -> Failur
         loss = -np.log1p(-np.minimum(doubt, 1.0 - 1e-15)).sum()
         return float(loss + 0.5 * (pull * weights).sum()), slope.sum(axis=0) + pull
 
-    fitted = minimize(cost, np.zeros(1 + len(names)), jac=True, method="L-BFGS-B").x
-    return FailureMap(names, points, failed, fitted[1:], float(fitted[0]))
+    fitted = minimize(cost, np.zeros(1 + len(known)), jac=True, method="L-BFGS-B").x
+    return FailureMap(known, points, failed, fitted[1:], float(fitted[0]))
 
 
 def _influences(

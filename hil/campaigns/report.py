@@ -14,6 +14,7 @@ from hil.campaigns.config import Spec, spec_text
 from hil.campaigns.dataset import about, read_flights, schema_of
 from hil.campaigns.findings import FailureMap, Findings, Limited, find
 from hil.campaigns.flying import Campaign
+from hil.campaigns.sampling import Axis, value_at
 from hil.laboratory.metrics import SHOWN
 from hil.pictures import curves
 from hil.pictures.drawing import WIDTH, png
@@ -22,6 +23,7 @@ from hil.pictures.pages import data_uri, write_page
 REPORT, RESULT = "report.html", "result.json"
 IN_A_ROW = 3
 GRID = 60
+TICKS = 5
 
 
 def write_report(folder: Path, file: Path, campaign: Campaign, complete: bool) -> tuple[Path, Findings]:
@@ -73,6 +75,7 @@ def _histograms(limits: list[Limited]) -> Figure:
         axes.hist(one.values * scale, bins=40, color=curves.BLUE)
         axes.axvline(one.bound * scale, color=curves.RED, linestyle="--")
         axes.set_yscale("log")  # so that the few failures are visible
+        axes.set_ylim(bottom=0.7)
         axes.set_xlabel(f"{one.name} [{unit}]" if unit else one.name)
         axes.set_title(f"{Path(one.experiment).name}, {Path(one.profile).name}", fontsize=8)
     for axes in grid[::IN_A_ROW]:
@@ -83,13 +86,23 @@ def _histograms(limits: list[Limited]) -> Figure:
 
 
 def _map(found: FailureMap) -> Figure:
-    """Draw the two axes on which failing depends most, the others at their centres, and the flights in them."""
-    across, up = ([*np.argsort(-np.abs(found.weights)), 0])[:2]
+    """Draw the two numbers on which failing depends most, with the faults that they belong to, and those flights.
+
+    All other numbers are at their centres, all other faults as frequent as they are.
+    """
+    strongest = np.argsort(-np.abs(found.weights))
+    numbers_first = sorted(strongest, key=lambda n: found.axes[n].varies is None)
+    across, up = [*numbers_first, 0][:2]
+    drawn = {found.axes[n].fault for n in (across, up)}
+    centre, those = np.full(len(found.axes), 0.5), np.full(len(found.failed), True)
+    for column, axis in enumerate(found.axes):
+        if axis.varies is None and column not in (across, up):
+            centre[column] = 1.0 if axis.fault in drawn else found.points[:, column].mean()
+            those &= (axis.fault not in drawn) | (found.points[:, column] == 1.0)
     line = np.linspace(0.0, 1.0, GRID)
-    points = np.full((GRID * GRID, len(found.axes)), 0.5)
+    points = np.tile(centre, (GRID * GRID, 1))
+    points[:, up] = np.repeat(line, GRID)
     points[:, across] = np.tile(line, GRID)
-    if len(found.axes) > 1:
-        points[:, up] = np.repeat(line, GRID)
     figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
     axes = figure.subplots()
     shown = axes.contourf(
@@ -97,9 +110,21 @@ def _map(found: FailureMap) -> Figure:
     )  # fmt: skip
     figure.colorbar(shown, label="chance of failing")
     for failed, colour, label in ((False, curves.BLUE, "holds"), (True, curves.RED, "fails")):
-        those = found.points[found.failed == failed]
-        axes.plot(those[:, across], those[:, up], ".", color=colour, markersize=3, label=label)
-    axes.set_xlabel(f"{found.axes[across]}, from low to high")
-    axes.set_ylabel(f"{found.axes[up]}, from low to high")
+        flights = found.points[those & (found.failed == failed)]
+        axes.plot(flights[:, across], flights[:, up], ".", color=colour, markersize=5, label=label)
+    axes.set_xlabel(found.axes[across].name)
+    axes.set_xticks(*_ticks(found.axes[across]))
+    axes.set_ylabel(found.axes[up].name)
+    axes.set_yticks(*_ticks(found.axes[up]))
     axes.legend(loc="upper left", bbox_to_anchor=(1.2, 1.0))
     return figure
+
+
+def _ticks(axis: Axis) -> tuple[list[float], list[str]]:
+    """Return places on an axis of the cube, and the values there."""
+    if axis.varies is None:
+        return [0.0, 1.0], ["without", "with"]
+    count = len(axis.varies.choice or ()) or TICKS
+    places = [(n + 0.5) / count for n in range(count)]
+    values = [value_at(axis.varies, place) for place in places]
+    return places, [f"{value:.3g}" if isinstance(value, float) else str(value) for value in values]

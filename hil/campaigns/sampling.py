@@ -50,10 +50,11 @@ class Draw:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One axis of the cube; a fault that may be absent has one without a distribution."""
+    """One axis of the cube: a number that varies, or whether a fault happens."""
 
     name: str
-    varies: Distribution | None
+    varies: Distribution | None  # None: whether the fault happens
+    fault: int | None = None  # whose axis it is
 
 
 @lru_cache(maxsize=8)
@@ -61,19 +62,23 @@ def axes_of(text: str) -> tuple[Axis, ...]:
     """Return the axes of a campaign, by its JSON text."""
     spec = Spec.model_validate_json(text)
     axes = [Axis(name, varies) for name, varies in _parameters(spec)]
-    for number, fault in enumerate(spec.faults, 1):
-        name = f"fault {number} {fault.kind}"
+    for number, fault in enumerate(spec.faults):
+        name = _name(number, fault)
         if fault.probability < 1.0:
-            axes.append(Axis(f"{name} happens", None))
+            axes.append(Axis(f"{name} happens", None, number))
         for part in _FAULT_PARTS:
             if isinstance(varies := getattr(fault, part), Distribution):
-                axes.append(Axis(f"{name} {part}", varies))
+                axes.append(Axis(f"{name} {part}", varies, number))
     return tuple(axes)
 
 
 def axes(spec: Spec) -> tuple[Axis, ...]:
     """Return the axes of a campaign."""
     return axes_of(spec.model_dump_json())
+
+
+def _name(number: int, fault: SampledFault) -> str:
+    return f"fault {number + 1} {fault.kind}"
 
 
 def _parameters(spec: Spec) -> list[tuple[str, Distribution]]:
@@ -92,6 +97,18 @@ def points_of(spec: Spec, first: int = 0, count: int | None = None) -> NDArray[n
     if spec.sampling == "sobol":
         return _sobol(width, spec.seed, first, count)
     return _design(spec.sampling, width, spec.points, spec.seed)[first : first + count]
+
+
+def as_flown(spec: Spec, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points of the cube, (N, D), with 1 or 0 for whether a fault happens, and 0.5 for numbers without effect."""
+    points, known = points.copy(), axes(spec)
+    for column, axis in enumerate(known):
+        if axis.varies is None and axis.fault is not None:
+            absent = points[:, column] < 1.0 - spec.faults[axis.fault].probability
+            its = [number for number, other in enumerate(known) if other.fault == axis.fault]
+            points[:, its] = np.where(absent[:, None], 0.5, points[:, its])
+            points[:, column] = ~absent
+    return points
 
 
 def _own_stream(seed: int, point: int, width: int) -> NDArray[np.float64]:
@@ -158,7 +175,7 @@ def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cel
     share = dict(zip((axis.name for axis in axes(spec)), shares.tolist(), strict=True))
     parameters = {name: value_at(varies, share[name]) for name, varies in _parameters(spec)}
     settings = (*spec.settings, *(f"{name}={_toml(value)}" for name, value in parameters.items()))
-    faults = (_fault_at(number, fault, share) for number, fault in enumerate(spec.faults, 1))
+    faults = (_fault_at(number, fault, share) for number, fault in enumerate(spec.faults))
     return Draw(
         index, point, spec.experiments[experiment], spec.profiles[profile],
         spec.seed + point * spec.seeds + repetition, settings, tuple(filter(None, faults)), parameters,
@@ -166,8 +183,8 @@ def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cel
 
 
 def _fault_at(number: int, fault: SampledFault, share: Mapping[str, float]) -> str:
-    name = f"fault {number} {fault.kind}"
-    if share.get(f"{name} happens", 0.0) >= fault.probability:
+    name = _name(number, fault)
+    if share.get(f"{name} happens", 1.0) < 1.0 - fault.probability:
         return ""
     values = [_number_at(getattr(fault, part), f"{name} {part}", share) for part in _FAULT_PARTS]
     start, duration, size = (None if value is None else repr(value) for value in values)
@@ -219,10 +236,10 @@ def check_spec(spec: Spec) -> None:
     check_design(spec)
     width = len(axes(spec))
     for cell in range(len(spec.experiments) * len(spec.profiles)):
-        request_of(spec, draw_at(spec, np.full(width, 0.001), 0, 0, cell))
+        request_of(spec, draw_at(spec, np.full(width, 0.999), 0, 0, cell))
     for column, axis in enumerate(axes(spec)):
         count = len(axis.varies.choice) if axis.varies and axis.varies.choice else 1
         for share in (0.001, *((part + 0.5) / count for part in range(count)), 0.999):
-            shares = np.full(width, 0.001)  # so that every fault occurs
+            shares = np.full(width, 0.999)  # so that every fault occurs
             shares[column] = share
             request_of(spec, draw_at(spec, shares, 0, 0, 0))

@@ -135,7 +135,8 @@ class Reflight:
         result = fly_within(self.request(trial), self._spec)
         self._outcome = self._outcome or result.outcome
         failed = not result.passed and result.outcome == self._outcome
-        self._said(f"{'fails' if failed else 'holds'}: {_text(trial)}{_why(result)}")
+        told = "fails" if failed else "holds" if result.passed else "fails otherwise"
+        self._said(f"{told}: {_text(trial)}{_why(result)}")
         return failed
 
 
