@@ -2,10 +2,11 @@
 
     python tools/bench.py             everything but the first compilation
     python tools/bench.py --compile   also a first compilation in an empty cache (about half a minute)
+    python tools/bench.py --campaign  also flights of a campaign on Dask's workers (about two minutes)
     python tools/bench.py --json FILE also writes the figures there
 
-Figures are processor time, but for the start, of this machine at this moment: compare rows of one run, not of two. Peers in
-the same run: simpy on the scheduler's scenario, a flight of RotorPy (extra `bench`), and as the floor a loop of as many
+Figures are processor time, but for start and campaign, of this machine at this moment: compare rows of one run, not of two.
+Peers in the same run: simpy on the scheduler's scenario, a flight of RotorPy (extra `bench`), and as the floor a loop of as many
 events in which nothing happens.
 """
 
@@ -192,11 +193,27 @@ class Figures:
         self.values[f"{name} [{unit}]"] = round(value, 4)
 
 
+def add_campaign(figures: Figures) -> None:
+    """Add a campaign's throughput on one worker and on one per core, and what Dask costs."""
+    from bench_campaign import growth_kb, overhead_s, throughputs  # the extra `campaign`
+
+    cores = len(os.sched_getaffinity(0))
+    first = 0.0
+    for found in throughputs(FLIGHT_S, tuple(dict.fromkeys((1, cores)))):
+        first = first or found.flights_per_s
+        name = f"campaign of 30 s flights, {found.workers} workers"
+        factor = found.flights_per_s * FLIGHT_S
+        figures.add(name, factor, "x real time", f"{found.flights_per_s / first:.2f} x one", 0)
+    figures.add("Dask, per flight", 1e3 * overhead_s(), "ms")
+    figures.add("memory kept per flight of 0.1 s", growth_kb(), "kB")
+
+
 def main() -> None:
     arguments = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     arguments.add_argument("--compile", action="store_true", help="measure a first compilation too")
+    arguments.add_argument("--campaign", action="store_true", help="measure a campaign's workers too")
     arguments.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     options = arguments.parse_args()
     with tempfile.TemporaryDirectory() as folder:  # warm up
@@ -237,6 +254,8 @@ def main() -> None:
             figures.add(
                 "start to first tick, first compilation ever", start_up_s(Path(folder)), "s", digits=1
             )
+    if options.campaign:
+        add_campaign(figures)
     Console(width=100).print(figures.table)
     if options.json:
         options.json.write_text(json.dumps(figures.values, indent=1) + "\n", encoding="utf-8")

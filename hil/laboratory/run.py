@@ -289,7 +289,11 @@ def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) ->
 
 
 def lockstep(
-    request: Request, telemetry: Path | None, clock: Clock | None, trace_all: bool, debugger: GdbServer | None = None
+    request: Request,
+    telemetry: Path | None,
+    clock: Clock | None,
+    trace_all: bool,
+    debugger: GdbServer | None = None,
 ) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` when its board is not available here."""
     with ExitStack() as stack:

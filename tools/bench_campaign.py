@@ -1,0 +1,79 @@
+"""What Dask's workers make of a campaign: `python tools/bench.py --campaign` calls this.
+
+The flights are those of `docs/table.toml`, of the length that the bench says.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from hil.campaigns.cluster import FlyOne, Workers
+from hil.campaigns.config import read_spec
+from hil.campaigns.flying import Campaign, Row, failed, fly_flight
+from hil.campaigns.sampling import draw
+
+TABLE = Path(__file__).parent.parent / "docs" / "table.toml"
+FLIGHTS = 24
+EMPTY_FLIGHTS = 300
+SHORT_S, SETTLED, SHORT_FLIGHTS = 0.1, 200, 1200  # flights until memory is measured first and last
+
+
+@dataclass(frozen=True, slots=True)
+class Throughput:
+    """Of so many workers: flights per second of wall time."""
+
+    workers: int
+    flights_per_s: float
+
+
+def nothing(campaign: Campaign, index: int) -> Row:
+    """Return a row without flying: what is left is Dask and the dataset's numbers."""
+    return failed(draw(campaign.spec, index), "not flown")
+
+
+def throughputs(flight_s: float, counts: tuple[int, ...]) -> Iterator[Throughput]:
+    """Measure flights with numbers of workers, each after one flight per worker that loads everything."""
+    for count in counts:
+        workers = Workers(count)
+        _timed(workers, flight_s, range(count), fly_flight)
+        yield Throughput(
+            count, FLIGHTS / _timed(workers, flight_s, range(count, count + FLIGHTS), fly_flight)
+        )
+        workers.close()
+
+
+def overhead_s() -> float:
+    """Wall time per flight of one worker whose flights do nothing."""
+    workers = Workers(1)
+    _timed(workers, 1.0, range(10), nothing)
+    wall_s = _timed(workers, 1.0, range(EMPTY_FLIGHTS), nothing)
+    workers.close()
+    return wall_s / EMPTY_FLIGHTS
+
+
+def growth_kb() -> float:
+    """Memory that a worker and the scheduler keep per short flight [kB]."""
+    workers = Workers(1)
+    _timed(workers, SHORT_S, range(SETTLED), fly_flight)
+    before = _memory(workers)
+    _timed(workers, SHORT_S, range(SETTLED, SHORT_FLIGHTS), fly_flight)
+    grown = _memory(workers) - before
+    workers.close()
+    return grown / 1e3 / (SHORT_FLIGHTS - SETTLED)
+
+
+def _timed(workers: Workers, flight_s: float, indices: range, fly_one: FlyOne) -> float:
+    spec = read_spec(TABLE).model_copy(update={"duration_s": flight_s, "flights": 2048})
+    start = time.perf_counter()
+    rows = list(workers.fly(Campaign.of(spec), lambda: False, iter(indices), fly_one))
+    assert len(rows) == len(indices)
+    return time.perf_counter() - start
+
+
+def _memory(workers: Workers) -> float:
+    """Bytes of this process, in which the scheduler is, and of all workers."""
+    here = psutil.Process()
+    return sum(process.memory_info().rss for process in (here, *here.children(recursive=True)))
