@@ -6,8 +6,8 @@
     python tools/bench.py --json FILE also writes the figures there
 
 Figures are processor time, but for start and campaign, of this machine at this moment: compare rows of one run, not of two.
-Peers in the same run: simpy on the scheduler's scenario, a flight of RotorPy (extra `bench`), and as the floor a loop of as many
-events in which nothing happens.
+Peers in the same run: simpy on the scheduler's scenario, a flight of RotorPy (extra `bench`), and as the floor a loop of as
+many events in which nothing happens.
 """
 
 import argparse
