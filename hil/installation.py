@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -26,12 +25,8 @@ PROGRAMS = ("git", "gcc", "clang", "arm-none-eabi-gcc", "gdb-multiarch")
 PROGRAM_TIMEOUT_S = 2.0
 
 
-@cache
 def commit() -> str:
-    """Return the git commit of the sources, with `+` when they were changed; empty when nothing knows it.
-
-    It is what it was at the first call: later changes are not in what this process executes.
-    """
+    """Return the git commit of the sources, with `+` when they were changed; empty when nothing knows it."""
     if COMMIT.is_file():
         return COMMIT.read_text(encoding="utf-8").strip()
     if not (ROOT / ".git").exists():

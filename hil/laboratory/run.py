@@ -41,7 +41,7 @@ from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Progress
 from hil.laboratory.lockstep import LOCKSTEP, MAVLINK, lockstep_flight
 from hil.laboratory.metrics import check_limits, free_flight, judge, measure
-from hil.laboratory.recorder import Onlooker, Recorder, load_log
+from hil.laboratory.recorder import EVENTS, Onlooker, Recorder, load_log
 from hil.laboratory.result import (
     RESULT,
     ImageReport,
@@ -53,6 +53,7 @@ from hil.laboratory.result import (
 )
 from hil.laboratory.robot import Executor
 
+OLDER = "older-run"  # in a run folder, until the next flight begins
 LOADED_US = 250_000  # every part of the core has been called by then
 BUILD = Path("runs/build")
 DURATION_MAX_S = 86_400.0
@@ -168,7 +169,12 @@ def fly(
 
     An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
-    flight = (flight_of or lockstep)(request, folder / TELEMETRY, clock, trace_all)
+    try:
+        flight = (flight_of or lockstep)(request, folder / TELEMETRY, clock, trace_all)
+    except BaseException:
+        _bring_back(folder)
+        raise
+    shutil.rmtree(folder / OLDER, ignore_errors=True)
     origin = request.origin()
     metadata = {**origin.metadata(), "config": request.config.model_dump_json()}
     recorder = flight.recorder = Recorder(folder, flight.channels(), metadata, onlooker)
@@ -321,14 +327,29 @@ def _runner(request: Request, stack: ExitStack, debugger: GdbServer | None) -> E
 
 
 def prepare(folder: Path) -> None:
-    """Make an empty run folder; one that holds something else than a run is left alone. Raises `LabError`."""
+    """Make a folder ready for a run; one that holds something else is left alone. Raises `LabError`.
+
+    An older run there is set aside; `fly` deletes it, or brings it back when there is no board or link to fly with.
+    """
     with writing("--out", folder):
-        if folder.exists():
-            if any(folder.iterdir()) and not any(
-                (folder / name).exists() for name in (RESULT, "events.jsonl")
-            ):
+        folder.mkdir(parents=True, exist_ok=True)
+        _bring_back(folder)  # before a flight that was never begun
+        if older := list(folder.iterdir()):
+            if not any((folder / name).exists() for name in (RESULT, EVENTS)):
                 raise LabError(
                     f"--out {folder}: the folder is not empty and holds no run; choose another one"
                 )
-            shutil.rmtree(folder)
-        folder.mkdir(parents=True)
+            (folder / OLDER).mkdir()
+            for path in older:
+                path.rename(folder / OLDER / path.name)
+
+
+def _bring_back(folder: Path) -> None:
+    """Undo what `prepare` did to an older run, and what an attempt to fly has left."""
+    if (folder / OLDER).exists():
+        for path in folder.iterdir():
+            if path.name != OLDER:
+                path.unlink()
+        for path in (folder / OLDER).iterdir():
+            path.rename(folder / path.name)
+        (folder / OLDER).rmdir()

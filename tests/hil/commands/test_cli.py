@@ -207,6 +207,17 @@ def test_a_missing_package_is_one_line_before_anything_is_flown_or_deleted(
     assert Path("runs/hover-1/log.parquet").is_file()
 
 
+@pytest.mark.parametrize("option", ["--board", "--link"])
+def test_an_older_run_is_kept_where_no_board_answers(
+    option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("runs/hover-1").mkdir(parents=True)
+    Path("runs/hover-1/result.json").write_bytes(b"of an older flight")
+    assert floaty(monkeypatch, "fly", "hover", option, "radio://7/80/2M/E7E7E7E7E7") == 2
+    assert "radio://7" in capsys.readouterr().err
+    assert [path.name for path in Path("runs/hover-1").iterdir()] == ["result.json"]
+
+
 @pytest.mark.long
 def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
