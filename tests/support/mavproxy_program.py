@@ -45,6 +45,19 @@ class MavProxy:
         """Wait for a text on the screen."""
         self._wait(lambda: text in self.screen.read_text(errors="replace"), repr(text))
 
+    def answers(self, line: str, text: str) -> None:
+        """Type a line every second until the text is on the screen: what it has logged it may not have handled yet."""
+        again = 0.0
+
+        def done() -> bool:
+            nonlocal again
+            if time.monotonic() >= again:
+                self.type(line)
+                again = time.monotonic() + 1.0
+            return text in self.screen.read_text(errors="replace")
+
+        self._wait(done, f"{text!r} after {line!r}")
+
     def heard(self) -> list[Any]:
         """Everything that it wrote into its log: 8 bytes of time ahead of each frame."""
         data, codec, messages = self._tlog.read_bytes(), dialect.MAVLink(None), []
