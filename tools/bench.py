@@ -195,15 +195,14 @@ class Figures:
 
 def add_campaign(figures: Figures) -> None:
     """Add a campaign's throughput on one worker and on one per core, and what Dask costs."""
-    from bench_campaign import growth_kb, overhead_s, throughputs  # the extra `campaign`
+    from bench_campaign import flights_per_s, growth_kb, overhead_s  # the extra `campaign`
 
-    cores = len(os.sched_getaffinity(0))
-    first = 0.0
-    for found in throughputs(FLIGHT_S, tuple(dict.fromkeys((1, cores)))):
-        first = first or found.flights_per_s
-        name = f"campaign of 30 s flights, {found.workers} workers"
-        factor = found.flights_per_s * FLIGHT_S
-        figures.add(name, factor, "x real time", f"{found.flights_per_s / first:.2f} x one", 0)
+    factors = {
+        count: FLIGHT_S * flights_per_s(FLIGHT_S, count) for count in {1, len(os.sched_getaffinity(0))}
+    }
+    for count, factor in sorted(factors.items()):
+        name = f"campaign of 30 s flights, {count} workers"
+        figures.add(name, factor, "x real time", f"{factor / factors[1]:.2f} x one", 0)
     figures.add("Dask, per flight", 1e3 * overhead_s(), "ms")
     figures.add("memory kept per flight of 0.1 s", growth_kb(), "kB")
 

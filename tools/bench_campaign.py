@@ -4,8 +4,6 @@ The flights are those of `docs/table.toml`, of the length that the bench says.
 """
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
@@ -21,28 +19,18 @@ EMPTY_FLIGHTS = 300
 SHORT_S, SETTLED, SHORT_FLIGHTS = 0.1, 200, 1200  # flights until memory is measured first and last
 
 
-@dataclass(frozen=True, slots=True)
-class Throughput:
-    """Of so many workers: flights per second of wall time."""
-
-    workers: int
-    flights_per_s: float
-
-
 def nothing(campaign: Campaign, index: int) -> Row:
     """Return a row without flying: what is left is Dask and the dataset's numbers."""
     return failed(draw(campaign.spec, index), "not flown")
 
 
-def throughputs(flight_s: float, counts: tuple[int, ...]) -> Iterator[Throughput]:
-    """Measure flights with numbers of workers, each after one flight per worker that loads everything."""
-    for count in counts:
-        workers = Workers(count)
-        _timed(workers, flight_s, range(count), fly_flight)
-        yield Throughput(
-            count, FLIGHTS / _timed(workers, flight_s, range(count, count + FLIGHTS), fly_flight)
-        )
-        workers.close()
+def flights_per_s(flight_s: float, count: int) -> float:
+    """Flights per second of wall time on `count` workers, after one flight of each that loads everything."""
+    workers = Workers(count)
+    _timed(workers, flight_s, range(count), fly_flight)
+    wall_s = _timed(workers, flight_s, range(count, count + FLIGHTS), fly_flight)
+    workers.close()
+    return FLIGHTS / wall_s
 
 
 def overhead_s() -> float:

@@ -104,7 +104,7 @@ def fly_within(request: Request, spec: Spec) -> Result:
 
 
 def _unlogged(request: Request, _telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
-    """Return the flight without the station's log, which nobody would read and a fifth of its time goes into."""
+    """Return the flight without the station's log, which nobody would read: an eighth of its time."""
     return lockstep(request, None, clock, trace_all)
 
 

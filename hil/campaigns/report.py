@@ -24,7 +24,7 @@ REPORT, RESULT = "report.html", "result.json"
 IN_A_ROW = 3
 GRID = 60
 TICKS = 5
-LEVELS = 10
+SHADES = 10
 
 
 def write_report(folder: Path, file: Path, campaign: Campaign, complete: bool) -> tuple[Path, Findings]:
@@ -107,7 +107,7 @@ def _map(found: FailureMap) -> Figure:
     figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
     axes = figure.subplots()
     percent = 100.0 * found.chance(points).reshape(GRID, GRID)
-    levels = np.linspace(0.0, percent.max(), LEVELS + 1)
+    levels = np.linspace(0.0, percent.max(), SHADES + 1)
     shown = axes.contourf(line, line, percent, levels=levels, cmap="Reds", alpha=0.6)
     figure.colorbar(shown, label="chance of failing [%]", format="%.3g")
     for failed, colour, label in ((False, curves.BLUE, "holds"), (True, curves.RED, "fails")):

@@ -81,6 +81,11 @@ def _name(number: int, fault: SampledFault) -> str:
     return f"fault {number + 1} {fault.kind}"
 
 
+def _happens_from(fault: SampledFault) -> float:
+    """Return the coordinate from which on a fault happens."""
+    return 1.0 - fault.probability
+
+
 def _parameters(spec: Spec) -> list[tuple[str, Distribution]]:
     return [*spec.parameters.items(), *table_dimensions(spec.table)]
 
@@ -104,7 +109,7 @@ def as_flown(spec: Spec, points: NDArray[np.float64]) -> NDArray[np.float64]:
     points, known = points.copy(), axes(spec)
     for column, axis in enumerate(known):
         if axis.varies is None and axis.fault is not None:
-            absent = points[:, column] < 1.0 - spec.faults[axis.fault].probability
+            absent = points[:, column] < _happens_from(spec.faults[axis.fault])
             its = [number for number, other in enumerate(known) if other.fault == axis.fault]
             points[:, its] = np.where(absent[:, None], 0.5, points[:, its])
             points[:, column] = ~absent
@@ -184,7 +189,7 @@ def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cel
 
 def _fault_at(number: int, fault: SampledFault, share: Mapping[str, float]) -> str:
     name = _name(number, fault)
-    if share.get(f"{name} happens", 1.0) < 1.0 - fault.probability:
+    if share.get(f"{name} happens", 1.0) < _happens_from(fault):
         return ""
     values = [_number_at(getattr(fault, part), f"{name} {part}", share) for part in _FAULT_PARTS]
     start, duration, size = (None if value is None else repr(value) for value in values)

@@ -95,7 +95,7 @@ class Request:
         self.experiment.check_goals(self.config.flight.home, self.duration_s)
 
     def _require_packages(self) -> None:
-        """Raise `LabError` for a package of the link or board that is missing: before an older run is deleted."""
+        """Raise `LabError` for a package of the link or board that is missing: before anything is written."""
         link, board = f"--link {self.link}", f"--board {self.board}"
         if self.link.startswith(MAVLINK):
             require(link, "mavlink", "pymavlink", *(() if self.in_lockstep else ("serial",)))

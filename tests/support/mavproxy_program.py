@@ -43,7 +43,7 @@ class MavProxy:
 
     def sees(self, text: str) -> None:
         """Wait for a text on the screen."""
-        self._wait(lambda: text in self.screen.read_text(errors="replace"), repr(text))
+        self._wait(lambda: text in self._shown(), repr(text))
 
     def answers(self, line: str, text: str) -> None:
         """Type a line every second until the text is on the screen: what it has logged it may not have handled yet."""
@@ -54,7 +54,7 @@ class MavProxy:
             if time.monotonic() >= again:
                 self.type(line)
                 again = time.monotonic() + 1.0
-            return text in self.screen.read_text(errors="replace")
+            return text in self._shown()
 
         self._wait(done, f"{text!r} after {line!r}")
 
@@ -71,10 +71,13 @@ class MavProxy:
         """Wait for a message."""
         self._wait(lambda: any(map(wanted, self.heard())), "message")
 
+    def _shown(self) -> str:
+        return self.screen.read_text(errors="replace")
+
     def _wait(self, done: Callable[[], bool], what: str) -> None:
         deadline = time.monotonic() + PATIENCE_S
         while not done():
-            screen = self.screen.read_text(errors="replace")
+            screen = self._shown()
             assert time.monotonic() < deadline, f"no {what} on {screen!r}"
             assert self.process.poll() is None, screen
             time.sleep(0.05)
