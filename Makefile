@@ -55,7 +55,7 @@ wheel: .venv/fast.stamp
 	@touch $@
 
 .venv/fly.stamp: .venv/pip.stamp pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable '.[radio,mavlink,view,identify]'
+	$(BIN)/python -m pip install --quiet --editable '.[radio,mavlink,view,identify,design]'
 	@touch $@
 
 .venv/test.stamp: .venv/fly.stamp

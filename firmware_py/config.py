@@ -1,22 +1,22 @@
 """The constants that are flashed: one section per part of the flight core, filled from a profile.
 
-No value has a default here: a profile states them all, with their reasons. Units are SI, angles in radians.
+No value has a default here: a profile states them all, with their reasons. Units are SI, angles in radians. The keys of
+what clients may set, too, are declared at the fields of the core.
 """
 
-from typing import Annotated, Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from firmware_py.core.structs import HORIZON_LIMIT, Parameters
-from firmware_py.core.subset import Block
+from firmware_py.core.structs import Parameters
+from firmware_py.core.subset import Block, f32, i32
 from firmware_py.drivers.imu import GYRO_SCALE
+from firmware_py.table import CORE_PARAMETERS, ProfileKey, profile_keys, value_in
 
-Gain = Annotated[float, Field(ge=-20, le=20)]
-Coupling = Annotated[float, Field(ge=-5000, le=5000)]
-Variance = Annotated[float, Field(gt=0, le=100)]
-Excitation = Annotated[float, Field(ge=0, le=0.3)]
-Frequency = Annotated[float, Field(ge=0.1, le=10)]
-Trim = Annotated[float, Field(ge=-12000, le=12000)]
+SIGNALS = ("off", "multisine", "chirp")  # by their numbers in excite.signal
+
+S = TypeVar("S", bound="Section")
 
 
 class Section(BaseModel):
@@ -25,103 +25,79 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class ModelConfig(Section):
+def _declared(section: str) -> Callable[[type[S]], type[S]]:
+    """Return the decorator that gives a section the keys which the table of variables declares for it."""
+
+    def filled(model: type[S]) -> type[S]:
+        fields: dict[str, Any] = {
+            key.name: (
+                _kind(key),
+                Field(description=f"{key.mark.meaning} [{key.mark.unit}]".removesuffix(" []")),
+            )
+            for key in profile_keys(section)
+        }
+        return create_model(
+            model.__name__, __base__=model, __doc__=model.__doc__, __module__=model.__module__, **fields
+        )
+
+    return filled
+
+
+def _kind(key: ProfileKey) -> Any:
+    """Return the type of a key, with its bounds."""
+    low, high = key.mark.low, key.mark.high
+    if key.base == "i32" and (low, high) == (0, 1):
+        return bool
+    number: Any = int if key.base == "i32" else float
+    bounded: Any = Annotated[number, Field(ge=low, le=high)]
+    return bounded if key.count == 1 else tuple.__class_getitem__((bounded,) * key.count)
+
+
+class Declared(Section):
+    """A section whose keys are declared at the fields that they set: `firmware_py.table`."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, key: str) -> Any:
+            """Return the value of a declared key."""
+
+
+@_declared("model")
+class ModelConfig(Declared):
     """The linear model on board: the paper's f_{affected, influencing} at hover, couplings to vx and vy included."""
 
-    flap_rate: float = Field(gt=1, le=1000, description="inverse time constant of servo and linkage [1/s]")
-    roll_u1: Coupling = Field(description="roll acceleration per u1 [1/s^2]")
-    roll_roll: Coupling = Field(description="roll acceleration per roll [1/s^2]")
-    roll_rate: Coupling = Field(description="roll acceleration per roll rate [1/s]")
-    roll_vy: Coupling = Field(description="roll acceleration per velocity to the left [rad/s/m]")
-    y_u1: Coupling = Field(description="y acceleration per u1 [m/s^2/rad]")
-    y_roll: Coupling = Field(description="y acceleration per roll [m/s^2/rad]")
-    y_vy: Coupling = Field(description="y acceleration per y velocity [1/s]")
-    pitch_u2: Coupling = Field(description="pitch acceleration per u2 [1/s^2]")
-    pitch_pitch: Coupling = Field(description="pitch acceleration per pitch [1/s^2]")
-    pitch_rate: Coupling = Field(description="pitch acceleration per pitch rate [1/s]")
-    pitch_vx: Coupling = Field(description="pitch acceleration per x velocity [rad/s/m]")
-    x_u2: Coupling = Field(description="x acceleration per u2 [m/s^2/rad]")
-    x_pitch: Coupling = Field(description="x acceleration per pitch [m/s^2/rad]")
-    x_vx: Coupling = Field(description="x acceleration per x velocity [1/s]")
-    yaw_u3: Coupling = Field(description="yaw acceleration per u3 [1/s^2]")
-    yaw_rate: Coupling = Field(description="yaw acceleration per yaw rate [1/s]")
-    z_u4: Coupling = Field(description="z acceleration per u4 [m/s^2/rad]")
-    z_vz: Coupling = Field(description="z acceleration per z velocity [1/s]")
 
-
-class EstimatorConfig(Section):
+@_declared("estimator")
+class EstimatorConfig(Declared):
     """Noise, gate and bounds of the Kalman filter."""
 
-    process_position: Variance = Field(description="variance per 10 ms tick [m^2]")
-    process_velocity: Variance = Field(description="variance per tick [m^2/s^2]")
-    process_attitude: Variance = Field(description="variance per tick [rad^2]")
-    process_rate: Variance = Field(description="variance per tick [rad^2/s^2]")
-    process_flap: Variance = Field(description="variance per tick [rad^2]")
-    measured_position: Variance = Field(description="variance of a mocap position [m^2]")
-    measured_attitude: Variance = Field(description="variance of a mocap angle [rad^2]")
-    measured_rate: Variance = Field(description="variance of a gyro sample, mean of 10 [rad^2/s^2]")
-    gate_sigma: float = Field(gt=1, le=100, description="innovation gate [standard deviations]")
-    gate_position: float = Field(gt=0, le=10, description="the gate never refuses less than this [m]")
-    gate_attitude: float = Field(gt=0, le=4, description="the gate never refuses less than this [rad]")
-    bound_position: float = Field(gt=0, le=10, description="bound on each position [m]")
-    bound_velocity: float = Field(gt=0, le=20, description="bound on each velocity [m/s]")
-    bound_tilt: float = Field(gt=0, le=1.5, description="bound on roll and pitch [rad]")
-    bound_rate: float = Field(gt=0, le=40, description="bound on body rates [rad/s]")
 
-
-class PredictorConfig(Section):
+@_declared("predictor")
+class PredictorConfig(Declared):
     """Delay compensation."""
 
-    enabled: bool = Field(description="false: every pose counts as current, as in the original firmware")
     age: Literal["measured", "fixed"] = Field(
         description="measured: poses state their age and the horizon follows it; fixed: always `horizon` ticks"
     )
-    horizon: int = Field(ge=1, le=HORIZON_LIMIT, description="first or fixed horizon [ticks of 10 ms]")
-    default_age_us: int = Field(ge=0, le=120_000, description="age of a pose that does not state it [us]")
 
 
-class ControllerConfig(Section):
+@_declared("controller")
+class ControllerConfig(Declared):
     """Gains in the paper's signs: u = gain (target - estimate) - gains (velocity, attitude, rate)."""
 
-    gain_y: Gain = Field(description="u1 per y error [rad/m]")
-    gain_vy: Gain = Field(description="u1 per -vy [rad s/m]")
-    gain_roll: Gain = Field(description="u1 per -roll")
-    gain_p: Gain = Field(description="u1 per -p [s]")
-    gain_x: Gain = Field(description="u2 per x error [rad/m]")
-    gain_vx: Gain = Field(description="u2 per -vx [rad s/m]")
-    gain_pitch: Gain = Field(description="u2 per -pitch")
-    gain_q: Gain = Field(description="u2 per -q [s]")
-    gain_yaw: Gain = Field(description="u3 per yaw error")
-    gain_r: Gain = Field(description="u3 per -r [s]")
-    gain_z: Gain = Field(description="u4 per z error [rad/m]")
-    gain_vz: Gain = Field(description="u4 per -vz [rad s/m]")
-    gain_iz: Gain = Field(description="u4 per integral of the z error [rad/m/s]")
-    limit_xy: float = Field(gt=0, le=5, description="limit on the x and y errors [m]")
-    limit_u: float = Field(gt=0, le=1.5, description="limit on u1, u2 and u4 [rad]")
-    limit_u3: float = Field(gt=0, le=1.5, description="limit on u3 [rad]")
-    limit_iz: float = Field(ge=0, le=5, description="limit on the integral of the z error [m s]")
 
-
-class AllocationConfig(Section):
+@_declared("allocation")
+class AllocationConfig(Declared):
     """Hover angle and range of the flaps, as openings (positive for every flap)."""
 
-    hover_angle: float = Field(ge=0, le=1.2, description="opening at hover, theta_H [rad]")
-    opening_min: float = Field(ge=-1, le=1.5, description="least opening [rad]")
-    opening_max: float = Field(ge=-1, le=1.5, description="greatest opening [rad]")
 
-
-class ExcitationConfig(Section):
+@_declared("excitation")
+class ExcitationConfig(Declared):
     """What is added to the inputs for identification, once `excite.signal` on board switches it on."""
 
     signal: Literal["multisine", "chirp"] = Field(
         description="multisine: all inputs at once, each with lines of its own; chirp: one input"
     )
-    u1: Excitation = Field(description="rms of what is added to u1 [rad]; 0: nothing")
-    u2: Excitation = Field(description="rms of what is added to u2 [rad]; 0: nothing")
-    u3: Excitation = Field(description="rms of what is added to u3 [rad]; 0: nothing")
-    u4: Excitation = Field(description="rms of what is added to u4 [rad]; 0: nothing")
-    low: Frequency = Field(description="lower end of the band [Hz]")
-    high: Frequency = Field(description="upper end of the band [Hz]")
 
     @property
     def rms(self) -> tuple[float, float, float, float]:
@@ -129,22 +105,23 @@ class ExcitationConfig(Section):
         return (self.u1, self.u2, self.u3, self.u4)
 
 
-class ServoConfig(Section):
+@_declared("servo")
+class ServoConfig(Declared):
     """Trim and direction of the four servo outputs."""
 
-    trim: tuple[Trim, Trim, Trim, Trim] = Field(description="added to the 16-bit word, 31290 per rad")
     direction: tuple[Literal[-1, 1], Literal[-1, 1], Literal[-1, 1], Literal[-1, 1]] = Field(
         description="sense of rotation"
     )
 
 
-class SupervisorConfig(Section):
+@_declared("supervisor")
+class SupervisorConfig(Declared):
     """When the loop is closed."""
 
-    pose_timeout_us: int = Field(
-        ge=20_000, le=5_000_000, description="silence after which the flaps go to hover [us]"
-    )
-    low_battery_mv: int = Field(ge=0, le=20_000, description="supply below which flight ends after 5 s [mV]")
+
+@_declared("box")
+class BoxConfig(Declared):
+    """Where goals may be, an upright cylinder around home: further out a hover is not held."""
 
 
 Cost = Annotated[int, Field(ge=0, le=100_000)]
@@ -165,7 +142,7 @@ class CpuConfig(Section):
     )
     syslink_us: Cost = Field(description="SYSLINK, per packet [us]")
     crtp_us: Cost = Field(description="CRTP-RX and CRTP-TX, per packet [us]")
-    log_us: Cost = Field(description="LOG and STREAM, per packet [us]")
+    log_us: Cost = Field(description="LOG, per packet [us]")
     mavlink_us: Cost = Field(description="MAV-RX and MAV-TX, per message [us]")
 
 
@@ -185,6 +162,13 @@ class StreamRates(Section):
     estimator_status: Rate = Field(description="ESTIMATOR_STATUS")
     named_values: Rate = Field(description="NAMED_VALUE_FLOAT, all of them")
     flight_array: Rate = Field(description="DEBUG_FLOAT_ARRAY floaty")
+    system_time: Rate = Field(description="SYSTEM_TIME")
+    current_mode: Rate = Field(description="CURRENT_MODE, beside every change")
+    position_target: Rate = Field(description="POSITION_TARGET_LOCAL_NED")
+    vfr_hud: Rate = Field(description="VFR_HUD")
+    actuator_output: Rate = Field(description="ACTUATOR_OUTPUT_STATUS")
+    home_position: Rate = Field(description="HOME_POSITION")
+    odometry: Rate = Field(description="ODOMETRY")
 
 
 class MavlinkConfig(Section):
@@ -226,6 +210,7 @@ class FirmwareConfig(Section):
     excitation: ExcitationConfig
     servo: ServoConfig
     supervisor: SupervisorConfig
+    box: BoxConfig
     cpu: CpuConfig
     mavlink: MavlinkConfig
     # The profile states only what it has of this section.
@@ -235,16 +220,11 @@ class FirmwareConfig(Section):
 def parameters_of(config: FirmwareConfig) -> Block[Parameters]:
     """Return the core's parameter block for a configuration."""
     block = Parameters.allocate()
-    values: dict[str, object] = {"gyro_scale": GYRO_SCALE}
-    for section in (config.model, config.estimator, config.controller, config.allocation, config.servo):
-        values.update(section.model_dump())
-    predictor = config.predictor
-    values["predict"] = int(predictor.enabled)
-    values["age_measured"] = int(predictor.age == "measured")
-    values["horizon"] = predictor.horizon
-    values["default_age_us"] = predictor.default_age_us
-    excitation = config.excitation
-    values |= {"excite_rms": excitation.rms, "excite_low": excitation.low, "excite_high": excitation.high}
-    for name, value in values.items():
-        block.memory[name] = value
+    for parameter in CORE_PARAMETERS:
+        place = parameter.place
+        if parameter.key and place.block == "parameters":
+            block.memory[place.field][(0, *place.index)] = value_in(config, parameter.key)
+    block.fields.gyro_scale = f32(GYRO_SCALE)
+    block.fields.age_measured = i32(config.predictor.age == "measured")
+    block.fields.direction[:] = config.servo.direction
     return block

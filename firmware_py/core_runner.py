@@ -5,38 +5,34 @@ under `firmware_py.export` the same core as C on this machine and as machine cod
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from firmware_py.config import CpuConfig
 from firmware_py.core import entry
-from firmware_py.core.structs import Control, Estimator, Input, Parameters
+from firmware_py.core.structs import Control, Estimator, Input, Parameters, Sampling, Supervisor
 from firmware_py.core.subset import Block, Struct
+from firmware_py.export.usage import Usage
 from firmware_py.logic.plugs import CALLS
 
 if TYPE_CHECKING:
-    from firmware_py.core.guard import Guard
     from firmware_py.logic.loading import Logic
 
 
 class CoreRunner(Protocol):
-    """Executes the core's entry points on the memory of `CoreBlocks`."""
+    """Executes the core on the memory of `CoreBlocks`."""
 
-    def reset(self) -> None:
-        """Start the estimator."""
-
-    def file_pose(self) -> int:
-        """File the input's pose; returns POSE_ON_TIME, POSE_TOO_OLD or POSE_INVALID."""
-
-    def estimate(self) -> None:
-        """Run one tick of the estimator."""
-
-    def control(self) -> None:
-        """Run one tick of the controller, down to the timer counts."""
+    def call(self, name: str) -> int:
+        """Execute an entry point of `firmware_py.core.entry`; returns its answer, 0 when it has none."""
 
 
 @runtime_checkable
 class CoreCosts(Protocol):
-    """States how long the core's next call takes on the board's processor, on the memory as it is now."""
+    """Measures how long the core's next call takes on the board's processor, on the memory as it is now."""
+
+    @property
+    def usage(self) -> Usage | None:
+        """What the core has taken so far."""
 
     def estimate_us(self) -> int:
         """Return the processor time of the estimator's tick."""
@@ -59,11 +55,12 @@ class CoreBlocks:
         "control",
         "data",
         "estimator",
-        "guard",
         "logic",
         "named",
         "parameters",
         "run",
+        "sampling",
+        "supervisor",
         "watchdog_fed_us",
     )
 
@@ -74,59 +71,49 @@ class CoreBlocks:
         self.data = Input.allocate()  # written by the estimator task, but for the mode: the stabilizer
         self.estimator = Estimator.allocate()  # by the estimator task; its `now` is the stabilizer's mailbox
         self.control = Control.allocate()  # written by the stabilizer task
+        self.sampling = Sampling.allocate()  # by both
+        self.supervisor = Supervisor.allocate()  # by the stabilizer task, and by requests
         self.watchdog_fed_us = 0  # by the stabilizer task
         self.logic = logic
         self.calls = CALLS if logic is None else logic.loaded.calls
         own = {} if logic is None else logic.allocate()
-        self.guard: Guard | None = own["guard"].fields if own else None  # type: ignore[assignment]
         core: dict[str, Block[Struct]] = {
             "parameters": parameters, "data": self.data, "estimator": self.estimator, "control": self.control,
+            "sampling": self.sampling, "supervisor": self.supervisor,
         }  # fmt: skip
         self.named = core | own
         self.run: CoreRunner = runner(self)
 
     @property
-    def inputs(self) -> tuple[Block[Struct], ...]:
-        """The blocks that the core only reads."""
-        return tuple(
-            block
-            for name, block in self.named.items()
-            if name in ("parameters", "data") or name.endswith("_own")
+    def inputs(self) -> frozenset[str]:
+        """The blocks that others than the core write, too."""
+        return frozenset(
+            name for name in self.named if name in ("parameters", "data") or name.endswith("_own")
         )
 
 
 class PythonRunner:
     """Runs the Python sources: compiled by numba, or plain with NUMBA_DISABLE_JIT=1."""
 
-    __slots__ = ("_arguments", "_entry")
+    __slots__ = ("_calls",)
 
     def __init__(self, blocks: CoreBlocks) -> None:
-        self._entry: Any = entry if blocks.logic is None else blocks.logic.loaded.entry
-        self._arguments = {
-            call: tuple(blocks.named[name].arg for name in names) for call, names in blocks.calls.items()
+        module = entry if blocks.logic is None else blocks.logic.loaded.entry
+        self._calls: dict[str, Callable[[], Any]] = {
+            name: partial(getattr(module, name), *(blocks.named[block].arg for block in taken))
+            for name, taken in blocks.calls.items()
         }
 
-    def reset(self) -> None:
-        """Start the estimator."""
-        self._entry.reset(*self._arguments["reset"])
-
-    def file_pose(self) -> int:
-        """File the input's pose."""
-        return int(self._entry.file_pose(*self._arguments["file_pose"]))
-
-    def estimate(self) -> None:
-        """Run one tick of the estimator."""
-        self._entry.estimate(*self._arguments["estimate"])
-
-    def control(self) -> None:
-        """Run one tick of the controller."""
-        self._entry.control(*self._arguments["control"])
+    def call(self, name: str) -> int:
+        """Execute an entry point."""
+        return int(self._calls[name]() or 0)
 
 
 class ConfiguredCosts:
     """What the profile states."""
 
     __slots__ = ("_cpu",)
+    usage: ClassVar[None] = None
 
     def __init__(self, cpu: CpuConfig) -> None:
         self._cpu = cpu

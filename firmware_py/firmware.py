@@ -4,13 +4,14 @@ Hardware calls `imu_ready`, `radio_received` and `uart_ready` (interrupts), then
 `Board`.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from firmware_py.board import Board
+from firmware_py.box import GoalBox
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
-from firmware_py.core.structs import EXCITE_OFF
-from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory, costs_of
-from firmware_py.drivers.imu import GyroZero, acceleration, rates
+from firmware_py.core_runner import CoreBlocks, CoreCosts, PythonRunner, RunnerFactory, costs_of
+from firmware_py.drivers.imu import acceleration, rates
+from firmware_py.export.usage import Usage
 from firmware_py.geometry import Vector
 from firmware_py.links.console import Console
 from firmware_py.links.crtp_stack import CrtpStack
@@ -18,10 +19,10 @@ from firmware_py.links.high_level import HighLevelService
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogService
 from firmware_py.links.memories import MemoryService, Tester, memories
+from firmware_py.links.notices import Notices
 from firmware_py.links.parameters import Parameter, ParameterService
 from firmware_py.links.platform import PlatformService
 from firmware_py.links.storage import ParameterStorage
-from firmware_py.links.stream import ReadBlock, TelemetryStream
 from firmware_py.links.trajectories import MEMORY_SIZE
 from firmware_py.logic.loading import load_logic
 from firmware_py.manual import ManualFlaps
@@ -32,11 +33,10 @@ from firmware_py.rtos import Kernel, Queue, WatchdogError
 from firmware_py.rtos.statistics import Statistics
 from firmware_py.running import Running, StockState
 from firmware_py.signals import Signals
-from firmware_py.stock_names import stock_parameters
+from firmware_py.stock_names import stock_parameters, stock_variables
 from firmware_py.supervisor import Supervisor
 from firmware_py.tasks import estimator_task, power_task, sensors_task, stabilizer_task
-from firmware_py.thief import PRIORITY, Thief, thief_task
-from firmware_py.variables import log_variables, telemetry_reader
+from firmware_py.variables import log_variables
 from firmware_py.wire import WireError
 from firmware_py.wire.memories import (
     CONFIG_SIZE,
@@ -63,8 +63,12 @@ DECK = (0xBC, 0xF1, "bcFloaty", "A")  # vendor, product, name, revision of the d
 class Firmware:
     """A booted board. `kernel`, `variables` and `parameters` may be read; `signals` are views on the core.
 
-    With `mavlink` the UART speaks MAVLink, which needs pymavlink. `runner` executes the flight core.
+    With `mavlink` the UART speaks MAVLink, which needs pymavlink. `runner` executes the flight core. Its clock is that of
+    who runs it, and it has its profile's constants: there is nothing to tell of either.
     """
+
+    clock_us: ClassVar[None] = None
+    flashed: ClassVar[None] = None
 
     def __init__(
         self,
@@ -73,17 +77,16 @@ class Firmware:
         mavlink: bool = False,
         runner: RunnerFactory = PythonRunner,
     ) -> None:
-        self.kernel = Kernel(preemption=True)
+        self.kernel = self.scheduler = Kernel(preemption=True)
         self._board = board
         core = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
-        core.run.reset()
-        core.run.control()
+        core.run.call("reset")
+        core.run.call("control")
         board.write_compare(core.control.fields.count.tolist())  # hover from the first PWM period on
         self._core = core
-        self._zero = GyroZero()
         self.link = CrtpStack(self.kernel, config.cpu, board)
         self._console = Console(self.link, board)
-        self._supervisor = Supervisor(config.supervisor, core.estimator.fields, self._console.write)
+        self._supervisor = Supervisor(core, self._console.write)
         self._imu_ready = self.kernel.create_binary_semaphore("imuReady")
         data_ready = self.kernel.create_binary_semaphore("dataReady")
         estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
@@ -91,7 +94,7 @@ class Firmware:
         kernel, cost, costs = self.kernel, config.cpu, costs_of(core.run, config.cpu)
         kernel.create_task(
             "SENSORS", 4, sensors_task,
-            kernel, cost, board, self._imu_ready, self.measurements, data_ready, self._zero, self._zero_found,
+            kernel, cost, board, self._imu_ready, self.measurements, data_ready, core,
         )  # fmt: skip
         kernel.create_task(
             "STABILIZER", 5, stabilizer_task,
@@ -99,12 +102,12 @@ class Firmware:
         )  # fmt: skip
         kernel.create_task(
             "KALMAN", 2, estimator_task,
-            kernel, cost, estimator_run, self.measurements, self._supervisor, core, costs,
+            kernel, cost, estimator_run, self.measurements, core, costs, self._zero_found,
         )  # fmt: skip
-        kernel.create_task("PWRMGNT", 0, power_task, kernel, board, self._supervisor)
+        kernel.create_task("PWRMGNT", 0, power_task, kernel, board, core)
         self.mavlink = self._mavlink_stack(config) if mavlink else None
         self._start_services(config)
-        self.signals = Signals.of(core.estimator, core.control, self._supervisor)
+        self.signals = Signals.of(core.estimator.memory, core.control.memory, self._supervisor)
         self.statistics = Statistics(self.kernel, DEADLINES_US)
         self.kernel.start()
 
@@ -116,39 +119,37 @@ class Firmware:
         if board.deck_memory == b"\xff" * len(board.deck_memory):
             board.deck_memory[:] = encode_one_wire(*DECK)
         tester, storage = Tester(), ParameterStorage(board.eeprom)
-        pilot = supervisor.goals = Pilot(config.predictor.default_age_us)
+        pilot = supervisor.goals = Pilot(config.predictor, GoalBox(config.box), config.mavlink.home)
         trajectories = bytearray(MEMORY_SIZE)
-        high_level = HighLevelService(link, pilot, supervisor, trajectories, self._console.write)
+        notices = Notices(self.kernel, self._console.write)
+        high_level = HighLevelService(link, pilot, supervisor, trajectories, notices)
         running = Running(
             board=board,
             core=core,
             supervisor=supervisor,
-            manual=ManualFlaps(supervisor, core.parameters.fields, core.data.fields),
+            manual=ManualFlaps(core.parameters.fields, core.data.fields),
             measurements=self.measurements,
             stack=link,
             localisation=LocalisationService(
-                link, self.measurements, supervisor, pilot, settings.address & 0xFF
+                link, self.measurements, supervisor, pilot, settings.address & 0xFF, notices
             ),
             platform=PlatformService(link, supervisor, pilot),
             tester=tester,
             storage=storage,
-            gyro_zero=self._zero,
             pilot=pilot,
             commander=high_level.defaults,
             stock=StockState(),
             say=self._console.write,
             mavlink=self.mavlink,
         )
-        self.variables = log_variables(running)
-        read = telemetry_reader(self.variables)
-        fields = running.core.parameters.fields
-        own = parameters(running, TelemetryStream(link, read, lambda: bool(fields.excite_kind != EXCITE_OFF)))
+        self.variables = (*log_variables(running), *stock_variables(running))
+        own = parameters(running)
         self.parameters = (*own, *stock_parameters(running))
         LogService(link, self.variables)
-        ParameterService(link, self.parameters, storage)
+        ParameterService(link, self.parameters, storage, notices)
         MemoryService(link, memories(board.eeprom, board.deck_memory, tester, trajectories))
         if self.mavlink is not None:
-            self._start_mavlink_services(self.mavlink, config.mavlink, running, own, read)
+            self._start_mavlink_services(self.mavlink, config.mavlink, running, own)
 
     def _mavlink_stack(self, config: FirmwareConfig) -> "MavlinkStack":
         from firmware_py.links.mavlink_stack import MavlinkStack
@@ -161,7 +162,6 @@ class Firmware:
         config: MavlinkConfig,
         running: Running,
         own: tuple[Parameter, ...],
-        read: ReadBlock,
     ) -> None:
         """Create the services for MAVLink clients."""
         from firmware_py.links.mavlink_absent import answer_for_what_is_not_there
@@ -169,25 +169,38 @@ class Firmware:
         from firmware_py.links.mavlink_on_request import RequestedMessages
         from firmware_py.links.mavlink_parameters import MavlinkParameters
         from firmware_py.links.mavlink_poses import PoseService
+        from firmware_py.links.mavlink_setpoints import SetpointService
         from firmware_py.links.mavlink_streams import StreamService
         from firmware_py.links.mavlink_telemetry import FlightMessages
         from firmware_py.links.mavlink_world import World
 
         core, supervisor = self._core, self._supervisor
-        poses = PoseService(stack, self.measurements, running.localisation, config.home)
-        world = World(core.estimator.fields, poses)
-        messages = FlightMessages(stack, supervisor, world, core.control.fields, read)
-        requested = RequestedMessages(supervisor, world, self._measured, config.home)
-        streams = StreamService(stack, (*messages.streams(config.rates), *requested.streams()))
+        setpoints = SetpointService(stack, running.pilot, config.home)
+        poses = PoseService(stack, self.measurements, running.localisation, setpoints)
+        world, control = World(core.estimator.fields, setpoints), core.control.fields
+        messages = FlightMessages(stack, supervisor, world, poses, control, self.variables)
+        requested = RequestedMessages(stack, supervisor, world, control, self._measured, config.home)
+        streams = StreamService(stack, (*messages.streams(config.rates), *requested.streams(config.rates)))
         MavlinkParameters(stack, own)
-        CommandService(stack, self._board, supervisor, streams, own, running.storage)
+        CommandService(stack, self._board, supervisor, streams, setpoints, own, running.storage)
         answer_for_what_is_not_there(stack)
         self._console.listeners.append(stack.say)
 
     @property
-    def runner(self) -> CoreRunner:
-        """What executes the flight core."""
-        return self._core.run
+    def log_numbers(self) -> dict[str, int]:
+        """The numbers of the log variables in the table of contents."""
+        return {variable.name: number for number, variable in enumerate(self.variables)}
+
+    @property
+    def usage(self) -> Usage | None:
+        """What the flight core takes of the processor, where that is measured."""
+        return self._core.run.usage if isinstance(self._core.run, CoreCosts) else None
+
+    @property
+    def overrun(self) -> str:
+        """Which loop of own logic first exceeded the budget of its call, as one line; empty: none."""
+        core = self._core
+        return "" if core.logic is None else core.logic.overrun(core.named)
 
     @property
     def next_wake_us(self) -> int | None:
@@ -225,12 +238,6 @@ class Firmware:
         """Run the tasks until all are blocked or busy."""
         self.kernel.run(now_us)
 
-    def add_thief(self) -> Thief:
-        """Add a task that takes a share of every tick before all others; it takes nothing until its share is set."""
-        thief = Thief()
-        self.kernel.create_task("THIEF", PRIORITY, thief_task, self.kernel, thief)
-        return thief
-
     def _measured(self) -> tuple[Vector, Vector]:
         """Return what the IMU measures now: rates [rad/s, B] and acceleration [g, B]."""
         counts = self._board.read_imu()
@@ -240,10 +247,7 @@ class Firmware:
         return self.link.connected or (self.mavlink is not None and self.mavlink.connected)
 
     def _zero_found(self) -> None:
-        bias = self._zero.bias
-        assert bias is not None
-        self._core.data.fields.gyro_bias[:] = bias
-        self._supervisor.calibrated = True
+        bias = self._core.data.fields.gyro_bias.tolist()
         self._console.write("imu: gyro zero found, {:.1f} {:.1f} {:.1f} counts".format(*bias))
 
 

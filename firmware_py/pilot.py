@@ -6,6 +6,8 @@ which the pose was true. While the planner is idle, corrections are errors alrea
 poses there is nothing to fly to: the goal stays under the robot, and the supervisor keeps the flaps at hover.
 """
 
+from firmware_py.box import GoalBox
+from firmware_py.config import PredictorConfig
 from firmware_py.geometry import Vector, in_goal_frame, to_euler_zyx
 from firmware_py.planner import Motion, Path, Phase, Planner, stay
 from firmware_py.wire.crtp import PoseMessage
@@ -17,13 +19,16 @@ SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHU
 class Pilot:
     """`absolute` says what poses are. `goal` is what the last error was formed against, None for an unchanged correction."""
 
-    def __init__(self, default_age_us: int) -> None:
+    def __init__(self, config: PredictorConfig, box: GoalBox, home: Vector) -> None:
+        self.box = box
         self.planner = Planner()
-        self.absolute = False
+        self.absolute: bool = config.absolute
         self.goal: Motion | None = None
         self.here: Motion | None = None  # the last absolute pose
+        self.seen_us = -1  # when the last pose came
         self._setpoint_us: int | None = None  # when the last set-point came, while they lead
-        self._default_age_us = default_age_us
+        self._default_age_us: int = config.default_age_us
+        self._home = home  # of absolute poses
 
     def flies(self, now_us: int) -> bool:
         """Whether there is something to fly to; poses from links other than CRTP do not pass the pilot."""
@@ -38,6 +43,20 @@ class Pilot:
     def forsaken(self, now_us: int) -> bool:
         """Whether set-points lead and have stopped arriving."""
         return self._setpoint_us is not None and now_us - self._setpoint_us >= SETPOINT_SILENCE_US
+
+    def admits(self, path: Path) -> bool:
+        """Return whether a path stays in the box, or returns to it."""
+        return self.box.holds(path.places(), self._centre)
+
+    def admits_place(self, position: Vector, now_us: int) -> bool:
+        """Return whether a set-point is in the box, or no further outside than what is flown to now."""
+        begin = self.begin(now_us)
+        allowed = self.box.excess(begin.position, self._centre) if begin is not None else 0.0
+        return self.box.excess(position, self._centre) <= allowed
+
+    @property
+    def _centre(self) -> Vector:
+        return self._home if self.absolute else ORIGIN.position
 
     def follow(self, path: Path, now_us: int, lands: bool = False) -> None:
         """Start a path of the high-level commander, which needs no further messages."""
@@ -70,6 +89,7 @@ class Pilot:
 
     def error(self, pose: PoseMessage, now_us: int) -> PoseMessage:
         """Return the error that the estimator takes for a pose that has just arrived."""
+        self.seen_us = now_us
         age_us = self._default_age_us if pose.age_us is None else pose.age_us
         if self.absolute:
             self.here = Motion(pose.p_GB, to_euler_zyx(pose.q_GB)[2])

@@ -6,7 +6,7 @@ from the beginning of the path. Only + - * / in a fixed order, and the functions
 Meaning of the commands: crazyflie-firmware 2a18fc29 (crtp_commander_high_level.c, planner.c).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, auto
 from math import comb
@@ -14,6 +14,7 @@ from math import comb
 from firmware_py.geometry import Vector, rotate, wrap_angle, yaw_quaternion
 
 AXES = 4  # x, y, z, yaw
+SAMPLES = 16  # positions of a piece that are compared with the box
 Coefficients = tuple[float, ...]  # ascending powers of the time in a piece
 
 
@@ -68,6 +69,15 @@ class Path:
             _scaled(motion.acceleration, rate * rate),
             motion.yaw_rate * rate,
         )
+
+    def places(self) -> Iterator[Vector]:
+        """Yield positions along the path, `SAMPLES` per piece and the end."""
+        t = 0.0
+        for piece in reversed(self.pieces) if self.reverse else self.pieces:
+            for step in range(SAMPLES):
+                yield self.at((t + piece.duration * step / SAMPLES) * self.timescale).position
+            t += piece.duration
+        yield self.at(self.duration).position
 
     def _placed(self, motion: Motion) -> Motion:
         if self.turn == 0.0:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from firmware_py.board import Board
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.drivers.imu import GyroZero
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.links.high_level import Defaults
 from firmware_py.links.localisation import LocalisationService
@@ -45,7 +44,6 @@ class Running:
     platform: PlatformService
     tester: Tester
     storage: ParameterStorage
-    gyro_zero: GyroZero
     pilot: Pilot
     commander: Defaults
     stock: StockState

@@ -1,16 +1,30 @@
 """What an observer outside the board may read: views on the running core and its counters."""
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.core.structs import Control, Estimator
-from firmware_py.core.subset import Block
-from firmware_py.supervisor import Supervisor
+from firmware_py.wire.supervisor import Cause, State
 
 ESTIMATOR, CONTROL = Estimator.dtype, Control.dtype  # how they lie in memory, here and in an image
 COUNTERS = ("fused", "refused", "jumps", "too_old", "invalid", "bounded", "resets", "horizon", "pose_age_us")
+
+
+class SupervisorState(Protocol):
+    """What the supervisor shows."""
+
+    @property
+    def state(self) -> State:
+        """What it does."""
+        ...
+
+    @property
+    def cause(self) -> Cause:
+        """Why it is in its failsafe."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +37,12 @@ class Signals:
     u: NDArray[np.float32]  # (4,) [rad] compound inputs
     flap: NDArray[np.float32]  # (4,) [rad] commanded flap angles
     count: NDArray[np.int32]  # (4,) timer compare counts
-    supervisor: Supervisor
+    supervisor: SupervisorState
 
     @classmethod
-    def of(cls, estimator: Block[Estimator], control: Block[Control], supervisor: Supervisor) -> "Signals":
-        """Return the views on the blocks of a running core."""
+    def of(cls, estimator: NDArray[Any], control: NDArray[Any], supervisor: SupervisorState) -> "Signals":
+        """Return the views on the structs of a running core, one of each."""
         start = dict(ESTIMATOR.fields or {})[COUNTERS[0]][1]
-        counters = np.ndarray(len(COUNTERS), np.int32, estimator.memory.data, start)
-        fields = control.fields
-        return cls(estimator.fields.now, counters, fields.u, fields.flap, fields.count, supervisor)
+        counters = np.ndarray(len(COUNTERS), np.int32, estimator.view(np.uint8).data, start)
+        u, flap, count = (control[name][0] for name in ("u", "flap", "count"))
+        return cls(estimator["now"][0], counters, u, flap, count, supervisor)

@@ -10,57 +10,44 @@ from dataclasses import dataclass
 from functools import partial
 from math import degrees
 
-from firmware_py.core.structs import ATTITUDE
-from firmware_py.geometry import Vector, rotate, wrap_angle, yaw_quaternion
+from firmware_py.core.subset import Logged
+from firmware_py.geometry import Vector, rotate, yaw_quaternion
 from firmware_py.links.log import LogVariable
 from firmware_py.links.parameters import Parameter
 from firmware_py.running import Running
+from firmware_py.table import whole_names
+from firmware_py.variables import F32, I8, U8, U16, U32, angle
 from firmware_py.wire.scalars import Scalar
 
-F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
 SIGNAL_DBM = 40  # radio.rssi: below 0 dBm, what the virtual radio chip measures
 INTEGER_LIMITS = {U8: 0xFF, U16: 0xFFFF, U32: 0xFFFFFFFF}
 FLOAT_LIMIT = 1e6
-YAW = ATTITUDE + 2
 VELOCITY_LIMITS = (0.01, 10.0)  # [m/s]
 
 
-@dataclass(frozen=True, slots=True)
-class Rest:
-    """Log variables of one group that stay as they are."""
-
-    group: str
-    names: str
-    scalar: Scalar
-    unit: str
-    value: float = 0.0
-
-
-RESTING = (
-    Rest("controller", "roll pitch", F32, "deg"),  # Floaty's controller wants the body level
-    Rest("controller", "rollRate pitchRate yawRate", F32, "deg/s"),
-    Rest("posCtl", "targetVX targetVY targetVZ", F32, "m/s"),
-    Rest("health", "motorPass", U8, ""),  # no propellers: never tested
-    Rest("health", "batterySag", F32, "V"),
-    Rest("radio", "rssi", U8, "dBm", SIGNAL_DBM),
-    Rest("colorLedBot", "throttlePct", U8, "%"),
-    Rest("colorLedTop", "throttlePct", U8, "%"),
-    Rest("lighthouse", "bsActive bsAvailable bsCalCon bsCalUd bsCalVal bsGeoVal bsReceive", U16, ""),
-    Rest("lighthouse", "status", U8, ""),  # no base stations
-    Rest("loco", "mode", U8, ""),
-    Rest("motion", "deltaX deltaY", I16, ""),
-    Rest("range", "back front left right up zrange", U16, "mm"),
-    Rest("ranging", " ".join(f"distance{anchor}" for anchor in range(8)), F32, "m"),
-    Rest("ring", "fadeTime", F32, "s"),
+RESTING = (  # log variables that stay zero
+    Logged("deg", "controller.roll pitch"),  # Floaty's controller wants the body level
+    Logged("deg/s", "controller.rollRate pitchRate yawRate"),
+    Logged("m/s", "posCtl.targetVX targetVY targetVZ"),
+    Logged("", "health.motorPass", type="U8"),  # no propellers: never tested
+    Logged("V", "health.batterySag"),
+    Logged("%", "colorLedBot.throttlePct", type="U8"),
+    Logged("%", "colorLedTop.throttlePct", type="U8"),
+    Logged("", "lighthouse.bsActive bsAvailable bsCalCon bsCalUd bsCalVal bsGeoVal bsReceive", type="U16"),
+    Logged("", "lighthouse.status", type="U8"),  # no base stations
+    Logged("", "loco.mode", type="U8"),
+    Logged("", "motion.deltaX deltaY", type="I16"),
+    Logged("mm", "range.back front left right up zrange", type="U16"),
+    Logged("m", "ranging." + " ".join(f"distance{anchor}" for anchor in range(8))),
+    Logged("s", "ring.fadeTime"),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Parameters of one group that are stored and have no effect: names, and the stock defaults of all of them."""
+    """Parameters of one group that are stored and have no effect, with the stock defaults."""
 
-    group: str
-    names: str
+    names: str  # "group.one two three"
     scalar: Scalar
     defaults: tuple[float, ...]
     persistent: bool = False
@@ -68,49 +55,50 @@ class Setting:
 
 
 SETTINGS = (
-    Setting("activeMarker", "back", U8, (3,), True),
-    Setting("colorLedBot", "brightCorr", U8, (1,)),
-    Setting("colorLedBot", "wrgb8888", U32, (0,)),
-    Setting("colorLedTop", "brightCorr", U8, (1,)),
-    Setting("colorLedTop", "wrgb8888", U32, (0,)),
-    Setting("commander", "enHighLevel", U8, (0,)),  # without effect on the stock board, too
-    Setting("flightmode", "althold", U8, (0,)),
-    Setting("kalman", "initialX initialY initialZ", F32, (0, 0, 0), unit="m"),  # the next pose decides
-    Setting("kalman", "initialYaw", F32, (0,), unit="rad"),
-    Setting("led", "bitmask", U8, (0,)),
-    Setting("led_deck_ctrl", "rgb888", U32, (0,)),
-    Setting("lighthouse", "bsCalibReset", U8, (0,)),
-    Setting("lighthouse", "systemType", U8, (2,)),
-    Setting("locSrv", "enLhAngleStream", U8, (0,)),
-    Setting("loco", "mode", U8, (0,)),
-    Setting("pid_attitude", "roll_kp roll_ki roll_kd", F32, (6, 3, 0), True),
-    Setting("pid_attitude", "pitch_kp pitch_ki pitch_kd", F32, (6, 3, 0), True),
-    Setting("pid_attitude", "yaw_kp yaw_ki yaw_kd", F32, (6, 1, 0.35), True),
-    Setting("pid_rate", "roll_kp roll_ki roll_kd", F32, (250, 500, 2.5), True),
-    Setting("pid_rate", "pitch_kp pitch_ki pitch_kd", F32, (250, 500, 2.5), True),
-    Setting("pid_rate", "yaw_kp yaw_ki yaw_kd", F32, (120, 16.7, 0), True),
-    Setting("posCtlPid", "xKp xKi xKd", F32, (2, 0, 0), True),
-    Setting("posCtlPid", "yKp yKi yKd", F32, (2, 0, 0), True),
-    Setting("posCtlPid", "zKp zKi zKd", F32, (2, 0.5, 0), True),
-    Setting("posCtlPid", "thrustBase", U16, (36000,), True),
-    Setting("velCtlPid", "vxKp vxKi vxKd vxKFF", F32, (25, 1, 0, 0), True),
-    Setting("velCtlPid", "vyKp vyKi vyKd vyKFF", F32, (25, 1, 0, 0), True),
-    Setting("velCtlPid", "vzKp vzKi vzKd", F32, (25, 15, 0), True),
-    Setting("ring", "effect", U8, (0,), True),
-    Setting("ring", "fadeColor", U32, (0,)),
-    Setting("ring", "fadeTime", F32, (0.5,), unit="s"),
-    Setting("ring", "headlightEnable", U8, (0,)),
-    Setting("ring", "solidRed solidGreen solidBlue", U8, (20, 20, 20)),
-    Setting("sound", "effect", U8, (0,), True),
-    Setting("stabilizer", "estimator", U8, (2,)),  # whatever its value, Floaty's own estimator runs
-    Setting("stabilizer", "controller", U8, (0,)),  # and controls
-    Setting("tdoaEngine", "logId logOthrId", U8, (0, 0)),
+    Setting("activeMarker.back", U8, (3,), True),
+    Setting("colorLedBot.brightCorr", U8, (1,)),
+    Setting("colorLedBot.wrgb8888", U32, (0,)),
+    Setting("colorLedTop.brightCorr", U8, (1,)),
+    Setting("colorLedTop.wrgb8888", U32, (0,)),
+    Setting("commander.enHighLevel", U8, (0,)),  # without effect on the stock board, too
+    Setting("flightmode.althold", U8, (0,)),
+    Setting("kalman.initialX initialY initialZ", F32, (0, 0, 0), unit="m"),  # the next pose decides
+    Setting("kalman.initialYaw", F32, (0,), unit="rad"),
+    Setting("led.bitmask", U8, (0,)),
+    Setting("led_deck_ctrl.rgb888", U32, (0,)),
+    Setting("lighthouse.bsCalibReset", U8, (0,)),
+    Setting("lighthouse.systemType", U8, (2,)),
+    Setting("locSrv.enLhAngleStream", U8, (0,)),
+    Setting("loco.mode", U8, (0,)),
+    Setting("pid_attitude.roll_kp roll_ki roll_kd", F32, (6, 3, 0), True),
+    Setting("pid_attitude.pitch_kp pitch_ki pitch_kd", F32, (6, 3, 0), True),
+    Setting("pid_attitude.yaw_kp yaw_ki yaw_kd", F32, (6, 1, 0.35), True),
+    Setting("pid_rate.roll_kp roll_ki roll_kd", F32, (250, 500, 2.5), True),
+    Setting("pid_rate.pitch_kp pitch_ki pitch_kd", F32, (250, 500, 2.5), True),
+    Setting("pid_rate.yaw_kp yaw_ki yaw_kd", F32, (120, 16.7, 0), True),
+    Setting("posCtlPid.xKp xKi xKd", F32, (2, 0, 0), True),
+    Setting("posCtlPid.yKp yKi yKd", F32, (2, 0, 0), True),
+    Setting("posCtlPid.zKp zKi zKd", F32, (2, 0.5, 0), True),
+    Setting("posCtlPid.thrustBase", U16, (36000,), True),
+    Setting("velCtlPid.vxKp vxKi vxKd vxKFF", F32, (25, 1, 0, 0), True),
+    Setting("velCtlPid.vyKp vyKi vyKd vyKFF", F32, (25, 1, 0, 0), True),
+    Setting("velCtlPid.vzKp vzKi vzKd", F32, (25, 15, 0), True),
+    Setting("ring.effect", U8, (0,), True),
+    Setting("ring.fadeColor", U32, (0,)),
+    Setting("ring.fadeTime", F32, (0.5,), unit="s"),
+    Setting("ring.headlightEnable", U8, (0,)),
+    Setting("ring.solidRed solidGreen solidBlue", U8, (20, 20, 20)),
+    Setting("sound.effect", U8, (0,), True),
+    Setting("stabilizer.estimator", U8, (2,)),  # whatever its value, Floaty's own estimator runs
+    Setting("stabilizer.controller", U8, (0,)),  # and controls
+    Setting("tdoaEngine.logId logOthrId", U8, (0, 0)),
 )
 
 
 def stock_variables(running: Running) -> Iterator[LogVariable]:
     """Yield the log variables."""
-    stack, supervisor, zero = running.stack, running.supervisor, running.gyro_zero
+    stack, supervisor, core = running.stack, running.supervisor, running.core
+    parameters = core.parameters.fields
 
     def along(axis: int) -> float:
         """The target in the axes of the poses."""
@@ -118,10 +106,9 @@ def stock_variables(running: Running) -> Iterator[LogVariable]:
 
     def across(axis: int) -> float:
         """The target in axes that turn with the body's yaw."""
-        return rotate(yaw_quaternion(-_yaw(running)), _target(running)[0])[axis]
+        return rotate(yaw_quaternion(-angle(running, 2)), _target(running)[0])[axis]
 
     for axis, name in enumerate("xyz"):
-        yield LogVariable(f"gyro.{name}Variance", F32, "counts^2", lambda axis=axis: zero.variance[axis])  # type: ignore[misc]
         yield LogVariable(f"ctrltarget.{name}", F32, "m", partial(along, axis))
         yield LogVariable(f"posCtl.target{name.upper()}", F32, "m", partial(across, axis))
     yield LogVariable("controller.yaw", F32, "deg", lambda: degrees(_target(running)[1]))
@@ -129,12 +116,13 @@ def stock_variables(running: Running) -> Iterator[LogVariable]:
     yield LogVariable("radio.numRxUc", U16, "", lambda: stack.unicasts & 0xFFFF)
     yield LogVariable("radio.numRxBc", U16, "", lambda: stack.broadcasts & 0xFFFF)
     yield LogVariable(
-        "health.batteryPass", U8, "", lambda: supervisor.battery_mv >= supervisor.low_battery_mv
+        "health.batteryPass", U8, "", lambda: supervisor.battery_mv >= int(parameters.low_battery_mv)
     )
     yield LogVariable("sys.testLogParam", I8, "", lambda: running.stock.test_value)
+    yield LogVariable("radio.rssi", U8, "dBm", lambda: SIGNAL_DBM)
     for rest in RESTING:
-        for name in rest.names.split():
-            yield LogVariable(f"{rest.group}.{name}", rest.scalar, rest.unit, lambda rest=rest: rest.value)  # type: ignore[misc]
+        for name in whole_names(rest.names):
+            yield LogVariable(name, Scalar[rest.type or "F32"], rest.unit, lambda: 0)
 
 
 def _target(running: Running) -> tuple[Vector, float]:
@@ -146,19 +134,12 @@ def _target(running: Running) -> tuple[Vector, float]:
     return (x, y, z), yaw
 
 
-def _yaw(running: Running) -> float:
-    frame = running.pilot.frame(running.stack.kernel.now_us)
-    yaw: float = running.core.estimator.fields.now.item(YAW)
-    return yaw if frame is None else wrap_angle(yaw + frame.yaw)
-
-
 def stock_parameters(running: Running) -> Iterator[Parameter]:
     """Yield the parameters."""
     for setting in SETTINGS:
         limit = INTEGER_LIMITS.get(setting.scalar)
         low, high = (-FLOAT_LIMIT, FLOAT_LIMIT) if limit is None else (0, limit)
-        for name, default in zip(setting.names.split(), setting.defaults, strict=True):
-            whole = f"{setting.group}.{name}"
+        for whole, default in zip(whole_names(setting.names), setting.defaults, strict=True):
             running.stock.settings[whole] = default
             yield Parameter(
                 whole, setting.scalar, setting.unit,
@@ -220,5 +201,5 @@ def _storage_lines(running: Running) -> Iterator[str]:
 
 
 def _battery_lines(running: Running) -> Iterator[str]:
-    supervisor = running.supervisor
-    yield f"health: battery {supervisor.battery_mv} mV, at least {supervisor.low_battery_mv} needed"
+    voltage, least = running.supervisor.battery_mv, running.core.parameters.fields.low_battery_mv
+    yield f"health: battery {voltage} mV, at least {least} needed"

@@ -1,43 +1,26 @@
-"""The supervisor decides, before every controller step, whether the loop may be closed.
+"""The supervisor of the flight core, as the rest of the firmware sees it: requests go in, state and cause come out.
 
-Whatever forbids it leads to the same defined flap state, the hover angles, and is announced once on the console. State
-and cause are log variables (`supervisor.state`, `supervisor.cause`). How it ends depends on the cause:
-
-    silence         no accepted pose for 500 ms (parameter): the next accepted pose ends it
-    out of bounds   the estimator was held at its bounds for 200 ms: ends after 500 ms inside them
-    disarmed        by request: ends with the request to arm
-    not finite      own logic returned NaN or infinity, the controller or the estimator: ends with a recovery request
-    emergency stop  by request, because a started emergency stop watchdog was not fed for 1 s, or because a stream of
-                    set-points fell silent for 2 s: ends only with a reboot. A stop by the parameter floaty.stop ends
-                    with a recovery request, too
-    low battery     below the limit for 5 s: ends only with a recovery request when the voltage is back above it
-
-Before the first pose, and with absolute poses while the high-level commander has nothing to do, it waits. The board arms
-itself at boot. One outlier pose is refused by the estimator's gate and has no effect here.
+The rules are in `firmware_py/core/supervisor.py`. A change of state or cause is announced once on the console; both
+are log variables (`supervisor.state`, `supervisor.cause`). Set-points that fall silent for 2 s stop the robot until a
+reboot, as on the Crazyflie. The board arms itself at boot.
 """
 
 from collections.abc import Callable
 from enum import IntEnum
 from typing import Protocol
 
-from firmware_py.config import SupervisorConfig
-from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL, Estimator
+from firmware_py.core import structs
+from firmware_py.core.subset import i32
+from firmware_py.core_runner import CoreBlocks
 from firmware_py.wire.supervisor import Cause, State
-
-WATCHDOG_US = 1_000_000  # Crazyflie firmware
-BATTERY_LOW_US = 5_000_000  # original firmware
-EPISODE_GAP_US = 50_000  # two bounded steps closer than this belong to one episode
-EPISODE_LIMIT_US = 200_000
-BOUNDS_RECOVERY_US = 500_000
-NEVER_US = -(1 << 40)
 
 
 class Manual(IntEnum):
     """Who moves the flaps: the original's parameter `extCtrl.manual`."""
 
-    OFF = 0  # the controller, when the state allows it
-    ANGLES = 1  # angles from outside, with or without poses, while a client is there to take them back
-    HOVER = 2  # hover angles
+    OFF = structs.MANUAL_OFF
+    ANGLES = structs.MANUAL_ANGLES
+    HOVER = structs.MANUAL_HOVER
 
 
 class GoalSource(Protocol):
@@ -56,179 +39,120 @@ class GoalSource(Protocol):
         ...
 
 
-class BoundsWatch:
-    """Notices when the estimator has been held at its bounds for too long; `estimator` is the core's fields."""
-
-    def __init__(self, estimator: Estimator) -> None:
-        self.estimator = estimator
-        self._bounded = 0
-        self._episode_start_us = self._bounded_us = self._outside_until_us = NEVER_US
-
-    def is_outside(self, now_us: int) -> bool:
-        """Whether the state counts as out of bounds; called every 10 ms."""
-        bounded = int(self.estimator.bounded)
-        if bounded != self._bounded:
-            self._bounded = bounded
-            if now_us - self._bounded_us > EPISODE_GAP_US:
-                self._episode_start_us = now_us
-            self._bounded_us = now_us
-            if now_us - self._episode_start_us >= EPISODE_LIMIT_US or now_us < self._outside_until_us:
-                self._outside_until_us = now_us + BOUNDS_RECOVERY_US
-        return now_us < self._outside_until_us
-
-
-class LogicWatch:
-    """Remembers in `cause` which of the user's modules has returned NaN or infinity since `reset`."""
-
-    def __init__(self) -> None:
-        self.cause = Cause.NONE
-        self._controller_faults = self._estimator_faults = 0
-
-    def see(self, controller_faults: int, estimator_faults: int) -> None:
-        """Take how often that has happened since boot."""
-        if estimator_faults > self._estimator_faults:
-            self.cause = Cause.ESTIMATOR_NOT_FINITE
-        elif controller_faults > self._controller_faults:
-            self.cause = Cause.CONTROLLER_NOT_FINITE
-        self._controller_faults, self._estimator_faults = controller_faults, estimator_faults
-
-    def reset(self) -> None:
-        """Forget the cause."""
-        self.cause = Cause.NONE
-
-
 class Supervisor:
-    """State machine over the facts in its attributes; `estimator` is the core's fields, read for its bounds."""
+    """Requests to the core's supervisor, and a view on it."""
 
-    def __init__(
-        self, config: SupervisorConfig, estimator: Estimator, announce: Callable[[str], None]
-    ) -> None:
-        self.state = State.CALIBRATING
-        self.cause = Cause.NONE
-        self.calibrated = False
-        self.armed = True
-        self.controlling = False  # whether the flaps obey controller or manual angles, as `mode` said last
-        self.manual = Manual.OFF
-        self.last_pose_us: int | None = None
-        self.pose_timeout_us = config.pose_timeout_us
-        self.low_battery_mv = config.low_battery_mv
-        self.battery_mv = 0
+    def __init__(self, core: CoreBlocks, announce: Callable[[str], None]) -> None:
         self.goals: GoalSource | None = None  # None: there is always something to fly to
         self.connected: Callable[[], bool] = lambda: True  # whether a client is there
-        self.logic = LogicWatch()
-        self.bounds = BoundsWatch(estimator)
+        self.state = State.CALIBRATING
+        self.cause = Cause.NONE
+        self._core = core
+        self._data, self._fields = core.data.fields, core.supervisor.fields
+        self._sampling, self._parameters = core.sampling.fields, core.parameters.fields
         self._announce = announce
-        self._stopped = self._locked = False
-        self._battery_empty = False
-        self._battery_good_us = 0
-        self._watchdog_us: int | None = None  # instant at which it triggers, None until it is fed once
+        self.arm(True)
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the gyro's zero is known."""
+        return bool(self._sampling.calibrated)
+
+    @property
+    def armed(self) -> bool:
+        """Whether the robot is armed."""
+        return bool(self._fields.armed)
 
     @property
     def stopped(self) -> bool:
         """Whether the robot was stopped, for a while or until a reboot."""
-        return self._stopped
+        return bool(self._fields.stopped)
 
     @property
     def locked(self) -> bool:
         """Whether an emergency stop holds until the board reboots."""
-        return self._locked
+        return bool(self._fields.locked)
 
     @property
     def battery_empty(self) -> bool:
         """Whether the battery counts as empty."""
-        return self._battery_empty
+        return bool(self._fields.battery_empty)
 
     @property
     def can_be_armed(self) -> bool:
-        """Whether a request to arm is obeyed: neither a stop nor the battery forbids it."""
-        return not self._stopped and not self._battery_empty and self.logic.cause is Cause.NONE
+        """Whether a request to arm is obeyed."""
+        return bool(self._fields.lasting == structs.CAUSE_NONE)
 
     @property
     def can_fly(self) -> bool:
         """Whether nothing but poses is needed."""
-        return self.calibrated and self.armed and self.can_be_armed
+        return bool(self._fields.ready) and not self.imu_is_stale
 
-    def mode(self, now_us: int) -> int:
-        """Return the controller's mode at this instant and announce a change of state; called every 10 ms."""
-        outside = self.bounds.is_outside(now_us)
-        if self._watchdog_us is not None and now_us >= self._watchdog_us:
-            self.emergency_stop()
-        if self.goals is not None:
-            if self.goals.forsaken(now_us):
+    @property
+    def imu_is_stale(self) -> bool:
+        """Whether the gyro delivers nothing new."""
+        return bool(self._sampling.recovering > 0)
+
+    @property
+    def has_recent_pose(self) -> bool:
+        """Whether an accepted pose is no older than silence allows."""
+        return bool(self._fields.pose_seen and self._fields.silent_us < self._parameters.pose_timeout_us)
+
+    @property
+    def controlling(self) -> bool:
+        """Whether the flaps obey controller or manual angles."""
+        return bool(self._data.mode != structs.MODE_HOVER)
+
+    @property
+    def battery_mv(self) -> int:
+        """The supply voltage [mV]."""
+        return int(self._data.battery_mv)
+
+    def look(self, now_us: int) -> None:
+        """Have the controller's mode decided at this instant and announce a change of state; called every 10 ms."""
+        data, goals = self._data, self.goals
+        data.now_us, data.connected = wrapped(now_us), i32(self.connected())
+        if goals is not None:
+            if goals.forsaken(now_us):
                 self.emergency_stop()
-            if not self.can_fly:
-                self.goals.abort()
-        state, cause = self._state(now_us, outside)
-        if state is not self.state or cause is not self.cause:
-            self.state, self.cause = state, cause
+            data.idle = i32(not goals.flies(now_us))
+        if self._core.run.call("supervise"):
+            self.state, self.cause = State(int(self._fields.state)), Cause(int(self._fields.cause))
+            cause = self.cause
             reason = "" if cause is Cause.NONE else f", {cause.name.lower().replace('_', ' ')}"
-            self._announce(f"supervisor: {state.name.lower()}{reason}")
-        mode = self._mode()
-        self.controlling = mode != MODE_HOVER
-        return mode
-
-    def _mode(self) -> int:
-        """Return the mode that follows from state, cause and who moves the flaps."""
-        if self.cause > Cause.OUT_OF_BOUNDS or self.manual is Manual.HOVER:
-            return MODE_HOVER
-        if self.manual is Manual.ANGLES:
-            return MODE_MANUAL if self.connected() else MODE_HOVER
-        return MODE_FLY if self.state is State.FLYING else MODE_HOVER
+            self._announce(f"supervisor: {self.state.name.lower()}{reason}")
+        if goals is not None and not self._fields.ready:
+            goals.abort()
 
     def emergency_stop(self) -> None:
         """Stop until the board reboots."""
-        self._stopped = self._locked = True
+        self._request(structs.REQUEST_LOCK)
 
     def stop(self) -> None:
         """Stop until `recover`."""
-        self._stopped = True
+        self._request(structs.REQUEST_STOP)
 
     def feed_watchdog(self, now_us: int) -> None:
         """Start the emergency stop watchdog, or hold it off for another second."""
-        self._watchdog_us = now_us + WATCHDOG_US
+        self._data.now_us = wrapped(now_us)
+        self._request(structs.REQUEST_FEED)
 
     def arm(self, armed: bool) -> bool:
         """Arm or disarm; False when the request to arm was refused."""
-        if armed and not self.can_be_armed:
-            return False
-        self.armed = armed
-        return True
+        return self._request(structs.REQUEST_ARM if armed else structs.REQUEST_DISARM)
 
-    def recover(self, now_us: int) -> bool:
+    def recover(self) -> bool:
         """Leave a lasting failsafe: a stop, logic that failed, and with a good voltage the low battery.
 
         False while the battery is low. The emergency stop cannot be left.
         """
-        self._stopped = self._locked
-        self.logic.reset()
-        if self.battery_mv >= self.low_battery_mv:
-            self._battery_empty = False
-            self._battery_good_us = now_us
-        return not self._battery_empty
+        return self._request(structs.REQUEST_RECOVER)
 
-    def see_battery(self, now_us: int, battery_mv: int) -> None:
-        """Take the supply voltage [mV]."""
-        self.battery_mv = battery_mv
-        if battery_mv >= self.low_battery_mv:
-            self._battery_good_us = now_us
-        elif now_us - self._battery_good_us >= BATTERY_LOW_US:
-            self._battery_empty = True
+    def _request(self, request: int) -> bool:
+        self._data.request = i32(request)
+        return bool(self._core.run.call("request"))
 
-    def _state(self, now_us: int, outside: bool) -> tuple[State, Cause]:
-        if self._stopped:
-            return State.FAILSAFE, Cause.EMERGENCY_STOP
-        if self.logic.cause is not Cause.NONE:
-            return State.FAILSAFE, self.logic.cause
-        if self._battery_empty:
-            return State.FAILSAFE, Cause.LOW_BATTERY
-        if not self.armed:
-            return State.FAILSAFE, Cause.DISARMED
-        if not self.calibrated:
-            return State.CALIBRATING, Cause.NONE
-        if self.last_pose_us is None or (self.goals is not None and not self.goals.flies(now_us)):
-            return State.WAITING, Cause.NONE
-        if now_us - self.last_pose_us >= self.pose_timeout_us:
-            return State.FAILSAFE, Cause.SILENCE
-        if outside:
-            return State.FAILSAFE, Cause.OUT_OF_BOUNDS
-        return State.FLYING, Cause.NONE
+
+def wrapped(time_us: int) -> i32:
+    """Return an instant as the core's clock of 32 bits shows it."""
+    return i32(((time_us + 0x8000_0000) & 0xFFFF_FFFF) - 0x8000_0000)

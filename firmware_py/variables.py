@@ -5,29 +5,22 @@ are in degrees with the nose up positive, `gyro` and `acc` in deg/s and g. Posit
 of the poses: for corrections the goal frame, because the board knows only its error; for absolute poses the cameras'.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from math import degrees
-from typing import TYPE_CHECKING
 
-from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, RATE, VELOCITY, Control, Estimator
-from firmware_py.core.subset import F32s, I32s
+from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, VELOCITY, Control, Estimator
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.drivers.imu import acceleration, rates
-from firmware_py.geometry import from_euler_zyx, rotate, wrap_angle, yaw_quaternion
+from firmware_py.geometry import Vector, from_euler_zyx, rotate, wrap_angle, yaw_quaternion
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
-from firmware_py.links.stream import ReadBlock
-from firmware_py.logic.plugs import GROUP
 from firmware_py.rtos.statistics import Load
 from firmware_py.running import Running
-from firmware_py.stock_names import stock_variables
+from firmware_py.table import CORE_VARIABLES, CoreVariable
 from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import State
-from firmware_py.wire.telemetry import ALL_BLOCKS, LEGACY_DEGREES
-
-if TYPE_CHECKING:
-    pass
+from firmware_py.wire.telemetry import LEGACY_DEGREES
 
 AGE_UNIT_US = 100  # locSrv.age counts tenths of a millisecond
 BATTERY_FULL_MV = 4200
@@ -36,48 +29,34 @@ LOAD_US = 100_000
 PM_BATTERY, PM_LOW = 0, 3  # pm.state
 
 F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scalar.I16, Scalar.U32
-SCALARS = {"f32": F32, "i32": Scalar.I32}  # by the core's types
 
 
 def log_variables(running: Running) -> tuple[LogVariable, ...]:
     """Return the table, in the order of the log TOC."""
-    estimator, control, supervisor = (
-        running.core.estimator.fields,
-        running.core.control.fields,
-        running.supervisor,
-    )
+    core, supervisor = running.core, running.supervisor
+    estimator, control = core.estimator.fields, core.control.fields
+    own = () if core.logic is None else core.logic.loaded.variables
     return (
+        *(_declared(core, variable) for variable in (*CORE_VARIABLES, *own)),
         *_state_estimate(running, estimator, control),
         *_crazyflie(running),
-        *_each("motor", "m1 m2 m3 m4", U16, "counts", control.count),
-        *_each("controller", "u1 u2 u3 u4", F32, "rad", control.u),
-        *_each("controller", "m1 m2 m3 m4", F32, "rad", control.command),  # deviation from the hover angle
-        *_each("motors_ctrp", "m1 m2 m3 m4", F32, "rad", control.flap),
-        *_each("excite", "u1 u2 u3 u4", F32, "rad", control.excitation),
         LogVariable("motors_ctrp.min_angle", F32, "rad", lambda: control.flap.min()),
         LogVariable("motors_ctrp.max_angle", F32, "rad", lambda: control.flap.max()),
-        LogVariable("Error.int_z_err", F32, "m s", partial(getattr, control, "integral_z")),
         LogVariable("supervisor.info", U16, "", running.platform.bits),
-        LogVariable("supervisor.state", U8, "", partial(getattr, supervisor, "state")),
-        LogVariable("supervisor.cause", U8, "", partial(getattr, supervisor, "cause")),
         LogVariable("sys.canfly", U8, "", partial(getattr, supervisor, "can_fly")),
-        LogVariable("sys.armed", U8, "", partial(getattr, supervisor, "armed")),
         LogVariable("sys.isFlying", U8, "", lambda: supervisor.state is State.FLYING),
         LogVariable("sys.isTumbled", U8, "", lambda: 0),
         *_localisation(running.localisation, estimator),
-        *_kalman(running, estimator),
+        *_parts("kalman", "stateX stateY stateZ", "m", partial(_vector, running, POSITION, "position")),
         *_counters(running),
-        *_own_logic(running.core),
-        *stock_variables(running),
     )
 
 
-def _each(
-    group: str, names: str, scalar: Scalar, unit: str, array: F32s | I32s, first: int = 0
-) -> Iterator[LogVariable]:
-    """Name elements of an array, from `first` on."""
-    for index, name in enumerate(names.split(), first):
-        yield LogVariable(f"{group}.{name}", scalar, unit, partial(array.item, index))
+def _declared(core: CoreBlocks, variable: CoreVariable) -> LogVariable:
+    """Return a variable of the table of variables."""
+    place = variable.place
+    read = partial(core.named[place.block].memory[place.field].item, 0, *place.index)
+    return LogVariable(variable.name, variable.scalar, variable.unit, read)
 
 
 def _fields(group: str, names: str, scalar: Scalar, unit: str, fields: object) -> Iterator[LogVariable]:
@@ -95,59 +74,53 @@ def _parts(group: str, names: str, unit: str, read: Callable[[int], float]) -> I
 def _state_estimate(running: Running, estimator: Estimator, control: Control) -> Iterator[LogVariable]:
     now, flap, command = estimator.now, control.flap, control.command
     angles = "flap_1 flap_2 flap_3 flap_4"
-    yield from _parts("stateEstimate", "x y z", "m", partial(_position, running))
-    yield from _parts("stateEstimate", "vx vy vz", "m/s", partial(_velocity, running))
+    yield from _parts("stateEstimate", "x y z", "m", partial(_vector, running, POSITION, "position"))
+    yield from _parts("stateEstimate", "vx vy vz", "m/s", partial(_vector, running, VELOCITY, "velocity"))
     yield from _parts("stateEstimate", "roll pitch yaw", "deg", partial(_legacy_angle, running))
-    yield from _each("stateEstimate", "roll_rate pitch_rate yaw_rate", F32, "rad/s", now, RATE)
     yield from _parts("stateEstimate", angles, "rad", lambda i: now[FLAP + i] + (flap[i] - command[i]))
-    yield from _parts(
-        "stateEstimate",
-        "qw qx qy qz",
-        "",
-        lambda i: from_euler_zyx(*(_angle(running, axis) for axis in range(3)))[i],
-    )
+    yield from _parts("stateEstimate", "qw qx qy qz", "", partial(_quaternion, running))
 
 
-def _position(running: Running, axis: int) -> float:
+def _vector(running: Running, first: int, of: str, axis: int) -> float:
+    """Return an axis of the position or velocity that begins at `first` of the state, in the frame of the poses."""
     now, frame = running.core.estimator.fields.now, running.pilot.frame(running.stack.kernel.now_us)
     if frame is None:
-        return now.item(POSITION + axis)
-    x, y, z = now[POSITION : POSITION + 3].tolist()
-    return frame.position[axis] + rotate(yaw_quaternion(frame.yaw), (x, y, z))[axis]
+        return now.item(first + axis)
+    x, y, z = now[first : first + 3].tolist()
+    origin: Vector = getattr(frame, of)
+    return origin[axis] + rotate(yaw_quaternion(frame.yaw), (x, y, z))[axis]
 
 
-def _velocity(running: Running, axis: int) -> float:
-    now, frame = running.core.estimator.fields.now, running.pilot.frame(running.stack.kernel.now_us)
-    if frame is None:
-        return now.item(VELOCITY + axis)
-    x, y, z = now[VELOCITY : VELOCITY + 3].tolist()
-    return frame.velocity[axis] + rotate(yaw_quaternion(frame.yaw), (x, y, z))[axis]
-
-
-def _angle(running: Running, axis: int) -> float:
-    angle = running.core.estimator.fields.now.item(ATTITUDE + axis)
+def angle(running: Running, axis: int) -> float:
+    """Return roll, pitch or yaw [rad] in the frame of the poses."""
+    own = running.core.estimator.fields.now.item(ATTITUDE + axis)
     frame = running.pilot.frame(running.stack.kernel.now_us) if axis == 2 else None
-    return angle if frame is None else wrap_angle(angle + frame.yaw)
+    return own if frame is None else wrap_angle(own + frame.yaw)
+
+
+def _quaternion(running: Running, part: int) -> float:
+    return from_euler_zyx(*(angle(running, axis) for axis in range(3)))[part]
 
 
 def _legacy_angle(running: Running, axis: int) -> float:
-    return LEGACY_DEGREES[axis] * _angle(running, axis)
+    return LEGACY_DEGREES[axis] * angle(running, axis)
 
 
 def _crazyflie(running: Running) -> Iterator[LogVariable]:
     """Variables that only the Crazyflie's own programs read."""
     board, bias = running.board, running.core.data.fields.gyro_bias
+    parameters = running.core.parameters.fields
 
     def rate(axis: int) -> float:
         return degrees(rates(board.read_imu(), bias.tolist())[axis])
 
     def battery_level() -> float:
-        low = running.supervisor.low_battery_mv
+        low = int(parameters.low_battery_mv)
         share = (board.read_battery_mv() - low) / max(1, BATTERY_FULL_MV - low)
         return 100 * min(1.0, max(0.0, share))
 
     def battery_state() -> float:
-        return PM_LOW if board.read_battery_mv() < running.supervisor.low_battery_mv else PM_BATTERY
+        return PM_LOW if board.read_battery_mv() < parameters.low_battery_mv else PM_BATTERY
 
     yield from _parts("stabilizer", "roll pitch yaw", "deg", partial(_legacy_angle, running))
     yield LogVariable("stabilizer.thrust", F32, "", lambda: 0.0)
@@ -168,20 +141,6 @@ def _localisation(service: LocalisationService, estimator: Estimator) -> Iterato
     yield LogVariable("locSrv.positions", U32, "", partial(getattr, service, "positions"))
 
 
-def _kalman(running: Running, estimator: Estimator) -> Iterator[LogVariable]:
-    covariance = estimator.P.reshape(-1)
-    variances = estimator.P.diagonal()
-    yield from _parts("kalman", "stateX stateY stateZ", "m", partial(_position, running))
-    yield from _each("kalman", "statePX statePY statePZ", F32, "m/s", estimator.now, VELOCITY)
-    yield from _each("kalman", "varX varY varZ", F32, "m^2", variances, POSITION)
-    yield from _each("kalman", "varPX varPY varPZ", F32, "m^2/s^2", variances, VELOCITY)
-    yield from _fields("kalman", "fused refused jumps too_old invalid bounded resets", U32, "", estimator)
-    yield from _each("Uncertainty", "P_x_x", F32, "m^2", covariance, POSITION)
-    yield from _each("Uncertainty", "P_x_vx", F32, "m^2/s", covariance, VELOCITY)
-    yield from _each("Uncertainty", "P_vx_vx", F32, "m^2/s^2", variances, VELOCITY)
-    yield LogVariable("delayComp.horizon", U8, "10 ms", partial(getattr, estimator, "horizon"))
-
-
 def _counters(running: Running) -> Iterator[LogVariable]:
     """What was lost, and where; the load of the processor."""
     yield from _fields("crtp", "malformed unserved dropped", U32, "", running.stack)
@@ -194,24 +153,9 @@ def _counters(running: Running) -> Iterator[LogVariable]:
     yield LogVariable("memTst.errCntW", U32, "", partial(getattr, running.tester, "errors"))
 
 
-def _own_logic(core: CoreBlocks) -> Iterator[LogVariable]:
-    """What the user's modules have declared as Logged."""
-    for own in () if core.logic is None else core.logic.loaded.variables:
-        array = core.named[own.block].memory[own.field]
-        read = partial(array.item, 0) if own.index is None else partial(array.item, 0, own.index)
-        yield LogVariable(f"{GROUP}.{own.name}", SCALARS[own.base], own.unit, read)
-
-
 def _rejected(estimator: Estimator) -> int:
     return int(estimator.refused + estimator.too_old + estimator.invalid)
 
 
 def _received(estimator: Estimator) -> int:
     return int(estimator.fused + estimator.jumps) + _rejected(estimator)
-
-
-def telemetry_reader(variables: Sequence[LogVariable]) -> ReadBlock:
-    """Return the function that reads a telemetry block from the log table."""
-    read = {variable.name: variable.read for variable in variables}
-    blocks = {block.id: [read[variable.name] for variable in block.variables] for block in ALL_BLOCKS}
-    return lambda block: [read() for read in blocks[block.id]]

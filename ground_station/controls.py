@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from enum import Enum
 from math import nan
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 REPEAT_US = 100_000  # without a reply, until the request is sent again
 PATIENCE_US = 2_000_000  # without a reply, until it is given up
@@ -49,18 +49,6 @@ class Answer:
     error: str = ""
 
 
-class Controls(Protocol):
-    """One board. A request replaces the one before it."""
-
-    def ask(self, now_us: int, request: Request) -> None:
-        """Begin."""
-        ...
-
-    def answer(self, now_us: int) -> Answer | None:
-        """Return the answer once, when it is there; to be called again and again."""
-        ...
-
-
 M = TypeVar("M")  # a message of the protocol
 
 
@@ -80,19 +68,23 @@ Script = Generator[Exchange[M], Any, Settings]
 
 
 class Dialogue(Generic[M]):
-    """`Controls` over any protocol: `script_of` says for a request which exchanges it takes; it raises `ControlsError`."""
+    """A script of exchanges over any protocol, which may raise `ControlsError`."""
 
-    def __init__(self, script_of: Callable[[Request], Script[M]]) -> None:
-        self._script_of = script_of
+    def __init__(self) -> None:
         self._script: Script[M] | None = None
         self._exchange: Exchange[M] | None = None
         self._answer: Answer | None = None
         self._again_us = self._give_up_us = 0
 
-    def ask(self, now_us: int, request: Request) -> None:
-        """Begin; an older request is dropped."""
+    @property
+    def busy(self) -> bool:
+        """Whether a script has not ended yet."""
+        return self._script is not None
+
+    def begin(self, now_us: int, script: Script[M]) -> None:
+        """Begin; an older script is dropped."""
         self._answer = None
-        self._script = self._script_of(request)
+        self._script = script
         self._go_on(now_us, None)
 
     def hear(self, now_us: int, message: M) -> bool:

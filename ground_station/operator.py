@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Sequence
 from difflib import get_close_matches
 from math import degrees, hypot, isfinite, radians
 
-from firmware_py.wire.parameter_names import OF_PROFILE, on_board
+from firmware_py.table import OF_PROFILE, on_board
 from firmware_py.wire.supervisor import State
 from ground_station.controls import Action, Answer, ControlsError, Request, Settings
 from ground_station.program import Cockpit
@@ -221,6 +221,7 @@ class Operator:
             raise ControlsError("nothing to reset: the values that are set are those that last flew well")
         for name, value in changed.items():
             ((_, self._set[name]),) = yield Request(Action.WRITE, name, value)
+            self._well_since_us = None  # the others have not flown beside it
         return "reset " + ", ".join(f"{name} {value:.6g}" for name, value in changed.items())
 
     def _mark(self, words: list[str]) -> Talk:

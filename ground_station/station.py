@@ -29,7 +29,7 @@ class Link(Protocol):
         ...
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Send a tracked pose and the goal in the form that the board needs; `WireError` for a pose that cannot be sent."""
+        """Send a tracked pose and the goal in the form that the board needs."""
         ...
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
@@ -120,11 +120,7 @@ class GroundStation:
         self.frame = frame
         if not due:
             return
-        try:
-            self._link.send(now_us, frame, self._trajectory.at(now_us))
-        except WireError:
-            counters.invalid += 1
-            return
+        self._link.send(now_us, frame, self._trajectory.at(now_us))
         counters.sent += 1
         self.budget.add(frame, now_us, self._link.latency)
         self._slots.take(frame.t_us)

@@ -10,7 +10,7 @@ from math import nan
 from pathlib import Path
 
 from firmware_py.geometry import to_euler_zyx
-from firmware_py.wire.telemetry import ALL_BLOCKS, SLOW_BLOCKS, Block, Sample
+from firmware_py.wire.telemetry import ALL_BLOCKS, Block, Sample
 from ground_station.latency import STAGES, LatencyBudget
 from ground_station.mocap import MocapFrame
 from ground_station.tracker import Track
@@ -51,7 +51,7 @@ def _columns_of(blocks: tuple[Block, ...]) -> tuple[list[str], dict[int, int]]:
     return titles, first
 
 
-_TELEMETRY_COLUMNS, _FIRST_COLUMN = _columns_of((*ALL_BLOCKS, *SLOW_BLOCKS))
+_TELEMETRY_COLUMNS, _FIRST_COLUMN = _columns_of(ALL_BLOCKS)
 _TIMES = (TIME_COLUMN, POSE_COLUMNS[0])  # to the microsecond
 _FORMATS = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *_TELEMETRY_COLUMNS)]
 _ROW = ",".join(["%d", *_FORMATS]) + "\n"

@@ -6,10 +6,11 @@ clock, `t`, which counts microseconds; frames are W (world, z up) and B (body, x
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -18,8 +19,10 @@ from typing import Any, TypedDict, Unpack
 import pyarrow as pa
 
 from firmware_py.export.boards import PYTHON
-from ground_station.trajectory import Along, Goal, Trajectory
-from hil.config import DEFAULT_PROFILE
+from ground_station import trajectory
+from ground_station.trajectory import Trajectory
+from hil.arguments import Known, checked
+from hil.config import DEFAULT_PROFILE, Overrides
 from hil.errors import LabError
 from hil.experiments import find_again, find_experiment
 from hil.laboratory.experiment import Experiment
@@ -31,8 +34,9 @@ from hil.laboratory.lockstep import RADIO
 from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Outcome, Result, read_result
-from hil.laboratory.run import MakeFlight, Request, prepare
+from hil.laboratory.run import MakeFlight, Request
 from hil.laboratory.run import fly as fly_into
+from hil.run_folder import folder_of, reserved
 
 __all__ = [
     "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Options", "Request", "Run",
@@ -42,44 +46,65 @@ __all__ = [
 Progress = Callable[[float], None]  # (share of the flight, 0..1)
 
 
-class Options(TypedDict, total=False):
-    """How to fly, everything optional."""
+@checked
+class Goal(trajectory.Goal):
+    """The goal frame G: upright, turned by `yaw`."""
+
+    __slots__ = ()
+
+
+@checked
+class Along(trajectory.Along):
+    """Makes a trajectory from a function of time, for experiments that move the goal."""
+
+    __slots__ = ()
+
+
+class Flown(TypedDict, total=False):
+    """What `Request.of` takes beside an experiment, everything optional."""
 
     profile: str  # one that ships, or a path that ends in .toml; default: floaty
-    overrides: Sequence[str]  # "section.key=value", as for `--set`
+    overrides: Overrides  # {"section.key": value}, or "section.key=value" as for `--set`
     seed: int  # of everything random; default: 1
-    duration_s: float  # of free flight; default: the experiment's
+    duration_s: float | None  # of free flight; default: the experiment's
     link: str  # radio and mavlink: in lockstep; a URI: in real time; default: radio
     faults: Sequence[Fault | str]  # on top of the experiment's own
     board: str  # what executes the flight core: python, c or cortex-m4; default: python
-    trajectory: Callable[[Goal, int], Trajectory]  # instead of the experiment's, like Along(path)
 
 
-def request_of(experiment: Experiment | str, **options: Unpack[Options]) -> Request:
+class Options(Flown, total=False):
+    """How to fly, everything optional."""
+
+    trajectory: Callable[[trajectory.Goal, int], Trajectory]  # instead of the experiment's, like Along(path)
+
+
+@checked
+def request_of(
+    experiment: Experiment | str,
+    *,
+    trajectory: Callable[[trajectory.Goal, int], Trajectory] | None = None,
+    **options: Unpack[Flown],
+) -> Request:
     """Return the request for an experiment, an object, a name or FILE.py:NAME. Raises `LabError` for bad input."""
     chosen = find_experiment(experiment) if isinstance(experiment, str) else experiment
-    if "trajectory" in options:
-        chosen = replace(chosen, trajectory=options["trajectory"])
-    return Request.of(
-        chosen,
-        options.get("profile", DEFAULT_PROFILE),
-        options.get("overrides", ()),
-        options.get("seed", 1),
-        options.get("duration_s"),
-        options.get("link", RADIO),
-        [fault(one) if isinstance(one, str) else one for one in options.get("faults", ())],
-        options.get("board", PYTHON),
-    )
+    if trajectory is not None:
+        chosen = dataclasses.replace(chosen, trajectory=trajectory)
+    return Request.of(chosen, **options)
 
 
+@checked
 def fly(
     flown: Request | Experiment | str,
     folder: Path | str | None = None,
     progress: bool | Progress = False,
     report: bool = False,
+    replace: bool = False,
     **options: Unpack[Options],
 ) -> Run:
-    """Fly once, into a run folder, by default `runs/EXPERIMENT-SEED`; its former content is replaced.
+    """Fly once, into a run folder, by default `runs/EXPERIMENT-SEED`.
+
+    An earlier flight of the same request is replaced there. A flight of another request stays: by default the folder is then
+    `runs/EXPERIMENT-SEED-2` and so on; a `folder` that holds one is refused, unless it may be replaced.
 
     `flown` is an experiment, the name of one, FILE.py:NAME, or a `Request`, which takes no options. `progress` shows the
     time in flight on standard error, or is called with the share of the flight that is over. `report` writes `report.html`.
@@ -92,22 +117,20 @@ def fly(
         request = flown
     else:
         request = request_of(flown, **options)
-    folder = (
-        Path(folder) if folder is not None else Path("runs") / f"{request.experiment.name}-{request.seed}"
-    )
-    prepare(folder)
+    place = folder_of(request) if folder is None else Path(folder)
     show = _shown(request) if progress is True else progress or None
 
     def on_progress(now_us: int, flight: Flight) -> None:
         if show is not None:
             show(min(now_us / flight.end_us, 1.0))  # almost 0 while the release is not planned
 
-    result = fly_into(request, folder, progress=on_progress, flight_of=_maker_of(request))
-    if show is not None:
-        show(1.0)
-    run = Run(result, request.experiment)
-    if report:
-        run.write_report()
+    with reserved(request, place, replace):
+        result = fly_into(request, place, progress=on_progress, flight_of=_maker_of(request))
+        if show is not None:
+            show(1.0)
+        run = Run(result, request.experiment)
+        if report:
+            run.write_report()
     return run
 
 
@@ -119,6 +142,7 @@ def _maker_of(request: Request) -> MakeFlight | None:
     return linked_flight
 
 
+@checked
 def load_run(folder: Path | str) -> Run:
     """Return a run that was flown before. Raises `LabError` when the folder holds none."""
     result = read_result(Path(folder))
@@ -155,7 +179,7 @@ class Run:
     @property
     def metrics(self) -> Mapping[str, float]:
         """Figures of the flight after the release, in the unit of `unit_of`; NaN where the flight has no value."""
-        return self.result.metrics
+        return Known("metric", self.result.metrics)
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
@@ -190,13 +214,13 @@ class Run:
     @property
     def units(self) -> Mapping[str, str]:
         """The unit of every column of the log, empty for a pure number."""
-        return {
-            name: self.log.schema.field(name).metadata[b"unit"].decode() for name in self.log.column_names
-        }
+        fields = [self.log.schema.field(name) for name in self.log.column_names]
+        return Known("column", {field.name: field.metadata[b"unit"].decode() for field in fields})
 
+    @checked
     def unit_of(self, metric: str) -> str:
         """Return the unit of a metric, empty for a pure number."""
-        return (self.result.own_metrics.get(metric) or METRICS[metric]).unit
+        return Known("metric", {**METRICS, **self.result.own_metrics})[metric].unit
 
     @property
     def events(self) -> list[dict[str, Any]]:
@@ -206,7 +230,7 @@ class Run:
     @property
     def paths(self) -> Mapping[str, Path]:
         """The files of the run by their names: log.parquet, events.jsonl, telemetry.csv, result.json, …"""
-        return {path.name: path for path in sorted(self.folder.iterdir())}
+        return Known("file", {path.name: path for path in sorted(self.folder.iterdir())})
 
     def write_report(self) -> Path:
         """Write `report.html` with all figures, and return its path."""
@@ -215,7 +239,7 @@ class Run:
         return write_report(self.folder, self.experiment)
 
     def __repr__(self) -> str:
-        failed = "; ".join(str(verdict) for verdict in self.verdicts if not verdict.holds)
+        failed = "; ".join(map(str, self.result.failed))
         how = self.cause or failed or ("all limits hold" if self.verdicts else "no limits")
         return f"<{self.result.experiment}, seed {self.result.seed}: {self.outcome}, {how}; {self.folder}>"
 
@@ -231,6 +255,7 @@ class Run:
         return f"<p>{escape(repr(self)[1:-1])}</p><table>{rows}</table>{link}"
 
 
+@checked
 def command_of(request: Request) -> str | None:
     """Return the command that flies a request again, bit for bit; None for an experiment that no command can name."""
     experiment = request.experiment

@@ -1,10 +1,15 @@
 """How simulated time follows the wall clock: not at all, or step by step. The only file that sleeps."""
 
+import os
 import select
 import socket
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Protocol
+
+PROCESS = Path("/proc/self/stat")
+START_TIME = 19  # among its figures behind the process's name, in ticks since the machine's boot
 
 Readers = dict[socket.socket | int, Callable[[int], None]]
 
@@ -136,3 +141,12 @@ class Paced:
         self._reported_us = self.stood_still_us
         self._next_notice_us = self.now_us() + self.NOTICE_PERIOD_US
         return [f"this machine was too slow: time stood still for {fresh_us / 1000:.0f} ms"]
+
+
+def process_age_s() -> float:
+    """How long this process has been running; NaN where the system does not say when it began."""
+    try:
+        figures = PROCESS.read_text().rpartition(")")[2].split()
+    except OSError:
+        return float("nan")
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - int(figures[START_TIME]) / os.sysconf("SC_CLK_TCK")

@@ -4,11 +4,13 @@
 Every mistake becomes a `LabError` that names the key, its value and what is allowed.
 """
 
+import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
@@ -16,13 +18,16 @@ from firmware_py.config import FirmwareConfig, LogicConfig
 from firmware_py.errors import FirmwareError
 from firmware_py.logic.loading import load_logic
 from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
-from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, RadioConfig, SerialConfig
+from hil.arguments import shown
+from hil.crazyflie.config import RadioConfig
+from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, SerialConfig
 from hil.errors import LabError, hint
 from hil.world.body import check_hover
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import check
 
 DEFAULT_PROFILE = "floaty"
+Overrides = Sequence[str] | Mapping[str, Any]  # "section.key=value", or the values by "section.key"
 _FOLDERS = (Path(__file__).parent.parent / "profiles", Path(__file__).parent / "profiles")
 
 
@@ -97,6 +102,30 @@ def _locate_logic(tree: dict[str, Any], folder: Path) -> None:
         for key in LogicConfig.model_fields.keys() & section.keys():
             if isinstance(section[key], str) and section[key]:
                 section[key] = str((folder / section[key]).resolve())
+
+
+def settings_of(overrides: Overrides) -> tuple[str, ...]:
+    """Return overrides as "section.key=value". Raises `LabError` for a value that no profile can have."""
+    if not isinstance(overrides, Mapping):
+        return tuple(overrides)
+    return tuple(f"{name}={_toml_of(name, value)}" for name, value in overrides.items())
+
+
+def _toml_of(name: str, value: Any) -> str:
+    """Return a value as TOML, a text as a bare word where that means the same."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_toml_of(name, one) for one in value)}]"
+    if isinstance(value, str):
+        return value if _toml_value(value) == value == value.strip() else json.dumps(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return repr(value)
+    raise LabError(
+        f"overrides: {name} = {shown(value)}: expected a number, text, True, False, or a list of them"
+    )
 
 
 def read_toml(kind: str, path: Path) -> dict[str, Any]:

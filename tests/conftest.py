@@ -2,9 +2,12 @@
 
 A test in `tests/realtime/` or marked `realtime` needs the wall clock: it runs alone (`make test-all`), and one that
 fails while this machine stood still is inconclusive and repeated. All other tests pass however busy the machine is.
-Property tests try the same examples on every machine, and look for new ones with FLOATY_FUZZ set.
+A test that exceeds its tier's time limit fails (pytest-timeout); one that does not even return from C takes its process
+with it, and pytest-xdist names it and goes on. Property tests try the same examples on every machine, and
+look for new ones with FLOATY_FUZZ set.
 """
 
+import faulthandler
 import gc
 import os
 import signal
@@ -28,6 +31,14 @@ STANDSTILL_MS = 100  # of the test's own process, which no real-time test need s
 METER_PERIOD_S = 0.005
 STEADY_MS, STEADY_S = 20, 5.0  # a machine runs steadily when a busy process misses no longer time for so long
 PATIENCE_S = 600.0  # that the tests of one session wait for a steady machine, together
+LIMITS_S = {
+    "realtime": 1800.0,
+    "long": 1800.0,
+    "fast": 300.0,
+}  # of one test with its fixtures, on a busy machine
+GRACE_S = (
+    60.0  # from a test's limit until its process ends, because numba's and C code let no exception through
+)
 
 
 class InconclusiveError(Exception):
@@ -76,16 +87,42 @@ class SteadyMachine:
 MACHINE = SteadyMachine()
 
 
-def pytest_configure() -> None:
+STDERR = pytest.StashKey[int]()  # where a test that has to be ended is reported: nothing captures it
+
+
+def pytest_configure(config: pytest.Config) -> None:
     """Let Ctrl-C reach the programs under test when these tests run in the background of a shell, which ignores it."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    config.stash[STDERR] = os.dup(2)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what stands in `tests/realtime/`."""
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Close what `pytest_configure` opened."""
+    os.close(config.stash[STDERR])
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests in `tests/realtime/`, and give every test its time limit."""
     for item in items:
         if item.path.is_relative_to(REALTIME):
             item.add_marker("realtime")
+        if config.pluginmanager.hasplugin("timeout"):  # `make` installs it
+            item.add_marker(pytest.mark.timeout(limit_s(item), method="signal"))
+
+
+def limit_s(item: pytest.Item) -> float:
+    """Return the time limit [s] of a test's tier."""
+    return next((limit for tier, limit in LIMITS_S.items() if tier in item.keywords), LIMITS_S["fast"])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[Any]:
+    """End the process of a test that its time limit did not end."""
+    faulthandler.dump_traceback_later(limit_s(item) + GRACE_S, exit=True, file=item.config.stash[STDERR])
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def pytest_collection_finish() -> None:
@@ -134,3 +171,11 @@ def judged(item: pytest.Item) -> Iterator[Any]:
             MACHINE.doubtful = True
             raise InconclusiveError(f"{text}: {type(error).__name__}: {error}") from error
         raise
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the exported app for this host, once for all files; an `App` runs a copy of it."""
+    from support.crazyflie_app import build_app
+
+    return build_app(tmp_path_factory.mktemp("app"))

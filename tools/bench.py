@@ -28,7 +28,7 @@ from rich.table import Table
 
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
-from firmware_py.core.structs import Control, Estimator, Input
+from firmware_py.core.structs import Control, Estimator, Input, Sampling, Supervisor
 from firmware_py.extras import install_command
 from firmware_py.fast import STALE, STATE
 from hil.config import load_config
@@ -68,13 +68,12 @@ def flight_s(recorded: bool) -> float:
     def measure() -> float:
         with tempfile.TemporaryDirectory() as folder:
             telemetry = Path(folder) / "telemetry.csv" if recorded else None
-            flight = lockstep_flight(load_config(), EXPERIMENTS["hover"], FLIGHT_S, 1, telemetry)
-            if recorded:
-                flight.recorder = Recorder(Path(folder), flight.channels(), {})
+            flight = lockstep_flight(Request.of(EXPERIMENTS["hover"], duration_s=FLIGHT_S), telemetry)
+            recorder = Recorder(Path(folder), flight.channels(), {}) if recorded else None
             start = time.process_time()
-            flight.run()
-            if flight.recorder is not None:
-                flight.recorder.close()
+            flight.run(recorder=recorder)
+            if recorder is not None:
+                recorder.close()
             flight.close()
             return time.process_time() - start
 
@@ -85,19 +84,20 @@ def core_us() -> tuple[float, float]:
     """Microseconds of one estimator tick (with a pose every other tick) and one controller tick."""
     parameters = parameters_of(load_config())
     data, estimator, control = (struct.allocate() for struct in (Input, Estimator, Control))
+    sampling, supervisor = Sampling.allocate(), Supervisor.allocate()
     entry.reset(parameters.arg, estimator.arg)
     data.fields.pose_quaternion[:] = 1.0, 0.0, 0.0, 0.0
-    data.fields.pose_age_us = 42_000
-    data.fields.gyro_samples = 10
     data.fields.mode = 1
     ticks = 0
 
     def estimate() -> None:
         nonlocal ticks
         ticks += 1
+        data.fields.gyro_samples = 10
         if ticks % 2:
-            entry.file_pose(parameters.arg, data.arg, estimator.arg)
-        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg)
+            data.fields.pose_age_us = 33_000
+            entry.file_pose(parameters.arg, data.arg, estimator.arg, sampling.arg, supervisor.arg)
+        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg)
 
     def steer() -> None:
         entry.control(parameters.arg, data.arg, estimator.arg, control.arg)
@@ -123,10 +123,10 @@ def plant_us() -> float:
 def start_up_s(cache: Path | None) -> float:
     """Wall time of a process that flies until its first tick; with a cache folder: compiling everything."""
     code = (
-        "from hil.config import load_config; from hil.experiments import EXPERIMENTS;"
-        "from hil.laboratory.lockstep import lockstep_flight;"
-        "flight = lockstep_flight(load_config(), EXPERIMENTS['hover'], 1.0, 1, None);"
-        "flight.lab.end_us = 30_000; flight.run()"
+        "from hil.experiments import EXPERIMENTS; from hil.laboratory.lockstep import lockstep_flight;"
+        "from hil.laboratory.run import Request;"
+        "flight = lockstep_flight(Request.of(EXPERIMENTS['hover'], duration_s=1.0));"
+        "flight.lab.end_at(30_000); flight.run()"
     )
     environment = dict(os.environ)
     if cache is not None:

@@ -1,25 +1,23 @@
 """What Dask's workers make of a campaign: `python tools/bench.py --campaign` calls this.
 
-The flights are those of `docs/table.toml`, of the length that the bench says.
+The flights are those of `floaty campaign table`, of the length that the bench says.
 """
 
 import time
-from pathlib import Path
 
 import psutil
 
 from hil.campaigns.cluster import FlyOne, Workers
-from hil.campaigns.config import read_spec
-from hil.campaigns.flying import Campaign, Row, failed, fly_flight
+from hil.campaigns.config import find_spec, read_spec
+from hil.campaigns.flying import Campaign, CampaignRow, failed, fly_flight
 from hil.campaigns.sampling import draw
 
-TABLE = Path(__file__).parent.parent / "docs" / "table.toml"
 FLIGHTS = 24
 EMPTY_FLIGHTS = 300
 SHORT_S, SETTLED, SHORT_FLIGHTS = 0.1, 200, 1200  # flights until memory is measured first and last
 
 
-def nothing(campaign: Campaign, index: int) -> Row:
+def nothing(campaign: Campaign, index: int) -> CampaignRow:
     """Return a row without flying: what is left is Dask and the dataset's numbers."""
     return failed(draw(campaign.spec, index), "not flown")
 
@@ -54,7 +52,7 @@ def growth_kb() -> float:
 
 
 def _timed(workers: Workers, flight_s: float, indices: range, fly_one: FlyOne) -> float:
-    spec = read_spec(TABLE).model_copy(update={"duration_s": flight_s, "flights": 2048})
+    spec = read_spec(find_spec("table")).model_copy(update={"duration_s": flight_s, "flights": 2048})
     start = time.perf_counter()
     rows = list(workers.fly(Campaign.of(spec), lambda: False, iter(indices), fly_one))
     assert len(rows) == len(indices)

@@ -29,12 +29,13 @@ from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from here, a
 PACKAGES = ("firmware_py", "ground_station", "hil")
 MODULES = {
     "firmware_py": "firmware geometry measurements pilot planner supervisor tasks",
-    "firmware_py/links": "crtp_stack localisation stream",
+    "firmware_py/links": "crtp_stack localisation log",
     "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",
-    "firmware_py/wire": "crtp telemetry",
+    "firmware_py/wire": "crtp log telemetry",
     "ground_station": "corrections mocap pose_filter station telemetry_log tracker",
     "hil": "events",
-    "hil/devices": "board cameras radio shockburst",
+    "hil/crazyflie": "shockburst",
+    "hil/devices": "board cameras radio",
     "hil/laboratory": "channels flight laboratory lockstep recorder robot",
     "hil/world": "battery plant",
 }

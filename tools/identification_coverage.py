@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from hil.experiments import find_experiment
-from hil.identify.identify import Constant, identify
+from hil.identify.identify import IdentifiedConstant, identify
 from hil.identify.record import KEPT, load_record
 from hil.laboratory.run import Request
 from hil.studies.sweep import Job, fly_all
@@ -55,7 +55,7 @@ def main(count: int, folder: Path) -> None:
         for place, name in enumerate(EXCITATIONS)
     ]  # fmt: skip
     fly_all(jobs, Console(stderr=True))
-    found: dict[str, list[Constant]] = {}
+    found: dict[str, list[IdentifiedConstant]] = {}
     for robot in robots:
         flights = [load_record(folder / f"{robot}-{name}", "floaty") for name in EXCITATIONS]
         for constant in identify(flights).constants:

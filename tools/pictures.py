@@ -61,9 +61,9 @@ def program(*names: str) -> str:
 
 def scene(run: Path, at_s: float, out: Path) -> None:
     """Write what rerun's viewer shows of a run at an instant."""
-    from hil.pictures.viewer import Recording
+    from hil.pictures.viewer.recording import ServedRecording
 
-    recording = Recording(run)
+    recording = ServedRecording(run)
     # The mouse pointer stands in the middle of the screen: below the window, where it lights nothing up.
     command = [
         program("xvfb-run"),

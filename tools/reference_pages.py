@@ -1,4 +1,4 @@
-"""The pages of the reference that are tables of the code: profile keys, log columns, kinds of faults, the command line.
+"""The pages of the reference that are tables of the code: the command line, profile keys, variables, log columns, faults.
 
 mkdocs-gen-files runs this while `make docs` builds the site. `pages` returns their text, so that a test reads what is built.
 """
@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import get_args
+from typing import Any, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -19,7 +19,11 @@ sys.path.insert(
     0, str(Path(__file__).parent.parent)
 )  # mkdocs runs the file in its own process, from any folder
 
+from firmware_py.firmware import Firmware
+from firmware_py.table import OF_PROFILE
+from hil.commands.app import app
 from hil.config import LabConfig, load_config
+from hil.devices.board import VirtualBoard
 from hil.laboratory.fault_kinds import KINDS
 
 # What the groups of columns mean; a group without a sentence, or a sentence without a group, ends the build.
@@ -48,49 +52,81 @@ GROUPS = {
     "excite": "what is added to the inputs for identification; only in the experiments `identify` and its kin",
 }
 
+LEADS = {
+    "cli": "`floaty COMMAND --help` prints the same text. More commands:",
+    "profile": "A profile contains everything about a flight except the experiment: the constants on board and the world "
+    "around it. Override a key with `--set SECTION.KEY=VALUE`. The tables show the values of the default profile, `floaty`. "
+    "More keys:",
+}
+# Pages of a long reference: title, and commands or sections. One that is on no page, or on two, ends the build.
+COMMANDS = {
+    "cli": ("Command line", "list fly new runs view report compare export"),
+    "cli-studies": ("Command line: studies", "paper study drag-model campaign identify tune design"),
+    "cli-programs": ("Command line: programs and real flights", "serve station param"),
+    "cli-boards": ("Command line: boards", "board deploy"),
+}
+SECTIONS = {
+    "profile": ("Profile keys", "flight limits controller model estimator predictor allocation excitation servo"),
+    "profile-board": ("Profile keys: board and station", "supervisor box cpu mavlink logic station tracker capture"),
+    "profile-world": ("Profile keys: robot and tunnel", "geometry plant actuators battery tunnel"),
+    "profile-devices": ("Profile keys: sensors and links", "imu mocap markers radio serial"),
+}  # fmt: skip
+
 
 def pages() -> dict[str, str]:
     """Return the text of each page by its place in the documentation."""
     return {
-        "reference/cli.md": command_line(),
-        "reference/profile.md": profile_keys(),
+        **split(COMMANDS, list(app.commands), command_line),
+        **split(SECTIONS, list(LabConfig.model_fields), profile_keys),
+        "reference/variables.md": board_variables(),
         "reference/log.md": log_columns(),
         "reference/faults.md": fault_kinds(),
     }
 
 
-def command_line() -> str:
+def split(
+    plan: Mapping[str, tuple[str, str]], names: list[str], part: Callable[[str], str]
+) -> dict[str, str]:
+    """Return the pages of a reference by their places; the first one introduces it and lists the others."""
+    if sorted(" ".join(shown for _, shown in plan.values()).split()) != sorted(names):
+        raise ValueError(
+            f"tools/reference_pages.py: {', '.join(plan)} do not show each of {', '.join(names)}"
+        )
+    (first, (whole, _)), *others = plan.items()
+    links = [f"- [{title}]({name}.md): `{shown.replace(' ', '`, `')}`" for name, (title, shown) in others]
+    leads = dict.fromkeys(plan, f"Continued from [{whole}]({first}.md).")
+    leads[first] = "\n".join([LEADS[first], "", *links])
+    return {
+        f"reference/{name}.md": "\n\n".join([f"# {title}", leads[name], *map(part, shown.split())])
+        for name, (title, shown) in plan.items()
+    }
+
+
+def command_line(name: str) -> str:
+    """Return the block that shows a command, which mkdocs-click finds by its module."""
+    function: Any = app.commands[name].callback
     return (
-        "# Command line\n\nWritten from the commands themselves; `floaty COMMAND --help` prints the same.\n\n"
-        "::: mkdocs-click\n    :module: hil.commands.app\n    :command: app\n    :prog_name: floaty\n"
-        "    :depth: 1\n    :style: plain\n    :list_subcommands: true\n"
+        f"::: mkdocs-click\n    :module: {function.__module__}\n    :command: {function.__name__}\n"
+        f"    :prog_name: floaty {name}\n    :depth: 1\n    :style: plain\n    :list_subcommands: true\n"
     )
 
 
-def profile_keys() -> str:
+def profile_keys(name: str) -> str:
+    """Return a section of the profile as a table."""
+    section = getattr(load_config(), name)
+    if not isinstance(section, BaseModel):
+        return f"## {name}\n\n{cell(LabConfig.model_fields[name].description or '')}\n"
     lines = [
-        "# Profile keys\n",
-        "A profile is everything about a flight that is not the experiment: what is flashed, and the world around it.",
-        "Each key can be overridden with `--set SECTION.KEY=VALUE`. The values are those of the profile `floaty`, which",
-        "flies when none is named. Written from the models themselves and that profile.",
+        f"## {name}\n",
+        cell((type(section).__doc__ or "").split("\n\n")[0]),
+        "",
+        "| key | value | allowed | meaning, unit, source |",
+        "|---|---|---|---|",
     ]
-    config = load_config()
-    for name, field in LabConfig.model_fields.items():
-        section = getattr(config, name)
-        lines += ["", f"## {name}", ""]
-        if not isinstance(section, BaseModel):
-            lines.append(cell(field.description or ""))
-            continue
-        lines += [
-            cell((type(section).__doc__ or "").split("\n\n")[0]),
-            "",
-            "| key | value | allowed | meaning, unit, source |",
-            "|---|---|---|---|",
-        ]
-        lines += [
-            f"| `{name}.{key}` | `{value}` | {allowed} | {text} |"
-            for key, value, allowed, text in rows(section, "")
-        ]
+    lines += [
+        f"| `{name}.{key}` | `{value}` | {allowed} | {text} |"
+        for key, value, allowed, text in rows(section, "")
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -123,6 +159,29 @@ def allowed_of(field: FieldInfo) -> str:
     ]
     choices = [repr(one) for one in get_args(field.annotation) if isinstance(one, str)]
     return ", ".join(bounds) or " \\| ".join(choices)
+
+
+def board_variables() -> str:
+    """Return the tables of contents of a board that boots with the default profile."""
+    firmware = Firmware(load_config(), VirtualBoard(lambda *_: None, lambda *_: True, lambda *_: None))
+    keys = {parameter.name: key for key, parameter in OF_PROFILE.items()}
+    lines = [
+        "# Variables of the board\n",
+        "Parameters and log variables of the Python board. The exported app has those of the core under the same names,",
+        "unless its firmware has the name already. Read from a board that boots with the profile `floaty`.",
+        "\n## Parameters\n",
+        "| parameter | type | unit | allowed | key of the profile | stored |",
+        "|---|---|---|---|---|---|",
+    ]
+    for one in firmware.parameters:
+        allowed = "read only" if one.write is None else f"{one.minimum:g} to {one.maximum:g}"
+        key, stored = f"`{keys[one.name]}`" if one.name in keys else "", "yes" if one.persistent else ""
+        lines.append(
+            f"| `{one.name}` | {one.scalar.name} | {cell(one.unit)} | {allowed} | {key} | {stored} |"
+        )
+    lines += ["\n## Log variables\n", "| variable | type | unit |", "|---|---|---|"]
+    lines += [f"| `{one.name}` | {one.scalar.name} | {cell(one.unit)} |" for one in firmware.variables]
+    return "\n".join(lines) + "\n"
 
 
 def log_columns() -> str:
@@ -169,22 +228,18 @@ def log_columns() -> str:
 def fault_kinds() -> str:
     lines = [
         "# Fault kinds\n",
-        "A fault is written `KIND@START:DURATION=SIZE`, the start in seconds after the release; duration and size may be",
-        "left out. The outcome is that of the hover with the default profile, size and duration, 6 s after it begins.",
-        "Written from the table that flies, as `floaty list --faults` is.",
+        "Write a fault as `KIND@START:DURATION=SIZE`. START is in seconds after the release; DURATION and SIZE are",
+        "optional. The columns show their defaults, and the allowed sizes in brackets. The column `hover` is the outcome",
+        "of a hover with the default profile, 6 s after the fault begins. `floaty list --faults` prints the same table.",
         "",
-        "| kind | meaning | default | from, to | lasts | hover | needs |",
-        "|---|---|---|---|---|---|---|",
+        "| kind | meaning | size | lasts | hover |",
+        "|---|---|---|---|---|",
     ]
     for name, kind in KINDS.items():
-        size, bounds = (
-            (f"{kind.size:g} {kind.unit}", f"{kind.low:g}, {kind.high:g}") if kind.sized else ("", "")
-        )
+        size = f"{kind.size:g} {kind.unit} ({kind.low:g} to {kind.high:g})" if kind.sized else ""
         lasts = f"{kind.duration_s:g} s" if math.isfinite(kind.duration_s) else "to the end"
-        needs = f"`{kind.needs}`" if kind.needs else ""
-        lines.append(
-            f"| `{name}` | {cell(kind.meaning)} | {size} | {bounds} | {lasts} | {kind.outcome} | {needs} |"
-        )
+        needs = f" (needs `{kind.needs}`)" if kind.needs else ""
+        lines.append(f"| `{name}` | {cell(kind.meaning)}{needs} | {size} | {lasts} | {kind.outcome} |")
     return "\n".join(lines) + "\n"
 
 

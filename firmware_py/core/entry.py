@@ -1,14 +1,24 @@
 """The calls by which the firmware enters the core; every argument is the memory of one struct."""
 
-from firmware_py.core import controller, predictor, servo
-from firmware_py.core.structs import Control, Estimator, Input, Parameters
+from firmware_py.core import controller, poses, predictor, sampling, servo, supervisor
+from firmware_py.core.structs import POSE_ON_TIME, Control, Estimator, Input, Parameters, Sampling, Supervisor
 from firmware_py.core.subset import Memory, i32, kernel
 
 _reset = predictor.reset
-_pose_into_history = predictor.pose_into_history
+_file_pose = predictor.pose_into_history
 _estimate = predictor.estimate
 _control_flaps = controller.control_flaps
 _drive_servos = servo.drive_servos
+_age_at_tick = poses.age_at_tick
+_begin_step = sampling.begin_step
+_take_sample = sampling.take_sample
+_clear_samples = sampling.clear_samples
+_forget_zero = sampling.forget_zero
+_supervise = supervisor.supervise
+_see_pose = supervisor.see_pose
+_serve = supervisor.serve
+_lose_control = supervisor.lose_control
+_begin_flight = supervisor.begin_flight
 
 
 @kernel
@@ -18,9 +28,31 @@ def reset(parameters: Memory[Parameters], estimator: Memory[Estimator]) -> None:
 
 
 @kernel
-def file_pose(parameters: Memory[Parameters], data: Memory[Input], estimator: Memory[Estimator]) -> i32:
+def begin_step(data: Memory[Input], sampling: Memory[Sampling]) -> i32:
+    """Begin a step of 1 ms; returns whether the controller runs in it."""
+    return _begin_step(data[0], sampling[0])
+
+
+@kernel
+def take_sample(data: Memory[Input], sampling: Memory[Sampling]) -> i32:
+    """Take a sample of the gyro; returns whether the gyro's zero has been found with it."""
+    return _take_sample(data[0], sampling[0])
+
+
+@kernel
+def file_pose(
+    parameters: Memory[Parameters],
+    data: Memory[Input],
+    estimator: Memory[Estimator],
+    sampling: Memory[Sampling],
+    supervisor: Memory[Supervisor],
+) -> i32:
     """File the pose in the input under the instant at which it was true."""
-    return _pose_into_history(parameters[0], data[0], estimator[0])
+    _age_at_tick(data[0], sampling[0])
+    answer = _file_pose(parameters[0], data[0], estimator[0])
+    if answer == POSE_ON_TIME:
+        _see_pose(data[0], supervisor[0])
+    return answer
 
 
 @kernel
@@ -29,9 +61,23 @@ def estimate(
     data: Memory[Input],
     estimator: Memory[Estimator],
     control: Memory[Control],
+    sampling: Memory[Sampling],
 ) -> None:
     """Run one tick of the estimator."""
     _estimate(parameters[0], data[0], estimator[0], control[0])
+    _clear_samples(data[0], sampling[0])
+
+
+@kernel
+def supervise(
+    parameters: Memory[Parameters],
+    data: Memory[Input],
+    estimator: Memory[Estimator],
+    sampling: Memory[Sampling],
+    supervisor: Memory[Supervisor],
+) -> i32:
+    """Decide the controller's mode; returns whether state or cause has changed."""
+    return _supervise(parameters[0], data[0], estimator[0], sampling[0], supervisor[0])
 
 
 @kernel
@@ -44,3 +90,27 @@ def control(
     """Run one tick of the controller, down to the timer counts."""
     _control_flaps(parameters[0], data[0], estimator[0], control[0])
     _drive_servos(parameters[0], control[0])
+
+
+@kernel
+def request(
+    parameters: Memory[Parameters],
+    data: Memory[Input],
+    sampling: Memory[Sampling],
+    supervisor: Memory[Supervisor],
+) -> i32:
+    """Serve a request; returns whether it was obeyed."""
+    return _serve(parameters[0], data[0], sampling[0], supervisor[0])
+
+
+@kernel
+def lose_control(supervisor: Memory[Supervisor]) -> None:
+    """Note that nobody asks for the mode any more; the next look says otherwise."""
+    _lose_control(supervisor[0])
+
+
+@kernel
+def begin_afresh(data: Memory[Input], sampling: Memory[Sampling], supervisor: Memory[Supervisor]) -> None:
+    """Seek the gyro's zero anew and forget the last flight."""
+    _forget_zero(data[0], sampling[0])
+    _begin_flight(supervisor[0])

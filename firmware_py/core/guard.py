@@ -6,7 +6,17 @@ The default core has no such logic and does without.
 from firmware_py.core import controller
 from firmware_py.core.controller import FLAP_LIMIT, release, sign
 from firmware_py.core.maths import ZERO, clamp, finite
-from firmware_py.core.structs import MODE_FLY, STATES, Control, Estimator, Input, Parameters
+from firmware_py.core.structs import (
+    CAUSE_CONTROLLER_NOT_FINITE,
+    CAUSE_ESTIMATOR_NOT_FINITE,
+    MODE_FLY,
+    STATES,
+    Control,
+    Estimator,
+    Input,
+    Parameters,
+    Supervisor,
+)
 from firmware_py.core.subset import Struct, i32, kernel
 
 _allocate = controller.allocate
@@ -61,3 +71,14 @@ def guard_estimate(estimator: Estimator, guard: Guard) -> None:
             estimator.now[i] = ZERO
     if not sound:
         guard.estimator_faults = i32(guard.estimator_faults + 1)
+
+
+@kernel
+def see_logic(supervisor: Supervisor, guard: Guard) -> None:
+    """Note which of the user's modules has returned NaN or infinity since the last look."""
+    if guard.estimator_faults > supervisor.estimator_faults:
+        supervisor.not_finite = i32(CAUSE_ESTIMATOR_NOT_FINITE)
+    elif guard.controller_faults > supervisor.controller_faults:
+        supervisor.not_finite = i32(CAUSE_CONTROLLER_NOT_FINITE)
+    supervisor.controller_faults = guard.controller_faults
+    supervisor.estimator_faults = guard.estimator_faults

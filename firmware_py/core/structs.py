@@ -7,7 +7,7 @@ body rates p, q, r [rad/s], and the four flap angles as deviations from the hove
 
 from typing import Annotated
 
-from firmware_py.core.subset import F32s, I32s, Struct, f32, i32
+from firmware_py.core.subset import F32s, I32s, Logged, Settable, Struct, f32, i32
 
 STATES = 16
 POSITION = 0
@@ -27,111 +27,205 @@ EXCITE_OFF = 0
 EXCITE_MULTISINE = 1
 EXCITE_CHIRP = 2
 
+MANUAL_OFF = 0  # the controller moves the flaps, when the state allows it
+MANUAL_ANGLES = 1  # angles from outside, with or without poses, while a client is there to take them back
+MANUAL_HOVER = 2
+
+STATE_CALIBRATING = 0  # the gyro's zero is unknown: flaps at hover
+STATE_WAITING = 1  # no pose has come yet, or there is nothing to fly to: flaps at hover
+STATE_FLYING = 2  # loop closed
+STATE_FAILSAFE = 3  # flaps at hover, see the cause
+
+CAUSE_NONE = 0
+CAUSE_SILENCE = 1
+CAUSE_OUT_OF_BOUNDS = 2
+CAUSE_EMERGENCY_STOP = 3
+CAUSE_LOW_BATTERY = 4
+CAUSE_DISARMED = 5
+CAUSE_NO_CONTROL = 6  # no controller step came, or another controller runs
+CAUSE_CONTROLLER_NOT_FINITE = 7  # own logic returned NaN or infinity
+CAUSE_ESTIMATOR_NOT_FINITE = 8
+CAUSE_IMU_STALE = 9  # the gyro delivers nothing new
+
+REQUEST_STOP = 1  # until a request to recover
+REQUEST_LOCK = 2  # stop until the board reboots
+REQUEST_RECOVER = 3
+REQUEST_ARM = 4
+REQUEST_DISARM = 5
+REQUEST_FEED = 6  # the watchdog of the emergency stop
+
 POSE_ON_TIME = 0
 POSE_TOO_OLD = 1
 POSE_INVALID = 2
 
 
+# fmt: off
 class Parameters(Struct):
     """What may be tuned: set at start from the profile, in flight by parameter messages."""
 
-    hover_angle: f32  # [rad] opening of every flap at hover
-    opening_min: f32  # [rad]
-    opening_max: f32  # [rad]
-    flap_rate: f32  # [1/s] inverse time constant of servo and linkage
+    hover_angle: Annotated[f32, Settable(
+        "allocation", "RandConsts.flapHoverAng", "rad", 0, 1.2, "opening at hover, theta_H")]
+    opening_min: Annotated[f32, Settable("allocation", "RandConsts.openMin", "rad", -1, 1.5, "least opening")]
+    opening_max: Annotated[f32, Settable("allocation", "RandConsts.openMax", "rad", -1, 1.5, "greatest opening")]
+    flap_rate: Annotated[f32, Settable(
+        "model", "RandConsts.flapTimeConst", "1/s", 1, 1000, "inverse time constant of servo and linkage")]
     # linear model at hover, the paper's f_{affected, influencing}
-    roll_u1: f32
-    roll_roll: f32
-    roll_rate: f32
-    roll_vy: f32
-    y_u1: f32
-    y_roll: f32
-    y_vy: f32
-    pitch_u2: f32
-    pitch_pitch: f32
-    pitch_rate: f32
-    pitch_vx: f32
-    x_u2: f32
-    x_pitch: f32
-    x_vx: f32
-    yaw_u3: f32
-    yaw_rate: f32
-    z_u4: f32
-    z_vz: f32
-    # process noise, variance per tick
-    process_position: f32
-    process_velocity: f32
-    process_attitude: f32
-    process_rate: f32
-    process_flap: f32
-    # measurement noise, variance
-    measured_position: f32
-    measured_attitude: f32
-    measured_rate: f32
+    roll_u1: Annotated[f32, Settable("model", "", "1/s^2", -5000, 5000, "roll acceleration per u1")]
+    roll_roll: Annotated[f32, Settable("model", "", "1/s^2", -5000, 5000, "roll acceleration per roll")]
+    roll_rate: Annotated[f32, Settable("model", "", "1/s", -5000, 5000, "roll acceleration per roll rate")]
+    roll_vy: Annotated[f32, Settable("model", "", "rad/s/m", -5000, 5000, "roll acceleration per velocity to the left")]
+    y_u1: Annotated[f32, Settable("model", "", "m/s^2/rad", -5000, 5000, "y acceleration per u1")]
+    y_roll: Annotated[f32, Settable("model", "", "m/s^2/rad", -5000, 5000, "y acceleration per roll")]
+    y_vy: Annotated[f32, Settable("model", "", "1/s", -5000, 5000, "y acceleration per y velocity")]
+    pitch_u2: Annotated[f32, Settable("model", "", "1/s^2", -5000, 5000, "pitch acceleration per u2")]
+    pitch_pitch: Annotated[f32, Settable("model", "", "1/s^2", -5000, 5000, "pitch acceleration per pitch")]
+    pitch_rate: Annotated[f32, Settable("model", "", "1/s", -5000, 5000, "pitch acceleration per pitch rate")]
+    pitch_vx: Annotated[f32, Settable("model", "", "rad/s/m", -5000, 5000, "pitch acceleration per x velocity")]
+    x_u2: Annotated[f32, Settable("model", "", "m/s^2/rad", -5000, 5000, "x acceleration per u2")]
+    x_pitch: Annotated[f32, Settable("model", "", "m/s^2/rad", -5000, 5000, "x acceleration per pitch")]
+    x_vx: Annotated[f32, Settable("model", "", "1/s", -5000, 5000, "x acceleration per x velocity")]
+    yaw_u3: Annotated[f32, Settable("model", "", "1/s^2", -5000, 5000, "yaw acceleration per u3")]
+    yaw_rate: Annotated[f32, Settable("model", "", "1/s", -5000, 5000, "yaw acceleration per yaw rate")]
+    z_u4: Annotated[f32, Settable("model", "", "m/s^2/rad", -5000, 5000, "z acceleration per u4")]
+    z_vz: Annotated[f32, Settable("model", "", "1/s", -5000, 5000, "z acceleration per z velocity")]
+    # process noise
+    process_position: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.procPos", "m^2", 1e-12, 100, "variance per 10 ms tick")]
+    process_velocity: Annotated[f32, Settable("estimator", "FloatyKalm.procVel", "m^2/s^2", 1e-12, 100, "variance per tick")]
+    process_attitude: Annotated[f32, Settable("estimator", "FloatyKalm.procAtt", "rad^2", 1e-12, 100, "variance per tick")]
+    process_rate: Annotated[f32, Settable("estimator", "FloatyKalm.procRate", "rad^2/s^2", 1e-12, 100, "variance per tick")]
+    process_flap: Annotated[f32, Settable("estimator", "FloatyKalm.procFlap", "rad^2", 1e-12, 100, "variance per tick")]
+    # measurement noise
+    measured_position: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.measPos", "m^2", 1e-12, 100, "variance of a mocap position")]
+    measured_attitude: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.measAtt", "rad^2", 1e-12, 100, "variance of a mocap angle")]
+    measured_rate: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.measRate", "rad^2/s^2", 1e-12, 100, "variance of a gyro sample, mean of 10")]
     # gate and bounds
-    gate_sigma: f32  # innovations beyond this many standard deviations are refused
-    gate_position: f32  # [m] but never below this
-    gate_attitude: f32  # [rad] nor this
-    bound_position: f32  # [m]
-    bound_velocity: f32  # [m/s]
-    bound_tilt: f32  # [rad]
-    bound_rate: f32  # [rad/s]
+    gate_sigma: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.gateSigma", "standard deviations", 1, 100, "innovation gate")]
+    gate_position: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.gatePos", "m", 1e-6, 10, "the gate never refuses less than this")]
+    gate_attitude: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.gateAtt", "rad", 1e-6, 4, "the gate never refuses less than this")]
+    bound_position: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.maxPos", "m", 1e-6, 10, "bound on each position", stock="kalman.maxPos")]
+    bound_velocity: Annotated[f32, Settable(
+        "estimator", "FloatyKalm.maxVel", "m/s", 1e-6, 20, "bound on each velocity", stock="kalman.maxVel")]
+    bound_tilt: Annotated[f32, Settable("estimator", "FloatyKalm.maxTilt", "rad", 1e-6, 1.5, "bound on roll and pitch")]
+    bound_rate: Annotated[f32, Settable("estimator", "FloatyKalm.maxRate", "rad/s", 1e-6, 40, "bound on body rates")]
     # delay predictor
-    predict: i32  # 0: every pose is taken as current
+    predict: Annotated[i32, Settable(
+        "predictor", "delayComp.activate", "", 0, 1, "false: every pose counts as current, as in the original firmware",
+        key="enabled", type="U8")]
     age_measured: i32  # 1: the age comes with the pose and the horizon follows it; 0: always `horizon`
-    horizon: i32  # ticks, 1..12: the fixed age, or the first one
-    default_age_us: i32  # of a pose that does not state its age
-    # controller: proportional, integrator on z only
-    gain_y: f32
-    gain_vy: f32
-    gain_roll: f32
-    gain_p: f32
-    gain_x: f32
-    gain_vx: f32
-    gain_pitch: f32
-    gain_q: f32
-    gain_yaw: f32
-    gain_r: f32
-    gain_z: f32
-    gain_vz: f32
-    gain_iz: f32
-    limit_xy: f32  # [m] on the position errors
-    limit_u: f32  # [rad] on u1, u2, u4
-    limit_u3: f32  # [rad]
-    limit_iz: f32  # [m s]
+    horizon: Annotated[i32, Settable(
+        "predictor", "delayComp.horizon", "10 ms", 1, HORIZON_LIMIT, "first or fixed horizon, in ticks", type="U8")]
+    default_age_us: Annotated[i32, Settable(
+        "predictor", "delayComp.defaultAge", "us", 0, 120_000, "age of a pose that does not state it")]
+    # controller: proportional, integrator on z only; clients see the gains with the signs of the original, which counted the
+    # inputs of roll and pitch the other way (u1 = -c1, u2 = -c0)
+    gain_y: Annotated[f32, Settable("controller", "extCtrl.y_P", "rad/m", -20, 20, "u1 per y error", scale=-1)]
+    gain_vy: Annotated[f32, Settable("controller", "extCtrl.vy_P", "rad s/m", -20, 20, "u1 per -vy", scale=-1)]
+    gain_roll: Annotated[f32, Settable("controller", "extCtrl.roll_P", "", -20, 20, "u1 per -roll", scale=-1)]
+    gain_p: Annotated[f32, Settable("controller", "extCtrl.roll_rate_P", "s", -20, 20, "u1 per -p", scale=-1)]
+    gain_x: Annotated[f32, Settable("controller", "extCtrl.x_P", "rad/m", -20, 20, "u2 per x error", scale=-1)]
+    gain_vx: Annotated[f32, Settable("controller", "extCtrl.vx_P", "rad s/m", -20, 20, "u2 per -vx", scale=-1)]
+    gain_pitch: Annotated[f32, Settable("controller", "extCtrl.pitch_P", "", -20, 20, "u2 per -pitch", scale=-1)]
+    gain_q: Annotated[f32, Settable("controller", "extCtrl.pitch_rate_P", "s", -20, 20, "u2 per -q", scale=-1)]
+    gain_yaw: Annotated[f32, Settable("controller", "extCtrl.yaw_P", "", -20, 20, "u3 per yaw error")]
+    gain_r: Annotated[f32, Settable("controller", "extCtrl.yaw_rate_P", "s", -20, 20, "u3 per -r")]
+    gain_z: Annotated[f32, Settable("controller", "extCtrl.z_P", "rad/m", -20, 20, "u4 per z error")]
+    gain_vz: Annotated[f32, Settable("controller", "extCtrl.vz_P", "rad s/m", -20, 20, "u4 per -vz")]
+    gain_iz: Annotated[f32, Settable("controller", "extCtrl.z_I", "rad/m/s", -20, 20, "u4 per integral of the z error")]
+    limit_xy: Annotated[f32, Settable("controller", "extCtrl.limXY", "m", 1e-6, 5, "limit on the x and y errors")]
+    limit_u: Annotated[f32, Settable("controller", "extCtrl.limU", "rad", 1e-6, 1.5, "limit on u1, u2 and u4")]
+    limit_u3: Annotated[f32, Settable("controller", "extCtrl.limU3", "rad", 1e-6, 1.5, "limit on u3")]
+    limit_iz: Annotated[f32, Settable("controller", "extCtrl.limIz", "m s", 0, 5, "limit on the integral of the z error")]
     # servos
-    trim: Annotated[F32s, 4]  # [1/65535 of the servo range] added to the word
+    trim: Annotated[F32s, 4, Settable(
+        "servo", "motorShifts.m1 m2 m3 m4", "words", -12_000, 12_000, "added to the 16-bit word, 31290 per rad", type="I16")]
     direction: Annotated[F32s, 4]  # +1 or -1
     # IMU
     gyro_scale: f32  # [rad/s per count]
     # set-point in G, normally zero: the correction that arrives is already relative to the goal
-    target: Annotated[F32s, 4]  # x, y, z [m], yaw [rad]
-    # excitation, for identification
-    excite_kind: i32  # EXCITE_OFF, EXCITE_MULTISINE or EXCITE_CHIRP
-    excite_rms: Annotated[F32s, 4]  # [rad] of u1..u4
-    excite_low: f32  # [Hz] the band
-    excite_high: f32
+    target: Annotated[  # x, y, z, yaw
+        F32s, 4,
+        Settable("", "extCtrl.target_yaw", "rad", -3.141592653589793, 3.141592653589793, first=3, persistent=False),
+        Settable("", "setpoint.X Y Z", "m", -5, 5, persistent=False),
+        Settable("", "setpoint.Yaw", "rad", -3.141592653589793, 3.141592653589793, first=3, persistent=False),
+    ]
+    # excitation, for identification; a board that boots excites nothing
+    excite_kind: Annotated[i32, Settable("", "excite.signal", "", EXCITE_OFF, EXCITE_CHIRP, type="U8", persistent=False)]
+    excite_rms: Annotated[F32s, 4, Settable(
+        "excitation", "excite.u1 u2 u3 u4", "rad", 0, 0.3, "rms of what is added to this input, 0: nothing",
+        key="u1 u2 u3 u4", persistent=False)]
+    excite_low: Annotated[f32, Settable(
+        "excitation", "excite.low", "Hz", 0.1, 10, "lower end of the band", key="low", persistent=False)]
+    excite_high: Annotated[f32, Settable(
+        "excitation", "excite.high", "Hz", 0.1, 10, "upper end of the band", key="high", persistent=False)]
+    # supervisor
+    pose_timeout_us: Annotated[i32, Settable(
+        "supervisor", "supervisor.poseTimeout", "us", 20_000, 5_000_000, "silence after which the flaps go to hover",
+        type="U16", scale=1000, shown="ms")]
+    low_battery_mv: Annotated[i32, Settable(
+        "supervisor", "supervisor.lowBattery", "mV", 0, 20_000, "supply below which flight ends after 5 s", type="U16")]
+# fmt: on
 
 
 class Input(Struct):
-    """What the tasks hand to the core."""
+    """What the tasks hand to the core; instants wrap."""
 
+    tick: i32  # [ms]
+    now_us: i32
+    gyro: Annotated[I32s, 3]  # [counts] the newest sample, sensor frame
+    gyro_again: i32  # 1: it is the last one again, because the next is late on a link
+    gyro_sample: Annotated[I32s, 3]  # [counts] the sample to take
     gyro_sum: Annotated[I32s, 3]  # [counts] sum over the samples since the last tick, sensor frame
     gyro_samples: i32
-    gyro_bias: Annotated[F32s, 3]  # [counts]
+    gyro_bias: Annotated[F32s, 3]  # [counts] the gyro's zero
+    pose_waited_us: i32  # since the pose's arrival
     pose_position: Annotated[F32s, 3]  # [m] p_GB
     pose_quaternion: Annotated[F32s, 4]  # q_GB, w x y z
-    pose_age_us: i32  # at the next tick; negative: unknown
-    mode: i32
-    manual: Annotated[F32s, 4]  # [rad] flap angles of MODE_MANUAL
+    pose_age_us: i32  # at its arrival, then at the next tick; negative: unknown
+    battery_mv: i32
+    connected: i32  # a client is there
+    idle: i32  # there is nothing to fly to
+    request: i32  # REQUEST_...
+    # MANUAL_...
+    manual_mode: Annotated[
+        i32, Settable("", "extCtrl.manual", "", MANUAL_OFF, MANUAL_HOVER, type="U8", persistent=False)
+    ]
+    mode: i32  # MODE_..., decided by the supervisor
+    # flap angles of MODE_MANUAL
+    manual: Annotated[
+        F32s,
+        4,
+        Settable("", "extCtrl.m1 m2 m3 m4", "rad", -1.5707963267948966, 1.5707963267948966, persistent=False),
+    ]
 
 
 class Estimator(Struct):
     """The delayed Kalman filter, its history, and the state that was brought to now."""
 
     x: Annotated[F32s, 16]  # at `filtered_tick`
-    P: Annotated[F32s, 16, 16]
-    now: Annotated[F32s, 16]  # at `tick`: what the controller reads
+    P: Annotated[
+        F32s,
+        16,
+        16,
+        Logged("m^2", stock="kalman.varX varY varZ", step=17),
+        Logged("m^2/s^2", stock="kalman.varPX varPY varPZ", first=51, step=17),
+        Logged("m^2", "Uncertainty.P_x_x"),
+        Logged("m^2/s", "Uncertainty.P_x_vx", first=VELOCITY),
+        Logged("m^2/s^2", "Uncertainty.P_vx_vx", first=51),
+    ]
+    now: Annotated[  # at `tick`: what the controller reads
+        F32s,
+        16,
+        Logged("rad/s", "stateEstimate.roll_rate pitch_rate yaw_rate", first=RATE),
+        Logged("m/s", stock="kalman.statePX statePY statePZ", first=VELOCITY),
+    ]
     tick: i32
     filtered_tick: i32
     quiet_ticks: i32  # since a pose was older than the horizon minus one
@@ -147,14 +241,15 @@ class Estimator(Struct):
     suspect_tick: i32
     suspect_waiting: i32
     # counters, and what an observer wants to see with them
-    fused: i32
-    refused: i32
-    jumps: i32
-    too_old: i32
-    invalid: i32
-    bounded: i32
-    resets: i32
-    horizon: i32  # ticks by which the filter runs behind
+    fused: Annotated[i32, Logged("", "kalman.fused", type="U32")]
+    refused: Annotated[i32, Logged("", "kalman.refused", type="U32")]
+    jumps: Annotated[i32, Logged("", "kalman.jumps", type="U32")]
+    too_old: Annotated[i32, Logged("", "kalman.too_old", type="U32")]
+    invalid: Annotated[i32, Logged("", "kalman.invalid", type="U32")]
+    bounded: Annotated[i32, Logged("", "kalman.bounded", type="U32")]
+    resets: Annotated[i32, Logged("", "kalman.resets", type="U32")]
+    # ticks by which the filter runs behind
+    horizon: Annotated[i32, Logged("10 ms", "delayComp.horizon", type="U8")]
     pose_age_us: i32  # of the last pose that was accepted for fusion, at its tick
     # work space, no meaning between ticks
     work_1: Annotated[F32s, 16]
@@ -166,11 +261,63 @@ class Estimator(Struct):
 class Control(Struct):
     """The controller's memory and what it put out last."""
 
-    u: Annotated[F32s, 4]  # [rad] u1 roll, u2 pitch, u3 yaw, u4 height
-    integral_z: f32  # [m s]
-    flap: Annotated[F32s, 4]  # [rad] commanded flap angles
-    command: Annotated[F32s, 4]  # [rad] the same as deviations from hover
+    # u1 roll, u2 pitch, u3 yaw, u4 height
+    u: Annotated[F32s, 4, Logged("rad", "controller.u1 u2 u3 u4")]
+    integral_z: Annotated[f32, Logged("m s", "Error.int_z_err")]
+    # commanded flap angles, and the same as deviations from hover
+    flap: Annotated[F32s, 4, Logged("rad", "motors_ctrp.m1 m2 m3 m4")]
+    command: Annotated[F32s, 4, Logged("rad", "controller.m1 m2 m3 m4")]
     word: Annotated[I32s, 4]
-    count: Annotated[I32s, 4]
-    excitation: Annotated[F32s, 4]  # [rad] its part of u
+    count: Annotated[I32s, 4, Logged("counts", "floaty.m1 m2 m3 m4", stock="motor.m1 m2 m3 m4", type="U16")]
+    excitation: Annotated[F32s, 4, Logged("rad", "excite.u1 u2 u3 u4")]  # its part of u
     excite_tick: i32  # of its period
+
+
+class Sampling(Struct):
+    """What the step of 1 kHz remembers: which step it is, the watch over the gyro, and the search for its zero."""
+
+    tick: i32  # [ms] of the last step
+    phase: i32  # its number, modulo the steps of a tick
+    estimate_due: i32  # the estimator's tick has come
+    before: Annotated[I32s, 3]  # [counts] of the step before
+    unchanged: i32  # steps
+    recovering: i32  # steps until the gyro counts as alive again
+    first: Annotated[I32s, 3]  # [counts] of the window in which the zero is sought
+    sums: Annotated[I32s, 3]  # [counts] of its samples
+    squares: Annotated[F32s, 3]  # [counts^2] of what its samples differ from the first
+    samples: i32
+    # of the last window
+    variance: Annotated[F32s, 3, Logged("counts^2", stock="gyro.xVariance yVariance zVariance")]
+    windows_refused: i32  # because the robot moved
+    calibrated: Annotated[i32, Logged("", "floaty.calibrated", type="U8")]  # the zero is known
+
+
+class Supervisor(Struct):
+    """What decides whether the loop may be closed; times are as of the last look."""
+
+    state: Annotated[i32, Logged("", "supervisor.state", type="U8")]
+    cause: Annotated[i32, Logged("", "supervisor.cause", type="U8")]
+    armed: Annotated[i32, Logged("", "floaty.armed", stock="sys.armed", type="U8")]
+    # for a while or until a reboot
+    stopped: Annotated[i32, Logged("", "floaty.stopped", type="U8")]
+    locked: i32  # until a reboot
+    battery_empty: i32
+    not_finite: i32  # the cause, when own logic failed
+    lasting: i32  # the cause that neither poses nor arming end
+    ready: i32  # it would fly with poses and an IMU, whose failures end by themselves
+    flown: i32  # since the gyro's zero was last sought
+    aloft: i32  # the robot may be in the air, or its flaps are moved
+    begun: i32
+    now_us: i32  # of the last look
+    pose_seen: i32
+    silent_us: i32  # since the last accepted pose
+    low_us: i32  # since the battery's voltage was good
+    down_us: i32  # since the robot was disarmed or stopped
+    watchdog_on: i32
+    watchdog_us: i32  # since it was fed
+    bounded: i32  # the estimator's counter
+    gap_us: i32  # in which a bounded step still belongs to the episode
+    episode_us: i32  # since it began
+    outside_us: i32  # until the state counts as inside its bounds again
+    controller_faults: i32  # of own logic
+    estimator_faults: i32

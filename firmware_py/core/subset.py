@@ -3,8 +3,8 @@
 Subset: module constants `f32(..)`, `i32(..)` and plain ints; state structs (`class Name(Struct)` with `f32`, `i32` or
 `Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs; `for` over `range`,
 `if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons, `and`/`or`/`not`; calls of
-other kernels; `abs`, `sqrt`. Floats never meet ints without `f32(..)`, and every constant is explicitly float32: numba
-would otherwise compute in double where CPython and C do not.
+other kernels; `abs`, `sqrt`, `elapsed`. Floats never meet ints without `f32(..)`, and every constant is explicitly float32:
+numba would otherwise compute in double where CPython and C do not.
 
 A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, numba and the
 microcontroller can be compared byte by byte. Kernels are compiled by numba (`firmware_py.compiling`); with
@@ -27,12 +27,20 @@ f32 = np.float32
 i32 = np.int32
 sqrt = np.sqrt  # correctly rounded on every target: sqrtss on x86, VSQRT.F32 on the Cortex-M4
 
+Integer: TypeAlias = int | np.int32
+
 # Compiles a function of the subset; the same function in plain Python when numba is switched off.
 kernel = compiling.compiler(Path(__file__).parent)
 
+
+@kernel
+def elapsed(later: Integer, earlier: Integer) -> i32:
+    """Return the time between two instants of a clock of 32 bits that wraps."""
+    return i32(((int(later) - int(earlier) + 2147483648) & 4294967295) - 2147483648)
+
+
 F32s: TypeAlias = NDArray[np.float32]
 I32s: TypeAlias = NDArray[np.int32]
-Integer: TypeAlias = int | np.int32
 S = TypeVar("S", bound="Struct")
 S_co = TypeVar("S_co", bound="Struct", covariant=True)
 Memory: TypeAlias = Sequence[S]  # a one-element array of structs: what an entry kernel takes
@@ -51,11 +59,41 @@ class Tunable:
     high: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Served:
+    """How clients see a field: under which names, from which of its elements on, and as which type on the wire."""
+
+    stock: str = ""  # names that the Crazyflie firmware has, too: an app in that firmware leaves them to it
+    type: str = ""  # a name in `Scalar`; empty: F32 or I32, as in memory
+    first: int = 0  # the element of an array that the first name stands for, counted in memory
+    step: int = 1  # from one name to the next
+
+
 @dataclass(frozen=True, slots=True)
-class Logged:
-    """Marks a field of own logic's memory as a log variable: `Annotated[f32, Logged("m s")]`."""
+class Logged(Served):
+    """Marks a field as log variables `names` ("group.one two three"); own logic states only the unit."""
 
     unit: str
+    names: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Settable(Served):
+    """Marks a field of the core as a parameter, within inclusive bounds: a profile states it, clients may set it.
+
+    `section` is the profile's, empty for what is zero at boot. In memory is `scale` times what a client sees.
+    """
+
+    section: str
+    names: str  # "group.one two three"; empty: "section.key"
+    unit: str
+    low: float
+    high: float
+    meaning: str = ""
+    key: str = ""  # in the section, for elements "one two three"; empty: the field's name
+    scale: int = 1
+    shown: str = ""  # the unit that a client sees, where it is not the profile's
+    persistent: bool = True
 
 
 class Block(Generic[S_co]):

@@ -1,4 +1,4 @@
-"""The user's own logic in the exported app: memory, parameters, log variables, and how the app enters the core.
+"""The user's own logic in the exported app: memory, and how the app enters the core.
 
 The default core has none; then only the calls remain.
 """
@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping
 
 from firmware_py.config import LogicConfig
 from firmware_py.export.reading import literal
+from firmware_py.logic.budget import ARGUMENT, STRUCT
 from firmware_py.logic.loading import Logic, load_logic
-from firmware_py.logic.plugs import CALLS, CORE_STRUCTS, GROUP, OWN
+from firmware_py.logic.plugs import ANSWERING, BLOCKS, CALLS, OWN
 
 CALLS_HEADER = """\
 /* How the app enters the core: every call with the memory that it takes. Written by `floaty deploy`. */
@@ -18,31 +19,12 @@ CALLS_HEADER = """\
 #include "floaty_wire.h"
 
 {memory}
-static inline void call_reset(void) {{
-  floaty_core_reset({reset});
-}}
-
-static inline int32_t call_file_pose(void) {{
-  return floaty_core_file_pose({file_pose});
-}}
-
-static inline void call_estimate(void) {{
-  floaty_core_estimate({estimate});
-}}
-
-static inline void call_control(void) {{
-  floaty_core_control({control});
-}}
-
+{calls}
 /* The counts of the hover angles, on memory of its own: for any task. */
 static inline void call_hover(FloatyControl *control) {{
   static const FloatyInput input; /* mode 0 */
 {scratch}  floaty_core_control({hover});
 }}
-
-/* Reports to the supervisor whether own logic has returned NaN or infinity. */
-static inline void call_guard(void) {{
-{guard}}}
 
 /* The memory of a core that does not fly. */
 typedef struct {{
@@ -50,15 +32,16 @@ typedef struct {{
 
 static inline int32_t call_on(FloatyMemory *on, uint8_t entry) {{
   switch (entry) {{
-    case FLOATY_CALL_RESET: floaty_core_reset({on_reset}); return 0;
-    case FLOATY_CALL_FILE_POSE: return floaty_core_file_pose({on_file_pose});
-    case FLOATY_CALL_ESTIMATE: floaty_core_estimate({on_estimate}); return 0;
-    default: floaty_core_control({on_control}); return 0;
+{on}    default: return 0;
   }}
 }}
 """
-CORE_TYPES = {name: f"Floaty{struct}" for name, struct in CORE_STRUCTS.items()}
-LOG_TYPES = {"f32": "LOG_FLOAT", "i32": "LOG_INT32"}
+CALL = """\
+static inline {result} call_{name}(void) {{
+  {returns}floaty_core_{name}({arguments});
+}}
+"""
+CORE_TYPES = {name: f"Floaty{struct}" for name, struct in BLOCKS.items()}
 
 
 def own_types(logic: Logic | None) -> dict[str, str]:
@@ -68,6 +51,8 @@ def own_types(logic: Logic | None) -> dict[str, str]:
     types = {"guard": "FloatyGuard"}
     for plug in logic.loaded.plugs:
         types |= {plug.block(argument): f"Floaty{struct.name}" for argument, struct in plug.structs.items()}
+        if plug.charged:
+            types[plug.block(ARGUMENT)] = f"Floaty{STRUCT}"
     return types
 
 
@@ -76,24 +61,31 @@ def calls_header(config: LogicConfig) -> str:
     logic = load_logic(config)
     types = own_types(logic)
     places = {"data": "&floaty_input"} | {
-        name: f"&floaty_{name}" for name in (*CORE_STRUCTS, *types) if name != "data"
+        name: f"&floaty_{name}" for name in (*BLOCKS, *types) if name != "data"
     }
     calls = CALLS if logic is None else logic.loaded.calls
     scratch = [name for name in calls["control"] if name in types and not name.endswith(f"_{OWN}")]
     alone = places | {"data": "&input", "control": "control"} | {name: f"&{name}" for name in scratch}
-    guard = (
-        "  floaty_supervisor_see_logic(&floaty_supervisor, floaty_guard.controller_faults, "
-        "floaty_guard.estimator_faults);\n"
-    )
     return CALLS_HEADER.format(
         memory="".join(f"extern {kind} floaty_{name};\n" for name, kind in types.items()),
         scratch="".join(f"  static {types[name]} {name};\n" for name in scratch),
         hover=_listed(calls["control"], alone),
-        guard=guard if types else "",
         members="".join(f"  {kind} {name};\n" for name, kind in {**CORE_TYPES, **types}.items()),
-        **{call: _listed(names, places) for call, names in calls.items()},
-        **{f"on_{call}": ", ".join(f"&on->{name}" for name in names) for call, names in calls.items()},
+        calls="\n".join(_call(name, _listed(taken, places)) for name, taken in calls.items()),
+        on="".join(_call_on(name, taken) for name, taken in calls.items()),
     )
+
+
+def _call(name: str, arguments: str) -> str:
+    result, returns = ("int32_t", "return ") if name in ANSWERING else ("void", "")
+    return CALL.format(name=name, result=result, returns=returns, arguments=arguments)
+
+
+def _call_on(name: str, taken: Iterable[str]) -> str:
+    """Return the case of an entry point on memory that does not fly."""
+    call = f"floaty_core_{name}({', '.join(f'&on->{block}' for block in taken)});"
+    case = f"    case FLOATY_CALL_{name.upper()}: "
+    return f"{case}return {call}\n" if name in ANSWERING else f"{case}{call} return 0;\n"
 
 
 def own_memory(config: LogicConfig) -> str:
@@ -118,19 +110,6 @@ def own_bytes(config: LogicConfig) -> bytes:
     logic = load_logic(config)
     blocks = {} if logic is None else logic.allocate()
     return b"".join(block.bytes() for name, block in blocks.items() if name.endswith(f"_{OWN}"))
-
-
-def own_logs(config: LogicConfig) -> str:
-    """Return the group of log variables; empty when nothing is logged."""
-    logic = load_logic(config)
-    variables = () if logic is None else logic.loaded.variables
-    lines = [
-        f"LOG_ADD({LOG_TYPES[one.base]}, {one.name}, &floaty_{one.block}.{one.field}"
-        + ("" if one.index is None else f"[{one.index}]")
-        + ")"
-        for one in variables
-    ]
-    return "\n".join((f"LOG_GROUP_START({GROUP})", *lines, f"LOG_GROUP_STOP({GROUP})")) if lines else ""
 
 
 def _listed(names: Iterable[str], places: Mapping[str, str]) -> str:

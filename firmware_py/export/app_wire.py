@@ -28,6 +28,7 @@ def wire_header() -> str:
         "#pragma once\n\n#include <stdint.h>",
         "\n".join(f"#define FLOATY_{name} {getattr(core_port, name)}" for name in constants),
         *(_enumeration(kind) for kind in (Kind, Refusal, Call, Hil)),
+        f"#define FLOATY_CALLS {len(Call)}",
         *(_struct(layout) for layout in LAYOUTS),
     )) + "\n"  # fmt: skip
 

@@ -8,7 +8,6 @@ for every instruction, flash read through a cache that is empty when the call be
 
 import ctypes
 import mmap
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.arm_image import FLASH, FLASH_SIZE, Image
+from firmware_py.export.arm_image import Image
 from firmware_py.export.cycles import count
+from firmware_py.export.elf import FLASH, FLASH_SIZE
 from firmware_py.export.errors import ExportError
+from firmware_py.export.usage import CLOCK_MHZ, Load, Usage
 from firmware_py.extras import install_command
+from firmware_py.logic.plugs import ANSWERING
 
-CLOCK_MHZ = 168
 RAM = 0x2000_0000
 RAM_SIZE = 0x8000
 STACK_TOP = RAM + RAM_SIZE  # full descending
@@ -31,58 +32,6 @@ REGISTERS = 4  # that carry arguments
 ALIGNMENT = 16
 UNDEFINED = b"\xde"  # two of them are UDF: a stray jump into empty flash is stopped
 LANDING = FLASH + FLASH_SIZE - 16  # where a call returns to, and stops
-
-
-@dataclass(slots=True)
-class Load:
-    """Instructions and cycles of an entry point so far, over all calls."""
-
-    calls: int = 0
-    instructions: int = 0
-    cycles: int = 0
-    worst_instructions: int = 0
-    worst_cycles: int = 0
-
-    def add(self, instructions: int, cycles: int) -> None:
-        """Add one call."""
-        self.calls += 1
-        self.instructions += instructions
-        self.cycles += cycles
-        self.worst_instructions = max(self.worst_instructions, instructions)
-        self.worst_cycles = max(self.worst_cycles, cycles)
-
-    def merge(self, other: "Load") -> None:
-        """Add what another load has counted."""
-        self.calls += other.calls
-        self.instructions += other.instructions
-        self.cycles += other.cycles
-        self.worst_instructions = max(self.worst_instructions, other.worst_instructions)
-        self.worst_cycles = max(self.worst_cycles, other.worst_cycles)
-
-    def __str__(self) -> str:
-        mean = self.instructions / max(self.calls, 1)
-        counted = f" {mean:8.0f} instructions ({self.worst_instructions} at most)," if mean else ""
-        return f"{self.calls:6} calls,{counted} {self.mean_us:6.1f} us ({self.worst_us:.1f})"
-
-    @property
-    def mean_us(self) -> float:
-        """Processor time of a mean call."""
-        return self.cycles / max(self.calls, 1) / CLOCK_MHZ
-
-    @property
-    def worst_us(self) -> float:
-        """Processor time of the longest call."""
-        return self.worst_cycles / CLOCK_MHZ
-
-
-@dataclass(frozen=True, slots=True)
-class Usage:
-    """What the core uses of the board: memory, and processor time by entry point."""
-
-    flash_bytes: int | None  # None: not known of a real board
-    ram_bytes: int  # the structs
-    stack_bytes: int | None  # at most so far
-    entries: dict[str, Load]
 
 
 def find_emulator() -> Any:
@@ -119,18 +68,23 @@ class CortexM4Runner:
         self._ram[:] = STACK_PATTERN
         ram = self._ram.ctypes.data
         self._cpu.mem_map_ptr(RAM, RAM_SIZE, unicorn_const.UC_PROT_READ | unicorn_const.UC_PROT_WRITE, ram)
-        self._here = tuple(block.memory.view(np.uint8) for block in blocks.named.values())
-        sizes = [-(-memory.size // ALIGNMENT) * ALIGNMENT for memory in self._here]
+        here = {name: block.memory.view(np.uint8) for name, block in blocks.named.items()}
+        sizes = [-(-memory.size // ALIGNMENT) * ALIGNMENT for memory in here.values()]
         places = [sum(sizes[:index]) for index in range(len(sizes) + 1)]
         self._stack_end = places[-1]
         if self._stack_end > RAM_SIZE - STACK_LEAST:
             raise ExportError(
                 f"the core's memory is {self._stack_end} bytes: at most {RAM_SIZE - STACK_LEAST} fit"
             )
-        self._there = tuple(
-            self._ram[place : place + memory.size]
-            for place, memory in zip(places[:-1], self._here, strict=True)
-        )
+        self.ram_bytes = sum(memory.size for memory in here.values())  # the memory of the structs
+        there = {
+            name: self._ram[place : place + memory.size]
+            for place, (name, memory) in zip(places[:-1], here.items(), strict=True)
+        }
+        # of each call: the memory that it takes, here and in the RAM
+        self._memories = {
+            name: [(here[block], there[block]) for block in taken] for name, taken in blocks.calls.items()
+        }
         addresses = dict(zip(blocks.named, (RAM + place for place in places), strict=False))
         r0, sp, lr = self._result, arm_const.UC_ARM_REG_SP, arm_const.UC_ARM_REG_LR
         self._registers = {}
@@ -145,24 +99,19 @@ class CortexM4Runner:
         self._filed_cycles = 0  # for poses since the last step of the estimator
         self._ahead: tuple[str, bytes] | None = None  # the call that RAM holds the results of, and its inputs
 
-    def reset(self) -> None:
-        """Start the estimator."""
-        self._call("reset")
-
-    def file_pose(self) -> int:
-        """File the input's pose."""
-        result = self._call("file_pose")
-        self._filed_cycles += self._meter.cycles
-        return result
-
-    def estimate(self) -> None:
-        """Run one tick of the estimator."""
-        self._call("estimate")
-        self._filed_cycles = 0
-
-    def control(self) -> None:
-        """Run one tick of the controller."""
-        self._call("control")
+    def call(self, name: str) -> int:
+        """Execute an entry point; results computed ahead from the same inputs are reused."""
+        if self._ahead is None or self._ahead != (name, self._inputs(name)):
+            self._execute(name)
+        self._ahead = None
+        for here, there in self._memories[name]:
+            here[:] = there
+        self.load[name].add(self._meter.instructions, self._meter.cycles)
+        if name == "file_pose":
+            self._filed_cycles += self._meter.cycles
+        elif name == "estimate":
+            self._filed_cycles = 0
+        return ctypes.c_int32(self._cpu.reg_read(self._result)).value if name in ANSWERING else 0
 
     def estimate_us(self) -> int:
         """Return the processor time of the estimator's next call, with that of the poses filed since the last one."""
@@ -184,36 +133,21 @@ class CortexM4Runner:
         return int(touched.size - touched.argmax()) if touched.any() else 0
 
     @property
-    def ram_bytes(self) -> int:
-        """The memory of the structs."""
-        return sum(memory.size for memory in self._here)
-
-    @property
     def usage(self) -> Usage:
         """What the core has used so far."""
         return Usage(len(self.image.code), self.ram_bytes, self.stack_bytes, self.load)
 
-    def _call(self, name: str) -> int:
-        """Run an entry point and copy its results out; results computed ahead from the same inputs are reused."""
-        if self._ahead is None or self._ahead != (name, self._inputs()):
-            self._execute(name)
-        self._ahead = None
-        for here, there in zip(self._here, self._there, strict=True):
-            here[:] = there
-        self.load[name].add(self._meter.instructions, self._meter.cycles)
-        return ctypes.c_int32(self._cpu.reg_read(self._result)).value
-
     def _look_ahead(self, name: str) -> int:
         """Run an entry point without copying its results out; returns its cycles."""
         self._execute(name)
-        self._ahead = name, self._inputs()
+        self._ahead = name, self._inputs(name)
         return self._meter.cycles
 
-    def _inputs(self) -> bytes:
-        return b"".join([memory.tobytes() for memory in self._here])
+    def _inputs(self, name: str) -> bytes:
+        return b"".join([here.tobytes() for here, _ in self._memories[name]])
 
     def _execute(self, name: str) -> None:
-        for here, there in zip(self._here, self._there, strict=True):
+        for here, there in self._memories[name]:
             there[:] = here
         self._cpu.reg_write_batch(self._registers[name])
         stacked = self._stacked[name].view(np.uint8)

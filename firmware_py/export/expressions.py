@@ -70,9 +70,9 @@ class Expressions:
         """Return the error for a construct of this kernel."""
         return refusal(self.kernel.path, node, f"{reason} (in {self.kernel.node.name})")
 
-    def scalar(self, node: ast.expr, kind: Kind, what: str) -> Value:
+    def scalar(self, node: ast.expr, kind: Kind, what: str, alone: bool = False) -> Value:
         """Return an expression that has to be of this type."""
-        value = self.value(node)
+        value = self.value(node, alone)
         if value.kind != kind:
             hint = instead(CONSTRUCTS, f"{describe(value.kind)} for {describe(kind)}")
             raise self.refuse(node, f"{what} is {describe(value.kind)}, not {describe(kind)}{hint}")
@@ -203,7 +203,7 @@ class Expressions:
 
     def _comparison(self, node: ast.Compare) -> Value:
         if len(node.ops) != 1 or type(node.ops[0]) not in COMPARISONS:
-            hint = instead(CONSTRUCTS, "Compare") if len(node.ops) > 1 else ""
+            hint = instead(CONSTRUCTS, type(node if len(node.ops) > 1 else node.ops[0]).__name__)
             raise self.refuse(node, f"comparison {ast.unparse(node)}{hint}")
         left, right = self.value(node.left), self.value(node.comparators[0])
         if left.kind != right.kind or left.kind not in (F32, I32):
@@ -236,6 +236,10 @@ class Expressions:
             and (name == "abs" or name in self.module.builtins)
         ):
             return Value(f"{FLOAT_FUNCTIONS[name]}({self.scalar(node.args[0], F32, f'{name} of').text})", F32)
+        if name == "elapsed" and len(node.args) == 2 and name in self.module.builtins:
+            later, earlier = (self.scalar(argument, I32, "an instant") for argument in node.args)
+            difference = f"(uint32_t){later.within(UNARY)} - (uint32_t){earlier.within(UNARY)}"
+            return Value(f"(int32_t)({difference})", I32, UNARY)
         kernel = self.module.names.get(name)
         if not isinstance(kernel, Kernel):
             raise self.refuse(node, f"call of {name}, which is no kernel{instead(FUNCTIONS, name)}")

@@ -161,11 +161,15 @@ class FunctionPrinter:
             ) if len(limits) in (1, 2):
                 pass
             case _:
+                if node.orelse:
+                    raise self._print.refuse(node.orelse[0], f"else of a loop{instead(CONSTRUCTS, 'else')}")
                 raise self._print.refuse(node, "a loop runs over range(end) or range(start, end)")
         if name in self._print.names:
             raise self._print.refuse(node, f"loop variable {name} is in use")
         start = self._print.scalar(limits[0], I32, "the start of a range").text if len(limits) == 2 else "0"
-        end = self._print.scalar(limits[-1], I32, "the end of a range").text
+        end = self._print.scalar(
+            limits[-1], I32, "the end of a range", alone=True
+        ).text  # evaluated once, and last
         limit = ""
         if not self._fixed(limits[-1]):  # Python looks at the end of a range once
             limit, end = f", {name}_end = {end}", f"{name}_end"

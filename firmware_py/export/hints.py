@@ -27,28 +27,62 @@ FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
     **dict.fromkeys(("exp", "log", "tan", "tanh", "hypot"), _NONE),
     "print": "a field of the memory struct marked Logged(unit)",
 }
+OUTSIDE = ("numpy", "math")  # modules whose functions have their like in the core
 GUARDED: Mapping[str, str] = {  # what logic of the user's own may not call, by its name in C
     "controller_allocate": "allocate, from firmware_py.core.guard: it does not make a number of NaN",
 }
+_OWN_LINE = "an assignment on a line of its own"
 CONSTRUCTS: Mapping[str, str] = {
     "AugAssign": "x = x + y",
     "AnnAssign": "x = value",
-    "While": _LOOP,
     "IfExp": "an if on lines of its own",
-    "ListComp": _LOOP,
     "Pow": "x * x",
-    "MatMult": _LOOP,
-    **dict.fromkeys(("GeneratorExp", "Slice", "Starred"), _LOOP),
+    **dict.fromkeys(("While", "AsyncFor", "MatMult", "Slice"), _LOOP),
+    **dict.fromkeys(("ListComp", "SetComp", "DictComp", "GeneratorExp"), _LOOP),
+    "Starred": "the arguments one by one",
     **dict.fromkeys(("Tuple", "Assign"), "one assignment for each value"),
     **dict.fromkeys(("List", "Dict", "Set"), _FIELD),
-    **dict.fromkeys(("Assert", "Raise", "Try", "Break", "Continue"), "an if"),
-    **dict.fromkeys(("Global", "Nonlocal"), "a field of the memory struct"),
-    "Lambda": "a @kernel of its own",
+    **dict.fromkeys(("Assert", "Raise", "Try", "TryStar", "Break", "Continue"), "an if"),
+    **dict.fromkeys(("With", "AsyncWith"), "its lines without it"),
+    **dict.fromkeys(("Global", "Nonlocal", "Yield", "YieldFrom"), "a field of the memory struct"),
+    **dict.fromkeys(("Lambda", "FunctionDef", "AsyncFunctionDef"), "a @kernel of its own, above this one"),
+    "ClassDef": "a Struct at the top of the file",
+    "ImportFrom": "it at the top of the file",
+    "JoinedStr": FUNCTIONS["print"],
+    "NamedExpr": _OWN_LINE,
+    "Match": "if and elif",
+    "Pass": "nothing, or return",
+    **dict.fromkeys(("Delete", "Await"), "nothing"),
     "Compare": "a < b and b < c",
+    "Is": "==",
+    "IsNot": "!=",
+    **dict.fromkeys(("In", "NotIn"), "== for each value"),
+    "else": "its lines behind the loop",
     "f32 and i32": "f32(..) around the integer",
     "f32 for bool": "a comparison, as x != ZERO",
     "keywords": "the arguments in their order, without names",
 }
+WORDS: Mapping[str, str] = {  # where Python's name of a construct is not what people call it
+    "ListComp": "list comprehension",
+    "SetComp": "set comprehension",
+    "DictComp": "dict comprehension",
+    "GeneratorExp": "generator expression",
+    "Lambda": "lambda",
+    "Starred": "* before an argument",
+    **dict.fromkeys(("FunctionDef", "AsyncFunctionDef"), "function inside a function"),
+    "ClassDef": "class inside a function",
+    "ImportFrom": "import inside a function",
+    "JoinedStr": "f-string",
+    "NamedExpr": "assignment with := ",
+    **dict.fromkeys(("Yield", "YieldFrom"), "yield"),
+    "Await": "await",
+}
+# What a kernel is made of; of these, the printer looks at how they are used.
+KNOWN = (
+    ast.Assign, ast.Expr, ast.Return, ast.If, ast.For,
+    ast.Name, ast.Constant, ast.Attribute, ast.Subscript, ast.Slice, ast.Tuple,
+    ast.BinOp, ast.UnaryOp, ast.BoolOp, ast.Compare, ast.Call,
+)  # fmt: skip
 
 
 def instead(table: Mapping[str, str], name: str) -> str:
@@ -58,8 +92,8 @@ def instead(table: Mapping[str, str], name: str) -> str:
     return f": {table[name]}" if table[name] is _NONE else f": write {table[name]}"
 
 
-def first_use(tree: ast.Module, node: ast.Import | ast.ImportFrom) -> tuple[ast.AST, str]:
-    """Return where a module first uses what it imports from outside, and what to write there."""
+def first_use(tree: ast.Module | ast.FunctionDef, node: ast.Import | ast.ImportFrom) -> tuple[ast.AST, str]:
+    """Return where a module or function first uses what it imports from outside, and what to write there."""
     names = {
         alias.asname or alias.name.partition(".")[0]: "" if isinstance(node, ast.Import) else alias.name
         for alias in node.names
@@ -75,3 +109,19 @@ def first_use(tree: ast.Module, node: ast.Import | ast.ImportFrom) -> tuple[ast.
     first = min(uses, key=lambda use: (use.lineno, use.col_offset))
     name = first.attr if isinstance(first, ast.Attribute) else names[first.id]
     return first, f"{ast.unparse(first)} is outside the subset{instead(FUNCTIONS, name)}"
+
+
+def outside_subset(function: ast.FunctionDef) -> tuple[ast.AST, str] | None:
+    """Return the first construct of a kernel's body that no kernel has, and what to write instead."""
+    parts = [
+        part for line in function.body for part in ast.walk(line) if isinstance(part, ast.stmt | ast.expr)
+    ]
+    unknown = [part for part in parts if not isinstance(part, KNOWN)]
+    if not unknown:
+        return None
+    first = min(unknown, key=lambda part: (part.lineno, part.col_offset))
+    if isinstance(first, ast.Import) or (isinstance(first, ast.ImportFrom) and first.module in OUTSIDE):
+        return first_use(function, first)
+    name = type(first).__name__
+    word = WORDS.get(name) or f"{name} {'statement' if isinstance(first, ast.stmt) else 'expression'}"
+    return first, f"{word}{instead(CONSTRUCTS, name)}"

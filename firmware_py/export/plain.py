@@ -1,8 +1,8 @@
 """The flight core as plain Python, in a process of its own: numba is switched on or off for a whole process.
 
-`PlainRunner` is the parent's end, `serve` the child's. A call goes over the pipe as one byte, its index in `CALLS`, and the
-memory of all blocks; the result, an int32, and the memory come back. The child's arguments say which own
-logic flies.
+`PlainRunner` is the parent's end, `serve` the child's. A call goes over the pipe as one byte, its index among the calls, and
+the memory of the blocks that it takes; the result, an int32, and the memory come back. The child's arguments say which
+own logic flies.
 """
 
 import json
@@ -24,7 +24,6 @@ from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.export.errors import ExportError
 from firmware_py.logic.loading import Logic, load_logic
 
-CALLS = ("reset", "file_pose", "estimate", "control")
 RESULT = struct.Struct("<i")
 
 
@@ -34,7 +33,7 @@ class PlainRunner:
     def __init__(self, blocks: CoreBlocks) -> None:
         root = str(Path(__file__).parents[2])
         path = os.pathsep.join((root, *filter(None, (os.environ.get("PYTHONPATH"),))))
-        self._memories = _memories(blocks)
+        self._calls = _calls(blocks)
         files = {} if blocks.logic is None else dict(blocks.logic.loaded.files)
         self._child = subprocess.Popen(
             [sys.executable, "-m", "firmware_py.export.plain", json.dumps(files)],
@@ -42,22 +41,6 @@ class PlainRunner:
             stdout=subprocess.PIPE,
             env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": path},
         )
-
-    def reset(self) -> None:
-        """Start the estimator."""
-        self._call("reset")
-
-    def file_pose(self) -> int:
-        """File the input's pose."""
-        return self._call("file_pose")
-
-    def estimate(self) -> None:
-        """Run one tick of the estimator."""
-        self._call("estimate")
-
-    def control(self) -> None:
-        """Run one tick of the controller."""
-        self._call("control")
 
     def close(self) -> None:
         """End the child process."""
@@ -68,26 +51,29 @@ class PlainRunner:
         self._child.wait()
         self._child.stdout.close()
 
-    def _call(self, name: str) -> int:
+    def call(self, name: str) -> int:
+        """Execute an entry point in the child process."""
+        memories = self._calls[name]
         up, down = self._child.stdin, self._child.stdout
         assert up is not None
         assert down is not None
         try:
-            up.write(bytes((CALLS.index(name),)) + b"".join(memory.tobytes() for memory in self._memories))
+            up.write(bytes((tuple(self._calls).index(name),)) + b"".join(one.tobytes() for one in memories))
             up.flush()
         except BrokenPipeError:
             raise ExportError("plain Python: the child process has ended") from None
-        size = RESULT.size + _size(self._memories)
+        size = RESULT.size + _size(memories)
         answer = down.read(size)
         if len(answer) < size:
             raise ExportError("plain Python: the child process has ended in the middle of a call")
-        _spread(answer[RESULT.size :], self._memories)
+        _spread(answer[RESULT.size :], memories)
         result: int = RESULT.unpack_from(answer)[0]
         return result
 
 
-def _memories(blocks: CoreBlocks) -> list[np.ndarray]:
-    return [block.memory for block in blocks.named.values()]
+def _calls(blocks: CoreBlocks) -> dict[str, list[np.ndarray]]:
+    """Return the memory that each call takes."""
+    return {name: [blocks.named[block].memory for block in taken] for name, taken in blocks.calls.items()}
 
 
 def _size(memories: list[np.ndarray]) -> int:
@@ -105,13 +91,13 @@ def _spread(data: bytes, memories: list[np.ndarray]) -> None:
 def serve(calls: BinaryIO, answers: BinaryIO, logic: Logic | None) -> None:
     """Execute calls until the other end closes."""
     blocks = CoreBlocks(Parameters.allocate(), PythonRunner, logic)
-    memories = _memories(blocks)
-    size = 1 + _size(memories)
-    while len(call := calls.read(size)) == size:
-        _spread(call[1:], memories)
+    names = list(_calls(blocks).items())
+    while number := calls.read(1):
+        name, memories = names[number[0]]
+        _spread(calls.read(_size(memories)), memories)
         with np.errstate(all="ignore"):  # the comparison deals with infinities and NaN
-            result = getattr(blocks.run, CALLS[call[0]])()
-        answers.write(RESULT.pack(result or 0) + b"".join(memory.tobytes() for memory in memories))
+            result = blocks.run.call(name)
+        answers.write(RESULT.pack(result) + b"".join(memory.tobytes() for memory in memories))
         answers.flush()
 
 

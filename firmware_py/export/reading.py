@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.core.subset import Logged, Tunable
+from firmware_py.core.subset import Logged, Settable, Tunable
 from firmware_py.export import hints
 from firmware_py.export.errors import ExportError, refusal
 from firmware_py.export.syntax import (
@@ -29,13 +29,14 @@ from firmware_py.export.syntax import (
     Constant,
     Kernel,
     Kind,
+    Mark,
     Module,
     Named,
     StructField,
     StructType,
 )
 
-MARKS: Mapping[str, type[Any]] = {"Tunable": Tunable, "Logged": Logged}
+MARKS: Mapping[str, type[Any]] = {"Tunable": Tunable, "Logged": Logged, "Settable": Settable}
 MARK_FORM = 'Tunable(default, "unit", low=.., high=..) of a parameter, or Logged("unit") of the memory'
 
 
@@ -172,9 +173,12 @@ class _Reader:
                 name = self._identifier(line.target.id, line)
                 if name in fields:
                     raise refusal(self.module.path, line, f"{name}: this name exists already")
-                kind, mark = self._field_kind(line.annotation, line)
+                kind, marks = self._field_kind(line.annotation, line)
                 above, comment = self.module.above(line.lineno), self.module.comment(line)
-                fields[name] = StructField(name, kind, above, comment, line.lineno, mark)
+                for mark in marks:
+                    if isinstance(mark, Settable) and not comment:
+                        comment = f"[{mark.unit}] {mark.meaning}"
+                fields[name] = StructField(name, kind, above, comment, line.lineno, marks)
             elif not (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant)):
                 raise refusal(self.module.path, line, "a struct has nothing but fields")
         if not fields:
@@ -182,36 +186,45 @@ class _Reader:
         prefix = self.module.name.removeprefix("own_").capitalize() if self.module.own else ""
         return StructType(prefix + node.name, ast.get_docstring(node) or "", fields)
 
-    def _field_kind(self, annotation: ast.expr, node: ast.stmt) -> tuple[Kind, Tunable | Logged | None]:
+    def _field_kind(self, annotation: ast.expr, node: ast.stmt) -> tuple[Kind, tuple[Mark, ...]]:
         match annotation:
             case ast.Name(id="f32" | "i32" as base):
-                return Kind(base), None
+                return Kind(base), ()
             case ast.Subscript(
                 value=ast.Name(id="Annotated"), slice=ast.Tuple(elts=[ast.Name(id=name), *rest])
             ):
-                mark = self._mark(rest.pop(), node) if rest and isinstance(rest[-1], ast.Call) else None
+                calls = [one for one in rest if isinstance(one, ast.Call)]
+                marks = tuple(self._mark(call, node) for call in calls)
                 values = [size.value for size in rest if isinstance(size, ast.Constant)]
                 shape = tuple(value for value in values if isinstance(value, int))
-                if name in ARRAYS and len(shape) == len(rest) in (1, 2):
-                    return Kind(ARRAYS[name], len(shape), shape), mark
-                if name in ("f32", "i32") and not rest:
-                    return Kind(name), mark
+                sizes = len(rest) - len(marks)
+                if self.module.own and len(marks) > 1:
+                    raise refusal(self.module.path, node, f"field with {len(marks)} marks")
+                if name in ARRAYS and len(shape) == sizes in (1, 2):
+                    return Kind(ARRAYS[name], len(shape), shape), marks
+                if name in ("f32", "i32") and not sizes:
+                    return Kind(name), marks
         raise refusal(self.module.path, node, f"field type {ast.unparse(annotation)}")
 
-    def _mark(self, call: ast.expr, node: ast.stmt) -> Tunable | Logged:
+    def _mark(self, call: ast.Call, node: ast.stmt) -> Mark:
         """Return what makes a field a parameter or a log variable."""
-        assert isinstance(call, ast.Call)
         name = ast.unparse(call.func)
         try:
-            given = [ast.literal_eval(argument) for argument in call.args]
-            named = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
-            mark: Tunable | Logged = MARKS[name](*given, **named)
+            given = [self._value(argument) for argument in call.args]
+            named = {str(keyword.arg): self._value(keyword.value) for keyword in call.keywords}
+            mark: Mark = MARKS[name](*given, **named)
             numbers = (mark.default, mark.low, mark.high) if isinstance(mark, Tunable) else ()
-            if isinstance(mark.unit, str) and all(type(number) in (int, float) for number in numbers):
+            typed = isinstance(mark.unit, str) and all(type(number) in (int, float) for number in numbers)
+            if not self.module.own or (typed and (numbers or mark == Logged(mark.unit))):
                 return mark
         except (KeyError, TypeError, ValueError):
             pass
         raise refusal(self.module.path, node, f"{ast.unparse(call)}: expected {MARK_FORM}")
+
+    def _value(self, node: ast.expr) -> Any:
+        """Return the value of a literal, or of a constant of this module."""
+        constant = self.module.names.get(node.id) if isinstance(node, ast.Name) else None
+        return int(constant.text) if isinstance(constant, Constant) else ast.literal_eval(node)
 
     def _kernel(self, node: ast.FunctionDef) -> Kernel:
         if [ast.unparse(decorator) for decorator in node.decorator_list] != ["kernel"]:
@@ -228,6 +241,8 @@ class _Reader:
                     self.module.path, node, f"{node.name} has no result type f32, i32, bool or None"
                 )
             result = SCALARS[name]
+        if outside := hints.outside_subset(node):
+            raise refusal(self.module.path, outside[0], f"{outside[1]} (in {node.name})")
         public = self.module.name == ENTRY
         c_name = f"floaty_core_{node.name}" if public else f"{self.module.name}_{node.name}"
         return Kernel(c_name, self.module.path, node, arguments, result, public, self.module)

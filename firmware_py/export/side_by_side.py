@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from firmware_py.core.structs import Parameters
 from firmware_py.core.subset import Block
-from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
+from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
 from firmware_py.export.compare import Difference, differing_bits
 from firmware_py.export.errors import ExportError
 
@@ -51,60 +51,41 @@ class SideBySide:
         self.targets = [Target(name, blocks, factory) for name, factory in targets.items()]
         self._reference = PythonRunner(blocks)
         self._blocks = blocks
+        self._inputs = blocks.inputs
         self._tick = 0
 
-    def reset(self) -> None:
-        """Start the estimator."""
-        self._call("reset")
-
-    def file_pose(self) -> int:
-        """File the input's pose."""
-        return self._call("file_pose")
-
-    def estimate(self) -> None:
-        """Run one tick of the estimator."""
-        self._tick += 1
-        self._call("estimate")
-        for target in self.targets:
-            target.ticks += target.divergence is None
-
-    def control(self) -> None:
-        """Run one tick of the controller."""
-        self._call("control")
-
-    def _call(self, name: str) -> int:
+    def call(self, name: str) -> int:
+        """Execute an entry point on the reference, and on every target that has not differed yet."""
+        self._tick += name == "estimate"
+        taken = self._blocks.calls[name]
         running = [target for target in self.targets if target.divergence is None]
         for target in running:
-            for source, copy in zip(self._blocks.inputs, target.blocks.inputs, strict=True):
-                copy.memory[:] = source.memory
-        result = _answer(self._reference, name)
-        memories = [block.bytes() for block in self._blocks.named.values()]
+            for block in self._inputs.intersection(taken):
+                target.blocks.named[block].memory[:] = self._blocks.named[block].memory
+        result = self._reference.call(name)
+        memories = {block: self._blocks.named[block].bytes() for block in taken}
         for target in running:
             target.calls += 1
             try:
-                answer = _answer(target.blocks.run, name)
+                answer = target.blocks.run.call(name)
             except ExportError as error:
                 target.divergence = Divergence(self._tick, name, str(error), ())
             else:
                 target.divergence = self._compare(name, memories, result, target.blocks, answer)
+            target.ticks += name == "estimate" and target.divergence is None
         return result
 
     def _compare(
-        self, call: str, memories: list[bytes], result: int, blocks: CoreBlocks, answer: int
+        self, call: str, memories: dict[str, bytes], result: int, blocks: CoreBlocks, answer: int
     ) -> Divergence | None:
         if answer != result:
             patterns = (result & 0xFFFFFFFF, answer & 0xFFFFFFFF)
             return Divergence(self._tick, call, "answer", (Difference("value", (result, answer), patterns),))
-        for memory, block in zip(memories, blocks.named.values(), strict=True):
+        for name, memory in memories.items():
+            block = blocks.named[name]
             if found := differing_bits(memory, block.bytes(), block.kind.dtype):
                 return Divergence(self._tick, call, block.kind.__name__, found)
         return None
-
-
-def _answer(runner: CoreRunner, name: str) -> int:
-    """Call an entry point; only `file_pose` has an answer, for the others 0."""
-    answer = getattr(runner, name)()
-    return int(answer) if name == "file_pose" else 0
 
 
 def _copy_of(parameters: Block[Parameters]) -> Block[Parameters]:

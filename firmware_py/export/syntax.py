@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Union
 
-from firmware_py.core.subset import Logged, Tunable
+from firmware_py.core.subset import Logged, Settable, Tunable
 
 PACKAGE = "firmware_py.core"
 SUBSET = f"{PACKAGE}.subset"
@@ -52,6 +52,9 @@ class Constant:
     shared: bool
 
 
+Mark = Tunable | Logged | Settable
+
+
 @dataclass(frozen=True, slots=True)
 class StructField:
     """A field of a struct, with the comments above and beside it, and what makes it a parameter or a log variable."""
@@ -61,7 +64,12 @@ class StructField:
     above: str
     comment: str
     line: int
-    mark: Tunable | Logged | None = None
+    marks: tuple[Mark, ...] = ()
+
+    @property
+    def mark(self) -> Mark | None:
+        """The first mark; own logic has no further ones."""
+        return self.marks[0] if self.marks else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,15 +6,15 @@ Commands are few and are planned at once, in the receiving task. Each is answere
 fourth byte, as the stock firmware answers.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from firmware_py.links.crtp_stack import CrtpStack, Task
+from firmware_py.links.notices import Notices
 from firmware_py.links.trajectories import decode_trajectory
 from firmware_py.pilot import Pilot
-from firmware_py.planner import Motion, Phase, go_to, straight_up
+from firmware_py.planner import Motion, Path, Phase, go_to, straight_up
 from firmware_py.supervisor import Supervisor
-from firmware_py.wire import WireError, high_level, setpoints
+from firmware_py.wire import WireError, check_size, high_level, setpoints
 from firmware_py.wire.crtp import PORT_COMMANDER, PORT_GENERIC_SETPOINT, Packet
 from firmware_py.wire.high_level import (
     Command,
@@ -27,7 +27,7 @@ from firmware_py.wire.high_level import (
 )
 
 OK, REFUSED, ENOEXEC, EBUSY = 0, 1, 8, 16
-LINE_PERIOD_US = 1_000_000  # set-points that come on without a pause of this length are refused once
+COMMANDS = {int(command) for command in Command}
 
 
 @dataclass(slots=True)
@@ -48,16 +48,15 @@ class HighLevelService:
         pilot: Pilot,
         supervisor: Supervisor,
         memory: bytearray,
-        say: Callable[[str], None],
+        notices: Notices,
     ) -> None:
         self.defaults = Defaults()
         self._stack = stack
         self._pilot = pilot
         self._supervisor = supervisor
         self._memory = memory
-        self._say = say
+        self._notices = notices
         self._definitions: dict[int, Define] = {}
-        self._setpoint_us: dict[str, int] = {}  # when each kind came last
         stack.handle(high_level.PORT, lambda packet: stack.answer(packet, self.answer, 0))
         stack.handle(PORT_COMMANDER, self._see_attitude)
         stack.handle(PORT_GENERIC_SETPOINT, self._see_setpoint)
@@ -67,7 +66,8 @@ class HighLevelService:
         try:
             status = self._obey(*decode(packet.data))
         except WireError as error:
-            self._say(f"commander: {error}")
+            number = packet.data[0] if packet.data else -1
+            self._refuse(f"command {number}" if number in COMMANDS else "unknown command", str(error))
             status = ENOEXEC
         return (packet.data[:3].ljust(3, b"\0") + bytes((status,)),)
 
@@ -91,7 +91,7 @@ class HighLevelService:
             return OK
         begin = self._pilot.begin(self._stack.kernel.now_us)
         if begin is None:
-            self._say("commander: no pose has come yet")
+            self._refuse("no pose", "there has been no pose yet")
             return EBUSY
         return self._plan(command, fields, begin)
 
@@ -108,7 +108,7 @@ class HighLevelService:
             groups, relative, reverse, number, timescale = fields
             return self._start(Start(groups, relative, False, reverse, number, timescale), begin)  # type: ignore[arg-type]
         if command is Command.SPIRAL:
-            self._say("commander: a spiral is not flown")
+            self._refuse("spiral", "a spiral is not flown")
             return ENOEXEC
         lands = command in (Command.LAND, Command.LAND_1, Command.LAND_WITH_VELOCITY)
         return self._climb(self._vertical(command, fields, begin, lands), begin, lands)
@@ -135,15 +135,13 @@ class HighLevelService:
         if phase is Phase.LANDING if lands else phase is not Phase.IDLE:
             return REFUSED
         yaw = begin.yaw if wish.current_yaw else wish.yaw
-        self._pilot.follow(straight_up(begin, wish.height, yaw, wish.duration), now_us, lands)
-        return OK
+        return self._follow(straight_up(begin, wish.height, yaw, wish.duration), lands)
 
     def _go_to(self, wish: GoTo, begin: Motion) -> int:
         path = go_to(
             begin, (wish.x, wish.y, wish.z), wish.yaw, wish.duration, bool(wish.relative), bool(wish.linear)
         )
-        self._pilot.follow(path, self._stack.kernel.now_us)
-        return OK
+        return self._follow(path)
 
     def _start(self, wish: Start, begin: Motion) -> int:
         definition = self._definitions.get(wish.trajectory)
@@ -155,41 +153,57 @@ class HighLevelService:
         path = replace(path, timescale=wish.timescale, reverse=bool(wish.reverse))
         if wish.relative:
             path = path.begun_at(begin.position, begin.yaw if wish.relative_yaw else None)
-        self._pilot.follow(path, self._stack.kernel.now_us)
+        return self._follow(path)
+
+    def _follow(self, path: Path, lands: bool = False) -> int:
+        """Start a path unless it leaves the box."""
+        if not self._pilot.admits(path):
+            self._refuse_place("path")
+            return ENOEXEC
+        self._pilot.follow(path, self._stack.kernel.now_us, lands)
         return OK
 
     def _see_attitude(self, packet: Packet) -> Task:
         """Port 3: roll, pitch, yaw rate and thrust. Clients send it without thrust when they disconnect."""
+        check_size("an attitude set-point", packet.data, setpoints.ATTITUDE_SIZE)
         if any(packet.data[12:14]):
-            self._refuse("attitude")
+            self._refuse_setpoint("attitude")
         yield from self._stack.kernel.yield_if_pending()
 
     def _see_setpoint(self, packet: Packet) -> Task:
         """Port 7: set-points, and the notice that no more will come."""
         kind = packet.data[0] if packet.data else None
         if packet.channel == setpoints.CHANNEL_NOTICE:
+            check_size("a notice", packet.data, setpoints.NOTICE_SIZE)
             self._pilot.release()
         elif packet.channel == setpoints.CHANNEL_SETPOINT and kind == setpoints.STOP:
+            check_size("a stop", packet.data, setpoints.STOP_SIZE)
             self._pilot.abort()
         elif packet.channel == setpoints.CHANNEL_SETPOINT and kind is not None:
-            self._follow(kind, packet.data)
+            self._hold(kind, packet.data)
         yield from self._stack.kernel.yield_if_pending()
 
-    def _follow(self, kind: int, data: bytes) -> None:
+    def _hold(self, kind: int, data: bytes) -> None:
         """Fly to a set-point if it gives a position and poses are absolute."""
         if kind in (setpoints.POSITION, setpoints.FULL_STATE) and self._pilot.absolute:
             place = setpoints.decode_place(data)
-            if self._supervisor.can_fly:
-                self._pilot.hold(*place, self._stack.kernel.now_us)
+            now_us = self._stack.kernel.now_us
+            if not self._pilot.admits_place(place[0], now_us):
+                self._refuse_place("set-point")
+            elif self._supervisor.can_fly:
+                self._pilot.hold(*place, now_us)
         else:
-            self._refuse(setpoints.NAMES.get(kind, f"type {kind}"))
+            self._refuse_setpoint(setpoints.NAMES.get(kind, "unknown"))
 
-    def _refuse(self, kind: str) -> None:
-        """Report once that set-points of this kind are not flown."""
-        now_us = self._stack.kernel.now_us
-        if now_us - self._setpoint_us.get(kind, -LINE_PERIOD_US) >= LINE_PERIOD_US:
-            instead = (
-                "positions are" if self._pilot.absolute else "poses are corrections, see extPose.absolute"
-            )
-            self._say(f"commander: {kind} set-points are not flown, {instead}")
-        self._setpoint_us[kind] = now_us
+    def _refuse_place(self, what: str) -> None:
+        self._refuse(
+            f"{what} in the box",
+            f"{what} refused: it leaves the box, see box.radius, box.below and box.above",
+        )
+
+    def _refuse_setpoint(self, kind: str) -> None:
+        instead = "positions are" if self._pilot.absolute else "poses are corrections, see extPose.absolute"
+        self._refuse(f"{kind} set-point", f"{kind} set-points are not flown, {instead}")
+
+    def _refuse(self, kind: str, why: str) -> None:
+        self._notices.refuse(kind, f"commander: {why}")

@@ -4,7 +4,9 @@ A position without attitude is counted and logged but not fused, as in the origi
 carry the last byte of the board's radio address. The pilot turns poses into errors.
 """
 
+from firmware_py.box import is_correction
 from firmware_py.links.crtp_stack import CrtpStack, Task
+from firmware_py.links.notices import Notices
 from firmware_py.measurements import POSE, Measurement, PoseMeasurement
 from firmware_py.pilot import Pilot
 from firmware_py.rtos import Queue
@@ -25,6 +27,7 @@ class LocalisationService:
         supervisor: Supervisor,
         pilot: Pilot,
         address: int,
+        notices: Notices,
     ) -> None:
         self.last = PoseMessage((0.0, 0.0, 0.0), UPRIGHT, None)
         self.positions = 0
@@ -33,6 +36,7 @@ class LocalisationService:
         self._supervisor = supervisor
         self._pilot = pilot
         self._address = address
+        self._notices = notices
         stack.handle(crtp.PORT_LOCALISATION, self._handle)
 
     def _handle(self, packet: Packet) -> Task:
@@ -50,9 +54,9 @@ class LocalisationService:
             for address, pose in localisation.decode_packed_poses(data):
                 if address == self._address:
                     yield from self._measure(now_us, pose)
-        elif kind == localisation.EMERGENCY_STOP:
+        elif data == bytes((localisation.EMERGENCY_STOP,)):
             self._supervisor.emergency_stop()
-        elif kind == localisation.EMERGENCY_STOP_WATCHDOG:
+        elif data == bytes((localisation.EMERGENCY_STOP_WATCHDOG,)):
             self._supervisor.feed_watchdog(now_us)
         elif kind == crtp.EXT_POSE:
             yield from self._measure(now_us, crtp.decode_ext_pose(data))
@@ -64,6 +68,12 @@ class LocalisationService:
         self.last = PoseMessage(p_GB, self.last.q_GB, None)
 
     def _measure(self, now_us: int, pose: PoseMessage) -> Task:
+        if not self._pilot.absolute and not is_correction(pose.p_GB):
+            place = "{:.2f} {:.2f} {:.2f}".format(*pose.p_GB)
+            self._notices.refuse(
+                "pose", f"pose refused: {place} m is no correction; for absolute poses set extPose.absolute 1"
+            )
+            raise WireError(f"a correction of {place} m")
         self.last = pose
         error = self._pilot.error(pose, now_us)
         yield from self._measurements.send((POSE, PoseMeasurement(now_us, error)), 0)

@@ -1,43 +1,22 @@
 """The log service: clients group variables into blocks, the board sends each block at its period.
 
-Port 5: channel 0 is the TOC, 1 creates, starts and stops blocks (version 2), 2 carries the data. Periods count in 10 ms,
-or with the newer command in 1 ms; 0 sends a block once. A refused request changes nothing. When the partner is
-gone, the first block that falls due deletes them all, as in the Crazyflie firmware.
+Periods count in 10 ms, or with the newer command in 1 ms; 0 sends a block once. A refused request changes nothing. When the
+partner is gone, the first block that falls due deletes them all, as in the Crazyflie firmware.
 """
 
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.rtos import FOREVER
-from firmware_py.wire import WireError, toc
-from firmware_py.wire.crtp import MAX_LOG_VALUES, PORT_LOG, Packet, encode_log_data
+from firmware_py.wire import WireError, log, toc
+from firmware_py.wire.crtp import PORT_LOG, Packet
+from firmware_py.wire.log import E2BIG, EEXIST, ENOENT, ENOEXEC, ENOMEM, ITEM, OK, Command
 from firmware_py.wire.scalars import LOG_SCALARS, Scalar
 
-CHANNEL_CONTROL = 1
 MAX_BLOCKS = 16
 MAX_VARIABLES = 128  # in all blocks together
-PERIOD_UNIT_MS = 10
-
-OK, ENOENT, E2BIG, ENOEXEC, ENOMEM, EEXIST = 0, 2, 7, 8, 12, 17  # status bytes are errno's
-
-_ITEM = struct.Struct("<BH")  # type and id
-
-
-class Command(IntEnum):
-    """The first byte on channel 1; versions 0 and 1 of the protocol are not spoken."""
-
-    DELETE = 2
-    START = 3
-    STOP = 4
-    RESET = 5
-    CREATE = 6
-    APPEND = 7
-    START_MS = 8
-
-
 COMMANDS = frozenset(Command)
 
 
@@ -59,13 +38,22 @@ class Block:
     """Variables that travel together. `due_tick` is None while the block is stopped."""
 
     items: list[Item] = field(default_factory=list)
-    size: int = 0
+    layout: struct.Struct = field(default_factory=lambda: struct.Struct("<"))
     period_ms: int = 0
     due_tick: int | None = None
 
     def values(self) -> bytes:
         """Return the present values as they travel."""
-        return b"".join([scalar.pack(read()) for scalar, read in self.items])
+        values = [read() for _, read in self.items]
+        try:
+            return self.layout.pack(*values)
+        except (
+            struct.error,
+            OverflowError,
+        ):  # one does not fit its type, or is no integer where it travels as one
+            return self.layout.pack(
+                *(item[0].cast(value) for item, value in zip(self.items, values, strict=True))
+            )
 
 
 class LogService:
@@ -84,7 +72,7 @@ class LogService:
         data = packet.data
         if packet.channel == toc.CHANNEL:
             return (self.toc.answer(data, bytes((MAX_BLOCKS, MAX_VARIABLES))),)
-        if packet.channel != CHANNEL_CONTROL or not data:
+        if packet.channel != log.CHANNEL_CONTROL or not data:
             raise WireError(f"log request on channel {packet.channel}: {data.hex()}")
         number = data[1] if len(data) > 1 else 0
         return (bytes((data[0], number, self._control(data[0], number, data[2:]))),)
@@ -125,19 +113,19 @@ class LogService:
     def _append(self, block: Block, rest: bytes) -> int:
         """Add the complete items in `rest`: a full packet of cflib's ends with the type byte of one more."""
         items: list[Item] = []
-        for offset in range(0, len(rest) - _ITEM.size + 1, _ITEM.size):
-            kind, number = _ITEM.unpack_from(rest, offset)
+        for offset in range(0, len(rest) - ITEM.size + 1, ITEM.size):
+            kind, number = ITEM.unpack_from(rest, offset)
             scalar = LOG_SCALARS.get(kind & 0x0F)
             if scalar is None or number >= len(self._variables):
                 return ENOENT
             items.append((scalar, self._variables[number].read))
-        size = block.size + sum(scalar.size for scalar, _ in items)
-        if size > MAX_LOG_VALUES:
+        layout = struct.Struct(block.layout.format + "".join(scalar.format for scalar, _ in items))
+        if layout.size > log.MAX_VALUES:
             return E2BIG
         if sum(len(other.items) for other in self.blocks.values()) + len(items) > MAX_VARIABLES:
             return ENOMEM
         block.items += items
-        block.size = size
+        block.layout = layout
         return OK
 
     def _start(self, block: Block, command: int, rest: bytes) -> None:
@@ -145,7 +133,7 @@ class LogService:
         if len(rest) < width:
             raise WireError("a log block started without a period")
         period = int.from_bytes(rest[:width], "little")
-        block.period_ms = period if command == Command.START_MS else period * PERIOD_UNIT_MS
+        block.period_ms = period if command == Command.START_MS else period * log.PERIOD_UNIT_MS
         block.due_tick = self._stack.kernel.tick_count + block.period_ms
 
     def _task(self) -> Task:
@@ -169,7 +157,7 @@ class LogService:
     def _send(self, number: int, block: Block, tick: int) -> Task:
         """Send a block that is due; the next time is planned from this one, missed ones are left out."""
         yield from self._stack.kernel.work(self._stack.cost.log_us)
-        yield from self._stack.offer(encode_log_data(number, tick, block.values()))
+        yield from self._stack.offer(log.encode_data(number, tick, block.values()))
         assert block.due_tick is not None
         late = tick - block.due_tick
         period = block.period_ms

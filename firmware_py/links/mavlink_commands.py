@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 
 from firmware_py.board import Board
+from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import WARNING, MavlinkStack, Task
 from firmware_py.links.mavlink_streams import StreamService
 from firmware_py.links.parameters import Parameter
@@ -14,7 +15,7 @@ from firmware_py.links.storage import ParameterStorage
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import Message
-from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Result
+from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Mode, Result
 
 FORCE = 21196  # MAVLink's magic number for disarming in flight
 REBOOT = 1  # PREFLIGHT_REBOOT_SHUTDOWN
@@ -37,6 +38,7 @@ class CommandService:
         board: Board,
         supervisor: Supervisor,
         streams: StreamService,
+        setpoints: SetpointService,
         parameters: Sequence[Parameter],
         storage: ParameterStorage,
     ) -> None:
@@ -48,6 +50,7 @@ class CommandService:
         self._storage = storage
         self._rebooting = False
         self._commands: dict[int, Callable[[Message], Outcome]] = {
+            Command.DO_SET_MODE: setpoints.choose,
             Command.DO_FLIGHTTERMINATION: self._terminate,
             Command.PREFLIGHT_STORAGE: self._store,
             Command.PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
@@ -56,7 +59,7 @@ class CommandService:
             Command.INJECT_FAILURE: self._fail,
             Command.GET_MESSAGE_INTERVAL: self._report_interval,
             Command.SET_MESSAGE_INTERVAL: self._set_interval,
-            Command.REQUEST_MESSAGE: lambda command: self._once(_whole(command.param1)),
+            Command.REQUEST_MESSAGE: self._request,
             Command.REQUEST_PROTOCOL_VERSION: lambda command: self._once(mavlink.MSG_PROTOCOL_VERSION),
             Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda command: self._once(mavlink.MSG_AUTOPILOT_VERSION),
         }
@@ -96,7 +99,7 @@ class CommandService:
         return self._not_now(f"not armed: {obstacle}")
 
     def _not_now(self, why: str) -> Outcome:
-        return Result.TEMPORARILY_REJECTED, (mavlink.status_text(WARNING, why),)
+        return Result.TEMPORARILY_REJECTED, mavlink.status_text(WARNING, why)
 
     def _reboot(self, command: Message) -> Outcome:
         if command.param1 != REBOOT:
@@ -141,6 +144,15 @@ class CommandService:
         if not 0 <= number <= 0xFFFF:
             return DENIED
         return Result.ACCEPTED, (mavlink.message_interval(number, self._streams.interval_us(number)),)
+
+    def _request(self, command: Message) -> Outcome:
+        number, index = _whole(command.param1), _whole(command.param2)
+        if number != mavlink.MSG_AVAILABLE_MODES:
+            return self._once(number)
+        modes = tuple(mavlink.available_mode(mode) for mode in Mode)
+        if index == 0:
+            return Result.ACCEPTED, modes
+        return (Result.ACCEPTED, modes[index - 1 : index]) if 1 <= index <= len(modes) else DENIED
 
     def _once(self, number: int) -> Outcome:
         """Send a message once."""

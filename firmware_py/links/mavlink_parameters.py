@@ -8,10 +8,9 @@ request for the list while it is being sent starts it again.
 
 from collections.abc import Sequence
 from math import isfinite
-from typing import NoReturn
 from zlib import crc32
 
-from firmware_py.links.mavlink_stack import WARNING, MavlinkStack, Task
+from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.links.parameters import Parameter
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.mavlink_frames import Message
@@ -35,7 +34,6 @@ class MavlinkParameters:
         self._numbers = {name: number for number, name in enumerate(self._names)}
         self._next = len(self._parameters)  # of the list that is being sent
         self._listing = stack.kernel.create_binary_semaphore("mavList")
-        self._complaint = ""  # the last one, which is not repeated
         stack.handle(mavlink.MSG_PARAM_REQUEST_LIST, self._start_list)
         stack.handle(mavlink.MSG_PARAM_REQUEST_READ, self._read)
         stack.handle(mavlink.MSG_PARAM_SET, self._set)
@@ -76,22 +74,15 @@ class MavlinkParameters:
         if not done:
             self._stack.reply(mavlink.parameter_error(message, name, NO_NUMBER, OUT_OF_RANGE))
             limits = f"{parameter.minimum:g}..{parameter.maximum:g}"
-            self._refuse(f"{name} = {value:g}: refused, {limits}")
+            raise WireError(f"{name} = {value:g}: refused, {limits}")
 
     def _find(self, request: Message) -> int:
         name = request.param_id
         number = self._numbers.get(name)
         if number is None:
             self._stack.reply(mavlink.parameter_error(request, name, NO_NUMBER, DOES_NOT_EXIST))
-            self._refuse(f"no parameter {name}")
+            raise WireError(f"no parameter {name}")
         return number
-
-    def _refuse(self, complaint: str) -> NoReturn:
-        """Report why, but do not repeat the same complaint."""
-        if complaint != self._complaint:
-            self._complaint = complaint
-            self._stack.reply(mavlink.status_text(WARNING, complaint))
-        raise WireError(complaint)
 
     def _value(self, number: int) -> Message:
         value = float(self._parameters[number].read())

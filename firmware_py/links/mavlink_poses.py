@@ -1,12 +1,13 @@
-"""Absolute poses and goals from the serial line into the measurement queue; runs in the receiving task.
+"""Absolute poses from the serial line into the measurement queue; runs in the receiving task.
 
 The board forms the correction itself: the pose as it looks from the goal that is in force when it arrives. How old a
 pose is follows from its time stamp and from the sender's clock, which is asked twice a second, faster at first. Whoever
 sends poses is the partner; before the first pose, whoever sends heartbeats.
 """
 
-from firmware_py.geometry import Vector, in_goal_frame
+from firmware_py.geometry import in_goal_frame
 from firmware_py.links.localisation import LocalisationService
+from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.links.timesync import RemoteClock
 from firmware_py.measurements import POSE, Measurement, PoseMeasurement
@@ -26,26 +27,24 @@ PATIENCE = 50  # requests after which it gives up, because some partners never a
 
 
 class PoseService:
-    """`goal` is where to fly, position in W and yaw; `last_goal` the one that the last pose was seen from."""
+    """`age_us` is that of the last pose when it arrived, None when it is not known."""
 
     def __init__(
         self,
         stack: MavlinkStack,
         measurements: Queue[Measurement],
         localisation: LocalisationService,
-        home: Vector,
+        setpoints: SetpointService,
     ) -> None:
-        self.goal: tuple[Vector, float] = (home, 0.0)
-        self.last_goal = self.goal
-        self.age_us: int | None = None  # of the last pose when it arrived
+        self.age_us: int | None = None
         self._stack = stack
+        self._setpoints = setpoints
         self._measurements = measurements
         self._localisation = localisation
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
         for number in mavlink.POSES:
             stack.handle(number, self._take_pose)
-        stack.handle(mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED, self._take_target)
         stack.handle(mavlink.MSG_HEARTBEAT, self._see_heartbeat)
         stack.handle(mavlink.MSG_TIMESYNC, self._take_timesync)
         stack.kernel.create_task("MAV-SYNC", 1, self._sync_task)
@@ -54,8 +53,7 @@ class PoseService:
         pose = mavlink.read_pose(message)
         self._meet(message)
         now_us = self._stack.kernel.now_us
-        self.last_goal = self.goal
-        p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self.goal)
+        p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self._setpoints.see_pose())
         self.age_us = self._age_us(now_us, pose.t_us)
         self._localisation.last = PoseMessage(p_GB, q_GB, self.age_us)
         self._measurements.send_nowait((POSE, PoseMeasurement(now_us, self._localisation.last)))
@@ -67,15 +65,6 @@ class PoseService:
             return None
         age_us = now_us + offset_us - t_us
         return max(0, age_us) if EARLIEST_US <= age_us <= OLDEST_US else None
-
-    def _take_target(self, message: Message) -> None:
-        target = mavlink.read_target(message)
-        p_WG, yaw = self.goal
-        if target.p_WG is not None:
-            p_WG = target.p_WG
-        if target.yaw is not None:
-            yaw = target.yaw
-        self.goal = (p_WG, yaw)
 
     def _see_heartbeat(self, message: Message) -> None:
         if self._partner is None:

@@ -4,12 +4,15 @@ Uplink: UART interrupt -> MAV-RX, which finds the frames and runs a handler for 
 Downlink: services -> transmit queue (32) -> MAV-TX -> UART. Replies may fill the queue; what is sent unasked leaves
 room for them and is dropped and counted when the line does not keep up. MAV-TX alone makes frames, so that their
 sequence numbers leave in order.
+
+No request is ignored silently: what is refused, and what no service reads, is reported in a STATUSTEXT per kind and sender.
 """
 
 from collections.abc import Callable, Generator, Iterable
 
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig, MavlinkConfig
+from firmware_py.links.notices import Notices
 from firmware_py.rtos import Kernel, Queue
 from firmware_py.rtos.scheduler import GO_ON
 from firmware_py.wire import WireError, mavlink
@@ -20,10 +23,12 @@ Handler = Callable[[Message], object]
 
 TRANSMIT_QUEUE = 32
 UNASKED_LIMIT = 24  # messages in the queue beyond which nothing is sent unasked
+BACKLOG = 4  # messages in the queue at which streams wait for their turn
 SILENCE_TICKS = 50  # after which MAV-RX lets the receiver search half a frame again
 
 SILENCE_US = 3_000_000  # three heartbeats of a ground station
 INFO, WARNING = 6, 4  # MAV_SEVERITY
+NOTICES = 64  # kinds and senders that are told apart
 
 
 class MavlinkStack:
@@ -37,7 +42,7 @@ class MavlinkStack:
         self.unserved = 0  # messages that no service reads, or that are for other systems
         self._heard_us = 0  # when a message was last received
         # Unrequested messages for which the line had no time, and messages that fit no frame.
-        self._unsent = 0
+        self.unsent = 0
         self._cost_us = cost.mavlink_us
         self._board = board
         signing = Signing(bytes.fromhex(config.signing_key)) if config.signing_key else None
@@ -47,6 +52,9 @@ class MavlinkStack:
         self._handlers: dict[int, Handler] = {}
         self._received = kernel.create_binary_semaphore("uartReady")
         self._transmit: Queue[Message] = kernel.create_queue(TRANSMIT_QUEUE, "mavTx")
+        self._notices = Notices(kernel, self._warn)
+        self._noticed: set[str] = set()
+        self._texts = 0  # sent
         self._paced: Message | None = None
         self._paced_sent = kernel.create_binary_semaphore("mavPaced")
         kernel.create_task("MAV-RX", 2, self._receive_task)
@@ -71,7 +79,7 @@ class MavlinkStack:
     @property
     def dropped(self) -> int:
         """Messages for which the line had no time, or that fit no frame."""
-        return self._unsent + self._transmit.dropped
+        return self.unsent + self._transmit.dropped
 
     @property
     def overruns(self) -> int:
@@ -95,12 +103,33 @@ class MavlinkStack:
         """Queue a message that was requested. A plain call, for handlers; dropped when the queue is full."""
         self._transmit.send_nowait(message)
 
+    @property
+    def room(self) -> int:
+        """How many messages of streams the queue takes: none before it is nearly empty, so that no answer waits long."""
+        waiting = len(self._transmit)
+        return UNASKED_LIMIT - waiting if waiting < BACKLOG else 0
+
     def offer(self, message: Message) -> Iterable[int]:
         """Queue a message that was not requested, if the line has time for it."""
         if len(self._transmit) >= UNASKED_LIMIT:
-            self._unsent += 1
+            self.unsent += 1
             return GO_ON
         return self._transmit.send_nowait(message)
+
+    def notice(self, message: Message, text: str) -> None:
+        """Report what became of a message that was not obeyed: once per kind and sender, then now and then with a count."""
+        source = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
+        kind = f"{source} {''.join(filter(str.isalpha, text))}"  # without its numbers
+        if kind not in self._noticed:
+            if len(self._noticed) == NOTICES:
+                kind, text = "others", "requests of further kinds or senders refused"
+            else:
+                self._noticed.add(kind)
+        self._notices.refuse(kind, text)
+
+    def _warn(self, line: str) -> None:
+        if len(self._transmit) < UNASKED_LIMIT:
+            self.report(WARNING, line)
 
     def deliver(self, message: Message) -> Task:
         """Queue one of many messages and wait until the line has taken it; for use by one task only."""
@@ -110,7 +139,13 @@ class MavlinkStack:
 
     def say(self, line: str) -> None:
         """Send a line of the console as STATUSTEXT."""
-        self.reply(mavlink.status_text(WARNING if "failsafe" in line else INFO, line))
+        self.report(WARNING if "failsafe" in line else INFO, line)
+
+    def report(self, severity: int, line: str) -> None:
+        """Send a line to the operators as STATUSTEXT."""
+        self._texts = self._texts % 0xFFFF + 1
+        for message in mavlink.status_text(severity, line, self._texts):
+            self.reply(message)
 
     def _receive_task(self) -> Task:
         kernel, receiver, board = self.kernel, self._receiver, self._board
@@ -125,20 +160,30 @@ class MavlinkStack:
         if (message.get_srcSystem(), message.get_srcComponent()) == (self.system, self.component):
             return  # an echo of our own
         self._heard_us = self.kernel.now_us
-        handler = self._handlers.get(message.get_msgId())
+        number = message.get_msgId()
+        handler = self._handlers.get(number)
         if handler is None or not self._is_ours(message):
             self.unserved += 1
+            if handler is None and number not in mavlink.ENDS and self._is_request(message):
+                self.notice(message, f"{message.get_type()} is not served")
             return
         try:
             handler(message)
-        except WireError:
+        except WireError as error:
             self.refused += 1
+            self.notice(message, str(error))
 
     def _is_ours(self, message: Message) -> bool:
         """Whether this board is addressed; 0 stands for all."""
         system = getattr(message, "target_system", 0)
         component = getattr(message, "target_component", 0)
         return system in (0, self.system) and component in (0, self.component)
+
+    def _is_request(self, message: Message) -> bool:
+        """Whether a message that no service reads has an address, and it is this board's."""
+        if hasattr(message, "target"):  # MANUAL_CONTROL
+            return message.target in (0, self.system)
+        return hasattr(message, "target_system") and self._is_ours(message)
 
     def _transmit_task(self) -> Task:
         kernel, sender, board = self.kernel, self._sender, self._board
@@ -150,7 +195,7 @@ class MavlinkStack:
             try:
                 frame = sender.encode(kernel.now_us, message)
             except WireError:
-                self._unsent += 1
+                self.unsent += 1
                 frame = b""
             while not board.uart_write(frame):
                 yield from kernel.delay(1)

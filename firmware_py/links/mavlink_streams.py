@@ -1,7 +1,8 @@
 """Messages that the board sends by itself, each at its own interval, which clients may change.
 
 Intervals are whole ticks and count from boot: messages of one interval are made in the same tick and carry the same time
-stamp, and a missed tick shifts nothing.
+stamp, and a missed tick shifts nothing. On a full line the stream that has waited longest is next, so that all have their
+turn; what is due again before its turn is dropped and counted.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,10 +41,12 @@ class Stream:
     make: Callable[[int], Sequence[Message]]
     interval_ticks: int | None = None
     due_tick: int = 0
+    waits_since: int | None = None  # tick; None: nothing is waiting for the line
 
     def start(self, interval_ticks: int | None, tick: int) -> None:
         """Go on at this interval."""
         self.interval_ticks = interval_ticks
+        self.waits_since = None
         if interval_ticks is not None:
             self.due_tick = tick // interval_ticks * interval_ticks + interval_ticks
 
@@ -99,18 +102,37 @@ class StreamService:
             self.set_interval(number, interval_us)
 
     def _task(self) -> Task:
-        kernel, stack, streams = self._stack.kernel, self._stack, tuple(self._streams.values())
+        kernel, stack = self._stack.kernel, self._stack
         while True:
-            tick = kernel.tick_count
+            tick, room = kernel.tick_count, stack.room
             messages: list[Message] = []
-            for stream in streams:
-                if stream.interval_ticks is not None and stream.due_tick <= tick:
-                    stream.start(stream.interval_ticks, tick)
-                    messages += stream.make(tick)
+            for stream in self._waiting(tick):
+                if len(messages) >= room:
+                    break
+                messages += stream.make(tick)
+                stream.waits_since = None
             for message in messages:
                 yield from stack.offer(message)
-            due = min(
-                (stream.due_tick for stream in streams if stream.interval_ticks is not None), default=None
-            )
-            timeout = FOREVER if due is None else max(0, due - kernel.tick_count)
-            yield from self._changed.take(timeout)
+            yield from self._changed.take(self._pause(kernel.tick_count))
+
+    def _waiting(self, tick: int) -> Sequence[Stream]:
+        """Return the streams that have something to send, the one that has waited longest first."""
+        waiting: list[tuple[int, int, Stream]] = []
+        for stream in self._streams.values():
+            since, interval = stream.waits_since, stream.interval_ticks
+            if interval is not None and stream.due_tick <= tick:
+                self._stack.unsent += since is not None
+                since = stream.due_tick if since is None else since
+                stream.start(interval, tick)
+                stream.waits_since = since
+            if since is not None:
+                waiting.append((since, len(waiting), stream))
+        return [stream for _, _, stream in sorted(waiting)]
+
+    def _pause(self, tick: int) -> int:
+        """Return the ticks until there is something to do."""
+        streams = self._streams.values()
+        if any(stream.waits_since is not None for stream in streams):
+            return 1
+        due = min((stream.due_tick for stream in streams if stream.interval_ticks is not None), default=None)
+        return FOREVER if due is None else max(0, due - tick)

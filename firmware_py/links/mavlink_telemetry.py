@@ -9,10 +9,11 @@ from math import sqrt
 
 from firmware_py.config import StreamRates
 from firmware_py.core.structs import POSITION, Control
+from firmware_py.links.log import LogVariable
+from firmware_py.links.mavlink_poses import PoseService
 from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
 from firmware_py.links.mavlink_world import World
-from firmware_py.links.stream import ReadBlock
 from firmware_py.rtos.statistics import Load
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink, telemetry
@@ -23,21 +24,24 @@ Messages = Sequence[Message]
 
 
 class FlightMessages:
-    """Makes messages from the present values; `read_block` returns the values of a telemetry block."""
+    """Makes messages from the present values; `variables` is the log table."""
 
     def __init__(
         self,
         stack: MavlinkStack,
         supervisor: Supervisor,
         world: World,
+        poses: PoseService,
         control: Control,
-        read_block: ReadBlock,
+        variables: Sequence[LogVariable],
     ) -> None:
         self._stack = stack
         self._supervisor = supervisor
         self._world = world
+        self._poses = poses
         self._control = control
-        self._read_block = read_block
+        read = {variable.name: variable.read for variable in variables}
+        self._blocks = [(block, [read[item.name] for item in block.variables]) for block in telemetry.BLOCKS]
         self._load = Load(stack.kernel)
 
     def streams(self, rates: StreamRates) -> tuple[Stream, ...]:
@@ -59,7 +63,8 @@ class FlightMessages:
         )
 
     def _heartbeat(self, tick: int) -> Messages:
-        return (mavlink.heartbeat(self._supervisor.controlling, self._supervisor.state),)
+        supervisor, mode = self._supervisor, self._world.setpoints.mode
+        return (mavlink.heartbeat(supervisor.controlling, supervisor.state, mode),)
 
     def _attitude(self, tick: int) -> Messages:
         return (mavlink.attitude(tick, *self._world.angles(), *self._world.rates()),)
@@ -71,15 +76,14 @@ class FlightMessages:
         return (mavlink.local_position(tick, *self._world.motion()),)
 
     def _flight_array(self, tick: int) -> Messages:
-        values = [value for block in telemetry.ALL_BLOCKS for value in block.si_of(self._read_block(block))]
+        values = [value for block, reads in self._blocks for value in block.si_of([read() for read in reads])]
         return (mavlink.flight_array(tick * 1000, values),)
 
     def _servo_outputs(self, tick: int) -> Messages:
         return (mavlink.servo_outputs(tick * 1000, tuple(self._control.count.tolist())),)
 
     def _estimator_status(self, tick: int) -> Messages:
-        last_us, timeout_us = self._supervisor.last_pose_us, self._supervisor.pose_timeout_us
-        healthy = last_us is not None and self._stack.kernel.now_us - last_us < timeout_us
+        healthy = self._supervisor.has_recent_pose
         x, y, z = self._world.estimator.P.diagonal()[POSITION : POSITION + 3].tolist()
         return (mavlink.estimator_status(tick * 1000, healthy, sqrt(max(0.0, x, y)), sqrt(max(0.0, z))),)
 
@@ -87,13 +91,14 @@ class FlightMessages:
         counters = self._stack.counters
         drop_rate = counters.lost / max(1, counters.frames + counters.lost)
         errors = self._stack.bad + self._stack.refused + self._stack.overruns
-        return (mavlink.sys_status(self._supervisor.battery_mv, drop_rate, errors, self._load()),)
+        alive = not self._supervisor.imu_is_stale
+        return (mavlink.sys_status(self._supervisor.battery_mv, drop_rate, errors, self._load(), alive),)
 
     def _battery(self, tick: int) -> Messages:
         return (mavlink.battery(self._supervisor.battery_mv),)
 
     def _named_values(self, tick: int) -> Messages:
-        age_us = self._world.poses.age_us
+        age_us = self._poses.age_us
         return tuple(
             mavlink.named_value(tick, name, value)
             for name, value in (

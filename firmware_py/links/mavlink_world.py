@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY, Estimator
 from firmware_py.geometry import Quaternion, Vector, from_euler_zyx, rotate, wrap_angle, yaw_quaternion
-from firmware_py.links.mavlink_poses import PoseService
+from firmware_py.links.mavlink_setpoints import SetpointService
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,12 +12,12 @@ class World:
     """Reads the running board; every call returns the present values."""
 
     estimator: Estimator
-    poses: PoseService
+    setpoints: SetpointService
 
     def angles(self) -> Vector:
         """Roll, pitch, yaw of B in W."""
         roll, pitch, yaw = self.estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
-        return roll, pitch, wrap_angle(yaw + self.poses.last_goal[1])
+        return roll, pitch, wrap_angle(yaw + self.setpoints.frame[1])
 
     def q_WB(self) -> Quaternion:
         """The attitude."""
@@ -30,7 +30,7 @@ class World:
 
     def motion(self) -> tuple[Vector, Vector]:
         """p_WB [m] and v_W [m/s]."""
-        p_WG, yaw = self.poses.last_goal
+        p_WG, yaw = self.setpoints.frame
         q_WG = yaw_quaternion(yaw)
         now = self.estimator.now
         x, y, z = rotate(q_WG, tuple(now[POSITION : POSITION + 3].tolist()))

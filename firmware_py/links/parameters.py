@@ -1,13 +1,14 @@
 """The parameter service: read, write and keep the values that may be changed while the board runs.
 
-A write is refused when the value is not a number or out of range; either way the reply carries the value that is
-in force. Persistent parameters can be stored in the EEPROM and are applied at the next boot.
+A write is refused when the value is not a number or out of range: the console names the range. Either way the reply carries
+the value that is in force. Persistent parameters can be stored in the EEPROM and are applied at the next boot.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from firmware_py.links.crtp_stack import CrtpStack
+from firmware_py.links.notices import Notices
 from firmware_py.links.storage import ParameterStorage
 from firmware_py.wire import WireError, toc
 from firmware_py.wire.crtp import PORT_PARAMETERS, Packet
@@ -70,13 +71,16 @@ class Parameter:
 class ParameterService:
     """Answers on port 2; the values at boot, before stored ones are applied, are the defaults."""
 
-    def __init__(self, stack: CrtpStack, parameters: Sequence[Parameter], storage: ParameterStorage) -> None:
+    def __init__(
+        self, stack: CrtpStack, parameters: Sequence[Parameter], storage: ParameterStorage, notices: Notices
+    ) -> None:
         self.toc = toc.Toc.of(PORT_PARAMETERS, ((item.type_byte, item.name) for item in parameters))
         self.refused = 0  # writes of values that are not allowed
         self._parameters = parameters
         self._numbers = {parameter.name: number for number, parameter in enumerate(parameters)}
         self._defaults = [parameter.value() for parameter in parameters]
         self._storage = storage
+        self._notices = notices
         for name, value in storage.load().items():
             parameter = parameters[self._numbers[name]] if name in self._numbers else None
             if parameter is not None and parameter.persistent and len(value) == parameter.scalar.size:
@@ -105,6 +109,9 @@ class ParameterService:
 
     def _set(self, parameter: Parameter, value: float) -> int:
         status = parameter.set(value)
+        if status == EINVAL:
+            allowed = f"{parameter.minimum:g}..{parameter.maximum:g} {parameter.unit}".rstrip()
+            self._notices.refuse(parameter.name, f"{parameter.name} = {value:g} refused: allowed {allowed}")
         self.refused += status != OK
         return status
 

@@ -5,7 +5,7 @@ from firmware_py.pilot import Pilot
 from firmware_py.planner import Phase
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
-from firmware_py.wire import WireError
+from firmware_py.wire import WireError, check_size
 from firmware_py.wire.crtp import (
     MAX_DATA,
     PORT_LINK,
@@ -95,21 +95,20 @@ class PlatformService:
         if packet.channel == SUPERVISOR_COMMAND:
             if command in (ARM, RECOVER):
                 return (bytes((REPLY | command,)) + self._command(data),)
-            if command == STOP:
+            if data == bytes((STOP,)):
                 supervisor.emergency_stop()
                 return ()
-            if command == STOP_WATCHDOG:
+            if data == bytes((STOP_WATCHDOG,)):
                 supervisor.feed_watchdog(self._stack.kernel.now_us)
                 return ()
         raise WireError(f"supervisor channel {packet.channel}: {data.hex()} is unknown")
 
     def _command(self, data: bytes) -> bytes:
         """Arm, disarm or recover; return whether it succeeded and the new state."""
+        check_size("a request to arm or recover", data, 1 if data[0] == COMMAND_RECOVER else 2)
         if data[0] == COMMAND_RECOVER:
-            recovered = self._supervisor.recover(self._stack.kernel.now_us)
+            recovered = self._supervisor.recover()
             return bytes((recovered, recovered))
-        if len(data) < 2:
-            raise WireError("a request to arm that does not say whether")
         return bytes((self._supervisor.arm(bool(data[1])), self._supervisor.armed))
 
     def _platform_task(self) -> Task:

@@ -4,34 +4,40 @@ core.
 Each call takes the memory that it needs and no more; `Entry.calls` names it, in the order of the arguments.
 """
 
+import ast
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from firmware_py.logic.plugs import CALLS, CONTROLLER, CORE_STRUCTS, ESTIMATOR, Plug
+from firmware_py.core import entry
+from firmware_py.logic.budget import ARGUMENT, STRUCT
+from firmware_py.logic.plugs import BLOCKS, CONTROLLER, ESTIMATOR, Plug
 
 GUARD = "guard"
-HEAD = '''"""The calls by which the firmware enters the core with {which}; every argument is the memory of one struct."""
-
-from firmware_py.core import controller, guard, predictor, servo
+HEAD = """
+from firmware_py.core import guard
 from firmware_py.core.guard import Guard
-from firmware_py.core.structs import Control, Estimator, Input, Parameters
-from firmware_py.core.subset import Memory, i32, kernel
 from {package} import {modules}
 
-_control_flaps = controller.control_flaps
-_drive_servos = servo.drive_servos
 _closed = guard.closed
 _guard_control = guard.guard_control
 _guard_estimate = guard.guard_estimate
-'''
-# The predictor's kernels that are called by default.
-PREDICTOR = {"reset": "reset", "file_pose": "pose_into_history", "estimate": "estimate"}
-DOCS = {
-    "reset": "Start the estimator.",
-    "file_pose": "File the pose in the input under the instant at which it was true.",
-    "estimate": "Run one tick of the estimator.",
-    "control": "Run one tick of the controller, down to the timer counts.",
+_see_logic = guard.see_logic
+"""
+BUDGET = f"""
+from firmware_py.core import budget
+from firmware_py.core.budget import {STRUCT}
+
+_begin_call = budget.begin_call
+_spoil_control = budget.spoil_control
+_spoil_estimate = budget.spoil_estimate
+"""
+TEXT = Path(entry.__file__).read_text(encoding="utf-8")
+PARTS = {  # of the default core's entry module: its entry points
+    node.name: node for node in ast.parse(TEXT).body if isinstance(node, ast.FunctionDef)
 }
+SUPERVISE = f"    _see_logic(supervisor[0], {GUARD}[0])\n"
+DRIVE = "    _drive_servos(parameters[0], control[0])\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,55 +52,75 @@ def compose(plugs: Sequence[Plug], package: str) -> Entry:
     """Return the entry module that finds the user's modules in a package."""
     by_name = {plug.point.name: plug for plug in plugs}
     modules = {plug.point.name: f"own_{plug.point.name}" for plug in plugs}
-    lines = [HEAD.format(
-        which=" and ".join(f"{plug.point.name} of one's own" for plug in plugs),
-        package=package, modules=", ".join(modules.values()),
-    )]  # fmt: skip
-    types = {**CORE_STRUCTS, GUARD: "Guard"}
+    first = min(node.decorator_list[0].lineno for node in PARTS.values())
+    lines = ["".join(TEXT.splitlines(keepends=True)[: first - 1]).rstrip() + "\n"]
+    lines.append(HEAD.format(package=package, modules=", ".join(modules.values())))
+    lines += [BUDGET] if any(plug.charged for plug in plugs) else []
+    types = {**BLOCKS, GUARD: "Guard"}
     for plug in plugs:
         for argument, struct in sorted(plug.structs.items(), reverse=True):  # own, memory
             alias = types[plug.block(argument)] = f"{plug.point.name.capitalize()}{argument.capitalize()}"
             own_name = struct.name.removeprefix(plug.point.name.capitalize())
             lines.append(f"{alias} = {modules[plug.point.name]}.{own_name}\n")
-        lines += [f"_{hook} = {modules[plug.point.name]}.{hook}\n" for hook in plug.hooks]
-    bodies = _estimator_bodies(by_name.get(ESTIMATOR.name)) | {
-        "control": _control_body(by_name.get(CONTROLLER.name))
-    }
-    if ESTIMATOR.name not in by_name:
-        lines += [f"_{hook} = predictor.{kernel}\n" for hook, kernel in PREDICTOR.items()]
+        lines += [f"_own_{hook} = {modules[plug.point.name]}.{hook}\n" for hook in plug.hooks]
+        if plug.charged:
+            types[plug.block(ARGUMENT)] = STRUCT
+    bodies = {name: _body(node) for name, node in PARTS.items()}
+    bodies["supervise"] = SUPERVISE + bodies["supervise"]
+    if ESTIMATOR.name in by_name:
+        for hook in ESTIMATOR.hooks:
+            bodies[hook] = _estimator_body(by_name[ESTIMATOR.name], hook, bodies[hook])
+    if CONTROLLER.name in by_name:
+        bodies["control"] = _control_body(by_name[CONTROLLER.name], bodies["control"].removesuffix(DRIVE))
     calls = {}
     for name, body in bodies.items():
         calls[name] = tuple(block for block in types if f"{block}[0]" in body)
         listed = "".join(f"    {block}: Memory[{types[block]}],\n" for block in calls[name])
-        result = "i32" if name == "file_pose" else "None"
-        lines.append(f'\n\n@kernel\ndef {name}(\n{listed}) -> {result}:\n    """{DOCS[name]}"""\n{body}')
+        result, doc = ast.unparse(PARTS[name].returns or ast.Constant(None)), ast.get_docstring(PARTS[name])
+        lines.append(f'\n\n@kernel\ndef {name}(\n{listed}) -> {result}:\n    """{doc}"""\n{body}')
     return Entry("".join(lines), calls)
 
 
+def _body(node: ast.FunctionDef) -> str:
+    """Return the statements of an entry point behind its docstring."""
+    return "".join(f"{line}\n" for line in TEXT.splitlines()[node.body[1].lineno - 1 : node.end_lineno])
+
+
+def _begin(plug: Plug, hook: str, indent: str) -> str:
+    """Return the line that begins a call whose loops are charged; empty for another."""
+    if hook not in plug.charged:
+        return ""
+    return f"{indent}_begin_call({plug.block(ARGUMENT)}[0], {plug.charged[hook]})\n"
+
+
+def _spoil(plug: Plug, result: str, block: str, indent: str) -> str:
+    """Return the line that takes a result away from calls over their budget; empty when no loop is charged."""
+    return f"{indent}_spoil_{result}({plug.block(ARGUMENT)}[0], {block}[0])\n" if plug.charged else ""
+
+
 def _call(plug: Plug, hook: str) -> str:
-    return f"_{hook}({', '.join(f'{plug.block(argument)}[0]' for argument in plug.hooks[hook])})"
+    return f"_own_{hook}({', '.join(f'{plug.block(argument)}[0]' for argument in plug.hooks[hook])})"
 
 
-def _estimator_bodies(plug: Plug | None) -> dict[str, str]:
-    hooks = dict.fromkeys(ESTIMATOR.hooks, "")
-    for hook in hooks:
-        default = f"_{hook}({', '.join(f'{block}[0]' for block in CALLS[hook])})"
-        hooks[hook] = (
-            f"    {'return ' if hook == 'file_pose' else ''}{_call(plug, hook) if plug else default}\n"
+def _estimator_body(plug: Plug, hook: str, body: str) -> str:
+    """Return an entry point with the user's hook in place of the core's."""
+    line = next(line for line in body.splitlines(keepends=True) if f"_{hook}(" in line)
+    before = line.partition(f"_{hook}(")[0]
+    own = f"{_begin(plug, hook, '    ')}{before}{_call(plug, hook)}\n"
+    if hook == "estimate":
+        own += (
+            _spoil(plug, "estimate", "estimator", "    ") + f"    _guard_estimate(estimator[0], {GUARD}[0])\n"
         )
-    if plug:
-        hooks["estimate"] += f"    _guard_estimate(estimator[0], {GUARD}[0])\n"
-    return hooks
+    return body.replace(line, own)
 
 
-def _control_body(plug: Plug | None) -> str:
-    default = "_control_flaps(parameters[0], data[0], estimator[0], control[0])\n"
-    drive = "    _drive_servos(parameters[0], control[0])\n"
-    if plug is None:
-        return f"    {default}{drive}"
+def _control_body(plug: Plug, default: str) -> str:
+    """Return the controller's entry point: the user's law while the loop is closed, otherwise the core's flaps."""
+    indent = " " * 8
     reset = f"        {_call(plug, 'reset_law')}\n" if "reset_law" in plug.hooks else ""
     return (
-        f"    if _closed(data[0]):\n        {_call(plug, 'control_law')}\n"
+        f"    if _closed(data[0]):\n{_begin(plug, 'control_law', indent)}        {_call(plug, 'control_law')}\n"
+        f"{_spoil(plug, 'control', 'control', indent)}"
         f"        _guard_control(parameters[0], control[0], {GUARD}[0])\n"
-        f"    else:\n{reset}        {default}{drive}"
+        f"    else:\n{_begin(plug, 'reset_law', indent)}{reset}    {default}{DRIVE}"
     )

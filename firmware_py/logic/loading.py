@@ -9,21 +9,24 @@ import hashlib
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from firmware_py.config import LogicConfig
+from firmware_py.core.budget import CALL_CYCLES, LoopBudget
 from firmware_py.core.guard import Guard
 from firmware_py.core.subset import Block, Struct
 from firmware_py.export.c99 import Translation, core_texts, translate
 from firmware_py.export.reading import read_modules
 from firmware_py.export.syntax import OWN as PACKAGE
+from firmware_py.logic.budget import ARGUMENT, budgeted
 from firmware_py.logic.entry import GUARD, compose
 from firmware_py.logic.errors import LogicError
-from firmware_py.logic.plugs import POINTS, OwnParameter, OwnVariable, Plug, read_plug
+from firmware_py.logic.plugs import GROUP, POINTS, Plug, read_plug
+from firmware_py.table import CoreParameter, CoreVariable
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +42,12 @@ class Loaded:
     files: Mapping[str, str]  # by plug point
 
     @property
-    def parameters(self) -> tuple[OwnParameter, ...]:
+    def parameters(self) -> tuple[CoreParameter, ...]:
         """All parameters."""
         return tuple(parameter for plug in self.plugs for parameter in plug.parameters)
 
     @property
-    def variables(self) -> tuple[OwnVariable, ...]:
+    def variables(self) -> tuple[CoreVariable, ...]:
         """All log variables."""
         return tuple(variable for plug in self.plugs for variable in plug.variables)
 
@@ -56,11 +59,22 @@ class Logic:
     loaded: Loaded
     values: Mapping[str, float]  # of every parameter
 
+    def overrun(self, blocks: Mapping[str, Block[Struct]]) -> str:
+        """Return which loop first exceeded the budget of its call, as one line; empty: none."""
+        for plug in self.loaded.plugs:
+            if plug.charged:
+                budget: Any = blocks[plug.block(ARGUMENT)].fields
+                if budget.line:
+                    place = f"{_shown(self.loaded.files[plug.point.name])}:{budget.line}"
+                    return f"{place}: the loop up to {budget.end} exceeds the {CALL_CYCLES} cycles of a call"
+        return ""
+
     def allocate(self) -> dict[str, Block[Struct]]:
         """Return the memory, with the parameters in it."""
         blocks = {name: kind.allocate() for name, kind in self.loaded.structs.items()}
         for parameter in self.loaded.parameters:
-            blocks[parameter.block].memory[parameter.name] = self.values[parameter.name]
+            place = parameter.place
+            blocks[place.block].memory[place.field] = self.values[place.field]
         return blocks
 
 
@@ -99,10 +113,9 @@ def digest_of(config: LogicConfig) -> str:
     return "" if logic is None else logic.loaded.digest
 
 
-def _values(given: Mapping[str, float], parameters: tuple[OwnParameter, ...]) -> dict[str, float]:
+def _values(given: Mapping[str, float], parameters: tuple[CoreParameter, ...]) -> dict[str, float]:
     """Return the value of every parameter: the profile's, or the default."""
-    known = {parameter.name: parameter.mark for parameter in parameters}
-    bases = {parameter.name: parameter.base for parameter in parameters}
+    known = {parameter.place.field: parameter for parameter in parameters}
     for name, value in given.items():
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.5)
@@ -111,9 +124,9 @@ def _values(given: Mapping[str, float], parameters: tuple[OwnParameter, ...]) ->
         if not known[name].low <= value <= known[name].high:
             bounds = f"{known[name].low:g}..{known[name].high:g} {known[name].unit}".rstrip()
             raise LogicError(f"logic.{name} = {value:g}: outside {bounds}")
-        if bases[name] == "i32" and value != int(value):
+        if not known[name].scalar.is_float and value != int(value):
             raise LogicError(f"logic.{name} = {value:g}: expected a whole number")
-    return {name: given.get(name, mark.default) for name, mark in known.items()}
+    return {name: given.get(name, parameter.default) for name, parameter in known.items()}
 
 
 @lru_cache(maxsize=64)
@@ -128,10 +141,16 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
     )
     _check_names(plugs, shown)
     digest = hashlib.sha256(repr([(name, text) for name, _, text in modules]).encode()).hexdigest()
+    translation = translate(texts | {"entry": compose(plugs, PACKAGE).text}, shown)
+    flown = {plug.point.name: _with_budget(plug, texts, shown) for plug in plugs}
+    plugs = tuple(plug for plug, _ in flown.values())
     entry = compose(plugs, PACKAGE)
-    translation = translate(texts | {"entry": entry.text}, shown)
+    if any(plug.charged for plug in plugs):
+        texts |= {f"own_{name}": text for name, (_, text) in flown.items()}
+        translation = translate(texts | {"entry": entry.text}, shown)
     files = {name: file for name, file, _ in modules}
-    package = f"{PACKAGE}_{digest[:16]}"
+    modules = tuple((name, file, flown[name][1]) for name, file, _ in modules)
+    package = f"{PACKAGE}_{hashlib.sha256(repr(modules).encode()).hexdigest()[:16]}"
     run = _execute(modules, compose(plugs, package).text, package)
     structs: dict[str, type[Struct]] = {GUARD: Guard}
     for plug in plugs:
@@ -139,7 +158,21 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
             module = getattr(sys.modules[package], f"own_{plug.point.name}")
             name = struct.name.removeprefix(plug.point.name.capitalize())
             structs[plug.block(argument)] = getattr(module, name)
+        if plug.charged:
+            structs[plug.block(ARGUMENT)] = LoopBudget
     return Loaded(plugs, digest, run, entry.calls, translation, structs, files)
+
+
+def _with_budget(plug: Plug, texts: Mapping[str, str], shown: Mapping[str, str]) -> tuple[Plug, str]:
+    """Return a module with its text as it flies: loops whose length depends on data are charged."""
+    name = f"own_{plug.point.name}"
+    found = budgeted(texts[name], read_modules(texts, shown, name))
+    hooks = {
+        hook: (ARGUMENT, *arguments) if hook in found.charged else arguments
+        for hook, arguments in plug.hooks.items()
+    }
+    charged = {hook: cycles for hook, cycles in found.charged.items() if hook in hooks}
+    return replace(plug, hooks=hooks, charged=charged), found.text
 
 
 def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
@@ -149,10 +182,11 @@ def _check_names(plugs: tuple[Plug, ...], shown: Mapping[str, str]) -> None:
         for plug in plugs:
             path = shown[f"own_{plug.point.name}"]
             for thing in getattr(plug, kind):
-                key = thing.name.upper()  # MAVLink knows no small letters
+                name = thing.name.removeprefix(f"{GROUP}.")
+                key = name.upper()  # MAVLink knows no small letters
                 if key in seen:
-                    raise LogicError(f"{path}: {thing.name}: this name exists already: {seen[key]}")
-                seen[key] = f"{thing.name} in {path}"
+                    raise LogicError(f"{path}: {name}: this name exists already: {seen[key]}")
+                seen[key] = f"{name} in {path}"
 
 
 def _execute(modules: tuple[tuple[str, str, str], ...], entry: str, package: str) -> ModuleType:

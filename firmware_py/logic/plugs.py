@@ -7,13 +7,18 @@ A hook is a kernel with a fixed name. It takes those of these arguments that it 
     memory: a struct                                                                what it remembers; fields may be Logged
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from inspect import signature
 
+import numpy as np
+
+from firmware_py.core import entry
 from firmware_py.core.subset import Logged, Tunable
 from firmware_py.export.errors import ExportError
 from firmware_py.export.locals import find_writes
 from firmware_py.export.syntax import I32, VOID, Kernel, Kind, Module, StructType
+from firmware_py.table import SCALARS, CoreParameter, CoreVariable, Place
 from firmware_py.wire.toc import MAX_NAME
 
 GROUP = "logic"  # of parameters, log variables and columns of the log
@@ -21,12 +26,15 @@ PARAMETER_ROOM = 12  # characters: MAVLink has 16, of which OWN_ takes four
 VARIABLE_ROOM = MAX_NAME - len(GROUP)
 CORE_STRUCTS = {"parameters": "Parameters", "data": "Input", "estimator": "Estimator", "control": "Control"}
 OWN, MEMORY = "own", "memory"
-CALLS: Mapping[str, tuple[str, ...]] = {  # the default core's entry points, and the blocks that they take
-    "reset": ("parameters", "estimator"),
-    "file_pose": ("parameters", "data", "estimator"),
-    "estimate": ("parameters", "data", "estimator", "control"),
-    "control": ("parameters", "data", "estimator", "control"),
+BLOCKS = CORE_STRUCTS | {"sampling": "Sampling", "supervisor": "Supervisor"}  # of the core, in their order
+_SIGNATURES = {
+    name: signature(function)
+    for name, function in vars(entry).items()
+    if not name.startswith("_") and getattr(function, "__module__", "") == entry.__name__
 }
+# The default core's entry points, and the blocks that they take; those that have an answer.
+CALLS: Mapping[str, tuple[str, ...]] = {name: tuple(one.parameters) for name, one in _SIGNATURES.items()}
+ANSWERING = frozenset(name for name, one in _SIGNATURES.items() if one.return_annotation is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,36 +54,15 @@ POINTS = (CONTROLLER, ESTIMATOR)
 
 
 @dataclass(frozen=True, slots=True)
-class OwnParameter:
-    """A field of an `own` struct: what clients may set."""
-
-    name: str
-    base: str  # f32 or i32
-    block: str
-    mark: Tunable
-
-
-@dataclass(frozen=True, slots=True)
-class OwnVariable:
-    """A field of a `memory` struct, or one element of it: what is logged."""
-
-    name: str
-    base: str
-    block: str
-    field: str
-    index: int | None  # in an array
-    unit: str
-
-
-@dataclass(frozen=True, slots=True)
 class Plug:
     """A module at its plug point."""
 
     point: PlugPoint
     hooks: Mapping[str, tuple[str, ...]]  # the arguments of those that it has
     structs: Mapping[str, StructType]  # by argument: own, memory
-    parameters: tuple[OwnParameter, ...]
-    variables: tuple[OwnVariable, ...]
+    parameters: tuple[CoreParameter, ...]
+    variables: tuple[CoreVariable, ...]
+    charged: Mapping[str, int]  # cycles of the hooks in which loops are charged
 
     def block(self, argument: str) -> str:
         """Return the name of the memory that an argument of a hook stands for."""
@@ -97,7 +84,7 @@ def read_plug(point: PlugPoint, module: Module) -> Plug:
             there = ", ".join(kernel.node.name for kernel in kernels) or "none"
             raise _refusal(module, 1, f"no function {name}; functions there: {there}")
     parameters = tuple(_parameters(point, module, structs))
-    return Plug(point, hooks, structs, parameters, tuple(_variables(point, module, structs)))
+    return Plug(point, hooks, structs, parameters, tuple(_variables(point, module, structs)), {})
 
 
 def _refusal(module: Module, line: int, reason: str) -> ExportError:
@@ -127,7 +114,7 @@ def _check_signature(point: PlugPoint, kernel: Kernel, structs: dict[str, Struct
 
 def _parameters(
     point: PlugPoint, module: Module, structs: Mapping[str, StructType]
-) -> Iterator[OwnParameter]:
+) -> Iterator[CoreParameter]:
     for field in structs[OWN].fields.values() if OWN in structs else ():
         name, mark = field.name, field.mark
         if not isinstance(mark, Tunable) or field.kind.rank:
@@ -141,10 +128,14 @@ def _parameters(
         if len(name) > PARAMETER_ROOM:
             text = f"{name}: {len(name)} characters; MAVLink leaves a parameter's name {PARAMETER_ROOM}"
             raise _refusal(module, field.line, text)
-        yield OwnParameter(name, field.kind.base, f"{point.name}_{OWN}", mark)
+        scalar = SCALARS[field.kind.base]
+        yield CoreParameter(
+            f"{GROUP}.{name}", scalar, mark.unit, Place(f"{point.name}_{OWN}", name, scalar),
+            low=mark.low, high=mark.high, default=mark.default,
+        )  # fmt: skip
 
 
-def _variables(point: PlugPoint, module: Module, structs: Mapping[str, StructType]) -> Iterator[OwnVariable]:
+def _variables(point: PlugPoint, module: Module, structs: Mapping[str, StructType]) -> Iterator[CoreVariable]:
     for field in structs[MEMORY].fields.values() if MEMORY in structs else ():
         mark, kind = field.mark, field.kind
         if mark is None:
@@ -152,10 +143,11 @@ def _variables(point: PlugPoint, module: Module, structs: Mapping[str, StructTyp
         if not isinstance(mark, Logged) or kind.rank == 2:
             text = f"{field.name}: in the memory numbers and lists of them may be Logged; parameters stand in `own`"
             raise _refusal(module, field.line, text)
-        elements: Iterable[int | None] = range(kind.shape[0]) if kind.rank else (None,)
-        for index in elements:
-            name = field.name if index is None else f"{field.name}{index + 1}"
+        for index in np.ndindex(kind.shape):
+            name = "".join((field.name, *(str(number + 1) for number in index)))
             if len(name) > VARIABLE_ROOM:
                 text = f"{name}: {len(name)} characters; a log variable's name has at most {VARIABLE_ROOM}"
                 raise _refusal(module, field.line, text)
-            yield OwnVariable(name, kind.base, f"{point.name}_{MEMORY}", field.name, index, mark.unit)
+            scalar = SCALARS[kind.base]
+            place = Place(f"{point.name}_{MEMORY}", field.name, scalar, index)
+            yield CoreVariable(f"{GROUP}.{name}", scalar, mark.unit, place)

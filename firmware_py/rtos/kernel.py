@@ -10,7 +10,7 @@ from typing import Any, TypeVarTuple
 
 from firmware_py.rtos.errors import KernelError
 from firmware_py.rtos.queue import Queue, T
-from firmware_py.rtos.scheduler import GO_ON, SWITCH, TICK_US, Scheduler, Trace
+from firmware_py.rtos.scheduler import GO_ON, MAX_PRIORITIES, SWITCH, TICK_US, Scheduler, Trace
 from firmware_py.rtos.semaphore import Mutex, Semaphore
 from firmware_py.rtos.task import Task
 from firmware_py.rtos.timer import SERVICE_PRIORITY, Callback, Timer, TimerService
@@ -48,6 +48,10 @@ class Kernel(Scheduler):
             self._first = task
         return task
 
+    def occupy(self, name: str, taken_us: Callable[[], int]) -> None:
+        """Lets something outside take the processor at every tick, before all tasks, for as long as it says then."""
+        self.create_task(name, MAX_PRIORITIES - 1, self._occupied, taken_us)
+
     def create_queue(self, length: int, name: str) -> Queue[T]:
         """Makes an empty queue for at most `length` items."""
         queue: Queue[T] = Queue(self, length, name)
@@ -69,6 +73,13 @@ class Kernel(Scheduler):
     def create_timer(self, name: str, period_ticks: int, autoreload: bool, callback: Callback) -> Timer:
         """Makes a dormant timer whose `callback(timer)` runs in the timer service task."""
         return Timer(self._timers, name, period_ticks, autoreload, callback)
+
+    def _occupied(self, taken_us: Callable[[], int]) -> Generator[int, None, None]:
+        wake_tick = self.tick_count
+        while True:
+            wake_tick += 1
+            yield from self.delay_until(wake_tick)
+            yield from self.work(taken_us())
 
     def start(self) -> None:
         """Creates the idle and the timer service task; the tasks begin at the first `run`."""

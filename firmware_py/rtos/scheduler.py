@@ -94,6 +94,12 @@ class Scheduler:
                 self._pass_ticks()
             self._dispatch()
             wake_us = self.next_wake_us
+            if wake_us is not None and wake_us <= self.now_us:
+                raise StuckTaskError(
+                    self._delayed[0].name,
+                    self.now_us,
+                    f"waits for {wake_us / TICK_US:.3f} ms, which has passed",
+                )
         if self._until_us > self.now_us:
             self.now_us = self._until_us
 

@@ -47,7 +47,7 @@ from firmware_py.wire.crtp import MAX_DATA
 PORT_CORE = 10
 CHANNEL_CALLS = 0
 CHANNEL_LOOP = 1
-VERSION = 2  # of this protocol
+VERSION = 3  # of this protocol
 NAME_SIZE = 8  # characters of a hash
 HIL_WAITING = 8  # samples of 1 ms
 HIL_HOLD = 250  # steps of 1 ms
@@ -71,8 +71,9 @@ class Refusal(IntEnum):
     """Why a board refuses a request."""
 
     NO_SESSION = 1  # it has rebooted, or another host has begun one
-    FLYING = 2
+    FLYING = 2  # or may be in the air
     OUTSIDE = 3  # of the memory, or no such call
+    LOOP = 4  # hardware in the loop flies
 
 
 class Call(IntEnum):
@@ -82,6 +83,12 @@ class Call(IntEnum):
     FILE_POSE = 1
     ESTIMATE = 2
     CONTROL = 3
+    BEGIN_STEP = 4
+    TAKE_SAMPLE = 5
+    SUPERVISE = 6
+    REQUEST = 7
+    LOSE_CONTROL = 8
+    BEGIN_AFRESH = 9
 
 
 class Hil(IntEnum):
@@ -119,7 +126,7 @@ PLACE = Layout("Place", (("offset", "H"),))
 PLACE_SIZE = Layout("PlaceSize", (("offset", "H"), ("size", "B")))
 CALL = Layout("Call", (("call", "B"),))
 CALLED = Layout("Called", (
-    ("answer", "b"),  # of file_pose; 0 of the others
+    ("answer", "b"),  # 0 of calls that have none
     ("cycles", "I"),  # that the call took, with the interrupts in it; no other task runs meanwhile
     ("digest", "I"),  # CRC-32 of the whole memory afterwards, as zlib.crc32
 ))  # fmt: skip

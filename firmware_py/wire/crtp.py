@@ -1,4 +1,4 @@
-"""CRTP, the Crazyflie's packet protocol: the header, the external pose, and log data.
+"""CRTP, the Crazyflie's packet protocol: the header and the external pose.
 
 A packet is one header byte and up to 30 bytes of data, little-endian. Here the quaternion changes its order
 (x y z w on the wire, w x y z inside) and time its unit; everything inside is SI. Malformed bytes raise
@@ -9,7 +9,7 @@ compare with cflib's own bytes.
 import struct
 from dataclasses import dataclass
 
-from firmware_py.wire import WireError
+from firmware_py.wire import WireError, check_size
 
 MAX_DATA = 30
 
@@ -18,7 +18,6 @@ PORT_PARAMETERS = 2
 PORT_COMMANDER = 3
 PORT_MEMORIES = 4
 PORT_LOG = 5
-CHANNEL_LOG_DATA = 2
 PORT_LOCALISATION = 6
 CHANNEL_GENERIC = 1
 EXT_POSE = 8  # type byte of the generic localisation channel
@@ -26,8 +25,6 @@ PORT_GENERIC_SETPOINT = 7
 PORT_SUPERVISOR = 9
 PORT_PLATFORM = 13
 PORT_LINK = 15
-
-MAX_LOG_VALUES = 26  # 30 less the block's id and the time stamp
 
 FAR = 1000.0  # [m] no tunnel is that large
 AGE_UNIT_US = 500
@@ -37,7 +34,6 @@ AGE_UNKNOWN_CODE = 255
 _RESERVED_BITS = 0x0C  # set by cflib, ignored by all receivers
 _POSE = struct.Struct("<B7f")
 _POSE_WITH_AGE = struct.Struct("<BB7fB")
-_LOG_HEAD = struct.Struct("<BBHB")
 _MIN_NORM2, _MAX_NORM2 = 0.9**2, 1.1**2
 
 
@@ -79,7 +75,6 @@ def decode(raw: bytes) -> Packet:
 
 
 _POSE_HEADER = header(PORT_LOCALISATION, CHANNEL_GENERIC)
-_LOG_HEADER = header(PORT_LOG, CHANNEL_LOG_DATA)
 
 
 def encode_ext_pose(
@@ -87,10 +82,8 @@ def encode_ext_pose(
 ) -> bytes:
     """The complete packet of cflib's `send_extpose` and one more byte, the age.
 
-    Stock firmware reads the pose and ignores the byte behind it. Raises `WireError` for a pose that the
-    receiver would refuse.
+    Stock firmware reads the pose and ignores the byte behind it. The sender judges its poses before.
     """
-    check_pose(p_GB, q_GB)
     x, y, z = p_GB
     qw, qx, qy, qz = q_GB
     return _POSE_WITH_AGE.pack(_POSE_HEADER, EXT_POSE, x, y, z, qx, qy, qz, qw, _age_code(age_us))
@@ -98,31 +91,14 @@ def encode_ext_pose(
 
 def decode_ext_pose(data: bytes) -> PoseMessage:
     """The pose in the data of a generic localisation packet; without an age byte the age is unknown."""
-    if len(data) < _POSE.size or data[0] != EXT_POSE:
+    check_size("an external pose", data, _POSE.size, _POSE.size + 1)
+    if data[0] != EXT_POSE:
         raise WireError(f"not an external pose: {data.hex()}")
     _, x, y, z, qx, qy, qz, qw = _POSE.unpack_from(data)
     p_GB, q_GB = (x, y, z), (qw, qx, qy, qz)
     check_pose(p_GB, q_GB)
     code = data[_POSE.size] if len(data) > _POSE.size else AGE_UNKNOWN_CODE
     return PoseMessage(p_GB, q_GB, None if code == AGE_UNKNOWN_CODE else code * AGE_UNIT_US)
-
-
-def encode_log_data(block_id: int, timestamp_ms: int, values: bytes) -> bytes:
-    """The complete packet with a log block's values, at most 26 bytes; the time stamp wraps after 2^24 ms."""
-    if len(values) > MAX_LOG_VALUES:
-        raise WireError(f"log block {block_id}: {len(values)} bytes of values, at most {MAX_LOG_VALUES} fit")
-    try:
-        head = _LOG_HEAD.pack(_LOG_HEADER, block_id, timestamp_ms & 0xFFFF, timestamp_ms >> 16 & 0xFF)
-    except struct.error as error:
-        raise WireError(f"log block {block_id}: the number must be 0..255") from error
-    return head + values
-
-
-def decode_log_data(data: bytes) -> tuple[int, int, bytes]:
-    """`(block id, time stamp [ms], values)` from the data of a log data packet."""
-    if len(data) < 4:
-        raise WireError(f"log data of {len(data)} bytes: at least 4 are needed")
-    return data[0], int.from_bytes(data[1:4], "little"), data[4:]
 
 
 def _age_code(age_us: int | None) -> int:
@@ -133,7 +109,7 @@ def _age_code(age_us: int | None) -> int:
 
 
 def check_pose(p_GB: tuple[float, float, float], q_GB: tuple[float, float, float, float]) -> None:
-    """Raise `WireError` for a pose that both ends refuse, of the body or, over the radio, of its error."""
+    """Raise `WireError` for a pose that the board refuses, of the body or, over the radio, of its error."""
     w, x, y, z = q_GB
     if not _MIN_NORM2 <= w * w + x * x + y * y + z * z <= _MAX_NORM2:
         raise WireError(f"quaternion {q_GB}: its length must be 0.9..1.1")

@@ -1,7 +1,7 @@
 """The commands of the high-level commander on port 8.
 
-A command is one byte, mostly followed by the groups that it addresses, and its fields; short ones are padded with zeros, as
-the stock firmware's buffer is. Facts: crazyflie-firmware 2a18fc29, cflib 0.1.34.
+A command is one byte, mostly followed by the groups that it addresses, and its fields.
+Facts: crazyflie-firmware 2a18fc29, cflib 0.1.34.
 """
 
 import struct
@@ -9,7 +9,7 @@ from enum import IntEnum
 from math import isfinite
 from typing import NamedTuple
 
-from firmware_py.wire import WireError
+from firmware_py.wire import WireError, check_size
 
 PORT = 8
 MAX_TRAJECTORIES = 10
@@ -114,7 +114,8 @@ def decode(data: bytes) -> tuple[Command, tuple[float, ...]]:
     except (IndexError, ValueError):
         raise WireError(f"high-level command {data.hex()}: unknown") from None
     layout = _LAYOUTS[command]
-    fields = layout.unpack(data[1 : 1 + layout.size].ljust(layout.size, b"\0"))
+    check_size(f"high-level command {command.name.lower()}", data, 1 + layout.size)
+    fields = layout.unpack_from(data, 1)
     if not all(isfinite(value) for value in fields):
         raise WireError(f"high-level command {command.name.lower()} {fields}: must be finite")
     return command, fields

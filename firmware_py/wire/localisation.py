@@ -7,7 +7,7 @@ quaternion is "smallest three": the largest component is left out, the others ta
 import struct
 from math import sqrt
 
-from firmware_py.wire import WireError
+from firmware_py.wire import WireError, check_size
 from firmware_py.wire.crtp import PoseMessage, check_place, check_pose
 
 CHANNEL_POSITION = 0
@@ -27,9 +27,8 @@ _SHARE = 1 / (511 * sqrt(2))  # of one step in a quaternion's component
 
 def decode_position(data: bytes) -> Vector:
     """The position [m] in the data of a channel 0 packet."""
-    if len(data) < _POSITION.size:
-        raise WireError(f"a position of {len(data)} bytes: {_POSITION.size} are needed")
-    x, y, z = _POSITION.unpack_from(data)
+    check_size("a position", data, _POSITION.size)
+    x, y, z = _POSITION.unpack(data)
     check_place((x, y, z))
     return x, y, z
 

@@ -10,7 +10,7 @@ Downlink values saturate where an integer is too narrow and never raise; bad inp
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
-from math import degrees, isfinite, isnan, nan
+from math import degrees, hypot, isfinite, isnan, nan
 
 import pymavlink.dialects.v20.common as dialect
 
@@ -19,24 +19,29 @@ from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_place, check_pose
 from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.mavlink_services import u16, u32
-from firmware_py.wire.telemetry import ALL_BLOCKS, BATTERY, BLOCKS, LOAD, TIMESTAMP_MASK, Sample
+from firmware_py.wire.telemetry import BATTERY, BLOCKS, LOAD, TIMESTAMP_MASK, Sample
 
 # isort: off
 from firmware_py.wire.mavlink_services import (  # offered here, too
-    autopilot_version as autopilot_version, command as command, command_ack as command_ack,
+    autopilot_version as autopilot_version, available_mode as available_mode, command as command,
+    command_ack as command_ack, current_mode as current_mode,
     extended_state as extended_state, ftp_nak as ftp_nak, heartbeat as heartbeat, mavlink_name as mavlink_name,
-    message_interval as message_interval, named_value as named_value, no_log_data as no_log_data, no_logs as no_logs,
+    message_interval as message_interval, named_value as named_value, no_control as no_control,
+    no_log_data as no_log_data, no_logs as no_logs,
     no_mission as no_mission, parameter as parameter, parameter_list as parameter_list,
     parameter_read as parameter_read, parameter_set as parameter_set,
     parameter_error as parameter_error, ping_answer as ping_answer, protocol_version as protocol_version,
-    refusal as refusal, refused_mission as refused_mission, station_heartbeat as station_heartbeat,
-    status_text as status_text, timesync as timesync,
+    read_heartbeat as read_heartbeat, refusal as refusal, refused_mission as refused_mission,
+    station_heartbeat as station_heartbeat, status_text as status_text, system_time as system_time,
+    timesync as timesync,
 )  # fmt: skip
 # isort: on
 
 MSG_HEARTBEAT = 0
 MSG_SYS_STATUS = 1
+MSG_SYSTEM_TIME = 2
 MSG_PING = 4
+MSG_CHANGE_OPERATOR_CONTROL = 5
 MSG_SET_MODE = 11
 MSG_PARAM_REQUEST_READ = 20
 MSG_PARAM_REQUEST_LIST = 21
@@ -48,11 +53,14 @@ MSG_LOCAL_POSITION_NED = 32
 MSG_GLOBAL_POSITION_INT = 33
 MSG_SERVO_OUTPUT_RAW = 36
 MSG_MISSION_REQUEST_LIST = 43
+MSG_MISSION_ACK = 47
 MSG_REQUEST_DATA_STREAM = 66
+MSG_VFR_HUD = 74
 MSG_COMMAND_INT = 75
 MSG_COMMAND_LONG = 76
 MSG_COMMAND_ACK = 77
 MSG_SET_POSITION_TARGET_LOCAL_NED = 84
+MSG_POSITION_TARGET_LOCAL_NED = 85
 MSG_GLOBAL_VISION_POSITION_ESTIMATE = 101
 MSG_VISION_POSITION_ESTIMATE = 102
 MSG_VICON_POSITION_ESTIMATE = 104
@@ -61,6 +69,7 @@ MSG_FILE_TRANSFER_PROTOCOL = 110
 MSG_TIMESYNC = 111
 MSG_LOG_REQUEST_LIST = 117
 MSG_LOG_REQUEST_DATA = 119
+MSG_LOG_REQUEST_END = 122
 MSG_ATT_POS_MOCAP = 138
 MSG_BATTERY_STATUS = 147
 MSG_AUTOPILOT_VERSION = 148
@@ -72,6 +81,9 @@ MSG_STATUSTEXT = 253
 MSG_PROTOCOL_VERSION = 300
 MSG_ODOMETRY = 331
 MSG_DEBUG_FLOAT_ARRAY = 350
+MSG_ACTUATOR_OUTPUT_STATUS = 375
+MSG_AVAILABLE_MODES = 435
+MSG_CURRENT_MODE = 436
 
 POSES = (
     MSG_ATT_POS_MOCAP,
@@ -80,17 +92,20 @@ POSES = (
     MSG_VICON_POSITION_ESTIMATE,
     MSG_ODOMETRY,
 )
+# They end a transaction, or answer: nothing is left to say.
+ENDS = (MSG_MISSION_ACK, MSG_COMMAND_ACK, MSG_LOG_REQUEST_END)
 # All messages about missions except the request for the list and its end.
 MISSION_MESSAGES = (37, 38, 39, 40, 41, 44, 45, 51, 73)
 
 FLIGHT_ARRAY = "floaty"
-FLIGHT_ARRAY_SIZE = sum(len(block.variables) for block in BLOCKS)  # without excitation
+FLIGHT_ARRAY_SIZE = sum(len(block.variables) for block in BLOCKS) - 4  # without excitation
 COUNTS_PER_US = 21  # of the servo timer
 
 _U16_MAX = 0xFFFF
 _FRAME_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
 _IGNORE_POSITION = 0x007  # bits of POSITION_TARGET_TYPEMASK
-_IGNORE_REST = 0x038 | 0x1C0 | 0x800  # velocity, acceleration, yaw rate
+_IGNORE_VELOCITY, _IGNORE_ACCELERATION, _IGNORE_YAW_RATE = 0x038, 0x1C0, 0x800
+_IGNORE_REST = _IGNORE_VELOCITY | _IGNORE_ACCELERATION | _IGNORE_YAW_RATE
 _IS_FORCE = 0x200
 _IGNORE_YAW = 0x400
 _MOCAP_NED = 14  # reserved today, but it is what MAVSDK sends
@@ -103,9 +118,9 @@ _UNKNOWN = (nan, *(0.0,) * 20)  # covariance
 _FAILED = -1  # quality of odometry
 _STANDARD_GRAVITY = 9.80665  # [m/s^2 per g]
 _GYRO_AND_ACCELEROMETER = 0x3F  # fields of HIGHRES_IMU
+_IMU = dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
 _SENSORS = (
-    dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    _IMU
     | dialect.MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL
     | dialect.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
     | dialect.MAV_SYS_STATUS_SENSOR_YAW_POSITION
@@ -143,6 +158,7 @@ class Target:
 
     p_WG: Vector | None  # [m]
     yaw: float | None  # [rad] about z up
+    moves: bool = False  # whether a velocity, acceleration or yaw rate stands beside them, which is not flown
 
 
 def turn(v: Vector) -> Vector:
@@ -159,11 +175,7 @@ def turn_quaternion(q: Quaternion) -> Quaternion:
 
 
 def pose(t_us: int, p_WB: Vector, q_WB: Quaternion) -> Message:
-    """The pose of a motion capture frame taken at `t_us` of the sender's clock; the covariance is not stated.
-
-    Raises `WireError` for a pose that the receiver would refuse.
-    """
-    check_pose(p_WB, q_WB)
+    """The pose of a motion capture frame taken at `t_us` of the sender's clock; the covariance is not stated."""
     return dialect.MAVLink_att_pos_mocap_message(max(0, t_us), turn_quaternion(q_WB), *turn(p_WB))
 
 
@@ -220,33 +232,45 @@ def target(t_ms: int, p_WG: Vector | None, yaw: float | None, system: int = 1, c
 
 
 def read_target(message: Message) -> Target:
-    """The goal in a SET_POSITION_TARGET_LOCAL_NED; velocities beside a position or yaw are left aside."""
+    """The goal in a SET_POSITION_TARGET_LOCAL_NED."""
     mask = message.type_mask
     if message.coordinate_frame != _FRAME_LOCAL_NED:
-        raise WireError(
-            f"target in frame {message.coordinate_frame}: only {_FRAME_LOCAL_NED}, LOCAL_NED, is served"
-        )
+        raise WireError(f"target in frame {message.coordinate_frame}: LOCAL_NED is flown")
     ignored = mask & _IGNORE_POSITION
     if ignored not in (0, _IGNORE_POSITION) or mask & _IS_FORCE:
-        raise WireError(f"target with mask {mask:#x}: x, y and z together or none, and no force")
+        raise WireError("target refused: x, y, z together, and no force")
+    if ignored and mask & _IGNORE_REST != _IGNORE_REST:
+        raise WireError("target refused: it has a velocity, no position")
     p_WG = None if ignored else turn((message.x, message.y, message.z))
     yaw = None if mask & _IGNORE_YAW else -message.yaw
     if p_WG is None and yaw is None:
-        raise WireError(f"target with mask {mask:#x}: neither position nor yaw")
+        raise WireError("target refused: neither position nor yaw")
     if p_WG is not None:
         check_place(p_WG)
     if yaw is not None and not isfinite(yaw):
         raise WireError(f"target with yaw {yaw} rad: must be finite")
-    return Target(p_WG, yaw)
+    beside = (
+        (_IGNORE_VELOCITY, (message.vx, message.vy, message.vz)),
+        (_IGNORE_ACCELERATION, (message.afx, message.afy, message.afz)),
+        (_IGNORE_YAW_RATE, (message.yaw_rate,)),
+    )
+    moves = any(
+        mask & ignore != ignore and any(value and not isnan(value) for value in values)
+        for ignore, values in beside
+    )
+    return Target(p_WG, yaw, moves)
 
 
 # Downlink
 
 
-def sys_status(battery_mV: int, drop_rate: float, errors: int, load: float) -> Message:
+def sys_status(
+    battery_mV: int, drop_rate: float, errors: int, load: float, imu_alive: bool = True
+) -> Message:
     """The supply, the share of received frames that were lost, receive errors, and the processor's load, 0..1."""
+    healthy = _HEALTHY if imu_alive else _HEALTHY & ~_IMU
     return dialect.MAVLink_sys_status_message(
-        _SENSORS, _SENSORS, _HEALTHY, round(1000 * min(1.0, max(0.0, load))), u16(battery_mV), -1, -1,
+        _SENSORS, _SENSORS, healthy, round(1000 * min(1.0, max(0.0, load))), u16(battery_mV), -1, -1,
         round(10_000 * min(1.0, max(0.0, drop_rate))), u16(errors), 0, 0, 0, 0,
     )  # fmt: skip
 
@@ -266,10 +290,34 @@ def local_position(t_ms: int, p_WB: Vector, v_W: Vector) -> Message:
     return dialect.MAVLink_local_position_ned_message(u32(t_ms), *turn(p_WB), *turn(v_W))
 
 
+def position_target(t_ms: int, p_WG: Vector, yaw: float) -> Message:
+    """The goal in force."""
+    return dialect.MAVLink_position_target_local_ned_message(
+        u32(t_ms), _FRAME_LOCAL_NED, _IGNORE_REST, *turn(p_WG), 0, 0, 0, 0, 0, 0, -yaw, 0
+    )
+
+
+def hud(p_WB: Vector, v_W: Vector, yaw: float) -> Message:
+    """Speed over ground, heading, height and climb; the speed in the air is not known, and there is no throttle."""
+    heading = round(degrees(-yaw)) % 360
+    return dialect.MAVLink_vfr_hud_message(nan, hypot(v_W[0], v_W[1]), heading, 0, p_WB[2], v_W[2])
+
+
 def servo_outputs(t_us: int, counts: Sequence[int]) -> Message:
-    """Pulse lengths of the four servos, from timer counts of 1/21 us."""
-    pulses = (u16((count + COUNTS_PER_US // 2) // COUNTS_PER_US) for count in counts)
-    return dialect.MAVLink_servo_output_raw_message(u32(t_us), 0, *pulses, 0, 0, 0, 0)
+    """Pulse lengths of the four servos [us], from timer counts."""
+    return dialect.MAVLink_servo_output_raw_message(u32(t_us), 0, *_pulses_us(counts), 0, 0, 0, 0)
+
+
+def actuator_outputs(t_us: int, counts: Sequence[int]) -> Message:
+    """The same in the newer message."""
+    pulses = _pulses_us(counts)
+    return dialect.MAVLink_actuator_output_status_message(
+        max(0, t_us), (1 << len(pulses)) - 1, (*map(float, pulses), *(0.0,) * (32 - len(pulses)))
+    )
+
+
+def _pulses_us(counts: Sequence[int]) -> tuple[int, ...]:
+    return tuple(u16((count + COUNTS_PER_US // 2) // COUNTS_PER_US) for count in counts)
 
 
 def battery(battery_mV: int) -> Message:
@@ -324,7 +372,7 @@ def imu(t_us: int, rates: Vector, acceleration: Vector) -> Message:
 
 
 def flight_array(t_us: int, values: Sequence[float]) -> Message:
-    """The samples of `telemetry.ALL_BLOCKS` in their order, relative to the goal as the board knows them, in SI.
+    """The samples of `telemetry.BLOCKS` in their order, relative to the goal as the board knows them, in SI.
 
     The excitation comes last: zeros at the end are not sent.
     """
@@ -340,9 +388,7 @@ def read_flight_array(message: Message) -> tuple[Sample, ...]:
     if message.name != FLIGHT_ARRAY:
         raise WireError(f"array {message.name!r}: not {FLIGHT_ARRAY!r}")
     values, timestamp_ms = iter(message.data), message.time_usec // 1000 & TIMESTAMP_MASK
-    return tuple(
-        Sample(block, timestamp_ms, tuple(islice(values, len(block.variables)))) for block in ALL_BLOCKS
-    )
+    return tuple(Sample(block, timestamp_ms, tuple(islice(values, len(block.variables)))) for block in BLOCKS)
 
 
 def read_sys_status(message: Message, timestamp_ms: int) -> tuple[Sample, ...]:

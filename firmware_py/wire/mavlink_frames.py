@@ -5,8 +5,8 @@ because pymavlink's parser drops whole supposed frames after a bad byte, lets on
 out, and counts a reordered pair as 256 lost frames. Here
 
 - bytes that are no frame are skipped one at a time, so that no good frame behind them is lost;
-- half a frame waits for its rest until 100 ms of silence have passed (call `feed` with no data to let time pass); the
-  - a signature is checked before anything is learnt from the frame; with a key, nothing unsigned is accepted.
+- half a frame waits for its rest until 100 ms of silence have passed (call `feed` with no data to let time pass); then its
+  bytes are searched for other frames;
 - a signature is checked before anything is learnt from the frame; with a key, nothing unsigned is accepted.
 
 Frames of MAVLink 1 are read, never written. The reader checks to whom a message is addressed.

@@ -1,4 +1,4 @@
-"""How MAVLink's messages lie in their payloads, from pymavlink's dialect `common`, and the one that this dialect lacks.
+"""How MAVLink's messages lie in their payloads, from pymavlink's dialect `common`, and those that this dialect lacks.
 
 pymavlink's own encoder and decoder take about twice as long, and the encoder writes into the message.
 """
@@ -53,10 +53,15 @@ class Layout:
         return self.create(*[fields[i] for i in self.order])
 
 
+def _stored(name: str, kind: str) -> str:
+    """The attribute in which pymavlink's classes keep a field's bytes or number."""
+    return f"_{name}_raw" if kind == "char" else name
+
+
 def _layout(kind: Any) -> Layout:
     """The layout of one of pymavlink's message classes."""
-    texts = {name for name, type in zip(kind.fieldnames, kind.fieldtypes, strict=True) if type == "char"}
-    names = [f"_{name}_raw" if name in texts else name for name in kind.ordered_fieldnames]
+    types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
+    names = [_stored(name, types[name]) for name in kind.ordered_fieldnames]
     get = attrgetter(*names)
     return Layout(
         create=kind,
@@ -68,8 +73,23 @@ def _layout(kind: Any) -> Layout:
     )
 
 
-class ProtocolVersion(MAVLink_message):  # type: ignore[misc]
-    """PROTOCOL_VERSION, in hundredths. pymavlink leaves out what the standard calls work in progress."""
+class _Later(MAVLink_message):  # type: ignore[misc]
+    """A message that pymavlink leaves out as work in progress; a subclass describes it as pymavlink's classes do."""
+
+    id: int
+    msgname: str
+    fieldnames: tuple[str, ...]
+    fieldtypes: tuple[str, ...]
+
+    def __init__(self, *fields: Any) -> None:
+        super().__init__(self.id, self.msgname)
+        self._fieldnames = self.fieldnames
+        for name, kind, field in zip(self.fieldnames, self.fieldtypes, fields, strict=True):
+            setattr(self, _stored(name, kind), field)
+
+
+class ProtocolVersion(_Later):
+    """PROTOCOL_VERSION, in hundredths."""
 
     id = 300
     msgname = "PROTOCOL_VERSION"
@@ -83,25 +103,37 @@ class ProtocolVersion(MAVLink_message):  # type: ignore[misc]
     unpacker = struct.Struct("<HHH8B8B")
     crc_extra = 217
 
-    def __init__(
-        self,
-        version: int,
-        min_version: int,
-        max_version: int,
-        spec_version_hash: list[int],
-        library_version_hash: list[int],
-    ) -> None:
-        super().__init__(self.id, self.msgname)
-        self._fieldnames = self.fieldnames
-        self.version = version
-        self.min_version = min_version
-        self.max_version = max_version
-        self.spec_version_hash = spec_version_hash
-        self.library_version_hash = library_version_hash
+
+class AvailableModes(_Later):
+    """AVAILABLE_MODES, one of the board's modes."""
+
+    id = 435
+    msgname = "AVAILABLE_MODES"
+    fieldnames = ("number_modes", "mode_index", "standard_mode", "custom_mode", "properties", "mode_name")
+    fieldtypes = ("uint8_t", "uint8_t", "uint8_t", "uint32_t", "uint32_t", "char")
+    ordered_fieldnames = (*fieldnames[3:5], *fieldnames[:3], "mode_name")
+    lengths = (1, 1, 1, 1, 1, 1)
+    orders = (2, 3, 4, 0, 1, 5)
+    unpacker = struct.Struct("<IIBBB35s")
+    crc_extra = 134
+
+
+class CurrentMode(_Later):
+    """CURRENT_MODE."""
+
+    id = 436
+    msgname = "CURRENT_MODE"
+    fieldnames = ("standard_mode", "custom_mode", "intended_custom_mode")
+    fieldtypes = ("uint8_t", "uint32_t", "uint32_t")
+    ordered_fieldnames = (*fieldnames[1:], "standard_mode")
+    lengths = (1, 1, 1)
+    orders = (2, 0, 1)
+    unpacker = struct.Struct("<IIB")
+    crc_extra = 193
 
 
 LAYOUTS = {number: _layout(kind) for number, kind in dialect.mavlink_map.items()}
-LAYOUTS[ProtocolVersion.id] = _layout(ProtocolVersion)
+LAYOUTS |= {kind.id: _layout(kind) for kind in (ProtocolVersion, AvailableModes, CurrentMode)}
 
 
 def crc16(data: bytes) -> int:

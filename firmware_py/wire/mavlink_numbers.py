@@ -8,6 +8,7 @@ WRITE_ALL = 1  # PREFLIGHT_STORAGE
 class Command(IntEnum):
     """MAV_CMD: what the board can do."""
 
+    DO_SET_MODE = 176
     DO_FLIGHTTERMINATION = 185
     PREFLIGHT_STORAGE = 245
     PREFLIGHT_REBOOT_SHUTDOWN = 246
@@ -19,6 +20,13 @@ class Command(IntEnum):
     REQUEST_MESSAGE = 512
     REQUEST_PROTOCOL_VERSION = 519
     REQUEST_AUTOPILOT_CAPABILITIES = 520
+
+
+class Mode(IntEnum):
+    """The board's modes, as custom modes. The numbers are PX4's: MAVSDK reads those of every autopilot but ArduPilot so."""
+
+    HOLD = 4 << 16 | 3 << 24  # main mode 4, sub-mode 3: fly at the last goal
+    OFFBOARD = 6 << 16  # one client's stream of set-points leads
 
 
 class Result(IntEnum):

@@ -6,7 +6,8 @@ Nothing here has an axis; what flies is in `mavlink`, which offers these functio
 import pymavlink.dialects.v20.common as dialect
 
 from firmware_py.wire.mavlink_frames import Message
-from firmware_py.wire.mavlink_layouts import ProtocolVersion
+from firmware_py.wire.mavlink_layouts import AvailableModes, CurrentMode, ProtocolVersion
+from firmware_py.wire.mavlink_numbers import Mode
 
 NAME_SIZE = 16  # of a parameter
 
@@ -23,7 +24,6 @@ PREFIXES = {  # of parameters, by group
     "locSrv": "LOC",
     "stabilizer": "STAB",
     "supervisor": "SUP",
-    "telemetry": "TLM",
     "logic": "OWN",
     "excite": "EXC",
     "memTst": "MEM",
@@ -35,8 +35,11 @@ PREFIXES = {  # of parameters, by group
 
 _VERSION = 3  # the heartbeat's field; MAVLink 1 and 2 both say 3
 _U16_MAX, _U32_MAX, _I32_MAX = 0xFFFF, 0xFFFFFFFF, 0x7FFFFFFF
+# MISSION_INT because the board answers these messages, though with "unsupported": clients ask only if it is set.
 _CAPABILITIES = (
-    dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
     | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
@@ -98,21 +101,57 @@ def ping_answer(request: Message) -> Message:
     )
 
 
-def heartbeat(armed: bool, state: int) -> Message:
-    """The board's heartbeat; `armed`: flaps under control. `state` is that of the supervisor, 0..3, and the custom mode."""
-    mode = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+def heartbeat(armed: bool, state: int, mode: int = Mode.HOLD) -> Message:
+    """The board's heartbeat; `armed`: flaps under control. `state` is that of the supervisor, 0..3."""
+    base_mode = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if armed:
-        mode |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
+        base_mode |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
     if state == _STATE_FLYING:
-        mode |= _MODE_FLYING
+        base_mode |= _MODE_FLYING
     return dialect.MAVLink_heartbeat_message(
         dialect.MAV_TYPE_GENERIC,
         dialect.MAV_AUTOPILOT_GENERIC,
+        base_mode,
         mode,
-        state,
         _STATUS_OF_STATE[state],
         _VERSION,
     )
+
+
+def read_heartbeat(message: Message) -> int | None:
+    """Return the supervisor's state that a board's heartbeat reports, 0..3; None for a status that no board sends."""
+    status = message.system_status
+    return _STATUS_OF_STATE.index(status) if status in _STATUS_OF_STATE else None
+
+
+def available_mode(mode: Mode) -> Message:
+    """One of the board's modes; their indices begin at 1."""
+    modes = tuple(Mode)
+    return AvailableModes(
+        len(modes),
+        modes.index(mode) + 1,
+        dialect.MAV_STANDARD_MODE_NON_STANDARD,
+        mode,
+        0,
+        _text(mode.name.capitalize(), 35),
+    )
+
+
+def current_mode(mode: Mode) -> Message:
+    """The mode in force, which is the one that was chosen last or took its place."""
+    return CurrentMode(dialect.MAV_STANDARD_MODE_NON_STANDARD, mode, mode)
+
+
+def no_control(request: Message) -> Message:
+    """The answer to CHANGE_OPERATOR_CONTROL: nobody gets control for himself. The nearest code that there is: 2, passkey."""
+    return dialect.MAVLink_change_operator_control_ack_message(
+        request.get_srcSystem(), request.control_request, 2
+    )
+
+
+def system_time(unix_us: int, t_ms: int) -> Message:
+    """The time of day, 0 while it is not known, and the time since boot."""
+    return dialect.MAVLink_system_time_message(unix_us, u32(t_ms))
 
 
 def named_value(t_ms: int, name: str, value: float) -> Message:
@@ -120,9 +159,18 @@ def named_value(t_ms: int, name: str, value: float) -> Message:
     return dialect.MAVLink_named_value_float_message(u32(t_ms), _text(name, 10), value)
 
 
-def status_text(severity: int, text: str) -> Message:
-    """A line for the operator, cut at 50 characters; severity as in syslog, 0 emergency .. 7 debug."""
-    return dialect.MAVLink_statustext_message(severity, _text(text, 50))
+def status_text(severity: int, text: str, number: int = 0) -> tuple[Message, ...]:
+    """A line for the operator; severity as in syslog, 0 emergency .. 7 debug.
+
+    A line of more than 50 characters travels in pieces that carry its number, 1..65535; the last is shorter.
+    """
+    size = dialect.MAVLink_statustext_message.array_lengths[1]
+    if len(text) <= size:
+        return (dialect.MAVLink_statustext_message(severity, _text(text, size)),)
+    return tuple(
+        dialect.MAVLink_statustext_message(severity, _text(text[start:], size), number, start // size)
+        for start in range(0, len(text) + 1, size)
+    )
 
 
 def parameter(name: str, value: float, index: int, count: int) -> Message:

@@ -19,6 +19,8 @@ TYPE_EXTENDED = 0x10  # bits of the type byte in the TOC
 TYPE_READ_ONLY = 0x40
 EXTENDED_PERSISTENT = 1
 
+ABSOLUTE = "extPose.absolute"  # what poses over CRTP are, a uint8
+
 OK, ENOENT, EACCES, EINVAL = 0, 2, 13, 22  # status bytes are errno's
 
 _IDENT = struct.Struct("<H")
@@ -53,6 +55,11 @@ def encode_set_by_name(request: SetByName) -> bytes:
     return encode(Packet(PORT_PARAMETERS, CHANNEL_MISC, data + request.scalar.pack(request.value)))
 
 
+def encode_pose_kind(absolute: bool) -> bytes:
+    """The complete packet that says what the poses are that follow."""
+    return encode_set_by_name(SetByName(ABSOLUTE, Scalar.U8, int(absolute)))
+
+
 def decode_set_by_name(data: bytes) -> SetByName:
     """The request in the data of a channel 3 packet."""
     parts = data[1:].split(b"\0", 2)
@@ -65,7 +72,7 @@ def decode_set_by_name(data: bytes) -> SetByName:
         name = f"{parts[0].decode('ascii')}.{parts[1].decode('ascii')}"
     except UnicodeDecodeError as error:
         raise WireError(f"set by name: a name of other than ASCII letters: {data.hex()}") from error
-    return SetByName(name, scalar, scalar.unpack(parts[2][1 : 1 + scalar.size]))
+    return SetByName(name, scalar, scalar.unpack(parts[2][1:]))
 
 
 def encode_set_by_name_reply(name: str, status: int) -> bytes:

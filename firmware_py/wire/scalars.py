@@ -35,7 +35,7 @@ class Scalar(Enum):
         """The value that this type holds in place of `value`."""
         if self.is_float:
             try:
-                return float(self.layout.unpack(self.layout.pack(value))[0])
+                return float(self.layout.unpack(self.layout.pack(float(value)))[0])
             except OverflowError:
                 return copysign(inf, value)
         if not isfinite(value):

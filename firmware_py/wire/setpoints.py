@@ -7,11 +7,12 @@ import struct
 from math import isfinite, radians, remainder, tau
 
 from firmware_py.elementary import atan2
-from firmware_py.wire import WireError
+from firmware_py.wire import WireError, check_size
 from firmware_py.wire.crtp import check_place
 from firmware_py.wire.localisation import Vector, unpack_quaternion
 
 CHANNEL_SETPOINT, CHANNEL_NOTICE = 0, 1
+STOP_SIZE, NOTICE_SIZE, ATTITUDE_SIZE = 1, 5, 14  # [bytes], the last on port 3
 STOP, FULL_STATE, POSITION = 0, 6, 7  # first byte on the channel of set-points
 NAMES = {
     1: "velocity", 2: "height and attitude", 4: "PPM", 5: "hover", FULL_STATE: "full state", POSITION: "position",
@@ -26,9 +27,8 @@ _MILLIMETRE = 1e-3
 def decode_place(data: bytes) -> tuple[Vector, float]:
     """Position [m] and yaw [rad] of a set-point that is `POSITION` or `FULL_STATE`."""
     layout = _POSITION if data[0] == POSITION else _FULL_STATE
-    if len(data) < layout.size:
-        raise WireError(f"a {NAMES[data[0]]} set-point of {len(data)} bytes: {layout.size} are needed")
-    fields = layout.unpack_from(data)
+    check_size(f"a {NAMES[data[0]]} set-point", data, layout.size)
+    fields = layout.unpack(data)
     if data[0] == POSITION:
         x, y, z, yaw = fields
         check_place((x, y, z))

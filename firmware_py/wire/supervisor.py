@@ -24,3 +24,4 @@ class Cause(IntEnum):
     NO_CONTROL = 6  # of a real board: no controller step came, or another controller runs
     CONTROLLER_NOT_FINITE = 7  # own logic returned NaN or infinity
     ESTIMATOR_NOT_FINITE = 8
+    IMU_STALE = 9  # the gyro delivers nothing new

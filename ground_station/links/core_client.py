@@ -32,7 +32,8 @@ SILENCE_S = 3.0  # after which the board is given up
 SESSIONS = 255
 TEXTS: dict[int, str] = {
     Refusal.NO_SESSION: "it has rebooted, or another program uses it",
-    Refusal.FLYING: "it flies: nothing else is executed until it is in failsafe",
+    Refusal.FLYING: "it may be in the air: disarm it (floaty.armed 0) and wait 5 s, or reboot it",
+    Refusal.LOOP: "it flies with hardware in the loop, and executes no calls meanwhile",
     Refusal.OUTSIDE: "it refuses a request: its app is another version",
 }
 
@@ -67,6 +68,10 @@ class Packets(Protocol):
     def close(self) -> None:
         """Close the link."""
         ...
+
+
+class SilenceError(LinkError):
+    """The app's port does not answer."""
 
 
 class CoreClient:
@@ -128,7 +133,7 @@ class CoreClient:
                 continue
             silent_s += wait_s
             if silent_s >= SILENCE_S:
-                raise LinkError(f"{self.name}: silent for {SILENCE_S:.0f} s")
+                raise SilenceError(f"{self.name}: silent for {SILENCE_S:.0f} s")
             wait_s = min(2.0 * wait_s, LONGEST_WAIT_S)
             for index in range(begin, sent):
                 if index not in answers:

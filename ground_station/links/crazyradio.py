@@ -17,21 +17,18 @@ from statistics import median_low
 
 import cflib.crtp
 from cflib.crazyflie import Crazyflie
-from cflib.crazyflie.log import LogConfig, LogTocElement
 from cflib.crazyflie.param import ParamTocElement
 from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
 
-from firmware_py.wire import WireError
 from firmware_py.wire.crtp import (
-    CHANNEL_LOG_DATA,
     PORT_CONSOLE,
     PORT_LOG,
     decode,
-    decode_log_data,
     encode_ext_pose,
 )
+from firmware_py.wire.parameters import ABSOLUTE
 from firmware_py.wire.scalars import PARAMETER_SCALARS
-from firmware_py.wire.telemetry import BLOCKS, PERIOD_MS, SLOW_BLOCKS, SLOW_PERIOD_MS, Block, Sample
+from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.clock import clock_us
 from ground_station.controls import Answer, Request
 from ground_station.corrections import correct
@@ -45,6 +42,7 @@ from ground_station.links.live_link import (
     LiveLink,
     seconds,
 )
+from ground_station.links.log_blocks import LogBlocks
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
@@ -59,7 +57,6 @@ OWN_ECHO = 1
 MIN_PROTOCOL = 4  # version from which the tables of contents are as read here
 NULL_HEADER, NULL_MASK = 0xF3, 0xF3
 URIS = (r"radio://\w+/\d{1,3}/(250K|1M|2M)(/[0-9A-Fa-f]{10})?", r"udp://[\w.-]+:\d{1,5}")
-SUPERVISOR_STATE = "supervisor.state"
 
 
 class CrazyradioLink(LiveLink):
@@ -77,10 +74,10 @@ class CrazyradioLink(LiveLink):
         self._connected = threading.Event()
         self._lost = ""  # cflib's reason for it
         self._console = b""  # the unfinished line that the board has printed
-        self._blocks: dict[int, Block] = {}
+        self._logs = LogBlocks(self._queue, self._log_table)
         self._telemetry_us = 0  # when the last packet of a log block arrived
         self._rate = 0.0  # of exchanges [1/s], 0 over UDP
-        self._controls = CrtpControls(lambda data: self._do(partial(self._transmit, data)), self._parameters)
+        self._controls = CrtpControls(partial(self._queue, 0), self._parameters)
         quiet_cflib()
 
     def _open(self) -> None:
@@ -89,7 +86,7 @@ class CrazyradioLink(LiveLink):
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
         self._connected = connected = threading.Event()
-        self._lost, self._blocks = "", {}
+        self._lost, self._logs = "", LogBlocks(self._queue, self._log_table)
         crazyflie = self._crazyflie = Crazyflie(rw_cache=self._cache)
         crazyflie.packet_received.add_callback(self._on_any_packet)
         crazyflie.connected.add_callback(lambda uri: connected.set())
@@ -107,12 +104,15 @@ class CrazyradioLink(LiveLink):
         if crazyflie is None or not self._connected.wait(POLL_S):
             return False
         crazyflie.add_port_callback(CRTPPort.LINKCTRL, self._on_echo)
-        for port in (*PORTS, PORT_CONSOLE):
-            crazyflie.add_port_callback(port, self._on_service_packet)
+        for port in (*PORTS, PORT_CONSOLE, PORT_LOG):
+            crazyflie.add_port_callback(port, self._on_packet)
         crazyflie.link_statistics.link_quality_updated.add_callback(self._on_quality)
         crazyflie.link_statistics.uplink_rssi_updated.add_callback(self._on_rssi)
         crazyflie.link_statistics.uplink_rate_updated.add_callback(self._on_rate)
-        self._create_blocks(crazyflie)
+        if crazyflie.param.toc.get_element_by_complete_name(ABSOLUTE) is not None:
+            crazyflie.param.set_value(ABSOLUTE, 0)  # it is corrections that follow
+        self._telemetry_us = now_us = clock_us()
+        self._logs.request(now_us)
         return True
 
     def _why_no_connection(self, now_us: int, within: str) -> str:
@@ -127,7 +127,7 @@ class CrazyradioLink(LiveLink):
 
     def _on_lost(self, crazyflie: Crazyflie, uri: str, text: str) -> None:
         if crazyflie is self._crazyflie:
-            self._lost = self._lost or _first_line(text)
+            self._lost = self._lost or first_line(text)
 
     def _failure(self) -> str:
         return self._lost
@@ -137,9 +137,10 @@ class CrazyradioLink(LiveLink):
         super().check()
         now_us = clock_us()
         # cflib does not notice a reboot.
-        if self._blocks and now_us - self._telemetry_us > SILENCE_TIMEOUT_US:
+        if self._logs.requested and now_us - self._telemetry_us > SILENCE_TIMEOUT_US:
             silence = seconds(SILENCE_TIMEOUT_US)
             raise LinkError(f"{self.uri}: lost: no telemetry for {silence}, it may have rebooted")
+        self._logs.tend(now_us)
         self._ask_for_echo(now_us)
 
     def _close(self) -> None:
@@ -149,31 +150,14 @@ class CrazyradioLink(LiveLink):
             closing.start()
             closing.join(CFLIB_CLOSES_S)
 
-    def _create_blocks(self, crazyflie: Crazyflie) -> None:
-        """Start the log blocks whose variables the board has."""
-        crazyflie.add_port_callback(CRTPPort.LOGGING, self._on_log_packet)
-        self._telemetry_us = clock_us()
-        missing: list[str] = []
-        for block in (*BLOCKS, *SLOW_BLOCKS):
-            absent = [
-                v.name
-                for v in block.variables
-                if crazyflie.log.toc.get_element_by_complete_name(v.name) is None
-            ]
-            missing += absent
-            if absent:
-                continue
-            period_ms = SLOW_PERIOD_MS if block in SLOW_BLOCKS else PERIOD_MS
-            wanted = LogConfig(block.variables[0].name, period_ms)
-            for variable in block.variables:
-                wanted.add_variable(
-                    variable.name, LogTocElement.get_cstring_from_id(variable.type.log_number)
-                )
-            crazyflie.log.add_config(wanted)
-            self._blocks[wanted.id] = block
-            wanted.start()
-        if missing:
-            self._notices.append(f"the board has no {', '.join(missing)}: without these blocks of telemetry")
+    def _log_table(self) -> dict[str, int]:
+        """Return the numbers of the board's log variables, as cflib has fetched them."""
+        groups = {} if self._crazyflie is None else self._crazyflie.log.toc.toc
+        return {
+            f"{group}.{name}": element.ident
+            for group, elements in groups.items()
+            for name, element in elements.items()
+        }
 
     def _parameters(self) -> dict[str, Entry]:
         """Return the board's table of parameters, as cflib has fetched it, without those of types that Floaty lacks."""
@@ -212,6 +196,9 @@ class CrazyradioLink(LiveLink):
     def _send_echo(self) -> None:
         self._transmit(bytes((ECHO_HEADER,)) + ECHO.pack(OWN_ECHO, clock_us()))
 
+    def _queue(self, now_us: int, data: bytes) -> None:
+        self._do(partial(self._transmit, data))
+
     def _transmit(self, data: bytes) -> None:
         if (crazyflie := self._crazyflie) is not None:
             crazyflie.send_packet(CRTPPacket(data[0], list(data[1:])))
@@ -219,38 +206,29 @@ class CrazyradioLink(LiveLink):
     # Downlink
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """The telemetry in a packet from the board, empty for a packet of another service.
-
-        Blocks of a board are not sampled together; here they get the beginning of their period as common time stamp.
-        """
+        """The telemetry in a packet from the board, empty for a packet of another service."""
         packet = decode(data)
         if packet.port in PORTS:
             self._controls.hear(now_us, packet)
         if packet.port == PORT_CONSOLE:
             *lines, self._console = (self._console + packet.data)[-CONSOLE_BYTES:].split(b"\n")
             self._notices += [f"board: {line.decode(errors='replace')}" for line in lines if line]
-        if packet.port != PORT_LOG or packet.channel != CHANNEL_LOG_DATA:
+        if packet.port != PORT_LOG:
             return ()
-        number, timestamp_ms, values = decode_log_data(packet.data)
-        block = self._blocks.get(number)
-        if block is None:
-            raise WireError(f"log block {number}: not one of ours")
-        sample = Sample(block, timestamp_ms - timestamp_ms % PERIOD_MS, block.unpack(values))
-        for variable, value in zip(block.variables, sample.values, strict=True):
-            if variable.name == SUPERVISOR_STATE:
-                self.supervisor_state = int(value)
-        return (sample,)
+        samples = self._logs.hear(now_us, packet)
+        if samples:
+            self._telemetry_us = now_us
+        if (state := state_in(samples)) is not None:
+            self.supervisor_state = state
+        self._notices += self._logs.notices
+        self._logs.notices.clear()
+        return samples
 
     def _on_any_packet(self, packet: CRTPPacket) -> None:
         if packet.header & NULL_MASK != NULL_HEADER:  # the radio chip answers even when no board is behind it
             self.heard_us = clock_us()
 
-    def _on_log_packet(self, packet: CRTPPacket) -> None:
-        if packet.channel == CHANNEL_LOG_DATA:
-            self._telemetry_us = clock_us()
-            self._hear(bytes((packet.header,)) + bytes(packet.data))
-
-    def _on_service_packet(self, packet: CRTPPacket) -> None:
+    def _on_packet(self, packet: CRTPPacket) -> None:
         self._hear(bytes((packet.header,)) + bytes(packet.data))
 
     def _ask_for_echo(self, now_us: int) -> None:
@@ -291,7 +269,7 @@ def quiet_cflib() -> None:
         logger.addHandler(logging.NullHandler())
 
 
-def _first_line(text: str) -> str:
+def first_line(text: str) -> str:
     """The first line of one of cflib's messages, which may carry a traceback."""
     lines = text.strip().splitlines() or ["no reason given"]
     return lines[0].removeprefix("Couldn't load link driver: ")

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 
+from firmware_py.table import OF_PROFILE
 from firmware_py.wire.crtp import (
     CHANNEL_GENERIC,
     PORT_LOCALISATION,
@@ -14,7 +15,6 @@ from firmware_py.wire.crtp import (
     encode,
 )
 from firmware_py.wire.localisation import EMERGENCY_STOP
-from firmware_py.wire.parameter_names import OF_PROFILE
 from firmware_py.wire.parameters import (
     CHANNEL_MISC,
     CHANNEL_READ,
@@ -53,11 +53,12 @@ class CrtpControls(Dialogue[Packet]):
     """`transmit` takes packets' bytes; `table` is the board's table of contents, which is known when it is connected."""
 
     def __init__(self, transmit: Callable[[bytes], object], table: Callable[[], Mapping[str, Entry]]) -> None:
-        super().__init__(self._script_for)
+        super().__init__()
         self._transmit = transmit
         self._table = table
 
-    def _script_for(self, request: Request) -> Script[Packet]:
+    def ask(self, now_us: int, request: Request) -> None:
+        """Begin."""
         scripts: dict[Action, Callable[[], Script[Packet]]] = {
             Action.LIST: lambda: self._list(request.name),
             Action.READ: lambda: self._read(request.name),
@@ -66,7 +67,7 @@ class CrtpControls(Dialogue[Packet]):
             Action.ARM: self._arm,
             Action.STOP: self._stop,
         }
-        return scripts[request.action]()
+        self.begin(now_us, scripts[request.action]())
 
     def _list(self, group: str) -> Script[Packet]:
         found: Settings = ()

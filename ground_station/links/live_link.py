@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from math import nan
 
-from firmware_py.wire import WireError
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us
 from ground_station.controls import Answer, Request
@@ -71,7 +70,7 @@ class LiveLink(ABC):
         # The last state received from the board, None before it and again after `mute`.
         self.supervisor_state: int | None = None
         self.sent = 0  # poses
-        # Poses that a newer one replaced, or that were too old or unfit when they were to be sent.
+        # Poses that a newer one replaced, or that were too old when they were to be sent.
         self.late = 0
         self.heard_us = 0  # when the board was last heard; 0: not yet
         # Of a radio: link quality, 100 % without retries, and signal strength at the board [-dBm].
@@ -99,7 +98,7 @@ class LiveLink(ABC):
 
     @abstractmethod
     def _send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Send a pose that leaves at `now_us`, in the sender's thread; `WireError` for one that cannot be sent."""
+        """Send a pose that leaves at `now_us`, in the sender's thread."""
 
     @abstractmethod
     def _failure(self) -> str:
@@ -119,7 +118,7 @@ class LiveLink(ABC):
 
     @abstractmethod
     def ask(self, now_us: int, request: Request) -> None:
-        """Begin an operator's request; a link is `ground_station.controls.Controls`."""
+        """Begin an operator's request, in place of the one before it."""
 
     @abstractmethod
     def answer(self, now_us: int) -> Answer | None:
@@ -205,10 +204,7 @@ class LiveLink(ABC):
         now_us = clock_us()
         late = now_us + self.latency.us - mail[0].t_us > MAX_AGE_US
         if not late:
-            try:
-                self._send(now_us, *mail)
-            except WireError:
-                late = True
+            self._send(now_us, *mail)
         with self._lock:
             self.late += late
             self.sent += not late

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
-from firmware_py.wire.telemetry import BLOCKS, Sample
+from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.latency import LinkLatency
 from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget
 from ground_station.links.mavlink_controls import BOARD_COMPONENT, MavlinkControls
@@ -28,9 +28,8 @@ EVERYBODY = 0  # system to talk to until the board is known
 LOOK_PERIOD_US = 1_000_000
 REPEAT_GOAL_US = round(1e6 / STANDING_GOAL_HZ)
 TEXTS = 100  # that wait to be read
+TEXT_PIECE = 50  # characters; a longer line comes in pieces
 SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # a command and its best result
-HEALTH = 3  # the block with the supervisor's state
-SUPERVISOR_STATE = [variable.name for variable in BLOCKS[HEALTH].variables].index("supervisor.state")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,16 +58,21 @@ class LinkStatistics:
 class MavlinkLink:
     """One board at the other end of `transmit(now_us, bytes)`; implements `ground_station.station.Link`.
 
-    Raises `LinkError` when the line cannot carry a flight.
+    `note_frame` receives every frame, in both directions. Raises `LinkError` when the line cannot carry a flight.
     """
 
-    def __init__(self, transmit: Callable[[int, bytes], object], config: MavlinkLinkConfig) -> None:
+    def __init__(
+        self,
+        transmit: Callable[[int, bytes], object],
+        config: MavlinkLinkConfig,
+        note_frame: Callable[[int, bytes], object] | None = None,
+    ) -> None:
         signing = Signing(config.signing_key, start=config.signing_start) if config.signing_key else None
         self.budget = link_budget(config.baud, config.pose_hz, signing is not None)
         self.texts: deque[str] = deque(maxlen=TEXTS)  # the board's, and what it refused
+        self._text = ""  # of which pieces may be missing
         self.supervisor_state: int | None = None  # as last received
-        # Receives every frame, in both directions.
-        self.note_frame: Callable[[int, bytes], object] | None = None
+        self._note_frame = note_frame
         self.board: int | None = None  # its system id, None before the first heartbeat
         self.answered = False  # it has acknowledged a command
         self.heard_us = 0  # when its last frame came
@@ -114,7 +118,7 @@ class MavlinkLink:
         self._look_after(now_us)
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Send the pose, after a goal that has changed; less urgent messages follow. `WireError` for an unfit pose."""
+        """Send the pose, after a goal that has changed; less urgent messages follow."""
         pose = mavlink.pose(frame.t_us, frame.p_WB, frame.q_WB)
         since_us = now_us - self._goal_us
         if self._goal is None or (goal != self._goal and since_us >= self.budget.goal_period_us):
@@ -138,8 +142,12 @@ class MavlinkLink:
     def _send(self, now_us: int, message: Message) -> None:
         frame = self._sender.encode(now_us, message)
         self._carry(now_us, frame)
-        if self.note_frame is not None:
-            self.note_frame(now_us, frame)
+        if self._note_frame is not None:
+            self._note_frame(now_us, frame)
+
+    def forget(self) -> None:
+        """Forget the board's state until the next heartbeat."""
+        self.supervisor_state = None
 
     def _look_after(self, now_us: int) -> None:
         """Send a time request and a heartbeat, and request telemetry that is too slow."""
@@ -163,8 +171,8 @@ class MavlinkLink:
         self._read_us = now_us if read_us is None else read_us
         samples: list[Sample] = []
         for message in self._receiver.feed(now_us, data):
-            if self.note_frame is not None:
-                self.note_frame(now_us, bytes(message.get_msgbuf()))
+            if self._note_frame is not None:
+                self._note_frame(now_us, bytes(message.get_msgbuf()))
             handler = self._handlers.get(message.get_msgId())
             if handler is None or not self._is_of_board(message):
                 continue
@@ -181,7 +189,7 @@ class MavlinkLink:
     def _on_heartbeat(self, now_us: int, message: Message) -> Sequence[Sample]:
         if message.autopilot != NO_AUTOPILOT:
             self.board = message.get_srcSystem()
-            self.supervisor_state = message.custom_mode
+            self.supervisor_state = mavlink.read_heartbeat(message)
         return ()
 
     def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:
@@ -206,8 +214,10 @@ class MavlinkLink:
         return ()
 
     def _on_text(self, now_us: int, message: Message) -> Sequence[Sample]:
-        if not self.controls.hear(self._read_us, message):
-            self.texts.append(f"board: {message.text}")
+        self._text = self._text + message.text if message.chunk_seq else message.text
+        continued = message.id and len(message.text) == TEXT_PIECE
+        if not self.controls.hear(self._read_us, message) and not continued:
+            self.texts.append(f"board: {self._text}")
         return ()
 
     def _on_flight_array(self, now_us: int, message: Message) -> Sequence[Sample]:
@@ -217,7 +227,7 @@ class MavlinkLink:
             return ()  # an array of another name
         self._samples += 1
         self._timestamp_ms = samples[0].timestamp_ms
-        self.supervisor_state = int(samples[HEALTH].values[SUPERVISOR_STATE])
+        self.supervisor_state = state_in(samples)
         return samples
 
     def _on_status(self, now_us: int, message: Message) -> Sequence[Sample]:

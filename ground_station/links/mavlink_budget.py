@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import SIGNATURE_SIZE, FrameSender, Message
+from firmware_py.wire.mavlink_numbers import Mode
 from ground_station.errors import LinkError
 
 BYTE_BITS = 10  # start, 8 data, stop
@@ -87,4 +88,11 @@ _BOARD = (
     (2.0, mavlink.servo_outputs(10**9, (31_500,) * 4)),
     (1.0, mavlink.estimator_status(10**12, True, 0.1, 0.1)),
     (3.0, mavlink.named_value(10**9, "ten_letter", 0.1)),
+    (0.2, mavlink.system_time(10**15, 10**9)),
+    (0.2, mavlink.current_mode(Mode.OFFBOARD)),
+    (0.2, mavlink.position_target(10**9, _U, 0.1)),
+    (0.2, mavlink.hud(_U, _U, 0.1)),
+    (0.2, mavlink.actuator_outputs(10**12, (31_500,) * 4)),
+    (0.2, mavlink.home_position(10**12, _U)),
+    (0.2, mavlink.odometry(10**12, _U, _Q, _U, _U)),
 )

@@ -24,12 +24,13 @@ class MavlinkControls(Dialogue[Message]):
     """`send(now_us, message)` frames and sends; `board` is the system to talk to."""
 
     def __init__(self, send: Callable[[int, Message], object], board: Callable[[], int]) -> None:
-        super().__init__(self._script_for)
+        super().__init__()
         self._send = send
         self._board = board
         self._names: tuple[str, ...] = ()  # of the board's parameters, once they were listed
 
-    def _script_for(self, request: Request) -> Script[Message]:
+    def ask(self, now_us: int, request: Request) -> None:
+        """Begin."""
         scripts: dict[Action, Callable[[], Script[Message]]] = {
             Action.LIST: self._list,
             Action.READ: lambda: self._read(request.name),
@@ -38,7 +39,7 @@ class MavlinkControls(Dialogue[Message]):
             Action.ARM: self._arm,
             Action.STOP: lambda: self._command(Command.DO_FLIGHTTERMINATION, TERMINATE),
         }
-        return scripts[request.action]()
+        self.begin(now_us, scripts[request.action]())
 
     def _list(self) -> Script[Message]:
         """Request all, then one by one those that do not arrive."""

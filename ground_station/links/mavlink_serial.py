@@ -115,7 +115,7 @@ class MavlinkSerialLink(LiveLink):
         self._port: _Port | None = None
         self._link_lock = threading.Lock()  # the sender's thread uses the link, too
         self._note_frame = note_frame
-        self._link = MavlinkLink(self._carry, self._config)
+        self._link = MavlinkLink(self._carry, self._config, note_frame)
         self._asked = False  # for telemetry
         super().__init__(uri, self._link.latency)
 
@@ -125,8 +125,7 @@ class MavlinkSerialLink(LiveLink):
         except (OSError, ValueError) as error:
             raise LinkError(f"{self.uri}: {reason(error)}") from None
         with self._link_lock:
-            self._link = MavlinkLink(self._carry, self._config)
-            self._link.note_frame = self._note_frame
+            self._link = MavlinkLink(self._carry, self._config, self._note_frame)
         self._asked = False
 
     def _connect(self) -> bool:
@@ -165,7 +164,7 @@ class MavlinkSerialLink(LiveLink):
     def mute(self) -> None:
         """Send no more poses until `open`."""
         with self._link_lock:
-            self._link.supervisor_state = None
+            self._link.forget()
         super().mute()
 
     def _close(self) -> None:

@@ -12,7 +12,7 @@ from firmware_py.wire.core_port import CHANNEL_CALLS, PORT_CORE
 from firmware_py.wire.crtp import header
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
-from ground_station.links.crazyradio import URIS, quiet_cflib
+from ground_station.links.crazyradio import URIS, first_line, quiet_cflib
 
 USB = r"usb://\d"
 HEADER = header(PORT_CORE, CHANNEL_CALLS)
@@ -32,7 +32,7 @@ class CflibPackets:
         try:
             self._driver = cflib.crtp.get_link_driver(uri, lambda statistics: None, self._lose)
         except Exception as error:  # cflib raises bare exceptions
-            raise LinkError(f"{uri}: {_first_line(str(error))}") from None
+            raise LinkError(f"{uri}: {first_line(str(error))}") from None
         if self._driver is None:
             raise LinkError(f"{uri}: no driver for this link")
 
@@ -77,12 +77,8 @@ class CflibPackets:
         self._driver.close()
 
     def _lose(self, text: str) -> None:
-        self._lost = self._lost or _first_line(text)
+        self._lost = self._lost or first_line(text)
 
     def _check(self) -> None:
         if self._lost:
             raise LinkError(f"{self._uri}: lost: {self._lost}")
-
-
-def _first_line(text: str) -> str:
-    return next(iter(text.strip().splitlines()), "no reason given")

@@ -17,7 +17,7 @@ from concurrent.futures import CancelledError
 import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 
-from hil.campaigns.flying import Campaign, Row, failed, fly_flight
+from hil.campaigns.flying import Campaign, CampaignRow, failed, fly_flight
 from hil.campaigns.sampling import draw
 from hil.errors import LabError
 
@@ -30,12 +30,12 @@ OF_OUR_OWN = {  # settings of the scheduler and the workers that are started her
     "distributed.admin.low-level-log-length": 10,
     "distributed.worker.profile.enabled": False,
 }
-FlyOne = Callable[[Campaign, int], Row]
+FlyOne = Callable[[Campaign, int], CampaignRow]
 
 _ALONE = threading.Lock()  # one flight per process at a time: its time limit is the process'
 
 
-def fly_alone(campaign: Campaign, index: int, fly_one: FlyOne) -> Row:
+def fly_alone(campaign: Campaign, index: int, fly_one: FlyOne) -> CampaignRow:
     """Fly in a worker; a flight that hangs ends the process."""
     with _ALONE, open(os.devnull, "w") as nowhere:
         faulthandler.dump_traceback_later(2.0 * campaign.spec.limits.wall_s, exit=True, file=nowhere)
@@ -83,7 +83,7 @@ class Workers:
         stopped: Callable[[], bool],
         indices: Iterator[int],
         fly_one: FlyOne = fly_flight,
-    ) -> Generator[Row]:
+    ) -> Generator[CampaignRow]:
         """Yield the rows of flights as they arrive, until `stopped`. Raises `LabError` for a full disk or a lost cluster."""
         suspects: list[int] = []
         room = PER_WORKER * sum(self.client.nthreads().values())
@@ -93,7 +93,7 @@ class Workers:
     def _fly(
         self, campaign: Campaign, stopped: Callable[[], bool], indices: Iterator[int], fly_one: FlyOne,
         room: int, suspects: list[int] | None,
-    ) -> Generator[Row]:  # fmt: skip
+    ) -> Generator[CampaignRow]:  # fmt: skip
         """Fly `room` flights at a time; those of dead workers become suspects, or rows where there is no such list."""
         flying: dict[Future, int] = {}
         try:
@@ -119,9 +119,9 @@ class Workers:
 
     def _row_of(
         self, future: Future, campaign: Campaign, index: int, suspects: list[int] | None
-    ) -> Row | None:
+    ) -> CampaignRow | None:
         try:
-            row: Row = future.result()
+            row: CampaignRow = future.result()
             return row
         except LabError:
             raise

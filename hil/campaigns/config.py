@@ -158,6 +158,18 @@ def table_dimensions(table: TableConfig | None) -> list[tuple[str, Distribution]
     return found
 
 
+def find_spec(campaign: str) -> Path:
+    """Return the file of a campaign: a path that ends in .toml, or the name of one that ships. Raises `LabError`."""
+    if campaign.endswith(".toml"):
+        return Path(campaign)
+    names = sorted(path.stem for path in Path(__file__).parent.glob("*.toml"))
+    if campaign not in names:
+        raise LabError(
+            f"campaign {campaign!r}: neither the name of a campaign ({hint(campaign, names)}) nor a path that ends in .toml"
+        )
+    return Path(__file__).with_name(f"{campaign}.toml")
+
+
 def read_spec(path: Path) -> Spec:
     """Return the campaign of a file; paths in it are relative to its folder. Raises `LabError` of one line."""
     tree = read_toml("campaign", path)

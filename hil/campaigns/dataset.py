@@ -21,12 +21,12 @@ import pyarrow.parquet as pq
 
 from firmware_py.logic.loading import digest_of
 from hil.campaigns.config import Distribution, spec_text, table_dimensions
-from hil.campaigns.flying import Campaign, Row
+from hil.campaigns.flying import Campaign, CampaignRow
 from hil.config import load_config
 from hil.errors import LabError, writing
 from hil.experiments import find_experiment
 from hil.installation import commit, versions
-from hil.laboratory.metrics import METRICS
+from hil.laboratory.metrics import METRICS, limits_of
 
 ABOUT, ARRIVING, FLIGHTS = "campaign.json", "arriving.jsonl", "flights"
 WHOLE = "all.parquet"
@@ -44,7 +44,7 @@ class Dataset:
         self._lines = 0
         self._pack()
 
-    def add(self, row: Row) -> None:
+    def add(self, row: CampaignRow) -> None:
         """Store a row."""
         with writing("--out", self.folder):
             if self._arriving is None:
@@ -170,7 +170,7 @@ def schema_of(campaign: Campaign) -> pa.Schema:
     limits: dict[str, None] = {}
     for experiment in experiments:
         metrics |= experiment.metrics
-        limits |= dict.fromkeys(experiment.limits)
+        limits |= dict.fromkeys(limits_of(experiment.limits))
         for profile in spec.profiles:
             limits |= dict.fromkeys(load_config(profile).limits.get(experiment.name, ()))
     texts = pa.list_(pa.string())

@@ -25,8 +25,8 @@ from scipy.special import expit
 
 from hil.api import command_of
 from hil.campaigns.config import Spec
-from hil.campaigns.run import interval
-from hil.campaigns.sampling import LEVELS, Axis, as_flown, axes, draw, points_of, problem, request_of
+from hil.campaigns.run import Rate
+from hil.campaigns.sampling import LEVELS, CubeAxis, as_flown, axes, draw, points_of, problem, request_of
 from hil.errors import LabError
 from hil.laboratory.metrics import METRICS, Metric
 
@@ -36,24 +36,6 @@ SLICES = 10
 MAPPED_FROM = 5  # failures, and flights that hold
 KOLMOGOROV_MEDIAN = 0.828  # median distance of a sample from its own distribution, times the root of its size
 PULL = 1.0  # weight of the prior that pulls the logistic map towards no influence
-
-
-@dataclass(frozen=True, slots=True)
-class Rate:
-    """How often something failed, with Wilson's interval."""
-
-    failed: int
-    flown: int
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """With 95 % confidence."""
-        return interval(self.failed, self.flown)
-
-    def __str__(self) -> str:
-        low, high = self.interval
-        share = self.failed / self.flown if self.flown else 0.0
-        return f"{self.failed} of {self.flown}: {100 * share:.2f} % ({100 * low:.2f} to {100 * high:.2f} %)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +78,7 @@ class Influence:
 class FailureMap:
     """A logistic map from the cube to the chance of failing."""
 
-    axes: tuple[Axis, ...]
+    axes: tuple[CubeAxis, ...]
     points: Array  # (N, D) 0..1, as flown
     failed: NDArray[np.bool_]  # (N,)
     weights: Array  # (D,) log-odds from one end of the axis to the other

@@ -10,10 +10,11 @@ import os
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from hil.campaigns.config import Spec, Value
+from hil.campaigns.config import Spec
 from hil.campaigns.sampling import Draw, draw, request_of
 from hil.clock import Clock
 from hil.errors import LabError, blame
@@ -40,16 +41,9 @@ class Campaign:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """The result of a flight; equal for the same flight on every worker."""
+class CampaignRow(Draw):
+    """A flight and its result; equal for the same flight on every worker."""
 
-    index: int
-    experiment: str
-    profile: str
-    seed: int
-    settings: tuple[str, ...]
-    faults: tuple[str, ...]
-    parameters: Mapping[str, Value]
     outcome: str  # completed, lost or error
     error: str  # why it was lost or failed
     passed: bool
@@ -62,7 +56,7 @@ class TooLongError(Exception):
     """A flight goes beyond the campaign's limits."""
 
 
-def fly_flight(campaign: Campaign, index: int) -> Row:
+def fly_flight(campaign: Campaign, index: int) -> CampaignRow:
     """Fly flight `index`. Raises `LabError` when there is no room on the disk, or an experiment's file has changed."""
     drawn = draw(campaign.spec, index)
     which = campaign.spec.experiments.index(drawn.experiment)
@@ -103,23 +97,24 @@ def fly_within(request: Request, spec: Spec) -> Result:
         return fly(request, folder, progress=watch, flight_of=_unlogged)
 
 
-def _unlogged(request: Request, _telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
+def _unlogged(
+    request: Request, _telemetry: Path, clock: Clock | None, trace_all: bool, stack: ExitStack
+) -> Flight:
     """Return the flight without the station's log, which nobody would read: an eighth of its time."""
-    return lockstep(request, None, clock, trace_all)
+    return lockstep(request, None, clock, trace_all, stack)
 
 
-def row_of(drawn: Draw, result: Result) -> Row:
+def row_of(drawn: Draw, result: Result) -> CampaignRow:
     """Return the row of a flight that was flown."""
-    return Row(
-        drawn.index, drawn.experiment, drawn.profile, drawn.seed, drawn.settings, drawn.faults, drawn.parameters,
-        result.outcome, result.cause or "", result.passed, result.hash if result.outcome != "error" else "",
-        dict(result.metrics), {verdict.metric: verdict.holds for verdict in result.verdicts},
+    return CampaignRow(
+        **asdict(drawn), outcome=result.outcome, error=result.cause or "", passed=result.passed,
+        hash=result.hash if result.outcome != "error" else "", metrics=dict(result.metrics),
+        holds={verdict.metric: verdict.holds for verdict in result.verdicts},
     )  # fmt: skip
 
 
-def failed(drawn: Draw, error: str) -> Row:
+def failed(drawn: Draw, error: str) -> CampaignRow:
     """Return the row of a flight that did not end by itself."""
-    return Row(
-        drawn.index, drawn.experiment, drawn.profile, drawn.seed, drawn.settings, drawn.faults, drawn.parameters,
-        "error", error, False, "", {}, {},
-    )  # fmt: skip
+    return CampaignRow(
+        **asdict(drawn), outcome="error", error=error, passed=False, hash="", metrics={}, holds={}
+    )

@@ -14,7 +14,7 @@ from hil.campaigns.config import Spec, spec_text
 from hil.campaigns.dataset import about, read_flights, schema_of
 from hil.campaigns.findings import FailureMap, Findings, Limited, find
 from hil.campaigns.flying import Campaign
-from hil.campaigns.sampling import Axis, value_at
+from hil.campaigns.sampling import CubeAxis, value_at
 from hil.laboratory.metrics import SHOWN
 from hil.pictures import curves
 from hil.pictures.drawing import WIDTH, png
@@ -27,8 +27,8 @@ TICKS = 5
 SHADES = 10
 
 
-def write_report(folder: Path, file: Path, campaign: Campaign, complete: bool) -> tuple[Path, Findings]:
-    """Write report and result of the dataset of a spec's file; return the report's path and the findings."""
+def write_report(folder: Path, named: str, campaign: Campaign, complete: bool) -> tuple[Path, Findings]:
+    """Write report and result of the dataset of a campaign, as the user names it; return report and findings."""
     spec = campaign.spec
     findings = find(spec, read_flights(folder, schema_of(campaign)))
     histograms = [one for one in findings.limits if len(one.values) > 1]
@@ -37,7 +37,7 @@ def write_report(folder: Path, file: Path, campaign: Campaign, complete: bool) -
         folder / REPORT, "campaign.html.j2", spec=spec, found=findings, complete=complete,
         histograms=data_uri(png(lambda: _histograms(histograms))) if histograms else "",
         failure_map=data_uri(png(lambda: _map(mapped))) if mapped is not None else "",
-        file=quote(str(file)), begun=about(campaign)["commit"],
+        named=quote(named), begun=about(campaign)["commit"],
     )  # fmt: skip
     text = json.dumps(_content(spec, findings, complete), indent=2)
     (folder / RESULT).write_text(text + "\n", encoding="utf-8")
@@ -121,7 +121,7 @@ def _map(found: FailureMap) -> Figure:
     return figure
 
 
-def _ticks(axis: Axis) -> tuple[list[float], list[str]]:
+def _ticks(axis: CubeAxis) -> tuple[list[float], list[str]]:
     """Return places on an axis of the cube, and the values there."""
     if axis.varies is None:
         return [0.0, 1.0], ["without", "with"]

@@ -13,28 +13,39 @@ from scipy.stats import binomtest
 
 from hil.campaigns.config import Spec
 from hil.campaigns.dataset import Dataset, read_flights
-from hil.campaigns.flying import Row
+from hil.campaigns.flying import CampaignRow
 
 CONFIDENCE = 0.95
 STOP_FROM = 30  # flights; from fewer the interval is too wide to stop
 
 # From numbers of flights to their rows, in any order; ends early when interrupted.
-Flyer = Callable[[Iterator[int]], Generator[Row]]
+Flyer = Callable[[Iterator[int]], Generator[CampaignRow]]
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
-    """The interim result."""
+class Rate:
+    """How often something failed."""
 
-    flown: int
     failed: int
-    planned: int
-    complete: bool  # all flights that the campaign needs have been flown
+    flown: int
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The interval of the failure rate with CONFIDENCE."""
+        """Wilson's interval of the rate with CONFIDENCE."""
         return interval(self.failed, self.flown)
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        share = self.failed / self.flown if self.flown else 0.0
+        return f"{self.failed} of {self.flown}: {100 * share:.2f} % ({100 * low:.2f} to {100 * high:.2f} %)"
+
+
+@dataclass(frozen=True, slots=True)
+class Standing(Rate):
+    """The interim result."""
+
+    planned: int
+    complete: bool  # all flights that the campaign needs have been flown
 
 
 def interval(failed: int, flown: int) -> tuple[float, float]:
@@ -75,8 +86,8 @@ class Progress:
     def standing(self) -> Standing:
         """The interim result now."""
         if self.end is None:
-            return Standing(self._flown, self._failed, self._spec.flights, complete=False)
-        return Standing(self.end, self._failed_of_known, self.end, complete=True)
+            return Standing(self._failed, self._flown, self._spec.flights, complete=False)
+        return Standing(self._failed_of_known, self.end, self.end, complete=True)
 
 
 def conduct(spec: Spec, dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) -> Standing:

@@ -26,7 +26,7 @@ from scipy.stats import qmc
 from hil.campaigns.config import DESIGNS, Distribution, SampledFault, Spec, Value, table_dimensions
 from hil.errors import LabError
 from hil.experiments import find_experiment
-from hil.laboratory.faults import Fault, parse
+from hil.laboratory.faults import Fault
 from hil.laboratory.run import Request
 
 DIGITS = 9
@@ -49,7 +49,7 @@ class Draw:
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class CubeAxis:
     """One axis of the cube: a number that varies, or whether a fault happens."""
 
     name: str
@@ -58,21 +58,21 @@ class Axis:
 
 
 @lru_cache(maxsize=8)
-def axes_of(text: str) -> tuple[Axis, ...]:
+def axes_of(text: str) -> tuple[CubeAxis, ...]:
     """Return the axes of a campaign, by its JSON text."""
     spec = Spec.model_validate_json(text)
-    axes = [Axis(name, varies) for name, varies in _parameters(spec)]
+    axes = [CubeAxis(name, varies) for name, varies in _parameters(spec)]
     for number, fault in enumerate(spec.faults):
         name = _name(number, fault)
         if fault.probability < 1.0:
-            axes.append(Axis(f"{name} happens", None, number))
+            axes.append(CubeAxis(f"{name} happens", None, number))
         for part in _FAULT_PARTS:
             if isinstance(varies := getattr(fault, part), Distribution):
-                axes.append(Axis(f"{name} {part}", varies, number))
+                axes.append(CubeAxis(f"{name} {part}", varies, number))
     return tuple(axes)
 
 
-def axes(spec: Spec) -> tuple[Axis, ...]:
+def axes(spec: Spec) -> tuple[CubeAxis, ...]:
     """Return the axes of a campaign."""
     return axes_of(spec.model_dump_json())
 
@@ -229,7 +229,7 @@ def request_of(spec: Spec, drawn: Draw, faults: tuple[Fault, ...] | None = None)
     """Return the request of a flight; `faults` replace those drawn. Raises `LabError` for what cannot be flown."""
     return Request.of(
         find_experiment(drawn.experiment), drawn.profile, drawn.settings, drawn.seed, spec.duration_s, spec.link,
-        tuple(map(parse, drawn.faults)) if faults is None else faults,
+        drawn.faults if faults is None else faults,
     )  # fmt: skip
 
 

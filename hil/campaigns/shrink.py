@@ -145,5 +145,5 @@ def _text(trial: Trial) -> str:
 
 
 def _why(result: Result) -> str:
-    broken = ", ".join(verdict.metric for verdict in result.verdicts if not verdict.holds)
+    broken = ", ".join(verdict.metric for verdict in result.failed)
     return f" ({result.cause or broken})" if not result.passed else ""

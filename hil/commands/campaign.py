@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from hil.campaigns.config import Spec
-    from hil.campaigns.flying import Campaign, Row
+    from hil.campaigns.flying import Campaign, CampaignRow
     from hil.campaigns.run import Standing
     from hil.campaigns.sampling import Draw
 
 
 @click.command()
-@click.argument("spec", type=click.Path(path_type=Path))
+@click.argument("spec")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="[runs/campaign-SPEC]")
 @click.option(
     "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes here; default: one per core."
@@ -37,9 +37,11 @@ if TYPE_CHECKING:
     help="Instead: reduce a failing flight to the fewest faults and the smallest sizes that still fail.",
 )  # fmt: skip
 def campaign(
-    spec: Path, out: Path | None, workers: int | None, cluster: str | None, resume: bool, shrink: int | None
+    spec: str, out: Path | None, workers: int | None, cluster: str | None, resume: bool, shrink: int | None
 ) -> int:
-    """Fly the campaign of SPEC, a TOML file, into a dataset, and report what breaks the robot (docs/howto/campaigns.md).
+    """Fly the campaign SPEC into a dataset, and report what breaks the robot (docs/howto/campaigns.md).
+
+    SPEC is a TOML file, or `table`: every robot that the paper's Table allows.
 
     Exit code 0: all flights were flown, whatever their outcome; 2: bad input or a full disk, with the flights kept; 130:
     interrupted, likewise.
@@ -47,22 +49,23 @@ def campaign(
     if workers and cluster:
         raise LabError(f"--workers {workers}: not together with --cluster {cluster}")
     require("floaty campaign", "campaign", "distributed", "SALib", "scipy")
-    from hil.campaigns.config import read_spec
+    from hil.campaigns.config import find_spec, read_spec
     from hil.campaigns.flying import Campaign
     from hil.campaigns.sampling import check_spec, draw
 
-    read = read_spec(spec)
+    file = find_spec(spec)
+    read = read_spec(file)
     check_spec(read)
     if shrink is not None:
         if shrink >= read.flights:
             raise LabError(f"--shrink {shrink}: the campaign has flights 0..{read.flights - 1}")
         announce_compilation()
         return _shrink(read, draw(read, shrink))
-    out = out or Path("runs") / f"campaign-{spec.stem}"
+    out = out or Path("runs") / f"campaign-{file.stem}"
     return _fly(spec, Campaign.of(read), out, workers, cluster or "", resume)
 
 
-def _fly(file: Path, flown: Campaign, out: Path, workers: int | None, address: str, resume: bool) -> int:
+def _fly(named: str, flown: Campaign, out: Path, workers: int | None, address: str, resume: bool) -> int:
     from hil.campaigns.cluster import Workers
     from hil.campaigns.dataset import Dataset
     from hil.campaigns.report import write_report
@@ -71,7 +74,7 @@ def _fly(file: Path, flown: Campaign, out: Path, workers: int | None, address: s
     dataset = Dataset(out, flown, resume)
     stops: list[int] = []
 
-    def flyer(indices: Iterator[int]) -> Generator[Row]:
+    def flyer(indices: Iterator[int]) -> Generator[CampaignRow]:
         first = next(indices, None)
         if first is None:
             return
@@ -87,7 +90,7 @@ def _fly(file: Path, flown: Campaign, out: Path, workers: int | None, address: s
 
     with _progress() as show:
         standing = conduct(flown.spec, dataset, flyer, show)
-    page, findings = write_report(out, file, flown, standing.complete)
+    page, findings = write_report(out, named, flown, standing.complete)
     console.print(f"failed: {findings.rate}", soft_wrap=True)
     for one in findings.limits:
         console.print(f"  {one.name}: {one.rate}", soft_wrap=True)

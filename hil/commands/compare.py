@@ -33,12 +33,12 @@ def compare(first: Path, second: Path, out: Path | None) -> int:
     Exit code 0: the logs are identical; 1: they differ; 2: bad input.
     """
     from hil.pictures.compare import compare as compare_runs
-    from hil.pictures.compare import load_run, write_comparison
+    from hil.pictures.compare import load_flown, write_comparison
     from hil.studies.two_boards import comparable, seeds_of, two_boards
 
     if all(folder.is_dir() and not any(folder.glob("log.*")) for folder in (first, second)):
         return _print_seeds(first, second, seeds_of(first, second))
-    a, b = load_run(first), load_run(second)
+    a, b = load_flown(first), load_flown(second)
     comparison = compare_runs(a, b)
     boards = two_boards(a, b) if comparable(a, b) else None
     why = () if boards is None else (str(boards.first or "no servo count differs"), *boards.causes)

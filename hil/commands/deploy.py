@@ -19,6 +19,7 @@ from hil.errors import LabError
 
 if TYPE_CHECKING:
     from hil.deploy.check import Checked
+    from hil.deploy.doctor import Finding
     from hil.deploy.targets import Loads, MachineCode
     from hil.laboratory.flight import Flight
 
@@ -58,7 +59,8 @@ def deploy() -> None:
 )  # fmt: skip
 @click.option(
     "--elf", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-    help="Check the core inside this linked firmware, like the build/cf2.elf that is flashed, as cortex-m4.",
+    help="Check this linked firmware, the build/cf2.elf that is flashed: its core as cortex-m4 (only that, unless --targets "
+    "says otherwise), its parameters and a flight of it on the emulated board.",
 )  # fmt: skip
 def check(
     experiment: str | None,
@@ -75,15 +77,15 @@ def check(
     """Fly with numba, plain Python, C and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
 
     Without EXPERIMENT: hover, yaw step and a hover with faults, 10 000 ticks of 10 ms. Exit code 0: no bit differs; 1: one
-    does; 2: bad input; 130: interrupted.
+    does; 2: bad input; 130: interrupted. With --elf 1 also when anything else in the firmware is not as in PROFILE.
     """
     from hil.deploy.check import check_flight, plan
-    from hil.deploy.targets import Toolbox, target_names
+    from hil.deploy.targets import CORTEX_M4, Toolbox, target_names
     from hil.laboratory.faults import parse
 
     if source and elf:
         raise LabError("--source and --elf: one or the other")
-    names = target_names(target_text)
+    names = target_names(CORTEX_M4 if elf and target_text is None else target_text)
     flights = plan(
         experiment, every, profile, overrides, seed, duration, [parse(text) for text in fault_texts]
     )
@@ -104,7 +106,42 @@ def check(
         _print_measured(board, measured, counted)
     if checked[-1].outcome == "interrupted":
         return INTERRUPTED
-    return 0 if all(one.equal and not one.failed for one in checked) else 1
+    well = all(one.equal and not one.failed for one in checked)
+    if elf is not None:
+        well = _check_around(elf, profile, overrides) and well
+    return 0 if well else 1
+
+
+def _check_around(elf: Path, profile: str, overrides: tuple[str, ...]) -> bool:
+    """Check what is around the core in an image; print what is found, and what stays unproven."""
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    from hil.deploy.image_check import UNPROVEN, check_image, check_memory, has_app
+
+    app, memory = has_app(elf)
+    well = True
+    say_finding(check_memory(memory))  # a warning: it flies
+    if not app:
+        console.print(f"unproven: everything but the core: {elf} has no exported app", soft_wrap=True)
+        return True
+    columns = (TextColumn("{task.description}"), BarColumn())
+    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+        bar = progress.add_task("", total=None)
+
+        def show(what: str, done: int, total: int) -> None:
+            progress.update(bar, description=what, completed=done, total=total)
+
+        for finding in check_image(elf, profile, overrides, show):
+            say_finding(finding)
+            well = well and finding.good
+    for text in UNPROVEN:
+        console.print(f"unproven: {text}", soft_wrap=True)
+    return well
+
+
+def say_finding(finding: Finding) -> None:
+    """Print a line about a board or an image, marked when it is not as it should be."""
+    say(f"{'  ' if finding.good else '! '}{finding.subject:<10}{finding.text}")
 
 
 @contextmanager
@@ -141,7 +178,7 @@ def _print_sum(checked: list[Checked]) -> None:
 
 
 def _print_machine_code(code: MachineCode) -> None:
-    from firmware_py.export.cortex_m4 import CLOCK_MHZ
+    from firmware_py.export.usage import CLOCK_MHZ
 
     ticks = code.ticks
     flash = "" if code.flash_bytes is None else f"flash {code.flash_bytes} B, "
@@ -257,7 +294,7 @@ def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
         client = open_real_core(link, "LINK", stack)
         try:
             for finding in examine(client, config):
-                say(f"{'  ' if finding.good else '! '}{finding.subject:<10}{finding.text}")
+                say_finding(finding)
                 well = well and finding.good
         except LinkError as error:
             raise LabError(str(error)) from None

@@ -15,7 +15,7 @@ from hil.commands.options import (
     set_option,
     wide_console,
 )
-from hil.errors import LabError, writing
+from hil.errors import LabError, require, writing
 
 if TYPE_CHECKING:
     from hil.design.analysis import Analysis
@@ -60,6 +60,7 @@ def design(
     out: Path,
 ) -> None:
     """Trim, constants, poles, authority and sweeps of a profile's robot, beside the paper's claims of its design."""
+    require("floaty design", "design", "scipy", "control")
     if context.invoked_subcommand is not None:
         return
     from hil.design.analysis import analyse, write
@@ -168,7 +169,7 @@ def point_of(
 ) -> "Point":
     """Return a profile's robot, or a similar one, at its design hover or at the hover of another speed or angle."""
     from hil.config import load_config
-    from hil.design.analysis import point_of as own_point_of
+    from hil.design.sweeps import point_of as own_point_of
     from hil.design.trim import opening_at, scaled
 
     point = own_point_of(load_config(profile, overrides))

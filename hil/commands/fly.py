@@ -72,7 +72,10 @@ SEEDS_MAX = 10_000
     "stay at hover, or move as well.",
 )  # fmt: skip
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [runs/EXPERIMENT-SEED]."
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Run folder [runs/EXPERIMENT-SEED, or -2, -3, … where another request was flown].",
 )
 def fly(
     experiment: str,
@@ -107,12 +110,10 @@ def fly(
         raise LabError(f"--hil: --seeds {seeds}: a real board is in one flight at a time")
     if perfetto:
         import hil.exports.perfetto  # noqa: F401 - reports a missing package now, not after the flight
-    from hil.laboratory.faults import parse
     from hil.laboratory.run import Request
 
-    faults = [parse(text) for text in fault_texts]
     requests = [
-        Request.of(chosen, profile, overrides, seed + index, duration, link, faults, board, elf)
+        Request.of(chosen, profile, overrides, seed + index, duration, link, fault_texts, board, elf)
         for index in range(seeds)
     ]
     if gdb is not None and (seeds > 1 or not requests[0].is_image):
@@ -124,8 +125,13 @@ def fly(
         raise LabError(f"--board {board}: --seeds {seeds}: a real board is in one flight at a time")
     if seeds > 1:
         return _fly_many(requests, out or Path("runs"))
-    folder = out or Path("runs") / f"{chosen.name}-{seed}"
-    return _fly_one(requests[0], folder, realtime, target, perfetto, in_loop, gdb)
+    from hil.run_folder import folder_of, moved, reserved
+
+    folder = out or folder_of(requests[0])
+    if out is None and (why := moved(requests[0], folder)):
+        notices.print(why, soft_wrap=True)
+    with reserved(requests[0], folder):
+        return _fly_one(requests[0], folder, realtime, target, perfetto, in_loop, gdb)
 
 
 def _fly_one(
@@ -141,12 +147,11 @@ def _fly_one(
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from hil.clock import FreeRunning, Paced
-    from hil.laboratory.run import fly, lockstep, prepare
+    from hil.laboratory.run import fly, lockstep
     from hil.servers.in_the_loop import in_the_loop
     from hil.servers.linked import linked_flight
 
     view = open_live(target)
-    prepare(folder)
     debugger = open_debugger(gdb, request.elf or Path(request.board))
     clock = Paced() if realtime else FreeRunning()
     columns = (
@@ -185,9 +190,15 @@ def _fly_one(
 
 def _fly_many(requests: list[Request], parent: Path) -> int:
     """Fly seeds in parallel processes; one row per seed, a summary at the end; returns the exit code."""
+    from hil.run_folder import folder_of, moved
     from hil.studies.sweep import Job, fly_all
 
-    jobs = [Job(request, parent / f"{request.experiment.name}-{request.seed}") for request in requests]
+    jobs = [Job(request, folder_of(request, parent)) for request in requests]
+    whys = [why for job in jobs if (why := moved(job.request, job.folder))]
+    for why in whys[:1]:
+        notices.print(
+            f"{why}{f', and so on: {len(whys)} of {len(jobs)}' if whys[1:] else ''}", soft_wrap=True
+        )
     rows, interrupted = fly_all(jobs, notices)
     print_seeds(rows)
     if interrupted:

@@ -1,7 +1,7 @@
 """`floaty identify` and `floaty tune`: from flights to the model's constants, and from those to gains."""
 
 from collections.abc import Iterable
-from math import degrees, inf, isnan
+from math import degrees, inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +18,8 @@ from hil.commands.options import (
 from hil.errors import LabError, require, writing
 
 if TYPE_CHECKING:
-    from hil.design.loop import Margins
-    from hil.identify.identify import Constant, Identification
+    from hil.design.margins import Margins
+    from hil.identify.identify import Identification
     from hil.studies.tuning import Round
 
 folder_type = click.Path(path_type=Path)
@@ -75,6 +75,8 @@ def identify(
 def _print_constants(found: "Identification") -> None:
     from rich.table import Table
 
+    from hil.identify.identify import interval_text
+
     table = Table(title="constants, with the half width of their 95 % interval")
     for heading in (
         "constant",
@@ -89,8 +91,8 @@ def _print_constants(found: "Identification") -> None:
         table.add_column(heading, no_wrap=heading != "verdict")
     for one in found.constants:
         table.add_row(
-            one.name, _pair(one.paper), _number(one.truth), _pair(one.two_controllers), _pair(one.instrumental),
-            _pair(one.joint), one.unit, _verdict(one),
+            one.name, interval_text(*one.paper), interval_text(one.truth), interval_text(*one.two_controllers),
+            interval_text(*one.instrumental), interval_text(*one.joint), one.unit, f"{one.verdict}: {one.why}",
         )  # fmt: skip
     wide_console().print(table)
     if found.excited:
@@ -98,18 +100,6 @@ def _print_constants(found: "Identification") -> None:
         console.print(
             f"periods of 20 s: {periods}; the model misses the log by {found.estimate.misfit**0.5:.2f} of its scatter"
         )
-
-
-def _verdict(one: "Constant") -> str:
-    return f"{one.verdict}: {one.why}"
-
-
-def _number(value: float) -> str:
-    return "" if isnan(value) else f"{value:.4g}"
-
-
-def _pair(pair: tuple[float, float]) -> str:
-    return "" if isnan(pair[0]) else f"{pair[0]:.4g} ± {pair[1]:.2g}"
 
 
 @click.command()
@@ -138,16 +128,16 @@ def tune(
     Exit code 0: the new gains hover no worse than the old ones, which are kept otherwise; 1: they do; 2: bad input, no
     gains, or a lost robot.
     """
-    require("floaty tune", "identify", "scipy")
+    require("floaty tune", "design", "scipy", "control")
     from hil.config import load_config
-    from hil.studies.tuning import Flights, fly_round, rounds, write_tuned
+    from hil.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
 
     if out is not None and out.suffix != ".toml":
         raise LabError(f"--out {out}: a profile's name ends in .toml")
     with writing("--runs", runs):
         runs.mkdir(parents=True, exist_ok=True)
     announce_compilation()
-    flights = Flights(seed, board, runs, notices)
+    flights = TuningFlights(seed, board, runs, notices)
     flown: Iterable[Round] = (
         [fly_round(profile, flights, robots)] if repeat is None else rounds(profile, flights, robots, repeat)
     )
@@ -194,8 +184,8 @@ def _print_round(one: "Round") -> None:
     )  # fmt: skip
     for axis in tuned.axes:
         old, new = (", ".join(f"{gain:.4g}" for gain in own) for own in (axis.old, axis.new))
-        gains.add_row(axis.axis.name, f"{', '.join(axis.axis.gains)} = {old}", new)
-        edge.add_row(axis.axis.name, "old", *_margins(axis.old_margins), end_section=False)
+        gains.add_row(axis.axis.label, f"{', '.join(axis.axis.gains)} = {old}", new)
+        edge.add_row(axis.axis.label, "old", *_margins(axis.old_margins), end_section=False)
         edge.add_row("", "new", *_margins(axis.margins, axis.late))
         edge.add_row(
             "",
@@ -211,7 +201,7 @@ def _print_round(one: "Round") -> None:
         ] or ["", ""]
         before = "not stable" if axis.old_motion is None else f"{scale * axis.old_motion.main:.2f} {unit}"
         after = f"{scale * axis.motion.main:.2f} {unit}"
-        moved.add_row(axis.axis.name, before, flown[0], after, flown[1], ", ".join(flown[2:]))
+        moved.add_row(axis.axis.label, before, flown[0], after, flown[1], ", ".join(flown[2:]))
     for table in (gains, edge, moved):
         wide.print(table)
     console.print(

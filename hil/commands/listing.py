@@ -1,12 +1,21 @@
-"""`floaty list`: what can be flown."""
+"""`floaty list`: what can be flown; `floaty runs`: what has been flown."""
+
+from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from hil.commands.options import console, wide_console
 from hil.errors import LabError
+
+if TYPE_CHECKING:
+    from hil.laboratory.result import Result
+
+HASH_DIGITS = 12
 
 
 @click.command("list")
@@ -65,3 +74,53 @@ def _list_faults() -> None:
         only = f" ({kind.needs})" if kind.needs else ""
         table.add_row(name, size, bounds, lasts, kind.outcome, f"{kind.meaning}{only}")
     wide_console().print(table)
+
+
+@click.command()
+@click.argument("folder", default="runs", type=click.Path(path_type=Path))
+def runs(folder: Path) -> None:
+    """List the run folders below FOLDER [runs], the latest last: date, request, verdict and hash."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from hil.laboratory.recorder import EVENTS
+    from hil.laboratory.result import RESULT, read_result
+
+    try:
+        written = {
+            path.parent: path.stat().st_mtime for name in (EVENTS, RESULT) for path in folder.rglob(name)
+        }
+    except OSError as error:
+        raise LabError(f"runs {folder}: {error.strerror or error}") from None
+    if not written:
+        raise LabError(f"runs {folder}: no run folder there; `floaty fly hover` makes one")
+    table = Table(box=None, pad_edge=False)
+    for heading in ("date", "folder", "request", "verdict", "hash"):
+        table.add_column(heading, overflow="fold", no_wrap=heading in ("date", "hash"))
+    for run in sorted(written, key=lambda run: (written[run], run)):
+        try:
+            result = read_result(run)
+            row = (_request_of(result), verdict_of(result), result.hash[:HASH_DIGITS])
+        except LabError as error:
+            row = ("", " ".join(str(error).removeprefix(f"{run / RESULT}: ").split()), "")
+        date = time.strftime("%m-%d %H:%M", time.localtime(written[run]))
+        table.add_row(date, *map(escape, (str(run.relative_to(folder)), *row)))
+    console.print(table)
+
+
+def _request_of(result: Result) -> str:
+    """Return what was flown, without what is usual."""
+    from hil.laboratory.result import USUAL
+
+    asked = {**result.requested(), "": result.experiment}
+    return ", ".join(
+        f"{name} {value}".strip() for name, value in asked.items() if value != USUAL.get(name, "")
+    )
+
+
+def verdict_of(result: Result) -> str:
+    """Return how a flight went, in a few words."""
+    failed = [verdict.metric for verdict in result.verdicts if not verdict.holds]
+    if result.outcome != "completed":
+        return result.outcome
+    return f"fails: {', '.join(failed)}" if failed else "ok"

@@ -16,10 +16,10 @@ from rich.console import Console
 from hil.errors import LabError
 
 if TYPE_CHECKING:
-    from hil.devices.stm32f405.gdb import GdbServer
     from hil.laboratory.experiment import Experiment
     from hil.laboratory.result import Result
     from hil.live.feed import LiveView
+    from hil.stm32f405.gdb import GdbServer
 
 INTERRUPTED = 130
 
@@ -72,7 +72,7 @@ def open_debugger(port: int | None, image: Path) -> GdbServer | None:
     """Open the port that `--gdb` asks for; it prints the command to type when it waits, and closes with this command."""
     if port is None:
         return None
-    from hil.devices.stm32f405.gdb import GdbServer
+    from hil.stm32f405.gdb import GdbServer
 
     def waiting(port: int) -> None:
         say(f"waiting for gdb-multiarch {shlex.quote(str(image))} -ex 'target remote 127.0.0.1:{port}'")
@@ -132,7 +132,7 @@ def write_pictures(folder: Path, experiment: Experiment) -> None:
 
     write_report(folder, experiment)
     try:
-        from hil.pictures.viewer import write_run_rrd
+        from hil.pictures.viewer.recording import write_run_rrd
 
         write_run_rrd(folder)
     except LabError as error:

@@ -19,11 +19,11 @@ from hil.commands.options import (
     set_option,
     wide_console,
 )  # fmt: skip
-from hil.errors import writing
+from hil.errors import require, writing
 
 if TYPE_CHECKING:
     from hil.studies.paper import Paper
-    from hil.studies.paper_identification import Constant
+    from hil.studies.paper_identification import PaperConstant
     from hil.studies.study import Study
 
 folder_type = click.Path(path_type=Path)
@@ -77,8 +77,10 @@ def study(name: str, seeds: int, out: Path | None) -> int:
 
 
 def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted: bool = False) -> int:
+    require("floaty paper", "design", "scipy")
     from hil.config import load_config
-    from hil.design.analysis import analyse, point_of
+    from hil.design.analysis import analyse
+    from hil.design.sweeps import point_of
     from hil.studies import drag_model
     from hil.studies.paper import fly_paper
     from hil.studies.paper_identification import fly_identification
@@ -136,7 +138,7 @@ def _print_rows(flown: "Paper") -> None:
         console.print(f"\n{why}", soft_wrap=True)
 
 
-def _print_constants(constants: "Sequence[Constant]") -> None:
+def _print_constants(constants: "Sequence[PaperConstant]") -> None:
     from rich.table import Table
 
     from hil.studies.paper_identification import COLUMNS, WHY
@@ -187,6 +189,5 @@ def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -
     announce_compilation()
     measured = drag_model.measure(config, seed)
     rows = list(track(measured, "mounted robot", drag_model.ROWS, console=notices, transient=True))
-    drag_model.write_csv(rows, out / "drag_model.csv")
-    page = drag_model_report.write(rows, math.degrees(config.plant.hover_angle), out)
+    page, _ = drag_model_report.write(rows, math.degrees(config.plant.hover_angle), out)
     console.print(f"report  {page}")

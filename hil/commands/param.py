@@ -47,7 +47,7 @@ def list_all(group: str, uri: str, profile: str, overrides: tuple[str, ...]) -> 
 @set_option
 def get(names: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ...]) -> None:
     """Show the values of parameters."""
-    from firmware_py.wire.parameter_names import on_board
+    from firmware_py.table import on_board
     from ground_station.controls import Action, Request
 
     requests = [Request(Action.READ, on_board(name)[0]) for name in names]
@@ -62,7 +62,7 @@ def get(names: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ..
 @set_option
 def set_values(settings: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ...]) -> None:
     """Change parameters, until the board's next boot; `floaty param save` keeps them."""
-    from firmware_py.wire.parameter_names import on_board
+    from firmware_py.table import on_board
     from ground_station.controls import Action, Request
 
     wanted = [_setting(text) for text in settings]

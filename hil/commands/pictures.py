@@ -18,7 +18,7 @@ def view(run: Path, at_s: float | None, web: bool) -> None:
     """Open RUN, a run folder, in the rerun viewer."""
     from hil.live.recording import browse, show_at
     from hil.live.window import show
-    from hil.pictures.viewer import recording_of
+    from hil.pictures.viewer.recording import recording_of
 
     if web:
         browse(run, at_s or 0.0, say)

@@ -65,7 +65,10 @@ BOARDS_MAX = 10
 )
 @gdb_option
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
-@click.option("--station", is_flag=True, help="Fly with the built-in ground station.")
+@click.option(
+    "--station", type=click.Choice(["corrections", "poses"]), is_flag=False, flag_value="corrections",
+    help="Fly at home with the built-in ground station; poses: it sends absolute poses, and clients say where to fly.",
+)  # fmt: skip
 @click.option(
     "--motive/--no-motive", default=True, show_default=True, help="Stream the cameras' poses over NatNet."
 )
@@ -99,7 +102,7 @@ def serve(
     board: str | None,
     gdb: int | None,
     boards: int,
-    station: bool,
+    station: str | None,
     motive: bool,
     natnet: str,
     natnet_port: int,
@@ -127,10 +130,10 @@ def serve(
     _check_options(udp, mavlink, baud, board, gdb, boards)
     if mavlink is not None:
         require(f"--mavlink {mavlink}", "mavlink", "pymavlink")
-    from firmware_py.core_runner import PythonRunner
     from hil.config import load_config
     from hil.laboratory.fault_kinds import MARKERS_ON
     from hil.laboratory.faults import check, parse
+    from hil.laboratory.robot import PYTHON_BOARD
     from hil.laboratory.run import image_at
     from hil.servers.live_faults import LiveFaults
     from hil.servers.motive import Streaming
@@ -139,21 +142,24 @@ def serve(
 
     markers = (MARKERS_ON,) if motive else ()
     line = (f"serial.baud={baud}",) if baud is not None else ()
-    config = load_config(profile, (*markers, *overrides, *line))
+    poses = (
+        () if station == "corrections" else ("predictor.absolute=true",)
+    )  # as Bitcraze's programs send them
+    config = load_config(profile, (*markers, *poses, *overrides, *line))
     ends = parse_addresses(mavlink, boards) if mavlink is not None else []
     faults = [parse(text) for text in fault_texts]
     check(faults, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
     announce_compilation()
     debugger = open_debugger(gdb, Path(board or ""))
-    runner = PythonRunner if board is None else image_at(board, None, debugger)
+    executor = PYTHON_BOARD if board is None else image_at(board, None, debugger)
     view = open_live(target)
-    server = Server(config, boards, seed, say, bool(ends), faults, state, view, runner)
+    server = Server(config, boards, seed, say, bool(ends), faults, state, view, executor)
     try:
         streaming = Streaming(natnet_port, NATNET[natnet], multicast, up) if motive else None
         _open_ends(server.ends, udp, radio_port if radio else None, ends, streaming)
-        if station:
+        if station is not None:
             for robot in server.ends.robots:
-                robot.fly()
+                robot.fly(station == "poses")
         LiveFaults(server, say).listen(sys.stdin)
         stops = stop_signals()
         say("serving; Ctrl-C ends")

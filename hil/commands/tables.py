@@ -29,7 +29,7 @@ def print_seeds(rows: list[Result]) -> None:
     for heading in ("seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict"):
         table.add_column(heading, justify="right")
     for result in rows:
-        failed = ", ".join(verdict.metric for verdict in result.verdicts if not verdict.holds)
+        failed = ", ".join(verdict.metric for verdict in result.failed)
         verdict = "ok" if result.passed else result.cause or f"fails: {failed}"
         table.add_row(
             str(result.seed),
@@ -62,7 +62,8 @@ def print_result(result: Result) -> None:
     from rich.table import Table
 
     from ground_station.latency import budget_line
-    from hil.laboratory.metrics import METRICS
+    from hil.clock import process_age_s
+    from hil.laboratory.metrics import METRICS, short_of
 
     table = Table(title=f"{result.title}, profile {result.profile}")
     table.add_column("metric")
@@ -76,12 +77,15 @@ def print_result(result: Result) -> None:
         limit = mark = ""
         if name in verdicts:
             limit = f"{'<=' if metric.bound == 'max' else '>='} {metric.show(verdicts[name].bound)}"
-            mark = "ok" if verdicts[name].holds else "FAILS"
-        table.add_row(name, metric.show(value), limit, mark)
+            mark = verdicts[name].mark
+        over = short_of(metric, value, result.metrics["flown"], result.duration_s)
+        table.add_row(name, metric.show(value) + over, limit, mark)
     console.print(table)
     cause = f": {result.cause}" if result.cause else ""
     speed = "" if math.isnan(result.real_time_factor) else f"{result.real_time_factor:.0f} times real time; "
-    console.print(f"{result.outcome}{cause}; {speed}hash {result.hash[:16]}")
+    taken_s = process_age_s()
+    taken = "" if math.isnan(taken_s) else f"{taken_s:.1f} s from start to end; "
+    console.print(f"{result.outcome}{cause}; {speed}{taken}hash {result.hash[:16]}", soft_wrap=True)
     if result.ages:
         console.print(budget_line(result.ages), soft_wrap=True)
     if result.usage is not None:

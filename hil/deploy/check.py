@@ -15,6 +15,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.export.side_by_side import SideBySide, Target
 from firmware_py.rtos import TaskError, WatchdogError
 from ground_station.errors import LinkError
+from hil.devices.board_firmware import PythonBoard
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.faults import Fault, parse
@@ -71,10 +72,7 @@ def check_flight(
                 raise LabError(str(error)) from None
             return made[0]
 
-        flight = lockstep_flight(
-            request.config, request.experiment, request.duration_s, request.seed, None,
-            link=request.link, faults=request.faults, runner=side_by_side,
-        )  # fmt: skip
+        flight = lockstep_flight(request, executor=PythonBoard(side_by_side))
         try:
             end = flight.run(lambda now_us: progress(now_us, flight))
             outcome = "interrupted" if end.interrupted else f"lost: {end.lost}" if end.lost else "completed"

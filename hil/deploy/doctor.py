@@ -35,13 +35,14 @@ from firmware_py.wire.platform import PLATFORM_VERSION, VERSION_FIRMWARE
 from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us, wait
 from ground_station.errors import LinkError
-from ground_station.links.core_client import CoreClient
+from ground_station.links.core_client import CoreClient, SilenceError
 from hil.config import LabConfig
 from hil.devices.real_core import RealCore
 from hil.devices.sample_window import SampleWindow
 
 ROUND_TRIPS = 100
 BURST = 600  # packets
+LOSSY = 0.1  # of them repeated
 LOOKS = 60  # at the gyro, with as many different samples
 LOOP_SAMPLES = 500  # of the gyro, which a board in the loop takes in as many milliseconds
 LOOP_TIMEOUT_US = 5_000_000
@@ -65,10 +66,22 @@ class Finding:
 
 def examine(client: CoreClient, config: LabConfig) -> Iterator[Finding]:
     """Yield what is found. Raises `LinkError` when the board does not answer, or flies."""
-    about = client.begin()
-    yield _firmware(client)
+    firmware = _firmware(client)
+    try:
+        about = client.begin()
+    except SilenceError:
+        if not firmware.good:
+            raise
+        yield firmware
+        yield Finding(
+            "app",
+            "missing: the firmware answers, Floaty's app does not; see floaty deploy export",
+            good=False,
+        )
+        return
+    yield firmware
     yield from _app(about, config)
-    yield _link(client)
+    yield _link(client, 1e6 / config.mocap.period_us)
     yield _memory(client, about.size)
     yield from _health(client)
     yield _core(client, about, config)
@@ -101,7 +114,8 @@ def _app(about: About, config: LabConfig) -> Iterator[Finding]:
     yield Finding("state", State(about.state).name.lower())
 
 
-def _link(client: CoreClient) -> Finding:
+def _link(client: CoreClient, poses_hz: float) -> Finding:
+    """Measure the link; a flight needs one packet per pose, and repeats none."""
     trips_us = []
     for _ in range(ROUND_TRIPS):
         start_us = clock_us()
@@ -111,8 +125,15 @@ def _link(client: CoreClient) -> Finding:
     client.execute([read(0, READ_MAX)] * BURST)
     rate = BURST / max(1, clock_us() - start_us) * 1e6
     trip = f"round trip {median(trips_us) / 1000:.1f} ms, the longest {max(trips_us) / 1000:.1f}"
-    again = f"{client.repeated - repeated} of {BURST} repeated"
-    return Finding("link", f"{trip}; {rate:.0f} packets/s each way, {again}")
+    again = client.repeated - repeated
+    text = f"{trip}; {rate:.0f} packets/s each way, {again} of {BURST} repeated"
+    if rate < poses_hz:
+        return Finding("link", f"{text}: too slow to fly with {poses_hz:.0f} poses/s", good=False)
+    if again > LOSSY * BURST:
+        return Finding(
+            "link", f"{text}: poses are lost or late in a flight; move the antenna, or change the channel"
+        )
+    return Finding("link", text)
 
 
 def _memory(client: CoreClient, size: int) -> Finding:
@@ -153,10 +174,10 @@ def _core(client: CoreClient, about: About, config: LabConfig) -> Finding:
         return Finding("computes", str(error).removeprefix(f"{client.name}: "), good=False)
     core = blocks.run
     assert isinstance(core, RealCore)
-    core.reset()
+    core.call("reset")
     for _ in range(TICKS):
-        core.estimate()
-        core.control()
+        for name in ("estimate", "supervise", "control"):
+            core.call(name)
     cycles = core.load["estimate"].cycles // TICKS, core.load["control"].cycles // TICKS
     times = f"estimate {cycles[0]} cycles, control {cycles[1]}, at {about.clock_mhz} MHz"
     verdict = (

@@ -11,10 +11,11 @@ from pathlib import Path
 from firmware_py.config import LogicConfig
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
 from firmware_py.export.arm_image import Image, build_image, build_meter, read_image
-from firmware_py.export.cortex_m4 import CortexM4Runner, Load, find_emulator
+from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
 from firmware_py.export.errors import ExportError
 from firmware_py.export.native import NativeRunner, build
 from firmware_py.export.plain import PlainRunner
+from firmware_py.export.usage import Load
 from firmware_py.logic.loading import translation_of
 from hil.devices.real_core import RealCore, is_link, open_real_core
 from hil.errors import LabError
@@ -50,14 +51,17 @@ class Metered(CortexM4Runner):
         self._ticks = ticks
         self._so_far: tuple[int, int] | None = None  # instructions, cycles at the last tick's end; None: boot
 
-    def control(self) -> None:
-        """Run the controller, with which a tick ends."""
-        super().control()
+    def call(self, name: str) -> int:
+        """Execute an entry point; with the controller a tick ends."""
+        answer = super().call(name)
+        if name != "control":
+            return answer
         loads = self.load.values()
         now = sum(load.instructions for load in loads), sum(load.cycles for load in loads)
         if self._so_far is not None:
             self._ticks.add(now[0] - self._so_far[0], now[1] - self._so_far[1])
         self._so_far = now
+        return answer
 
 
 @dataclass(slots=True)

@@ -10,30 +10,18 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hil.config import LabConfig
 from hil.design import figures
 from hil.design.authority import QUANTITIES, attainable, pressure_at, single, wrenches
 from hil.design.claims import Claim, claims, robot_lines
 from hil.design.linear import calm_plates
 from hil.design.sweeps import Point, authorities, hover_angles, scaling, stability
-from hil.design.trim import coefficient_of
 from hil.pictures.drawing import png
-from hil.pictures.pages import data_uri, write_page
+from hil.pictures.pages import PageFigure, data_uri, write_page
 from hil.world import layout as at
 from hil.world.body import SIGNS
 from hil.world.motion import evaluate
 
 CHECKED = 200  # openings at which plant and plate equations are compared
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """A picture of the design."""
-
-    name: str
-    title: str
-    caption: str
-    content: bytes  # PNG
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,19 +32,7 @@ class Analysis:
     robot: list[tuple[str, str]]
     inputs: list[tuple[str, str, str]]  # input, alone, about the hover
     claims: list[Claim]
-    pictures: list[Picture]
-
-
-def point_of(config: LabConfig) -> Point:
-    """Return a profile's robot at its design hover."""
-    limits = config.allocation
-    return Point(
-        config.geometry,
-        coefficient_of(config),
-        config.plant.hover_angle,
-        limits.opening_min,
-        limits.opening_max,
-    )
+    pictures: list[tuple[PageFigure, bytes]]  # with the figure's PNG
 
 
 def model_error(point: Point) -> float:
@@ -89,8 +65,9 @@ def analyse(point: Point) -> Analysis:
         for index, name in enumerate(QUANTITIES)
     ]
 
-    def picture(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> Picture:
-        return Picture(name, title, caption, png(draw))
+    def picture(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> tuple[PageFigure, bytes]:
+        content = png(draw)
+        return PageFigure(name, title, caption, data_uri(content)), content
 
     pictures = [
         picture(
@@ -128,14 +105,13 @@ def analyse(point: Point) -> Analysis:
 
 def write(analysis: Analysis, folder: Path) -> Path:
     """Write `design.html`, `design.json` and the pictures; returns the page."""
-    for one in analysis.pictures:
-        (folder / f"{one.name}.png").write_bytes(one.content)
-    content = {
+    for one, content in analysis.pictures:
+        (folder / f"{one.name}.png").write_bytes(content)
+    result = {
         "geometry": analysis.point.geometry.model_dump(),
         "constants": asdict(analysis.point.linear.constants),
         "robot": dict(analysis.robot),
         "claims": [asdict(claim) for claim in analysis.claims],
     }
-    (folder / "design.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    shown = [(one, data_uri(one.content)) for one in analysis.pictures]
-    return write_page(folder / "design.html", "design.html.j2", analysis=analysis, shown=shown)
+    (folder / "design.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return write_page(folder / "design.html", "design.html.j2", analysis=analysis)

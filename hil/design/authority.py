@@ -6,7 +6,6 @@ at once are one array.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import product
 
@@ -106,23 +105,3 @@ def authority(linear: Linear, opening: float, low: float, high: float) -> dict[s
 def least(authorities: dict[str, float], of: dict[str, float]) -> float:
     """Return the smallest authority over the axes, each as a share of another robot's."""
     return min(authorities[name] / of[name] for name in QUANTITIES)
-
-
-def hull(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the corners of the convex hull of points (N, 2), in turn and closed."""
-    ordered = sorted(set(map(tuple, points.tolist())))
-
-    def side(path: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
-        kept: list[tuple[float, ...]] = []
-        for x, y in path:
-            while len(kept) > 1 and _turn(kept[-2], kept[-1], (x, y)) <= 0.0:
-                kept.pop()
-            kept.append((x, y))
-        return kept[:-1]
-
-    corners = side(ordered) + side(ordered[::-1])
-    return np.array([*corners, corners[0]])
-
-
-def _turn(a: tuple[float, ...], b: tuple[float, ...], c: tuple[float, ...]) -> float:
-    return math.fsum(((b[0] - a[0]) * (c[1] - a[1]), -(b[1] - a[1]) * (c[0] - a[0])))

@@ -7,13 +7,14 @@ derivation of scaling analysis", "Force analysis", "Torque analysis" and the Tab
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees
 
 import numpy as np
 
 from hil.design.authority import wrenches
-from hil.design.linear import AXES
+from hil.design.axes import AXES, PITCH, ROLL
+from hil.design.linear import places
 from hil.design.sweeps import (
     OPENINGS,
     RESERVE,
@@ -39,13 +40,13 @@ FORCES, CONSTANTS = "Force and torque analysis", "Table of dynamics constants"
 RATES = (
     "Plates damp by 1 to 3 1/s; the Table's value is that of a loop closed by the firmware's own rate gain."
 )
-PITCH = "13 times too large for any plate model of 0.34 kg: as if I_yy were 1e-4 kg m²."
+PITCH_INERTIA = "13 times too large for any plate model of 0.34 kg: as if I_yy were 1e-4 kg m²."
 SIDE = (
     "The five force constants mix balance, plate model and flight: no one geometry has them all. With the firmware's "
     "measured normal-force factor z/u4 is 3.05 and y/u1 -4.81."
 )
 WHY = {
-    "roll_rate": RATES, "pitch_rate": RATES, "yaw_rate": RATES, "pitch_u2": PITCH, "pitch_pitch": PITCH,
+    "roll_rate": RATES, "pitch_rate": RATES, "yaw_rate": RATES, "pitch_u2": PITCH_INERTIA, "pitch_pitch": PITCH_INERTIA,
     "y_u1": SIDE, "y_roll": SIDE, "x_u2": SIDE, "x_pitch": SIDE, "z_u4": SIDE,
 }  # fmt: skip
 
@@ -96,9 +97,8 @@ def claims(
 def _stable(point: Point, sweep: Stability) -> Iterator[Claim]:
     first = flat_high(point)
     linear, high = point.linear, first.linear
-    moved = Point(
-        balanced(changed(point.geometry, kink_angle=0.0), 0.0), point.coefficient, point.opening, point.low, point.high
-    ).linear.constants.roll_roll  # fmt: skip
+    lowered = balanced(changed(point.geometry, kink_angle=0.0), 0.0)
+    moved = replace(point, geometry=lowered).linear.constants.roll_roll
     f, g = linear.constants, high.constants
     yield Claim(
         "flat flaps, centre of mass in their plane: f_αα", DESIGN, "≈ +100 1/s²", f"{g.roll_roll:+.1f} 1/s²",
@@ -106,20 +106,20 @@ def _stable(point: Point, sweep: Stability) -> Iterator[Claim]:
         f"At the inertia of the robot as it is; with masses moved up it is smaller, and f_αα {moved:+.0f}. The paper gives "
         "neither the inertia nor the height of its first robot.",
     )  # fmt: skip
-    growth = high.growth("roll")
+    growth = high.growth(ROLL)
     yield Claim(
         "the same: unstable pole", DESIGN, "p₁ ≈ 9.5 1/s", f"{growth:.2f} 1/s", _near(growth, 9.5),
         "√f_αα would be the pole without damping and without the drift in y.",
     )  # fmt: skip
     yield Claim(
-        "flat flaps: pitch is stable by its V", DESIGN, "stable", text_of(high.poles("pitch")),
-        _holds(high.growth("pitch") < 0.0),
+        "flat flaps: pitch is stable by its V", DESIGN, "stable", text_of(high.poles(PITCH)),
+        _holds(high.growth(PITCH) < 0.0),
     )  # fmt: skip
     ours = f"{f.roll_roll:+.1f} 1/s²"
     yield Claim("kink and low centre of mass: f_αα", DESIGN, "≈ -16 1/s²", ours, _near(f.roll_roll, -16.0))
-    first_pole = linear.poles("roll")[0]
+    first_pole = linear.poles(ROLL)[0]
     yield Claim(
-        "the same: roll poles", DESIGN, "-0.5 ± 4i", text_of(linear.poles("roll")),
+        "the same: roll poles", DESIGN, "-0.5 ± 4i", text_of(linear.poles(ROLL)),
         _holds(abs(first_pole - complex(-0.5, 4.0)) < ROUGHLY * 4.0),
         "The real pole is the drift in y. These poles need a rate constant of -1 to -2, not the Table's -40.",
     )  # fmt: skip
@@ -132,17 +132,16 @@ def _stable(point: Point, sweep: Stability) -> Iterator[Claim]:
         "pitch stays stable by its V",
         DESIGN,
         "stable",
-        text_of(linear.poles("pitch")),
-        _holds(linear.growth("pitch") < 0),
+        text_of(linear.poles(PITCH)),
+        _holds(linear.growth(PITCH) < 0),
     )
     yield Claim(
         "rates are damped in roll and pitch", DESIGN, "both < 0", f"{f.roll_rate:.2f}, {f.pitch_rate:.2f} 1/s",
         _holds(f.roll_rate < 0 and f.pitch_rate < 0),
     )  # fmt: skip
-    states = [list(axis) for axis in AXES.values()]
     own = np.zeros_like(linear.A, dtype=bool)
-    for axis in [*states, [5, 8]]:
-        own[np.ix_(axis, axis)] = True
+    for states in [*map(places, AXES), [5, 8]]:
+        own[np.ix_(states, states)] = True
     foreign = float(np.abs(linear.A[~own]).max())
     yield Claim(
         "dynamics decouple into roll, pitch, yaw and height", DESIGN, "four parts",
@@ -239,5 +238,5 @@ def robot_lines(point: Point) -> list[tuple[str, str]]:
                                   f"{100 * point.geometry.base_side:.1f} cm"),
         ("hover", f"{degrees(point.opening):.1f}° at {point.speed:.2f} m/s, C_D = {point.coefficient:.3f}"),
         ("updrafts with 8° left for attitude", f"{low:.2f} to {high:.2f} m/s"),
-        *((f"poles, {axis}", text_of(linear.poles(axis))) for axis in AXES),
+        *((f"poles, {axis.name}", text_of(linear.poles(axis))) for axis in AXES),
     ]  # fmt: skip

@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
-from hil.design.authority import QUANTITIES, Attainable, hull
+from hil.design.authority import QUANTITIES, Attainable
 from hil.design.sweeps import FACTORS, HEIGHTS, KINKS, OPENINGS, HoverAngles, Law, Point, Stability
 from hil.pictures import scene
 from hil.pictures.curves import (
@@ -153,7 +154,8 @@ def reach(point: Point, found: Attainable) -> Figure:
 
 def _outline(axes: Axes, points: Points, colour: str, label: str) -> None:
     if len(points) > 2:
-        axes.fill(*hull(points).T, facecolor=colour, alpha=0.25, edgecolor=colour, label=label)
+        corners = points[ConvexHull(points, qhull_options="QJ").vertices]
+        axes.fill(*corners.T, facecolor=colour, alpha=0.25, edgecolor=colour, label=label)
 
 
 def scale(laws: tuple[Law, ...]) -> Figure:

@@ -7,101 +7,90 @@ weights by Bryson's rule. `floaty design --write` puts them into a profile.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from math import radians
 
+import control
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.optimize import minimize
 
+from hil.design.axes import ANGLE, AXES, POSITION, RATE, STEP_S, VELOCITY, YAW, Axis, Matrix, Robot, dynamics
 from hil.design.linear import Linear
+from hil.design.loop import held
 from hil.errors import LabError
 
-try:
-    from scipy.linalg import expm, solve_discrete_are, solve_discrete_lyapunov
-    from scipy.optimize import minimize
-except ImportError:
-    from firmware_py.extras import install_command
-
-    raise LabError(f"gains need scipy: {install_command('design')}") from None
-
-PERIOD = 0.01  # [s] of the controller
 FLAP_RATE = 20.0  # [1/s] of the servos' lag; original firmware
 # The greatest deviation that Bryson's rule allows, in SI units.
-ALLOWED = {"position": 0.06, "velocity": 0.3, "angle": radians(8.0), "rate": 1.0, "turn": radians(10.0)}
+ALLOWED = {POSITION: 0.06, VELOCITY: 0.3, ANGLE: radians(8.0), RATE: 1.0}
+TURN_ALLOWED = ALLOWED | {ANGLE: radians(10.0)}  # of yaw
 FLAPS_ALLOWED = radians(8.0)
-GUSTS = {"velocity": 0.01, "rate": 0.15}  # [m/s], [rad/s] per period: T0 on the paper's robot
-INTEGRAL = 1.0 / 3.0  # [1/s] gain_iz per gain_z, as in profiles/floaty.toml
+GUSTS = {VELOCITY: 0.01, RATE: 0.15}  # [m/s], [rad/s] per period: T0 on the paper's robot
+INTEGRAL = 1.0 / 3.0  # [1/s] gain of the integral per gain, as in profiles/floaty.toml
 LOST = 1e9
-Matrix = NDArray[np.float64]
-
-# Gains by input: names in the profile, states of `Linear` behind them (None: the integral of the next), their kinds of units
-LOOPS: tuple[tuple[tuple[str, ...], tuple[int | None, ...], tuple[str, ...]], ...] = (
-    (("gain_y", "gain_vy", "gain_roll", "gain_p"), (None, 1, 3, 6), ("position", "velocity", "angle", "rate")),
-    (("gain_x", "gain_vx", "gain_pitch", "gain_q"), (None, 0, 4, 7), ("position", "velocity", "angle", "rate")),
-    (("gain_yaw", "gain_r"), (5, 8), ("turn", "rate")),
-    (("gain_z", "gain_vz"), (None, 2), ("position", "velocity")),
-)  # fmt: skip
 
 
 def gains_of(model: Linear) -> dict[str, float]:
     """Return the controller's gains by their names in a profile. Raises `LabError` when an axis cannot be held."""
+    robot = model.robot | {"flap_rate": FLAP_RATE}
     found: dict[str, float] = {}
-    for index, (names, states, kinds) in enumerate(LOOPS):
-        values = _least_cost(*_sampled(model, index, states), kinds, names[0])
-        found |= {name: float(f"{value:.4g}") for name, value in zip(names, values, strict=True)}
-    return found | {"gain_iz": float(f"{INTEGRAL * found['gain_z']:.4g}")}
+    for axis in AXES:
+        found |= dict(zip(axis.gains, rounded(with_integral(axis, _least_cost(axis, robot))), strict=True))
+    return found
 
 
-def _sampled(model: Linear, index: int, states: Sequence[int | None]) -> tuple[Matrix, Matrix]:
-    """Return one axis sampled: its states, the flap angle, and the command that is still delayed."""
-    n = len(states)
-    flow = np.zeros((n + 2, n + 2))  # the last one is the command, held
-    for row, state in enumerate(states):
-        if state is None:
-            flow[row, row + 1] = 1.0
-            continue
-        for column, other in enumerate(states):
-            if other is not None:
-                flow[row, column] = model.A[state, other]
-        flow[row, n] = model.B[state, index]
-    flow[n, n], flow[n, n + 1] = -FLAP_RATE, FLAP_RATE
-    stepped = expm(flow * PERIOD)
-    A = np.zeros((n + 2, n + 2))
-    A[: n + 1] = stepped[: n + 1]
-    B = np.zeros((n + 2, 1))
-    B[n + 1] = 1.0
-    return A, B
+def rounded(gains: Matrix) -> list[float]:
+    """Return gains to the four digits that a profile keeps."""
+    return [float(f"{gain:.4g}") for gain in gains]
 
 
-def _least_cost(A: Matrix, B: Matrix, kinds: Sequence[str], name: str) -> Matrix:
-    n = len(kinds)
+def with_integral(axis: Axis, gains: Matrix) -> Matrix:
+    """Return the gains on the states, and that of the integral where there is one."""
+    return gains if len(axis.gains) == len(axis.states) else np.append(gains, INTEGRAL * gains[0])
+
+
+def regulator(axis: Axis, A: Matrix, B: Matrix, allowed: Mapping[str, float], input_allowed: float) -> Matrix:
+    """Return the gains of the linear quadratic regulator on all rows of `A`, whose first are the axis' states.
+
+    Raises `LabError` when the flaps cannot hold the axis.
+    """
     Q = np.zeros_like(A)
-    Q[range(n), range(n)] = [ALLOWED[kind] ** -2 for kind in kinds]
-    R = np.array([[FLAPS_ALLOWED**-2]])
-    W = np.zeros_like(A)
-    W[range(n), range(n)] = [GUSTS.get(kind, 0.0) ** 2 for kind in kinds]
+    n = len(axis.states)
+    Q[range(n), range(n)] = [allowed[state] ** -2 for state in axis.states]
     try:
-        P = solve_discrete_are(A, B, Q, R)
+        K, _, _ = control.dlqr(A, B, Q, [[input_allowed**-2]])
     except (np.linalg.LinAlgError, ValueError):
-        raise LabError(f"no gains: {name[5:]} cannot be held by the flaps") from None
-    start = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)[0, :n]
+        raise LabError(f"no gains: {axis.label} cannot be held by the flaps") from None
+    return np.asarray(K[0])
 
-    def radius(K: Matrix) -> float:
-        return float(np.abs(np.linalg.eigvals(A - B @ np.append(K, (0.0, 0.0))[None])).max())
 
-    def cost(K: Matrix) -> float:
-        if radius(K) >= 0.9999:
-            return LOST * radius(K)
-        row = np.append(K, (0.0, 0.0))[None]
-        closed = A - B @ row
-        return float(np.trace(solve_discrete_lyapunov(closed.T, Q + row.T @ R @ row) @ W))
+def _least_cost(axis: Axis, robot: Robot) -> Matrix:
+    Phi, Gamma = held(*dynamics(axis, robot), STEP_S)
+    n, size = len(axis.states), len(Phi) + 1  # the last state is the command, which is still delayed
+    A, B = np.zeros((size, size)), np.eye(size)[:, -1:]
+    A[:-1] = np.hstack([Phi, Gamma[:, :1]])
+    allowed = TURN_ALLOWED if axis is YAW else ALLOWED
+    Q, W = np.zeros((size, size)), np.zeros((size, size))
+    Q[range(n), range(n)] = [allowed[state] ** -2 for state in axis.states]
+    W[range(n), range(n)] = [GUSTS.get(state, 0.0) ** 2 for state in axis.states]
+
+    def closed(gains: Matrix) -> tuple[Matrix, float]:
+        row = np.append(gains, (0.0, 0.0))[None]
+        return row, float(np.abs(np.linalg.eigvals(A - B @ row)).max())
+
+    def cost(gains: Matrix) -> float:
+        row, radius = closed(gains)
+        if radius >= 0.9999:
+            return LOST * radius
+        weight = Q + row.T @ row * FLAPS_ALLOWED**-2
+        return float(np.trace(solve_discrete_lyapunov((A - B @ row).T, weight) @ W))
 
     search = {"maxiter": 4000, "maxfev": 4000, "xatol": 1e-5, "fatol": 1e-9, "adaptive": True}
-    best: Matrix = np.asarray(start)
+    best = regulator(axis, A, B, allowed, FLAPS_ALLOWED)[:n]
     for _ in range(2):  # the second from the end of the first, with a fresh simplex
         best = np.asarray(minimize(cost, best, method="Nelder-Mead", options=search).x)
     if cost(best) >= LOST * 0.9:
         raise LabError(
-            f"no gains: {name[5:]} cannot be held by these four gains; its loop grows by {radius(best):.3f} per step"
+            f"no gains: {axis.label} cannot be held by these gains; its loop grows by {closed(best)[1]:.3f} per step"
         )
     return best

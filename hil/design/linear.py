@@ -9,8 +9,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.design.axes import ANGLE, AXES, FLAP, NUISANCES, PITCH, RATE, ROLL, VELOCITY, Axis, Matrix
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
 from hil.world.correction import DIFFERENCE, Constants, accelerations, calm, slope
 from hil.world.plant import assemble
@@ -18,8 +18,6 @@ from hil.world.plates import State
 
 CAUSES = ("vx", "vy", "vz", "qx", "qy", "qz", "ox", "oy", "oz", "u1", "u2", "u3", "u4")
 STATES = 9
-AXES = {"roll": (1, 3, 6), "pitch": (0, 4, 7), "yaw": (8,), "height": (2,)}  # states of each, by input u1..u4
-Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,34 +30,48 @@ class Linear:
     @property
     def constants(self) -> Constants:
         """The constants by the paper's names."""
-        A, B = self.A, self.B
-        chosen = {
-            "roll_u1": B[6, 0], "roll_roll": A[6, 3], "roll_rate": A[6, 6], "y_u1": B[1, 0], "y_roll": A[1, 3],
-            "pitch_u2": B[7, 1], "pitch_pitch": A[7, 4], "pitch_rate": A[7, 7], "x_u2": B[0, 1], "x_pitch": A[0, 4],
-            "yaw_u3": B[8, 2], "yaw_rate": A[8, 8], "z_u4": B[2, 3], "z_vz": A[2, 2], "y_vy": A[1, 1], "x_vx": A[0, 0],
-            "roll_vy": A[6, 1], "pitch_vx": A[7, 0],
-        }  # fmt: skip
-        return Constants(**{name: float(value) for name, value in chosen.items()})
+        return Constants(**{name: value for name, value in self.robot.items() if name not in NUISANCES})
 
-    def poles(self, axis: str) -> list[complex]:
+    @property
+    def robot(self) -> dict[str, float]:
+        """All constants of the four axes."""
+        both = np.hstack([self.A, self.B])
+        return {
+            name: float(both[_place(axis, affected), _place(axis, cause)])
+            for axis in AXES
+            for name, (affected, cause) in axis.terms.items()
+        }
+
+    def poles(self, axis: Axis) -> list[complex]:
         """Return the open-loop poles [1/s] of an axis with the velocity that it drives, the slowest oscillation first."""
-        chosen = list(AXES[axis])
+        chosen = places(axis)
         found = np.linalg.eigvals(self.A[np.ix_(chosen, chosen)])
         return sorted(map(complex, found), key=lambda pole: (-abs(pole.imag), -pole.real, -pole.imag))
 
-    def steady(self, axis: str) -> float:
+    def steady(self, axis: Axis) -> float:
         """Return the sideways acceleration per input [m/s2] once the attitude has followed, in its usual direction.
 
         Negative: the robot steers in the opposite direction to the paper's; NaN for yaw and height.
         """
         f = self.constants
-        if axis == "pitch":
+        if axis is PITCH:
             return f.x_u2 - f.x_pitch * f.pitch_u2 / f.pitch_pitch
-        return -(f.y_u1 - f.y_roll * f.roll_u1 / f.roll_roll) if axis == "roll" else math.nan
+        return -(f.y_u1 - f.y_roll * f.roll_u1 / f.roll_roll) if axis is ROLL else math.nan
 
-    def growth(self, axis: str) -> float:
+    def growth(self, axis: Axis) -> float:
         """Return the largest real part of an axis' poles [1/s]: positive when it falls over by itself."""
         return max(pole.real for pole in self.poles(axis))
+
+
+def places(axis: Axis) -> list[int]:
+    """Return the places of an axis' states in CAUSES; the controlled one, a cause of nothing, has none."""
+    return [_place(axis, state) for state in axis.states[1:]]
+
+
+def _place(axis: Axis, state: str) -> int:
+    if state == VELOCITY:
+        return "xyz".index(axis.coordinate)
+    return {ANGLE: 3, RATE: 6, FLAP: STATES}[state] + axis.input
 
 
 def calm_plates(geometry: GeometryConfig, speed: float, opening: float) -> State:

@@ -9,23 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import differential_evolution
 
 from hil.design.authority import least
+from hil.design.axes import PITCH, ROLL
 from hil.design.sweeps import RESERVE, Point, authorities
 from hil.design.trim import balanced, changed, opening_at, speed_at
 from hil.errors import LabError
 from hil.world.geometry import weigh
-
-try:
-    from scipy.optimize import differential_evolution
-except ImportError:
-    from firmware_py.extras import install_command
-
-    raise LabError(f"floaty design optimise needs scipy: {install_command('design')}") from None
 
 BOUNDS = {  # shares of the footprint, except the kink
     "kink": (0.0, math.radians(80.0)), "height": (0.0, 0.5), "base": (0.15, 0.5), "strip": (0.02, 0.2),
@@ -57,10 +52,7 @@ class Optimum:
 def held(point: Point) -> tuple[float, float]:
     """Return the updrafts [m/s] around the hover that the robot holds: stable, steering, 8° of each flap in reserve."""
     openings = np.arange(point.low + RESERVE, point.high - RESERVE + 1e-9, STEP)
-    good = [
-        _flies(Point(point.geometry, point.coefficient, one, point.low, point.high))
-        for one in openings.tolist()
-    ]
+    good = [_flies(replace(point, opening=one)) for one in openings.tolist()]
     middle = int(np.abs(openings - point.opening).argmin())
     if not good[middle]:
         return math.nan, math.nan
@@ -76,15 +68,15 @@ def held(point: Point) -> tuple[float, float]:
 def _flies(point: Point) -> bool:
     model = point.linear
     return (
-        max(model.growth("roll"), model.growth("pitch")) < 0.0
-        and min(model.steady("roll"), model.steady("pitch")) > 0.0
+        max(model.growth(ROLL), model.growth(PITCH)) < 0.0
+        and min(model.steady(ROLL), model.steady(PITCH)) > 0.0
     )
 
 
 def least_authority(point: Point, reference: Mapping[str, float]) -> float:
     """Return the least authority over roll, pitch, yaw and lift as a share of the reference's; BAD when it cannot fly."""
     around = (point.opening - RESERVE, point.opening, point.opening + RESERVE)
-    robots = [Point(point.geometry, point.coefficient, one, point.low, point.high) for one in around]
+    robots = [replace(point, opening=one) for one in around]
     return least(authorities(point), dict(reference)) if all(map(_flies, robots)) else BAD
 
 
@@ -118,7 +110,7 @@ def optimise(reference: Point, figure: str, seed: int, generations: int = GENERA
             opening = opening_at(shape, reference.coefficient, speed)
         except LabError:  # no hover at this speed
             return None
-        return Point(shape, reference.coefficient, opening, reference.low, reference.high)
+        return replace(reference, geometry=shape, opening=opening)
 
     def loss(x: NDArray[np.float64]) -> float:
         point = build(x)

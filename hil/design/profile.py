@@ -7,6 +7,8 @@ from dataclasses import asdict
 from math import degrees
 from typing import Any
 
+from pydantic import BaseModel
+
 from hil.design.sweeps import Point
 from hil.world.config import GeometryConfig
 
@@ -16,27 +18,32 @@ def profile_text(point: Point, gains: Mapping[str, float], about: str, length: f
     found = point.linear
     model = asdict(found.constants)
     sections: dict[str, Mapping[str, Any]] = {
-        "geometry": _stated(point.geometry),
+        "geometry": changes(point.geometry, GeometryConfig()),
         "plant": {"variant": "plate", "airspeed": point.speed, "hover_angle": point.opening},
         "tunnel": {"speed": point.speed} | ({"profile_radius": 0.45 * length} if length > 1.0 else {}),
         "model": {name: float(f"{value:.5g}") for name, value in model.items()},
         "controller": gains,
         "allocation": {"hover_angle": float(f"{point.opening:.6g}"), "opening_min": point.low, "opening_max": point.high},
     }  # fmt: skip
-    lines = [
-        *(f"# {line}" for line in about.splitlines()),
-        f"# Written by floaty design; hover at {degrees(point.opening):.2f} deg and {point.speed:.2f} m/s, C_D = "
-        f"{point.coefficient:.4f}. Plate model on board; gains by hil/design/gains.py.",
-        'base = "floaty"',
-    ]
+    written = (
+        f"{about}\nWritten by floaty design; hover at {degrees(point.opening):.2f} deg and {point.speed:.2f} m/s, C_D = "
+        f"{point.coefficient:.4f}. Plate model on board; gains by hil/design/gains.py."
+    )
+    return toml_text(written, "floaty", sections)
+
+
+def toml_text(about: str, base: str, sections: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a profile on top of another one, with comments first; sections without keys are left out."""
+    lines = [*(f"# {line}" for line in about.splitlines()), f'base = "{base}"']
     for name, values in sections.items():
-        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
+        if values:
+            lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
     return "\n".join(lines) + "\n"
 
 
-def _stated(geometry: GeometryConfig) -> dict[str, Any]:
-    """Return the values of a geometry that differ from G0."""
-    own, usual = geometry.model_dump(), GeometryConfig().model_dump()
+def changes(section: BaseModel, base: BaseModel) -> dict[str, Any]:
+    """Return the values of a section that differ from another profile's."""
+    own, usual = section.model_dump(), base.model_dump()
     return {key: value for key, value in own.items() if value != usual[key]}
 
 

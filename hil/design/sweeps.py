@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.config import LabConfig
 from hil.design.authority import QUANTITIES, authority, reach
+from hil.design.axes import ROLL
 from hil.design.linear import Linear, linear, stiffness
-from hil.design.trim import balanced, changed, scaled, speed_at
+from hil.design.trim import balanced, changed, coefficient_of, scaled, speed_at
 from hil.world.body import AIR_DENSITY
 from hil.world.config import GeometryConfig
 from hil.world.geometry import weigh
@@ -46,6 +48,18 @@ class Point:
         return linear(self.geometry, self.speed, self.opening)
 
 
+def point_of(config: LabConfig) -> Point:
+    """Return a profile's robot at its design hover."""
+    limits = config.allocation
+    return Point(
+        config.geometry,
+        coefficient_of(config),
+        config.plant.hover_angle,
+        limits.opening_min,
+        limits.opening_max,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Stability:
     """f_αα [1/s2] over kink and height, and the roll poles over the kink at the robot's own height; the inertia is kept."""
@@ -58,34 +72,24 @@ class Stability:
 
 def stability(point: Point) -> Stability:
     """Return the sweep over kink and centre of mass, at the same hover angle."""
+    from scipy.optimize import brentq
+
     rows = [balanced(point.geometry, height, keep_inertia=True) for height in HEIGHTS.tolist()]
     surface = [[_stiffness(point, row, kink) for kink in KINKS.tolist()] for row in rows]
     along = np.array([_stiffness(point, point.geometry, kink) for kink in KINKS.tolist()])
     kinked = [changed(point.geometry, kink_angle=kink) for kink in KINKS.tolist()]
-    poles = [_at(point, one).linear.poles("roll") for one in kinked]
+    poles = [replace(point, geometry=one).linear.poles(ROLL) for one in kinked]
     falling = np.flatnonzero((along[:-1] > 0.0) & (along[1:] <= 0.0))
     crossing = np.nan
     if len(falling):
-        crossing = _zero(
-            lambda kink: _stiffness(point, point.geometry, kink), KINKS[falling[0]], KINKS[falling[0] + 1]
-        )
+        ends = KINKS[falling[0]], KINKS[falling[0] + 1]
+        crossing = brentq(lambda kink: _stiffness(point, point.geometry, kink), *ends)
     return Stability(np.array(surface), along, np.array(poles), crossing)
-
-
-def _at(point: Point, geometry: GeometryConfig) -> Point:
-    return Point(geometry, point.coefficient, point.opening, point.low, point.high)
 
 
 def _stiffness(point: Point, geometry: GeometryConfig, kink: float) -> float:
     bent = changed(geometry, kink_angle=kink)
     return stiffness(bent, speed_at(bent, point.coefficient, point.opening), point.opening)
-
-
-def _zero(of: Callable[[float], float], above: float, below: float) -> float:
-    for _ in range(40):
-        middle = (above + below) / 2
-        above, below = (middle, below) if of(middle) > 0.0 else (above, middle)
-    return above
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +108,7 @@ class HoverAngles:
 
 def hover_angles(point: Point) -> HoverAngles:
     """Return the sweep over the hover angle; the updraft follows."""
-    found = [
-        Point(point.geometry, point.coefficient, o, point.low, point.high).linear.constants
-        for o in OPENINGS.tolist()
-    ]
+    found = [replace(point, opening=opening).linear.constants for opening in OPENINGS.tolist()]
     names = dict(zip(QUANTITIES, ("roll_u1", "pitch_u2", "yaw_u3", "z_u4"), strict=True))
     constants = {key: np.array([getattr(f, name) for f in found]) for key, name in names.items()}
     sizes = {key: np.maximum(values, 0.0) for key, values in constants.items()}
@@ -135,8 +136,8 @@ class Law:
 
 def scaling(point: Point) -> tuple[Law, ...]:
     """Return the effect of size and mass at the same hover angle."""
-    sizes = [_at(point, scaled(point.geometry, factor, 1.0)) for factor in FACTORS.tolist()]
-    masses = [_at(point, scaled(point.geometry, 1.0, factor)) for factor in FACTORS.tolist()]
+    sizes = [replace(point, geometry=scaled(point.geometry, factor, 1.0)) for factor in FACTORS.tolist()]
+    masses = [replace(point, geometry=scaled(point.geometry, 1.0, factor)) for factor in FACTORS.tolist()]
 
     def law(
         quantity: str, cause: str, points: list[Point], of: Callable[[Point], float], paper: float
@@ -188,13 +189,12 @@ def updrafts(point: Point, reserve: float) -> tuple[float, float]:
     )
 
 
-FLAT = {"kink_angle": 0.0}
 RESERVE = radians(8.0)  # of the opening, for attitude: 95 % of the hover's time (hil/experiments/airspeed.py)
 
 
 def flat_high(point: Point) -> Point:
     """Return the paper's first idea: flat flaps, the centre of mass in their plane; the inertia is kept."""
-    return _at(point, balanced(changed(point.geometry, **FLAT), 0.0, keep_inertia=True))
+    return replace(point, geometry=balanced(changed(point.geometry, kink_angle=0.0), 0.0, keep_inertia=True))
 
 
 def authorities(point: Point) -> dict[str, float]:

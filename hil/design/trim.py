@@ -18,7 +18,6 @@ from hil.world.config import GeometryConfig
 from hil.world.geometry import weigh
 
 OPENINGS = np.radians(np.arange(-20.0, 75.5, 2.5))  # searched for a trim
-BISECTIONS = 50
 
 
 def coefficient_of(config: LabConfig) -> float:
@@ -36,6 +35,8 @@ def opening_at(geometry: GeometryConfig, coefficient: float, speed: float) -> fl
 
     Raises `LabError` when there is none.
     """
+    from scipy.optimize import brentq
+
     speeds = np.array([speed_at(geometry, coefficient, opening) for opening in OPENINGS.tolist()])
     below = np.flatnonzero((speeds[:-1] <= speed) & (speeds[1:] > speed))
     if not len(below):
@@ -44,11 +45,8 @@ def opening_at(geometry: GeometryConfig, coefficient: float, speed: float) -> fl
             f"{math.degrees(OPENINGS[-1]):.0f} deg the flaps carry {weigh(geometry).mass:.3g} kg at "
             f"{speeds.min():.2f} to {speeds.max():.2f} m/s"
         )
-    low, high = OPENINGS[below[-1]], OPENINGS[below[-1] + 1]
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if speed_at(geometry, coefficient, middle) <= speed else (low, middle)
-    return float(low)
+    ends = OPENINGS[below[-1]], OPENINGS[below[-1] + 1]
+    return float(brentq(lambda opening: speed_at(geometry, coefficient, opening) - speed, *ends))
 
 
 def changed(geometry: GeometryConfig, **changes: Any) -> GeometryConfig:

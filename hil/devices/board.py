@@ -1,10 +1,12 @@
 """The board's pins, joined to the virtual world: IMU registers, servo timers, radio chip, UART, debug console."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.wire.mavlink_numbers import Result
+from hil.devices.board_firmware import Processor
 from hil.events import EventQueue
 
 STILL: ImuCounts = (0, 0, 0, 0, 0, 0)
@@ -29,25 +31,28 @@ class Uart(Protocol):
         ...
 
 
-class Processing(Protocol):
-    """The time of a booted processor, counted from its boot."""
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """What a board keeps without power."""
 
-    @property
-    def now_us(self) -> int:
-        """The present instant."""
-        ...
+    eeprom: bytearray = field(default_factory=lambda: bytearray(b"\xff" * EEPROM_SIZE))
+    deck: bytearray = field(default_factory=lambda: bytearray(b"\xff" * DECK_MEMORY_SIZE))
 
-    def stop_before(self, us: int) -> None:
-        """Limit the run to the instants before this one."""
-        ...
+
+def stay_on(now_us: int) -> None:
+    """Ignore a reset."""
+
+
+def unsupported(now_us: int, unit: int, failing: int, instance: int) -> Result:
+    """Let nothing fail."""
+    return Result.UNSUPPORTED
 
 
 class VirtualBoard:
     """Implements `firmware_py.board.Board`; `servo`, `radio`, `console` and `uart` are where the pins lead to.
 
     They get instants by the clock of the hardware. `run_on` sets the processor whose time counts, and the hardware that pins
-    may trigger. `on_reset` and `on_failure` may be set later: by default a reset has no effect and no failure can be
-    injected.
+    may trigger. `reset` is called when the processor resets itself, `fail` when a client lets a part of the robot fail.
     """
 
     def __init__(
@@ -56,26 +61,37 @@ class VirtualBoard:
         radio: Callable[[int, bytes], bool],
         console: Callable[[int, str], None],
         uart: Uart | None = None,
+        reset: Callable[[int], None] = stay_on,
+        fail: InjectFailure = unsupported,
+        memory: Memory | None = None,
     ) -> None:
-        self.on_reset: Callable[[int], None] = lambda now_us: None
-        self.on_failure: InjectFailure = lambda now_us, unit, failing, instance: Result.UNSUPPORTED
         self.imu: ImuCounts = STILL
         self.battery_mv = 3900
-        self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
-        self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
+        memory = memory or Memory()
+        self.eeprom, self.deck_memory = memory.eeprom, memory.deck
+        self._reset = reset
+        self._fail = fail
         self._servo = servo
         self._radio = radio
         self._console = console
         self._uart = uart
-        self._kernel: Processing | None = None
+        self._kernel: Processor | None = None
         self._events: EventQueue | None = None
         self._booted_us = 0
+
+    def measure(self, counts: ImuCounts) -> None:
+        """Load the IMU's registers with a sample."""
+        self.imu = counts
+
+    def supply(self, millivolts: int) -> None:
+        """Let the supply voltage be that."""
+        self.battery_mv = millivolts
 
     def boot(self, now_us: int) -> None:
         """Start a processor's time at an instant of the hardware's; `run_on` follows when it has booted."""
         self._kernel, self._booted_us = None, now_us
 
-    def run_on(self, kernel: Processing, events: EventQueue) -> None:
+    def run_on(self, kernel: Processor, events: EventQueue) -> None:
         """Join the pins to a booted processor and to the queue of hardware events."""
         self._kernel, self._events = kernel, events
 
@@ -97,7 +113,9 @@ class VirtualBoard:
         self._servo(self.now_us, counts)
 
     def radio_send(self, data: bytes) -> bool:
-        """Hand a packet to the radio chip."""
+        """Hand a packet to the radio chip; while the processor boots nobody listens."""
+        if self._kernel is None:
+            return True
         accepted = self._radio(self.now_us, data)
         self._let_hardware_go_first()
         return accepted
@@ -130,11 +148,11 @@ class VirtualBoard:
 
     def reset(self) -> None:
         """Notify the owner, who reboots the processor before its tasks continue."""
-        self.on_reset(self.now_us)
+        self._reset(self.now_us)
         self._let_hardware_go_first()
 
     def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
         """Pass a request for a failure to the world."""
-        result = self.on_failure(self.now_us, unit, failing, instance)
+        result = self._fail(self.now_us, unit, failing, instance)
         self._let_hardware_go_first()
         return result

@@ -1,7 +1,7 @@
 """A Crazyradio dongle: vendor requests in, one packet and its acknowledgement per exchange, boards within reach.
 
 Here the host is real software, so every exchange happens, empty polls included. Losses on the air are in
-`hil.devices.shockburst`. With acknowledgements switched off a packet is sent once and the host reads nothing. A packet to
+`hil.crazyflie.shockburst`. With acknowledgements switched off a packet is sent once and the host reads nothing. A packet to
 the address of all boards reaches every board on that channel, and none of them answers.
 """
 
@@ -10,9 +10,9 @@ from functools import partial
 
 import numpy as np
 
-from hil.devices.config import RadioConfig
-from hil.devices.nrf51 import RATES, Nrf51, RadioSettings
-from hil.devices.shockburst import MAX_PACKET, RETRIES, Air, Exchange, Transmitter
+from hil.crazyflie.config import RadioConfig
+from hil.crazyflie.nrf51 import RATES, Nrf51, RadioSettings
+from hil.crazyflie.shockburst import MAX_PACKET, RETRIES, Air, Exchange, Transmitter
 from hil.events import EventQueue
 
 Answer = Callable[[int, bytes], None]  # (now_us, what the host reads from the dongle)

@@ -37,7 +37,8 @@ def low_pass(bandwidth: float) -> tuple[float, float, float]:
 class VirtualImu:
     """One specimen of the sensor: its biases are drawn from `rng` when it is made.
 
-    `noise_scale`, `rate_bias` (p, q, r [rad/s] in B), `rate_range` [rad/s] and `frozen` hold the values last set.
+    `noise_scale`, `rate_bias` (p, q, r [rad/s] in B), `rate_range` [rad/s], `frozen` and `silent` hold the values last
+    set.
     """
 
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
@@ -50,8 +51,9 @@ class VirtualImu:
         rows[3:, [at.B0, at.A1, at.A2]] = low_pass(config.accel_bandwidth)
         self._draws: list[View] = []
         rows[:, at.RANGE] = COUNTS
-        self.rate_range = COUNTS / GYRO_COUNTS
-        self.frozen = False
+        self.rate_range: float = COUNTS / GYRO_COUNTS
+        self.frozen: bool = False
+        self.silent: bool = False
         self.set_noise_scale(1.0)
         self.set_rate_bias(0.0, 0.0, 0.0)
 
@@ -65,7 +67,7 @@ class VirtualImu:
         """Scale the white noise of all channels; 1 as configured."""
         if not 0.0 <= scale <= 1000.0:
             raise LabError(f"IMU noise scale = {scale}: outside 0..1000")
-        self.noise_scale = scale
+        self.noise_scale: float = scale
         self._rows[:, at.NOISE] = scale * self._noise
 
     def set_rate_bias(self, p: float, q: float, r: float) -> None:
@@ -82,3 +84,7 @@ class VirtualImu:
         """Repeat the last sample from now on, or end that."""
         self.frozen = frozen
         self._rows[:, at.STUCK] = float(frozen)
+
+    def silence(self, silent: bool) -> None:
+        """Raise no data-ready interrupt from now on, or end that."""
+        self.silent = silent

@@ -2,7 +2,7 @@
 
 One exchange carries at most one packet in each direction: the host hands a packet (or an empty poll) to the dongle over USB,
 and the board's answer goes back to it. A packet that the dongle repeats in vain is repeated by the host with the same
-contents; safelink's counters make delivery exactly once and in order. Losses on the air are in `hil.devices.shockburst`.
+contents; safelink's counters make delivery exactly once and in order. Losses on the air are in `hil.crazyflie.shockburst`.
 
 Exchanges that carry something are events. The empty polls in between are not: when something is ready, the
 poll that it meets is computed (the first of the pause) or drawn (any later one: the host's jitter has made
@@ -20,8 +20,8 @@ from typing import Final
 import numpy as np
 
 from firmware_py.elementary import power
-from hil.devices.config import RadioConfig
-from hil.devices.shockburst import (
+from hil.crazyflie.config import RadioConfig
+from hil.crazyflie.shockburst import (
     MAX_PACKET,
     RETRIES,
     TURN_ROUND_US,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
-from firmware_py.export.cortex_m4 import Load, Usage
+from firmware_py.export.usage import Load, Usage
 from firmware_py.extras import install_command
 from firmware_py.wire.core_port import WRITE_MAX, About, Call, Called, call, write
 from ground_station.errors import LinkError
@@ -22,6 +22,8 @@ from ground_station.links.core_client import CoreClient, runs
 from hil.errors import LabError
 
 Bytes = NDArray[np.uint8]
+# What runs every millisecond is executed on this side: a link takes longer than that for a call.
+HERE = ("begin_step", "take_sample")
 
 
 def is_link(board: str) -> bool:
@@ -56,9 +58,10 @@ class RealCore:
     """
 
     def __init__(self, blocks: CoreBlocks, client: CoreClient) -> None:
-        self.load = {entry.name.lower(): Load() for entry in Call}
+        self.load = {entry.name.lower(): Load() for entry in Call if entry.name.lower() not in HERE}
         self.unexpected = 0  # calls that came to something else than here
         self._client = client
+        self._host = PythonRunner(blocks)
         self._here = _bytes_of(blocks)
         # where a call is computed without touching what flies
         self._copy = CoreBlocks(blocks.parameters.kind.allocate(), PythonRunner, blocks.logic)
@@ -74,24 +77,23 @@ class RealCore:
         # the call whose results the board has, and its inputs
         self._ahead: tuple[str, Bytes, Called] | None = None
 
-    def reset(self) -> None:
-        """Start the estimator."""
-        self._call("reset")
-
-    def file_pose(self) -> int:
-        """File the input's pose."""
-        called = self._call("file_pose")
-        self._filed_cycles += called.cycles
+    def call(self, name: str) -> int:
+        """Have an entry point executed and let its results out; what was executed ahead on the same inputs is taken."""
+        if name in HERE:
+            return self._host.call(name)
+        inputs = np.concatenate(self._here)
+        if self._ahead is not None and self._ahead[0] == name and np.array_equal(self._ahead[1], inputs):
+            called = self._ahead[2]
+        else:
+            called = self._execute(name, inputs)
+        self._ahead = None
+        self.load[name].add(0, called.cycles)
+        if name == "file_pose":
+            self._filed_cycles += called.cycles
+        elif name == "estimate":
+            self._filed_cycles = 0
+        _fill(self._here, self._there)
         return called.answer
-
-    def estimate(self) -> None:
-        """Run one tick of the estimator."""
-        self._call("estimate")
-        self._filed_cycles = 0
-
-    def control(self) -> None:
-        """Run one tick of the controller."""
-        self._call("control")
 
     def estimate_us(self) -> int:
         """Return the processor time of the estimator's next call, with that of the poses filed since the last one."""
@@ -105,18 +107,6 @@ class RealCore:
     def usage(self) -> Usage:
         """What the core has taken so far."""
         return Usage(None, self.about.size, None, self.load)
-
-    def _call(self, name: str) -> Called:
-        """Have an entry point executed and let its results out; what was executed ahead on the same inputs is taken."""
-        inputs = np.concatenate(self._here)
-        if self._ahead is not None and self._ahead[0] == name and np.array_equal(self._ahead[1], inputs):
-            called = self._ahead[2]
-        else:
-            called = self._execute(name, inputs)
-        self._ahead = None
-        self.load[name].add(0, called.cycles)
-        _fill(self._here, self._there)
-        return called
 
     def _look_ahead(self, name: str) -> Called:
         """Have an entry point executed without letting its results out."""
@@ -132,7 +122,7 @@ class RealCore:
         answers = self._client.execute((*requests, call(Call[name.upper()])))
         called = answers[-1].called()
         _fill(self._expected, inputs)
-        getattr(self._copy.run, name)()
+        self._copy.run.call(name)
         self._there = np.concatenate(self._expected)
         if crc32(self._there.data) != called.digest:
             self.unexpected += 1

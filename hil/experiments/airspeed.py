@@ -54,7 +54,8 @@ def airspeed(speed: float) -> Experiment:
     """Return the hover at a speed [m/s]."""
     low, high = attainable()
     carried = low <= speed <= high
-    limits = {"as_computed": 1.0} | ({"lost": 0.0, "height_off": 0.06, "in_box": 0.85} if carried else {})
+    held = {"lost": 0.0, "height_off": 0.06, "in_box": 0.85}
+    limits = {"as_computed": 1.0} | (held if carried else {"lost": 1.0})
     wanted = hover_angle(speed)
     angle = float(np.clip(wanted, 0.0, OPENING_MAX))
     outcome = "carried" if carried else "beyond the flaps"

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
-from firmware_py.wire.parameter_names import SIGNALS
+from firmware_py.config import SIGNALS
 from firmware_py.wire.parameters import SetByName, encode_set_by_name
 from firmware_py.wire.scalars import Scalar
 from hil.laboratory.experiment import Experiment

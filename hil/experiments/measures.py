@@ -35,9 +35,12 @@ def seconds(flight: pa.Table) -> Signal:
 
 
 def yaw_and_goal(flight: pa.Table) -> tuple[Signal, Signal]:
-    """Return the true yaw without jumps at half turns, and the wanted one [rad]."""
-    yaw = euler_zyx_of(body(flight, "qw", "qx", "qy", "qz"))[:, 2]
-    return np.unwrap(yaw), column(flight, "goal.yaw")
+    """Return the true yaw without jumps at half turns, counted like the wanted one, and the wanted one [rad]."""
+    yaw, goal = (
+        np.unwrap(euler_zyx_of(body(flight, "qw", "qx", "qy", "qz"))[:, 2]),
+        column(flight, "goal.yaw"),
+    )
+    return yaw + 2 * np.pi * np.round((goal[:1] - yaw[:1]) / (2 * np.pi)), goal
 
 
 def axis_and_goal(axis: str, flight: pa.Table) -> tuple[Signal, Signal]:

@@ -21,7 +21,7 @@ from hil.laboratory.metrics import BOX, column, position_error
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from firmware_py.thief import Thief
+    from hil.devices.thief import Thief
     from hil.laboratory.flight import Flight
     from hil.laboratory.robot import Robot
 
@@ -78,7 +78,13 @@ OVERLOAD = Experiment(
     name="overload",
     summary="hover while a task above all others takes 0 to 100 % of the processor",
     duration_s=21 * STEP_US * 1e-6,
-    limits={"estimator_late_from": 0.10, "controller_late_from": 0.60, "held_up_to": 0.60},
+    limits={
+        "estimator_late_from": 0.10,
+        "controller_late_from": 0.60,
+        "held_up_to": 0.60,
+        "lost": 1.0,
+        "uncontrolled": 21 * STEP_US * 1e-6,
+    },
     prepare=with_a_thief,
     script=steal_more_and_more,
     measure=loads_that_hurt,

@@ -35,7 +35,7 @@ def end_with_the_battery(flight: Flight) -> None:
 def _watch(flight: Flight, now_us: int) -> None:
     if flight.robot.firmware.signals.supervisor.cause is Cause.LOW_BATTERY:
         flight.note("lab", f"the battery is empty: {flight.robot.battery.charge:.1%} left")
-        flight.lab.end_us = now_us
+        flight.lab.end_at(now_us)
         return
     flight.events.at(now_us + WATCH_US, partial(_watch, flight))
 
@@ -84,7 +84,7 @@ ENDURANCE = Experiment(
     name="endurance",
     summary="hover until the supervisor reports the battery empty (paper: 33 min)",
     duration_s=LONGEST_S,
-    limits=LIMITS,
+    limits=LIMITS,  # the failsafe at its end lasts less than `uncontrolled` allows
     script=end_with_the_battery,
     measure=until_empty,
     pictures=("specific-power", "discharge"),

@@ -125,6 +125,7 @@ TAKE_OFF_LANDING = Experiment(
         "touch_down_speed": 0.8,  # a fall from 3 cm
         "landed_off_axis": 0.10,
         "attitude_max": 0.349066,  # 20 deg
+        "uncontrolled": CONTROLLER_ON + END - FANS_OFF + 0.2,  # before and after
     },
     script=operate,
     settings=(

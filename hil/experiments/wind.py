@@ -44,7 +44,7 @@ SIDE_WINDS = (
     side_wind(1, {"lost": 0.0, "wind_offset": 0.05, "max_y": 0.10}, "(paper: up to about 4 m/s)"),
     side_wind(2, {"lost": 0.0, "wind_offset": 0.08, "max_y": 0.15}, "(paper: up to about 4 m/s)"),
     side_wind(3, {"lost": 0.0, "wind_offset": 0.12}, "(paper: up to about 4 m/s)"),
-    side_wind(4, {"flown": BEGIN_S + 3 * SPIN_UP_S}, "(paper: up to about 4 m/s; here a third is lost)"),
+    side_wind(4, {"lost": 1.0, "flown": BEGIN_S + 3 * SPIN_UP_S}, "(paper: up to about 4 m/s; here a third is lost)"),
     side_wind(
         4, {"lost": 0.0, "wind_offset": 0.13}, "with the flaps opened through zero, -17..52 deg", "-open",
         ("allocation.opening_min=-0.3", "allocation.hover_angle=0.1745"),

@@ -40,7 +40,9 @@ def write_tlog(folder: Path) -> Path:
     """Write `flight.tlog` from the log and the texts of a run folder and return its path. Raises `LabError`."""
     log = load_log(folder)
     texts = [
-        (event["t_us"], BOARD, mavlink.status_text(INFO, event["text"])) for event in load_events(folder)
+        (event["t_us"], BOARD, message)
+        for number, event in enumerate(load_events(folder), 1)
+        for message in mavlink.status_text(INFO, event["text"], number)
     ]
     senders = {who: FrameSender(*who) for who in (BOARD, STATION)}
     path = folder / FILE

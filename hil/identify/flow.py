@@ -6,42 +6,19 @@ took, so that limits, limit cycles and excitations do not count as disturbance. 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
-from hil.design.loop import (
-    ANGLE,
-    DELAY,
-    FREQUENCIES,
-    POSITION,
-    RATE,
-    TICK_DELAYS_S,
-    VELOCITY,
-    Axis,
-    Robot,
-    dynamics,
-)
+from hil.design.axes import ANGLE, DELAY, PITCH, POSITION, RATE, ROLL, VELOCITY, Axis, Robot, dynamics
+from hil.design.loop import FREQUENCIES, Complex
+from hil.design.tune import Flow
 from hil.errors import LabError
-from hil.identify.axes import flap_response
 from hil.identify.joint import LATE_S
 from hil.identify.record import Array, Record
-from hil.identify.spectra import Complex
+from hil.identify.response import TICK_DELAYS_S, flap_response
 
 WINDOW_S = 10.0
 BEGIN_S = 2.0  # after the release
 USED = 0.8  # of the frequencies below half the sampling rate
-PLACES = {0: (1, 3), 1: (0, 4), 2: (5, 5), 3: (2, 2)}  # of an input's position and angle in the pose
-
-
-@dataclass(frozen=True, slots=True)
-class Flow:
-    """The disturbance of an axis in a hover, and its mean input and angle."""
-
-    spectrum: Complex  # (L, W, W) on FREQUENCIES, per Hz: of the velocity, of the rate, as the axis has them
-    input: float  # [rad] mean
-    angle: float  # [rad] mean; 0 for an axis without an angle
 
 
 def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
@@ -55,10 +32,10 @@ def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
             f"{record.name}: {len(grid) * step:.1f} s of flight: {1.5 * WINDOW_S:g} s after the first {BEGIN_S:g} s are "
             "needed to estimate the flow"
         )
-    place, angle = PLACES[axis.input]
     u = np.interp(grid, record.t, record.u[:, axis.input])
-    rate = np.interp(grid, record.t, record.rates[:, axis.input]) if axis.input < 3 else np.zeros(len(grid))
-    poses = [np.interp(grid, record.pose_t, record.pose[:, column]) for column in (place, angle)]
+    poses = {
+        state: np.interp(grid, record.pose_t, record.pose[:, column]) for state, column in axis.pose.items()
+    }
     w: Array = np.linspace(0.0, 2 * np.pi / step, size + 1)[1 : int(USED * size / 2)]
     taper = np.hanning(size)
 
@@ -69,12 +46,11 @@ def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
 
     s: Complex = 1j * w
     shown: Complex = np.exp(s * LATE_S)  # by how much poses are later than their stamps
-    of: dict[str, Complex] = {
-        POSITION: spectra(poses[0]) / shown,
-        ANGLE: spectra(poses[1]) / shown,
-        RATE: spectra(rate),
-    }
-    of[VELOCITY] = s * of[POSITION]
+    of: dict[str, Complex] = {state: spectra(values) / shown for state, values in poses.items()}
+    if POSITION in of:
+        of[VELOCITY] = s * of[POSITION]
+    if RATE in axis.states:
+        of[RATE] = spectra(np.interp(grid, record.t, record.rates[:, axis.input]))
     flap = spectra(u) * flap_response(w, 1 / robot["flap_rate"], robot[DELAY] + TICK_DELAYS_S)
     flow, _ = dynamics(axis, robot)
     left = []
@@ -86,15 +62,12 @@ def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
             left.append(s * of[state] - explained - flow[row, -1] * flap)
     both = np.stack(left, axis=2)  # (windows, lines, W)
     each = np.einsum("klw,klx->lwx", both, both.conj()) / len(starts) * 2 * step / np.sum(taper**2)
-    mean_angle = float(poses[1].mean()) if ANGLE in axis.states and axis.input < 2 else 0.0
+    mean_angle = float(poses[ANGLE].mean()) if axis in (ROLL, PITCH) else 0.0
     return Flow(_on_lines(w / (2 * np.pi), each), float(u.mean()), mean_angle)
 
 
 def _on_lines(hertz: Array, each: Complex) -> Complex:
     """Return spectra on FREQUENCIES; the end values beyond both ends."""
-    flat = each.reshape(len(hertz), -1)
-    at: Sequence[Complex] = [
-        np.interp(FREQUENCIES, hertz, column.real) + 1j * np.interp(FREQUENCIES, hertz, column.imag)
-        for column in flat.T
-    ]
-    return np.stack(at, axis=1).reshape(len(FREQUENCIES), *each.shape[1:])
+    columns = each.reshape(len(hertz), -1).T
+    at = np.stack([np.interp(FREQUENCIES, hertz, column) for column in columns], axis=1)
+    return at.reshape(len(FREQUENCIES), *each.shape[1:])

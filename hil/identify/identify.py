@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from math import nan
+from math import isnan, nan
 
+from hil.design.axes import AXES
 from hil.errors import LabError
-from hil.identify.axes import AXES, DELAY, LAG, UNITS
 from hil.identify.joint import Estimate, Excited, excited_axes, instrumental, joint
 from hil.identify.record import Record
+from hil.identify.response import DELAY, LAG, UNIT
 from hil.identify.two_controllers import two_controllers
 from hil.laboratory.robot import Streams
 from hil.world.paper_table import PAPER_TABLE
@@ -24,11 +25,10 @@ IDENTIFIED, WEAK, UNKNOWN = "identified", "weak", "not identifiable"
 NARROW, KNOWN = 0.25, 0.7  # half width of the interval over the value
 EXPLAINED = 10.0  # misfit beyond which the linear model does not explain the log
 SATURATED, LOST = 0.05, 0.30  # shares of the rows
-NUISANCES = ("y_rate", "x_rate")  # in no profile
 
 
 @dataclass(frozen=True, slots=True)
-class Constant:
+class IdentifiedConstant:
     """One constant: (value, half width of its 95 % interval) by method; NaN where a method gives none."""
 
     name: str
@@ -56,15 +56,22 @@ class Constant:
 class Identification:
     """The estimated constants of a robot."""
 
-    constants: tuple[Constant, ...]
+    constants: tuple[IdentifiedConstant, ...]
     excited: tuple[Excited, ...]
     estimate: Estimate  # of the joint fit
     records: tuple[Record, ...]  # with an excitation, in the order that `excited` refers to
     free: tuple[Record, ...]  # without
 
-    def constant(self, name: str) -> Constant:
+    def constant(self, name: str) -> IdentifiedConstant:
         """Return one by its name."""
         return next(constant for constant in self.constants if constant.name == name)
+
+
+def interval_text(value: float, half: float = nan, digits: int = 4) -> str:
+    """Return a value with the half width of its interval; empty without a value."""
+    if isnan(value):
+        return ""
+    return f"{value:.{digits}g}" + ("" if isnan(half) else f" ± {half:.2g}")
 
 
 def identify(records: Sequence[Record]) -> Identification:
@@ -97,8 +104,8 @@ def identify(records: Sequence[Record]) -> Identification:
         )
         verdict, why = _verdict(name, joint_pair, fitted, rich)
         constants.append(
-            Constant(
-                name, UNITS[name], PAPER_TABLE.get(name, (nan, nan)), truth.get(name, nan), printed_pair, instruments,
+            IdentifiedConstant(
+                name, UNIT[name], PAPER_TABLE.get(name, (nan, nan)), truth.get(name, nan), printed_pair, instruments,
                 joint_pair, verdict, why,
             )
         )  # fmt: skip

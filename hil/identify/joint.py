@@ -11,15 +11,17 @@ of the periods explains, they are model errors: the intervals grow with them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
-from hil.identify.axes import AXES, DELAY, LAG, Axis, flap_response, response
+from hil.design.axes import ANGLE, AXES, FLAP, RATE, VELOCITY, Axis
 from hil.identify.record import Array, Record
+from hil.identify.response import DELAY, LAG, flap_response, outputs, response
 from hil.identify.spectra import Complex, Spectra, period_spectra, spectra_of
 
 CONFIDENCE = 0.95
@@ -33,7 +35,7 @@ ROUNDS = 6
 # inputs are excited at once, products of three of them lie on lines.
 CURVED, CURVED_TOGETHER = 0.04, 0.12
 ALIKE = 4  # lines over which the model's errors may be alike
-RATE, ANGLE, PLACE = 1, 2, 3  # places of an axis' outputs in its spectra
+GYRO, CAMERAS = 1, 2  # places of a turn's rate and angle in its spectra
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +65,7 @@ def excited_axes(records: Sequence[Record]) -> list[Excited]:
         periods = period_spectra(record)
         for axis in AXES:
             if len(periods[0][axis.input]):
-                found.append(Excited(axis, number, spectra_of(record, periods, axis.input, axis.outputs)))
+                found.append(Excited(axis, number, spectra_of(record, periods, axis.input, outputs(axis))))
     return found
 
 
@@ -71,12 +73,12 @@ def pose_lateness(excited: Sequence[Excited], record: int) -> float:
     """Return by how much poses are later than their stamps [s]: the gyro's angle against the cameras'."""
     above = below = 0.0
     for one in excited:
-        if one.record != record or len(one.axis.outputs) < 2:
+        if one.record != record or len(outputs(one.axis)) < 2:
             continue
         Z, w = one.spectra.Z, one.spectra.w
-        ratio = Z[:, RATE] / (1j * w) / Z[:, ANGLE]
-        variance = one.spectra.C[:, RATE, RATE].real / np.abs(Z[:, RATE]) ** 2
-        variance += one.spectra.C[:, ANGLE, ANGLE].real / np.abs(Z[:, ANGLE]) ** 2
+        ratio = Z[:, GYRO] / (1j * w) / Z[:, CAMERAS]
+        variance = one.spectra.C[:, GYRO, GYRO].real / np.abs(Z[:, GYRO]) ** 2
+        variance += one.spectra.C[:, CAMERAS, CAMERAS].real / np.abs(Z[:, CAMERAS]) ** 2
         above += float(np.sum(np.angle(ratio) * w / variance))
         below += float(np.sum(w * w / variance))
     return above / below if below else LATE_S
@@ -111,74 +113,47 @@ def instrumental(excited: Sequence[Excited], lag: float) -> Estimate:
 Rows = tuple[Complex, Complex]
 
 
-def _equations(axis: Axis):  # type: ignore[no-untyped-def]
+def _equations(axis: Axis) -> Iterator[tuple[list[str], Callable[[Array, Complex, float], Rows]]]:
     """Yield names of constants, and the function (w, F, late) that returns left side and regressors of their equation."""
-    if len(axis.constants) == 2:
-        yield axis.constants, _turn_alone if axis.name == "yaw" else _rise
-        return
-    yield axis.constants[:4], _turn
-    yield axis.constants[4:], _shift
+    for affected in (RATE, VELOCITY):
+        names = [name for name, term in axis.terms.items() if term[0] == affected]
+        if names:
+            yield names, partial(_equation, axis, affected)
 
 
-def _rows(w: Array, size: int, *terms: Mapping[int, Complex]) -> Rows:
-    combined = np.zeros((len(w), len(terms), size), complex)
-    for row, term in enumerate(terms):
-        for signal, factor in term.items():
-            combined[:, row, signal] = factor
+def _equation(axis: Axis, affected: str, w: Array, F: Complex, late: float) -> Rows:
+    s: Complex = 1j * w
+    signals = 1 + len(outputs(axis))
+    # What telemetry says of each state: a signal, and the factor on it. Angles are those of the gyro.
+    of = {FLAP: (0, F), RATE: (1, s**0), ANGLE: (1, 1 / s), VELOCITY: (signals - 1, s * np.exp(s * late))}
+    causes = [cause for state, cause in axis.terms.values() if state == affected]
+    combined = np.zeros((len(w), 1 + len(causes), signals), complex)
+    for row, state in enumerate((affected, *causes)):
+        signal, factor = of[state]
+        combined[:, row, signal] = factor * (s if row == 0 else 1)
     return combined[:, 0], combined[:, 1:]
 
 
-def _turn(w: Array, F: Complex, late: float) -> Rows:
-    s: Complex = 1j * w
-    return _rows(w, 4, {RATE: s}, {0: F}, {RATE: s**0}, {RATE: 1 / s}, {PLACE: s * np.exp(s * late)})
-
-
-def _shift(w: Array, F: Complex, late: float) -> Rows:
-    s: Complex = 1j * w
-    to_place: Complex = np.exp(s * late)
-    return _rows(w, 4, {PLACE: s * s * to_place}, {0: F}, {RATE: 1 / s}, {PLACE: s * to_place}, {RATE: s**0})
-
-
-def _turn_alone(w: Array, F: Complex, late: float) -> Rows:
-    s: Complex = 1j * w
-    return _rows(w, 3, {RATE: s}, {0: F}, {RATE: s**0})
-
-
-def _rise(w: Array, F: Complex, late: float) -> Rows:
-    s: Complex = 1j * w
-    to_place: Complex = np.exp(s * late)
-    return _rows(w, 2, {1: s * s * to_place}, {0: F}, {1: s * to_place})
-
-
-def _regress(own, rows, lag: float, delay: float) -> tuple[Array, Array, float]:  # type: ignore[no-untyped-def]
+def _regress(
+    own: Sequence[tuple[Spectra, float]],
+    rows: Callable[[Array, Complex, float], Rows],
+    lag: float,
+    delay: float,
+) -> tuple[Array, Array, float]:
     """Return the constants of one equation, their covariance, and the misfit; weights follow the constants."""
-    pieces = []
-    for spectra, late in own:
-        left, right = rows(spectra.w, flap_response(spectra.w, lag, delay), late)
-        pieces.append((left, right, spectra))
-    count = pieces[0][1].shape[1]
-    theta = np.zeros(count)
-    weights = [np.ones(len(spectra.w)) / np.abs(spectra.w) ** 2 for _, _, spectra in pieces]
+    sides = [rows(spectra.w, flap_response(spectra.w, lag, delay), late) for spectra, late in own]
+    left, right = (np.concatenate(side) for side in zip(*sides, strict=True))
+    w, Z, C = (np.concatenate([getattr(spectra, name) for spectra, _ in own]) for name in ("w", "Z", "C"))
+    count = right.shape[1]
+    weights = 1.0 / w**2
     for _ in range(ROUNDS):
-        A = np.concatenate(
-            [
-                np.sqrt(k)[:, None] * np.einsum("lns,ls->ln", right, one.Z)
-                for k, (_, right, one) in zip(weights, pieces, strict=True)
-            ]
-        )
-        b = np.concatenate(
-            [
-                np.sqrt(k) * np.einsum("ls,ls->l", left, one.Z)
-                for k, (left, _, one) in zip(weights, pieces, strict=True)
-            ]
-        )
+        root = np.sqrt(weights)
+        A = root[:, None] * np.einsum("lns,ls->ln", right, Z)
+        b = root * np.einsum("ls,ls->l", left, Z)
         both, target = np.concatenate([A.real, A.imag]), np.concatenate([b.real, b.imag])
         theta = np.linalg.lstsq(both, target, rcond=None)[0]
-        weights = []
-        for left, right, one in pieces:
-            mix = left - np.einsum("lns,n->ls", right, theta)
-            variance = np.einsum("ls,lst,lt->l", mix, one.C, mix.conj()).real
-            weights.append(2.0 / variance)
+        mix = left - np.einsum("lns,n->ls", right, theta)
+        weights = 2.0 / np.einsum("ls,lst,lt->l", mix, C, mix.conj()).real
     residual = target - both @ theta
     misfit = float(np.sum(residual**2) / max(1, len(target) - count))
     covariance = np.linalg.pinv(both.T @ both) * max(1.0, misfit)
@@ -237,10 +212,10 @@ def _meat(excited: Sequence[Excited], errors: Array, J: Array) -> Array:
     weights = np.ones(len(errors))
     place = 0
     for one in excited:
-        outputs, count = len(one.axis.outputs), len(one.spectra.w)
-        block = slice(place, place + 2 * outputs * count)
-        place += 2 * outputs * count
-        own = errors[block].reshape(2, count, outputs)
+        shown, count = len(outputs(one.axis)), len(one.spectra.w)
+        block = slice(place, place + 2 * shown * count)
+        place += 2 * shown * count
+        own = errors[block].reshape(2, count, shown)
         power = np.mean(own**2, axis=(0, 1))
         alike = power.copy()
         for step in range(1, min(ALIKE, count - 1) + 1):

@@ -15,22 +15,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from hil.design.axes import ROLL
 from hil.errors import LabError
-from hil.identify.axes import response
-from hil.identify.identify import Identification
+from hil.identify.identify import Identification, interval_text
 from hil.identify.joint import Excited, excited_axes, whitened
 from hil.identify.prediction import one_step
 from hil.identify.record import Record
+from hil.identify.response import response
 from hil.identify.spectra import PERIOD_S
 from hil.identify.two_controllers import SIGMAS, closed_loop
 from hil.pictures import curves
 from hil.pictures.drawing import WIDTH, png
 from hil.pictures.pages import data_uri, write_page
 
-OUTPUTS = {"roll": "roll rate", "pitch": "pitch rate", "yaw": "yaw rate", "z": "height"}
+OUTPUTS = {"roll": "roll rate", "pitch": "pitch rate", "yaw": "yaw rate", "height": "height"}
 HERTZ = (0.5, 1, 2, 4, 8)
 SHOWN_S = 1.5  # of the one-step prediction
-UNITS = {"roll": "rad/s", "pitch": "rad/s", "yaw": "rad/s", "z": "m"}
+UNITS = {"roll": "rad/s", "pitch": "rad/s", "yaw": "rad/s", "height": "m"}
 
 
 def write_pages(out: Path, found: Identification, held_out: Record | None) -> Path:
@@ -61,20 +62,14 @@ def write_pages(out: Path, found: Identification, held_out: Record | None) -> Pa
         {
             "name": one.name, "unit": one.unit, "verdict": f"{one.verdict}: {one.why}",
             "cells": [
-                _pair(one.paper), _pair((one.truth, np.nan)), _pair(one.two_controllers), _pair(one.instrumental),
-                _pair(one.joint),
+                interval_text(*one.paper), interval_text(one.truth), interval_text(*one.two_controllers),
+                interval_text(*one.instrumental), interval_text(*one.joint),
             ],
         }
         for one in found.constants
     ]  # fmt: skip
     names = ", ".join(record.name for record in (*found.records, *found.free))
     return write_page(out / "identify.html", "identify.html.j2", rows=rows, figures=figures, names=names)
-
-
-def _pair(pair: tuple[float, float]) -> str:
-    if pair[0] != pair[0]:
-        return ""
-    return f"{pair[0]:.4g}" + (f" ± {pair[1]:.2g}" if pair[1] == pair[1] else "")
 
 
 def _axis(
@@ -154,7 +149,7 @@ def _identity(records: tuple[Record, ...]) -> Figure:
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     panels = figure.subplots(1, min(2, len(records)), squeeze=False)[0]
     for axes, record in zip(panels, records, strict=False):
-        loop = closed_loop(record, "roll")
+        loop = closed_loop(record, ROLL)
         axes.plot(
             loop.w**2,
             (loop.acceleration / loop.angle).real,

@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.signal import dlsim
 
-from hil.design.loop import AXES, RATE, dynamics, filter_gain, held
-from hil.identify.axes import DELAY, LAG
-from hil.identify.flow import PLACES
+from hil.design.axes import AXES, RATE, dynamics
+from hil.design.loop import filter_gain, held
 from hil.identify.record import Array, Record
+from hil.identify.response import DELAY, LAG
 
 
 def one_step(
@@ -31,18 +32,19 @@ def one_step(
     K, C = filter_gain(axis, record.config, Phi)
     first = max(record.t[0] + values[DELAY], record.pose_t[0] - late)
     t = np.arange(first, min(record.t[-1], record.pose_t[-1] - late), step)
-    place, angle = PLACES[input]
-    shown = [
-        np.interp(t + late, record.pose_t, record.pose[:, column]) for column in dict.fromkeys((place, angle))
-    ]
+    shown = [np.interp(t + late, record.pose_t, record.pose[:, column]) for column in axis.pose.values()]
     turn = [np.interp(t, record.t, record.rates[:, input])] if RATE in axis.states else []
     measured = np.stack([*turn, *shown], axis=1)
     # The mean effect until the next step; `delay` counts the half tick by which an input that is held is late.
     u = np.interp(t - values[DELAY] + step / 2, record.t, record.u[:, input])
     measured -= measured.mean(axis=0)
     u -= u.mean()
-    state, predicted = np.zeros(len(Phi)), np.empty_like(measured)
-    for row, (now, command) in enumerate(zip(measured, u, strict=True)):
-        predicted[row] = C @ state
-        state = Phi @ (state + K @ (now - predicted[row])) + G[:, 0] * command
+    filtered = (
+        Phi @ (np.eye(len(Phi)) - K @ C),
+        np.hstack([Phi @ K, G]),
+        C[:1],
+        np.zeros((1, len(C) + 1)),
+        step,
+    )
+    _, predicted, _ = dlsim(filtered, np.column_stack([measured, u]))
     return t, measured[:, 0], predicted[:, 0]

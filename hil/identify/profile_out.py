@@ -13,10 +13,11 @@ import numpy as np
 
 from firmware_py.config import ModelConfig
 from hil.config import base_name, load_config
+from hil.design.axes import AXES, NUISANCES
 from hil.errors import LabError, writing
-from hil.identify.axes import AXES, DELAY, LAG
-from hil.identify.identify import NUISANCES, UNKNOWN, Identification
+from hil.identify.identify import UNKNOWN, Identification
 from hil.identify.joint import Estimate, joint
+from hil.identify.response import DELAY, LAG
 from hil.identify.robots import write_known
 from hil.world.body import MIX
 from hil.world.servos import WORDS_PER_RADIAN

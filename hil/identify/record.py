@@ -30,6 +30,7 @@ EXCITATIONS = tuple(f"excite.u{i} [rad]" for i in range(1, 5))
 # The files of a run folder that are read or that tell its history.
 KEPT = ("log.parquet", "telemetry.csv", "events.jsonl", "result.json")
 RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch", "yaw"))
+FACING = np.radians(30.0)  # a choice: how far the robot may have turned on the median
 WRAP_MS = 1 << 24  # of the board's time stamps
 SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 closes
 
@@ -69,12 +70,12 @@ def load_record(path: Path, profile: str) -> Record:
     flown = (state == State.FLYING) & np.all(
         np.isfinite([columns[name] for name in (*INPUTS, *RATES)]), axis=0
     )
-    flown &= columns[BOARD_COLUMN] * 1e-3 > release_s
+    board_s = 1e-3 * np.unwrap(columns[BOARD_COLUMN], period=WRAP_MS)
+    flown &= board_s > release_s
     if np.count_nonzero(flown) < 100:
         raise LabError(
             f"{path}: {np.count_nonzero(flown)} rows of flight under control; identification needs 100 at least"
         )
-    board_s = 1e-3 * np.unwrap(columns[BOARD_COLUMN], period=WRAP_MS)
     ahead_s = float(np.median(columns[TIME_COLUMN] - board_s))
     t = board_s[flown]
     order = np.concatenate([[True], np.diff(t) > 0])
@@ -85,6 +86,12 @@ def load_record(path: Path, profile: str) -> Record:
     steps = np.diff(t)
     usual = float(np.median(steps))
     pose_t, pose = _poses(columns, flown, ahead_s)
+    facing = float(np.median(pose[:, 5])) if len(pose) else 0.0
+    if np.cos(facing) < np.cos(FACING):
+        raise LabError(
+            f"{path}: it looks along {np.degrees(facing):.0f} deg; expected within {np.degrees(FACING):.0f} deg of 0, "
+            "because x and y of the world count as those of the body"
+        )
     excitation = np.nan_to_num(np.stack([columns[name][flown] for name in EXCITATIONS], axis=1))
     rates = np.stack([columns[name][flown] for name in RATES], axis=1)
     return Record(

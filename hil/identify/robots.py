@@ -14,19 +14,19 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from scipy.stats import qmc
 
 from hil.config import LabConfig
-from hil.design.loop import DELAY, TICK_DELAYS_S, robot_of
+from hil.design.axes import DELAY, NUISANCES, robot_of
 from hil.errors import LabError
-from hil.identify.axes import DELAY as INPUT_TO_GYRO
-from hil.identify.axes import LAG
-from hil.identify.identify import NUISANCES, Identification
+from hil.identify.identify import Identification
 from hil.identify.record import Array
+from hil.identify.response import DELAY as INPUT_TO_GYRO
+from hil.identify.response import LAG, TICK_DELAYS_S
 from hil.identify.two_controllers import SIGMAS
 
 UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, of a constant of unknown uncertainty
 FLAP_RATE = "flap_rate"
 
 
-class Known(BaseModel):
+class KnownModel(BaseModel):
     """The file beside a profile."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -51,7 +51,7 @@ def write_known(path: Path, config: LabConfig, found: Identification, delay_s: f
     half = np.array([estimate.errors[name] for name in names])[kept]
     own = estimate.covariance[np.ix_(kept, kept)]
     grown = half / SIGMAS / np.sqrt(np.diag(own))  # curvature makes the intervals wider than the scatter does
-    known = Known(
+    known = KnownModel(
         values=config.model.model_dump(),
         half_widths={names[index]: float(width) for index, width in zip(kept, half, strict=True)},
         covariance=(own * np.outer(grown, grown)).tolist(),
@@ -91,9 +91,9 @@ def robots_of(profile: str, config: LabConfig, count: int) -> Robots:
     )
 
 
-def _read(file: Path) -> Known:
+def _read(file: Path) -> KnownModel:
     try:
-        known = TypeAdapter(Known).validate_json(file.read_bytes())
+        known = TypeAdapter(KnownModel).validate_json(file.read_bytes())
         size = len(known.half_widths)
         if [len(row) for row in known.covariance] != [size] * size:
             raise LabError(f"{file}: the covariance of {size} constants has {size} rows and columns")

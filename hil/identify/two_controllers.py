@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.design.axes import ANGLE, PITCH, POSITION, RATE, ROLL, VELOCITY, Axis
 from hil.errors import LabError
 from hil.identify.record import Array, Record
 from hil.identify.spectra import Complex
@@ -23,17 +24,6 @@ RATE_HZ, WINDOW = 50.0, 200  # samples; the author's script
 BINS = slice(1, 20)  # 0.25 to 4.75 Hz
 TAPER = (0.0, 1 / 3, 2 / 3)
 SIGMAS = 1.96  # of a 95 % interval
-# Turning axis: places in the pose of angle and position, the gains on rate, angle and velocity, and the constants' names.
-AXES = {
-    "roll": (3, 1, ("gain_p", "gain_roll", "gain_vy"), ("roll_rate", "roll_roll", "roll_vy"), "roll_u1"),
-    "pitch": (
-        4,
-        0,
-        ("gain_q", "gain_pitch", "gain_vx"),
-        ("pitch_rate", "pitch_pitch", "pitch_vx"),
-        "pitch_u2",
-    ),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +43,11 @@ def input_constant(starred: Sequence[float], own: Sequence[float]) -> tuple[floa
     return a, starred[0] - a * own[0]
 
 
-def closed_loop(record: Record, axis: str) -> ClosedLoop:
+def closed_loop(record: Record, axis: Axis) -> ClosedLoop:
     """Return a flight's closed-loop constants. Raises `LabError` for one without a window of 4 s."""
-    angle_at, place_at, *_ = AXES[axis]
     grid = np.arange(record.pose_t[0], record.pose_t[-1], 1 / RATE_HZ)
-    angle = np.interp(grid, record.pose_t, record.pose[:, angle_at])
-    place = np.interp(grid, record.pose_t, record.pose[:, place_at])
+    angle = np.interp(grid, record.pose_t, record.pose[:, axis.pose[ANGLE]])
+    place = np.interp(grid, record.pose_t, record.pose[:, axis.pose[POSITION]])
     rate, velocity = (0.5 * RATE_HZ * (x[2:] - x[:-2]) for x in (angle, place))
     count = len(rate) // WINDOW
     if count < 1:
@@ -92,7 +81,9 @@ def closed_loop(record: Record, axis: str) -> ClosedLoop:
 def two_controllers(records: Sequence[Record]) -> dict[str, tuple[float, float]]:
     """Return a, b, c, d of roll and pitch with 95 % errors, from the first two records whose gains on the angle differ."""
     found: dict[str, tuple[float, float]] = {}
-    for axis, (_, _, gains, names, input_name) in AXES.items():
+    for axis in (ROLL, PITCH):
+        gains = [axis.gains[axis.states.index(state)] for state in (RATE, ANGLE, VELOCITY)]
+        input_name, *names = axis.constants[:4]
         pair = _pair(records, gains[1])
         if pair is None:
             continue

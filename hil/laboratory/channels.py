@@ -8,18 +8,18 @@ from collections.abc import Callable, Sequence
 from math import nan
 from typing import Any
 
-from firmware_py.firmware import DEADLINES_US, Firmware
+from firmware_py.firmware import DEADLINES_US
 from firmware_py.logic.plugs import GROUP
 from firmware_py.signals import COUNTERS
-from firmware_py.wire.telemetry import BLOCKS, SLOW_BLOCKS
+from firmware_py.wire.telemetry import ATTITUDE, CONTROL, MOTION, SLOW_BLOCKS
+from firmware_py.wire.telemetry import FLAPS as FLAP_BLOCK
 from ground_station.latency import STAGES
 from ground_station.program import Cockpit
 from ground_station.tracker import Tracker
 from ground_station.trajectory import Goal, Trajectory
+from hil.devices.board_firmware import BoardFirmware
 from hil.devices.cameras import VirtualMocap
 from hil.devices.radio import VirtualRadio
-from hil.devices.real_firmware import RealFirmware
-from hil.devices.stm32f405.firmware import ImageFirmware
 from hil.laboratory.faults import Fault
 from hil.laboratory.recorder import Channel, Quantity
 from hil.laboratory.robot import Robot
@@ -28,6 +28,8 @@ from hil.world.battery import Battery
 UNKNOWN_STATE = 4  # of the supervisor, beside those of `firmware_py.wire.supervisor`
 WRAP = 1 << 16  # the board's counters of poses are uint16
 AGE_UNIT_US = 100  # of locSrv.age
+LOOP = "loop"  # group of variables that a real board in the loop has
+MEASUREMENTS = "measurements"  # the queue of poses on board
 
 
 def quantity(prefix: str, names: str, unit: str = "", frame: str = "") -> Quantity:
@@ -102,29 +104,6 @@ def battery_channel(battery: Battery) -> Channel:
     )
 
 
-def loop_channel(firmware: RealFirmware) -> Channel:
-    """Return what the loop through a real board costs and counts."""
-
-    def read() -> tuple[int, ...]:
-        last = firmware.told
-        counted = (0,) * 5 if last is None else (last.waiting, last.held, last.late, last.lost, last.doubled)
-        return (firmware.delay_us, firmware.added_us, firmware.stood_us, *counted)
-
-    return Channel(
-        "int32",
-        read,
-        (
-            quantity("loop", "delay added stood", "us"),
-            quantity("loop", "waiting held late lost doubled"),
-        ),
-    )
-
-
-def clock_channel(image: ImageFirmware) -> Channel:
-    """Return the time of an image's own clock; a read while its timer carries may be 65 ms short."""
-    return Channel("int64", lambda: (image.clock_us,), (quantity("clock", "board_us", "us"),))
-
-
 def tracker_channel(tracker: Tracker) -> Channel:
     """Return what the tracker makes of frames."""
     counters = tracker.counters
@@ -135,15 +114,19 @@ def tracker_channel(tracker: Tracker) -> Channel:
     )
 
 
-def logic_channels(firmware: Firmware | ImageFirmware | RealFirmware) -> tuple[Channel, ...]:
-    """Return what logic of the user's own logs."""
-    own = [variable for variable in firmware.variables if variable.name.startswith(f"{GROUP}.")]
+def board_channels(firmware: BoardFirmware) -> tuple[Channel, ...]:
+    """Return what logic of the user's own logs, what the loop through a real board costs, and the board's own time."""
+    own = [variable for variable in firmware.variables if variable.name.partition(".")[0] in (GROUP, LOOP)]
     channels = []
     for dtype, is_float in (("float32", True), ("int32", False)):
         chosen = [variable for variable in own if variable.scalar.is_float is is_float]
         quantities = tuple(Quantity((variable.name,), variable.unit) for variable in chosen)
         if chosen:
             channels.append(Channel(dtype, _all([variable.read for variable in chosen]), quantities))
+    if firmware.clock_us is not None:
+        channels.append(
+            Channel("int64", lambda: (firmware.clock_us,), (quantity("clock", "board_us", "us"),))
+        )
     return tuple(channels)
 
 
@@ -151,7 +134,7 @@ def _all(reads: Sequence[Callable[[], float]]) -> Callable[[], list[float]]:
     return lambda: [read() for read in reads]
 
 
-def excitation_channel(firmware: Firmware | ImageFirmware | RealFirmware) -> Channel:
+def excitation_channel(firmware: BoardFirmware) -> Channel:
     """Return what is added to the inputs for identification."""
     reads = [variable.read for variable in firmware.variables if variable.name.startswith("excite.")]
     return Channel("float32", _all(reads), (quantity("excite", "u1 u2 u3 u4", "rad"),))
@@ -204,16 +187,19 @@ def _coordinates(goal: Goal) -> tuple[float, ...]:
     return (*goal.p_WG, goal.yaw)
 
 
-def _scheduler_channels(firmware: Firmware | ImageFirmware | RealFirmware) -> tuple[Channel, ...]:
+def _scheduler_channels(firmware: BoardFirmware) -> tuple[Channel, ...]:
     """Return what the scheduler counts; a real board does not report what its tasks do."""
-    kernel: Any = firmware.kernel  # ours or an image's, whose tasks have names and run times alike
-    queue, tasks = firmware.measurements, tuple(kernel.tasks)
+    scheduler = firmware.scheduler
+    if scheduler is None:
+        return ()
+    tasks = tuple(scheduler.tasks)
+    queues = [queue for queue in scheduler.queues if queue.name == MEASUREMENTS]
     timed = [task for task in tasks if task.name in DEADLINES_US]
 
     def counts() -> tuple[int, ...]:
         return (
-            queue.high_water, queue.dropped,
-            *[task.deadline_misses for task in timed], *kernel.run_times_us()[: len(tasks)],
+            sum(queue.high_water for queue in queues), sum(queue.dropped for queue in queues),
+            *[task.deadline_misses for task in timed], *scheduler.run_times_us()[: len(tasks)],
         )  # fmt: skip
 
     quantities = (
@@ -259,13 +245,17 @@ class StationView:
 
     def telemetry(self) -> tuple[float, ...]:
         """TELEMETRY, when there is a sample of every block."""
-        samples = [self._ground.telemetry.get(block.id) for block in BLOCKS]
-        if None in samples:
+        newest = self._ground.telemetry
+        try:
+            motion, attitude, flaps, control = (
+                newest[block.id].values for block in (MOTION, ATTITUDE, FLAP_BLOCK, CONTROL)
+            )
+        except KeyError:
             return (nan,) * 27
-        motion, attitude, flaps, health = (sample.values for sample in samples if sample is not None)
-        *inputs, _, age, poses, rejected = health
+        *angles, age, poses, rejected = attitude
+        _, *rates_and_inputs = control[:8]
         counted = (AGE_UNIT_US * age, self._poses(poses), self._rejected(rejected))
-        return (*motion, *attitude, *flaps, *inputs, *counted)
+        return (*motion, *angles, *rates_and_inputs[:3], *flaps, *rates_and_inputs[3:], *counted)
 
     def slow(self) -> tuple[float, ...]:
         """Battery and load."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ground_station.trajectory import Goal, Hold, Trajectory
+from hil.arguments import checked
 from hil.errors import LabError, blame
-from hil.laboratory.metrics import METRICS, Metric
+from hil.laboratory.metrics import METRICS, Metric, check_limits
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 
 
 LOOK_US = 20_000  # how often a goal is sent
+JUMP_MAX = (
+    0.2 + 1e-9
+)  # [m] sideways on an axis: y-square's; a jump of 0.2 m in x or 0.3 m in y loses the robot
 NAME = re.compile(r"\w[\w.-]*")
 
 
@@ -51,6 +55,7 @@ class Source:
     package: str = ""  # and version, of one that is installed
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class Experiment:
     """One experiment; `limits` maps names of `hil.laboratory.metrics.METRICS` or of its own `metrics` to bounds in that
@@ -90,6 +95,10 @@ class Experiment:
         for name in self.metrics:
             if name in METRICS:
                 raise LabError(f"experiment {self.name}: metric {name}: every flight has one of that name")
+        try:
+            check_limits(self.limits, self.metrics)
+        except LabError as error:
+            raise LabError(f"experiment {self.name}: {error}") from None
 
     @property
     def reference(self) -> str:
@@ -108,13 +117,25 @@ class Experiment:
             )
         return values
 
-    def check_goals(self, home: tuple[float, float, float], duration_s: float) -> None:
-        """Raise `LabError` when the trajectory has no goal at an instant of the flight."""
-        t_us = 0
+    def check_goals(
+        self, home: tuple[float, float, float], duration_s: float, left: Callable[[Sequence[float]], str]
+    ) -> None:
+        """Raise `LabError` when the trajectory has no goal at an instant, leaves the flow, or jumps too far to be followed.
+
+        `left` returns why a robot would be lost at a place (3,) [m] in W; empty: it would not.
+        """
+        t_us, before = 0, home
         try:
             trajectory = self.trajectory(Goal(home, 0.0), 0)
             for t_us in range(0, round(duration_s * 1e6), LOOK_US):
-                trajectory.at(t_us)
+                goal = trajectory.at(t_us)
+                if not math.isfinite(math.fsum((*goal.p_WG, goal.yaw))) or len(goal.p_WG) != 3:
+                    raise LabError(f"{goal}: expected three finite numbers and a yaw")
+                if why := left(goal.p_WG):
+                    raise LabError(f"a goal outside the flow: {why}")
+                if (jump := max(abs(goal.p_WG[axis] - before[axis]) for axis in (0, 1))) > JUMP_MAX:
+                    raise LabError(f"the goal jumps {jump:.2f} m sideways: up to 0.2 m can be followed")
+                before = goal.p_WG
         except Exception as error:
             raise LabError(
                 f"experiment {self.name}: trajectory at {t_us * 1e-6:g} s: {blame(error)}"

@@ -22,7 +22,11 @@ CUT = "serial.cut"
 # The kinds of faults for each way of failing; {} stands for the number of the flap.
 KindsByFailing = dict[Failing, tuple[str, ...]]
 # The IMU is one part: its gyro does not fail alone.
-_IMU: KindsByFailing = {Failing.STUCK: ("imu.freeze",), Failing.GARBAGE: ("imu.noise",)}
+_IMU: KindsByFailing = {
+    Failing.OFF: ("imu.silent",),
+    Failing.STUCK: ("imu.freeze",),
+    Failing.GARBAGE: ("imu.noise",),
+}
 _FLAP: KindsByFailing = {
     Failing.STUCK: ("servo.stuck.{}",),
     Failing.WRONG: ("servo.trim.{}",),

@@ -12,11 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from hil.errors import LabError
+from hil.arguments import checked, fits, shown
+from hil.errors import LabError, blame, hint
 
 if TYPE_CHECKING:
+    from hil.crazyflie.shockburst import Air
     from hil.devices.rigid_body import VirtualMarkers
-    from hil.devices.shockburst import Air
     from hil.devices.uart import VirtualSerial
     from hil.laboratory.robot import Robot
 
@@ -31,6 +32,7 @@ Turn = Callable[["Robot", float], None]
 Blend = Callable[[float, float], float]
 
 
+@checked
 @dataclass(frozen=True, slots=True, eq=False)
 class Knob:
     """One number of the world. `read` creates whatever it needs; `blend` takes its value and a fault's size."""
@@ -40,6 +42,7 @@ class Knob:
     blend: Blend
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class Kind:
     """A kind of fault. `low` and `high` bound its size; where they are the same, the size is fixed.
@@ -62,7 +65,7 @@ class Kind:
     outcome: Outcome = ""
     scale: float = 1.0  # from the unit to SI
     duration_s: float = math.inf  # default; inf: to the end of the flight
-    link: str = ""  # the only one on which it acts
+    link: Literal["", "radio", "mavlink"] = ""  # the only one on which it acts
     markers: bool = False  # acts on markers: only with `markers.enabled`
 
     @property
@@ -91,8 +94,24 @@ def either(value: float, size: float) -> float:
     return 1.0 - (1.0 - value) * (1.0 - size)
 
 
+@checked
 def knob(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
-    """Return the knob that is a plain attribute of a part of the robot, by that part and the attribute's name."""
+    """Return the knob that is a plain attribute of a part of the robot, by that part and the attribute's name.
+
+    Raises `LabError` for an attribute that the part lacks or that is no number.
+    """
+    from hil.laboratory.robot import attributes_of, specimen
+
+    try:
+        part = owner(specimen("", markers=True))
+    except Exception as error:
+        raise LabError(f"knob {name!r}: {blame(error)}") from error
+    if name not in (known := attributes_of(part)):
+        raise LabError(f"knob {name!r} of {type(part).__name__}: {hint(name, known)}")
+    return _attribute(owner, name, blend)
+
+
+def _attribute(owner: Callable[[Robot], object], name: str, blend: Blend) -> Knob:
     return Knob(
         lambda robot: float(getattr(owner(robot), name)),
         lambda robot, value: setattr(owner(robot), name, value),
@@ -111,11 +130,11 @@ def _of_robot(robot: Robot) -> VirtualMarkers:
 
 
 def _markers(name: str, blend: Blend) -> tuple[Knob, ...]:
-    return (knob(_of_robot, name, blend),)
+    return (_attribute(_of_robot, name, blend),)
 
 
 def _mocap(name: str, blend: Blend) -> Knob:
-    return knob(lambda robot: robot.mocap, name, blend)
+    return _attribute(lambda robot: robot.mocap, name, blend)
 
 
 def _air(robot: Robot) -> Air:
@@ -124,7 +143,7 @@ def _air(robot: Robot) -> Air:
 
 
 def _radio(name: str, blend: Blend = either) -> Knob:
-    return knob(_air, name, blend)
+    return _attribute(_air, name, blend)
 
 
 def _bias(axis: int) -> Knob:
@@ -172,7 +191,10 @@ def _push(part: int) -> Knob:
 
 UPLINK_LOSS, DOWNLINK_LOSS = _radio("uplink_loss"), _radio("downlink_loss")
 RADIO_BITS = (_radio("uplink_bit_error_rate"), _radio("downlink_bit_error_rate"))
-SERIAL_BITS = (knob(_uart, "uplink_bit_error_rate", either), knob(_uart, "downlink_bit_error_rate", either))
+SERIAL_BITS = (
+    _attribute(_uart, "uplink_bit_error_rate", either),
+    _attribute(_uart, "downlink_bit_error_rate", either),
+)
 CABLE = Knob(
     lambda robot: float(_uart(robot).connected),
     lambda robot, value: setattr(_uart(robot), "connected", value > 0.5),
@@ -187,6 +209,9 @@ GYRO_RANGE = Knob(
     lambda robot: robot.imu.rate_range, lambda robot, value: robot.imu.set_rate_range(value), min
 )
 FREEZE = Knob(lambda robot: float(robot.imu.frozen), lambda robot, value: robot.imu.freeze(value > 0.5), max)
+SILENCE = Knob(
+    lambda robot: float(robot.imu.silent), lambda robot, value: robot.imu.silence(value > 0.5), max
+)
 FANS = Knob(
     lambda robot: robot.plant.tunnel.fan_factor,
     lambda robot, value: robot.plant.tunnel.set_fan_factor(min(value, 2.0)),
@@ -202,8 +227,8 @@ GUSTS = Knob(
     lambda robot, value: robot.plant.tunnel.set_gust_scale(min(value, 5.0)),
     times,
 )
-LOAD = knob(lambda robot: robot.thief, "share", lambda value, size: min(value + size, 1.0))
-SAG = knob(lambda robot: robot.battery, "sag_V", add)
+LOAD = _attribute(lambda robot: robot.thief, "share", lambda value, size: min(value + size, 1.0))
+SAG = _attribute(lambda robot: robot.battery, "sag_V", add)
 PACES = tuple(_pace(servo) for servo in range(4))
 
 DEG = math.radians(1.0)
@@ -282,7 +307,10 @@ KINDS: dict[str, Kind] = {
     "imu.saturation": Kind(
         "the gyro's range ends here", "deg/s", 20.0, 1.0, 2000.0, (GYRO_RANGE,), "holds", DEG
     ),
-    "imu.freeze": Kind("the IMU repeats its last sample", "", 1.0, 1.0, 1.0, (FREEZE,), "holds", duration_s=GLIMPSE_S),
+    "imu.freeze": Kind("the IMU repeats its last sample", "", 1.0, 1.0, 1.0, (FREEZE,), "failsafe", duration_s=GLIMPSE_S),
+    "imu.silent": Kind(
+        "the IMU raises no data-ready interrupt", "", 1.0, 1.0, 1.0, (SILENCE,), "failsafe", duration_s=GLIMPSE_S
+    ),
     **{
         f"servo.stuck.{number}": Kind(
             f"flap {number} is stuck", "", 0.0, 0.0, 0.0, (PACES[number - 1],), "degrades"
@@ -331,8 +359,9 @@ KINDS: dict[str, Kind] = {
 SHIPPED = frozenset(KINDS)
 
 
+@checked
 def declare(name: str, kind: Kind) -> Kind:
-    """Register the user's own kind of fault under a name. Raises `LabError` for a name that is taken."""
+    """Register the user's own kind of fault under a name. Raises `LabError` for a name that is taken or knobs that fail."""
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise LabError(f"fault kind {name!r}: a name has letters, digits, dots, hyphens and underscores")
     if name in SHIPPED:
@@ -342,5 +371,24 @@ def declare(name: str, kind: Kind) -> Kind:
             f"fault kind {name}: size {kind.size:g} in {kind.low:g}..{kind.high:g}, {len(kind.knobs)} knobs: expected the "
             "size within its bounds, and a knob"
         )
+    _try(name, kind)
     KINDS[name] = kind
     return kind
+
+
+def _try(name: str, kind: Kind) -> None:
+    """Turn all knobs of a kind there and back, on every robot on which it acts. Raises `LabError` when that fails."""
+    from hil.laboratory.robot import LINKS, specimen
+
+    for link in (kind.link,) if kind.link else LINKS:
+        robot = specimen(link, kind.markers)
+        for one in kind.knobs:
+            try:
+                before = one.read(robot)
+                turned = one.blend(before, kind.scale * kind.size)
+                if not (fits(before, float) and fits(turned, float)):
+                    raise LabError(f"from {shown(before)} to {shown(turned)}: expected a number")
+                one.turn(robot, turned)
+                one.turn(robot, before)
+            except Exception as error:
+                raise LabError(f"fault kind {name}: with --link {link}: {blame(error)}") from error

@@ -10,10 +10,11 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
+from hil.arguments import checked
 from hil.errors import LabError, hint
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
 from hil.laboratory.recorder import release_of
@@ -21,9 +22,12 @@ from hil.laboratory.recorder import release_of
 if TYPE_CHECKING:
     from hil.laboratory.robot import Robot
 
-SHAPE = re.compile(r"([^@:=]+)@([^@:=]+)(?::([^@:=]+))?(?:=([^@:=]+))?")
+_LENGTH_AND_SIZE = r"(?::(?P<duration>[^@:=]+))?(?:=(?P<size>[^@:=]+))?"
+SHAPE = re.compile(rf"(?P<kind>[^@:=]+)@(?P<start>[^@:=]+){_LENGTH_AND_SIZE}")
+LIVE_SHAPE = re.compile(rf"(?P<kind>[^@:=]+){_LENGTH_AND_SIZE}")
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class Fault:
     """One fault. `size` is in the unit of its kind. Raises `LabError` for an unknown kind or an impossible number."""
@@ -32,13 +36,18 @@ class Fault:
     start_s: float  # after the release
     duration_s: float  # inf: to the end
     size: float
+    live: bool = field(
+        default=False, repr=False
+    )  # typed into a running server: it acts at once, and its text has no start
 
     def __post_init__(self) -> None:
         kind = _kind(self.kind, self.kind)
         if not 0.0 <= self.start_s < math.inf:
-            raise LabError(f"fault {self}: it begins 0 or more seconds after the release")
+            raise LabError(
+                f"fault {self.kind}: start {self.start_s:g} s: expected 0 or more after the release"
+            )
         if not self.duration_s > 0.0:
-            raise LabError(f"fault {self}: it lasts more than 0 seconds, or inf")
+            raise LabError(f"fault {self.kind}: duration {self.duration_s:g} s: expected more than 0, or inf")
         if not kind.low <= self.size <= kind.high:
             unit = f" {kind.unit}".rstrip()
             allowed = (
@@ -50,7 +59,8 @@ class Fault:
         kind = KINDS[self.kind]
         duration = "" if self.duration_s == kind.duration_s else f":{_number(self.duration_s)}"
         size = f"={_number(self.size)}" if kind.sized else ""
-        return f"{self.kind}@{_number(self.start_s)}{duration}{size}"
+        start = "" if self.live else f"@{_number(self.start_s)}"
+        return f"{self.kind}{start}{duration}{size}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,21 +72,26 @@ class Span:
     end_us: float
 
 
-def parse(text: str) -> Fault:
-    """Return the fault that a text means; omitted parts have the kind's defaults. Raises `LabError`."""
-    match = SHAPE.fullmatch(text.strip())
+@checked
+def parse(text: str, live: bool = False) -> Fault:
+    """Return the fault that a text means; omitted parts have the kind's defaults. Raises `LabError`.
+
+    A `live` one, for a running server, has no start.
+    """
+    match = (LIVE_SHAPE if live else SHAPE).fullmatch(text.strip())
     if match is None:
-        raise LabError(f"fault {text!r}: expected KIND@START[:DURATION][=SIZE], like mocap.dropout@10:0.5")
-    name, *numbers = match.groups()
-    kind = _kind(name, text)
+        start, like = ("", "mocap.dropout:0.5") if live else ("@START", "mocap.dropout@10:0.5")
+        raise LabError(f"fault {text!r}: expected KIND{start}[:DURATION][=SIZE], like {like}")
+    parts = match.groupdict()
+    kind = _kind(parts["kind"], text)
     try:
-        start_s, duration_s, size = (None if number is None else float(number) for number in numbers)
+        start_s = float(parts.get("start") or 0.0)
+        duration_s = kind.duration_s if parts["duration"] is None else float(parts["duration"])
+        size = kind.size if parts["size"] is None else float(parts["size"])
     except ValueError:
-        raise LabError(f"fault {text!r}: start, duration and size are numbers") from None
-    assert start_s is not None
-    return Fault(
-        name, start_s, kind.duration_s if duration_s is None else duration_s, kind.size if size is None else size
-    )  # fmt: skip
+        numbers = "duration and size" if live else "start, duration and size"
+        raise LabError(f"fault {text!r}: {numbers} are numbers") from None
+    return Fault(parts["kind"], start_s, duration_s, size, live)
 
 
 def check(faults: Iterable[Fault], duration_s: float, link: str, markers: bool) -> None:

@@ -1,39 +1,34 @@
 """One flight of one robot: an experiment's script and faults, what is recorded and noted, how it ends.
 
-The line connects the robot to the ground: `hil.laboratory.lockstep` models link and ground station on the same time
-line, `hil.laboratory.linked` connects the robot to a ground station in a process of its own.
+The line makes the robot and connects it to the ground: `hil.laboratory.lockstep` models link and ground station on the same
+time line, `hil.servers.linked` connects the robot to a ground station in a process of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from firmware_py.core_runner import PythonRunner
 from firmware_py.wire.supervisor import Cause
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock
 from hil.config import LabConfig
-from hil.devices.real_firmware import RealFirmware
-from hil.devices.stm32f405.firmware import ImageFirmware
+from hil.devices.board_firmware import Executor
 from hil.events import EventQueue
 from hil.laboratory.channels import (
     battery_channel,
-    clock_channel,
+    board_channels,
     excitation_channel,
     fault_channel,
     flight_channels,
-    logic_channels,
-    loop_channel,
     marker_channel,
 )
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.laboratory import Laboratory, Progress
 from hil.laboratory.recorder import Channel, Recorder
-from hil.laboratory.robot import Executor, Robot, Streams
+from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams
 from hil.laboratory.schedule import WINDOW_US, ScheduleTrace
 
 RECORD_PERIOD_US = 10_000
@@ -52,9 +47,14 @@ class Outcome:
 
 
 class Line(Protocol):
-    """What is between the robot and the ground, both ends included."""
+    """A robot, what is between it and the ground, and the ground."""
 
     record: Path | None  # of the ground station, where only that knows the goals it sent
+
+    @property
+    def robot(self) -> Robot:
+        """The robot at its end."""
+        ...
 
     @property
     def trajectory(self) -> Trajectory:
@@ -63,6 +63,10 @@ class Line(Protocol):
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
         """The channels to record: of the line itself, and of the ground station."""
+        ...
+
+    def begin(self, release: Callable[[int], None]) -> None:
+        """Have the release planned, for an instant that is not over: once, now or when the robot is ready."""
         ...
 
     def command(self, now_us: int, packet: bytes) -> None:
@@ -111,51 +115,82 @@ class Programme(Protocol):
         ...
 
 
+class Order(Protocol):
+    """The part of a request that a flight needs."""
+
+    @property
+    def config(self) -> LabConfig:
+        """The profile."""
+        ...
+
+    @property
+    def experiment(self) -> Programme:
+        """The experiment."""
+        ...
+
+    @property
+    def duration_s(self) -> float:
+        """How long it is free."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """The seed of everything random."""
+        ...
+
+    @property
+    def link(self) -> str:
+        """Over which line."""
+        ...
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Faults on top of the experiment's own."""
+        ...
+
+
+LineOf = Callable[[Order, Site, Laboratory], Line]  # makes the line of a flight
+
+
 class Flight:
-    """A robot in its tunnel, ready to be released; `faults` come on top of the experiment's own.
-
-    `line` is set first; `release_us` exists once the release is planned.
-    """
-
-    line: Line
-    release_us: int
+    """A robot in its tunnel with all that its flight needs; `run` it. With `trace_all` its schedule is traced throughout."""
 
     def __init__(
         self,
-        config: LabConfig,
-        experiment: Programme,
-        duration_s: float,
-        seed: int,
+        order: Order,
         clock: Clock,
-        radio: bool,
-        mavlink: bool,
-        faults: Sequence[Fault] = (),
-        runner: Executor = PythonRunner,
+        line_of: LineOf,
+        executor: Executor = PYTHON_BOARD,
         trace_all: bool = False,
     ) -> None:
-        self.config = config
-        self.closing = ExitStack()  # what is closed with it
-        self.experiment = experiment
-        self.faults = (*experiment.faults, *faults)
-        self.streams = Streams.of_seed(seed)
+        self.config = order.config
+        self.experiment = order.experiment
+        self.faults = (*order.experiment.faults, *order.faults)
         self.lab = Laboratory(clock)
-        self.recorder: Recorder | None = None
-        self._early: list[tuple[str, str]] = []  # messages from before there was a recorder
         self.lost: str | None = None
         self.logic_failed: str | None = None  # how own logic failed, and when
         self.over = False
-        self._duration_us = round(duration_s * 1e6)
+        self._recorder: Recorder | None = None
+        self._early: list[tuple[str, str]] = []  # messages from before there was a recorder
+        self._release_us: int | None = None
+        self._duration_us = round(order.duration_s * 1e6)
         self._trace_all = trace_all
         self._drops_noted: dict[str, int] = {}
         self._next_drop_note_us = 0
-        self.robot = Robot(config, self.events, self.streams, self.note, radio, mavlink, runner)
-        self.robot.boot(0)
+        site = Site(order.config, self.events, Streams.of_seed(order.seed), self.note, executor)
+        self.line = line_of(order, site, self.lab)
+        self.robot = self.line.robot
         self.lab.robots.append(self.robot)
         self.robot.plant.hold()
         self.switchboard = Switchboard(self.robot)
-        experiment.prepare(self.robot)
+        order.experiment.prepare(self.robot)
         self.switchboard.prepare(self.faults)
-        self.schedule = ScheduleTrace(self.robot.firmware.kernel)
+        self.schedule = ScheduleTrace(self.robot.firmware.scheduler)
+        self._recorded = self.robot.firmware
+        self._resets_before = 0  # the release
+        self.line.begin(self._plan)
+        self.robot.watch(0)
+        self.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._record)
 
     @property
     def events(self) -> EventQueue:
@@ -168,25 +203,32 @@ class Flight:
         return max(self.lab.now_us, self.events.now_us)
 
     @property
+    def resets(self) -> int:
+        """How often the board was reset since the release."""
+        return self.robot.resets - self._resets_before
+
+    @property
     def end_us(self) -> int:
         """When the flight ends, as far as that is known."""
         return self.lab.end_us
 
-    def plan(self, release_us: int) -> None:
+    @property
+    def release_us(self) -> int:
+        """When the robot is released, once that is planned: its script knows."""
+        assert self._release_us is not None
+        return self._release_us
+
+    def _plan(self, release_us: int) -> None:
         """Plan everything that counts from the release; it may be now."""
-        self.release_us = release_us
-        self.lab.end_us = end_us = release_us + self._duration_us
+        self._release_us = release_us
+        end_us = release_us + self._duration_us
+        self.lab.end_at(end_us)
         self.events.at(release_us, self._release)
         self.experiment.script(self)
         self.switchboard.plan(self.faults, release_us, end_us)
         start_us = 0 if self._trace_all and release_us > self.now_us else release_us
         self.events.at(start_us, self.schedule.begin)
         self.events.at(end_us if self._trace_all else start_us + WINDOW_US, self.schedule.end)
-
-    def watch(self) -> None:
-        """Set sensors, cameras and recorder going; the last step before `run`."""
-        self.robot.watch(0)
-        self.events.every(RECORD_PERIOD_US, RECORD_PHASE_US, self._record)
 
     def channels(self) -> tuple[Channel, ...]:
         """Return the channels to record."""
@@ -196,17 +238,15 @@ class Flight:
         faults = (fault_channel(self.switchboard.active),) if self.faults else ()
         line, tracker = self.line.channels()
         excited = (excitation_channel(robot.firmware),) if any(self.config.excitation.rms) else ()
-        own = logic_channels(robot.firmware)
-        if isinstance(robot.firmware, RealFirmware):
-            own = (*own, loop_channel(robot.firmware))
-        if isinstance(robot.firmware, ImageFirmware) and robot.firmware.has_clock:
-            own = (*own, clock_channel(robot.firmware))
         battery = battery_channel(robot.battery)
-        return (*channels, *line, battery, *tracker, *markers, *faults, *excited, *own)
+        return (
+            *channels, *line, battery, *tracker, *markers, *faults, *excited, *board_channels(robot.firmware)
+        )  # fmt: skip
 
-    def run(self, progress: Progress | None = None) -> Outcome:
-        """Fly to the end, the crash, or Ctrl-C; the log is left open for the caller to close."""
+    def run(self, progress: Progress | None = None, recorder: Recorder | None = None) -> Outcome:
+        """Fly to the end, the crash, or Ctrl-C, into a log of `channels`; it is left open for the caller to close."""
         interrupted = False
+        self._recorder = recorder
         for source, text in self._early:
             self.note(source, text)
         try:
@@ -221,16 +261,20 @@ class Flight:
 
     def _release(self, now_us: int) -> None:
         self.robot.release()
-        if self.recorder is not None:
-            self.recorder.release_us = now_us
+        self._resets_before = self.robot.resets
+        if self._recorder is not None:
+            self._recorder.released(now_us)
         self.note("lab", "released")
 
     def _record(self, now_us: int) -> None:
         if self.over:
             return
         lost = self.robot.look(now_us)
-        if self.recorder is not None:
-            self.recorder.row(now_us)
+        if self._recorder is not None:
+            if self.robot.firmware is not self._recorded:  # it has booted
+                self._recorded = self.robot.firmware
+                self._recorder.read_from(self.channels())
+            self._recorder.row(now_us)
         self.robot.firmware.check_watchdog()
         self._watch_logic(now_us)
         self._note_drops(now_us)
@@ -240,20 +284,21 @@ class Flight:
             self.note("lab", line)
         if lost is not None:
             self.lost = lost
-            self.lab.end_us = now_us
+            self.lab.end_at(now_us)
             self.note("lab", f"lost: {lost}")
 
     def _watch_logic(self, now_us: int) -> None:
         """Note which of the user's modules first returned NaN or infinity."""
         cause = self.robot.firmware.signals.supervisor.cause
         if self.logic_failed is None and cause in NOT_FINITE:
-            what = cause.name.lower().replace("_", " ")
-            self.logic_failed = f"own {what} at {now_us * 1e-6:.2f} s of simulated time: failsafe"
+            what = self.robot.firmware.overrun or f"own {cause.name.lower().replace('_', ' ')}"
+            self.logic_failed = f"{what} at {now_us * 1e-6:.2f} s of simulated time: failsafe"
             self.note("lab", self.logic_failed)
 
     def _note_drops(self, now_us: int) -> None:
         """Report which queue drops, at most once per second."""
-        for queue in self.robot.firmware.kernel.queues:
+        scheduler = self.robot.firmware.scheduler
+        for queue in scheduler.queues if scheduler is not None else ():
             if queue.dropped > self._drops_noted.get(queue.name, 0) and now_us >= self._next_drop_note_us:
                 self.note("board", f"queue {queue.name} is full: {queue.dropped} dropped so far")
                 self._drops_noted[queue.name] = queue.dropped
@@ -261,8 +306,8 @@ class Flight:
 
     def note(self, source: str, text: str) -> None:
         """Write a line into the event log."""
-        if self.recorder is not None:
-            self.recorder.note(self.now_us, source, text)
+        if self._recorder is not None:
+            self._recorder.note(self.now_us, source, text)
         else:
             self._early.append((source, text))
 
@@ -272,6 +317,5 @@ class Flight:
         self.schedule.write(folder)
 
     def close(self) -> None:
-        """Close the resources that the flight itself opened."""
-        with self.closing:
-            self.line.close()
+        """Close what the line has opened."""
+        self.line.close()

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from hil.clock import Clock, FreeRunning
-from hil.events import EventQueue
+from hil.errors import LabError
+from hil.events import EndlessInstantError, EventQueue
 from hil.laboratory.robot import Robot
 
 NEVER_US = 1 << 62
@@ -21,7 +22,7 @@ Progress = Callable[[int], None]  # (now_us)
 
 
 class Laboratory:
-    """Robots on one time line; `add` them before `run`. `end_us` may be changed while it runs."""
+    """Robots on one time line; `add` them before `run`. `end_at` may be called while it runs."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
@@ -32,7 +33,16 @@ class Laboratory:
         self._alone = False  # one robot and no wall clock: no turns to take
 
     def run(self, progress: Progress | None = None) -> None:
-        """Go from one instant at which anything happens to the next, until `end_us`; may be called again."""
+        """Go from one instant at which anything happens to the next, until `end_us`; may be called again.
+
+        Raises `LabError` when an experiment plans events at one instant without end.
+        """
+        try:
+            self._run(progress)
+        except EndlessInstantError as error:
+            raise LabError(str(error)) from None
+
+    def _run(self, progress: Progress | None) -> None:
         clock, next_progress_us = self.clock, self.now_us
         self._alone = not clock.paced and len(self.robots) == 1
         self._run_firmware()
@@ -44,6 +54,10 @@ class Laboratory:
             if progress is not None and self.now_us >= next_progress_us:
                 progress(self.now_us)
                 next_progress_us = self.now_us + PROGRESS_PERIOD_US
+
+    def end_at(self, us: int) -> None:
+        """End `run` at an instant."""
+        self.end_us = us
 
     def stop(self) -> None:
         """End `run` after the present instant."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from firmware_py.core_runner import PythonRunner
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation, Link
@@ -16,16 +15,16 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal
 from hil.clock import Clock, FreeRunning
 from hil.config import LabConfig
+from hil.crazyflie.shockburst import Air
+from hil.devices.board_firmware import Executor, Flashed
+from hil.devices.image_settings import ImageSettings
 from hil.devices.radio import Receiver, VirtualRadio
-from hil.devices.stm32f405.firmware import ImageFirmware
-from hil.devices.stm32f405.settings import ImageSettings
+from hil.devices.uart import VirtualSerial
 from hil.laboratory.channels import radio_channel, tracker_channel
-from hil.laboratory.experiment import Experiment
-from hil.laboratory.faults import Fault
-from hil.laboratory.flight import Flight
+from hil.laboratory.flight import Flight, Order
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.recorder import Channel
-from hil.laboratory.robot import Executor
+from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
 
 RADIO, MAVLINK = "radio", "mavlink"
 LOCKSTEP = (RADIO, MAVLINK)  # links that are fully simulated
@@ -34,39 +33,44 @@ LOCKSTEP = (RADIO, MAVLINK)  # links that are fully simulated
 class ModelledLine:
     """`hil.laboratory.flight.Line` for the modelled links; `station`, `tracker` and `radio` may be read."""
 
-    def __init__(self, flight: Flight, link: str, telemetry_path: Path | None) -> None:
-        config, robot = flight.config, flight.robot
+    def __init__(self, telemetry: Path | None, order: Order, site: Site, lab: Laboratory) -> None:
+        config, events, streams = site.config, site.events, site.streams
+        serial = order.link == MAVLINK
         self.record: Path | None = None  # the log has the goals already
-        self._robot = robot
-        self.trajectory = flight.experiment.trajectory(
-            Goal(config.flight.home, 0.0), config.flight.release_us
-        )
+        self._release_us = config.flight.release_us
+        self.trajectory = order.experiment.trajectory(Goal(config.flight.home, 0.0), self._release_us)
         self.tracker = tracker_of(config.tracker, config.mocap.period_us)
-        self.radio = VirtualRadio(config.radio, flight.events, flight.streams.radio, robot.air, robot.wire_us)
-        robot.send_packet = self.radio.downlink
+        air = Air.of(config.radio)
+        uart = VirtualSerial(config.serial, events, streams.serial) if serial else None
+        self.radio = VirtualRadio(config.radio, events, streams.radio, air, site.executor.wire_us)
+        self.robot = Robot(site, Ports(self.radio.downlink, None if serial else air, uart))
         self._frames: FrameLog | None = None
         self._link, self._channel = (
-            self._serial(flight, telemetry_path) if link == MAVLINK else self._radio(config)
+            self._radio(config) if uart is None else self._serial(site, uart, telemetry)
         )
-        self._telemetry = TelemetryLog(telemetry_path) if telemetry_path else None
+        self._telemetry = TelemetryLog(telemetry) if telemetry else None
         self.station = GroundStation(
             self._link, self.trajectory, self._telemetry, config.station, self.tracker
         )
         on_ground: Receiver = self.station.on_packet
-        if isinstance(robot.firmware, ImageFirmware):
-            on_ground = self._set_up(flight, robot.firmware)
-        self.radio.connect(robot.packet_received, on_ground, robot.polled)
-        if robot.uart is not None:
-            robot.uart.connect(robot.uart_ready, self.station.on_packet)
-        robot.seen_by(lambda frame, now_us, _: self.station.on_frame(frame, now_us))
+        if self.robot.firmware.flashed is not None:
+            on_ground = self._set_up(site, self.robot.firmware.flashed)
+        self.radio.connect(self.robot.packet_received, on_ground, self.robot.polled)
+        if uart is not None:
+            uart.connect(self.robot.uart_ready, self.station.on_packet)
+        self.robot.seen_by(lambda frame, now_us, _: self.station.on_frame(frame, now_us))
 
-    def _set_up(self, flight: Flight, image: ImageFirmware) -> Receiver:
-        """Let the settings of the flight reach the image; returns what takes packets from the board."""
-        say = partial(flight.note, "lab")
+    def _set_up(self, site: Site, flashed: Flashed) -> Receiver:
+        """Let the settings of the flight reach the board; returns what takes packets from it."""
         settings = ImageSettings(
-            image.parameters, image.differences, flight.config, flight.events, self.radio.uplink, say
+            flashed.parameters,
+            flashed.differences,
+            site.config,
+            site.events,
+            self.radio.uplink,
+            partial(site.say, "lab"),
         )
-        flight.events.at(0, settings.begin)
+        site.events.at(0, settings.begin)
 
         def on_ground(now_us: int, data: bytes) -> None:
             self.station.on_packet(now_us, data)
@@ -74,25 +78,33 @@ class ModelledLine:
 
         return on_ground
 
+    def begin(self, release: Callable[[int], None]) -> None:
+        """Have the release planned for when the profile has it."""
+        release(self._release_us)
+
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
         """The counters of line and tracker."""
         return (self._channel,), (tracker_channel(self.tracker),) if self.tracker else ()
 
     def _radio(self, config: LabConfig) -> tuple[Link, Channel]:
-        return LoopbackLink(self.radio.uplink, config.station.link_latency_us), radio_channel(self.radio)
+        link = LoopbackLink(
+            self.radio.uplink, config.station.link_latency_us, lambda: self.robot.firmware.log_numbers
+        )
+        return link, radio_channel(self.radio)
 
-    def _serial(self, flight: Flight, telemetry_path: Path | None) -> tuple[Link, Channel]:
+    def _serial(self, site: Site, uart: VirtualSerial, telemetry: Path | None) -> tuple[Link, Channel]:
         """Return the station's end of the serial line, whose package is an extra."""
         from hil.laboratory.serial_line import link_of, serial_channel
 
-        uart = self._robot.uart
-        assert uart is not None
-        link = link_of(flight.config, uart)
-        if telemetry_path is not None:
-            self._frames = FrameLog(telemetry_path.with_name(FRAME_LOG))
-            link.note_frame = self._frames.note
-        flight.events.at(0, lambda now_us: flight.note("lab", link.budget.text))
-        return link, serial_channel(uart, self._robot.firmware, link)
+        link = link_of(site.config, uart, None if telemetry is None else self._note_frame)
+        if telemetry is not None:
+            self._frames = FrameLog(telemetry.with_name(FRAME_LOG))
+        site.events.at(0, lambda now_us: site.say("lab", link.budget.text))
+        return link, serial_channel(uart, self.robot.firmware, link)
+
+    def _note_frame(self, now_us: int, data: bytes) -> None:
+        if self._frames is not None:
+            self._frames.note(now_us, data)
 
     def command(self, now_us: int, packet: bytes) -> None:
         """Send a packet of the operator over the radio."""
@@ -114,23 +126,11 @@ class ModelledLine:
 
 
 def lockstep_flight(
-    config: LabConfig,
-    experiment: Experiment,
-    duration_s: float,
-    seed: int,
-    telemetry_path: Path | None,
+    order: Order,
+    telemetry: Path | None = None,
     clock: Clock | None = None,
     trace_all: bool = False,
-    link: str = RADIO,
-    faults: Sequence[Fault] = (),
-    runner: Executor = PythonRunner,
+    executor: Executor = PYTHON_BOARD,
 ) -> Flight:
-    """Return a flight that is released at `flight.release_us`, over a modelled link."""
-    flight = Flight(
-        config, experiment, duration_s, seed, clock or FreeRunning(), link == RADIO, link == MAVLINK,
-        faults, runner, trace_all,
-    )  # fmt: skip
-    flight.line = ModelledLine(flight, link, telemetry_path)
-    flight.plan(config.flight.release_us)
-    flight.watch()
-    return flight
+    """Return a flight over a modelled link."""
+    return Flight(order, clock or FreeRunning(), partial(ModelledLine, telemetry), executor, trace_all)

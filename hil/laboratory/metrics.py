@@ -1,7 +1,11 @@
 """From a flight log to metrics and verdicts, after the release: from the truth, never from the estimate.
 
-In a real flight, whose truth is unknown, from the cameras' poses; rows without a pose do not count.
+In a real flight, whose truth is unknown, from the cameras' poses: errors and shares are those of the time `flown`, in
+which the robot was seen; the rest of the flight is the metric `unseen`. A lost flight holds none of its limits, unless
+its limit on `lost` admits the loss.
 """
+
+from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,12 +18,24 @@ from pydantic import BeforeValidator, PlainSerializer
 
 from firmware_py.geometry import euler_zyx_of
 from firmware_py.wire.supervisor import State
+from hil.arguments import checked, shown
 from hil.errors import LabError, hint
 
 NEAR = 0.06  # [m] "less than 6 cm over each axis"
 BOX = 0.10  # [m] half of the 20 cm box
+UNDER_WAY_US = 100_000  # at the end of a real flight, whose last poses have not arrived yet
+STEADY = tuple(f"estimate.{name}" for name in "xyzpqr")  # change in every step of an estimator that runs
+SHORT_S = 0.1  # less than this of the flight's duration need not be mentioned
+
+# Limits of every flight, for which an experiment may have its own.
+ALWAYS: Mapping[str, float] = {
+    "resets": 0.0,
+    "uncontrolled": 0.2,  # [s] a silence that outlasts the supervisor's patience a little
+    "unseen": 0.5,  # [s] the patience itself
+}
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class Metric:
     """A figure of a flight; a limit on it is an upper or a lower bound."""
@@ -27,6 +43,7 @@ class Metric:
     unit: str
     bound: Literal["max", "min"]
     meaning: str
+    over_time: bool = False  # a share of the time in which the robot was seen
 
     def show(self, value: float) -> str:
         """Return a value as text with its unit."""
@@ -51,17 +68,19 @@ def show(value: float, unit: str) -> str:
 
 METRICS: Mapping[str, Metric] = {
     "lost": Metric("", "max", "1 when the flight ended as a crash"),
-    "flown": Metric("s", "min", "free flight, from the release to the end"),
+    "flown": Metric("s", "min", "free flight in which the robot was seen: what errors and shares are of"),
     "rms_x": Metric("m", "max", "root mean square of the x error, goal frame"),
     "rms_y": Metric("m", "max", "root mean square of the y error"),
     "rms_z": Metric("m", "max", "root mean square of the z error"),
     "max_x": Metric("m", "max", "largest x error"),
     "max_y": Metric("m", "max", "largest y error"),
     "max_z": Metric("m", "max", "largest z error"),
-    "within_6cm_x": Metric("share", "min", "share of the time with |x error| < 6 cm"),
-    "within_6cm_y": Metric("share", "min", "share of the time with |y error| < 6 cm"),
-    "within_6cm_z": Metric("share", "min", "share of the time with |z error| < 6 cm"),
-    "in_box": Metric("share", "min", "share of the time inside the 20 cm box around the goal"),
+    "within_6cm_x": Metric("share", "min", "share of the time with |x error| < 6 cm", over_time=True),
+    "within_6cm_y": Metric("share", "min", "share of the time with |y error| < 6 cm", over_time=True),
+    "within_6cm_z": Metric("share", "min", "share of the time with |z error| < 6 cm", over_time=True),
+    "in_box": Metric(
+        "share", "min", "share of the time inside the 20 cm box around the goal", over_time=True
+    ),
     "attitude_max": Metric("rad", "max", "largest roll, pitch or yaw error"),
     "y_over_x": Metric("", "min", "rms of y over rms of x"),
     "settle": Metric("s", "max", "from a step of the goal until the error stays within 5 % of it"),
@@ -85,8 +104,14 @@ METRICS: Mapping[str, Metric] = {
     "age_mean": Metric("s", "max", "mean age of the pose when the estimator takes it"),
     "poses_refused": Metric("", "max", "poses that the estimator did not fuse"),
     "frames_refused": Metric("", "max", "frames that the ground station's tracker refused"),
-    "unseen": Metric("s", "max", "time in which the cameras did not see the robot, of a real flight"),
     "failsafe": Metric("s", "max", "time in failsafe: flaps at hover, loop open"),
+    "resets": Metric("", "max", "how often the board's processor was reset"),
+    "uncontrolled": Metric(
+        "s", "max", "time in which no loop was closed: failsafe, or the board hangs, boots or waits"
+    ),
+    "unseen": Metric(
+        "s", "max", "time whose true pose is unknown: of a real flight, without the cameras' poses"
+    ),
     "line_up": Metric("share", "max", "mean load of the serial line to the board"),
     "line_down": Metric("share", "max", "mean load of the serial line from the board"),
     "line_overrun": Metric("bytes", "max", "lost because the board's receive buffer was full"),
@@ -142,15 +167,26 @@ class Verdict:
     holds: bool
     unit: str
     sense: Literal["max", "min"]  # of the bound
+    applies: bool = True  # False: the flight was lost, and what was measured before says nothing
+
+    @property
+    def mark(self) -> str:
+        """The verdict in one word."""
+        return "ok" if self.holds else "FAILS" if self.applies else "lost"
 
     def __str__(self) -> str:
         relation = "<=" if self.sense == "max" else ">="
         value, bound = show(self.value, self.unit), show(self.bound, self.unit)
-        return f"{self.metric} = {value} (limit {relation} {bound})"
+        until = "" if self.applies else " until the robot was lost"
+        return f"{self.metric} = {value}{until} (limit {relation} {bound})"
 
 
+@checked
 def column(table: pa.Table, *names: str) -> NDArray[np.float64]:
-    """Return columns of a log as an array (N,) or (N, len(names))."""
+    """Return columns of a log as an array (N,) or (N, len(names)). Raises `LabError` for a column that it lacks."""
+    for name in names:
+        if name not in table.column_names:
+            raise LabError(f"column {shown(name)}: the log has none; {hint(name, table.column_names)}")
     arrays = [table.column(name).to_numpy().astype(np.float64) for name in names]
     return arrays[0] if len(arrays) == 1 else np.stack(arrays, axis=1)
 
@@ -173,6 +209,7 @@ def known(table: pa.Table) -> pa.Table:
     return table.filter(np.isfinite(column(table, "cameras.x") + column(table, "estimate.x")))
 
 
+@checked
 def position_error(table: pa.Table) -> NDArray[np.float64]:
     """Return the body's position in the goal frame, (N, 3) [m]."""
     offset = body(table, "x", "y", "z") - column(table, "goal.x", "goal.y", "goal.z")
@@ -211,16 +248,40 @@ def _seen(table: pa.Table) -> NDArray[np.bool_]:
     return np.isfinite(column(table, "cameras.x"))
 
 
-def _unseen(table: pa.Table) -> float:
-    """Return how long [s] the cameras did not see the robot between the release and their last pose of it."""
+def _time_seen(table: pa.Table) -> tuple[float, float]:
+    """Return how long [s] the robot was seen between the release and the end, and how long it was not."""
     free = _rows(table, _free(table))
-    last = np.flatnonzero(_seen(free))[-1]
-    times = column(free, "t")[: last + 1]
-    return float((~_seen(free))[: last + 1].mean() * (times[-1] - times[0]) * 1e-6)
+    times, seen = column(free, "t"), _seen(free) if is_real(table) else np.ones(free.num_rows, np.bool_)
+    if (last := times[seen][-1]) >= times[-1] - UNDER_WAY_US:
+        times, seen = times[times <= last], seen[times <= last]
+    steps = np.diff(times)
+    flown = float(steps[seen[1:] & seen[:-1]].sum())
+    return flown * 1e-6, (float(steps.sum()) - flown) * 1e-6
 
 
-def measure(table: pa.Table, lost: bool) -> dict[str, float]:
-    """Return every metric of METRICS; NaN where the flight was too short."""
+def _without_control(table: pa.Table) -> tuple[float, float]:
+    """Return how long [s] the supervisor was in failsafe after the release, and how long no loop was closed."""
+    free = _rows(table, _free(table))
+    times, state = column(free, "t"), column(free, "supervisor.state")
+    open_loop = state != State.FLYING
+    if not is_real(table):
+        stands = (np.diff(column(free, *STEADY), axis=0) == 0.0).all(axis=1)
+        open_loop[1:] |= stands  # also of a board that hangs in flight, whose state is what it was
+    whole_s = float(times[-1] - times[0]) * 1e-6
+    return float((state == State.FAILSAFE).mean()) * whole_s, float(open_loop.mean()) * whole_s
+
+
+def _boots(table: pa.Table) -> int:
+    """Return how often a board began to calibrate its gyro after the release, which it does after a reset."""
+    calibrating = column(_rows(table, _free(table)), "supervisor.state") == State.CALIBRATING
+    return int((calibrating[1:] & ~calibrating[:-1]).sum())
+
+
+def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str, float]:
+    """Return every metric of METRICS; NaN where the flight was too short.
+
+    `resets`: of the board after the release; None: as far as the log shows them.
+    """
     flight = free_flight(table)
     values = dict.fromkeys(METRICS, float("nan"))
     values["lost"] = float(lost)
@@ -234,16 +295,16 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
         values[f"rms_{axis}"] = float(rms[index])
         values[f"max_{axis}"] = float(error[:, index].max())
         values[f"within_6cm_{axis}"] = float((error[:, index] < NEAR).mean())
-    values["flown"] = float(times[-1] - times[0]) * 1e-6
+    values["flown"], values["unseen"] = _time_seen(table)
     values["in_box"] = float((error <= BOX).all(axis=1).mean())
     values["attitude_max"] = float(np.abs(attitude_error(flight)).max())
     values["y_over_x"] = float(rms[1] / rms[0]) if rms[0] > 0 else float("nan")
     values["age_mean"] = _mean_age(flight)
-    in_failsafe = column(flight, "supervisor.state") == State.FAILSAFE
-    values["failsafe"] = float(in_failsafe.mean()) * values["flown"]
+    values["resets"] = float(_boots(table) if resets is None else resets)
+    values["failsafe"], values["uncontrolled"] = _without_control(table)
     if "serial.up_busy" in table.schema.names:
         busy = column(flight, "serial.up_busy", "serial.down_busy")
-        values["line_up"], values["line_down"] = (busy[-1] - busy[0]) * 1e-6 / values["flown"]
+        values["line_up"], values["line_down"] = (busy[-1] - busy[0]) / (times[-1] - times[0])
         values["line_overrun"] = float(column(flight, "serial.overrun")[-1])
     if "loop.delay" in table.schema.names:
         values["loop_delay"], values["loop_added"] = (
@@ -254,7 +315,6 @@ def measure(table: pa.Table, lost: bool) -> dict[str, float]:
             values[f"samples_{name}"] = float(column(flight, f"loop.{name}")[-1])
     if is_real(table):
         values["poses_refused"] = float(column(flight, "estimator.rejected")[-1])
-        values["unseen"] = _unseen(table)
     else:
         refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
         values["poses_refused"] = float(refused[-1])
@@ -269,17 +329,34 @@ def _mean_age(flight: pa.Table) -> float:
     return float(ages.mean()) * 1e-6 if len(ages) else np.nan
 
 
+def limits_of(own: Mapping[str, float], profile: Mapping[str, float] | None = None) -> dict[str, float]:
+    """Return the limits of a flight: those of every flight, and the profile's for the experiment or the experiment's own."""
+    always = {name: own.get(name, bound) for name, bound in ALWAYS.items()}
+    return {**(own if profile is None else profile), **always, **(profile or {})}
+
+
 def judge(
     values: Mapping[str, float], limits: Mapping[str, float], own: Mapping[str, Metric]
 ) -> list[Verdict]:
-    """Return the verdict on each limit; a metric that is not a number fails. Raises `LabError` like `check_limits`."""
+    """Return the verdict on each limit; a metric that is not a number fails. Raises `LabError` like `check_limits`.
+
+    A lost flight fails all of them, unless the limit on `lost` admits the loss.
+    """
     check_limits(limits, own)
+    lost = values.get("lost", 0.0) > limits.get("lost", 0.0)
     verdicts = []
     for name, bound in limits.items():
         metric, value = own.get(name) or METRICS[name], values[name]
-        holds = value <= bound if metric.bound == "max" else value >= bound
-        verdicts.append(Verdict(name, value, bound, bool(holds), metric.unit, metric.bound))
+        applies = name == "lost" or not lost
+        holds = applies and bool(value <= bound if metric.bound == "max" else value >= bound)
+        verdicts.append(Verdict(name, value, bound, holds, metric.unit, metric.bound, applies))
     return verdicts
+
+
+def short_of(metric: Metric, value: float, flown_s: float, duration_s: float) -> str:
+    """Return what follows a share of the time: of how much time, where that is less than the flight's duration."""
+    short = metric.over_time and np.isfinite(value) and flown_s < duration_s - SHORT_S
+    return f" of {flown_s:.4g} s" if short else ""
 
 
 def check_limits(limits: Mapping[str, float], own: Mapping[str, Metric]) -> None:

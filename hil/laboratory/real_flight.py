@@ -26,9 +26,9 @@ from hil.laboratory.ages import STATION_START, ages_of, reported_ages
 from hil.laboratory.channels import station_channels
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import RECORD_PERIOD_US
-from hil.laboratory.metrics import check_limits, free_flight, judge, measure
+from hil.laboratory.metrics import check_limits, free_flight, judge, limits_of, measure
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
-from hil.laboratory.result import REAL, Origin, Outcome, Result, write_result
+from hil.laboratory.result import REAL, Origin, Outcome, Result, with_resets, write_result
 from hil.world.config import LimitsConfig
 
 
@@ -55,7 +55,7 @@ class RealFlight:
         self._onlooker = onlooker
         self._experiment = experiment
         self._config = config
-        self._limits = config.limits.get(experiment.name, experiment.limits)
+        self._limits = limits_of(experiment.limits, config.limits.get(experiment.name))
         check_limits(self._limits, experiment.metrics)
         self._origin = Origin(
             experiment.name, profile, overrides, None, experiment.duration_s, uri, REAL, (), versions(),
@@ -134,7 +134,7 @@ class RealFlight:
         if recorder is None or start_us is None or now_us < start_us:
             return
         if recorder.release_us is None:
-            recorder.release_us = start_us - self._start_us
+            recorder.released(start_us - self._start_us)
             self._note(now_us, "lab", f"{self._experiment.name} begins")
         if not self._whole and now_us - start_us >= 1e6 * self._experiment.duration_s:
             self._whole = True
@@ -179,10 +179,11 @@ class RealFlight:
                 )
         cut_short: Outcome = "error" if failure else "interrupted" if interrupted else "completed"
         outcome: Outcome = "lost" if self._lost else "completed" if self._whole else cut_short
+        outcome, cause = with_resets(outcome, self._lost or failure or None, metrics["resets"])
         return Result(
             **self._origin.fields(),
             outcome=outcome,
-            cause=self._lost or failure or None,
+            cause=cause,
             metrics=metrics,
             own_metrics=own,
             verdicts=tuple(judge(metrics, self._limits, own)),

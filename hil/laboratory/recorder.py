@@ -83,7 +83,7 @@ class Recorder:
         metadata: Mapping[str, str],
         onlooker: Onlooker | None = None,
     ) -> None:
-        self.release_us: int | None = None  # of the robot, once it is known
+        self.release_us: int | None = None
         self._sources: list[tuple[Callable[[], Any], NDArray[Any]]] = []
         self._times = np.zeros(ROWS_PER_BATCH, np.int64)
         self._row = self._shown = 0
@@ -106,6 +106,10 @@ class Recorder:
             self._file = pa.OSFile(str(folder / STREAM), "wb")
             self._stream = pa.ipc.new_stream(self._file, self._schema)
             self._events = (folder / EVENTS).open("w", encoding="utf-8")
+
+    def released(self, at_us: int) -> None:
+        """Note when the robot is released."""
+        self.release_us = at_us
 
     def row(self, now_us: int) -> None:
         """Take one sample of every channel."""
@@ -218,6 +222,8 @@ def log_pieces(folder: Path) -> Iterator[pa.Table]:
     elif (folder / STREAM).is_file():
         yield from _read_stream(folder / STREAM)
     else:
+        if not folder.exists():
+            raise LabError(f"{folder}: there is no such run folder; `floaty runs` lists those that exist")
         raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
 
 

@@ -13,18 +13,21 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, computed_field
 
-from firmware_py.export.cortex_m4 import Usage
+from firmware_py.export.usage import Usage
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
+from hil.devices.board_firmware import ImageReport
 from hil.errors import LabError
 from hil.laboratory.experiment import Source
 from hil.laboratory.metrics import Figure, Metric, Verdict, measure
 from hil.laboratory.recorder import load_log
 
 RESULT = "result.json"
+USUAL = {"profile": "floaty", "link": "radio", "board": "python"}  # of `Origin.requested`
 REAL = "real"  # the board of a flight that only its ground station saw
 
-Outcome = Literal["completed", "lost", "interrupted", "error"]
+# reset: flown to its end, but the board was reset on the way.
+Outcome = Literal["completed", "lost", "reset", "interrupted", "error"]
 # In a log's schema values are JSON text.
 AsText = BeforeValidator(lambda value: json.loads(value) if isinstance(value, str) else value)
 OrNone = BeforeValidator(lambda value: None if value == "null" else value)  # likewise
@@ -38,18 +41,6 @@ class QueueReport:
     length: int
     high_water: int
     dropped: int
-
-
-@dataclass(frozen=True, slots=True)
-class ImageReport:
-    """What an image left unused at the end of its flight, and how often it began anew."""
-
-    sha256: str  # of what is in flash
-    stack_free_bytes: Mapping[str, int]  # of each task, never used since its creation
-    heap_free_bytes: int | None  # None: it has no heap of FreeRTOS
-    heap_least_free_bytes: int | None  # when it was fullest
-    watchdog_resets: int
-    software_resets: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +63,14 @@ class Origin:
     def fields(self) -> dict[str, Any]:
         """Return them by name, also of a `Result`."""
         return {field.name: getattr(self, field.name) for field in fields(Origin)}
+
+    def requested(self) -> dict[str, str]:
+        """Return the request as text, by what `floaty fly` calls it: equal for flights that were asked for alike."""
+        return {
+            "": self.source.reference if self.source else self.experiment,
+            "seed": str(self.seed), "duration": f"{self.duration_s!r} s", "profile": self.profile,
+            "set": " ".join(self.overrides), "fault": " ".join(self.faults), "link": self.link, "board": self.board,
+        }  # fmt: skip
 
     @property
     def title(self) -> str:
@@ -111,8 +110,23 @@ class Result(Origin):
     @computed_field  # type: ignore[prop-decorator]
     @property
     def passed(self) -> bool:
-        """Whether the flight ended by itself, which may be a crash, and every limit holds."""
-        return self.outcome in ("completed", "lost") and all(verdict.holds for verdict in self.verdicts)
+        """Whether the flight ended by itself, which may be a crash if a limit admits it, and every limit holds."""
+        return self.outcome in ("completed", "reset", "lost") and all(
+            verdict.holds for verdict in self.verdicts
+        )
+
+    @property
+    def failed(self) -> tuple[Verdict, ...]:
+        """The limits that its figures fail; of a lost flight that on the loss alone, which fails the others."""
+        return tuple(verdict for verdict in self.verdicts if verdict.applies and not verdict.holds)
+
+
+def with_resets(outcome: Outcome, cause: str | None, resets: float) -> tuple[Outcome, str | None]:
+    """Return outcome and cause of a flight whose board was reset so often."""
+    if not resets > 0:
+        return outcome, cause
+    how = f"the board was reset {resets:.0f} time{'s' if resets > 1 else ''}"
+    return "reset" if outcome == "completed" else outcome, "; ".join(filter(None, (cause, how)))
 
 
 _ORIGIN, _RESULT = TypeAdapter(Origin), TypeAdapter(Result)
@@ -126,10 +140,12 @@ def write_result(result: Result) -> None:
 def read_result(folder: Path) -> Result:
     """Return the result of a run folder. Raises `LabError` when the folder holds no run of this version."""
     path = folder / RESULT
-    if not path.is_file():
-        return _of_killed(folder)
     try:
+        if not path.is_file():
+            return _of_killed(folder)
         return replace(_RESULT.validate_json(path.read_bytes()), folder=folder)
+    except OSError as error:
+        raise LabError(f"{folder}: {error.strerror or error}") from None
     except ValidationError as error:
         raise LabError(f"{path}: {_first_of(error)}") from None
 

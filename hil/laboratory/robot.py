@@ -7,24 +7,24 @@ radio packets and the other end of its UART are handed in.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Literal
 
 import numpy as np
 
-from firmware_py.core_runner import PythonRunner, RunnerFactory
-from firmware_py.firmware import Firmware
-from firmware_py.thief import Thief
 from ground_station.mocap import MocapFrame
-from hil.config import LabConfig
-from hil.devices.board import VirtualBoard
+from hil.config import LabConfig, load_config
+from hil.crazyflie.shockburst import Air
+from hil.devices.board import InjectFailure, Memory, VirtualBoard, unsupported
+from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import VirtualImu
 from hil.devices.markers import Sighting
-from hil.devices.real_firmware import RealBoard, RealFirmware
 from hil.devices.rigid_body import make_markers
-from hil.devices.shockburst import Air, syslink_us
-from hil.devices.stm32f405.firmware import ChipImage, ImageFirmware
+from hil.devices.thief import Thief
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue
@@ -38,7 +38,7 @@ MOCAP_PHASE_US = 7_000  # so that a pose of 40 ms reaches the estimator 1-3 ms b
 
 See = Callable[[MocapFrame, int, Sighting | None], None]  # (frame, now_us, sighting of the markers)
 Say = Callable[[str, str], None]  # (source, text)
-Executor = RunnerFactory | ChipImage | RealBoard  # of the flight core, or of the whole image
+PYTHON_BOARD = PythonBoard()
 SendPacket = Callable[[int, bytes], bool]  # (now_us, packet): False when it has to wait
 
 
@@ -59,55 +59,77 @@ class Streams:
         return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)))
 
 
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where a robot stands, on which time line, and what executes its firmware."""
+
+    config: LabConfig
+    events: EventQueue
+    streams: Streams
+    say: Say
+    executor: Executor = PYTHON_BOARD
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """What a robot's board leads to: the medium of its radio and its UART, None where it lacks them, and who takes what.
+
+    `polled`: a real host polls its radio, so empty polls need no model. `restart` boots the robot again after a reset of its
+    processor; by default it does so itself. `fail` lets a part of it fail. `memory` may have something in it.
+    """
+
+    send_packet: SendPacket
+    air: Air | None = None
+    uart: VirtualSerial | None = None
+    polled: bool = False
+    restart: Callable[[int], None] | None = None
+    fail: InjectFailure = unsupported
+    memory: Memory = field(default_factory=Memory)
+
+
 class Robot:
     """Built at rest in its holder at home, with the firmware running; `watch` starts IMU and cameras.
 
     `air` (of its radio) and `uart` are changed by faults of its lines, None for a line that it lacks. `firmware` is that
-    of the present boot; `wire_us` is how long packets take from its radio chip to it, or back, where it does not simulate
-    that itself; `restart` is called on a reset of its processor, and may be replaced.
+    of the present boot.
     """
 
-    def __init__(
-        self,
-        config: LabConfig,
-        events: EventQueue,
-        streams: Streams,
-        say: Say,
-        radio: bool = True,
-        mavlink: bool = False,
-        runner: Executor = PythonRunner,
-    ) -> None:
+    def __init__(self, site: Site, ports: Ports) -> None:
+        config, streams = site.config, site.streams
         home, offset = config.flight.home, config.flight.start_offset
         self.start_W = (home[0] + offset[0], home[1] + offset[1], home[2] + offset[2])
         self.config = config
-        self.events = events
-        self.say = say
+        self.events = site.events
+        self.say = site.say
         self.free = False
         self.powered = True
-        self.plant = Plant(
+        self.plant: Plant = Plant(
             config.geometry, config.plant, config.tunnel, config.actuators, streams.gusts, self.start_W
         )
         self.battery: Battery = Battery(config.battery)
-        self.imu = VirtualImu(config.imu, streams.imu)
+        self.imu: VirtualImu = VirtualImu(config.imu, streams.imu)
         self.mocap = VirtualMocap(
             config.mocap,
             streams.mocap,
             make_markers(config.markers, config.geometry, config.plant.ground, streams.markers),
         )
-        self.air = Air.of(config.radio) if radio else None
-        self.uart = VirtualSerial(config.serial, events, streams.serial) if mavlink else None
-        self.send_packet: SendPacket = _nobody_listens
-        self._runner = runner
-        self.wire_us: Callable[[bytes], int] = _no_time if isinstance(runner, ChipImage) else syslink_us
-        self.polled_by_host = False  # a real host polls, so empty polls need no model
-        self.executes_image = isinstance(runner, ChipImage)
+        self.air, self.uart = ports.air, ports.uart
+        self.executor = site.executor
+        self._ports = ports
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
-        self.booted_us = 0
-        self.board = VirtualBoard(self.plant.set_counts, self._send, self._console, self.uart)
-        self.board.on_reset = self._reset
-        self.restart: Callable[[int], None] = self.boot
-        self.board.battery_mv = self.battery.millivolts
+        self._resets = 0
+        self.board = VirtualBoard(
+            self.plant.set_counts,
+            ports.send_packet,
+            self._console,
+            self.uart,
+            self._reset,
+            ports.fail,
+            ports.memory,
+        )
+        self.board.supply(self.battery.millivolts)
+        self.boot(0)
 
     def boot(self, now_us: int) -> None:
         """Start the firmware; its clock begins here. EEPROM and deck memory keep their content."""
@@ -116,22 +138,14 @@ class Robot:
         if self.uart is not None:
             self.uart.read()  # a booted processor starts with an empty buffer
         self.board.boot(now_us)
-        self.firmware = self._firmware(now_us)
-        self.board.run_on(self.firmware.kernel, self.events)
-        if self._thief is not None:
-            share, self._thief = self._thief.share, self.firmware.add_thief()
-            self._thief.share = share
-
-    def _firmware(self, now_us: int) -> Firmware | ImageFirmware | RealFirmware:
-        """Return the firmware of a new boot; an image is powered some time before the laboratory's time begins."""
-        if isinstance(self._runner, RealBoard):
-            return RealFirmware(self._runner, self.board)
-        if not isinstance(self._runner, ChipImage):
-            return Firmware(self.config, self.board, mavlink=self.uart is not None, runner=self._runner)
         specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is the same for every board
         specimen.set_noise_scale(BENCH_NOISE)
         rest = None if now_us else lambda: specimen.sample(self.plant)
-        return ImageFirmware(self._runner, self.board, rest, polls=not self.polled_by_host)
+        start = PowerOn(self.board, self.config, self.uart is not None, self._ports.polled, rest)
+        self.firmware = self.executor.boot(start)
+        self.board.run_on(self.firmware.kernel, self.events)
+        if self._thief is not None:
+            self._occupy(self._thief)
 
     def cut_power(self) -> None:
         """Stop the firmware: the servos keep their last pulse."""
@@ -148,10 +162,22 @@ class Robot:
 
     @property
     def thief(self) -> Thief:
-        """The thief task on the board, created on first use; it takes nothing until its share is set."""
+        """What takes processor time from the board, there from its first use on; it takes nothing until its share is set."""
         if self._thief is None:
-            self._thief = self.firmware.add_thief()
+            self._thief = Thief()
+            self._occupy(self._thief)
         return self._thief
+
+    def _occupy(self, thief: Thief) -> None:
+        if self.firmware.scheduler is None:
+            raise LabError("--hil: the processor time of a real board cannot be taken")
+        self.firmware.scheduler.occupy("THIEF", thief.taken_us)
+
+    @property
+    def resets(self) -> int:
+        """How often the processor was reset."""
+        flashed = self.firmware.flashed
+        return self._resets + (0 if flashed is None else flashed.resets)
 
     # Time
 
@@ -180,6 +206,10 @@ class Robot:
         self.plant.release()
         self.free = True
 
+    def catch(self) -> None:
+        """Take the body out of the flow."""
+        self.free = False
+
     def put_back(self, now_us: int) -> None:
         """Put the body into the holder, as at the start; flaps, air and faults are unchanged."""
         self.plant.advance(now_us)
@@ -190,7 +220,7 @@ class Robot:
         """Bring the truth and the battery up to this instant; returns why the flight is over, None while it is not."""
         self.plant.advance(now_us)
         self.battery.draw(now_us, self.plant.flap_travel)
-        self.board.battery_mv = self.battery.millivolts
+        self.board.supply(self.battery.millivolts)
         return self.plant.lost
 
     # Interrupts
@@ -213,8 +243,10 @@ class Robot:
     def _sample(self, now_us: int) -> None:
         self.plant.advance(now_us)
         if self.powered:
-            self.board.imu = self.imu.sample(self.plant)
-            self.firmware.imu_ready()
+            counts = self.imu.sample(self.plant)
+            if not self.imu.silent:
+                self.board.measure(counts)
+                self.firmware.imu_ready()
 
     def _expose(self, now_us: int) -> None:
         self.plant.advance(now_us)
@@ -233,12 +265,10 @@ class Robot:
         def restart(now_us: int) -> None:
             if self.powered:
                 self.say("board", "reset")
-                self.restart(now_us)
+                self._resets += 1
+                (self._ports.restart or self.boot)(now_us)
 
         self.events.at(now_us, restart)
-
-    def _send(self, now_us: int, data: bytes) -> bool:
-        return self.send_packet(now_us, data)
 
     def _console(self, now_us: int, text: str) -> None:
         self.say("board", text)
@@ -255,11 +285,31 @@ def with_system(config: LabConfig, system: int) -> LabConfig:
 MAX_SYSTEM = 255
 
 
-def _no_time(data: bytes) -> int:
-    """Take no time: the chip's own serial line does."""
-    return 0
-
-
-def _nobody_listens(now_us: int, data: bytes) -> bool:
+def nobody_listens(now_us: int, data: bytes) -> bool:
     """Lose a packet."""
     return True
+
+
+LINKS: tuple[Literal["radio", "mavlink"], ...] = ("radio", "mavlink")
+
+
+@cache
+def specimen(link: Literal["", "radio", "mavlink"], markers: bool) -> Robot:
+    """Return a booted robot that never flies, for trying what a user declares; without a link it has both."""
+    config, events = load_config(overrides=("markers.enabled=true",) if markers else ()), EventQueue()
+    site = Site(config, events, Streams.of_seed(0), lambda *_: None)
+    air = Air.of(config.radio) if link != "mavlink" else None
+    uart = VirtualSerial(config.serial, events, site.streams.serial) if link != "radio" else None
+    return Robot(site, Ports(nobody_listens, air, uart))
+
+
+def attributes_of(part: object) -> list[str]:
+    """Return the attributes of a part that are numbers and can be set."""
+    found = []
+    for name in dir(part):
+        value = getattr(part, name)
+        if not name.startswith("_") and isinstance(value, int | float):
+            with suppress(AttributeError, TypeError):
+                setattr(part, name, value)
+                found.append(name)
+    return found

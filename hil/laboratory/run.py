@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shutil
 import time
@@ -15,50 +14,51 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 
 from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import BOARDS, CORTEX_M4, PYTHON, runner_of
-from firmware_py.export.cortex_m4 import CortexM4Runner
 from firmware_py.logic.loading import digest_of
 from firmware_py.rtos import WatchdogError
 from ground_station.errors import LinkError
+from ground_station.links.schemes import SCHEMES
 from ground_station.telemetry_log import TELEMETRY
+from hil.arguments import checked
 from hil.clock import Clock
-from hil.config import DEFAULT_PROFILE, LabConfig, load_config
-from hil.devices.real_core import RealCore, is_link, real_core
-from hil.devices.stm32f405.chip import SOFTWARE, WATCHDOG
-from hil.devices.stm32f405.firmware import ChipImage, ImageFirmware
-from hil.devices.stm32f405.gdb import GdbServer
+from hil.config import DEFAULT_PROFILE, LabConfig, Overrides, load_config, settings_of
+from hil.devices.board_firmware import Executor, PythonBoard
+from hil.devices.image_firmware import ChipImage
+from hil.devices.real_core import is_link, real_core
 from hil.errors import LabError, require, writing
 from hil.installation import commit, versions
 from hil.laboratory.ages import ages_of, reported_ages, with_goals_sent
 from hil.laboratory.experiment import Experiment
-from hil.laboratory.faults import Fault, check
+from hil.laboratory.faults import Fault, check, parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Progress
 from hil.laboratory.lockstep import LOCKSTEP, MAVLINK, lockstep_flight
-from hil.laboratory.metrics import check_limits, free_flight, judge, measure
+from hil.laboratory.metrics import check_limits, free_flight, judge, limits_of, measure
 from hil.laboratory.recorder import EVENTS, Onlooker, Recorder, load_log
 from hil.laboratory.result import (
     RESULT,
-    ImageReport,
     Origin,
     Outcome,
     QueueReport,
     Result,
+    with_resets,
     write_result,
 )
-from hil.laboratory.robot import Executor
+from hil.stm32f405.gdb import GdbServer
 
 OLDER = "older-run"  # in a run folder, until the next flight begins
 LOADED_US = 250_000  # every part of the core has been called by then
 BUILD = Path("runs/build")
 DURATION_MAX_S = 86_400.0
+SEED_MAX = 2**62
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class Request:
     """The user's request for a flight."""
@@ -85,6 +85,13 @@ class Request:
             raise LabError(
                 f"--board {self.board}: --link {self.link}: only python flies over a link, and an image"
             )
+        if not self.in_lockstep and self.link.partition(":")[0] not in SCHEMES:
+            raise LabError(
+                f"--link {self.link}: expected radio, mavlink, radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:PORT, "
+                "mavlink:pty or mavlink:PATH"
+            )
+        if not 0 <= self.seed <= SEED_MAX:
+            raise LabError(f"--seed {self.seed}: expected a whole number, 0 to {SEED_MAX}")
         if not 0.0 < self.duration_s <= DURATION_MAX_S:
             raise LabError(
                 f"--duration {self.duration_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}"
@@ -92,7 +99,7 @@ class Request:
         self._require_packages()
         check(self.faults, self.duration_s, self.link, self.config.markers.enabled)
         check_limits(self.limits, self.experiment.metrics)
-        self.experiment.check_goals(self.config.flight.home, self.duration_s)
+        self.experiment.check_goals(self.config.flight.home, self.duration_s, partial(why_left, self.config))
 
     def _require_packages(self) -> None:
         """Raise `LabError` for a package of the link or board that is missing: before anything is written."""
@@ -106,26 +113,28 @@ class Request:
         elif self.board == CORTEX_M4:
             require(board, "deploy", "unicorn", "elftools", "ziglang")
         elif self.is_image:
-            require(board, "deploy", "unicorn", "elftools")
+            require(board, "deploy", "unicorn", "cffi", "elftools")
 
     @classmethod
+    @checked
     def of(
         cls,
         experiment: Experiment,
         profile: str = DEFAULT_PROFILE,
-        overrides: Sequence[str] = (),
+        overrides: Overrides = (),
         seed: int = 1,
         duration_s: float | None = None,
         link: str = "radio",
-        faults: Sequence[Fault] = (),
+        faults: Sequence[Fault | str] = (),
         board: str = PYTHON,
         elf: Path | None = None,
     ) -> Request:
         """Return the request for an experiment: its settings on the profile, `overrides` on both. Raises `LabError`."""
-        overrides = (*experiment.settings, *overrides)
-        config = load_config(profile, overrides)
+        settings = (*experiment.settings, *settings_of(overrides))
+        config = load_config(profile, settings)
         duration_s = experiment.duration_s if duration_s is None else duration_s
-        return cls(experiment, config, profile, overrides, seed, duration_s, link, tuple(faults), board, elf)
+        chosen = tuple(parse(one) if isinstance(one, str) else one for one in faults)
+        return cls(experiment, config, profile, settings, seed, duration_s, link, chosen, board, elf)
 
     @property
     def is_image(self) -> bool:
@@ -139,8 +148,8 @@ class Request:
 
     @property
     def limits(self) -> Mapping[str, float]:
-        """The limits of the flight: the profile's for the experiment, or the experiment's own."""
-        return self.config.limits.get(self.experiment.name, self.experiment.limits)
+        """The limits of the flight."""
+        return limits_of(self.experiment.limits, self.config.limits.get(self.experiment.name))
 
     def origin(self) -> Origin:
         """Return the origin that log and result state."""
@@ -151,7 +160,8 @@ class Request:
         )  # fmt: skip
 
 
-MakeFlight = Callable[["Request", Path, Clock | None, bool], Flight]  # (request, telemetry, clock, trace_all)
+# (request, telemetry, clock, trace_all, what is closed after the flight)
+MakeFlight = Callable[["Request", Path, Clock | None, bool, ExitStack], Flight]
 
 
 def fly(
@@ -169,29 +179,32 @@ def fly(
 
     An error of the firmware ends in the outcome "error", Ctrl-C in "interrupted".
     """
-    try:
-        flight = (flight_of or lockstep)(request, folder / TELEMETRY, clock, trace_all)
-    except BaseException:
-        _bring_back(folder)
-        raise
-    shutil.rmtree(folder / OLDER, ignore_errors=True)
-    origin = request.origin()
-    metadata = {**origin.metadata(), "config": request.config.model_dump_json()}
-    recorder = flight.recorder = Recorder(folder, flight.channels(), metadata, onlooker)
-    pace = _Pace()
+    with ExitStack() as stack:
+        try:
+            flight = (flight_of or lockstep)(request, folder / TELEMETRY, clock, trace_all, stack)
+        except BaseException:
+            _bring_back(folder)
+            raise
+        shutil.rmtree(folder / OLDER, ignore_errors=True)
+        origin = request.origin()
+        metadata = {**origin.metadata(), "config": request.config.model_dump_json()}
+        recorder = Recorder(folder, flight.channels(), metadata, onlooker)
+        pace = _Pace()
 
-    def on_progress(now_us: int) -> None:
-        pace.begin(now_us)
-        if progress is not None:
-            progress(now_us, flight)
+        def on_progress(now_us: int) -> None:
+            pace.begin(now_us)
+            if progress is not None:
+                progress(now_us, flight)
 
-    try:
-        outcome, cause = _fly_to_the_end(flight, on_progress)
-    finally:
-        factor = pace.end(flight.now_us)
-        digest = _close(flight, recorder, folder)
+        try:
+            outcome, cause = _fly_to_the_end(flight, on_progress, recorder)
+        finally:
+            factor = pace.end(flight.now_us)
+            digest = _close(flight, recorder, folder)
     log, firmware = load_log(folder), flight.robot.firmware
-    metrics = _metrics_of(request.experiment, log, outcome == "lost" or flight.lost is not None)
+    lost = outcome == "lost" or flight.lost is not None
+    metrics = _metrics_of(request.experiment, log, lost, flight.resets)
+    outcome, cause = with_resets(outcome, cause, flight.resets)
     result = Result(
         **origin.fields(),
         outcome=outcome,
@@ -200,27 +213,26 @@ def fly(
         own_metrics=request.experiment.metrics,
         verdicts=tuple(judge(metrics, request.limits, request.experiment.metrics)),
         tasks=tuple(firmware.statistics.reports()),
-        queues=tuple(map(_queue_report, firmware.kernel.queues)),
-        usage=firmware.runner.usage if isinstance(firmware.runner, CortexM4Runner | RealCore) else None,
+        queues=tuple(
+            QueueReport(one.name, one.length, one.high_water, one.dropped)
+            for one in (firmware.scheduler.queues if firmware.scheduler is not None else ())
+        ),
+        usage=firmware.usage,
         ages=ages_of(reported_ages(folder), log, request.link),
         hash=digest,
         real_time_factor=round(factor, 2),
         stood_still_ms=flight.lab.clock.stood_still_us / 1000,
         folder=folder,
-        image=_image_report(firmware) if isinstance(firmware, ImageFirmware) else None,
+        image=None if firmware.flashed is None else firmware.flashed.report(),
     )
     write_result(result)
     return result
 
 
-def _queue_report(queue: Any) -> QueueReport:
-    return QueueReport(queue.name, queue.length, queue.high_water, queue.dropped)
-
-
-def _fly_to_the_end(flight: Flight, progress: Progress) -> tuple[Outcome, str | None]:
+def _fly_to_the_end(flight: Flight, progress: Progress, recorder: Recorder) -> tuple[Outcome, str | None]:
     """Fly; return the outcome and its cause, which goes into the event log when the firmware ended the flight."""
     try:
-        end = flight.run(progress)
+        end = flight.run(progress, recorder)
     except WatchdogError as error:
         flight.note("board", str(error))
         return "lost", str(error)
@@ -243,20 +255,12 @@ def _close(flight: Flight, recorder: Recorder, folder: Path) -> str:
     return digest
 
 
-def _metrics_of(experiment: Experiment, log: pa.Table, lost: bool) -> dict[str, float]:
+def _metrics_of(experiment: Experiment, log: pa.Table, lost: bool, resets: int) -> dict[str, float]:
     """Return the metrics of every flight and the experiment's own; NaN where the flight was too short."""
-    metrics = measure(log, lost) | dict.fromkeys(experiment.metrics, math.nan)
+    metrics = measure(log, lost, resets) | dict.fromkeys(experiment.metrics, math.nan)
     if (free := free_flight(log)).num_rows > 1:
         metrics.update(experiment.measured(free))
     return metrics
-
-
-def _image_report(firmware: ImageFirmware) -> ImageReport:
-    free, least = firmware.heap_left()
-    return ImageReport(
-        hashlib.sha256(firmware.image.code).hexdigest(), firmware.stacks_left(), free, least,
-        firmware.resets[WATCHDOG], firmware.resets[SOFTWARE],
-    )  # fmt: skip
 
 
 class _Pace:
@@ -274,6 +278,17 @@ class _Pace:
     def end(self, now_us: int) -> float:
         """Return the factor up to now."""
         return (now_us - self._us) * 1e3 / (time.monotonic_ns() - self._ns)
+
+
+def why_left(config: LabConfig, p_W: Sequence[float]) -> str:
+    """Return why a robot at a place [m] has left the flow, by the limits of the plant; empty when it has not."""
+    limits, height = config.plant.limits, p_W[2] - config.tunnel.hover_height
+    if (radius := math.sqrt(p_W[0] * p_W[0] + p_W[1] * p_W[1])) > limits.radius:
+        return f"{radius:.2f} m from the axis; up to {limits.radius:g} m"
+    if not -limits.below <= height <= limits.above:
+        where = "below" if height < 0.0 else "above"
+        return f"{abs(height):.2f} m {where} the hover point; up to {getattr(limits, where):g} m"
+    return ""
 
 
 def check_image(board: str) -> None:
@@ -299,29 +314,23 @@ def lockstep(
     telemetry: Path | None,
     clock: Clock | None,
     trace_all: bool,
+    stack: ExitStack,
     debugger: GdbServer | None = None,
 ) -> Flight:
     """Return a flight over a modelled link. Raises `LabError` when its board is not available here."""
-    with ExitStack() as stack:
-        runner = _runner(request, stack, debugger)
-        try:
-            flight = lockstep_flight(
-                request.config, request.experiment, request.duration_s, request.seed, telemetry, clock, trace_all,
-                request.link, request.faults, runner,
-            )  # fmt: skip
-        except LinkError as error:
-            raise LabError(f"--board {error}") from None
-        flight.closing = stack.pop_all()
-    return flight
+    try:
+        return lockstep_flight(request, telemetry, clock, trace_all, _executor(request, stack, debugger))
+    except LinkError as error:
+        raise LabError(f"--board {error}") from None
 
 
-def _runner(request: Request, stack: ExitStack, debugger: GdbServer | None) -> Executor:
+def _executor(request: Request, stack: ExitStack, debugger: GdbServer | None) -> Executor:
     if is_link(request.board):
-        return real_core(request.board, stack)
+        return PythonBoard(real_core(request.board, stack))
     try:
         if request.is_image:
             return image_at(request.board, request.elf, debugger)
-        return runner_of(request.board, BUILD, request.config.logic)
+        return PythonBoard(runner_of(request.board, BUILD, request.config.logic))
     except FirmwareError as error:
         raise LabError(f"--board {request.board}: {error}") from None
 

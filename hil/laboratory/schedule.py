@@ -11,8 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet
 
-from firmware_py.rtos import Kernel
-from hil.devices.stm32f405.processor import Processor
+from hil.devices.board_firmware import Scheduler
 
 FILE = "schedule.parquet"
 WINDOW_US = 50_000
@@ -31,22 +30,23 @@ class Run:
 
 
 class ScheduleTrace:
-    """Collects the kernel's trace between `begin` and `end`; the flight plans both as events."""
+    """Collects the scheduler's trace between `begin` and `end`; the flight plans both as events."""
 
-    def __init__(self, kernel: Kernel | Processor) -> None:
-        self._kernel = kernel
+    def __init__(self, scheduler: Scheduler | None) -> None:
+        self._scheduler = scheduler
         self._rows: list[tuple[int, str, str, int, int]] = []
 
     def begin(self, now_us: int) -> None:
         """Start tracing; the task that has the processor is noted as if it had just been switched to."""
-        self._take(now_us, "IN", self._kernel.current.name, self._kernel.current.priority, 0)
-        self._kernel.set_trace(self._take)
+        if self._scheduler is not None:
+            self._take(now_us, "IN", self._scheduler.current.name, self._scheduler.current.priority, 0)
+            self._scheduler.set_trace(self._take)
 
     def end(self, now_us: int) -> None:
         """Stop tracing, if it goes on."""
-        if self._kernel.trace is not None:
+        if self._scheduler is not None and self._scheduler.trace is not None:
             self._take(now_us, "END", "-", 0, 0)
-            self._kernel.set_trace(None)
+            self._scheduler.set_trace(None)
 
     def write(self, folder: Path) -> None:
         """Write `schedule.parquet`."""

@@ -1,32 +1,32 @@
 """The serial line of a flight in lockstep, with MAVLink on it: the station's end, the board's UART, logged counters."""
 
-from firmware_py.firmware import Firmware
+from collections.abc import Callable
+
 from ground_station.errors import LinkError
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from hil.config import LabConfig
-from hil.devices.real_firmware import RealFirmware
-from hil.devices.stm32f405.firmware import ImageFirmware
+from hil.devices.board_firmware import BoardFirmware
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.laboratory.channels import quantity
 from hil.laboratory.recorder import Channel
 
 
-def link_of(config: LabConfig, line: VirtualSerial) -> MavlinkLink:
-    """Return the station's end of a line. Raises `LabError` when no flight fits on it."""
+def link_of(
+    config: LabConfig, line: VirtualSerial, note_frame: Callable[[int, bytes], object] | None
+) -> MavlinkLink:
+    """Return the station's end of a line; `note_frame` gets its frames. Raises `LabError` when no flight fits on it."""
     poses_hz = min(config.station.corrections_hz, 1e6 / config.mocap.period_us)
     key = bytes.fromhex(config.mavlink.signing_key)
     latency_us = config.station.link_latency_us
     settings = MavlinkLinkConfig(config.serial.baud, poses_hz, key, latency_us=latency_us)
     try:
-        return MavlinkLink(line.uplink, settings)
+        return MavlinkLink(line.uplink, settings, note_frame)
     except LinkError as error:
         raise LabError(f"--link mavlink: {error}") from None
 
 
-def serial_channel(
-    uart: VirtualSerial, firmware: Firmware | ImageFirmware | RealFirmware, link: MavlinkLink | None
-) -> Channel:
+def serial_channel(uart: VirtualSerial, firmware: BoardFirmware, link: MavlinkLink | None) -> Channel:
     """Return the counters of a serial line; without a `link` the station's frames are unknown and stay 0.
 
     `link.*` counts pieces of the stream, `serial.*` bytes, bits and frames.

@@ -12,14 +12,14 @@ from hil.laboratory.result import read_result
 from hil.live.window import end, page_of, serve_viewer, show
 from hil.pictures.links import HOST, PORT, key_of
 from hil.pictures.report import REPORT
-from hil.pictures.viewer import Recording
+from hil.pictures.viewer.recording import ServedRecording
 
 ROUTE = re.compile(r"/(\w+)/(-?\d+(?:\.\d+)?)")
 
 
 def show_at(run: Path, at_s: float) -> None:
     """Show the recording of a run folder until the window is closed. Raises `LabError` when no window opens."""
-    recording = Recording(run)  # it has to exist as long as the window
+    recording = ServedRecording(run)  # it has to exist as long as the window
     show(recording.at(at_s), "--new")
 
 
@@ -29,7 +29,7 @@ def browse(run: Path, at_s: float, say: Callable[[str], None]) -> None:
     Raises `LabError` when the links' port is taken, or no viewer opens.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # the viewer ends with this process
-    recording = Recording(run)
+    recording = ServedRecording(run)
     with Links(run, lambda instant_s: page_of(web_port, recording.at(instant_s))) as links:
         web_port, viewer = serve_viewer(recording.at(at_s))
         try:

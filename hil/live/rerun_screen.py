@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 import subprocess
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import pyarrow as pa
 
 from hil.errors import LabError
 from hil.live.window import address_of, end, is_open, open_window, serve_web
-from hil.pictures.viewer import LivePicture
+from hil.pictures.viewer.layout import blueprint
+from hil.pictures.viewer.recording import RerunFlight, stream_to
+
+CATCH_UP_S = 5.0  # granted to the viewer at the end of a live flight
 
 
 class RerunScreen:
@@ -27,18 +31,24 @@ class RerunScreen:
             self.address, taker, self._server = serve_web()
         else:
             taker = _there(target)
-        self._picture = LivePicture(taker)
+        self._recording = stream_to(taker)
+        self._flight: RerunFlight | None = None
 
     def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         """Show the next rows, and texts up to them."""
-        self._picture.show(rows, events)
+        if self._flight is None:
+            self._recording.send_blueprint(blueprint(rows.schema, live=True))
+            self._flight = RerunFlight(self._recording, rows.schema)
+        self._flight.add_rows(rows)
+        self._flight.add_events(events)
 
     def know(self, values: Mapping[str, float]) -> None:
         """Nothing: rerun has no parameters; their changes are texts."""
 
     def close(self) -> None:
         """Send the rest to the viewer; the browser keeps what it has, the window stays."""
-        self._picture.close()
+        with suppress(RuntimeError):  # a viewer that was closed, or is stuck
+            self._recording.flush(timeout_sec=CATCH_UP_S)
         if self._server is not None:
             end(self._server)
 

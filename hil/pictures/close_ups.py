@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from hil.pictures import curves
 from hil.pictures.curves import since_release
-from hil.pictures.pages import Shown, embedded
+from hil.pictures.pages import PageFigure, embedded
 from hil.pictures.panels import Marks, Plot, Spell, panel
 
 BEFORE_S, AFTER_S = 0.5, 1.0  # of a fault
@@ -20,7 +20,7 @@ LAST_S = 3.0  # before a loss
 class CloseUp:
     """A close-up, with its begin and end [s]."""
 
-    figure: Shown
+    figure: PageFigure
     at_s: float
     begin_s: float
     end_s: float
@@ -34,7 +34,7 @@ def close_ups(log: pa.Table, marks: Marks) -> list[CloseUp]:
         rows = log.filter((times >= begin_s) & (times <= end_s))
         if rows.num_rows > 1:
             plot = embedded(_plot(rows, (begin_s, end_s)))
-            figure = Shown(f"close-up-{len(shown) + 1}", title, "", plot=plot, alone=True, marks=marks)
+            figure = PageFigure(f"close-up-{len(shown) + 1}", title, "", plot=plot, alone=True, marks=marks)
             shown.append(CloseUp(figure, at_s, begin_s, end_s))
     return shown
 

@@ -23,7 +23,7 @@ from hil.laboratory.result import Result, read_result
 from hil.pictures import curves
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import png
-from hil.pictures.pages import Shown, embedded, write_page, zoomable
+from hil.pictures.pages import PageFigure, embedded, write_page, zoomable
 from hil.pictures.panels import Panel, Plot, Series
 from hil.pictures.trials import DARK
 
@@ -36,7 +36,7 @@ SETTINGS = ("experiment", "profile", "seed", "duration_s", "link", "board", "out
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class FlownRun:
     """A run folder's log and result."""
 
     log: pa.Table
@@ -44,7 +44,7 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class FirstDifference:
     """The first position at which two logs differ; a value is None where that log has ended."""
 
     row: int
@@ -85,7 +85,7 @@ class Apart:
 class Comparison:
     """The differences between two runs."""
 
-    first: Difference | None  # None: identical
+    first: FirstDifference | None  # None: identical
     # Columns that only the second flight has, and that only the first has.
     missing: tuple[tuple[str, ...], tuple[str, ...]]
     span: str  # of the metrics
@@ -101,15 +101,15 @@ class Comparison:
         return self.first is None and self.missing == ((), ())
 
 
-def load_run(folder: Path) -> Run:
+def load_flown(folder: Path) -> FlownRun:
     """Return the log and result of a run folder. Raises `LabError` when it cannot be read."""
-    run = Run(load_log(folder), read_result(folder))
+    run = FlownRun(load_log(folder), read_result(folder))
     if "flight.free" not in run.log.column_names:
         raise LabError(f"{folder}: its log is not that of a flight")
     return run
 
 
-def compare(a: Run, b: Run) -> Comparison:
+def compare(a: FlownRun, b: FlownRun) -> Comparison:
     """Compare two runs."""
     names_a, names_b = a.log.column_names, b.log.column_names
     common = [name for name in names_a if name in names_b]
@@ -128,14 +128,16 @@ def compare(a: Run, b: Run) -> Comparison:
     )
 
 
-def write_comparison(folder: Path, a: Run, b: Run, comparison: Comparison, why: Sequence[str] = ()) -> Path:
+def write_comparison(
+    folder: Path, a: FlownRun, b: FlownRun, comparison: Comparison, why: Sequence[str] = ()
+) -> Path:
     """Write `compare.png` and `compare.html` into a folder; returns the page. Raises `LabError`.
 
     `why` are lines on what makes them differ.
     """
     logs, names = (_judged(a.log), _judged(b.log)), (str(a.result.folder), str(b.result.folder))
     plot = pair(logs, names)
-    figure = Shown(
+    figure = PageFigure(
         "both",
         "Both flights",
         f"Position and attitude against the goal and the flap angles over time. Blue: {names[0]}; orange: {names[1]}. "
@@ -185,15 +187,16 @@ def _apart(a: pa.Table, b: pa.Table) -> Iterator[Apart]:
     for plot in (curves.POSITION, curves.ATTITUDE, curves.FLAPS):
         first, second = (plot.read(log) for log in free)
         for index, name in enumerate(plot.names):
-            miss = np.interp(times[common], others, second[:, index]) - first[common, index]
-            if name == "yaw":
+            values = np.unwrap(second[:, index], period=360) if plot is curves.ATTITUDE else second[:, index]
+            miss = np.interp(times[common], others, values) - first[common, index]
+            if plot is curves.ATTITUDE:
                 miss = (miss + 180) % 360 - 180
             miss = miss[np.isfinite(miss)]
             if len(miss):
                 yield Apart(name, plot.unit, float(np.sqrt((miss**2).mean())), float(np.abs(miss).max()))
 
 
-def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Difference | None:
+def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> FirstDifference | None:
     rows = min(a.num_rows, b.num_rows)
     row, column = rows, ""
     for name in columns:
@@ -203,15 +206,15 @@ def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> Differenc
             row, column = int(np.argmax(differs)), name
     if column:
         x, y = (table.column(column)[row].as_py() for table in (a, b))
-        return Difference(row, float(since_release(a)[row]), column, (x, y))
+        return FirstDifference(row, float(since_release(a)[row]), column, (x, y))
     if a.num_rows == b.num_rows:
         return None
     times = [table.column("t")[rows].as_py() if table.num_rows > rows else None for table in (a, b)]
     longer = a if times[0] is not None else b
-    return Difference(rows, float(since_release(longer)[rows]), "t", (times[0], times[1]))
+    return FirstDifference(rows, float(since_release(longer)[rows]), "t", (times[0], times[1]))
 
 
-def _flown_s(run: Run) -> float:
+def _flown_s(run: FlownRun) -> float:
     # A real flight may go on after the part that was judged.
     flown = free_flight(run.log) if is_real(run.log) else run.log
     return float(since_release(flown).max(initial=0.0))
@@ -226,7 +229,7 @@ def _span(first_s: float, second_s: float) -> str:
     )
 
 
-def _up_to(run: Run, end_s: float) -> Result:
+def _up_to(run: FlownRun, end_s: float) -> Result:
     """Return the result of a flight with the metrics of its first `end_s` after the release."""
     if _flown_s(run) < end_s + ROW_S:
         return run.result
@@ -248,7 +251,7 @@ def _metric_pairs(a: Result, b: Result) -> list[MetricPair]:
     return pairs
 
 
-def _differing_settings(a: Run, b: Run) -> list[tuple[str, str, str]]:
+def _differing_settings(a: FlownRun, b: FlownRun) -> list[tuple[str, str, str]]:
     trees = [
         {name: getattr(run.result, name) for name in SETTINGS}
         | {f"versions.{name}": number for name, number in run.result.versions.items()}

@@ -7,7 +7,6 @@ of colour vision.
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,13 +24,13 @@ AXIS_COLOURS = (RED, GREEN, BLUE)  # x, y, z; roll, pitch, yaw
 FLAP_COLOURS = (BLUE, ORANGE, GREEN, PINK)
 SERIES_COLOURS = (BLUE, ORANGE, GREEN, PINK, SKY, RED, YELLOW, GREY)
 TASK_COLOURS = {
-    "STABILIZER": BLUE, "KALMAN": ORANGE, "SENSORS": GREEN, "THIEF": PINK, "SYSLINK": "#1b04fa", "TELEMETRY": "#082427",
-    "CRTP-RX": "#7f2a04", "CRTP-TX": "#8ef199", "LOG": "#2571fa", "CRTP-SRV": "#2ce5ff", "PARAM": "#c27934",
+    "STABILIZER": BLUE, "KALMAN": ORANGE, "SENSORS": GREEN, "THIEF": PINK, "SYSLINK": "#1b04fa", "LOG": "#082427",
+    "CRTP-RX": "#7f2a04", "CRTP-TX": "#8ef199", "CRTP-SRV": "#2ce5ff", "PARAM": "#c27934",
     "CONSOLE": "#97eccd", "PLATFORM-SRV": "#704369", "APP": "#000690", "MEM": "#011d57", "PWRMGNT": "#26b5ff",
     "Tmr Svc": "#51fb62",
 }  # fmt: skip
 IN_ITS_PLACE = {  # over MAVLink
-    "MAV-RX": "CRTP-RX", "MAV-TX": "CRTP-TX", "MAV-STREAM": "TELEMETRY", "MAV-PARAM": "PARAM", "MAV-SYNC": "CRTP-SRV",
+    "MAV-RX": "CRTP-RX", "MAV-TX": "CRTP-TX", "MAV-STREAM": "LOG", "MAV-PARAM": "PARAM", "MAV-SYNC": "CRTP-SRV",
     "MAV-BOOT": "PLATFORM-SRV",
 }  # fmt: skip
 STAGE_COLOURS = dict(zip(STAGES, SERIES_COLOURS, strict=False))  # of a pose's age
@@ -88,6 +87,11 @@ def row_of_last_fusion(rows: pa.Table) -> pa.Table:
     return rows.take(fusions[-1:])
 
 
+def plain(*names: str, scale: float = 1.0) -> Read:
+    """Return what reads columns as they are, but for their unit."""
+    return lambda rows: scale * column(rows, *names).reshape(-1, len(names))
+
+
 def _degrees(*names: str) -> Read:
     return lambda rows: np.degrees(column(rows, *names))
 
@@ -124,33 +128,26 @@ FLAPS_COMMAND = Curves(
 INPUTS = Curves(
     ("u1 roll", "u2 pitch", "u3 yaw", "u4 height"), FLAP_COLOURS, "deg", _degrees(*_four("control.u"))
 )
-AGE = Curves(
-    ("age of the pose",), (BLUE,), "ms", lambda rows: 1e-3 * column(rows, "estimator.pose_age_us")[:, None]
-)
+AGE = Curves(("age of the pose",), (BLUE,), "ms", plain("estimator.pose_age_us", scale=1e-3))
 HORIZON = Curves(
-    ("horizon",), (ORANGE,), "ms", lambda rows: TICK_MS * column(rows, "estimator.horizon")[:, None],
-    needs="estimator.horizon",
-)  # fmt: skip
+    ("horizon",), (ORANGE,), "ms", plain("estimator.horizon", scale=TICK_MS), needs="estimator.horizon"
+)
 SINCE_FUSION = Curves(("since the last fused pose",), (RED,), "ms", since_fusion, needs="estimator.fused")
 PACKETS = Curves(
     ("lost up", "lost down", "sent again"), (RED, ORANGE, BLUE), "packets",
-    lambda rows: column(rows, "link.up_dropped", "link.down_dropped", "link.retried"),
-    needs="link.retried",
+    plain("link.up_dropped", "link.down_dropped", "link.retried"), needs="link.retried",
 )  # fmt: skip
 SERIAL_FAULTS = Curves(
     ("overrun", "no room", "bad up", "bad down"), (RED, ORANGE, BLUE, SKY), "so far",
-    lambda rows: column(rows, "serial.overrun", "serial.no_room", "serial.up_bad", "serial.down_bad"),
-    needs="serial.overrun",
+    plain("serial.overrun", "serial.no_room", "serial.up_bad", "serial.down_bad"), needs="serial.overrun",
 )  # fmt: skip
 STATION = Curves(
     ("poses late", "poses unusable", "telemetry malformed"), (RED, ORANGE, BLUE), "so far",
-    lambda rows: column(rows, "link.late", "station.unusable", "station.malformed"),
-    needs="link.late",
+    plain("link.late", "station.unusable", "station.malformed"), needs="link.late",
 )  # fmt: skip
 QUEUE = Curves(
     ("longest so far", "dropped"), (BLUE, RED), "measurements",
-    lambda rows: column(rows, "rtos.measurements_high_water", "rtos.measurements_dropped"),
-    needs="rtos.measurements_dropped",
+    plain("rtos.measurements_high_water", "rtos.measurements_dropped"), needs="rtos.measurements_dropped",
 )  # fmt: skip
 # The states of firmware_py.wire.supervisor.State, and one for a board that has not reported its state.
 SUPERVISOR = States(
@@ -190,14 +187,10 @@ def own_logic(rows: pa.Table) -> list[Curves]:
         Curves(
             tuple(name.removeprefix("logic.") for name in names),
             tuple(SERIES_COLOURS[index % len(SERIES_COLOURS)] for index in range(len(names))),
-            unit, partial(_columns, tuple(names)),
+            unit, plain(*names),
         )
         for unit, names in by_unit.items()
     ]  # fmt: skip
-
-
-def _columns(names: tuple[str, ...], rows: pa.Table) -> NDArray[np.float64]:
-    return column(rows, *names).reshape(-1, len(names))
 
 
 def latency(rows: pa.Table) -> NDArray[np.float64]:

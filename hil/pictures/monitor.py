@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from hil.laboratory.metrics import column
-from hil.pictures.curves import BLUE, GREEN, ORANGE, PINK, RED, SKY, Curves
+from hil.pictures.curves import BLUE, GREEN, ORANGE, PINK, RED, SKY, Curves, plain
 
 SECOND_US = 1_000_000
 ROWS_OF_A_SECOND = 100
@@ -30,16 +30,15 @@ AGE_STAGES = Curves(
     ("camera", "+ processing", "+ network", "+ station", "+ link: on board"), (BLUE, SKY, GREEN, ORANGE, PINK), "ms",
     _stages, needs="age.link",
 )  # fmt: skip
-BATTERY = Curves(
-    ("a cell",), (GREEN,), "V", lambda rows: column(rows, "battery.voltage")[:, None], needs="battery.voltage"
-)  # fmt: skip
-LOAD = Curves(
-    ("all tasks",), (BLUE,), "%", lambda rows: column(rows, "board.load")[:, None], needs="board.load"
-)  # fmt: skip
+BATTERY = Curves(("a cell",), (GREEN,), "V", plain("battery.voltage"), needs="battery.voltage")
+LOAD = Curves(("all tasks",), (BLUE,), "%", plain("board.load"), needs="board.load")
 AIR = Curves(
-    ("link quality [%]", "RSSI [-dBm]"), (BLUE, ORANGE), "", lambda rows: column(rows, "link.quality", "link.rssi"),
+    ("link quality [%]", "RSSI [-dBm]"),
+    (BLUE, ORANGE),
+    "",
+    plain("link.quality", "link.rssi"),
     needs="link.rssi",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True, slots=True)

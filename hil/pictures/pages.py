@@ -31,7 +31,7 @@ _ENVIRONMENT = Environment(
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class PageFigure:
     """A figure of a page: a plot that can be zoomed, or a picture as a data URI."""
 
     name: str  # in the page's addresses
@@ -54,18 +54,18 @@ def data_uri(png: bytes) -> str:
     return "data:image/png;base64," + base64.b64encode(png).decode()
 
 
-def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> Shown:
+def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> PageFigure:
     """Return a picture of flights for a page."""
     from hil.pictures.drawing import drawn
 
     name = picture.title.lower().replace(" ", "-")
     shown = drawn(picture.draw, *flights)
     if isinstance(shown, Plot):
-        return Shown(name, picture.title, picture.caption, plot=embedded(shown), marks=marks)
-    return Shown(name, picture.title, picture.caption, data_uri(shown))
+        return PageFigure(name, picture.title, picture.caption, plot=embedded(shown), marks=marks)
+    return PageFigure(name, picture.title, picture.caption, data_uri(shown))
 
 
-def zoomable(shown: Iterable[Shown]) -> dict[str, Any]:
+def zoomable(shown: Iterable[PageFigure]) -> dict[str, Any]:
     """Return what `figures.html.j2` embeds: uPlot, and the plots among the figures as JSON values."""
     plots = [(one, one.plot) for one in shown if one.plot is not None]
     marks = list({id(one.marks): one.marks for one, _ in plots}.values())

@@ -15,7 +15,7 @@ from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, spans_of
-from hil.laboratory.metrics import METRICS, SHOWN
+from hil.laboratory.metrics import METRICS, SHOWN, short_of
 from hil.laboratory.recorder import load_events, load_log, release_of
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
@@ -33,15 +33,15 @@ TEMPLATE = "report.html.j2"
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """One line of the table of metrics, ready to print; `holds` is None where there is no limit."""
+class MetricRow:
+    """One line of the table of metrics, ready to print; `mark` is None where there is no limit."""
 
     name: str
     meaning: str
     value: str
     unit: str
     limit: str
-    holds: bool | None
+    mark: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     )
 
 
-def metric_rows(result: Result) -> list[Row]:
+def metric_rows(result: Result) -> list[MetricRow]:
     """Return one row per metric that has a value or a limit, those with a limit first."""
     verdicts = {verdict.metric: verdict for verdict in result.verdicts}
     rows = []
@@ -108,8 +108,11 @@ def metric_rows(result: Result) -> list[Row]:
         sign = "≤" if metric.bound == "max" else "≥"
         limit = "" if verdict is None else f"{sign} {verdict.bound * scale:.4g}"
         text = "–" if math.isnan(value) else "never" if math.isinf(value) else f"{value * scale:.4g}"
-        rows.append(Row(name, metric.meaning, text, unit, limit, None if verdict is None else verdict.holds))
-    return sorted(rows, key=lambda row: row.holds is None)
+        unit += short_of(metric, value, result.metrics.get("flown", math.nan), result.duration_s)
+        rows.append(
+            MetricRow(name, metric.meaning, text, unit, limit, None if verdict is None else verdict.mark)
+        )
+    return sorted(rows, key=lambda row: row.mark is None)
 
 
 def fault_rows(faults: Iterable[Fault]) -> list[FaultRow]:

@@ -44,7 +44,7 @@ HEIGHT = 2.6  # [in] of one axis
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class TrialCurve:
     """A quantity on a vertical axis: (value, goal) of a flight, (N,) each, in the unit of the label."""
 
     label: str
@@ -75,12 +75,12 @@ def _tenth(values: Signal) -> Signal:
     return np.convolve(np.pad(values, (5, 4), "edge"), np.full(10, 0.1), "valid")
 
 
-YAW = Quantity("yaw [deg]", yaw_degrees)
-X, Y, Z = (Quantity(f"{axis} [cm]", partial(centimetres, axis)) for axis in "xyz")
-OPENING = Quantity("mean opening [deg]", openings)
+YAW = TrialCurve("yaw [deg]", yaw_degrees)
+X, Y, Z = (TrialCurve(f"{axis} [cm]", partial(centimetres, axis)) for axis in "xyz")
+OPENING = TrialCurve("mean opening [deg]", openings)
 
 
-def follow(quantities: tuple[Quantity, ...], window_s: tuple[float, float], *flights: pa.Table) -> Plot:
+def follow(quantities: tuple[TrialCurve, ...], window_s: tuple[float, float], *flights: pa.Table) -> Plot:
     """Quantities and their goals, one panel each, of one flight or of several trials, inside a window of time."""
     panels = []
     for quantity in quantities:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hil.devices.board import VirtualBoard
+from hil.devices.board import Memory
 from hil.errors import LabError
 
 
 class BoardFiles:
     """`board-N.eeprom` and `board-N.deck` are the bare bytes; `load` before the board boots, `keep` now and then."""
 
-    def __init__(self, folder: Path, number: int, board: VirtualBoard) -> None:
+    def __init__(self, folder: Path, number: int, memory: Memory) -> None:
         self._memories = {
-            folder / f"board-{number}.eeprom": board.eeprom,
-            folder / f"board-{number}.deck": board.deck_memory,
+            folder / f"board-{number}.eeprom": memory.eeprom,
+            folder / f"board-{number}.deck": memory.deck,
         }
         self._kept: dict[Path, bytes] = {}
         try:

@@ -23,7 +23,7 @@ class Holder:
 
     def put_back_later(self, now_us: int) -> None:
         """Put the robot back into the holder after a while."""
-        self._robot.free = False
+        self._robot.catch()
         self._robot.events.at(now_us + PUT_BACK_US, self._put_back)
 
     def _put_back(self, now_us: int) -> None:

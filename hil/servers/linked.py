@@ -11,22 +11,23 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
-from firmware_py.core_runner import PythonRunner
 from ground_station.links.frame_log import FRAME_LOG
 from ground_station.trajectory import Goal, Trajectory
 from hil.clock import Clock, Paced
-from hil.devices.stm32f405.firmware import ImageFirmware
-from hil.devices.stm32f405.settings import to_set
+from hil.devices.image_settings import to_set
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.ages import STATION_CLOCK
 from hil.laboratory.channels import radio_channel
-from hil.laboratory.flight import Flight
+from hil.laboratory.flight import Flight, Order
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
 from hil.laboratory.recorder import Channel, Quantity
+from hil.laboratory.robot import PYTHON_BOARD, Site
 from hil.laboratory.run import Request, image_at
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.holder import HOLD_US, Holder
@@ -55,39 +56,36 @@ class StationProcess:
     """
 
     def __init__(
-        self, flight: Flight, uri: str, seed: int, telemetry: Path, arguments: Sequence[str]
+        self, telemetry: Path, arguments: Sequence[str], order: Order, site: Site, lab: Laboratory
     ) -> None:
-        clock = flight.lab.clock
-        assert isinstance(clock, Paced)
-        self._flight = flight
-        self._served = ServedRobot(
-            1, flight.robot, flight.streams.radio, lambda text: flight.note("lab", text)
-        )
-        self._ends = Ends(flight.lab, clock.readers, flight.config, seed)
+        assert isinstance(lab.clock, Paced)
+        config, uri = site.config, order.link
+        self._say = site.say
+        self._served = ServedRobot(1, site, partial(site.say, "lab"), uri.startswith(SERIAL))
+        self.robot = self._served.robot
+        self._ends = Ends(lab, lab.clock.readers, config, order.seed)
         self._ends.robots.append(self._served)
-        self._experiment = flight.experiment
+        self._experiment = order.experiment
         self.record: Path | None = telemetry
-        self._home = Goal(flight.config.flight.home, 0.0)
-        self.released = False
+        self._home = Goal(config.flight.home, 0.0)
+        self._release_us: int | None = None  # the robot is held
         self._next_listen_us = 0
         self._heard = 0  # bytes of the station's output
         self._said = ""  # its last line
-        station_uri, self._environment = self._serve(uri, flight.config.serial.baud)
+        station_uri, self._environment = self._serve(uri, config.serial.baud)
         motive = self._ends.serve_motive(Streaming(0, (4, 1), multicast=False))
         self._command = [
             sys.executable, "-m", "hil.commands", "station", "--link", station_uri,
             "--mocap", f"optitrack:127.0.0.1:{motive.port},body={name_of(1)},y-up",
-            "--trajectory", flight.experiment.reference, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
+            "--trajectory", order.experiment.reference, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
             *(("--tlog", str(telemetry.with_name(FRAME_LOG))) if uri.startswith(SERIAL) else ()), *arguments, *ALIGNED,
         ]  # fmt: skip
         self._output = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - closed with the line
         self._typed = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - likewise
         self._station: subprocess.Popen[bytes] | None = None
-        image = flight.robot.firmware
-        if isinstance(
-            image, ImageFirmware
-        ):  # what the laboratory's own board has from the profile, an operator sets
-            lines = [f"set {name} {value!r}\n" for name, value in to_set(image.parameters, flight.config)]
+        flashed = self.robot.firmware.flashed
+        if flashed is not None:  # what the laboratory's own board has from the profile, an operator sets
+            lines = [f"set {name} {value!r}\n" for name, value in to_set(flashed.parameters, config)]
             self._typed.write("".join(lines).encode())
             self._typed.flush()
 
@@ -115,13 +113,22 @@ class StationProcess:
 
     def at(self, t_us: int) -> Goal:
         """The goal at an instant of the laboratory."""
-        if not self.released:
+        if self._release_us is None:
             return self._home
-        return self._experiment.trajectory(self._home, self._flight.release_us).at(t_us)
+        return self._experiment.trajectory(self._home, self._release_us).at(t_us)
+
+    def begin(self, release: Callable[[int], None]) -> None:
+        """Have the robot released when its board has flown in the holder."""
+
+        def let_go(now_us: int) -> None:
+            self._release_us = now_us
+            release(now_us)
+
+        Holder(self.robot, let_go)
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
         """What line and board count; the station keeps its own record."""
-        robot = self._flight.robot
+        robot = self.robot
         if robot.uart is not None:
             from hil.laboratory.serial_line import serial_channel  # needs pymavlink
 
@@ -133,7 +140,7 @@ class StationProcess:
 
     def command(self, now_us: int, packet: bytes) -> None:
         """Hand the operator's packet to the board as its radio does."""
-        self._flight.robot.packet_received(now_us, packet)
+        self.robot.packet_received(now_us, packet)
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
         """Raise `LabError` when the station has ended, or nothing flies for too long; return what it said."""
@@ -142,7 +149,7 @@ class StationProcess:
         station = self._running_station()
         if station.poll() is not None:
             self._give_up(f"the station ended with {station.returncode}")
-        if not self.released and now_us >= RELEASE_TIMEOUT_US:
+        if self._release_us is None and now_us >= RELEASE_TIMEOUT_US:
             self._give_up(f"no flight within {RELEASE_TIMEOUT_US * 1e-6:.0f} s")
         if now_us < self._next_listen_us:
             return []
@@ -161,7 +168,7 @@ class StationProcess:
 
     def _give_up(self, why: str) -> None:
         for source, text in self._listen():
-            self._flight.note(source, text)
+            self._say(source, text)
         raise LabError(f"{why}: {self._said or 'no output'}")
 
     def _listen(self) -> list[tuple[str, str]]:
@@ -182,13 +189,13 @@ class StationProcess:
                 lab.stop()
 
         station.terminate()
-        lab.end_us = lab.now_us + STATION_EXIT_TIMEOUT_US
+        lab.end_at(lab.now_us + STATION_EXIT_TIMEOUT_US)
         try:
             lab.run(progress)
         finally:
             self._kill()
         for source, text in self._listen():
-            self._flight.note(source, text)
+            self._say(source, text)
 
     def _kill(self) -> None:
         if self._station is not None:
@@ -203,7 +210,9 @@ class StationProcess:
         self._ends.close()
 
 
-def linked_flight(request: Request, telemetry: Path, clock: Clock | None, trace_all: bool) -> Flight:
+def linked_flight(
+    request: Request, telemetry: Path, clock: Clock | None, trace_all: bool, stack: ExitStack
+) -> Flight:
     """Return a flight over a real link, always paced; it is released when its board flies.
 
     Raises `LabError` for an experiment whose trajectory the station's process cannot find.
@@ -219,22 +228,9 @@ def linked_flight(request: Request, telemetry: Path, clock: Clock | None, trace_
             f"--link {request.link}: experiment {experiment.name}: its trajectory must stand in a file or a package, where "
             "the ground station's process finds it"
         )
-    flight = Flight(
-        request.config, request.experiment, request.duration_s, request.seed, Paced(), radio=True,
-        mavlink=request.link.startswith(SERIAL), faults=request.faults, trace_all=trace_all,
-        runner=image_at(request.board, request.elf) if request.is_image else PythonRunner,
-    )  # fmt: skip
     arguments = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
-    line = StationProcess(flight, request.link, request.seed, telemetry, arguments)
-    flight.line = line
-
-    def let_go(now_us: int) -> None:
-        flight.plan(now_us)
-        line.released = True
-
-    Holder(flight.robot, let_go)
-    flight.watch()
-    return flight
+    executor = image_at(request.board, request.elf) if request.is_image else PYTHON_BOARD
+    return Flight(request, Paced(), partial(StationProcess, telemetry, arguments), executor, trace_all)
 
 
 def _pty(uri: str) -> Address:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Callable
 from typing import IO
 
+from firmware_py.wire.supervisor import Cause
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
-from hil.laboratory.faults import parse
+from hil.laboratory.faults import Fault, parse
+from hil.laboratory.robot import Robot
 from hil.servers.server import Server
 
 READ_SIZE = 4096
 HELP = """[N] KIND[:DURATION][=SIZE]  lets a fault act on robot N (1) from now on: push.y=2, 2 mocap.dropout:0.5
 [N] clear                   ends all faults of robot N
+[N] status                  what robot N does, its faults, and where its radio is
+[N] restart                 switches board N off and on: its radio returns to the settings in its EEPROM
 kinds                       the kinds of faults
 help                        this"""
+COMMANDS = ("clear", "status", "restart", "kinds", "help")
 
 
 class LiveFaults:
@@ -41,7 +47,7 @@ class LiveFaults:
                 return
             *lines, self._rest = (self._rest + data).split(b"\n")
             for line in lines:
-                self.take(line.decode(errors="replace").strip(), now_us)
+                self.take(line.decode(errors="backslashreplace").strip(), now_us)
 
         if os.isatty(descriptor) or not os.path.samestat(os.fstat(descriptor), os.stat(os.devnull)):
             readers[descriptor] = read
@@ -64,10 +70,37 @@ class LiveFaults:
         number, text = (int(first), rest.strip()) if first.isdecimal() else (1, line)
         if not 1 <= number <= len(boards):
             raise LabError(f"robot {number}: expected 1..{len(boards)}")
-        board = boards[number - 1]
-        if text == "clear":
+        board, served = boards[number - 1], self._server.ends.robots[number - 1]
+        robot = served.robot
+        if text == "status":
+            faults = ", ".join(map(str, board.active)) or "none"
+            self._say(f"robot {number}: {_status(robot)}; faults: {faults}; {served.uri}")
+        elif text == "restart":
+            served.nrf51.power_cycle(now_us)
+        elif text == "clear":
             for fault in board.active.copy():
                 board.end(fault, now_us)
-            return
-        name = text.partition(":")[0].partition("=")[0]
-        board.act(parse(f"{name}@0{text[len(name) :]}"), now_us)
+        else:
+            board.act(_fault(text), now_us)
+            if not robot.free:
+                self._say(f"robot {number} is held: what moves it has no effect before it is released")
+
+
+def _fault(text: str) -> Fault:
+    """Return the fault that a line means; `LabError` names the commands, too, when it is none."""
+    try:
+        return parse(text, live=True)
+    except LabError as error:
+        near = difflib.get_close_matches(text, COMMANDS, 1)
+        if near and text not in KINDS:
+            raise LabError(f"{text!r} is unknown; did you mean {near[0]}?") from None
+        raise LabError(f"{error}; help lists what can be typed") from None
+
+
+def _status(robot: Robot) -> str:
+    """Return what a robot does, in a few words."""
+    if not robot.powered:
+        return "without power"
+    supervisor = robot.firmware.signals.supervisor
+    cause = "" if supervisor.cause is Cause.NONE else f", {supervisor.cause.name.lower().replace('_', ' ')}"
+    return f"{'free' if robot.free else 'held'}, {supervisor.state.name.lower()}{cause}"

@@ -150,7 +150,9 @@ class VirtualMotive:
             self._socket.bind((HOST, settings.port))
         except OSError as error:
             self._socket.close()
-            raise LabError(f"natnet port {settings.port}: {error.strerror or error}") from None
+            raise LabError(
+                f"natnet port {settings.port}: {error.strerror or error}; --natnet-port 0 takes a free one, --no-motive none"
+            ) from None
         self.port: int = self._socket.getsockname()[1]
         self.data_port = self.port + 1
         self._groups = [_group_sender(interface) for interface in _interfaces(self.data_port)]

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
-
-import numpy as np
 
 from firmware_py.wire import WireError
 from firmware_py.wire.memories import CONFIG_SIZE, decode_config, encode_config
 from firmware_py.wire.memories import RadioSettings as EepromSettings
+from firmware_py.wire.parameters import encode_pose_kind
 from ground_station.links.loopback import LoopbackLink
+from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Readers
-from hil.devices.nrf51 import RATES, Nrf51, RadioSettings
+from hil.config import LabConfig
+from hil.crazyflie.crazyflie import POLL_PERIOD_US
+from hil.crazyflie.nrf51 import RATES, Nrf51, RadioSettings
+from hil.crazyflie.shockburst import Air
+from hil.devices.board import InjectFailure, Memory, unsupported
 from hil.devices.radio import VirtualRadio
-from hil.devices.stm32f405.firmware import POLL_PERIOD_US, ImageFirmware
+from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
-from hil.laboratory.robot import Robot
+from hil.laboratory.robot import Ports, Robot, Site
 from hil.servers.board_files import BoardFiles
 from hil.servers.serial_server import Address, Endpoint
 from hil.servers.udp_server import UdpServer
@@ -28,6 +31,7 @@ from hil.servers.udp_server import UdpServer
 CHANNEL = 80
 RATE_NAMES = ("250K", "1M", "2M")  # in a URI
 UDP_RETRY_US = 500_000
+STAYS_US = 1_000_000  # a radio that was moved and stays there this long is reported
 UDP_QUEUE = 1000  # packets of a program that wait at the host: cflib does not repeat over UDP
 
 
@@ -36,51 +40,62 @@ def address_of(number: int) -> bytes:
     return bytes((0xE7, 0xE7, 0xE7, 0xE7, 0xE7 if number == 1 else number))
 
 
+WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # seen from here a pose is absolute
+
+
 class _Wire(LoopbackLink):
-    """Carries corrections only: telemetry belongs to the clients."""
+    """Carries corrections, or absolute poses; telemetry belongs to the clients."""
+
+    def __init__(self, transmit: Callable[[int, bytes], object], latency_us: int, absolute: bool) -> None:
+        super().__init__(transmit, latency_us, dict)
+        self._absolute = absolute
 
     def start_telemetry(self, now_us: int) -> None:
-        """Nothing."""
+        """Set what the poses are instead: an image that has booted begins with absolute ones."""
+        self._transmit(now_us, encode_pose_kind(self._absolute))
+
+    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
+        """Hand a pose to the board: seen from the goal, or as the cameras saw it."""
+        super().send(now_us, frame, WORLD if self._absolute else goal)
 
 
 class ServedRobot:
-    """One robot and its ends; it implements `hil.devices.nrf51.Processor` towards its radio chip, and boots the robot."""
+    """One robot and its ends; it implements `hil.crazyflie.nrf51.Processor` towards its radio chip, and boots the robot."""
 
     def __init__(
         self,
         number: int,
-        robot: Robot,
-        rng: np.random.Generator,
+        site: Site,
         say: Callable[[str], None],
+        mavlink: bool = False,
         state: Path | None = None,
+        fail: InjectFailure = unsupported,
     ) -> None:
-        config, events = robot.config, robot.events
-        assert robot.air is not None
+        config, events, rng = site.config, site.events, site.streams.radio
+        memory = self._memory = Memory()
+        air, wire_us = Air.of(config.radio), site.executor.wire_us
+        uart = VirtualSerial(config.serial, events, site.streams.serial) if mavlink else None
         self.number = number
-        self.robot = robot
         self.udp: UdpServer | None = None
         self._say = say
         self._udp_awaited = False  # somebody else has the port
         self._line_end: Endpoint | None = None
-        if robot.uart is not None:
-            robot.uart.connect(robot.uart_ready, self._from_line)
         patient = config.radio.model_copy(update={"uplink_queue": UDP_QUEUE})
-        self.udp_radio = VirtualRadio(patient, events, rng, robot.air, robot.wire_us)
-        self.udp_radio.connect(robot.packet_received, self._to_udp)
+        self.udp_radio = VirtualRadio(patient, events, rng, air, wire_us)
         settings = RadioSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
-        self.nrf51 = Nrf51(
-            settings, chip, config.radio.downlink_queue, events, self, robot.air, robot.wire_us
-        )
-        robot.send_packet = self._send
-        robot.polled_by_host = True
-        robot.restart = self.start
-        robot.board.eeprom[:CONFIG_SIZE] = self._factory_config()
-        self._files = BoardFiles(state, number, robot.board) if state is not None else None
+        self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, events, self, air, wire_us)
+        memory.eeprom[:CONFIG_SIZE] = _factory_config(number, config)
+        self._files = BoardFiles(state, number, memory) if state is not None else None
         if self._files is not None:
             self._files.load()
-        self.start(0)
-        if isinstance(robot.firmware, ImageFirmware) and (stays := robot.firmware.differences(config)):
+        self.nrf51.tune(self._settings_at_boot())
+        self.robot = Robot(site, Ports(self._send, air, uart, True, self.start, fail, memory))
+        self.udp_radio.connect(self.robot.packet_received, self._to_udp)
+        if uart is not None:
+            uart.connect(self.robot.uart_ready, self._from_line)
+        flashed = self.robot.firmware.flashed
+        if flashed is not None and (stays := flashed.differences(config)):
             say(f"the image has its own {stays}")
 
     @property
@@ -92,8 +107,10 @@ class ServedRobot:
 
     def serve_udp(self, port: int, readers: Readers) -> str:
         """Be reachable over UDP, too; returns the URI."""
-        self.udp = UdpServer(port, readers, self.udp_radio.uplink)
-        if self.robot.executes_image:
+        self.udp = UdpServer(
+            port, readers, self.udp_radio.uplink, lambda text: self._say(f"board {self.number}: {text}")
+        )
+        if self.robot.executor.needs_polls:
             self.robot.events.every(POLL_PERIOD_US, self.robot.events.now_us, self._poll)
         return f"udp://127.0.0.1:{self.udp.port}"
 
@@ -122,10 +139,13 @@ class ServedRobot:
             self._line_end.close()
             self._line_end = None
 
-    def fly(self) -> None:
-        """Fly at home with a ground station of its own, on a wire that no client sees."""
+    def fly(self, absolute: bool = False) -> None:
+        """Send poses from a ground station on a wire that no client sees: corrections for home, or absolute poses.
+
+        With absolute poses the goal is the clients' matter.
+        """
         config = self.robot.config
-        link = _Wire(self._wire, config.station.link_latency_us)
+        link = _Wire(self._wire, config.station.link_latency_us, absolute)
         tracker = tracker_of(config.tracker, config.mocap.period_us)
         home = Hold(Goal(config.flight.home, 0.0))
         ground = GroundStation(link, home, None, config.station, tracker)
@@ -146,7 +166,7 @@ class ServedRobot:
 
     def start(self, now_us: int) -> None:
         """Boot the firmware."""
-        self._tune()
+        self.nrf51.tune(self._settings_at_boot())
         self.robot.boot(now_us)
         self._open_udp(now_us)
 
@@ -169,6 +189,20 @@ class ServedRobot:
         """Notice an empty packet from the radio chip."""
         self.robot.polled(now_us)
 
+    def retuned(self, now_us: int) -> None:
+        """Report where the radio is, once it has stayed there: a program that scans moves it a hundred times."""
+        settings = self.nrf51.settings
+
+        def report(now_us: int) -> None:
+            if self.nrf51.settings is not settings:
+                return
+            where = f"a client moved the radio to {self.uri}; restart moves it back"
+            if settings == self._settings_at_boot():
+                where = f"a client moved the radio back to {self.uri}"
+            self._say(f"board {self.number}: {where}")
+
+        self.robot.events.at(now_us + STAYS_US, report)
+
     def _open_udp(self, now_us: int) -> None:
         """Listen again; while the board was off, another program may have taken the port: then try until it is free."""
         if self.udp is None or not self.robot.powered:
@@ -185,17 +219,13 @@ class ServedRobot:
             self._udp_awaited = False
             self._say(f"board {self.number}: udp port {self.udp.port} is open again")
 
-    def _factory_config(self) -> bytes:
-        """Return the configuration block with this board's own address and the profile's data rate."""
-        rate = RATES.index(self.robot.config.radio.bits_per_second)
-        return encode_config(EepromSettings(CHANNEL, rate, int.from_bytes(address_of(self.number))))
-
-    def _tune(self) -> None:
-        """Set the radio to what the configuration block says, as the firmware does at boot; keep it when that is none."""
-        with suppress(WireError, IndexError):
-            block = decode_config(bytes(self.robot.board.eeprom[:CONFIG_SIZE]))
-            address = block.address.to_bytes(5)
-            self.nrf51.settings = RadioSettings(block.channel, RATES[block.data_rate], address)
+    def _settings_at_boot(self) -> RadioSettings:
+        """Return where the firmware sets the radio at boot: to its configuration block; nowhere else when that is none."""
+        try:
+            block = decode_config(bytes(self._memory.eeprom[:CONFIG_SIZE]))
+            return RadioSettings(block.channel, RATES[block.data_rate], block.address.to_bytes(5))
+        except (WireError, IndexError):
+            return self.nrf51.settings
 
     # Packets of the board
 
@@ -212,3 +242,9 @@ class ServedRobot:
     def _from_line(self, now_us: int, data: bytes) -> None:
         if self._line_end is not None:
             self._line_end.send(data)
+
+
+def _factory_config(number: int, config: LabConfig) -> bytes:
+    """Return the configuration block with a board's own address and the profile's data rate."""
+    rate = RATES.index(config.radio.bits_per_second)
+    return encode_config(EepromSettings(CHANNEL, rate, int.from_bytes(address_of(number))))

@@ -6,20 +6,20 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from firmware_py.core_runner import PythonRunner
-from firmware_py.firmware import Firmware
 from firmware_py.rtos import WatchdogError
+from firmware_py.wire.mavlink_numbers import Result
 from ground_station.trajectory import Goal, Hold
 from hil.clock import Paced, Readers
 from hil.config import LabConfig
+from hil.crazyflie.nrf51 import Power
+from hil.devices.board_firmware import Executor
 from hil.devices.dongle import VirtualDongle
 from hil.devices.markers import NO_POINTS, marker_places
-from hil.devices.nrf51 import Power
 from hil.errors import LabError
 from hil.laboratory.channels import (
     battery_channel,
+    board_channels,
     flight_channels,
-    logic_channels,
     marker_channel,
     radio_channel,
 )
@@ -28,7 +28,7 @@ from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.recorder import Channel, Onlooker, Recorder
-from hil.laboratory.robot import Executor, Robot, Streams, with_system
+from hil.laboratory.robot import PYTHON_BOARD, Site, Streams, with_system
 from hil.servers.dongle_server import DongleServer
 from hil.servers.holder import Holder
 from hil.servers.motive import Streaming, VirtualMotive
@@ -36,6 +36,8 @@ from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
 
 DONGLE_SEED = 10_000  # random streams of dongles: apart from those of the robots
+# Of each USB transfer: cflib and the socket of the dongle, unpaced, manage 4500 exchanges per second.
+HOST_SHARE_US = 110
 BUTTON_US = 5_000_000  # off, or in the bootloader with nobody talking to it: then somebody presses the button
 
 
@@ -96,11 +98,14 @@ class Ends:
             self.motive.close()
 
     def _new_dongle(self) -> VirtualDongle:
+        """Return a dongle at a real host, which takes its share of every exchange itself."""
         self._seed += 1
         rng = Streams.of_seed(self._seed).radio
-        return VirtualDongle(
-            self._config.radio, self._lab.events, rng, [robot.nrf51 for robot in self.robots]
+        radio = self._config.radio
+        at_real_host = radio.model_copy(
+            update={"usb_us": max(0, radio.usb_us - HOST_SHARE_US), "usb_jitter_us": 0}
         )
+        return VirtualDongle(at_real_host, self._lab.events, rng, [robot.nrf51 for robot in self.robots])
 
 
 def name_of(number: int) -> str:
@@ -113,7 +118,7 @@ class Shown:
 
     def __init__(self, served: ServedRobot, onlooker: Onlooker) -> None:
         self._served = served
-        if isinstance(served.robot.firmware, Firmware):
+        if served.robot.firmware.flashed is None:
             # A task that a fault may add later: the columns are those of all tasks.
             served.robot.thief.share = 0.0
         self._firmware = served.robot.firmware
@@ -138,7 +143,7 @@ class Shown:
             line = radio_channel(self._served.udp_radio)
         home = Hold(Goal(robot.config.flight.home, 0.0))
         markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()
-        own = logic_channels(robot.firmware)
+        own = board_channels(robot.firmware)
         return (*flight_channels(robot, home), line, battery_channel(robot.battery), *markers, *own)
 
 
@@ -146,7 +151,7 @@ class Server:
     """`count` robots that are let go when they fly, and put back when they are lost; `run` them after opening ends.
 
     `faults` act from the first release of each robot on. `say` gets lines for the user, `onlooker` sees the
-    first robot. EEPROM and deck memories are kept in the folder `state`; `runner` executes what is on board.
+    first robot. EEPROM and deck memories are kept in the folder `state`; `executor` what is on board.
     """
 
     def __init__(
@@ -159,7 +164,7 @@ class Server:
         faults: Sequence[Fault] = (),
         state: Path | None = None,
         onlooker: Onlooker | None = None,
-        runner: Executor = PythonRunner,
+        executor: Executor = PYTHON_BOARD,
     ) -> None:
         self.clock = Paced()
         self.lab = Laboratory(self.clock)
@@ -169,7 +174,7 @@ class Server:
         self._faults = faults
         self._state = state
         self._onlooker = onlooker
-        self._runner = runner
+        self._executor = executor
         self._shown: Shown | None = None
         for number in range(1, count + 1):
             own = with_system(config, config.mavlink.system + number - 1) if mavlink else config
@@ -181,14 +186,17 @@ class Server:
             if number == 1 and self._onlooker is not None:
                 self._onlooker.note(self.lab.now_us, source, text)
 
-        robot = Robot(config, self.lab.events, streams, say, True, mavlink, self._runner)
-        served = ServedRobot(number, robot, streams.radio, self._say, self._state)
+        def fail(now_us: int, unit: int, failing: int, instance: int) -> Result:
+            return Failures(robot, switchboard).inject(now_us, unit, failing, instance)
+
+        site = Site(config, self.lab.events, streams, say, self._executor)
+        served = ServedRobot(number, site, self._say, mavlink, self._state, fail)
+        robot = served.robot
         robot.plant.hold()
         self.lab.robots.append(robot)
         self.ends.robots.append(served)
         switchboard = Switchboard(robot)
         self.switchboards.append(switchboard)
-        robot.board.on_failure = Failures(robot, switchboard).inject
         planned = False
 
         def let_go(now_us: int) -> None:
@@ -214,7 +222,7 @@ class Server:
             if stopping():
                 self.lab.stop()
 
-        self.lab.end_us = NEVER_US
+        self.lab.end_at(NEVER_US)
         self.lab.run(progress)
 
     def _look(self, served: ServedRobot, holder: Holder, now_us: int) -> None:

@@ -1,31 +1,40 @@
 """A board on `udp://127.0.0.1:PORT`: one datagram is one CRTP packet, for quick use without a radio.
 
-The newest client is the session: packets of the board go to it until it is silent for `SESSION_TIMEOUT_US`; clients
-that it displaced are ignored as long as they go on talking. Who looks for boards sends an empty packet and is answered
-without becoming the session. What happens between here and the board is the matter of a `VirtualRadio`, which repeats
-what the air loses: cflib does not repeat over UDP.
+The first client is the session: the board hears it alone, until it is silent for `SESSION_TIMEOUT_US` (cflib pings ten
+times per second) or its port is closed. Packets of others are counted and reported in one line. Who looks for boards sends
+an empty packet and is answered without becoming the session.
+
+What happens between here and the board is the matter of a `VirtualRadio`, which repeats what the air loses: cflib does not
+repeat over UDP.
 """
 
 import socket
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 
 from hil.clock import Readers
-from hil.devices.nrf51 import NULL, NULL_MASK
+from hil.crazyflie.nrf51 import NULL, NULL_MASK
 from hil.errors import LabError
 from hil.servers.dongle_server import HOST
 
-SESSION_TIMEOUT_US = 5_000_000
+SESSION_TIMEOUT_US = 1_000_000
+PROBE_PERIOD_US = 100_000  # between looks whether the session's port is still open, while others send
+IP_RECVERR = 11  # Linux: report that a client's port is closed
 MAX_PACKET = 31
 
 Address = tuple[str, int]
 
 
 class UdpServer:
-    """One board's port (0: any, kept afterwards). `received` gets the packets of the session."""
+    """One board's port (0: any, kept afterwards). `received` gets the packets of the session, `say` lines for the user."""
 
-    def __init__(self, port: int, readers: Readers, received: Callable[[int, bytes], None]) -> None:
+    def __init__(
+        self, port: int, readers: Readers, received: Callable[[int, bytes], None], say: Callable[[str], None]
+    ) -> None:
         self.port = port
+        self.ignored = 0  # packets of others during this session
+        self._say = say
         self._readers = readers
         self._received = received
         self._socket: socket.socket | None = None
@@ -36,9 +45,12 @@ class UdpServer:
         if self._socket is not None:
             return
         self._session: Address | None = None
-        self._heard_us: dict[Address, int] = {}  # when each client spoke last
+        self._heard_us = 0  # when the session spoke last
+        self._probed_us = -PROBE_PERIOD_US
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         opened.setblocking(False)
+        if sys.platform == "linux":
+            opened.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
         try:
             opened.bind((HOST, self.port))
         except OSError as error:
@@ -56,47 +68,66 @@ class UdpServer:
             self._socket = None
 
     def end_session(self) -> None:
-        """Displace the client, in favour of one on another link."""
+        """Let go of the client: it is gone, or one on another link is newer."""
+        if self.ignored:
+            self._say(f"udp port {self.port}: {self.ignored} packets of others were ignored")
+        self.ignored = 0
         self._session = None
 
     def has_session(self, now_us: int) -> bool:
         """Whether a client talks to the board."""
         if self._socket is None or self._session is None:
             return False
-        if now_us - self._heard_us[self._session] > SESSION_TIMEOUT_US:
-            self._session = None
+        if now_us - self._heard_us > SESSION_TIMEOUT_US:
+            self.end_session()
         return self._session is not None
 
     def send(self, data: bytes) -> None:
         """Send a packet of the board to the session, if there is one."""
         if self._socket is not None and self._session is not None:
-            with suppress(OSError):  # its buffer is full or it is gone: UDP loses packets then
+            try:
                 self._socket.sendto(data, self._session)
+            except ConnectionRefusedError:
+                self.end_session()
+            except OSError:  # its buffer is full: UDP loses packets then
+                pass
 
     def _read(self, now_us: int) -> None:
         """Take one datagram."""
         assert self._socket is not None
         try:
             data, client = self._socket.recvfrom(2048)
-        except OSError:  # the report of an earlier packet that a client did not want
+        except ConnectionRefusedError:  # the report of an earlier packet: its client is gone
+            self.end_session()
+            return
+        except OSError:
             return
         if not 1 <= len(data) <= MAX_PACKET:
             return
         if data[0] & NULL_MASK == NULL and len(data) == 1:
-            self._socket.sendto(data, client)
+            with suppress(OSError):
+                self._socket.sendto(data, client)
             return
         if not self._admit(now_us, client):
             return
         self._received(now_us, data)
 
+    def _probe(self, now_us: int) -> None:
+        """Let go of a session whose port is closed: its program has ended, and cflib sends its first packet only once."""
+        if now_us - self._probed_us >= PROBE_PERIOD_US:
+            self._probed_us = now_us
+            for _ in range(2):  # the second reports what the first has found
+                self.send(bytes((NULL,)))
+
     def _admit(self, now_us: int, client: Address) -> bool:
-        """Make a new client the session; refuse one that was displaced."""
-        last_us = self._heard_us.get(client)
-        displaced = client != self._session and last_us is not None and now_us - last_us < SESSION_TIMEOUT_US
-        if client != self._session and not displaced:
-            self._session = client
-            self._heard_us = {
-                other: t_us for other, t_us in self._heard_us.items() if now_us - t_us < SESSION_TIMEOUT_US
-            }
-        self._heard_us[client] = now_us
-        return not displaced
+        """Make a client the session when there is none; refuse any other."""
+        if client != self._session and self.has_session(now_us):
+            self._probe(now_us)
+        if self._session is not None and client != self._session:
+            if self.ignored == 0:
+                new, old = ("{}:{}".format(*address) for address in (client, self._session))
+                self._say(f"udp port {self.port}: {new} is ignored while {old} talks to the board")
+            self.ignored += 1
+            return False
+        self._session, self._heard_us = client, now_us
+        return True

@@ -12,8 +12,7 @@ from functools import cache
 import numpy as np
 
 from hil.config import load_config
-from hil.design.analysis import point_of
-from hil.design.sweeps import RESERVE, Point
+from hil.design.sweeps import RESERVE, Point, point_of
 from hil.design.trim import opening_at
 from hil.errors import LabError
 from hil.studies.study import Change, Expected, Study, Variant

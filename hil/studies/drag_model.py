@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -21,14 +21,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.elementary import cos, sin
 from hil.config import LabConfig
+from hil.design.authority import pressure_at, wrenches
 from hil.laboratory.robot import Streams
-from hil.world.body import MIRRORS, SIGNS, flap_plates
-from hil.world.config import GeometryConfig, PlantConfig
-from hil.world.geometry import axis_of, weigh
+from hil.world.body import SIGNS
 from hil.world.layout import STEP_US
-from hil.world.motion import GRAVITY
 from hil.world.noise import normal
 from hil.world.plant import Plant
 
@@ -68,7 +65,7 @@ ROWS = len(ROBOTS) * len(SWEEPS) * len(ANGLES_DEG)
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class MountedRow:
     """Model and measurement at one angle."""
 
     robot: str  # flat or kinked flaps
@@ -79,49 +76,13 @@ class Row:
     deviation: Wrench
 
 
-class SimplifiedModel:
-    """The paper's plates in a uniform flow. The drag coefficient is the one with which the robot hovers."""
-
-    def __init__(self, geometry: GeometryConfig, config: PlantConfig) -> None:
-        weight = weigh(geometry)
-        self._airspeed = config.airspeed
-        self._base_area = geometry.base_side * geometry.base_side
-        self._axes = np.array([0.0, 0.0, weight.axis_height])
-        self._axis = axis_of(geometry)
-        self._parts = flap_plates(geometry)
-        self._pressure = 1.0  # [kg/m3] rho C_D / 2
-        lift = self.wrench(SIGNS * config.hover_angle)[2]
-        self._pressure = weight.mass * GRAVITY / lift
-
-    def wrench(self, flaps: NDArray[np.float64]) -> Wrench:
-        """Return force and torque in B, (6,), for flap angles (4,) [rad]."""
-        total = self._push(self._base_area, np.array([0.0, 0.0, 1.0]), self._axes)
-        for mirror, sign, angle in zip(MIRRORS, SIGNS, flaps, strict=True):
-            for part in self._parts:
-                n, r = (mirror * _turned(v, self._axis, -sign * angle) for v in (part.normal, part.centre))
-                total += self._push(part.area, n, r + self._axes)
-        return total
-
-    def _push(self, area: float, normal: NDArray[np.float64], centre: NDArray[np.float64]) -> Wrench:
-        """Return force and torque of the flow on one plate (eq. flaps_drag_force_simplified, drag_torque_equation)."""
-        across = self._airspeed * normal[2]
-        force = self._pressure * area * across * abs(across) * normal
-        return np.concatenate([force, np.cross(centre, force)])
-
-
-def _turned(vector: NDArray[np.float64], axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """Return a vector of flap 2 turned about its axis."""
-    along = axis * math.fsum(axis * vector)
-    return np.asarray(along + (vector - along) * cos(angle) + np.cross(axis, vector) * sin(angle))
-
-
-def measure(config: LabConfig, seed: int) -> Iterator[Row]:
+def measure(config: LabConfig, seed: int) -> Iterator[MountedRow]:
     """Yield the ROWS rows, robot by robot and sweep by sweep."""
     streams = Streams.of_seed(seed)
     body = config.plant.model_copy(update={"variant": "plate", "constant_factors": {}})
     for robot, kink in zip(ROBOTS, (0.0, config.geometry.kink_angle), strict=True):
         geometry = config.geometry.model_copy(update={"kink_angle": kink})
-        model = SimplifiedModel(geometry, body)
+        pressure = pressure_at(geometry, body.hover_angle)
         plant = Plant(geometry, body, config.tunnel, config.actuators, streams.gusts)
         plant.hold()
         for servo in range(4):
@@ -132,7 +93,8 @@ def measure(config: LabConfig, seed: int) -> Iterator[Row]:
             noise = normal(streams.imu, (SAMPLES, 6)) * SENSOR_NOISE
             samples = _measure(plant, flaps, index * SAMPLES * STEP_US) + noise
             mean, deviation = samples.mean(axis=0), samples.std(axis=0)
-            yield Row(robot, sweep.name, angle_deg, model.wrench(flaps), mean, deviation)
+            (model,) = wrenches(geometry, (SIGNS * flaps)[None], pressure)
+            yield MountedRow(robot, sweep.name, angle_deg, model, mean, deviation)
 
 
 def _measure(plant: Plant, flaps: NDArray[np.float64], start_us: int) -> NDArray[np.float64]:
@@ -145,7 +107,7 @@ def _measure(plant: Plant, flaps: NDArray[np.float64], start_us: int) -> NDArray
     return samples
 
 
-def write_csv(rows: list[Row], path: Path) -> None:
+def write_csv(rows: Sequence[MountedRow], path: Path) -> None:
     """Write one line per angle: model, mean and standard deviation of each force [N] and torque [N m]."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

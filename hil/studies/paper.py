@@ -20,9 +20,9 @@ from hil.laboratory.metrics import METRICS, SHOWN
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request
 from hil.studies.catalogue import PROFILES
-from hil.studies.paper_rows import ROWS, Row
+from hil.studies.paper_rows import ROWS, PaperRow
 from hil.studies.study import Study
-from hil.studies.study_run import StudyResult, flights_of, summarise
+from hil.studies.study_run import StudyResult, distance, flights_of, summarise
 from hil.studies.sweep import Job, fly_all
 
 KEPT = ("log.parquet", "events.jsonl", "result.json")
@@ -87,7 +87,7 @@ class Trials:
         """The number of lost flights."""
         return sum(result.outcome == "lost" for result in self.results)
 
-    def missed(self, row: Row, metric: str) -> str:
+    def missed(self, row: PaperRow, metric: str) -> str:
         """Return by how much the mean misses the paper's value; empty when it does not, or the paper has none."""
         bound, spread = row.claims[metric].bound, Spread.of(metric, self.results)
         if bound is None or not spread.count:
@@ -108,12 +108,12 @@ class Trials:
 class Paper:
     """All flights."""
 
-    rows: tuple[tuple[str, Row, tuple[Trials, ...]], ...]  # experiment, row, per profile
+    rows: tuple[tuple[str, PaperRow, tuple[Trials, ...]], ...]  # experiment, row, per profile
     studies: tuple[StudyResult, ...]
     interrupted: bool
 
     @property
-    def misses(self) -> list[tuple[Row, str, list[str]]]:
+    def misses(self) -> list[tuple[PaperRow, str, list[str]]]:
         """Rows and profiles that miss a value of the paper or fail a limit, with the reasons."""
         found = []
         for _, row, both in self.rows:
@@ -207,4 +207,4 @@ def _key(request: Request) -> Hashable:
 
 def _error(result: Result) -> tuple[bool, float]:
     """Return an order of flights from good to bad."""
-    return result.outcome != "completed", sum(result.metrics[f"rms_{axis}"] ** 2 for axis in "xyz")
+    return result.outcome != "completed", distance(result.metrics)

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from rich.console import Console
 
+from hil.design.axes import ROLL
 from hil.errors import LabError
 from hil.experiments import find_experiment
-from hil.identify.identify import Identification, identify
+from hil.identify.identify import Identification, identify, interval_text
 from hil.identify.record import KEPT, load_record
 from hil.identify.two_controllers import SIGMAS, closed_loop, input_constant
 from hil.laboratory.run import Request
@@ -38,7 +39,7 @@ COLUMNS = ("constant", "paper", "its arithmetic", "truth", "its method here", "i
 
 
 @dataclass(frozen=True, slots=True)
-class Constant:
+class PaperConstant:
     """One row: the estimates by method, as text; empty for none."""
 
     title: str
@@ -50,7 +51,7 @@ class Constant:
     joint: str
 
 
-def fly_identification(out: Path, notices: Console) -> tuple[Constant, ...]:
+def fly_identification(out: Path, notices: Console) -> tuple[PaperConstant, ...]:
     """Fly and identify; empty after Ctrl-C."""
     folders = [out / name for name in FLIGHTS]
     jobs = [
@@ -66,30 +67,26 @@ def fly_identification(out: Path, notices: Console) -> tuple[Constant, ...]:
     return constants(identify([load_record(folder, "floaty") for folder in folders]))
 
 
-def constants(found: Identification) -> tuple[Constant, ...]:
+def constants(found: Identification) -> tuple[PaperConstant, ...]:
     """Return the rows of an identification with the paper's two flights and an excitation of u1."""
     a, c = input_constant(STARRED, OWN)
     computed = {"roll_u1": f"{a:.0f}", "roll_roll": f"{c:.0f}", "roll_rate": ""}
     rows = [
-        Constant(
-            TITLES[name], PRINTED[name], computed[name], f"{one.truth:.4g}", _pair(one.two_controllers),
-            _pair(one.instrumental), _pair(one.joint),
+        PaperConstant(
+            TITLES[name], PRINTED[name], computed[name], f"{one.truth:.4g}", interval_text(*one.two_controllers, digits=3),
+            interval_text(*one.instrumental, digits=3), interval_text(*one.joint, digits=3),
         )
         for name in TITLES
         for one in [found.constant(name)]
     ]  # fmt: skip
     value = {name: found.constant(name) for name in ("roll_u1", "roll_roll")}
     for number, (starred, own, record) in enumerate(zip(STARRED, OWN, found.free, strict=True), 1):
-        loop = closed_loop(record, "roll")
+        loop = closed_loop(record, ROLL)
         rows.append(
-            Constant(
+            PaperConstant(
                 f"c*{number}, roll per roll with a gain of {-own:g} [1/s²]", f"{starred:g}", "",
                 f"{value['roll_roll'].truth + own * value['roll_u1'].truth:.4g}",
-                _pair((float(loop.starred[1]), SIGMAS * float(loop.errors[1]))), "", "",
+                interval_text(float(loop.starred[1]), SIGMAS * float(loop.errors[1]), 3), "", "",
             )
         )  # fmt: skip
     return tuple(rows)
-
-
-def _pair(pair: tuple[float, float]) -> str:
-    return "" if pair[0] != pair[0] else f"{pair[0]:.3g} ± {pair[1]:.2g}"

@@ -12,8 +12,6 @@ from math import degrees
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hil.config import load_config
 from hil.design.analysis import Analysis
 from hil.design.analysis import write as write_design
@@ -24,29 +22,29 @@ from hil.laboratory.recorder import load_log
 from hil.laboratory.result import RESULT
 from hil.pictures.figures import PICTURES
 from hil.pictures.gallery import pictures_of
-from hil.pictures.pages import Shown, data_uri, draw, write_page, zoomable
+from hil.pictures.pages import PageFigure, data_uri, draw, write_page, zoomable
 from hil.pictures.panels import marks_of_flight
-from hil.studies import drag_model, drag_model_report
+from hil.studies import drag_model_report
 from hil.studies.catalogue import PROFILES
+from hil.studies.drag_model import MountedRow
 from hil.studies.paper import Paper, Spread, Trials
-from hil.studies.paper_identification import COLUMNS, WHY, Constant
-from hil.studies.paper_rows import Row
+from hil.studies.paper_identification import COLUMNS, WHY, PaperConstant
+from hil.studies.paper_rows import PaperRow
 from hil.studies.study_figures import picture
 from hil.studies.study_run import StudyResult
 
 REPORT = "report.html"
 # Names of the pages beside those of the experiments.
 DRAG_MODEL, STUDIES, DESIGN = "drag-model", "studies", "design/design"
-OPERATIONAL_DEG = 50  # flap angles of flight, in the steps of the test
 OF_EVERY_FLIGHT = PICTURES[:2]  # for an experiment without pictures of its own
 
 
 def write_paper(
     out: Path,
     paper: Paper,
-    mounted: Sequence[drag_model.Row] = (),
+    mounted: Sequence[MountedRow] = (),
     shape: Analysis | None = None,
-    constants: Sequence[Constant] = (),
+    constants: Sequence[PaperConstant] = (),
 ) -> Path:
     """Write `result.json`, `report.html` and the pictures of the studies; returns the report.
 
@@ -67,7 +65,11 @@ def write_paper(
             png = picture(result)
             (out / f"study-{result.study.name}.png").write_bytes(png)
             studies.append((result, data_uri(png)))
-    bench = _mounted(out / "drag-model", list(mounted)) if mounted else []
+    bench: list[PageFigure] = []
+    if mounted:
+        (out / DRAG_MODEL).mkdir(exist_ok=True)
+        hover_deg = degrees(load_config().plant.hover_angle)
+        _, bench = drag_model_report.write(mounted, hover_deg, out / DRAG_MODEL)
     pages = [
         *((name, row.title) for name, row, _ in paper.rows),
         *([(DRAG_MODEL, "Drag model")] if bench else []),
@@ -96,28 +98,7 @@ def write_paper(
     )  # fmt: skip
 
 
-def _mounted(folder: Path, rows: list[drag_model.Row]) -> list[Shown]:
-    """Write the test of the drag model into a folder; returns its figures."""
-    folder.mkdir(exist_ok=True)
-    drag_model.write_csv(rows, folder / "drag_model.csv")
-    drag_model_report.write(rows, degrees(load_config().plant.hover_angle), folder)
-    figures = []
-    for robot, text in drag_model_report.ROBOTS.items():
-        for sweep in drag_model.SWEEPS:
-            png = (folder / f"drag_model_{robot}_{sweep.name}.png").read_bytes()
-            chosen = [row for row in rows if (row.robot, row.sweep) == (robot, sweep.name)]
-            misses = [np.abs(row.model - row.mean) for row in chosen if 0 <= row.angle_deg <= OPERATIONAL_DEG]
-            force, torque = (float(np.max(misses, axis=0)[part].max()) for part in (slice(0, 3), slice(3, 6)))
-            caption = (
-                f"{sweep.title}. From 0 to {OPERATIONAL_DEG} degrees model and measurement differ by at most "
-                f"{force:.2f} N and {torque:.3f} N m."
-            )
-            name = f"{robot}-{sweep.name}"
-            figures.append(Shown(name, f"Drag model, {text}", caption, data_uri(png)))
-    return figures
-
-
-def _figures(both: Sequence[Trials]) -> list[tuple[str, list[Shown]]]:
+def _figures(both: Sequence[Trials]) -> list[tuple[str, list[PageFigure]]]:
     """Return the profiles with the pictures of a row, the default profile first."""
     figures = []
     for trials in both:
@@ -151,7 +132,7 @@ def _content(paper: Paper) -> dict[str, Any]:
     }
 
 
-def _trials(row: Row, trials: Trials) -> dict[str, Any]:
+def _trials(row: PaperRow, trials: Trials) -> dict[str, Any]:
     return {
         "holds": trials.holds,
         "missed": {name: gap for name in row.claims if (gap := trials.missed(row, name))},

@@ -12,7 +12,7 @@ from hil.experiments.identification import IDENTIFICATION
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
+class MetricClaim:
     """The paper's claim about a metric."""
 
     text: str = ""  # empty: no claim
@@ -20,21 +20,21 @@ class Claim:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class PaperRow:
     """One row of the paper's table."""
 
     title: str
     claim: str  # the paper's, in short
     place: str  # in the paper
-    claims: Mapping[str, Claim]  # by metric, in the order of the table
+    claims: Mapping[str, MetricClaim]  # by metric, in the order of the table
     why: str = ""  # why it misses the paper's value, if it does
     note: str = ""  # how to read ours
 
 
-SILENT = Claim()
-NEVER_LOST = Claim("0", 0.0)
-MOSTLY = Claim("mostly", 0.5)
-ABOUT_ONE = Claim("about 1", 0.95)
+SILENT = MetricClaim()
+NEVER_LOST = MetricClaim("0", 0.0)
+MOSTLY = MetricClaim("mostly", 0.5)
+ABOUT_ONE = MetricClaim("about 1", 0.95)
 
 YAW, HEIGHT, LATERAL = (
     "Yaw tracking, Fig. experiments_fig a, b",
@@ -55,71 +55,71 @@ LIFT = (
 )
 
 
-def _sine(frequency: str, rate: Claim = SILENT) -> Row:
-    return Row(
+def _sine(frequency: str, rate: MetricClaim = SILENT) -> PaperRow:
+    return PaperRow(
         f"Yaw sine of ±90° at {frequency} Hz", "follows the target up to 0.15 Hz and keeps its position", YAW,
         {"gain": ABOUT_ONE, "lag": SILENT, "rms_yaw": SILENT, "peak_rate": rate, "rms_x": SILENT, "rms_y": SILENT},
     )  # fmt: skip
 
 
-def _side_wind(speed: int, flaps: str = "", why: str = NO_DAMPING, note: str = "") -> Row:
-    return Row(
+def _side_wind(speed: int, flaps: str = "", why: str = NO_DAMPING, note: str = "") -> PaperRow:
+    return PaperRow(
         f"Side wind of {speed} m/s along y{flaps}", "maintains stable flight up to about 4 m/s, 40 % of the updraft", ROBUST,
         {"lost": NEVER_LOST, "wind_offset": SILENT, "flown": SILENT, "max_y": SILENT}, why, note,
     )  # fmt: skip
 
 
-def _airspeed(speed: str) -> Row:
-    return Row(
+def _airspeed(speed: str) -> PaperRow:
+    return PaperRow(
         f"Updraft of {speed} m/s", "stable flight from 8 to 11 m/s with the hover angle adapted", ROBUST,
-        {"lost": NEVER_LOST, "height_off": Claim("hovers", 0.1), "in_box": SILENT, "as_computed": SILENT}, LIFT,
+        {"lost": NEVER_LOST, "height_off": MetricClaim("hovers", 0.1), "in_box": SILENT, "as_computed": SILENT}, LIFT,
     )  # fmt: skip
 
 
-ROWS: Mapping[str, Row] = {
-    "hover": Row(
+ROWS: Mapping[str, PaperRow] = {
+    "hover": PaperRow(
         "Hover for 30 s at 1.15 m",
         "inside a 20 cm box; below 6 cm per axis most of the time; attitude below 20°; y worst",
         "Hover performance, Fig. Hover_figure",
         {
-            "in_box": Claim("always", 1.0),
+            "in_box": MetricClaim("always", 1.0),
             "within_6cm_x": MOSTLY, "within_6cm_y": MOSTLY, "within_6cm_z": MOSTLY,
-            "attitude_max": Claim("< 20 deg", radians(20.0)), "rms_x": SILENT, "rms_y": SILENT, "rms_z": SILENT,
-            "y_over_x": Claim("> 1", 1.0),
+            "attitude_max": MetricClaim("< 20 deg", radians(20.0)), "rms_x": SILENT, "rms_y": SILENT, "rms_z": SILENT,
+            "y_over_x": MetricClaim("> 1", 1.0),
         },
         "y is the worst axis with the author's gains only: they leave the y loop at +0.26 ± 4.9i, a limit cycle of "
         "0.8 Hz. With roll gains that damp it (floaty) y becomes the best axis.",
     ),
-    "yaw-step": Row(
+    "yaw-step": PaperRow(
         "Yaw step of 110°, flaps -11..52°", "settles in less than 0.5 s; steps up to 110°", YAW,
         {
-            "settle": Claim("< 0.5 s", 0.5), "overshoot": SILENT, "peak_rate": SILENT,
+            "settle": MetricClaim("< 0.5 s", 0.5), "overshoot": SILENT, "peak_rate": SILENT,
             "max_x": SILENT, "max_y": SILENT, "max_z": SILENT,
         },
         note="Within 5 % of the step. It takes flaps opened through zero: between 0 and 52° the time-optimal bound is "
         "0.47 s, without a controller, a filter or a delay.",
     ),
-    "yaw-step-0": Row(
+    "yaw-step-0": PaperRow(
         "Yaw step of 110°, flaps 0..52°", "settles in less than 0.5 s; steps up to 110°", YAW,
-        {"settle": Claim("< 0.5 s", 0.5), "overshoot": SILENT, "peak_rate": SILENT, "max_z": SILENT},
+        {"settle": MetricClaim("< 0.5 s", 0.5), "overshoot": SILENT, "peak_rate": SILENT, "max_z": SILENT},
         "The firmware's range of the flaps allows ±25° about hover: with 110 rad/s² per rad and a damping of 7.7 1/s even "
         "the best switching needs 0.47 s to 5 %. The paper names neither range nor band.",
     ),
     "yaw-sine-0.02": _sine("0.02"),
     "yaw-sine-0.05": _sine("0.05"),
     "yaw-sine-0.10": _sine("0.10"),
-    "yaw-sine-0.15": _sine("0.15", Claim("> 80 deg/s", radians(80.0))),
-    "height-sine": Row(
+    "yaw-sine-0.15": _sine("0.15", MetricClaim("> 80 deg/s", radians(80.0))),
+    "height-sine": PaperRow(
         "Height sine of ±20 cm at 0.05 Hz", "follows, five trials alike; height gives way to attitude", HEIGHT,
         {"gain": ABOUT_ONE, "lag": SILENT, "rms_z": SILENT, "rms_x": SILENT, "rms_y": SILENT},
     ),
-    "y-square": Row(
+    "y-square": PaperRow(
         "Square of ±10 cm in y", "follows; the flow's diameter allows ±10 cm", LATERAL,
         {"rise": SILENT, "overshoot": SILENT, "hold_rms": SILENT, "lost": NEVER_LOST}, NO_DAMPING,
     ),
-    "pushes": Row(
+    "pushes": PaperRow(
         "Pushes from every side", "consistently regains stable hover after pushes with a stick", ROBUST,
-        {"recovered": Claim("all 9", 9.0), "excursion": SILENT, "back_in_box": SILENT}, NO_DAMPING,
+        {"recovered": MetricClaim("all 9", 9.0), "excursion": SILENT, "back_in_box": SILENT}, NO_DAMPING,
     ),
     "side-wind-1": _side_wind(1),
     "side-wind-2": _side_wind(2),
@@ -131,23 +131,26 @@ ROWS: Mapping[str, Row] = {
     "side-wind-4-open": _side_wind(
         4, ", flaps -11..52°", note="Opened through zero, with a hover angle of 15°, the flaps have more lift in reserve."
     ),
-    "side-wind-x-0.25": Row(
+    "side-wind-x-0.25": PaperRow(
         "Side wind of 0.25 m/s along x", "not shown; the paper's fan blows along y", ROBUST,
         {"lost": SILENT, "wind_offset": SILENT},
         note="In x the robot has 1.1 m/s² to set against 1 m/s² per m/s of wind: it is lost from 0.75 m/s on.",
     ),
-    "occlusion": Row(
+    "occlusion": PaperRow(
         "A fifth of the flow blocked for 0.4 s", "recovers from partial temporary occlusions", ROBUST,
-        {"recovered": Claim("yes", 1.0), "excursion": SILENT, "back_in_box": SILENT},
+        {"recovered": MetricClaim("yes", 1.0), "excursion": SILENT, "back_in_box": SILENT},
     ),
     **{f"airspeed-{speed}": _airspeed(speed) for speed in ("8", "8.5", "9", "9.5", "9.75", "10", "10.25", "10.5", "11")},
-    "power": Row(
+    "power": PaperRow(
         "Power of the hover, and the endurance with two 250 mAh cells", "about 33 min, 3.4 W, 10 W/kg", ENERGY,
-        {"power": Claim("3.4 W"), "specific_power": Claim("10 W/kg", 10.05), "endurance": Claim("33 min", 33.0)},
+        {
+            "power": MetricClaim("3.4 W"), "specific_power": MetricClaim("10 W/kg", 10.05),
+            "endurance": MetricClaim("33 min", 33.0),
+        },
         note="The servos' two constants are calibrated on the paper's one figure: agreement of the hover is no test of the "
         "model, the differences between flights are.",
     ),
-    "take-off-landing": Row(
+    "take-off-landing": PaperRow(
         "Take-off from the net and landing on it", "the author's operator menu; not measured in the paper", "ground station",
         {"lift_off": SILENT, "reached_box": SILENT, "hover_in_box": SILENT, "touch_down_speed": SILENT},
     ),

@@ -101,11 +101,11 @@ def flights_of(study: Study, seeds: int) -> Iterator[tuple[Variant, float, Reque
 def outcome_of(result: Result) -> str:
     """Return the outcome of a flight, one of OUTCOMES.
 
-    lost: it ended as a crash; failsafe: the supervisor opened the loop for a while; degrades: a limit fails.
+    lost: it ended as a crash; failsafe: the supervisor, or a reset, opened the loop for a while; degrades: a limit fails.
     """
-    if result.outcome != "completed":
+    if result.outcome not in ("completed", "reset"):
         return "lost" if result.outcome == "lost" else "error"
-    if result.metrics["failsafe"] > 0:
+    if result.outcome == "reset" or result.metrics["failsafe"] > 0:
         return "failsafe"
     return "holds" if result.passed else "degrades"
 
@@ -119,12 +119,13 @@ def summarise(study: Study, flown: list[tuple[Variant, float, Result]]) -> Study
             results = [result for v, s, result in flown if v is variant and s == size]
             if results:
                 outcomes = tuple(map(outcome_of, results))
-                errors = tuple(_distance(r.metrics) for r in results if r.outcome == "completed")
+                errors = tuple(distance(r.metrics) for r in results if r.outcome == "completed")
                 cells.append(Cell(size, outcomes, errors))
         if cells:
             curves.append(Curve(variant, tuple(cells)))
     return StudyResult(study, tuple(curves))
 
 
-def _distance(metrics: Mapping[str, float]) -> float:
+def distance(metrics: Mapping[str, float]) -> float:
+    """Return the rms distance from the goal [m]."""
     return float(np.sqrt(sum(metrics[f"rms_{axis}"] ** 2 for axis in "xyz")))

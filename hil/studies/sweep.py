@@ -1,5 +1,7 @@
 """Many flights at once: one process per core, results in the order of the jobs, a progress bar meanwhile."""
 
+from __future__ import annotations
+
 import io
 import multiprocessing
 import os
@@ -14,22 +16,29 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from hil.arguments import checked
 from hil.errors import LabError
 from hil.experiments import find_again
 from hil.laboratory.experiment import Experiment, Source
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import Request, fly
+from hil.run_folder import reserved
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A flight, its folder, and which of its files are kept: None for all, an empty tuple for none, not even the folder."""
+    """A flight, its folder, and which of its files are kept: None for all, an empty tuple for none, not even the folder.
+
+    Where all are kept, a flight of another request is not replaced.
+    """
 
     request: Request
     folder: Path
     keep: tuple[str, ...] | None = None
 
 
+@checked
 def fly_all(jobs: Sequence[Job], notices: Console) -> tuple[list[Result], bool]:
     """Fly every job; return the results in the order of the jobs, and whether Ctrl-C ended it early.
 
@@ -82,14 +91,14 @@ def _packed(job: Job) -> bytes:
 
 def _fly(packed: bytes) -> Result:
     job: Job = _Unpacker(io.BytesIO(packed)).load()
-    prepare(job.folder)
-    result = fly(job.request, job.folder)
-    if job.keep is not None:
-        for file in job.folder.iterdir():
-            if file.name not in job.keep:
-                file.unlink()
-        if not job.keep:
-            job.folder.rmdir()
+    with reserved(job.request, job.folder, replace=job.keep is not None):
+        result = fly(job.request, job.folder)
+        if job.keep is not None:
+            for file in job.folder.iterdir():
+                if file.name not in job.keep:
+                    file.unlink()
+            if not job.keep:
+                job.folder.rmdir()
     return result
 
 

@@ -6,30 +6,19 @@ and a link alone; the plant's truth is used only to fly other robots.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from math import sqrt
 from pathlib import Path
 from typing import get_args
 
 from rich.console import Console
 
 from hil.config import LabConfig, base_name, load_config
-from hil.design.loop import (
-    ANGLE,
-    AXES,
-    Axis,
-    Loop,
-    Margins,
-    Matrix,
-    Timing,
-    build,
-    gains_in,
-    margins,
-    pose_delay_margin,
-    worst,
-)
-from hil.design.tune import Motion, Task, design, motion, regulator
+from hil.design.axes import AXES, gains_in
+from hil.design.loop import Timing, build
+from hil.design.margins import peak_of
+from hil.design.profile import changes, toml_text
+from hil.design.tune import GainTask, TunedAxis, by_regulator, design, judged, refuse_late
 from hil.errors import LabError, writing
 from hil.experiments import find_experiment
 from hil.identify.flow import flow_of
@@ -40,6 +29,7 @@ from hil.identify.robots import FLAP_RATE, Robots, robots_of
 from hil.laboratory.result import Result
 from hil.laboratory.robot import Streams
 from hil.laboratory.run import Request
+from hil.studies.study_run import distance
 from hil.studies.sweep import Job, fly_all
 from hil.world.config import ConstantName
 from hil.world.plant import Plant
@@ -47,13 +37,12 @@ from hil.world.plant import Plant
 HOVER_S = 60.0
 EXCITATIONS = tuple(f"identify-u{number}" for number in range(1, 5))
 FLOWN = 3  # of the worst robots
-WORSE = 10  # robots whose margin for late poses is computed, the worst of an axis
 FACTOR_MAX = 4.0  # of plant.constant_factors
 BETTER = 0.95  # of the last round's rms, or it is the last
 
 
 @dataclass(frozen=True, slots=True)
-class Flights:
+class TuningFlights:
     """The settings that all flights share."""
 
     seed: int
@@ -95,27 +84,6 @@ class Flights:
 
 
 @dataclass(frozen=True, slots=True)
-class TunedAxis:
-    """One axis before and after."""
-
-    axis: Axis
-    old: Matrix
-    new: Matrix
-    old_margins: Margins
-    margins: Margins
-    least: Margins  # of all robots
-    late: float  # [s] by which poses may be older than they state, for the robot
-    least_late: float  # of the worst robots
-    old_motion: Motion | None  # None: not stable by the model
-    motion: Motion
-
-    @property
-    def metric(self) -> str:
-        """The metric of its motion in a flight's result, empty for yaw, which has none."""
-        return {0: "rms_y", 1: "rms_x", 3: "rms_z"}.get(self.axis.input, "")
-
-
-@dataclass(frozen=True, slots=True)
 class Tuned:
     """The result of tuning."""
 
@@ -132,7 +100,7 @@ class Tuned:
         return min(min(one.least.delay, one.least_late) for one in self.axes)
 
 
-def tune(profile: str, flights: Flights, count: int) -> Tuned:
+def tune(profile: str, flights: TuningFlights, count: int) -> Tuned:
     """Return gains for a profile's robot and `count` others within its intervals. Raises `LabError` when there are none."""
     config = load_config(profile)
     if config.logic.controller:
@@ -149,64 +117,15 @@ def tune(profile: str, flights: Flights, count: int) -> Tuned:
     age_s, jitter_s = 1e-6 * pose.mean_us, 1e-6 * (pose.p99_us - pose.mean_us)
     timing = Timing.of(config, age_s)
     record = load_record(before.folder, profile)
-    axes = []
+    axes, every = [], [robots.nominal, *robots.drawn]
     for axis in AXES:
-        every = [robots.nominal, *robots.drawn]
+        task = GainTask(axis, flow_of(record, axis, robots.nominal), config, timing, jitter_s)
         loops = [build(axis, robot, config, timing) for robot in every]
-        flow = flow_of(record, axis, robots.nominal)
-        task = Task(
-            axis, flow.spectrum, flow.input, flow.angle, _flap_range(config), _error_limit(config, axis), jitter_s
-        )  # fmt: skip
         old = gains_in(config, axis)
-        new = design(task, loops, [regulator(axis, robots.nominal), old])
-        axes.append(judged(task, loops, every, config, timing, old, new))
+        new = design(task, loops, [by_regulator(axis, robots.nominal), old])
+        axes.append(judged(task, every, loops, old, new))
     refuse_late(axes, jitter_s)
     return Tuned(tuple(axes), robots, age_s, jitter_s, _with_gains(config, axes), before)
-
-
-def refuse_late(axes: Sequence[TunedAxis], jitter_s: float) -> None:
-    """Raise `LabError` for loops that tolerate less delay than the link has."""
-    for one in axes:
-        least = min(one.least.delay, one.least_late)
-        if least < jitter_s:
-            raise LabError(
-                f"refused: {one.axis.name} tolerates {1e3 * least:.1f} ms of delay, and poses arrive up to "
-                f"{1e3 * jitter_s:.1f} ms later than on the mean"
-            )
-
-
-def judged(
-    task: Task,
-    loops: Sequence[Loop],
-    every: Sequence[Mapping[str, float]],
-    config: LabConfig,
-    timing: Timing,
-    old: Matrix,
-    new: Matrix,
-) -> TunedAxis:
-    """Return an axis with the margins and the motion of old and new gains; the first loop is the profile's robot."""
-    axis = task.axis
-    before, found = margins(loops[0], old), [margins(loop, new) for loop in loops]
-    late = [
-        pose_delay_margin(axis, every[place], config, timing, new)
-        for place in [0, *sorted(range(1, len(every)), key=lambda place: -found[place].peak)[:WORSE]]
-    ]
-    return TunedAxis(
-        axis, old, new, before, found[0], worst(found), late[0], min(late),
-        motion(loops[0], task, old) if before.stable else None, motion(loops[0], task, new),
-    )  # fmt: skip
-
-
-def _flap_range(config: LabConfig) -> float:
-    allocation = config.allocation
-    return min(
-        allocation.opening_max - allocation.hover_angle, allocation.hover_angle - allocation.opening_min
-    )
-
-
-def _error_limit(config: LabConfig, axis: Axis) -> float:
-    """Return the largest error of the main state for which the flaps alone should suffice."""
-    return config.controller.limit_xy if ANGLE in axis.states else 0.0
 
 
 def _with_gains(config: LabConfig, axes: Sequence[TunedAxis]) -> LabConfig:
@@ -217,18 +136,11 @@ def _with_gains(config: LabConfig, axes: Sequence[TunedAxis]) -> LabConfig:
 def write_tuned(path: Path, base: str, config: LabConfig, about: str) -> None:
     """Write a profile based on another one, with the values of `config` that differ: model, trim, gains."""
     old = load_config(base)
-    lines = [f"# {about}", f'base = "{base_name(base)}"']
-    for section in ("model", "servo", "controller"):
-        own, usual = getattr(config, section).model_dump(), getattr(old, section).model_dump()
-        changed = {key: value for key, value in own.items() if value != usual[key]}
-        if changed:
-            lines += ["", f"[{section}]"]
-            lines += [
-                f"{key} = {list(value) if isinstance(value, tuple) else value}"
-                for key, value in changed.items()
-            ]
+    sections = {
+        name: changes(getattr(config, name), getattr(old, name)) for name in ("model", "servo", "controller")
+    }
     with writing("--out", path):
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        path.write_text(toml_text(about, base_name(base), sections), encoding="utf-8")
     load_config(str(path))
 
 
@@ -245,7 +157,7 @@ def worst_settings(tuned: Tuned, config: LabConfig) -> list[tuple[str, ...]]:
         if min(of.values()) < 0.0 or max(of.values()) > FACTOR_MAX:
             continue
         peak = max(
-            margins(build(one.axis, robot, tuned.config, timing), one.new).peak / one.margins.peak
+            peak_of(build(one.axis, robot, tuned.config, timing).open_loop(one.new)) / one.margins.peak
             for one in tuned.axes
         )
         text = ", ".join(f"{name}={factor:.5f}" for name, factor in of.items())
@@ -259,7 +171,7 @@ def rms(result: Result) -> float:
     """Return the rms distance from the goal [m], infinite for a robot that was lost."""
     if result.outcome != "completed":
         return float("inf")
-    return sqrt(sum(result.metrics[f"rms_{axis}"] ** 2 for axis in "xyz"))
+    return distance(result.metrics)
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +199,7 @@ class Round:
         return str(self.written) if self.better else self.given
 
 
-def fly_round(profile: str, flights: Flights, count: int) -> Round:
+def fly_round(profile: str, flights: TuningFlights, count: int) -> Round:
     """Tune a profile and fly the result. Raises `LabError` when nothing can be flown."""
     tuned = tune(profile, flights, count)
     path = flights.folder / "tuned.toml"
@@ -296,7 +208,7 @@ def fly_round(profile: str, flights: Flights, count: int) -> Round:
     return Round(tuned, tuple(flown), profile, path)
 
 
-def rounds(profile: str, flights: Flights, count: int, most: int) -> Iterator[Round]:
+def rounds(profile: str, flights: TuningFlights, count: int, most: int) -> Iterator[Round]:
     """Yield rounds of excitation, identification and tuning, `most` of them or until one is no better than the last.
 
     Raises `LabError` when a robot is lost, or nothing is identified.

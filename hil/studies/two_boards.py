@@ -20,7 +20,7 @@ from hil.errors import LabError
 from hil.laboratory.metrics import column, free_flight, position_error
 from hil.laboratory.result import RESULT
 from hil.laboratory.schedule import load_schedule, runs
-from hil.pictures.compare import Run, load_run
+from hil.pictures.compare import FlownRun, load_flown
 from hil.pictures.curves import since_release
 
 COUNTS = tuple(f"motor.m{servo}" for servo in range(1, 5))
@@ -61,7 +61,7 @@ class TwoBoards:
     causes: tuple[str, ...]
 
 
-def comparable(a: Run, b: Run) -> bool:
+def comparable(a: FlownRun, b: FlownRun) -> bool:
     """Return whether two runs differ in their boards, and in nothing else that was asked for."""
     asked = [
         (one.experiment, one.profile, one.overrides, one.seed, one.link, one.faults)
@@ -70,7 +70,7 @@ def comparable(a: Run, b: Run) -> bool:
     return asked[0] == asked[1] and a.result.seed is not None and a.result.board != b.result.board
 
 
-def two_boards(a: Run, b: Run) -> TwoBoards:
+def two_boards(a: FlownRun, b: FlownRun) -> TwoBoards:
     """Compare two runs that are `comparable`; of the longer one the rows that both have."""
     rows = min(a.log.num_rows, b.log.num_rows)
     logs = a.log.slice(0, rows), b.log.slice(0, rows)
@@ -130,7 +130,7 @@ def _gyro_zero(logs: Sequence[pa.Table]) -> str:
     return f"with gyro zeros of other samples at rest, the second estimates {shown} mrad/s (p q r) above the first"
 
 
-def _phases(a: Run, b: Run) -> str:
+def _phases(a: FlownRun, b: FlownRun) -> str:
     """Tell when in its ten milliseconds each estimator begins, and how old the poses are that it takes."""
     begins = [_phase_us(run.result.folder) for run in (a, b)]
     ages = [_pose_age_us(run.log) for run in (a, b)]
@@ -203,7 +203,7 @@ def seeds_of(first: Path, second: Path) -> list[Seed]:
     for folder in first.iterdir():
         other = second / folder.name
         if (folder / RESULT).is_file() and (other / RESULT).is_file():
-            a, b = load_run(folder), load_run(other)
+            a, b = load_flown(folder), load_flown(other)
             if comparable(a, b):
                 seeds.append(_seed(a, b))
     if not seeds:
@@ -213,7 +213,7 @@ def seeds_of(first: Path, second: Path) -> list[Seed]:
     return sorted(seeds, key=lambda one: one.seed)
 
 
-def _seed(a: Run, b: Run) -> Seed:
+def _seed(a: FlownRun, b: FlownRun) -> Seed:
     flights = [free_flight(run.log) for run in (a, b)]
     rows = min(flight.num_rows for flight in flights)
     flights = [flight.slice(0, rows) for flight in flights]

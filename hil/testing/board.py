@@ -61,6 +61,7 @@ class BareBoard:
         self.console: list[str] = []
         self.sent: list[tuple[int, bytes]] = []
         self.now_us = 0
+        self._noise = 1
         self.imu_running = True  # False: no more interrupts of the IMU
         self._heard = 0  # lines of the console that an `expect` has matched or passed
         self._repeats = 0  # the present generation of repeated packets
@@ -83,10 +84,11 @@ class BareBoard:
         (p, q, r), (fx, fy, fz) = omega_B, f_B
         rates = (COS * p + SIN * q, COS * q - SIN * p, r)
         forces = (COS * fx + SIN * fy, COS * fy - SIN * fx, fz)
-        self._board.imu = counts or (
+        self._fed = counts or (
             _count(rates[0], GYRO_COUNTS), _count(rates[1], GYRO_COUNTS), _count(rates[2], GYRO_COUNTS),
             _count(forces[0], ACCEL_COUNTS), _count(forces[1], ACCEL_COUNTS), _count(forces[2], ACCEL_COUNTS),
         )  # fmt: skip
+        self._board.measure(self._fed)
 
     def receive(self, packet: bytes, every_ms: float = 0.0) -> None:
         """Deliver a packet now, and again every `every_ms` until `hush`: CRTP from the radio, MAVLink from the UART."""
@@ -150,7 +152,7 @@ class BareBoard:
 
     @battery_mv.setter
     def battery_mv(self, value: int) -> None:
-        self._board.battery_mv = value
+        self._board.supply(value)
 
     def _run_until(self, end_us: int) -> None:
         """Go from one instant at which anything happens to the next: hardware first, then the firmware."""
@@ -166,6 +168,9 @@ class BareBoard:
 
     def _sample(self, now_us: int) -> None:
         if self.imu_running:
+            self._noise = -self._noise  # of one count: a real gyro never repeats itself for long
+            *before, r, x, y, z = self._fed
+            self._board.measure((*before, r + self._noise, x, y, z))
             self.firmware.imu_ready()
 
     def _arrive(self, packet: bytes) -> None:

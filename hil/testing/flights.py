@@ -12,9 +12,10 @@ from typing import Unpack
 
 import pytest
 
-from firmware_py.export.boards import runner_of
+from firmware_py.export.boards import BOARDS, runner_of
 from hil.api import Options, Run, command_of, fly, request_of
-from hil.config import load_config
+from hil.arguments import checked
+from hil.config import Overrides, load_config, settings_of
 from hil.errors import LabError
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.lockstep import MAVLINK, RADIO
@@ -82,6 +83,7 @@ class Flights:
         """What executes the flight core: python, c or cortex-m4."""
         return self.choice.board
 
+    @checked
     def fly(self, experiment: Experiment | str = "hover", **options: Unpack[Options]) -> Run:
         """Fly once; defaults of options come from the test's mark and the command line.
 
@@ -103,9 +105,8 @@ class Flights:
         item.flown.append(Flown(number, request, run))
         return run
 
-    def board(
-        self, link: str = RADIO, profile: str | None = None, overrides: tuple[str, ...] = ()
-    ) -> BareBoard:
+    @checked
+    def board(self, link: str = RADIO, profile: str | None = None, overrides: Overrides = ()) -> BareBoard:
         """Boot a board without a world. With `link="mavlink"` it speaks MAVLink over its UART.
 
         Skips the test when the board is not available here. Raises `LabError` for bad input.
@@ -113,11 +114,11 @@ class Flights:
         if link not in (RADIO, MAVLINK):
             raise LabError(f"board: link {link!r}: expected {RADIO} or {MAVLINK}")
         self._need(self.choice.board)
-        config = load_config(self._placed(profile or self.choice.profile), overrides)
+        config = load_config(self._placed(profile or self.choice.profile), settings_of(overrides))
         return BareBoard(config, runner_of(self.choice.board, BUILD, config.logic), link == MAVLINK)
 
     def _need(self, board: str) -> None:
-        if reason := why_no_board(board):
+        if board in BOARDS and (reason := why_no_board(board)):
             pytest.skip(f"floaty: {reason}")
 
     def _placed(self, name: str) -> str:
@@ -151,7 +152,7 @@ def text_of(item: Item, kept: bool, options: str) -> str:
             f"{request.experiment.name}, seed {request.seed}, board {request.board}, profile {request.profile}, "
             f"{request.link}: {how}"
         ]
-        lines += [f"  limit    {verdict}" for verdict in result.verdicts if not verdict.holds]
+        lines += [f"  limit    {verdict}" for verdict in result.failed]
         lines += [f"  fault    {fault}" for fault in result.faults]
         lines += [f"  folder   {one.run.folder}"] if kept else []
         lines += [f"  picture  {one.run.folder / PICTURE}"] if (one.run.folder / PICTURE).is_file() else []

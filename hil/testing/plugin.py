@@ -23,6 +23,9 @@ KEEP = ("failed", "all", "none")
 FOLDER = "runs/pytest"  # in pytest's root folder
 FLIGHTS = pytest.StashKey["Flights"]()
 ITEM = pytest.StashKey["Item"]()
+FIRST = pytest.StashKey[
+    dict[str, str]
+]()  # the test that an error of the user's failed first, by the error's text
 ALL = pytest.StashKey[list["Item"]]()  # of this process
 MARK = (
     "floaty(seeds=20, boards=[...], profiles=[...], needs=...): choices of the fixture `floaty`. seeds: how many, or "
@@ -106,15 +109,17 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Show a failed test's flights, and record those of every test."""
+    """Show a failed test's flights, and record those of every test; a request that cannot be flown is one line."""
     flown = item.stash.get(ITEM, None)
-    if flown is None or not flown.flown:
+    if flown is None:
         return (yield)
+    if not flown.flown:
+        return _in_one_line(item, call, (yield))
     from hil.testing.flights import draw, properties_of, text_of, trim
 
     if call.when == "call":
         item.user_properties.extend(properties_of(flown))
-    report = yield
+    report = _in_one_line(item, call, (yield))
     keep = item.config.getoption("floaty_keep")
     if report.failed:
         if keep != "none" and not flown.failed:
@@ -152,6 +157,22 @@ def _flights(config: pytest.Config) -> Flights:
     from hil.testing.flights import Flights
 
     return config.stash.setdefault(FLIGHTS, Flights(config.rootpath, config.rootpath / FOLDER))
+
+
+def _in_one_line(
+    item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport
+) -> pytest.TestReport:
+    """Show what the user has done wrong without a traceback, and once when it fails many tests."""
+    from hil.errors import LabError
+
+    if call.excinfo is None or not isinstance(error := call.excinfo.value, LabError):
+        return report
+    first = item.config.stash.setdefault(FIRST, {}).setdefault(str(error), item.nodeid)
+    own = [entry for entry in call.excinfo.traceback if entry.path == item.path]
+    place = f"{item.path.name}:{own[-1].lineno + 1}: " if own else ""
+    line = f"{place}{error}" if first == item.nodeid else f"as in {first}"
+    report.longrepr = "\n".join([line, *getattr(error, "__notes__", ())])
+    return report
 
 
 def _marked(item: pytest.Item) -> Marked:

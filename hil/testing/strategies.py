@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
 from ground_station.trajectory import Along
+from hil.arguments import checked
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS, Kind, times
 from hil.laboratory.faults import Fault, parse
@@ -22,6 +23,7 @@ GRID_S = 0.1  # of begins and durations
 GRID_M, GRID_RAD = 0.01, math.radians(5.0)
 
 
+@checked
 def faults(
     *kinds: str,
     start_s: tuple[float, float] = (1.0, 1.0),
@@ -49,6 +51,7 @@ def _of_kind(
     return st.builds(Fault, st.just(name), _grid(*start_s), lasting, _sizes(kind, size))
 
 
+@checked
 @dataclass(frozen=True, slots=True)
 class Waypoints:
     """A function of time for `Along`: goals relative to home, W, each held for `every_s`, the last to the end."""
@@ -63,6 +66,7 @@ class Waypoints:
         )
 
 
+@checked
 def trajectories(
     reach_m: float = 0.06, turn_rad: float = 0.0, every_s: float = 1.0, most: int = 4
 ) -> SearchStrategy[Along]:

@@ -73,6 +73,7 @@ class Plant:
         q_WB: Vector = (1.0, 0.0, 0.0, 0.0),
     ) -> None:
         """Start at rest with the flaps at the hover angle, at the hover point unless `p_WB` [m] says otherwise."""
+        self.tunnel: Tunnel
         s, self.tunnel = assemble(geometry, config, tunnel)
         self._s, self._airspeed = s, config.airspeed
 

@@ -1,4 +1,4 @@
-"""Laws of `ground_station.controls.Controls` on every protocol, each against the firmware in simulated time."""
+"""Laws of an operator's requests on every protocol, each against the firmware in simulated time."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,15 +7,16 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 
+from firmware_py import table
 from firmware_py.firmware import Firmware
 from firmware_py.wire import crtp
-from firmware_py.wire.parameter_names import OF_PROFILE
 from firmware_py.wire.parameters import TYPE_EXTENDED, TYPE_READ_ONLY
 from firmware_py.wire.scalars import PARAMETER_SCALARS
 from firmware_py.wire.supervisor import Cause, State
-from ground_station.controls import PATIENCE_US, REPEAT_US, Action, Answer, Controls, Request
+from ground_station.controls import PATIENCE_US, REPEAT_US, Action, Answer, Request
 from ground_station.links.crtp_controls import CrtpControls, Entry
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
+from ground_station.links.mavlink_controls import MavlinkControls
 from hil.config import load_config
 from support.crtp_client import CrtpClient
 from support.mavlink_client import MavlinkClient
@@ -27,7 +28,7 @@ GYRO_ZERO_US = 700_000
 class Bench(Protocol):
     """A board, and an operator's controls at the other end of a line that may lose what `lossy` says."""
 
-    controls: Controls
+    controls: CrtpControls | MavlinkControls
     firmware: Firmware
     lossy: Callable[[], bool]
     now_us: int
@@ -263,12 +264,14 @@ def test_a_new_request_replaces_the_one_before(bench: Bench) -> None:
         assert bench.controls.answer(bench.now_us) is None
 
 
-@pytest.mark.parametrize("key", OF_PROFILE)
+@pytest.mark.parametrize("key", table.OF_PROFILE)
 def test_a_profile_s_value_is_the_board_s_times_the_factor(key: str) -> None:
     """A board that boots with the value, and one that is told it, believe the same."""
-    name, factor = OF_PROFILE[key]
-    section, field = key.split(".")
+    name, factor = table.on_board(key)
+    section, _, field = key.partition(".")
+    field, _, element = field.rstrip("]").partition("[")
     before = getattr(getattr(load_config(), section), field)
+    before = before[int(element)] if element else before
     value = (not before) if isinstance(before, bool) else type(before)(0.8 * before or 0.01)
     bench = CrtpBench()
     assert ask(bench, Action.WRITE, name, factor * value).error == ""

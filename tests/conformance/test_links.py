@@ -14,16 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.wire import WireError
+from ground_station.config import StationConfig
 from ground_station.links.loopback import LoopbackLink
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from ground_station.mocap import MocapFrame
-from ground_station.station import Link
-from ground_station.trajectory import Goal
+from ground_station.station import GroundStation, Link
+from ground_station.trajectory import Goal, Hold
+from support.log_board import TABLE
 
 LATENCY_US = 900
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 NAN, INFINITE = float("nan"), float("inf")
-EXT_POSE, LOG_DATA = 0x61, 0x52  # port and channel, without the link bits
+EXT_POSE, LOG_REQUEST, LOG_DATA = 0x61, 0x51, 0x52  # port and channel, without the link bits
 Place = tuple[float, ...]
 
 
@@ -47,14 +49,26 @@ class CrtpBoard:
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
-        self.link = LoopbackLink(lambda now_us, data: self.sent.append(data), LATENCY_US)
+        self.link = LoopbackLink(lambda now_us, data: self.sent.append(data), LATENCY_US, lambda: TABLE)
+        self._granted = 0
 
     def errors(self) -> list[Place]:
         poses = [data for data in self.sent if data[0] & 0xF3 == EXT_POSE and data[1] == 8]
         return [struct.unpack_from("<3f", data, 2) for data in poses]
 
     def telemetry(self, t_ms: int, p_GB: Place) -> bytes:
-        return bytes((LOG_DATA, 0xF1)) + t_ms.to_bytes(3, "little") + struct.pack("<6f", *p_GB, 0, 0, 0)
+        if not self._granted:
+            self._grant()
+        return bytes((LOG_DATA, 0)) + t_ms.to_bytes(3, "little") + struct.pack("<6f", *p_GB, 0, 0, 0)
+
+    def _grant(self) -> None:
+        """Grant what the station asks for, until it asks for nothing more."""
+        self.link.start_telemetry(0)
+        while self._granted < len(self.sent):
+            request = self.sent[self._granted]
+            self._granted += 1
+            if request[0] & 0xF3 == LOG_REQUEST:
+                self.link.receive(0, bytes((request[0], *request[1:3].ljust(2, b"\0"), 0)))
 
 
 class MavlinkBoard:
@@ -124,14 +138,14 @@ def test_every_pose_reaches_the_board_once_and_in_order_against_the_goal_of_its_
         ((0.0, 0.0, 0.0), (1.0, NAN, 0.0, 0.0)),
     ],
 )
-def test_a_pose_that_is_none_is_refused_and_not_sent_and_the_next_one_is(
+def test_a_station_sends_no_pose_that_is_none_over_any_link_and_the_next_one_it_does(
     board: BoardEnd, p: Place, q: Place
 ) -> None:
-    with pytest.raises(WireError):
-        send(board, 40_000, p, q)
-    assert board.sent == []
-    send(board, 60_000, (0.1, 0.2, 0.3))
+    station = GroundStation(board.link, Hold(Goal((0.0, 0.0, 0.0), 0.0)), None, StationConfig())
+    for t_us, place, rotation in ((0, p, q), (20_000, (0.1, 0.2, 0.3), UPRIGHT)):
+        station.on_frame(MocapFrame(t_us, place, rotation, True), t_us + 40_000)
     assert board.errors() == [pytest.approx((0.1, 0.2, 0.3))]
+    assert station.counters.invalid == 1
 
 
 def test_telemetry_arrives_once_and_in_order_in_the_goals_frame(board: BoardEnd) -> None:

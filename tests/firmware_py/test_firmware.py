@@ -4,9 +4,14 @@ from itertools import pairwise
 
 import pytest
 
-from firmware_py.drivers.imu import SAMPLES, GyroZero
+from firmware_py.config import parameters_of
+from firmware_py.core import entry
+from firmware_py.core.sampling import WINDOW
+from firmware_py.core.structs import Input, Sampling
+from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.errors import FirmwareError
 from firmware_py.firmware import MEASUREMENT_QUEUE
+from firmware_py.supervisor import wrapped
 from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.supervisor import State
 from hil.config import load_config
@@ -95,8 +100,9 @@ def test_garbage_on_the_radio_is_counted_and_flies_on(bench: FirmwareBench) -> N
 
 
 def test_a_radio_that_takes_nothing_fills_the_queue_and_counts(bench: FirmwareBench) -> None:
-    bench.radio_open = False
     bench.stream(0)
+    bench.run(200_000)
+    bench.radio_open = False
     bench.run(3_000_000)
     queue = next(queue for queue in bench.firmware.kernel.queues if queue.name == "crtpTx")
     assert len(queue) == queue.high_water == 120
@@ -112,21 +118,20 @@ def test_telemetry_leaves_at_fifty_hertz_with_the_running_values(bench: Firmware
     assert [data for _, data in bench.sent if data[0] >> 4 == crtp.PORT_LOG] == []  # nothing comes unasked
     bench.stream(507_000)
     bench.run(1_000_000)
-    samples = [
-        telemetry.decode_sample(packet.data)
-        for packet in (crtp.decode(data) for _, data in bench.sent)
-        if packet.port == crtp.PORT_LOG
-    ]
-    assert len(samples) == 24 * len(telemetry.BLOCKS)  # those of the last tick are still being packed
-    assert [sample.timestamp_ms for sample in samples[::4]] == list(range(520, 1000, 20))
-    motion = [sample for sample in samples if sample.block is telemetry.BLOCKS[0]][-1]
-    assert motion.values[:3] == pytest.approx((0.01, 0.02, -0.03), abs=2e-3)
-    flaps = [sample for sample in samples if sample.block is telemetry.BLOCKS[2]][-1]
-    assert list(flaps.values[4:]) == pytest.approx(bench.writes[-2][1], abs=600)
-    turned = [sample for sample in samples if sample.block is telemetry.BLOCKS[1]][-1]
-    assert turned.values == pytest.approx(bench.firmware.signals.estimate[6:12].tolist(), abs=2e-3)
-    health = [sample for sample in samples if sample.block is telemetry.BLOCKS[3]][-1]
-    assert health.values[4] == State.FLYING
+    of = {block: [s for s in bench.samples if s.block is block] for block in telemetry.ALL_BLOCKS}
+    begin_ms = of[telemetry.CONTROL][0].timestamp_ms
+    assert 527 <= begin_ms <= 560  # some thirty requests and answers, and the first period
+    for block in telemetry.BLOCKS:
+        assert [s.timestamp_ms for s in of[block]][:-1] == list(range(begin_ms, 980, 20))[
+            : len(of[block]) - 1
+        ]
+        assert len(of[block]) in (len(range(begin_ms, 1000, 20)), len(range(begin_ms, 980, 20)))
+    motion, attitude, flaps, control = (of[block][-1].values for block in telemetry.BLOCKS)
+    assert motion[:3] == pytest.approx((0.01, 0.02, -0.03), abs=2e-3)
+    assert list(flaps[4:]) == pytest.approx(bench.writes[-2][1], abs=600)
+    assert attitude[:3] == pytest.approx(bench.firmware.signals.estimate[6:9].tolist(), abs=2e-3)
+    assert control[1:4] == pytest.approx(bench.firmware.signals.estimate[9:12].tolist(), abs=2e-3)
+    assert control[0] == State.FLYING
 
 
 def test_measurement_queue_has_the_originals_length(bench: FirmwareBench) -> None:
@@ -135,25 +140,89 @@ def test_measurement_queue_has_the_originals_length(bench: FirmwareBench) -> Non
     assert bench.firmware.measurements.dropped == 0
 
 
+class Gyro:
+    """A gyro whose zero the core seeks."""
+
+    def __init__(self) -> None:
+        self.data, self.sampling = Input.allocate(), Sampling.allocate()
+
+    def add(self, *counts: int) -> bool:
+        self.data.fields.gyro_sample[:] = counts
+        return bool(entry.take_sample(self.data.arg, self.sampling.arg))
+
+    @property
+    def bias(self) -> list[float]:
+        bias: list[float] = self.data.fields.gyro_bias.tolist()
+        return bias
+
+
 def test_gyro_zero_is_the_mean_of_a_still_window() -> None:
-    zero = GyroZero()
-    found = [zero.add((5 if k % 2 else 7, -3, 100, 0, 0, 0)) for k in range(SAMPLES)]
-    assert found == [False] * (SAMPLES - 1) + [True]
-    assert zero.bias == (6.0, -3.0, 100.0)
+    gyro = Gyro()
+    found = [gyro.add(5 if k % 2 else 7, -3, 100) for k in range(WINDOW)]
+    assert found == [False] * (WINDOW - 1) + [True]
+    assert gyro.bias == [6.0, -3.0, 100.0]
+    assert gyro.sampling.fields.variance.tolist() == [1.0, 0.0, 0.0]
+    assert not any(gyro.add(500, 0, 0) for _ in range(WINDOW))
+    assert gyro.bias == [6.0, -3.0, 100.0]
 
 
-def test_gyro_zero_waits_until_the_robot_is_still() -> None:
-    zero = GyroZero()
-    for k in range(SAMPLES):
-        assert not zero.add((500 if k < 256 else -500, 0, 0, 0, 0, 0))
-    assert zero.bias is None
-    assert zero.windows_refused == 1
-    assert [zero.add((1, 2, 3, 0, 0, 0)) for _ in range(SAMPLES)][-1]
-    assert zero.bias == (1.0, 2.0, 3.0)
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("noise", "still"), [(99, True), (101, False), (32767, False)])
+def test_gyro_zero_waits_until_the_robot_is_still(axis: int, noise: int, still: bool) -> None:
+    gyro = Gyro()
+    for k in range(WINDOW):
+        sample = [0, 0, 0]
+        sample[axis] = noise if k % 4 < 2 else -noise
+        found = gyro.add(*sample)
+    assert found == still
+    assert gyro.sampling.fields.windows_refused == (not still)
+    assert gyro.bias == [0.0, 0.0, 0.0]
+    if not still:
+        assert [gyro.add(1, 2, 3) for _ in range(WINDOW)][-1]
+        assert gyro.bias == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("zero", [-32768, -12345, 32767])
+def test_gyro_zero_is_exact_at_the_ends_of_its_range(zero: int) -> None:
+    gyro = Gyro()
+    for _ in range(WINDOW):
+        gyro.add(zero, zero, zero)
+    assert gyro.bias == [zero] * 3
+
+
+def test_samples_are_summed_from_tick_to_tick() -> None:
+    core = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    core.run.call("reset")
+    data = core.data.fields
+    for _ in range(2):
+        for k in range(10):
+            data.gyro_sample[:] = k, -k, 1
+            core.run.call("take_sample")
+        assert (data.gyro_sum.tolist(), data.gyro_samples) == ([45, -45, 10], 10)
+        core.run.call("estimate")
+        assert (data.gyro_sum.tolist(), data.gyro_samples) == ([0, 0, 0], 0)
+
+
+@pytest.mark.parametrize("start", [0, 2**31 - 35])
+def test_the_controller_runs_in_every_tenth_step_and_the_estimator_in_the_one_before(start: int) -> None:
+    """Steps are counted over the wrap of their number; one that is missed is caught up, and does not move the next."""
+    core = CoreBlocks(parameters_of(load_config()), PythonRunner)
+    data, sampling = core.data.fields, core.sampling.fields
+    sampling.tick, sampling.phase = start, 0
+    controls, estimates = [], []
+    for step in [*range(1, 32), 45, 46, 49, 50, 52, 60, 85, 86, 90]:
+        data.tick = wrapped(start + step)
+        if core.run.call("begin_step"):
+            controls.append(step)
+        if sampling.estimate_due:
+            estimates.append(step)
+            core.run.call("estimate")
+    assert controls == [10, 20, 30, 45, 50, 60, 85, 90]
+    assert estimates == [9, 19, 29, 45, 49, 60, 85, 90]
 
 
 def test_an_error_in_a_task_names_task_and_time(bench: FirmwareBench) -> None:
     bench.run(50_000)
     bench.imu = None  # type: ignore[assignment]  # a driver that returns nonsense
-    with pytest.raises(FirmwareError, match=r"task KALMAN at 5[01]\.\d+ ms: TypeError"):
+    with pytest.raises(FirmwareError, match=r"task SENSORS at 5[01]\.\d+ ms: TypeError"):
         bench.run(60_000)

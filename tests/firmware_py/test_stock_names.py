@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from firmware_py.drivers.imu import GyroZero
+from firmware_py.core import entry
+from firmware_py.core.structs import Input, Sampling
 from firmware_py.wire import crtp
 from firmware_py.wire.scalars import LOG_SCALARS, PARAMETER_SCALARS
 from support.crtp_client import LOG, PARAM, CrtpClient
@@ -141,7 +142,8 @@ def test_the_radio_counts_what_came_to_this_board_and_to_all(client: CrtpClient,
 def test_the_gyros_variance_is_that_of_the_samples_its_zero_is_from() -> None:
     rng = np.random.default_rng(1)
     samples = np.rint(rng.normal(0, (1.0, 2.0, 0.5), (512, 3))).astype(int).tolist()
-    zero = GyroZero()
-    for number, (x, y, z) in enumerate(samples):
-        assert zero.add((x, y, z, 0, 0, 1365)) == (number == 511)
-    assert zero.variance == pytest.approx(np.var(samples, axis=0))
+    data, sampling = Input.allocate(), Sampling.allocate()
+    for number, sample in enumerate(samples):
+        data.fields.gyro_sample[:] = sample
+        assert entry.take_sample(data.arg, sampling.arg) == (number == 511)
+    assert sampling.fields.variance == pytest.approx(np.var(samples, axis=0), rel=1e-5)

@@ -3,19 +3,26 @@
 import struct
 from collections.abc import Callable
 from itertools import pairwise
-from types import SimpleNamespace
 
 import pytest
 
+from firmware_py.core import structs
+from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
+from firmware_py.core.supervisor import (
+    BATTERY_LOW_US,
+    DOWN_US,
+    EPISODE_GAP_US,
+    EPISODE_LIMIT_US,
+)
 from firmware_py.links.platform import supervisor_bits
-from firmware_py.supervisor import Manual, Supervisor
+from firmware_py.supervisor import Manual
 from firmware_py.wire import crtp
 from firmware_py.wire.supervisor import Cause, State
-from hil.config import load_config
 from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, CrtpClient
 from support.firmware_bench import HOVER_COUNTS, LEVEL
 from support.mavlink_client import MavlinkClient
+from support.supervisor_bench import SupervisorBench
 
 OFF_CENTRE = (0.0, 0.04, 0.02)
 
@@ -155,52 +162,92 @@ def test_emergency_stop_beats_flaps_from_outside(flying: CrtpClient) -> None:
     assert flying.writes[-1][1] == HOVER_COUNTS
 
 
-def fell_silent(supervisor: Supervisor) -> None:
-    supervisor.last_pose_us = 0
+def had_a_frozen_gyro(bench: SupervisorBench) -> None:
+    bench.steps(STALE_STEPS + 1)
 
 
-def was_held_at_its_bounds(supervisor: Supervisor) -> None:
-    for now_us in range(5_000_000, 6_000_000, 10_000):
-        supervisor.bounds.estimator.bounded += 1
-        supervisor.mode(now_us)
+def fell_silent(bench: SupervisorBench) -> None:
+    bench.now_us += int(bench.parameters.pose_timeout_us)
 
 
-def ran_down(supervisor: Supervisor) -> None:
-    for now_us in range(0, 6_000_000, 100_000):
-        supervisor.see_battery(now_us, 3000)
+def was_held_at_its_bounds(bench: SupervisorBench) -> None:
+    bench.fly(1_000_000, bounded=True)
+
+
+def ran_down(bench: SupervisorBench) -> None:
+    bench.data.battery_mv = 3000
+    bench.fly(6_000_000)
+
+
+def logic_failed(estimator: bool) -> Callable[[SupervisorBench], None]:
+    """Own logic has returned NaN or infinity; what the guard does then is tested with own logic."""
+
+    def happen(bench: SupervisorBench) -> None:
+        cause = Cause.ESTIMATOR_NOT_FINITE if estimator else Cause.CONTROLLER_NOT_FINITE
+        bench.core.supervisor.fields.not_finite = cause
+        bench.look()
+
+    return happen
 
 
 EVENTS = pytest.mark.parametrize(
     ("happen", "cause", "flown_by"),
     [
-        (lambda supervisor: None, Cause.NONE, (MODE_FLY, MODE_MANUAL, MODE_HOVER)),
+        (lambda bench: None, Cause.NONE, (MODE_FLY, MODE_MANUAL, MODE_HOVER)),
+        (had_a_frozen_gyro, Cause.IMU_STALE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
         (fell_silent, Cause.SILENCE, (MODE_HOVER, MODE_MANUAL, MODE_HOVER)),
         (was_held_at_its_bounds, Cause.OUT_OF_BOUNDS, (MODE_HOVER, MODE_MANUAL, MODE_HOVER)),
-        (Supervisor.emergency_stop, Cause.EMERGENCY_STOP, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (
+            lambda bench: bench.view.emergency_stop(),
+            Cause.EMERGENCY_STOP,
+            (MODE_HOVER, MODE_HOVER, MODE_HOVER),
+        ),
         (ran_down, Cause.LOW_BATTERY, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
-        (lambda supervisor: supervisor.arm(False), Cause.DISARMED, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
-        (lambda s: s.logic.see(1, 0), Cause.CONTROLLER_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
-        (lambda s: s.logic.see(1, 1), Cause.ESTIMATOR_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (lambda bench: bench.view.arm(False), Cause.DISARMED, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (logic_failed(False), Cause.CONTROLLER_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
+        (logic_failed(True), Cause.ESTIMATOR_NOT_FINITE, (MODE_HOVER, MODE_HOVER, MODE_HOVER)),
     ],
 )
 
 
-def in_flight(happen: Callable[[Supervisor], object]) -> Supervisor:
-    supervisor = Supervisor(load_config().supervisor, SimpleNamespace(bounded=0), lambda text: None)
-    supervisor.calibrated, supervisor.last_pose_us = True, 6_000_000
-    happen(supervisor)
-    return supervisor
+def in_flight(happen: Callable[[SupervisorBench], object], now_us: int = 0) -> SupervisorBench:
+    bench = SupervisorBench(now_us)
+    bench.calibrate()
+    bench.pose()
+    happen(bench)
+    return bench
 
 
 @EVENTS
 @pytest.mark.parametrize("manual", Manual)
 def test_angles_from_outside_move_the_flaps_unless_somebody_the_battery_or_own_logic_stopped_the_robot(
-    happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int], manual: Manual
+    happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int], manual: Manual
 ) -> None:
-    supervisor = in_flight(happen)
-    supervisor.manual = manual
-    assert supervisor.mode(6_000_000) == flown_by[manual]
-    assert supervisor.cause is cause
+    bench = in_flight(happen)
+    bench.data.manual_mode = manual
+    assert bench.look() == flown_by[manual]
+    assert bench.view.cause is cause
+    bench.view.connected = lambda: False
+    assert bench.look() == (MODE_HOVER if manual is Manual.ANGLES else flown_by[manual])
+
+
+@pytest.mark.parametrize(("gap_us", "outside"), [(EPISODE_GAP_US, True), (EPISODE_GAP_US + 10_000, False)])
+def test_bounded_steps_up_to_50_ms_apart_are_one_episode_which_counts_after_200_ms(
+    gap_us: int, outside: bool
+) -> None:
+    bench = in_flight(lambda bench: bench.fly(1_000_000))
+    for now_us in range(0, EPISODE_LIMIT_US + gap_us, gap_us):
+        bench.fly(10_000, bounded=True)
+        expected = Cause.OUT_OF_BOUNDS if outside and now_us >= EPISODE_LIMIT_US else Cause.NONE
+        assert bench.view.cause is expected
+        bench.fly(gap_us - 10_000)
+
+
+def test_an_episode_after_a_silent_one_begins_anew() -> None:
+    bench = in_flight(lambda bench: None)
+    for _ in range(3):
+        bench.fly(3_800_000)
+        assert bench.fly(EPISODE_LIMIT_US, bounded=True) == MODE_FLY
 
 
 CAN_BE_ARMED, CAN_FLY = 1 << 0, 1 << 3
@@ -208,36 +255,170 @@ CAN_BE_ARMED, CAN_FLY = 1 << 0, 1 << 3
 
 @EVENTS
 def test_a_board_that_says_that_it_can_fly_flies_at_the_next_pose(
-    happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int]
+    happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
 ) -> None:
-    supervisor = in_flight(happen)
-    told = supervisor_bits(supervisor)
-    supervisor.last_pose_us = 9_000_000  # after any time out of bounds
-    supervisor.mode(9_000_000)
-    assert bool(told & CAN_FLY) == (supervisor.state is State.FLYING)
+    bench = in_flight(happen)
+    bench.look()
+    told = supervisor_bits(bench.view)
+    bench.fly(3_000_000)  # after any time out of bounds
+    assert bool(told & CAN_FLY) == (bench.view.state is State.FLYING)
 
 
 @EVENTS
 def test_a_disarmed_board_that_says_that_it_can_be_armed_obeys(
-    happen: Callable[[Supervisor], object], cause: Cause, flown_by: tuple[int, int, int]
+    happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int]
 ) -> None:
-    supervisor = in_flight(happen)
-    assert not supervisor_bits(supervisor) & CAN_BE_ARMED or cause is Cause.DISARMED
-    supervisor.arm(False)
-    assert bool(supervisor_bits(supervisor) & CAN_BE_ARMED) == supervisor.arm(True)
+    bench = in_flight(happen)
+    assert not supervisor_bits(bench.view) & CAN_BE_ARMED or cause is Cause.DISARMED
+    bench.view.arm(False)
+    assert bool(supervisor_bits(bench.view) & CAN_BE_ARMED) == bench.view.arm(True)
 
 
-def test_silence_begins_when_the_last_pose_is_as_old_as_its_limit() -> None:
-    supervisor = in_flight(lambda supervisor: None)
-    end_us = 6_000_000 + supervisor.pose_timeout_us
-    assert (supervisor.mode(end_us - 1), supervisor.mode(end_us)) == (MODE_FLY, MODE_HOVER)
+# Instants wrap after 2^32 us, differences are ambiguous after 2^31 us: flights across both, and far from them.
+STARTS_US = pytest.mark.parametrize("start_us", [0, 2**31 - 1_000_000, 2**32 - 1_000_000, 3_600_000_000])
+
+
+@STARTS_US
+@pytest.mark.parametrize("waited_us", [0, 30_000])
+def test_silence_begins_when_the_last_pose_is_as_old_as_its_limit(start_us: int, waited_us: int) -> None:
+    bench = in_flight(lambda bench: bench.fly(990_000), start_us)
+    bench.now_us += 7_000
+    bench.pose(waited_us)
+    limit_us = int(bench.parameters.pose_timeout_us) - waited_us
+    assert (bench.look(limit_us - 1), bench.look(1)) == (MODE_FLY, MODE_HOVER)
+    assert bench.view.cause is Cause.SILENCE
+
+
+@STARTS_US
+@pytest.mark.parametrize(
+    ("happen", "cause"),
+    [
+        (ran_down, Cause.LOW_BATTERY),
+        (was_held_at_its_bounds, Cause.OUT_OF_BOUNDS),
+        (fell_silent, Cause.SILENCE),
+    ],
+)
+def test_what_is_decided_by_time_is_decided_over_the_wrap_of_its_clock(
+    happen: Callable[[SupervisorBench], object], cause: Cause, start_us: int
+) -> None:
+    bench = in_flight(lambda bench: bench.fly(500_000), start_us)
+    happen(bench)
+    bench.look()
+    assert bench.view.cause is cause
+
+
+@STARTS_US
+def test_the_watchdog_bites_over_the_wrap_of_its_clock(start_us: int) -> None:
+    bench = in_flight(lambda bench: bench.fly(300_000), start_us)
+    bench.now_us += 4_000
+    bench.view.feed_watchdog(bench.now_us)
+    bench.fly(990_000)
+    assert (bench.look(9_999), bench.look(1)) == (MODE_FLY, MODE_HOVER)
+    assert bench.found == (State.FAILSAFE, Cause.EMERGENCY_STOP)
+    assert bench.view.locked
+
+
+def test_silence_lasts_for_hours() -> None:
+    """Longer than differences of a clock of 32 bits reach."""
+    bench = in_flight(fell_silent)
+    for _ in range(2 * 3600):
+        assert bench.look(1_000_000) == MODE_HOVER
+        assert bench.found == (State.FAILSAFE, Cause.SILENCE)
+    assert bench.fly(10_000) == MODE_FLY
+
+
+def test_a_voltage_that_sags_for_less_than_five_seconds_does_no_harm() -> None:
+    bench = in_flight(lambda bench: None)
+    for voltage_mv, time_us in (
+        (3000, BATTERY_LOW_US - 10_000),
+        (3900, 10_000),
+        (3000, BATTERY_LOW_US - 10_000),
+    ):
+        bench.data.battery_mv = voltage_mv
+        assert bench.fly(time_us) == MODE_FLY
+    bench.fly(10_000)
+    assert bench.view.cause is Cause.LOW_BATTERY
 
 
 def test_a_board_that_is_disarmed_while_it_calibrates_is_in_failsafe() -> None:
-    supervisor = in_flight(lambda supervisor: supervisor.arm(False))
-    supervisor.calibrated = False
-    supervisor.mode(6_000_000)
-    assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.DISARMED)
+    bench = SupervisorBench()
+    bench.view.arm(False)
+    bench.look()
+    assert bench.found == (State.FAILSAFE, Cause.DISARMED)
+
+
+def test_nothing_is_in_the_air_before_a_flight_and_five_seconds_after_it_was_stopped() -> None:
+    bench = in_flight(lambda bench: None)
+    supervisor = bench.core.supervisor.fields
+    assert not supervisor.aloft
+    bench.fly(100_000)
+    for end in (lambda: bench.view.arm(False), bench.view.stop):
+        assert supervisor.aloft
+        end()
+        bench.fly(DOWN_US - 10_000)
+        assert supervisor.aloft
+        bench.fly(10_000)
+        assert not supervisor.aloft
+        bench.view.arm(True)
+        bench.fly(10_000)
+
+
+def test_flaps_that_are_moved_by_hand_are_not_at_rest() -> None:
+    bench = SupervisorBench()
+    bench.data.manual_mode = Manual.ANGLES
+    bench.look()
+    assert bench.core.supervisor.fields.aloft
+
+
+def test_a_gyro_is_stale_after_20_steps_and_alive_after_100_with_new_counts() -> None:
+    bench = in_flight(lambda bench: bench.steps(50, moving=True))
+    found = []
+    for steps, moving in ((STALE_STEPS - 1, False), (1, False), (RECOVERY_STEPS - 1, True), (1, True)):
+        bench.steps(steps, moving)
+        bench.fly(10_000)
+        found.append(bench.view.cause is Cause.IMU_STALE)
+    assert found == [False, True, True, False]
+
+
+def test_a_sample_that_is_late_on_a_link_is_no_fault_of_the_gyro() -> None:
+    bench = in_flight(lambda bench: None)
+    bench.data.gyro_again = 1
+    bench.steps(10 * STALE_STEPS)
+    assert bench.look() == MODE_FLY
+
+
+def test_lost_control_is_a_failsafe_until_the_next_look() -> None:
+    bench = in_flight(lambda bench: bench.fly(100_000))
+    bench.core.run.call("lose_control")
+    supervisor = bench.core.supervisor.fields
+    assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.NO_CONTROL)
+    assert bench.fly(10_000) == MODE_FLY
+
+
+def test_a_flight_that_begins_afresh_waits_for_gyro_and_pose_and_is_not_armed_by_it() -> None:
+    bench = in_flight(lambda bench: bench.fly(100_000))
+    bench.view.arm(False)
+    bench.core.run.call("begin_afresh")
+    bench.look()
+    assert (bench.view.calibrated, bench.view.armed) == (False, False)
+    assert not bench.core.supervisor.fields.aloft
+    bench.view.arm(True)
+    bench.calibrate()
+    bench.look()
+    assert bench.view.state is State.WAITING
+
+
+def test_a_robot_without_anything_to_fly_to_waits() -> None:
+    bench = in_flight(lambda bench: bench.fly(100_000))
+    bench.data.idle = 1
+    assert bench.look() == MODE_HOVER
+    assert bench.found == (State.WAITING, Cause.NONE)
+
+
+def test_the_wire_has_the_numbers_of_the_core() -> None:
+    for kind in (State, Cause, Manual):
+        numbers = {one.name: getattr(structs, f"{kind.__name__.upper()}_{one.name}") for one in kind}
+        assert numbers == {one.name: one.value for one in kind}
 
 
 @pytest.mark.parametrize(("port", "data"), [(LOC, b"\4"), (SUPERVISOR, b"\4")])
@@ -296,7 +477,7 @@ def test_one_outlier_pose_changes_neither_the_state_nor_the_estimate(flying: Crt
     counters = flying.firmware.signals.counters
     resets = counters[6]
     flying.run(flying.now_us + 18_000)  # of two poses that were true in one tick the later counts
-    for outlier in ((1.0, 0.0, 0.0), (0.0, -1.4, 0.5), (0.3, 0.3, 0.3)):
+    for outlier in ((0.85, 0.0, 0.0), (0.0, -0.8, -1.4), (0.3, 0.3, 0.3)):
         flying.send(LOC, 1, crtp.encode_ext_pose(outlier, LEVEL, 40_000)[1:])
         for _ in range(20):
             flying.run(flying.now_us + 10_000)
@@ -345,3 +526,26 @@ def test_flaps_never_rest_whatever_the_supervisor_says(flying: CrtpClient) -> No
     flying.run(flying.now_us + 500_000)
     times = [t for t, _ in flying.writes]
     assert max(later - earlier for earlier, later in pairwise(times[1:])) <= 11_000
+
+
+def freeze(client: CrtpClient, frozen: bool) -> None:
+    client.imu_noise = 0 if frozen else 1
+
+
+def silence(client: CrtpClient, silent: bool) -> None:
+    client.imu_alive = not silent
+
+
+@pytest.mark.parametrize("fail", [freeze, silence])
+def test_a_gyro_that_delivers_nothing_new_opens_the_loop_until_it_has_worked_for_a_while(
+    flying: CrtpClient, fail: Callable[[CrtpClient, bool], None]
+) -> None:
+    fail(flying, True)
+    assert after(flying, 10_000) == (State.FLYING, Cause.NONE)
+    assert after(flying, 21_000) == (State.FAILSAFE, Cause.IMU_STALE)
+    assert flying.console == ["supervisor: failsafe, imu stale"]
+    assert after(flying, 2_000_000) == (State.FAILSAFE, Cause.IMU_STALE)
+    assert flying.writes[-1][1] == HOVER_COUNTS
+    fail(flying, False)
+    assert after(flying, 90_000) == (State.FAILSAFE, Cause.IMU_STALE)
+    assert after(flying, 31_000) == (State.FLYING, Cause.NONE)

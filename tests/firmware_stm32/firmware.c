@@ -15,7 +15,10 @@
 #define MAGIC_ASSERT 0x2F8A001Fu
 #define assert_that(condition) ((condition) ? (void)0 : assertFail(#condition, __FILE__, __LINE__))
 
-enum planted { NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG };
+enum planted {
+  NOTHING, BUS_FAULT, UNDEFINED, ASSERTION, HUNGRY_WATCHDOG, NULL_CALL, NULL_READ, NULL_WRITE, DIVISION, HANG, OVERFLOW,
+  BRIEF_OVERFLOW, LAST_CALL
+};
 enum { ASSERTED = 1 };
 
 typedef struct xLIST_ITEM {
@@ -324,8 +327,54 @@ __attribute__((noinline)) static void send_line(void) {
   lines_sent++;
 }
 
+static void (*volatile nobody)(void);
+static volatile uint32_t *volatile nowhere;
+static volatile uint32_t zero, wasted;
+
+__attribute__((noinline)) static uint32_t dig(uint32_t depth) {
+  volatile uint32_t hole[16];
+  hole[depth % 16] = depth;
+  return depth ? dig(depth - 1) + hole[depth % 16] : hole[0];
+}
+
+__attribute__((noinline)) static void hang(void) {
+  for (;;) {
+    wasted++;
+  }
+}
+
+/* Writes the last word of a stack, and is back, within one block of instructions. */
+__attribute__((naked, noinline)) static void touch(__attribute__((unused)) uint32_t *end_of_stack) {
+  __asm volatile("mov r1, sp\n mov sp, r0\n str r1, [sp]\n mov sp, r1\n bx lr");
+}
+
+__attribute__((noinline)) static void check_last(uint32_t how) {
+  assert_that(how != LAST_CALL);
+}
+
 __attribute__((noinline)) static uint32_t go_wrong(uint32_t how) {
   switch (how) {
+    case NULL_CALL:
+      nobody();
+      break;
+    case NULL_READ:
+      return nowhere[2];
+    case NULL_WRITE:
+      nowhere[3] = 1;
+      break;
+    case DIVISION:
+      return 7 / zero;
+    case HANG:
+      hang();
+      break;
+    case OVERFLOW:
+      return dig(20);
+    case BRIEF_OVERFLOW:
+      touch(pxCurrentTCB->pxStack);
+      break;
+    case LAST_CALL:
+      check_last(how);
+      break;
     case BUS_FAULT:
       return REGISTER(0x30000000); /* nothing is there */
     case UNDEFINED:

@@ -132,7 +132,8 @@ def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
             lines.append(rate.on_frame(t_us))
         return [line for line in lines if line]
 
-    assert told(*[5000] * 3000) == told(*[5400] * 3000) == []
+    assert told(*[5000] * 3000) == told(*[5500] * 3000) == told(*[4500] * 3000) == []
+    assert len(told(*[5501] * 3000)) == len(told(*[4499] * 3000)) == 1
     assert told(*[400] * 280, 1_400_000, *[5000] * 3000) == []  # a burst and a stall
     assert len(told(*[10_000] * 1000)) == len(told(*[4000] * 3000)) == 1
     (faster,) = told(*[10_000] * 1000)

@@ -12,15 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import from_euler_zyx
 from firmware_py.wire import crtp, telemetry
-from firmware_py.wire.scalars import Scalar
 from ground_station.config import StationConfig, TrackerConfig
 from ground_station.corrections import correct
+from ground_station.links.log_blocks import START_ORDER
 from ground_station.links.loopback import LoopbackLink
 from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import Quality, Tracker
 from ground_station.trajectory import Goal, Hold, Offsets, Sine, Square, Step
+from support.log_board import TABLE, LogBoard, data_packet
 
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -33,14 +34,23 @@ class StationWithPackets:
 
     def __init__(self, corrections_hz=50.0, latency_us=1000, log=None, trajectory=None, tracker=None):
         self.sent = []  # corrections
-        self.requests = []  # for telemetry
-        link = LoopbackLink(self._transmit, latency_us)
+        self.requests = []  # for telemetry, which the board grants when it is there
+        self.board = LogBoard()
+        self.link = LoopbackLink(self._transmit, latency_us, lambda: TABLE)
         self.station = GroundStation(
-            link, trajectory or Hold(HOME), log, StationConfig(corrections_hz=corrections_hz), tracker
+            self.link, trajectory or Hold(HOME), log, StationConfig(corrections_hz=corrections_hz), tracker
         )
 
     def _transmit(self, now_us, data):
         (self.sent if data[0] >> 4 == crtp.PORT_LOCALISATION else self.requests).append((now_us, data))
+
+    def hear(self, now_us, data):
+        """Take telemetry, for which the station has asked the board."""
+        if not self.board.periods:
+            self.link.start_telemetry(now_us)
+            while self.requests:
+                self.station.on_packet(now_us, self.board.answer(self.requests.pop()[1]))
+        self.station.on_packet(now_us, data)
 
     def frames(
         self, count, valid=lambda number: True, p=lambda number: (0.001 * number, 0.0, 1.15), period_us=5000
@@ -198,19 +208,23 @@ def test_bad_configuration_is_refused(change):
 def test_telemetry_is_asked_for_at_the_first_frame_and_after_half_a_second_without_it():
     bench = StationWithPackets()
     bench.frames(300)
-    assert [now_us for now_us, _ in bench.requests] == [38_000, 538_000, 1_038_000]
-    assert {data for _, data in bench.requests} == {b"\x2f\0telemetry\0stream\0\x08\x01"}
-    bench.requests.clear()
+    asked_us = [now_us for now_us, _ in bench.requests]
+    assert asked_us[0] == 38_000
+    assert np.diff(asked_us) == pytest.approx(100_000, abs=20_000)  # with a correction, while no answer comes
+    assert {data for _, data in bench.requests} == {b"\x5d\x05"}  # reset: the first of many
     for now_us in range(1_540_000, 3_000_000, 400_000):
-        bench.station.on_packet(now_us, next(telemetry_packets(now_us // 1000)))
+        bench.hear(now_us, next(telemetry_packets(now_us // 1000)))
         bench.station.on_frame(MocapFrame(now_us, HOME.p_WG, UPRIGHT, True), now_us + 399_000)
     assert bench.requests == []
 
 
-def telemetry_packets(timestamp_ms, blocks=telemetry.BLOCKS):
+def telemetry_packets(timestamp_ms, blocks=START_ORDER):
     for block in blocks:
         shown = [(variable.scale or 1) * (0.5 + block.id) for variable in block.variables]
-        yield telemetry.encode_block(block, timestamp_ms, shown)
+        kinds = [float if variable.type.is_float else int for variable in block.variables]
+        yield data_packet(
+            block, timestamp_ms, [kind(value) for kind, value in zip(kinds, shown, strict=True)]
+        )
 
 
 def rows(path):
@@ -224,7 +238,7 @@ def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
     bench.frames(1, p=lambda number: (0.25, 0.0, 1.15))
     for timestamp_ms in (0, 20):  # a board that has just booted, too
         for data in telemetry_packets(timestamp_ms):
-            bench.station.on_packet(timestamp_ms * 1000 + 900, data)
+            bench.hear(timestamp_ms * 1000 + 900, data)
     log.close()
     log.close()
     first, second = rows(tmp_path / "telemetry.csv")
@@ -234,7 +248,7 @@ def test_log_has_one_row_per_time_stamp_with_what_the_ground_knew(tmp_path):
     assert float(first["mocap.x [m]"]) == 0.25
     for block in telemetry.BLOCKS:
         for variable in block.variables:
-            expected = 0.5 + block.id if variable.type is Scalar.F32 else block.id
+            expected = 0.5 + block.id if variable.type.is_float else block.id
             assert float(first[f"{variable.name} [{variable.unit}]"]) == expected
 
 
@@ -244,7 +258,7 @@ def test_times_are_to_the_microsecond_on_a_computer_that_has_run_for_days(tmp_pa
     now_us = 1_000_000_123_457
     bench.station.on_frame(MocapFrame(now_us - 38_001, (0.0, 0.0, 1.15), UPRIGHT, True), now_us)
     for data in telemetry_packets(20):
-        bench.station.on_packet(now_us, data)
+        bench.hear(now_us, data)
     log.close()
     (row,) = rows(tmp_path / "telemetry.csv")
     times_us = [round(float(row[title]) * 1e6) for title in ("ground.t [s]", "mocap.t [s]")]
@@ -254,9 +268,12 @@ def test_times_are_to_the_microsecond_on_a_computer_that_has_run_for_days(tmp_pa
 def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
     bench = StationWithPackets(log=log)
-    for timestamp_ms, blocks in ((20, telemetry.BLOCKS), (40, telemetry.BLOCKS[1:])):
+    for timestamp_ms, blocks in (
+        (20, START_ORDER),
+        (40, [b for b in START_ORDER if b is not telemetry.MOTION]),
+    ):
         for data in telemetry_packets(timestamp_ms, blocks):
-            bench.station.on_packet(0, data)
+            bench.hear(0, data)
     log.close()
     first, second = rows(tmp_path / "telemetry.csv")
     assert float(first["stateEstimate.x [m]"]) == 0.5 + telemetry.BLOCKS[0].id
@@ -268,11 +285,11 @@ def test_a_lost_block_leaves_nan_in_its_own_row_only(tmp_path):
 def test_log_knows_velocity_and_quality_of_the_track_and_the_last_usable_pose(tmp_path):
     log = TelemetryLog(tmp_path / "telemetry.csv")
     bench = StationWithPackets(log=log, tracker=Tracker(TrackerConfig(), 5000))
-    packet = next(telemetry_packets(20, telemetry.BLOCKS))
+    packet = next(telemetry_packets(20))
     bench.frames(100)
-    bench.station.on_packet(500_000, packet)
+    bench.hear(500_000, packet)
     bench.station.on_frame(MocapFrame(500_000, (0.5, 0.0, 1.15), UPRIGHT, True), 538_000)
-    bench.station.on_packet(540_000, next(telemetry_packets(40, telemetry.BLOCKS)))
+    bench.hear(540_000, next(telemetry_packets(40)))
     log.close()
     good, refused = rows(tmp_path / "telemetry.csv")
     assert (float(good["mocap.quality []"]), float(refused["mocap.quality []"])) == (
@@ -290,7 +307,7 @@ def test_log_on_disk_is_never_much_more_than_a_second_old(tmp_path):
     bench = StationWithPackets(log=log)
     for timestamp_ms in range(0, 10_000, 500):  # few bytes: no buffer is ever full
         for data in telemetry_packets(timestamp_ms):
-            bench.station.on_packet(timestamp_ms * 1000, data)
+            bench.hear(timestamp_ms * 1000, data)
     # not closed, as after a crash
     assert int(rows(tmp_path / "telemetry.csv")[-1]["board.t [ms]"]) >= 8000
     log.close()

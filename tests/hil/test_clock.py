@@ -1,5 +1,8 @@
 """Simulated time against the wall clock, on a wall clock that only moves when it is told to."""
 
+import math
+from pathlib import Path
+
 import pytest
 
 from hil import clock
@@ -75,3 +78,12 @@ def test_free_running_time_never_stands_still() -> None:
     free = FreeRunning()
     free.wait_until(10**15)
     assert (free.stood_still_us, free.notices()) == (0, [])
+
+
+def test_the_age_of_the_process_counts_from_its_start_and_is_nan_where_no_system_says_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    first = clock.process_age_s()
+    assert 0.0 < first <= clock.process_age_s()
+    monkeypatch.setattr(clock, "PROCESS", tmp_path / "none")
+    assert math.isnan(clock.process_age_s())

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.events import EventQueue
+from hil.events import EVENTS_AT_ONE_INSTANT, EndlessInstantError, EventQueue
 
 
 @given(st.lists(st.integers(0, 20)), st.integers(0, 25))
@@ -64,3 +64,34 @@ def test_a_period_counts_from_the_planned_instant():
     assert ran == [5, -15, 15, 25, 35]
     with pytest.raises(ValueError, match="period of 0"):
         events.every(0, 50, ran.append)
+
+
+@pytest.mark.parametrize("in_a_run_for_each", [False, True])
+def test_a_callback_that_plans_itself_at_its_own_instant_for_ever_is_named(in_a_run_for_each):
+    events, ran = EventQueue(), []
+
+    def again(time_us):
+        ran.append(time_us)
+        if not in_a_run_for_each:
+            events.at(time_us, again)
+
+    def run_for_ever():
+        while True:
+            events.at(2_000, again)
+            events.run(2_000)
+
+    with pytest.raises(
+        EndlessInstantError, match=r"again at 0\.002000 s of simulated time: more than 10000 events"
+    ):
+        run_for_ever()
+    assert len(ran) == EVENTS_AT_ONE_INSTANT
+
+
+def test_events_of_many_instants_are_not_counted_together():
+    events, ran = EventQueue(), []
+    for time_us in range(0, 3 * EVENTS_AT_ONE_INSTANT // 2):
+        events.at(time_us // 2, ran.append)
+    for _ in range(EVENTS_AT_ONE_INSTANT):
+        events.at(EVENTS_AT_ONE_INSTANT, ran.append)
+    events.run(EVENTS_AT_ONE_INSTANT)
+    assert len(ran) == 5 * EVENTS_AT_ONE_INSTANT // 2

@@ -1,6 +1,7 @@
 """GDB itself, Debian's `gdb-multiarch`, at the server of `--gdb`."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -10,10 +11,12 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
 
-from hil.devices.stm32f405.chip import CYCLES_PER_US
-from hil.devices.stm32f405.gdb import DebuggedChip, GdbServer
-from hil.devices.stm32f405.image import Image
+from hil.stm32f405.chip import CYCLES_PER_US
+from hil.stm32f405.freertos import FreeRtos
+from hil.stm32f405.gdb import DebuggedChip, GdbServer
+from hil.stm32f405.image import Image
 from support import stm32_firmware
 from support.bare_cortex import BareCortex
 from support.paths import ROOT
@@ -110,6 +113,39 @@ def test_gdb_sees_through_an_interrupt_into_the_task_below_it() -> None:
     assert frames[1] == "<signal handler called>"
     assert any("report ()" in frame or "spin" in frame or "rest ()" in frame for frame in frames[2:])
     assert machine.peek("i2c_reads") >= 1
+
+
+def test_gdb_shows_tasks_and_stops_at_a_write() -> None:
+    machine = FirmwareOnChip("gcc")
+    chip, kernel = machine.chip, FreeRtos(machine.image, machine.chip.read)
+
+    def run(server: GdbServer) -> None:
+        debugged_chip = DebuggedChip(chip, server, kernel)
+        while chip.now_us < 30_000:
+            debugged_chip.run(30_000 * CYCLES_PER_US)
+
+    printed = "\n".join(
+        debugged(
+            run,
+            machine.image,
+            "break send_line",
+            "continue",
+            "info threads",
+            "thread apply all backtrace",
+            "delete",
+            "watch xTickCount",
+            "continue",
+            "backtrace 1",
+            "delete",
+        )
+    )
+    for name in ("REPORT, running", "FILTER, blocked", "FROZEN, suspended", "SPIN-0, ready"):
+        assert f"({name}, priority " in printed
+    assert re.search(r"receive \(\) at .*firmware.c:\d+|filter \(\) at .*firmware.c:\d+", printed), printed
+    assert re.search(r"Hardware watchpoint 2: xTickCount\s+Old value = \d+\s+New value = \d+", printed), (
+        printed
+    )
+    assert re.search(r"#0  .*tick \(\)", printed), printed
 
 
 def test_a_flight_that_stood_at_breakpoints_has_the_hash_of_one_that_did_not(tmp_path: Path) -> None:

@@ -245,4 +245,6 @@ def test_a_taken_natnet_port_is_one_line_and_exit_code_two() -> None:
         command = [sys.executable, "-m", "hil.commands", "serve", "--udp", "0", "--natnet-port", port]
         shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert shown.returncode == 2
-    assert shown.stderr.strip().endswith(f"natnet port {port}: Address already in use")
+    assert shown.stderr.strip().endswith(
+        f"natnet port {port}: Address already in use; --natnet-port 0 takes a free one, --no-motive none"
+    )

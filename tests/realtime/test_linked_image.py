@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
 pytest.importorskip("cflib")
 
 from hil.experiments import find_experiment

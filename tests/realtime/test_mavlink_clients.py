@@ -3,6 +3,7 @@
 import hashlib
 import importlib.util
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -110,6 +111,7 @@ def test_mavsdk_reads_telemetry_and_tunes(url: str) -> None:
     assert seen["imu"] == pytest.approx([0, 0, -9.8], abs=3)  # in the flow
     assert seen["home"] == pytest.approx([0, 0, -1.15])
     assert abs(seen["height"]) < 1.0
+    assert seen["velocity"] == pytest.approx([0, 0, 0], abs=0.5)
     assert min(seen["heading_deg"], 360 - seen["heading_deg"]) < 5
     assert (seen["in_air"], seen["landed_state"], seen["armed"]) == (False, "ON_GROUND", False)
     assert len(seen["floats"]) > 30
@@ -137,3 +139,31 @@ def test_mavsdk_lets_units_fail_stops_and_reboots() -> None:
     assert seen["parameter out of range"] == "VALUE_OUT_OF_RANGE"
     assert seen["arm after the stop"] == "COMMAND_DENIED"
     assert "not armed: emergency stop; reboot first" in seen["texts"]
+
+
+@mavsdk_here
+def test_mavsdk_flies_offboard_and_hears_that_there_are_no_missions() -> None:
+    with serve("--mavlink", address("udp"), "--station") as served:
+        served.wait_for("released", PATIENCE_S)
+        _, host, port = served.line("mavlink ")[0].split(":")
+        command = [sys.executable, str(SUPPORT / "mavsdk_offboard.py"), f"udpin://{host}:{port}"]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=2 * PROGRAM_S, check=False)
+    assert ended.returncode == 0, ended.stderr + ended.stdout
+    seen = json.loads(ended.stdout.splitlines()[-1])
+    assert [name for name, there in seen["streams"].items() if not there] == []
+    assert (seen["arm"], seen["start"], seen["stop"]) == ("done", "done", "done")
+    assert (seen["mode in offboard"], seen["mode after"], seen["active"]) == ("OFFBOARD", "HOLD", True)
+    for begin, end, *goal in seen["goals"]:
+        there = [place for instant, *place in seen["places"] if begin <= instant < end]
+        assert len(there) > 80
+        assert (
+            max(rms_m(axis, wanted) for axis, wanted in zip(zip(*there, strict=True), goal, strict=True))
+            < 0.06
+        )
+    assert "target refused: it has a velocity, no position" in seen["texts"]
+    assert (seen["raw mission"], seen["mission"]) == ("UNSUPPORTED", "UNSUPPORTED")
+    assert seen["start mission"] == "DENIED"
+
+
+def rms_m(values: tuple[float, ...], wanted: float) -> float:
+    return math.sqrt(sum((value - wanted) ** 2 for value in values) / len(values))

@@ -16,7 +16,6 @@ from hil.laboratory.result import read_result
 from hil.laboratory.run import Request, fly, prepare
 from support.app_board import board
 from support.command import floaty
-from support.crazyflie_app import build_app
 from support.plugged_dongle import plug
 from support.serving import START_TIMEOUT_S, Served, started
 
@@ -30,11 +29,6 @@ LOSSY = (
 
 BEARABLE_S = 0.026  # of the loop's delay, by flights on one time line
 SERVO_S = 0.005  # what servos and control period take at least
-
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_app(tmp_path_factory.mktemp("app"))
 
 
 @pytest.fixture(scope="module")

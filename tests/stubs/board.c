@@ -23,6 +23,7 @@
 #include "param_task.h"
 #include "platform.h"
 #include "pm.h"
+#include "power_distribution.h"
 #include "queue.h"
 #include "stm32fxxx.h"
 #include "supervisor.h"
@@ -43,6 +44,7 @@ int32_t stub_estimator = StateEstimatorTypeAutoSelect; /* what the stabilizer st
 int32_t stub_connected = 1;
 int32_t stub_after_watchdog, stub_after_assert, stub_self_test_passed;
 int32_t stub_ratios[4];
+uint32_t stub_idle_thrust;
 char stub_console[4096];
 uint32_t stub_cycles = 1000; /* that the processor counts from one look at the counter to the next */
 int32_t stub_suspended;
@@ -57,6 +59,7 @@ void crtpSupervisorSetEmergencyStop(void) { stub_stop_requested = 1; }
 void crtpSupervisorNotifyEmergencyStopWatchdog(void) { stub_watchdog_fed += 1; }
 bool crtpSupervisorIsEmergencyStopRequested(void) { return stub_stop_requested != 0; }
 bool crtpIsConnected(void) { return stub_connected != 0; }
+uint32_t powerDistributionGetIdleThrust() { return stub_idle_thrust; }
 void motorsSetRatio(uint32_t id, uint16_t ratio) { stub_ratios[id] = ratio; }
 SensorImplementation_t platformConfigGetSensorImplementation() { return (SensorImplementation_t)stub_sensors; }
 bool paramTest(void) { return true; }

@@ -26,6 +26,7 @@
 #include "param_task.h"
 #include "platform.h"
 #include "pm.h"
+#include "power_distribution.h"
 #include "stm32fxxx.h"
 #include "supervisor.h"
 #include "system.h"
@@ -74,6 +75,7 @@ FUNCTION(crtpSupervisorNotifyEmergencyStopWatchdog, void, void)
 FUNCTION(crtpSupervisorIsEmergencyStopRequested, bool, void)
 VALUE(MOTOR_M4, 3)
 FUNCTION(motorsSetRatio, void, uint32_t, uint16_t)
+FUNCTION(powerDistributionGetIdleThrust, uint32_t, void)
 VALUE(SensorImplementation_bmi088_bmp3xx, 0)
 VALUE(SensorImplementation_mpu9250_lps25h, 1)
 FUNCTION(platformConfigGetSensorImplementation, SensorImplementation_t, void)

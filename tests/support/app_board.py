@@ -14,16 +14,15 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
-from firmware_py.board import EEPROM_SIZE
+from firmware_py.board import Board
 from firmware_py.wire.supervisor import Cause, State
 from hil.clock import Paced
-from hil.config import LabConfig, load_config
-from hil.devices.shockburst import Air, syslink_us
-from hil.events import EventQueue
+from hil.config import load_config
+from hil.crazyflie.shockburst import syslink_us
+from hil.devices.board_firmware import PowerOn
 from hil.laboratory.laboratory import NEVER_US, Laboratory
-from hil.laboratory.robot import Streams
+from hil.laboratory.robot import Site, Streams
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.served_robot import ServedRobot
 from hil.servers.server import Ends
@@ -35,63 +34,63 @@ STEP_US = 1000
 TRANSMIT_PERIOD_US = 1000  # in which the firmware tries again when its radio chip takes nothing
 
 
-class AppRobot:
-    """What `ServedRobot` and `Laboratory` need of a robot, with the app in it and nothing around it."""
+class AppBoard:
+    """Executes the app in place of the firmware: `hil.devices.board_firmware.Executor`."""
 
-    uart = firmware = None
-    polled_by_host = executes_image = False
+    needs_polls = False
     wire_us = staticmethod(syslink_us)
-    next_wake_us = None
 
-    def __init__(self, library: Path, folder: Path, events: EventQueue, config: LabConfig) -> None:
-        self.config, self.events, self.air = config, events, Air.of(config.radio)
-        self.board = SimpleNamespace(eeprom=bytearray(b"\xff" * EEPROM_SIZE), battery_mv=3900)
-        self.powered = False
-        self._library, self._folder = library, folder
-        self._boots = self._booted_us = 0
+    def __init__(self, library: Path, folder: Path) -> None:
+        self._library, self._folder, self._boots = library, folder, 0
+
+    def boot(self, start: PowerOn) -> "AppFirmware":
+        self._boots += 1
+        return AppFirmware(App(self._library, self._folder / f"{self._boots}.so"), start.board)
+
+
+class AppFirmware:
+    """The app that has booted, stepped with every sample of the IMU, which has its own gyro."""
+
+    flashed = scheduler = usage = clock_us = mavlink = next_wake_us = None
+    overrun = ""
+    variables = ()
+
+    def __init__(self, app: App, board: Board) -> None:
+        self.app, self.now_us, self.kernel = app, 0, self
+        self._board = board
         self._state = ""
         self._waiting: deque[bytes] = deque()
-        events.every(STEP_US, STEP_US, self._step)
-
-    def boot(self, now_us: int) -> None:
-        self._boots += 1
-        self._booted_us = now_us
-        self.powered = True
-        self.app = App(self._library, self._folder / f"{self._boots}.so")
-        self.app.boot()
-        self._waiting.clear()
-
-    def cut_power(self) -> None:
-        self.powered = False
-
-    def packet_received(self, now_us: int, data: bytes, broadcast: bool = False) -> None:
-        if self.powered:
-            self.app.radio(data[1:], data[0] >> 4, data[0] & 3)
-            self._transmit(now_us)
-
-    def polled(self, now_us: int) -> None:
-        pass
-
-    def run(self, now_us: int) -> None:
-        pass
+        app.boot()
 
     def advance(self, now_us: int) -> None:
+        self.now_us = now_us
+
+    def run(self, now_us: int, until_us: int = 0) -> None:
+        self.now_us = now_us
+
+    def stop_before(self, us: int) -> None:
         pass
 
-    def _step(self, now_us: int) -> None:
-        if self.powered:
-            self.app.step((now_us - self._booted_us) // STEP_US)
-            supervisor = self.app.supervisor
-            state = f"state {State(supervisor.state).name} {Cause(supervisor.cause).name}"
-            if state != self._state:
-                print(state, flush=True)
-            self._state = state
-            self._transmit(now_us)
+    def radio_received(self, data: bytes, broadcast: bool = False) -> None:
+        self.app.radio(data[1:], data[0] >> 4, data[0] & 3)
+        self._transmit()
 
-    def _transmit(self, now_us: int) -> None:
+    def radio_polled(self) -> None:
+        pass
+
+    def imu_ready(self) -> None:
+        self.app.step(self.now_us // STEP_US)
+        supervisor = self.app.supervisor
+        state = f"state {State(supervisor.state).name} {Cause(supervisor.cause).name}"
+        if state != self._state:
+            print(state, flush=True)
+        self._state = state
+        self._transmit()
+
+    def _transmit(self) -> None:
         while packet := self.app.sent():
             self._waiting.append(packet)
-        while self._waiting and self.send_packet(now_us, self._waiting[0]):
+        while self._waiting and self._board.radio_send(self._waiting[0]):
             self._waiting.popleft()
 
 
@@ -100,16 +99,19 @@ def main(library: str, *overrides: str) -> None:
     clock, config = Paced(), load_config(overrides=overrides)
     lab = Laboratory(clock)
     with tempfile.TemporaryDirectory() as folder:
-        robot = AppRobot(Path(library), Path(folder), lab.events, config)
-        served = ServedRobot(1, robot, Streams.of_seed(1).radio, print)
+        board = AppBoard(Path(library), Path(folder))
+        site = Site(config, lab.events, Streams.of_seed(1), lambda source, text: None, board)
+        served = ServedRobot(1, site, print)
+        served.robot.plant.hold()
+        served.robot.watch(0)
         ends = Ends(lab, clock.readers, config, 1)
         ends.robots.append(served)
-        lab.robots.append(robot)
+        lab.robots.append(served.robot)
         print("use", f"{VARIABLE}={ends.serve_radio(0)}")
         print("udp", *ends.serve_udp(0))
         print("radio", served.uri)
         print("serving", flush=True)
-        lab.end_us = NEVER_US
+        lab.end_at(NEVER_US)
         lab.run()
 
 

@@ -3,10 +3,10 @@
 from unicorn import UC_ARCH_ARM, UC_HOOK_CODE, UC_MODE_MCLASS, UC_MODE_THUMB, Uc, UcError
 from unicorn import arm_const as arm
 
-from hil.devices.stm32f405.gdb import GdbServer
-from hil.devices.stm32f405.gdb_protocol import REGISTERS, SIGINT, SIGTRAP, Wish
-from hil.devices.stm32f405.image import Image
 from hil.errors import LabError
+from hil.stm32f405.gdb import GdbServer
+from hil.stm32f405.gdb_protocol import REGISTERS, SIGINT, SIGTRAP, Wish
+from hil.stm32f405.image import Image
 
 SLICE = 1000  # instructions between two looks at the debugger
 NUMBERS = {name: getattr(arm, f"UC_ARM_REG_{name.upper()}") for name, _ in REGISTERS}
@@ -31,6 +31,9 @@ class BareCortex:
         self._leaving = 0
         self.set_register("sp", image.initial_stack_pointer)
         self.set_register("pc", image.reset)
+
+    def watch(self, kind: int, address: int, size: int, on: bool) -> None:
+        raise LabError("no watchpoints")
 
     def read(self, address: int, size: int) -> bytes:
         try:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
-from firmware_py.core.structs import MODE_FLY, Control, Estimator, Input
+from firmware_py.core.structs import MODE_FLY, Control, Estimator, Input, Sampling, Supervisor
 from hil.config import load_config
 
 Vector = NDArray[np.float64]
@@ -22,6 +22,8 @@ class Core:
     def __init__(self, **parameters: float) -> None:
         self.parameters = parameters_of(CONFIG)
         self.data, self.estimator, self.control = (kind.allocate() for kind in (Input, Estimator, Control))
+        self.sampling, self.supervisor = Sampling.allocate(), Supervisor.allocate()
+        self.sampling.fields.phase = 9  # the estimator's tick comes in this step
         for name, value in parameters.items():
             self.parameters.memory[name] = value
         self.fields = self.estimator.fields
@@ -31,14 +33,16 @@ class Core:
         """File a pose that will be `age_us` old at the next tick."""
         data = self.data.fields
         data.pose_position[:], data.pose_quaternion[:], data.pose_age_us = p, q, age_us
-        return int(entry.file_pose(self.parameters.arg, self.data.arg, self.estimator.arg))
+        blocks = (self.parameters, self.data, self.estimator, self.sampling, self.supervisor)
+        return int(entry.file_pose(*(block.arg for block in blocks)))
 
     def tick(self, gyro_sum: object = (0, 0, 0), samples: int = 10, command: object = (0, 0, 0, 0)) -> None:
         """Run one tick on gyro counts and the command (deviation from hover [rad]) that held until now."""
         data = self.data.fields
         data.gyro_sum[:], data.gyro_samples = gyro_sum, samples
         self.control.fields.command[:] = command
-        entry.estimate(self.parameters.arg, self.data.arg, self.estimator.arg, self.control.arg)
+        blocks = (self.parameters, self.data, self.estimator, self.control, self.sampling)
+        entry.estimate(*(block.arg for block in blocks))
 
     def fly(self) -> None:
         """Run the controller on the estimate."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.config import parameters_of
-from firmware_py.core.structs import Control, Estimator, Input, Parameters
+from firmware_py.core.structs import Control, Estimator, Input, Parameters, Sampling, Supervisor
 from firmware_py.core.subset import Block
 from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.export.native import NativeRunner
@@ -22,10 +22,16 @@ from hil.config import load_config
 from hil.experiments.hover import HOVER
 from hil.laboratory.faults import parse
 from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.run import Request
 from support.paths import ROOT
 
 CONFIG = load_config()
 BUILD = ROOT / "runs" / "build" / "core"
+# Calls with arbitrary bits in what the tasks write, and their shares; sums of samples would overflow.
+WILD = {
+    "reset": 0.02, "file_pose": 0.26, "estimate": 0.3, "control": 0.22, "begin_step": 0.08, "supervise": 0.08,
+    "request": 0.04,
+}  # fmt: skip
 ONE_NAN = 0x7FC00000
 SPECIAL_FLOATS = np.array(
     [0.0, -0.0, 1.0, -1.0, 1e-45, -1e-42, 1.1754942e-38, 3.4028235e38, -3.4028235e38, 1e30, -1e20, 16777216.0,
@@ -40,7 +46,9 @@ def float_words(dtype: np.dtype[Any]) -> NDArray[np.bool_]:
     return np.concatenate(ones)
 
 
-FLOATS = {struct.dtype: float_words(struct.dtype) for struct in (Parameters, Input, Estimator, Control)}
+STRUCTS = (Parameters, Input, Estimator, Control, Sampling, Supervisor)
+MEMORY = sum(struct.dtype.itemsize for struct in STRUCTS)  # [B] of the default core
+FLOATS = {struct.dtype: float_words(struct.dtype) for struct in STRUCTS}
 
 
 def one_nan(words: NDArray[np.uint32], floats: NDArray[np.bool_] | bool = True) -> bytes:
@@ -55,8 +63,8 @@ def block_bits(block: Block) -> bytes:
     return one_nan(block.memory.view(np.uint32), FLOATS[block.memory.dtype])
 
 
-def blocks_of(core: CoreBlocks) -> tuple[Block, Block, Block, Block]:
-    return core.parameters, core.data, core.estimator, core.control
+def blocks_of(core: CoreBlocks) -> tuple[Block, ...]:
+    return tuple(core.named.values())
 
 
 def fill(block: Block, content: bytes) -> None:
@@ -75,7 +83,7 @@ class Step:
 
 @dataclass(slots=True)
 class Recording:
-    """The four blocks at the start, the calls, and result and blocks after each."""
+    """The blocks at the start, the calls, and result and blocks after each."""
 
     start: list[bytes]
     steps: list[Step] = field(default_factory=list)
@@ -90,7 +98,7 @@ def run_step(core: CoreBlocks, step: Step) -> bytes:
         floats = FLOATS[Estimator.dtype]
         words = core.estimator.memory.view(np.uint32)
         words[floats] = np.frombuffer(step.floats, np.uint32)[floats]
-    result = getattr(core.run, step.call)()
+    result = core.run.call(step.call)
     return repr(result).encode() + b"".join(map(block_bits, blocks_of(core)))
 
 
@@ -117,22 +125,21 @@ class RecordingRunner:
         self._core, self._inner = core, core.run
         self.recording = Recording([block.bytes() for block in blocks_of(core)])
 
-    def _call(self, name: str) -> Any:
+    def call(self, name: str) -> int:
         parameters, data = self._core.parameters.bytes(), self._core.data.bytes()
-        result = getattr(self._inner, name)()
+        result = self._inner.call(name)
         self.recording.steps.append(Step(name, parameters, data))
         blocks = b"".join(map(block_bits, blocks_of(self._core)))
         self.recording.after.append(repr(result).encode() + blocks)
         return result
 
-    def __getattr__(self, name: str) -> Any:
-        return partial(self._call, name)
-
 
 def record_flight(duration_s: float) -> Recording:
     """Return the core's calls in a hover with pushes and with gaps, outliers and late poses."""
     faults = ["push.y@2=2", "push.roll@3=0.2", "mocap.dropout@4:0.4", "push.z@5=2"]
-    flight = lockstep_flight(CONFIG, HOVER, duration_s, 1, None, faults=[parse(text) for text in faults])
+    flight = lockstep_flight(
+        Request(HOVER, CONFIG, "floaty", (), 1, duration_s, faults=tuple(parse(text) for text in faults))
+    )
     core = flight.robot.firmware._core
     runner = RecordingRunner(core)
     core.run = runner  # type: ignore[assignment]
@@ -159,14 +166,15 @@ def wild_words(rng: np.random.Generator, block: Block) -> bytes:
 def record_wild(seed: int, count: int) -> Recording:
     """Return calls with arbitrary bits in parameters, input and the estimator's floats, run on Python."""
     rng = np.random.default_rng(seed)
-    parameters, data, estimator = parameters_of(CONFIG), Input.allocate(), Estimator.allocate()
+    core = CoreBlocks(parameters_of(CONFIG), PythonRunner)
+    parameters, data, estimator = core.parameters, core.data, core.estimator
     data.fields.pose_quaternion[0] = 1.0
     data.fields.gyro_samples = 10
-    recording = Recording([block.bytes() for block in (parameters, data, estimator, Control.allocate())])
+    recording = Recording([block.bytes() for block in blocks_of(core)])
     sane = parameters.bytes(), data.bytes()
     recording.steps.append(Step("reset", *sane))
     for _ in range(count):
-        call = rng.choice(["reset", "file_pose", "estimate", "control"], p=[0.02, 0.28, 0.4, 0.3])
+        call = rng.choice(list(WILD), p=list(WILD.values()))
         first = wild_words(rng, parameters) if rng.random() < 0.5 else sane[0]
         second = wild_words(rng, data) if rng.random() < 0.7 else sane[1]
         floats = wild_words(rng, estimator) if rng.random() < 0.15 else b""
@@ -178,12 +186,11 @@ def record_wild(seed: int, count: int) -> Recording:
 def record_plausible(seed: int, ticks: int) -> Recording:
     """Return ticks with poses, outliers, ages and rates of a flight, under profiles that are varied now and then."""
     rng = np.random.default_rng(seed)
-    parameters, data = parameters_of(CONFIG), Input.allocate()
+    core = CoreBlocks(parameters_of(CONFIG), PythonRunner)
+    parameters, data = core.parameters, core.data
     sane = parameters.memory.view(np.uint32).copy()
     floats = FLOATS[Parameters.dtype]
-    recording = Recording(
-        [block.bytes() for block in (parameters, data, Estimator.allocate(), Control.allocate())]
-    )
+    recording = Recording([block.bytes() for block in blocks_of(core)])
     recording.steps.append(Step("reset", parameters.bytes(), data.bytes()))
     fields = data.fields
     for tick in range(ticks):
@@ -213,7 +220,14 @@ def record_plausible(seed: int, ticks: int) -> Recording:
         fields.gyro_samples = rng.choice([0, 9, 10])
         fields.mode = rng.choice(3, p=[0.1, 0.8, 0.1])
         fields.manual[:] = rng.normal(0, 1, 4)
-        recording.steps += [Step(call, parameters.bytes(), data.bytes()) for call in ("estimate", "control")]
+        fields.tick, fields.now_us = tick, 1000 * tick
+        fields.gyro[:] = fields.gyro_sample[:] = rng.normal(0, 300, 3)
+        fields.battery_mv, fields.manual_mode = rng.integers(3000, 4000), rng.choice(3, p=[0.8, 0.1, 0.1])
+        fields.idle, fields.connected = rng.random(2) < 0.1
+        fields.request = rng.integers(7)
+        calls = ["begin_step", "take_sample", "estimate", "supervise", "control"]
+        calls += ["request"] if rng.random() < 0.02 else []
+        recording.steps += [Step(call, parameters.bytes(), data.bytes()) for call in calls]
     recording.after = list(replay(recording, None))
     return recording
 

@@ -7,9 +7,12 @@ import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from firmware_py.core.structs import Estimator
+import numpy as np
+
+from firmware_py.core.structs import Estimator, Input, Sampling, Supervisor
+from firmware_py.core.subset import S
+from firmware_py.export.compilers import compilers
 from firmware_py.export.crazyflie import write_app
-from firmware_py.export.native import compilers
 from hil.config import LabConfig, load_config
 from support.paths import STUBS
 
@@ -20,43 +23,14 @@ GENERIC = 1
 OUT_OF_TREE = 3  # StateEstimatorTypeOutOfTree
 
 
-class Supervisor(ctypes.Structure):
-    """FloatySupervisor."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in (
-            "last_pose_us", "battery_good_us", "episode_start_us", "bounded_us", "outside_until_us",
-        )),
-        *((name, ctypes.c_int32) for name in (
-            "pose_timeout_us", "low_battery_mv", "battery_mv", "bounded", "controller_faults", "estimator_faults",
-        )),
-        *((name, ctypes.c_uint8) for name in (
-            "state", "cause", "manual", "calibrated", "armed", "pose_seen", "stopped", "battery_empty",
-            "not_finite",
-        )),
-    )  # fmt: skip
-
-
 class Pose(ctypes.Structure):
     """FloatyPose."""
 
     _fields_ = (
-        ("arrival_us", ctypes.c_int64),
+        ("arrival_us", ctypes.c_int32),
         ("position", ctypes.c_float * 3),
         ("quaternion", ctypes.c_float * 4),
         ("age_us", ctypes.c_int32),
-    )
-
-
-class GyroZero(ctypes.Structure):
-    """FloatyGyroZero."""
-
-    _fields_ = (
-        ("squares", ctypes.c_int64 * 3),
-        ("sums", ctypes.c_int32 * 3),
-        ("samples", ctypes.c_int32),
-        ("windows_refused", ctypes.c_int32),
-        ("found", ctypes.c_bool),
     )
 
 
@@ -141,17 +115,12 @@ class App:
         c.stub_log_name.restype = c.stub_param_name.restype = ctypes.c_char_p
         c.stub_log_value.restype = c.stub_param_get.restype = ctypes.c_double
         c.stub_param_set.argtypes = c.stub_param_load.argtypes = (ctypes.c_int, ctypes.c_double)
-        c.floaty_supervisor_mode.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32)
-        c.floaty_supervisor_arm.argtypes = (ctypes.c_void_p, ctypes.c_bool)
-        c.floaty_supervisor_recover.argtypes = (ctypes.c_void_p, ctypes.c_int64)
-        c.floaty_supervisor_see_logic.argtypes = (ctypes.c_void_p, ctypes.c_int32, ctypes.c_int32)
-        c.floaty_supervisor_see_battery.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32)
-        c.floaty_supervisor_arm.restype = c.floaty_supervisor_recover.restype = ctypes.c_bool
-        c.floaty_pose_decode.argtypes = (ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int64, ctypes.c_void_p)
-        c.floaty_pose_decode.restype = c.floaty_gyro_zero_add.restype = ctypes.c_bool
+        c.floaty_pose_decode.argtypes = (ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int32, ctypes.c_void_p)
+        c.floaty_pose_decode.restype = ctypes.c_bool
         for test in (c.estimatorOutOfTreeTest, c.watchdogNormalStartTest, c.cfAssertNormalStartTest):
             test.restype = ctypes.c_bool
         self.now = ctypes.c_uint64.in_dll(c, "stub_now_us")
+        self.gyro_noise = 1  # of the last bit, from step to step; 0: frozen
         self.gyro = (ctypes.c_int32 * 3).in_dll(c, "stub_gyro")
         self.battery = ctypes.c_float.in_dll(c, "stub_battery")
         self.usec_reset = ctypes.c_uint64.in_dll(c, "stub_usec_reset_us")
@@ -169,8 +138,10 @@ class App:
         self.cycles = ctypes.c_uint32.in_dll(c, "stub_cycles")
         self.suspended = ctypes.c_int32.in_dll(c, "stub_suspended")
         self.transmit_full = ctypes.c_int32.in_dll(c, "stub_transmit_full")
+        self.idle_thrust = ctypes.c_uint32.in_dll(c, "stub_idle_thrust")
         self.ratios = (ctypes.c_int32 * 4).in_dll(c, "stub_ratios")
-        self.supervisor = Supervisor.in_dll(c, "floaty_supervisor")
+        self.supervisor, self.sampling = self._struct(Supervisor), self._struct(Sampling)
+        self.data = self._struct(Input)
         self.timers = [Timer.in_dll(c, name) for name in ("stub_tim3", "stub_tim5")]
         self.pins = [Pins.in_dll(c, name) for name in ("stub_gpio_a", "stub_gpio_b")]
         self._estimator = (ctypes.c_char * Estimator.dtype.itemsize).in_dll(c, "floaty_estimator")
@@ -182,8 +153,17 @@ class App:
         self.params = {name: i for i, name in _names(c.stub_param_name)}
         self.logs = {name: i for i, name in _names(c.stub_log_name)}
 
-    def boot(self, stored: Mapping[str, float] | None = None) -> None:
-        """Start as the firmware's system task does, with parameters `stored` in the EEPROM, up to the stabilizer's loop."""
+    def _struct(self, kind: type[S]) -> S:
+        """Return a struct of the core's, as if it were one here."""
+        memory = (ctypes.c_char * kind.dtype.itemsize).in_dll(self.c, f"floaty_{kind.__name__.lower()}")
+        view: S = kind._view(np.frombuffer(memory, kind.dtype))
+        return view
+
+    def boot(self, stored: Mapping[str, float] | None = None, absolute: bool = False) -> None:
+        """Start as the firmware's system task does, with parameters `stored` in the EEPROM, up to the stabilizer's loop.
+
+        Then set what poses are, as whoever connects does: `absolute`, in a box as wide as a room, or corrections.
+        """
         c = self.c
         c.appInit()
         for name, value in (stored or {}).items():
@@ -194,6 +174,9 @@ class App:
         tests = (c.estimatorOutOfTreeTest, c.watchdogNormalStartTest, c.cfAssertNormalStartTest)
         self.self_test_passed.value = min(test() for test in tests)  # each of them is asked
         c.stub_run_app(0)
+        self.set("extPose.absolute", absolute)
+        for size in ("radius", "below", "above") if absolute else ():
+            self.set(f"box.{size}", 5.0)
 
     def step(self, step: int, *, controlled: bool = True) -> None:
         """Run one pass of the stabilizer, which waits for the self-test; another controller may be selected."""
@@ -205,6 +188,7 @@ class App:
             self.c.controllerOutOfTree(
                 self._control, ctypes.byref(self.setpoint), self._nothing, self._state, step
             )
+        self.gyro[2] ^= self.gyro_noise
 
     def radio(self, data: bytes, port: int = LOCALISATION, channel: int = GENERIC) -> None:
         """Receive a packet."""

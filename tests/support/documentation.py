@@ -40,7 +40,7 @@ NOT_RUN = (
     (r"gdb-multiarch ", IMAGE),
     (r"floaty fly .*--link (radio|udp|mavlink):", PACED),
     (r"env PYTHONPATH=\S+ FLOATY_DONGLE=", SERVER),
-    (r"(mavproxy\.py|python tests/support/mavsdk_client\.py) ", SERVER),
+    (r"(mavproxy\.py|python tests/support/mavsdk_(client|offboard)\.py) ", SERVER),
     (r"floaty deploy check$", DEAR),
     (r"floaty (campaign|tune)\b", DEAR),
     (r"floaty fly hover --profile tuned\.toml", DEAR),

@@ -18,7 +18,7 @@ import pytest
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FILE = re.compile(r"# ([\w./-]+\.\w+)\n")  # a first line that names the file in which the block belongs
 FRAME = re.compile(r"^[\s━─═┏┓┗┛┡┩└┘┳┻╇┴┬╋┼]*$")
-SPEED = re.compile(r"\d[\d.]*(?= times real time| ?s\b.* ===$)")
+SPEED = re.compile(r"\d[\d.]*(?= times real time| s from start to end| ?s\b.* ===$)")
 COMPILED = re.compile(
     r"\d[\d.]*(?=.* instructions)|(?<=instructions).*"
 )  # how long the compiler's code takes

@@ -1,11 +1,14 @@
 """The firmware as a whole on a board of plain numbers, in simulated time."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.firmware import Firmware
-from firmware_py.wire import crtp, telemetry
+from firmware_py.wire import WireError, crtp
 from firmware_py.wire.mavlink_numbers import Result
+from firmware_py.wire.telemetry import Sample
+from ground_station.links.log_blocks import LogBlocks
 from hil.config import load_config
 from hil.events import EventQueue
 
@@ -23,10 +26,12 @@ class FirmwareBench:
         self.events = EventQueue()
         self.imu: ImuCounts = (3, -2, 1, 0, 0, 1365)
         self.imu_alive = True
+        self.imu_noise = 1  # of the last bit; 0: frozen
         self.radio_open = True
         self.polling = True  # the dongle asks all the time, as every real one
         self.writes: list[tuple[int, list[int]]] = []
         self.sent: list[tuple[int, bytes]] = []
+        self.samples: list[Sample] = []  # of telemetry, once `stream` has asked for it
         self.console: list[str] = []
         self.resets_us: list[int] = []
         self.now_us = 0
@@ -34,6 +39,10 @@ class FirmwareBench:
         self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
         self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
         self.firmware = Firmware(load_config(), self)
+        self._to_station: list[bytes] = []
+        self._logs = LogBlocks(
+            lambda now_us, data: self.firmware.radio_received(data), lambda: self.firmware.log_numbers
+        )
         self.events.at(1000, self._sample)
 
     def read_imu(self) -> ImuCounts:
@@ -48,6 +57,7 @@ class FirmwareBench:
     def radio_send(self, data: bytes) -> bool:
         if self.radio_open:
             self.sent.append((self.now_us, data))
+            self._to_station.append(data)
         return self.radio_open
 
     def debug_write(self, text: str) -> None:
@@ -61,6 +71,7 @@ class FirmwareBench:
 
     def _sample(self, now_us: int) -> None:
         if self.imu_alive:
+            self.imu = (*self.imu[:2], self.imu[2] ^ self.imu_noise, *self.imu[3:])
             self.firmware.imu_ready()
         if self.polling:
             self.firmware.radio_polled()
@@ -77,8 +88,8 @@ class FirmwareBench:
             self.pose(at_us, p)
 
     def stream(self, at_us: int) -> None:
-        data = telemetry.encode_stream_request(True)
-        self.events.at(at_us, lambda now_us: self.firmware.radio_received(data))
+        """Let a station ask for the telemetry of a flight."""
+        self.events.at(at_us, self._logs.request)
 
     def run(self, end_us: int) -> None:
         while self.now_us < end_us:
@@ -86,3 +97,9 @@ class FirmwareBench:
             self.now_us = min(wake for wake in wakes if wake is not None)
             self.events.run(self.now_us)
             self.firmware.run(self.now_us)
+            while self._to_station:
+                packet = crtp.decode(self._to_station.pop(0))
+                if packet.port == crtp.PORT_LOG:
+                    with suppress(WireError):  # blocks of another client
+                        self.samples += self._logs.hear(self.now_us, packet)
+                    self.firmware.run(self.now_us)

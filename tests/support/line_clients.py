@@ -121,7 +121,7 @@ ENDS: dict[str, tuple[Callable[[Any], OpenEnd], Callable[[OpenEnd], LineClient]]
     "udp": (lambda port: OpenEnd(Address("udp", port=port).open), UdpClient),
     "tcp": (lambda port: OpenEnd(Address("tcp", port=port).open), TcpClient),
     "crtp": (
-        lambda port: OpenEnd(lambda readers, received: UdpServer(port, readers, received)),
+        lambda port: OpenEnd(lambda readers, received: UdpServer(port, readers, received, print)),
         CrtpUdpClient,
     ),
 }

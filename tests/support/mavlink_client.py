@@ -13,7 +13,8 @@ from support.firmware_bench import LEVEL, FirmwareBench
 STATION = (255, 190)
 STREAMS = (
     "HEARTBEAT", "SYS_STATUS", "BATTERY_STATUS", "ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED",
-    "SERVO_OUTPUT_RAW", "ESTIMATOR_STATUS", "NAMED_VALUE_FLOAT",
+    "SERVO_OUTPUT_RAW", "ESTIMATOR_STATUS", "NAMED_VALUE_FLOAT", "SYSTEM_TIME", "UNKNOWN_436",  # CURRENT_MODE
+    "POSITION_TARGET_LOCAL_NED", "VFR_HUD", "ACTUATOR_OUTPUT_STATUS", "HOME_POSITION", "ODOMETRY",
 )  # fmt: skip
 GYRO_ZERO_US = 600_000  # the gyro's zero is found by then
 Pose = tuple[tuple[float, float, float], tuple[float, float, float, float]]
@@ -76,8 +77,9 @@ class MavlinkClient(FirmwareBench):
 
     def one(self, name: str, *fields: Any) -> Any:
         """The only answer, whatever the board sent by itself meanwhile."""
-        (answer,) = [answer for answer in self.ask(name, *fields) if answer.get_type() not in STREAMS]
-        return answer
+        answers = [answer for answer in self.ask(name, *fields) if answer.get_type() not in STREAMS]
+        assert len(answers) == 1, answers
+        return answers[0]
 
     def command(self, number: int, *params: float, target: tuple[int, int] = (1, 1)) -> list[Any]:
         """The answers to a COMMAND_LONG."""
@@ -100,7 +102,18 @@ class MavlinkClient(FirmwareBench):
         return [message for _, message in self.messages if message.get_type() == kind]
 
     def texts(self) -> list[str]:
-        return [message.text for message in self.of("STATUSTEXT")]
+        return lines(self.of("STATUSTEXT"))
+
+
+def lines(texts: Iterable[Any]) -> list[str]:
+    """What these STATUSTEXTs say; a long line comes in pieces."""
+    found: list[str] = []
+    for message in texts:
+        if message.chunk_seq:
+            found[-1] += message.text
+        else:
+            found.append(message.text)
+    return found
 
 
 def codec(system: int, component: int) -> Any:

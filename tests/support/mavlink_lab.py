@@ -7,7 +7,7 @@ from hil.clock import FreeRunning, Readers
 from hil.config import load_config
 from hil.laboratory.robot import Robot
 from hil.servers.server import Server
-from support.mavlink_client import STATION, codec
+from support.mavlink_client import STATION, codec, lines
 
 
 class MavlinkLab:
@@ -15,7 +15,7 @@ class MavlinkLab:
 
     master = "here"
 
-    def __init__(self, *settings: str, flying: bool = False) -> None:
+    def __init__(self, *settings: str, flying: bool = False, absolute: bool = False) -> None:
         self.said: list[str] = []
         self.messages: list[tuple[int, Any]] = []
         self._codec, self._parser = codec(*STATION), codec(0, 0)
@@ -25,7 +25,7 @@ class MavlinkLab:
         self.robot: Robot = self.served.robot
         self.served.serve_mavlink(self, {})  # type: ignore[arg-type]
         if flying:
-            self.served.fly()
+            self.served.fly(absolute)
         self.run(0.1)
 
     @property
@@ -46,21 +46,46 @@ class MavlinkLab:
         return self
 
     def send(self, data: bytes) -> None:
+        now_us = self.server.lab.events.now_us
         for message in self._parser.parse_buffer(bytearray(data)) or ():
-            self.messages.append((self.server.lab.events.now_us, message))
+            self.messages.append((now_us, message))
+            if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                self.tell("timesync", now_us * 1000, message.ts1)
 
     # The client
 
     def run(self, duration_s: float) -> None:
         lab = self.server.lab
-        lab.end_us = lab.now_us + round(duration_s * 1e6)
+        lab.end_at(lab.now_us + round(duration_s * 1e6))
         lab.run()
+
+    def tell(self, name: str, *fields: Any) -> None:
+        """Send a message of pymavlink's own making."""
+        message = getattr(self._codec, f"{name}_encode")(*fields)
+        self._uplink(self.server.lab.events.now_us, message.pack(self._codec))
+
+    def goal(self, x: float, y: float, z: float, yaw: float = 0.0) -> None:
+        """Send a goal, z up."""
+        self.tell("set_position_target_local_ned", 0, 1, 1, 1, 0x9F8, x, -y, -z, 0, 0, 0, 0, 0, 0, -yaw, 0)
+
+    def repeat(self, goal: tuple[float, ...], duration_s: float) -> list[Any]:
+        """Send a goal 20 times per second; returns where the robot was each time."""
+        places = []
+        for _ in range(round(20 * duration_s)):
+            self.goal(*goal)
+            self.run(0.05)
+            places.append(self.place)
+        return places
+
+    @property
+    def place(self) -> Any:
+        """Where the robot truly is [m, W]."""
+        return self.robot.plant.p_WB.copy()
 
     def command(self, number: int, *params: float) -> Any:
         """Send a COMMAND_LONG; returns what comes of it, None when no acknowledgement comes."""
         self.messages.clear()
-        values = (*params, *(0.0,) * (7 - len(params)))
-        self._uplink(self.now_us, self._codec.command_long_encode(1, 1, number, 0, *values).pack(self._codec))
+        self.tell("command_long", 1, 1, number, 0, *params, *(0.0,) * (7 - len(params)))
         self.run(0.05)
         return next((message.result for message in self.of("COMMAND_ACK")), None)
 
@@ -68,7 +93,7 @@ class MavlinkLab:
         return [message for _, message in self.messages if message.get_type() == kind]
 
     def texts(self) -> list[str]:
-        return [message.text for message in self.of("STATUSTEXT")]
+        return lines(self.of("STATUSTEXT"))
 
     def armed(self) -> bool:
         """What the next heartbeat says."""

@@ -73,6 +73,8 @@ async def main(url, parameter, value):
         seen["odometry"] = [getattr(odometry.position_body, f"{axis}_m") for axis in "xyz"]
         seen["imu"] = [getattr(imu.acceleration_frd, f"{axis}_m_s2") for axis in ("forward", "right", "down")]
         seen["home"] = [home.local_north_m, home.local_east_m, home.local_down_m]
+        velocity = await requested(telemetry, "velocity_ned")
+        seen["velocity"] = [velocity.north_m_s, velocity.east_m_s, velocity.down_m_s]
         seen["height"] = position.relative_altitude_m
         seen["heading_deg"] = (await first(telemetry.subscribe_heading())).heading_deg
         seen["in_air"] = await requested(telemetry, "in_air")

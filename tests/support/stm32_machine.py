@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
 
-from hil.devices.stm32f405.chip import CYCLES_PER_US, Chip, Why, build_machine
-from hil.devices.stm32f405.image import Image
+from hil.stm32f405.chip import CYCLES_PER_US, Chip, Why, build_machine
+from hil.stm32f405.freertos import FreeRtos
+from hil.stm32f405.image import Image
+from hil.stm32f405.processor import Processor
 from support.stm32_firmware import BUILD, build
 
 
@@ -22,6 +25,10 @@ class FirmwareOnChip:
         self.chip.add_device(1, 0x50, self.eeprom, 2)
         for name, value in variables.items():
             self.poke(name, value)
+
+    def processor(self) -> Processor:
+        """Return the chip as the laboratory's time line sees it."""
+        return Processor(self.chip, FreeRtos.of(self.image, self.chip.read), lambda why: None, self.chip.run)
 
     def run(self, us: int) -> Why:
         """Run until that long after power-on, or until something stops the chip."""

@@ -25,6 +25,22 @@ TESTS = """from steps import count
 def test_three_steps_are_counted():
     assert count(3) == 3
 """
+C_SOURCE = "int steps(int n) { return n < 0 ? -n : n; }\n"
+C_BUILD = """import subprocess
+from firmware_py.export.compilers import compilers
+
+def build(folder):
+    compiler = min(compilers(), key=lambda one: one.name == "zig")
+    flags = ("-shared", "-fPIC", "-o", folder / "steps.so", "native/steps.c")
+    subprocess.run([*compiler.command, *flags], check=True)
+    return folder / "steps.so"
+"""
+C_TESTS = """import ctypes
+from native.building import build
+
+def test_three_steps_are_counted(tmp_path):
+    assert ctypes.CDLL(str(build(tmp_path))).steps(-3) == 3
+"""
 CAUGHT = "{ old = 'left, steps = abs(n), 0', new = 'left, steps = abs(n), 1' }"
 SURVIVES = "{ old = 'abs(n)', new = 'n' }"
 HANGS = "{ old = 'left - 1', new = 'left', hangs = true }"
@@ -69,6 +85,37 @@ def test_an_endless_loop_is_caught_where_the_row_says_so(project, capsys, monkey
     assert "1 of 2 caught" in said
 
 
+def plant_c(project: Path, *rows: str, build: str = "build = 'native.building:build'") -> int:
+    (project / "native").mkdir(exist_ok=True)
+    (project / "native" / "__init__.py").touch()
+    (project / "native" / "steps.c").write_text(C_SOURCE)
+    (project / "native" / "building.py").write_text(C_BUILD)
+    (project / "test_c.py").write_text(C_TESTS)
+    table = project / "table.toml"
+    table.write_text(
+        f'[[file]]\npath = "native/steps.c"\ntests = "test_c.py"\n{build}\nmistakes = [{", ".join(rows)}]\n'
+    )
+    return planted_mistakes.main((), project, table)
+
+
+@pytest.mark.long
+def test_a_mistake_in_c_is_caught_by_a_test_that_fails(project, capsys) -> None:
+    assert plant_c(project, "{ old = '-n', new = 'n' }", "{ old = 'n < 0', new = 'n <= 0' }") == 1
+    assert "1 of 2 caught, 50.0 %; survived:\n  native/steps.c: n < 0 -> n <= 0\n" in capsys.readouterr().out
+    assert (project / "native" / "steps.c").read_text() == C_SOURCE
+
+
+@pytest.mark.long
+def test_c_that_does_not_compile_is_a_mistake_of_the_table(project, capsys) -> None:
+    assert plant_c(project, "{ old = '-n', new = 'm' }") == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("native/steps.c: 'm' does not build: ")
+    assert said.err.count("\n") == 1
+    assert "caught" not in said.out
+    assert plant_c(project, "{ old = '-n', new = 'n' }", build="") == 2
+    assert 'native/steps.c: `build = "module:function"` is missing' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("row", "complaint"),
     [
@@ -86,6 +133,46 @@ def test_a_bad_row_is_one_line_and_exit_code_two_before_anything_is_planted(
     assert said.err.startswith(complaint)
     assert said.err.count("\n") == 1
     assert "caught" not in said.out
+
+
+def test_every_room_has_its_own_count() -> None:
+    paths = ("hil/world/plant.py", "hil/world/native/plant.c", "hil/clock.py", "hil/live/feed.py")
+    rows = [planted_mistakes.Mistake(path, old, "b", ("test.py",)) for path in paths for old in "ac"]
+    assert planted_mistakes.by_room(rows, [rows[0], rows[2], rows[-1]]) == [
+        ("hil", 2, 2), ("hil/live", 1, 2), ("hil/world", 2, 4),
+    ]  # fmt: skip
+
+
+@pytest.mark.long
+def test_one_room_with_too_many_survivors_is_not_made_up_for_by_the_others(
+    project, capsys, monkeypatch
+) -> None:
+    monkeypatch.setattr(planted_mistakes, "SHARE_CAUGHT", 0.5)
+    (project / "room").mkdir()
+    (project / "room" / "__init__.py").touch()
+    (project / "room" / "quiet.py").write_text("LOUD = 1\n")
+    table = project / "table.toml"
+    table.write_text(
+        '[[file]]\npath = "steps.py"\ntests = "test_steps.py"\nmistakes = ['
+        + ", ".join([CAUGHT] * 2)
+        + ']\n[[file]]\npath = "room/quiet.py"\ntests = "test_steps.py"\n'
+        + "mistakes = [{ old = '1', new = '2' }]\n"
+    )
+    assert planted_mistakes.main(("--jobs", "2"), project, table) == 1
+    said = capsys.readouterr().out
+    assert ".                              2 of   2 caught" in said
+    assert "room                           0 of   1 caught" in said
+    assert "2 of 3 caught, 66.7 %" in said
+
+
+@pytest.mark.long
+def test_a_long_test_that_a_row_names_counts(project, capsys) -> None:
+    (project / "pytest.ini").write_text("[pytest]\naddopts = -m 'not long'\nmarkers = long: takes long\n")
+    (project / "test_steps.py").write_text(
+        TESTS.replace("def test", "import pytest\n\n@pytest.mark.long\ndef test")
+    )
+    named = CAUGHT.replace("}", ", tests = 'test_steps.py::test_three_steps_are_counted' }")
+    assert plant(project, named) == 0
 
 
 def test_a_pattern_that_no_row_matches_is_exit_code_two(project, capsys) -> None:

@@ -45,6 +45,8 @@ def test_sdist_and_wheel_are_complete_and_the_wheel_flies_from_an_empty_folder(t
     with zipfile.ZipFile(wheel) as archive:
         packed = {member for member in archive.namelist() if ".dist-info/" not in member}
         assert archive.read(COMMIT).decode().strip() == commit()
+        [licence] = [member for member in archive.namelist() if member.endswith("/LICENSE")]
+        assert archive.read(licence) == (ROOT / "LICENSE").read_bytes()
     assert packed == tracked(*PACKAGES) | {f"hil/{path}" for path in tracked("profiles")} | {COMMIT}
 
     programs, packages = install(wheel, tmp_path)
@@ -58,6 +60,8 @@ def test_sdist_and_wheel_are_complete_and_the_wheel_flies_from_an_empty_folder(t
     run(empty, floaty, "fly", "hover", "--duration", "2")
     flown = read_result(empty / "runs" / "hover-1")
     assert (flown.passed, flown.commit) == (True, commit())
+    found = run(empty, floaty, "campaign", "table", "--shrink", "1000", code=2).stderr
+    assert "the campaign has flights 0..999" in found
     refused = run(empty, floaty, "view", "runs/hover-1", code=2).stderr
     assert refused.count("\n") == 1
     assert f"{programs / 'python'} -m pip install " in refused

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import chirp
 
-from firmware_py.config import parameters_of
+from firmware_py.config import SIGNALS, parameters_of
 from firmware_py.core import entry
 from firmware_py.core.structs import (
     EXCITE_CHIRP,
@@ -17,7 +17,6 @@ from firmware_py.core.structs import (
     Estimator,
     Input,
 )
-from firmware_py.wire.parameter_names import SIGNALS
 from hil.config import load_config
 
 PERIOD = 2000

@@ -1,4 +1,4 @@
-"""The core gives the same bits as plain Python as compiled: 2000 ticks, all four structs, every tick.
+"""The core gives the same bits as plain Python as compiled: 2000 ticks, all structs, every tick.
 
 Run as a script, this file flies the stream and prints one digest per tick.
 """
@@ -14,7 +14,16 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
-from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL, Control, Estimator, Input
+from firmware_py.core.structs import (
+    MODE_FLY,
+    MODE_HOVER,
+    MODE_MANUAL,
+    Control,
+    Estimator,
+    Input,
+    Sampling,
+    Supervisor,
+)
 from hil.config import load_config
 
 TICKS = 2000
@@ -25,6 +34,7 @@ def fly() -> None:
     rng = np.random.default_rng(5)
     parameters = parameters_of(load_config())
     data, estimator, control = Input.allocate(), Estimator.allocate(), Control.allocate()
+    sampling, supervisor = Sampling.allocate(), Supervisor.allocate()
     fields = data.fields
     entry.reset(parameters.arg, estimator.arg)
     for tick in range(TICKS):
@@ -42,7 +52,7 @@ def fly() -> None:
             fields.pose_position[:] = position
             fields.pose_quaternion[:] = q * rng.choice([1, -1])
             fields.pose_age_us = rng.choice([40_000, 41_234, 37_777, 5_000, 83_000, 200_000, -1])
-            entry.file_pose(parameters.arg, data.arg, estimator.arg)
+            entry.file_pose(parameters.arg, data.arg, estimator.arg, sampling.arg, supervisor.arg)
         gyro = rng.normal(0, 3000, 3) if rng.random() < 0.97 else rng.choice([-327_680, 327_670], 3)
         fields.gyro_sum[:] = gyro.astype(np.int32)
         fields.gyro_samples = rng.choice([10, 9, 0], p=[0.9, 0.08, 0.02])
@@ -53,11 +63,13 @@ def fly() -> None:
             parameters.fields.horizon = 6
         if tick in (700, 1300):
             estimator.fields.x[tick % 16] = math.nan
-        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg)
+        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg)
         fields.mode = MODE_FLY if tick % 100 < 90 else (MODE_MANUAL if tick % 2 else MODE_HOVER)
         fields.manual[:] = (0.1, math.nan, -9.0, math.inf)
         entry.control(parameters.arg, data.arg, estimator.arg, control.arg)
-        structs = b"".join(block.bytes() for block in (parameters, data, estimator, control))
+        structs = b"".join(
+            block.bytes() for block in (parameters, data, estimator, control, sampling, supervisor)
+        )
         print(hashlib.sha256(structs).hexdigest()[:16])
     counters = {name: int(getattr(estimator.fields, name)) for name in
                 ("fused", "refused", "jumps", "too_old", "invalid", "bounded", "resets")}  # fmt: skip

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from firmware_py.core.structs import HORIZON_LIMIT, POSE_ON_TIME, POSE_TOO_OLD
+from firmware_py.core.predictor import QUIET_TICKS
+from firmware_py.core.structs import HORIZON_LIMIT, POSE_INVALID, POSE_ON_TIME, POSE_TOO_OLD
 from support.core_bench import LEVEL, Core, Vector, counts, quaternion, turned
 from support.paper_model import model
 
@@ -221,6 +222,23 @@ def test_measured_horizon_follows_an_older_pose_at_once_and_a_younger_one_slowly
     assert all(0 <= a - b <= 1 for a, b in pairwise(seen))
     assert all(90 <= 10 * seen.count(horizon) <= 110 for horizon in (8, 7, 6, 5))
     assert core.fields.tick - core.fields.filtered_tick == 4
+
+
+def test_the_horizon_shrinks_by_a_pose_more_than_a_second_after_the_last_old_one() -> None:
+    for ticks, horizon in ((QUIET_TICKS, 8), (QUIET_TICKS + 1, 7)):
+        core = Core()
+        glide(core, 100, 80_000)
+        assert (core.fields.horizon, core.fields.quiet_ticks) == (8, 2)
+        for _ in range(ticks - 2):
+            core.tick()
+        core.pose((0, 0, 0), LEVEL, 40_000)
+        assert core.fields.horizon == horizon, ticks
+
+
+@pytest.mark.parametrize(("length", "valid"), [(1.19, True), (1.21, False), (0.81, True), (0.79, False)])
+def test_a_quaternion_counts_within_a_fifth_of_its_squared_length(length: float, valid: bool) -> None:
+    answer = Core().pose((0, 0, 0), (math.sqrt(length), 0, 0, 0), age_us=0)
+    assert (answer == POSE_ON_TIME, answer == POSE_INVALID) == (valid, not valid)
 
 
 def test_fixed_horizon_ignores_the_age() -> None:

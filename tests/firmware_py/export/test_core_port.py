@@ -21,16 +21,20 @@ from firmware_py.wire.core_port import (
     WRITE_MAX,
     Call,
     CoreAnswer,
+    Hil,
     Kind,
     Refusal,
     call,
     decode_answer,
     encode_request,
+    health,
     hello,
+    loop,
     read,
     write,
 )
-from firmware_py.wire.supervisor import State
+from firmware_py.wire.crtp import encode_ext_pose
+from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
 from hil.config import load_config
@@ -41,15 +45,13 @@ from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.run import Request
 from support.app_packets import AppPackets
+from support.core_streams import MEMORY
 from support.crazyflie_app import App, build_app
 from support.own_logic import LAW, own_config
 
 TICK = Parameters.dtype.itemsize + Input.dtype.itemsize + Estimator.dtype.fields["tick"][1]  # where it lies
 
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_app(tmp_path_factory.mktemp("app"))
+POSE = encode_ext_pose((0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 40_000)[1:]
 
 
 @pytest.fixture
@@ -97,10 +99,10 @@ def test_a_session_begins_with_what_is_on_board_and_memory_of_zeros(app: App) ->
 
 def test_a_call_is_answered_with_cycles_and_the_digest_of_all_memory(app: App) -> None:
     blocks = CoreBlocks(parameters_of(load_config()), PythonRunner)
-    blocks.run.reset()
+    blocks.run.call("reset")
     begun(app)
     app.cycles.value = 4321
-    blocks.run.estimate()
+    blocks.run.call("estimate")
     called = ask(app, BEGUN, call(Call.ESTIMATE)).called()
     assert called.digest == crc32(b"".join(block.bytes() for block in blocks.named.values()))
     assert (called.answer, called.cycles) == (0, 4321)
@@ -162,7 +164,8 @@ def test_a_new_session_ends_the_old_one(app: App) -> None:
 @pytest.mark.parametrize(
     "request_",
     [
-        read(4868 - 3, 4), read(0, READ_MAX + 1), write(4868 - 3, bytes(4)), (Kind.CALL, b"\4"), (Kind.CALL, b""),
+        read(MEMORY - 3, 4), read(0, READ_MAX + 1), write(MEMORY - 3, bytes(4)),
+        (Kind.CALL, bytes((len(Call),))), (Kind.CALL, b""),
         (Kind.WRITE, b"\0"), (Kind.READ, b"\0\0"), (9, b""),
     ],
 )  # fmt: skip
@@ -172,15 +175,77 @@ def test_what_lies_outside_is_refused_and_takes_no_number(app: App, request_: tu
     assert ticks(app, BEGUN) == 0
 
 
-def test_in_flight_nothing_is_executed_and_what_flies_is_never_touched(app: App) -> None:
+def step(app: App, steps: range, *, poses: bool = False) -> None:
+    for now in steps:
+        if poses and now % 20 == 0:
+            app.radio(POSE)
+        app.step(now)
+
+
+@pytest.fixture
+def flown(app: App) -> App:
+    """In the air, and its poses have stopped."""
+    begun(app)
+    step(app, range(1, 1001), poses=True)
+    assert app.supervisor.state == State.FLYING
+    assert ask(app, BEGUN, call(Call.ESTIMATE)).refusal() == Refusal.FLYING
+    step(app, range(1001, 2001))
+    assert app.supervisor.cause == Cause.SILENCE
+    return app
+
+
+def test_a_call_touches_nothing_that_flies(app: App) -> None:
     flies = app.estimator()
     begun(app)
     ask(app, BEGUN, call(Call.ESTIMATE))
     assert app.estimator() == flies
-    app.supervisor.state = State.FLYING
-    assert ask(app, BEGUN + 1, call(Call.ESTIMATE)).refusal() == Refusal.FLYING
-    app.supervisor.state = State.FAILSAFE
-    assert ticks(app, BEGUN + 1) == 1
+
+
+def test_what_fell_into_its_failsafe_in_the_air_executes_nothing(flown: App) -> None:
+    for request in (call(Call.ESTIMATE), loop(Hil.STILL), read(0, 4), write(0, b"\0")):
+        assert ask(flown, BEGUN, request).refusal() == Refusal.FLYING
+    assert ask(flown, BEGUN, health()).kind == Kind.HEALTH
+
+
+@pytest.mark.parametrize("parameter", ["armed", "stop"])
+def test_disarmed_or_stopped_for_five_seconds_a_board_serves_again(flown: App, parameter: str) -> None:
+    flown.set(f"floaty.{parameter}", parameter == "stop")
+    step(flown, range(2001, 7000))
+    assert ask(flown, BEGUN, read(0, 4)).refusal() == Refusal.FLYING
+    step(flown, range(7000, 7011))
+    assert ask(flown, BEGUN, read(0, 4)).kind == Kind.READ
+    flown.set(f"floaty.{parameter}", parameter != "stop")
+    step(flown, range(7011, 7021))
+    assert ask(flown, BEGUN + 1, read(0, 4)).refusal() == Refusal.FLYING
+
+
+def test_while_flaps_are_moved_by_hand_nothing_is_executed(app: App) -> None:
+    begun(app)
+    app.set("extCtrl.manual", 1)
+    step(app, range(1, 21))
+    assert ask(app, BEGUN, read(0, 4)).refusal() == Refusal.FLYING
+    app.set("extCtrl.manual", 0)
+    step(app, range(21, 41))
+    assert ask(app, BEGUN, read(0, 4)).kind == Kind.READ
+
+
+def test_a_board_that_restarted_by_itself_may_be_in_the_air(library: Path, tmp_path: Path) -> None:
+    app = App(library, tmp_path / "copy.so")
+    app.after_watchdog.value = 1
+    app.boot()
+    ask(app, 0, hello())
+    step(app, range(1, 11))
+    assert ask(app, 0, read(0, 4)).refusal() == Refusal.FLYING
+
+
+def test_with_hardware_in_the_loop_no_call_stops_the_scheduler(app: App) -> None:
+    begun(app)
+    assert ask(app, BEGUN, loop(Hil.STILL)).kind == Kind.LOOP
+    step(app, range(1, 3))
+    while app.sent():
+        pass
+    assert ask(app, BEGUN + 1, call(Call.ESTIMATE)).refusal() == Refusal.LOOP
+    assert ticks(app, BEGUN + 1) == 0
 
 
 def test_a_packet_without_a_head_or_on_another_channel_is_not_answered(app: App) -> None:
@@ -257,8 +322,8 @@ def test_what_the_board_computes_flies_even_where_it_is_wrong(tmp_path: Path) ->
     blocks = CoreBlocks(parameters_of(load_config()), partial(RealCore, client=client))
     right = CoreBlocks(parameters_of(load_config()), PythonRunner)
     for core in (blocks, right):
-        core.run.reset()
-        core.run.control()
+        core.run.call("reset")
+        core.run.call("control")
     assert blocks.control.fields.count.tolist() == [count + 1 for count in right.control.fields.count]
     assert blocks.run.unexpected == 1
 
@@ -269,27 +334,28 @@ def test_measured_cycles_become_processor_time_whatever_is_changed_before_the_ca
     blocks = CoreBlocks(parameters_of(load_config()), partial(RealCore, client=client))
     right = CoreBlocks(parameters_of(load_config()), PythonRunner)
     for core in (blocks, right):
-        core.run.reset()
-        core.run.estimate()
+        core.run.call("reset")
+        core.run.call("estimate")
     assert blocks.run.control_us() == 101  # executed ahead on the board ...
     for core in (blocks, right):
         core.data.fields.mode = 1  # ... on other inputs than it then gets
-        core.run.control()
+        core.run.call("control")
     assert [block.bytes() for block in blocks.named.values()] == [
         block.bytes() for block in right.named.values()
     ]
-    assert [load.calls for load in blocks.run.load.values()] == [1, 0, 1, 1]
+    calls = {name: load.calls for name, load in blocks.run.load.items() if load.calls}
+    assert calls == {"reset": 1, "estimate": 1, "control": 1}
     assert client.sent > 0
 
 
 def test_an_estimate_is_charged_with_the_poses_filed_before_it(app: App) -> None:
     client, _ = client_of(app)
     blocks = CoreBlocks(parameters_of(load_config()), partial(RealCore, client=client))
-    blocks.run.reset()
+    blocks.run.call("reset")
     app.cycles.value = 168 * 50
-    blocks.run.file_pose()
+    blocks.run.call("file_pose")
     assert blocks.run.estimate_us() == 100
-    blocks.run.estimate()
+    blocks.run.call("estimate")
     assert blocks.run.estimate_us() == 50
 
 
@@ -340,7 +406,7 @@ def test_no_more_requests_are_under_way_than_the_boards_queue_holds(app: App) ->
         return answer
 
     packets.send, packets.receive = counted_send, counted_receive
-    client.memory(4868)
+    client.memory(MEMORY)
     assert most[0] == 4  # RADIOLINK_CRTP_QUEUE_SIZE is 5, and an assert in the firmware guards it
 
 
@@ -358,6 +424,6 @@ def test_a_core_of_another_layout_is_refused_in_one_line(app: App, tmp_path: Pat
     config = own_config(tmp_path, LAW)
     request = Request(find_experiment("hover"), config, "own", (), 1, 0.5)
     with pytest.raises(
-        LabError, match=r"^app: its core has 4868 B of memory, this one \d+: export and flash it again$"
+        LabError, match=rf"^app: its core has {MEMORY} B of memory, this one \d+: export and flash it again$"
     ):
         check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)

@@ -15,11 +15,13 @@ from unicorn import UC_HOOK_BLOCK, UC_HOOK_CODE
 
 from firmware_py.config import parameters_of
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
-from firmware_py.export.arm_image import FLASH, Image, build_image, build_meter
+from firmware_py.export.arm_image import Image, build_image, build_meter
 from firmware_py.export.c99 import Translation, translate
-from firmware_py.export.cortex_m4 import CLOCK_MHZ, CortexM4Runner
+from firmware_py.export.cortex_m4 import CortexM4Runner
 from firmware_py.export.cycles import count
+from firmware_py.export.elf import FLASH
 from firmware_py.export.errors import ExportError
+from firmware_py.export.usage import CLOCK_MHZ
 from hil.config import load_config
 from support.paths import ROOT
 
@@ -106,7 +108,7 @@ def runner_of(image: Image) -> Callable[[CoreBlocks], CoreRunner]:
 def started(image: Image) -> tuple[CoreBlocks, CortexM4Runner]:
     blocks = CoreBlocks(parameters_of(CONFIG), runner_of(image))
     assert isinstance(blocks.run, CortexM4Runner)
-    blocks.run.reset()
+    blocks.run.call("reset")
     return blocks, blocks.run
 
 
@@ -124,7 +126,7 @@ def feed(blocks: CoreBlocks, tick: int) -> None:
 
 
 def memory(blocks: CoreBlocks) -> list[bytes]:
-    return [block.bytes() for block in (blocks.parameters, blocks.data, blocks.estimator, blocks.control)]
+    return [block.bytes() for block in blocks.named.values()]
 
 
 @pytest.mark.long
@@ -132,15 +134,15 @@ def memory(blocks: CoreBlocks) -> list[bytes]:
 def test_machine_code_gives_the_bits_of_python(kind: str, request: pytest.FixtureRequest) -> None:
     blocks, _ = started(request.getfixturevalue(kind))
     python = CoreBlocks(parameters_of(CONFIG), PythonRunner)
-    python.run.reset()
+    python.run.call("reset")
     for tick in range(300):
         for each in (blocks, python):
             feed(each, tick)
         if tick % 2:
-            assert blocks.run.file_pose() == python.run.file_pose()
+            assert blocks.run.call("file_pose") == python.run.call("file_pose")
         for each in (blocks, python):
-            each.run.estimate()
-            each.run.control()
+            each.run.call("estimate")
+            each.run.call("control")
         assert memory(blocks) == memory(python), tick
 
 
@@ -171,8 +173,8 @@ def test_a_call_takes_the_instructions_and_cycles_of_its_way(
     blocks, runner = started(image)
     for tick in range(20):
         feed(blocks, tick)
-        runner.file_pose()
-        runner.estimate()
+        runner.call("file_pose")
+        runner.call("estimate")
     instructions = {one.address: one for one in listed(image)}
     starts: list[int] = []
     ways: list[tuple[int, int]] = []
@@ -180,7 +182,7 @@ def test_a_call_takes_the_instructions_and_cycles_of_its_way(
     runner._cpu.hook_add(UC_HOOK_BLOCK, lambda cpu, address, size, user: ways.append((address, size)))
     runner._cpu.ctl_flush_tb()
     feed(blocks, 20)
-    runner.estimate()
+    runner.call("estimate")
     passed: list[int] = []
     cycles, lines, at = 0, OrderedDict[int, None](), 0
     for address, size in ways:
@@ -207,18 +209,18 @@ def test_looking_ahead_tells_the_cost_and_leaves_the_memory_alone(image: Image) 
     for tick in range(30):
         for each in (blocks, direct):
             feed(each, tick)
-        assert runner.file_pose() == other.file_pose()
+        assert runner.call("file_pose") == other.call("file_pose")
         filed = other._meter.cycles
         before = memory(blocks)
         cost_us = runner.estimate_us()
         assert memory(blocks) == before
-        other.estimate()
+        other.call("estimate")
         assert cost_us == -(-(filed + other._meter.cycles) // CLOCK_MHZ)
-        runner.estimate()
+        runner.call("estimate")
         cost_us = runner.control_us()
-        other.control()
+        other.call("control")
         assert cost_us == -(-other._meter.cycles // CLOCK_MHZ)
-        runner.control()
+        runner.call("control")
         assert memory(blocks) == memory(direct)
     assert runner.usage == other.usage
 
@@ -230,13 +232,13 @@ def test_what_was_seen_ahead_is_forgotten_when_the_inputs_change(image: Image) -
     runner.estimate_us()
     for each in (blocks, direct):
         each.data.fields.gyro_sum[0] += 100
-    runner.estimate()
-    other.estimate()
+    runner.call("estimate")
+    other.call("estimate")
     assert memory(blocks) == memory(direct)
     runner.estimate_us()
     runner.control_us()  # overwrites what the estimator has left in RAM
-    runner.estimate()
-    other.estimate()
+    runner.call("estimate")
+    other.call("estimate")
     assert memory(blocks) == memory(direct)
 
 
@@ -245,16 +247,16 @@ def test_code_that_goes_astray_is_stopped(image: Image) -> None:
         replace(image, entries={**image.entries, "control": (FLASH + len(image.code) + 2) | 1})
     )
     with pytest.raises(ExportError, match="control stopped at 0x0800"):
-        runner.control()
+        runner.call("control")
 
 
 def test_the_core_leaves_room_on_the_board(image: Image) -> None:
     blocks, runner = started(image)
     for tick in range(50):
         feed(blocks, tick)
-        runner.file_pose()
-        runner.estimate()
-        runner.control()
+        runner.call("file_pose")
+        runner.call("estimate")
+        runner.call("control")
     usage = runner.usage
     assert usage.flash_bytes < 16_384
     assert usage.ram_bytes == sum(map(len, memory(blocks))) < 8_192
@@ -287,5 +289,5 @@ def test_code_that_cannot_be_a_core_is_refused_in_one_line(
 def test_what_is_built_is_not_compiled_again(
     core: Translation, image: Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("firmware_py.export.arm_image.subprocess", None)
+    monkeypatch.setattr("firmware_py.export.compilers.subprocess", None)
     assert build_image(core.source, core.header, BUILD) == image

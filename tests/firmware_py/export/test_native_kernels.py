@@ -11,20 +11,22 @@ import numpy as np
 import pytest
 
 from firmware_py.config import parameters_of
-from firmware_py.core.structs import Control, Estimator, Input, Parameters, Struct
+from firmware_py.core.poses import LONG_US
+from firmware_py.core.structs import Control, Estimator, Input, Parameters, Sampling, Struct, Supervisor
 from firmware_py.core.subset import F32s, Integer
 from firmware_py.export.c99 import Translation, translate
-from firmware_py.export.native import build, compilers
+from firmware_py.export.compilers import compilers
+from firmware_py.export.native import build
 from support import core_streams
 from support.core_streams import BUILD, one_nan, wild_words
 
-STRUCTS = (Parameters, Input, Estimator, Control)
+STRUCTS = (Parameters, Input, Estimator, Control, Sampling, Supervisor)
 
 SHAPES = {"x": 16, "dx": 16, "first": 16, "other": 16, "command": (32, 4), "P": (16, 16), "M": (16, 16), "q": 4,
           "attitude": 16, "pose": 16}  # fmt: skip
 RANGES = {"flap": (0, 4), "state": (0, 16), "row": (0, 32), "offset": (0, 13), "turns": (-637, 638),
           "quarters": (0, 2), "word": (0, 65536), "ticks": (-(2**31), 2**31), "first": (0, 504), "last": (-1, 500),
-          "tick": (0, 2000)}  # fmt: skip
+          "tick": (0, 2000), "time_us": (-1, 10**9 + 1), "by_us": (0, 10**9 + 1), "cause": (0, 12)}  # fmt: skip
 # Kernels whose callers clamp the argument.
 INSIDE_1000 = {"maths_quarter_turns", "excitation_line_above", "excitation_chirp"}
 SCALARS = {np.float32: ctypes.c_float, np.int32: ctypes.c_int32, Integer: ctypes.c_int32, bool: ctypes.c_bool,
@@ -62,6 +64,16 @@ def struct_block(rng: np.random.Generator, struct: type[Struct]) -> Any:
             setattr(fields, name, rng.integers(1000))
         if rng.random() < 0.7:
             fields.x[:], fields.P[:], fields.now[:] = rng.normal(0, 1, 16), rng.normal(0, 1, (16, 16)), 0.5
+    if struct is Input:
+        block.fields.gyro_sample[:] = rng.integers(-(2**15), 2**15, 3)
+    if struct is Sampling:
+        fields = block.fields
+        fields.phase, fields.samples = rng.integers(10), rng.choice((0, 1, 510, 511))
+        fields.first[:] = rng.integers(-(2**15), 2**15, 3)
+        fields.sums[:] = rng.integers(-(2**24), 2**24, 3)
+    if struct is Supervisor:
+        for name in ("silent_us", "low_us", "down_us", "watchdog_us", "episode_us", "gap_us", "outside_us"):
+            setattr(block.fields, name, rng.choice((-1, 0, 1000, 5_000_000, LONG_US)))
     return block
 
 

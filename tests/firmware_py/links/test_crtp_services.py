@@ -3,6 +3,7 @@
 import ctypes
 import errno
 import json
+import math
 import struct
 from collections import Counter
 from math import inf, nan
@@ -45,7 +46,6 @@ IDLE_TASKS = (
     "LOG",
     "PARAM",
     "MEM",
-    "TELEMETRY",
     "CONSOLE",
     "CRTP-SRV",
     "APP",
@@ -180,7 +180,7 @@ def test_log_variable_that_clients_look_for_is_there(logs, name: str) -> None:
         *("delayComp.activate", "motorShifts.m1", "motorPowerSet.enable", "kalman.maxPos", "setpoint.X"),
         *("RandConsts.flapHoverAng", "stabilizer.stop", "FloatyKalm.resetKalman", "system.selftestPassed"),
         *("deck.bcFloaty", "firmware.revision0", "cpu.flash", "imu_sensors.BMP3XX", "sound.effect"),
-        *("ring.effect", "memTst.resetW", "telemetry.stream"),
+        *("ring.effect", "memTst.resetW"),
     ],
 )
 def test_parameter_that_clients_look_for_is_there(params, name: str) -> None:
@@ -190,29 +190,25 @@ def test_parameter_that_clients_look_for_is_there(params, name: str) -> None:
 # Log
 
 
-def test_the_stream_is_byte_for_byte_what_the_same_log_blocks_give(client: CrtpClient, logs) -> None:
-    client.poses(605_000, 1_500_000, (0.01, 0.02, -0.03))
-    client.stream(900_000)
-    client.run(1_000_000)
-    for number, block in enumerate(telemetry.BLOCKS):
+def test_telemetry_has_the_types_and_units_of_the_table_of_contents(client: CrtpClient, logs) -> None:
+    for block in telemetry.ALL_BLOCKS:
         for variable in block.variables:
-            assert logs[variable.name][1] == variable.type.log_number
+            stored = (
+                Scalar.F32 if variable.type is Scalar.F16 else variable.type
+            )  # halves are made as they are sent
+            assert logs[variable.name][1] == stored.log_number
             unit = "deg" if variable.scale else variable.unit
             assert client.firmware.variables[logs[variable.name][0]].unit == unit
-        assert client.create(number, *(logs[variable.name][::-1] for variable in block.variables[:8])) == 0
-        rest = b"".join(struct.pack("<BH", *logs[variable.name][::-1]) for variable in block.variables[8:])
-        assert client.one(LOG, 1, bytes((7, number)) + rest) == bytes((7, number, 0))
-    client.run(1_200_000)
-    for number in range(len(telemetry.BLOCKS)):
-        client.send(LOG, 1, bytes((3, number, 2)))
-    client.sent.clear()
-    client.run(1_400_000)
-    rows = client.packets(LOG, 2)
-    for number, block in enumerate(telemetry.BLOCKS):
-        ours = [row[1:] for row in rows if row[0] == number]
-        streamed = [row[1:] for row in rows if row[0] == block.id]
-        assert len(ours) >= 9
-        assert ours == [row for row in streamed if row[:3] in {other[:3] for other in ours}]
+
+
+def test_values_that_do_not_fit_their_type_travel_as_c_casts_them(client: CrtpClient, logs) -> None:
+    client.firmware.signals.counters[0] = 70_000  # poses that were fused
+    fused = logs["kalman.fused"][0]
+    assert client.create(1, (2, logs["locSrv.poses"][0]), (1, fused), (8, fused), (7, fused)) == 0
+    client.one(LOG, 1, bytes((3, 1, 1)))
+    client.run(client.now_us + 30_000)
+    values = struct.unpack("<HBef", client.packets(LOG, 2)[0][4:])
+    assert values == (70_000 % (1 << 16), 70_000 % (1 << 8), math.inf, 70_000.0)
 
 
 def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_firmware_shows_them(
@@ -232,34 +228,28 @@ def test_attitudes_are_shown_in_degrees_with_the_nose_up_positive_as_the_stock_f
         assert angles == pytest.approx([roll, -pitch, yaw], rel=1e-5)
 
 
-def test_stream_is_a_parameter_that_can_be_switched_off_and_on(client: CrtpClient, params) -> None:
-    for value, count in ((1, 25), (0, 0), (1, 25)):
-        assert client.write(params, telemetry.STREAM, value) == value
-        client.run(client.now_us // 20_000 * 20_000 + 30_000)
-        client.sent.clear()
-        client.run(client.now_us + 500_000)
-        assert len(client.packets(LOG, 2)) == count * len(telemetry.BLOCKS)
-
-
-def test_the_stream_tells_the_excitation_sample_by_sample_while_there_is_one(
-    client: CrtpClient, params
-) -> None:
+def test_telemetry_tells_the_excitation_sample_by_sample(client: CrtpClient, params) -> None:
+    client.poses(605_000, 3_000_000)
+    client.write(params, "excite.u1", 0.05)
     client.stream(client.now_us)
-    for signal, count in ((0, 0), (1, 25), (0, 0)):
+    client.run(1_000_000)
+    for signal in (0, 1, 0):
         client.write(params, "excite.signal", signal)
-        client.run(client.now_us // 20_000 * 20_000 + 30_000)
-        client.sent.clear()
+        client.run(client.now_us + 50_000)
+        client.samples.clear()
         client.run(client.now_us + 500_000)
-        rows = client.packets(LOG, 2)
-        assert sum(row[0] == telemetry.EXCITATION.id for row in rows) == count
-        assert sum(row[0] == telemetry.BLOCKS[0].id for row in rows) == 25
+        rows = [sample.values for sample in client.samples if sample.block is telemetry.CONTROL]
+        assert len(rows) == 25
+        excitation = {row[8] for row in rows}
+        assert len(excitation) > 20 if signal else excitation == {0.0}
+        assert {row[9:] for row in rows} == {(0.0, 0.0, 0.0)}
 
 
-@pytest.mark.parametrize("kind", ["blocks", "stream"])
+@pytest.mark.parametrize("kind", ["a block", "telemetry"])
 def test_rows_end_a_second_after_the_partner_fell_silent_and_the_next_one_gets_none_of_them(
     client: CrtpClient, logs, kind: str
 ) -> None:
-    if kind == "stream":
+    if kind == "telemetry":
         client.stream(client.now_us)
     else:
         assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
@@ -386,14 +376,15 @@ def test_a_full_request_of_cflibs_ends_in_the_middle_of_an_item(client: CrtpClie
 
 
 def test_a_block_that_the_processor_kept_waiting_returns_to_its_grid(client: CrtpClient, logs) -> None:
-    thief = client.firmware.add_thief()
+    taken_us = 0
+    client.firmware.kernel.occupy("LOAD", lambda: taken_us)
     assert client.create(1, logs["pm.vbatMV"][::-1]) == 0
     client.one(LOG, 1, bytes((3, 1, 2)))
     client.sent.clear()
     client.run(client.now_us + 200_000)
-    thief.share = 47.0  # ticks at once
+    taken_us = 47_000
     client.run(client.now_us + 2000)
-    thief.share = 0.0
+    taken_us = 0
     client.run(client.now_us + 250_000)
     stamps = [int.from_bytes(row[1:4], "little") for row in client.packets(LOG, 2)]
     off_grid = [stamp for stamp in stamps if (stamp - stamps[0]) % 20]
@@ -503,6 +494,7 @@ def test_every_parameter_refuses_what_is_no_number_or_outside_and_says_what_is_i
     assert client.write(params, "supervisor.poseTimeout", 10) == 500
     assert client.write(params, "motorShifts.m1", 12_001) == -3600
     assert client.write(params, "extCtrl.x_P", 20.5) == client.read(params, "extCtrl.x_P")
+    assert "motorShifts.m1 = 12001 refused: allowed -12000..12000 words" in client.console
 
 
 @pytest.mark.parametrize("channel", [1, 2])
@@ -782,7 +774,6 @@ def test_idle_services_do_not_run(client: CrtpClient) -> None:
         "LOG",
         "PARAM",
         "MEM",
-        "TELEMETRY",
         "CONSOLE",
         "CRTP-SRV",
         "PLATFORM-SRV",

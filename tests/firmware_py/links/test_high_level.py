@@ -36,6 +36,8 @@ class Flyer(CrtpClient):
         )
         self.commander, self.low_level = HighLevelCommander(radio), Commander(radio)
         self.write(self.params, "extPose.absolute", absolute)
+        for size in ("radius", "below", "above"):  # wide: the box has tests of its own
+            self.write(self.params, f"box.{size}", 5.0)
         self.events.at(self.now_us + 1000, self._pose)
         self.run(max(self.now_us, 700_000) + 300_000)
         self.sent.clear()
@@ -143,9 +145,8 @@ def test_a_moving_goal_is_that_of_the_instant_at_which_the_pose_was_true(absolut
     absolute.order(absolute.commander.go_to, 1.0, 0.0, 0.0, 0.0, 1.0, relative=True, linear=True)
     absolute.wait(0.5)
     pilot = absolute.firmware.signals.supervisor.goals
-    last = absolute.firmware.signals.supervisor.last_pose_us
-    assert last is not None
     assert isinstance(pilot, Pilot)
+    last = pilot.seen_us
     assert pilot.goal is not None
     assert pilot.goal.position[0] == pytest.approx(pilot.planner.at(last - 20_000).position[0], abs=2e-3)
 
@@ -199,7 +200,8 @@ def test_what_cannot_be_flown_is_refused_with_the_stock_status_and_a_line(absolu
     assert absolute.order(commander.go_to, float("nan"), 0, 0, 0, 1.0) == ENOEXEC
     assert absolute.order(commander.spiral, 1.0, 0.1, 0.1, 0.0, 1.0) == ENOEXEC
     assert absolute.one(HIGH_LEVEL, 0, b"\x63")[3] == ENOEXEC
-    assert sum(line.startswith("commander:") for line in absolute.console) == 6
+    lines = [line for line in absolute.console if line.startswith("commander:")]
+    assert len(lines) == 4  # one for each kind: a start, a path, a spiral, an unknown command
     assert absolute.state == "WAITING"
     assert absolute.order(commander.takeoff, 1.0, 1.0) == 0
     assert absolute.order(commander.takeoff, 1.2, 1.0) == REFUSED
@@ -214,7 +216,7 @@ def test_without_a_pose_nobody_knows_where_to_begin(absolute: Flyer) -> None:
     absolute.write(absolute.params, "extPose.absolute", 1)
     absolute.run(800_000)
     assert absolute.order(absolute.commander.takeoff, 1.0, 1.0) == EBUSY
-    assert "commander: no pose has come yet" in absolute.console
+    assert "commander: there has been no pose yet" in absolute.console
 
 
 def test_who_may_not_fly_takes_no_commands_and_forgets_its_path(absolute: Flyer) -> None:
@@ -286,13 +288,97 @@ def test_set_points_that_cannot_be_flown_are_refused_once_in_words(absolute: Fly
     assert refusals() == [
         f"commander: {kind} set-points are not flown, positions are" for kind in ("velocity", "attitude")
     ]
-    absolute.wait(1.5)
+    absolute.wait(10.0)
     absolute.post(low.send_hover_setpoint, 0.0, 0.0, 0.0, 1.0)
     absolute.post(low.send_velocity_world_setpoint, 0.0, 0.0, 1.0, 0.0)
     assert len(refusals()) == 4
+    assert refusals()[-1] == "commander: velocity set-points are not flown, positions are (19 more before)"
     absolute.post(low.send_setpoint, 0.0, 0.0, 0.0, 0)  # cflib's farewell
     absolute.post(low.send_notify_setpoint_stop)
     assert len(refusals()) == 4
+
+
+@pytest.fixture
+def boxed(absolute: Flyer) -> Flyer:
+    """A board at home in the middle of its box."""
+    absolute.place = (0.0, 0.0, 1.15)
+    for size, value in (("radius", 0.15), ("below", 0.65), ("above", 0.5)):
+        absolute.write(absolute.params, f"box.{size}", value)
+    absolute.wait(0.1)
+    return absolute
+
+
+@pytest.mark.parametrize(
+    ("place", "status"),
+    [
+        ((0.149, 0.0, 1.15), 0), ((0.151, 0.0, 1.15), ENOEXEC),
+        ((0.0, -0.149, 1.15), 0), ((0.0, -0.151, 1.15), ENOEXEC),
+        ((0.12, 0.12, 1.15), ENOEXEC),  # a cylinder has no corners
+        ((0.0, 0.0, 0.501), 0), ((0.0, 0.0, 0.499), ENOEXEC),
+        ((0.0, 0.0, 1.649), 0), ((0.0, 0.0, 1.651), ENOEXEC),
+    ],
+)  # fmt: skip
+def test_goal_outside_the_box_is_refused(
+    boxed: Flyer, place: tuple[float, float, float], status: int
+) -> None:
+    assert boxed.order(boxed.commander.go_to, *place, 0.0, 1.0) == status
+    boxed.wait(1.5)
+    goal = place if status == 0 else (0.0, 0.0, 1.15)  # where it is
+    assert boxed.goal() == pytest.approx(goal, abs=1e-3)
+    lines = [line for line in boxed.console if "box" in line]
+    assert lines == (
+        []
+        if status == 0
+        else ["commander: path refused: it leaves the box, see box.radius, box.below and box.above"]
+    )
+
+
+def test_landing_to_the_ground_is_refused_and_the_goal_stays(boxed: Flyer) -> None:
+    boxed.order(boxed.commander.takeoff, 1.2, 1.0)
+    boxed.wait(1.2)
+    assert boxed.order(boxed.commander.land, 0.0, 2.0) == ENOEXEC
+    boxed.wait(2.5)
+    assert boxed.goal() == pytest.approx([0.0, 0.0, 1.2], abs=1e-3)
+
+
+def test_path_that_swings_out_of_the_box_in_between_is_refused(boxed: Flyer) -> None:
+    swing = Poly4D.Poly([0.0, 0.4, -0.2] + [0.0] * 5)  # x: 0, 0.2 after 1 s, 0 after 2 s
+    still, height = Poly4D.Poly([0.0] * 8), Poly4D.Poly([1.15] + [0.0] * 7)
+    boxed.upload(Poly4D(2.0, swing, still, height, still).pack())
+    assert boxed.order(boxed.commander.define_trajectory, 1, 0, 1) == 0
+    assert boxed.order(boxed.commander.start_trajectory, 1) == ENOEXEC
+
+
+def test_robot_that_was_pushed_out_of_the_box_may_return(boxed: Flyer) -> None:
+    boxed.place = (0.3, 0.0, 1.15)
+    boxed.wait(0.1)
+    assert boxed.order(boxed.commander.go_to, 0.1, 0.0, 1.15, 0.0, 1.0) == 0
+    boxed.commander.stop()
+    assert boxed.order(boxed.commander.go_to, 0.31, 0.0, 1.15, 0.0, 1.0) == ENOEXEC
+
+
+def test_set_point_outside_the_box_leaves_the_last_one_in_force(boxed: Flyer) -> None:
+    boxed.post(boxed.low_level.send_position_setpoint, 0.1, 0.0, 1.2, 0.0)
+    boxed.post(boxed.low_level.send_position_setpoint, 1.0, 0.0, 1.2, 0.0)
+    assert boxed.goal() == pytest.approx([0.1, 0.0, 1.2], abs=1e-6)
+    assert any(line.startswith("commander: set-point refused: it leaves the box") for line in boxed.console)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 1.1), (0.95, 0.0, 0.0), (0.7, 0.7, 0.0), (0.0, 0.0, -2.1)])
+def test_pose_that_cannot_be_a_correction_changes_nothing_and_is_reported_once(
+    relative: Flyer, place: tuple[float, float, float]
+) -> None:
+    before = relative.estimate()
+    relative.place = place
+    relative.wait(0.3)
+    assert relative.estimate() == pytest.approx(before, abs=1e-3)
+    lines = [line for line in relative.console if "extPose.absolute" in line]
+    assert lines == [
+        "pose refused: {:.2f} {:.2f} {:.2f} m is no correction; for absolute poses set extPose.absolute 1".format(
+            *place
+        )
+    ]
+    assert relative.firmware.link.malformed >= 14
 
 
 def test_among_corrections_a_position_is_no_place_to_fly_to(relative: Flyer) -> None:

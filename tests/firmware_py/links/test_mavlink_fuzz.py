@@ -3,78 +3,21 @@
 FLOATY_FUZZ is the number of messages of the long run (default 20,000).
 """
 
-from typing import Any
-
 import numpy as np
-import pymavlink.dialects.v20.common as dialect
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from firmware_py.wire.supervisor import State
 from support.mavlink_client import STATION, MavlinkClient, codec
+from support.random_requests import random_message, spoilt
 
 BATCH = 4  # messages per millisecond: twice what 921600 baud can carry
-COMMANDS = (185, 245, 400, 410, 510, 511, 512, 519, 520)
-SERVED = (0, 4, 20, 21, 23, 66, 75, 76, 84, 102, 110, 111, 138)
-NAMES = (b"EXT_Z_P", b"DLY_ACTIVATE", b"_HASH_CHECK", b"TLM_STREAM", b"KAL_MAXPOS", b"\xff\xfe\x00", b"")
-FLOATS = (0.0, 1.0, -1.0, 0.5, np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 30.0, 1000.0, 21196.0)
-SIZES = {"int8_t": 8, "int16_t": 16, "int32_t": 32, "int64_t": 64}
-SIZES |= {f"u{kind}": -bits for kind, bits in SIZES.items()}
-
-
-def number(rng: np.random.Generator, kind: str) -> float:
-    """A value of a C type, often at its limits."""
-    if kind in ("float", "double"):
-        return float(rng.choice(FLOATS)) if rng.random() < 0.7 else float(rng.normal())
-    bits = SIZES[kind]
-    low, high = (0, (1 << -bits) - 1) if bits < 0 else (-(1 << bits - 1), (1 << bits - 1) - 1)
-    if rng.random() < 0.6:
-        return int(rng.choice(np.array((0, 1, low, high), dtype=object)))
-    return int.from_bytes(rng.bytes(8), "little") % (high - low + 1) + low
-
-
-def message(rng: np.random.Generator) -> Any:
-    """A message with any contents; most are of kinds that the board serves, and for it."""
-    kinds = SERVED if rng.random() < 0.7 else tuple(dialect.mavlink_map)
-    cls = dialect.mavlink_map[int(rng.choice(kinds))]
-    fields: dict[str, Any] = {}
-    for name, kind, length in zip(cls.fieldnames, cls.fieldtypes, array_lengths(cls), strict=True):
-        if kind == "char":
-            fields[name] = NAMES[rng.integers(len(NAMES))][: max(1, length)]
-        elif length:
-            fields[name] = [number(rng, kind) for _ in range(length)]
-        else:
-            fields[name] = number(rng, kind)
-    if rng.random() < 0.8:
-        fields |= {name: 1 for name in ("target_system", "target_component") if name in fields}
-    if cls.id in (75, 76) and rng.random() < 0.9:
-        fields["command"] = int(rng.choice(COMMANDS))
-    return cls(**fields)
-
-
-def array_lengths(cls: Any) -> list[int]:
-    """In the order of the fields; 0 for a plain one."""
-    by_name = dict(zip(cls.ordered_fieldnames, cls.array_lengths, strict=True))
-    return [by_name[name] for name in cls.fieldnames]
-
-
-def spoilt(rng: np.random.Generator, frame: bytes) -> bytes:
-    """The frame with bytes changed, cut or added."""
-    data = bytearray(frame)
-    kind = rng.integers(3)
-    if kind == 0:
-        data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-    elif kind == 1:
-        del data[int(rng.integers(len(data))) :]
-    else:
-        data += rng.bytes(int(rng.integers(1, 40)))
-    return bytes(data)
 
 
 def recover(client: MavlinkClient) -> None:
     """Undo what the fuzz did to the supervisor and its parameters, as a ground station would."""
-    client.firmware.signals.supervisor._locked = False  # without a reboot: this board shall fly on
+    client.firmware.signals.supervisor._fields.locked = 0  # without a reboot: this board shall fly on
     for name, value in (
         (b"FLOATY_STOP", 1.0),
         (b"FLOATY_STOP", 0.0),
@@ -93,7 +36,7 @@ def test_the_board_survives_messages_of_every_kind_with_any_contents(messages: i
     client.imu_alive = False
     sender, sent = codec(*STATION), 0
     while sent < messages:
-        frames = [message(rng).pack(sender) for _ in range(BATCH)]
+        frames = [random_message(rng).pack(sender) for _ in range(BATCH)]
         sent += BATCH
         if rng.random() < 0.2:
             frames[0] = spoilt(rng, frames[0])
@@ -150,7 +93,7 @@ def test_a_board_with_a_key_learns_nothing_from_a_hundred_thousand_unsigned_byte
     client = MavlinkClient(f'mavlink.signing_key="{bytes(32).hex()}"')
     sender = codec(*STATION)
     for _ in range(1000):
-        client.receive(message(rng).pack(sender) + rng.bytes(50))
+        client.receive(random_message(rng).pack(sender) + rng.bytes(50))
         client.run(client.now_us + 1000)
     assert client.stack.counters.unsigned > 900
     assert client.stack.counters.frames == 0

@@ -1,4 +1,4 @@
-"""What goes out on request only: odometry, IMU, state of landing, home, heading; against scipy, in the standard's axes."""
+"""What goes out seldom or on request: odometry, IMU, landing, home, heading; against scipy, in the standard's axes."""
 
 import math
 from typing import Any
@@ -10,8 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from support.mavlink_client import GYRO_ZERO_US, MavlinkClient
 
-ON_REQUEST = {33: "GLOBAL_POSITION_INT", 105: "HIGHRES_IMU", 148: "AUTOPILOT_VERSION", 242: "HOME_POSITION",
-              245: "EXTENDED_SYS_STATE", 331: "ODOMETRY"}  # fmt: skip
+ON_REQUEST = {
+    33: "GLOBAL_POSITION_INT", 105: "HIGHRES_IMU", 148: "AUTOPILOT_VERSION", 245: "EXTENDED_SYS_STATE",
+}  # fmt: skip
+SELDOM = (
+    "SYSTEM_TIME", "POSITION_TARGET_LOCAL_NED", "VFR_HUD", "ACTUATOR_OUTPUT_STATUS", "HOME_POSITION", "ODOMETRY",
+)  # fmt: skip
 R_WB = Rotation.from_euler("ZYX", (0.6, 0.1, -0.2))
 TURN = Rotation.from_euler("x", math.pi)  # W to NED, B to FRD
 START, V_W = np.array((-0.3, -0.2, 1.25)), np.array((0.3, 0.2, -0.1))
@@ -20,7 +24,7 @@ START, V_W = np.array((-0.3, -0.2, 1.25)), np.array((0.3, 0.2, -0.1))
 @pytest.fixture(scope="module")
 def moving() -> MavlinkClient:
     """A board that was carried through the tunnel, turned, with a goal that has a yaw."""
-    client = MavlinkClient()
+    client = MavlinkClient("box.radius=1")
     client.command(400, 0)  # disarmed: no flap moves the model elsewhere than the poses go
     client.send(
         "set_position_target_local_ned", 0, 1, 1, 1, 0x9F8, 0.1, -0.2, -1.15, 0, 0, 0, 0, 0, 0, -0.4, 0
@@ -122,3 +126,44 @@ def test_the_board_says_whether_it_is_in_the_air_as_far_as_it_knows() -> None:
     client.poses(710_000, 1_400_000)
     assert landed(1_300_000) == dialect.MAV_LANDED_STATE_IN_AIR
     assert landed(2_100_000) == dialect.MAV_LANDED_STATE_UNDEFINED  # silence
+
+
+def test_what_seldom_comes_comes_unasked_within_five_seconds_and_is_right(moving: MavlinkClient) -> None:
+    moving.messages.clear()
+    moving.run(moving.now_us + 5_100_000)
+    heard = {name: moving.of(name)[-1] for name in SELDOM}
+    assert heard["SYSTEM_TIME"].time_unix_usec == 0  # nobody has said what time of day it is
+    assert heard["SYSTEM_TIME"].time_boot_ms % 5000 == 0
+    target = heard["POSITION_TARGET_LOCAL_NED"]
+    assert (target.x, target.y, target.z, target.yaw) == pytest.approx((0.1, -0.2, -1.15, -0.4))
+    assert (target.coordinate_frame, target.type_mask) == (dialect.MAV_FRAME_LOCAL_NED, 0x9F8)
+    outputs, servos = heard["ACTUATOR_OUTPUT_STATUS"], moving.of("SERVO_OUTPUT_RAW")[-1]
+    assert outputs.active == 0b1111
+    assert outputs.actuator[:5] == [
+        servos.servo1_raw,
+        servos.servo2_raw,
+        servos.servo3_raw,
+        servos.servo4_raw,
+        0,
+    ]
+    assert heard["HOME_POSITION"].z == pytest.approx(-1.15)
+    assert heard["ODOMETRY"].estimator_type == dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT
+
+
+def test_the_hud_shows_speed_over_ground_heading_height_and_climb(moving: MavlinkClient) -> None:
+    hud, place = once(moving, 74), once(moving, 32)
+    assert hud.groundspeed == pytest.approx(math.hypot(place.vx, place.vy), abs=0.02)
+    assert (hud.alt, hud.climb) == pytest.approx((-place.z, -place.vz), abs=0.02)
+    assert hud.heading == pytest.approx(360 - math.degrees(0.6), abs=2)
+    assert math.isnan(hud.airspeed)
+
+
+def test_the_time_of_day_is_that_of_a_station_which_knows_it(moving: MavlinkClient) -> None:
+    unix_us = 1_700_000_000_000_000
+    moving.send("system_time", unix_us, 77)
+    sent_us = moving.now_us
+    moving.send("system_time", 0, 78)  # this one does not
+    moving.run(sent_us + 2_000_000)
+    found = once(moving, 2)
+    assert found.time_unix_usec - unix_us == pytest.approx(2_000_000, abs=5_000)
+    assert found.time_boot_ms == pytest.approx(moving.now_us / 1000, abs=5)

@@ -367,7 +367,7 @@ def test_an_edited_module_is_never_mistaken_for_what_it_was(tmp_path: Path) -> N
         config = own_config(tmp_path, law)
         blocks = CoreBlocks(parameters_of(config), PythonRunner, load_logic(config.logic))
         blocks.data.fields.mode = 1
-        blocks.run.control()
+        blocks.run.call("control")
         return float(blocks.control.fields.u[0])
 
     assert [after_one_tick(factor) for factor in ("0.25", "0.5", "0.25")] == [0.25, 0.5, 0.25]

@@ -150,13 +150,13 @@ def test_no_number_is_let_through_at_any_place(
 ) -> None:
     data: Any = loop.data.fields
     data.manual[:], data.pose_quaternion[:] = (0.1, 0.2, 0.3, 0.4), (0.5, -0.4, 3.0, -3.0)
-    loop.run.control()
+    loop.run.call("control")
     assert loop.control.fields.flap.tolist() == pytest.approx([0.5, -0.4, math.pi / 2, -math.pi / 2])
-    assert loop.guard is not None
-    before = int(loop.guard.controller_faults)
+    guard = loop.named["guard"].fields
+    before = int(guard.controller_faults)
     (data.manual if place == "u" else data.pose_quaternion)[index] = wrong
-    loop.run.control()
-    assert loop.guard.controller_faults == before + 1
+    loop.run.call("control")
+    assert guard.controller_faults == before + 1
     hover = float(loop.parameters.fields.hover_angle)
     assert loop.control.fields.flap.tolist() == pytest.approx([hover, -hover, hover, -hover])
     assert loop.control.fields.u.tolist() == loop.control.fields.command.tolist() == [0.0] * 4

@@ -736,6 +736,22 @@ def sleeper(kernel):
     yield from kernel.delay(1_000)
 
 
+def test_a_wait_for_an_instant_that_has_passed_is_named():
+    kernel = Kernel()
+
+    def body():
+        yield from kernel.delay(3)
+        kernel.block(None, kernel.tick_count)  # what no call of the kernel does: each checks that it may wait
+        yield 0
+
+    kernel.create_task("late", 1, body)
+    kernel.start()
+    with pytest.raises(
+        StuckTaskError, match=r"task late at 3\.000 ms: waits for 3\.000 ms, which has passed"
+    ):
+        kernel.run(10_000)
+
+
 def test_two_tasks_that_hand_each_other_the_processor_for_ever_are_stuck():
     kernel = Kernel()
     ping, pong = kernel.create_binary_semaphore("ping"), kernel.create_binary_semaphore("pong")

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.wire import WireError, mavlink, telemetry
 from firmware_py.wire.mavlink_frames import FrameSender
+from firmware_py.wire.mavlink_numbers import Mode
 from firmware_py.wire.supervisor import State
 from support.crtp_client import PARAM, CrtpClient
 
@@ -279,7 +280,8 @@ def test_heartbeat_tells_state_and_arming(state: int, status: str) -> None:
         message = over_the_wire(mavlink.heartbeat(armed, state))
         # With INVALID no client takes us for a vehicle.
         assert message.autopilot == dialect.MAV_AUTOPILOT_GENERIC
-        assert message.custom_mode == state
+        assert message.custom_mode == Mode.HOLD
+        assert mavlink.read_heartbeat(message) == state
         assert message.system_status == getattr(dialect, f"MAV_STATE_{status}")
         assert bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED) == armed
         assert message.base_mode & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -296,6 +298,9 @@ def test_status_has_the_standards_units() -> None:
     assert not present & dialect.MAV_SYS_STATUS_GEOFENCE
     assert present & dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
     assert not present & dialect.MAV_SYS_STATUS_GEOFENCE
+    stale = over_the_wire(mavlink.sys_status(3900, 0.05, 0, 0.25, imu_alive=False))
+    failed = dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    assert stale.onboard_control_sensors_health == message.onboard_control_sensors_health & ~failed
 
 
 def test_battery_is_one_cell() -> None:
@@ -317,9 +322,7 @@ def test_flight_array_carries_the_telemetry_blocks() -> None:
     message = over_the_wire(mavlink.flight_array(12_000, values))
     assert (message.name, message.time_usec, message.data[28:]) == ("floaty", 12_000, [0.0] * 30)
     samples = mavlink.read_flight_array(message)
-    assert [(sample.block, sample.timestamp_ms) for sample in samples] == [
-        (b, 12) for b in telemetry.ALL_BLOCKS
-    ]
+    assert [(sample.block, sample.timestamp_ms) for sample in samples] == [(b, 12) for b in telemetry.BLOCKS]
     assert tuple(value for sample in samples for value in sample.values) == (*values, *4 * (0.0,))
     with pytest.raises(WireError, match="other"):
         mavlink.read_flight_array(
@@ -328,9 +331,19 @@ def test_flight_array_carries_the_telemetry_blocks() -> None:
 
 
 def test_texts_are_cut_to_their_fields() -> None:
-    assert over_the_wire(mavlink.status_text(4, "ö" + "x" * 60)).text == "?" + "x" * 49
+    (text,) = mavlink.status_text(4, "ö" + "x" * 49)
+    assert (over_the_wire(text).text, text.id) == ("?" + "x" * 49, 0)
     assert over_the_wire(mavlink.named_value(1, "abcdefghijklm", 2.5)).name == "abcdefghij"
     assert over_the_wire(mavlink.parameter("A" * 16, 2.5, 3, 60)).param_id == "A" * 16
+
+
+@pytest.mark.parametrize(("size", "pieces"), [(51, [50, 1]), (100, [50, 50, 0]), (101, [50, 50, 1])])
+def test_a_long_text_travels_in_pieces_of_which_the_last_is_shorter(size: int, pieces: list[int]) -> None:
+    line = ("0123456789" * 11)[:size]
+    messages = [over_the_wire(message) for message in mavlink.status_text(4, line, 7)]
+    assert "".join(message.text for message in messages) == line
+    assert [len(message.text) for message in messages] == pieces
+    assert [(message.id, message.chunk_seq) for message in messages] == [(7, n) for n in range(len(pieces))]
 
 
 def test_parameters_are_real32() -> None:
@@ -389,7 +402,7 @@ def test_nothing_that_goes_down_raises(n: int, m: int, a: float, b: float, text:
         mavlink.home_position(t, v),
         mavlink.flight_array(t, (a, b) * 14),
         mavlink.named_value(n, text, a),
-        mavlink.status_text(6, text),
+        *mavlink.status_text(6, text),
         mavlink.parameter(text, a, n, m),
         mavlink.message_interval(n, m),
     ):
@@ -424,7 +437,7 @@ def test_parameter_names_are_unique_and_fit() -> None:
         (mavlink.servo_outputs(10**9, (31_500,) * 4), 24),
         (mavlink.parameter("ABC", 1.0, 0, 60), 37),
         (mavlink.command_ack(400, 0, 255, 190), 22),
-        (mavlink.status_text(6, "hello"), 18),
+        (mavlink.status_text(6, "hello")[0], 18),
     ],
 )
 def test_frame_sizes_are_those_of_the_line_budget(message: Any, size: int) -> None:

@@ -16,7 +16,7 @@ from scipy.stats import binomtest
 from hil.campaigns.config import Spec
 from hil.campaigns.dataset import ARRIVING, FLIGHTS, Dataset, read_flights, schema_of
 from hil.campaigns.findings import find
-from hil.campaigns.flying import Campaign, Row, fly_flight
+from hil.campaigns.flying import Campaign, CampaignRow, fly_flight
 from hil.campaigns.report import write_report
 from hil.campaigns.run import Flyer, Progress, Standing, conduct, interval
 from hil.errors import LabError
@@ -38,7 +38,7 @@ def workers(spec: Spec, count: int, asked: list[int] | None = None) -> Flyer:
     """`count` workers, whose flights come in an order of their own."""
     campaign, rng = Campaign.of(spec), random.Random(count)
 
-    def fly(indices: Iterator[int]) -> Iterator[Row]:
+    def fly(indices: Iterator[int]) -> Iterator[CampaignRow]:
         under_way: list[int] = []
         while under_way := under_way + list(itertools.islice(indices, count - len(under_way))):
             index = under_way.pop(rng.randrange(len(under_way)))
@@ -94,7 +94,7 @@ def test_a_campaign_that_was_interrupted_flies_the_rest_and_nothing_twice(tmp_pa
 def limited(flyer: Flyer, count: int) -> Flyer:
     """Workers that are interrupted after `count` flights."""
 
-    def fly(indices: Iterator[int]) -> Iterator[Row]:
+    def fly(indices: Iterator[int]) -> Iterator[CampaignRow]:
         yield from itertools.islice(flyer(indices), count)
 
     return fly  # type: ignore[return-value]
@@ -206,7 +206,7 @@ def test_what_comes_beyond_the_end_does_not_count() -> None:
     for index in reversed(range(200)):  # all hold: 38 are enough
         progress.add(index, True)
     assert progress.end is not None
-    assert progress.standing == Standing(progress.end, 0, progress.end, complete=True)
+    assert progress.standing == Standing(0, progress.end, progress.end, complete=True)
     assert 30 <= progress.end < 60
 
 
@@ -237,7 +237,7 @@ def test_the_report_has_rates_influences_commands_and_pictures(tmp_path: Path) -
     spec = spec_of(flights=128, sampling="sobol")
     campaign = Campaign.of(spec)
     flown_into(tmp_path, spec, workers(spec, 2))
-    path, found = write_report(tmp_path, Path("my spec.toml"), campaign, complete=True)
+    path, found = write_report(tmp_path, "my spec.toml", campaign, complete=True)
     page = Page(path.read_text(encoding="utf-8"))
     assert [len(page.tables[name]) for name in ("limits", "worst")] == [1 + len(found.limits), 1 + 10]
     assert len(page.tables["influences"]) == 1 + len(found.influences) > 2
@@ -252,9 +252,11 @@ def test_a_report_of_nothing_and_of_nothing_that_failed_can_be_written(tmp_path:
     spec = spec_of(faults=[])
     Dataset(tmp_path, Campaign.of(spec), resume=False).close()
     file = Path("spec.toml")
-    assert "not complete" in write_report(tmp_path, file, Campaign.of(spec), complete=False)[0].read_text()
+    assert (
+        "not complete" in write_report(tmp_path, str(file), Campaign.of(spec), complete=False)[0].read_text()
+    )
     flown_into(tmp_path, spec, workers(spec, 1), resume=True)
-    text = write_report(tmp_path, file, Campaign.of(spec), complete=True)[0].read_text()
+    text = write_report(tmp_path, str(file), Campaign.of(spec), complete=True)[0].read_text()
     assert "No flight failed a limit." in text
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
@@ -85,6 +86,31 @@ def test_a_fault_to_the_end_that_needs_all_its_time_stays_as_it_is_written() -> 
     fault = Fault("servo.stuck.1", 2.0, math.inf, 0.0)
     least = shrink(Trial((), (fault,)), DURATION_S, lambda one: one.faults == (fault,))
     assert least.faults == (fault,)
+
+
+def test_a_fault_that_the_flights_end_cuts_off_lasts_no_longer_than_to_there() -> None:
+    tried: list[float] = []
+
+    def fails(one: Trial) -> bool:
+        tried.extend(fault.duration_s for fault in one.faults)
+        return bool(one.faults)
+
+    shrink(trial("push.y@8:9=12", settings=()), DURATION_S, fails)
+    assert max(span for span in tried if span != 9.0) <= DURATION_S - 8.0
+
+
+def test_a_flight_that_fails_in_another_manner_is_not_the_one_to_be_shrunk(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    results = [
+        SimpleNamespace(passed=False, outcome=name, verdicts=(), failed=(), cause="")
+        for name in ("lost", "completed")
+    ]
+    monkeypatch.setattr("hil.campaigns.shrink.fly_within", lambda request, spec: results.pop(0))
+    spec = spec_of()
+    reflight = Reflight(spec, draw(spec, 0), lambda line: None)
+    assert reflight.fails(reflight.whole)
+    assert not reflight.fails(reflight.whole)
 
 
 def test_a_flight_that_holds_cannot_be_shrunk() -> None:

@@ -4,17 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from hil.campaigns.config import read_spec
+from hil.campaigns.config import find_spec, read_spec
 from hil.campaigns.sampling import check_spec, draw, request_of
 from support.command import floaty
 
-ROOT = Path(__file__).parents[3]
-EXAMPLE = ROOT / "docs" / "table.toml"
 HOVER = 'experiments = ["hover"]\nflights = 64\n'
 
 
 def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> None:
-    spec = read_spec(EXAMPLE)
+    spec = read_spec(find_spec("table"))
     check_spec(spec)
     assert (spec.flights, spec.experiments) == (1000, ("hover",))
     factors = request_of(spec, draw(spec, 999)).config.plant.constant_factors
@@ -96,17 +94,22 @@ def test_a_bad_spec_is_one_line_and_exit_code_two(
     ("arguments", "message"),
     [
         (["nowhere.toml"], "campaign nowhere.toml: No such file"),
-        (["table.toml", "--shrink", "1000"], "--shrink 1000: the campaign has flights 0..999"),
+        (["tabel"], "campaign 'tabel': neither the name of a campaign (did you mean table?) nor a path"),
+        (["table", "--shrink", "1000"], "--shrink 1000: the campaign has flights 0..999"),
         (
-            ["table.toml", "--workers", "2", "--cluster", "tcp://a:1"],
+            ["table", "--workers", "2", "--cluster", "tcp://a:1"],
             "--workers 2: not together with --cluster",
         ),
     ],
 )
 def test_a_bad_option_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    arguments: list[str],
+    message: str,
 ) -> None:
-    monkeypatch.chdir(EXAMPLE.parent)
+    monkeypatch.chdir(tmp_path)
     assert floaty(monkeypatch, "campaign", *arguments) == 2
     assert message in capsys.readouterr().err
 
@@ -123,7 +126,7 @@ def test_a_missing_extra_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("hil.errors.find_spec", lambda name: None)
-    assert floaty(monkeypatch, "campaign", EXAMPLE) == 2
+    assert floaty(monkeypatch, "campaign", "table") == 2
     told = capsys.readouterr().err
     assert "floaty campaign: distributed is missing: " in told
     assert "pip install 'dask[distributed]" in told

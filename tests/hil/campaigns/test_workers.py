@@ -15,7 +15,7 @@ from distributed.worker_state_machine import StateMachineEvent
 from hil.campaigns.cluster import FlyOne, Workers
 from hil.campaigns.config import Spec
 from hil.campaigns.dataset import FLIGHTS, Dataset
-from hil.campaigns.flying import Campaign, Row, fly_flight
+from hil.campaigns.flying import Campaign, CampaignRow, fly_flight
 from hil.campaigns.run import Standing, conduct
 from hil.errors import LabError
 from support.campaigns import hanging, killing, planted, raising, spec_of
@@ -31,7 +31,7 @@ def crew() -> Iterator[Workers]:
     workers.close()
 
 
-def rows_of(crew: Workers, spec: Spec, fly_one: FlyOne) -> dict[int, Row]:
+def rows_of(crew: Workers, spec: Spec, fly_one: FlyOne) -> dict[int, CampaignRow]:
     rows = list(crew.fly(Campaign.of(spec), lambda: False, iter(range(spec.flights)), fly_one))
     assert len({row.index for row in rows}) == len(rows), "none twice"
     return {row.index: row for row in rows}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -35,6 +36,7 @@ def test_fly_writes_everything_and_says_where(
     shown = capsys.readouterr().out
     assert "within_6cm_x" in shown
     assert "runs/hover-5/report.html" in shown
+    assert re.search(r"completed; \d+ times real time; \d+\.\d s from start to end; hash \w{16}\n", shown)
     assert json.loads((folder / "result.json").read_text())["passed"] is True
 
 
@@ -187,7 +189,10 @@ def test_a_killed_flight_can_still_be_reported(monkeypatch: pytest.MonkeyPatch, 
         (["fly", "hover", "--board", __file__], "unicorn", "deploy"),
         (["serve", "--mavlink", "pty"], "pymavlink", "mavlink"),
         (["identify", "runs/hover-1"], "scipy", "identify"),
-        (["tune"], "scipy", "identify"),
+        (["tune"], "control", "design"),
+        (["design"], "control", "design"),
+        (["design", "optimise"], "scipy", "design"),
+        (["paper"], "scipy", "design"),
     ],
 )
 def test_a_missing_package_is_one_line_before_anything_is_flown_or_deleted(
@@ -207,6 +212,12 @@ def test_a_missing_package_is_one_line_before_anything_is_flown_or_deleted(
     assert Path("runs/hover-1/log.parquet").is_file()
 
 
+def test_listing_the_studies_loads_neither_an_extra_nor_what_draws() -> None:
+    code = "import hil.studies.catalogue, sys; print(*{'scipy.optimize', 'control', 'matplotlib'} & {*sys.modules})"
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert found.stdout.strip() == ""
+
+
 @pytest.mark.parametrize("option", ["--board", "--link"])
 def test_an_older_run_is_kept_where_no_board_answers(
     option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -223,7 +234,8 @@ def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "hil.pictures.viewer", raising=False)
+    for module in ("hil.pictures.viewer", "hil.pictures.viewer.recording"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
     assert floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--out", "run") == 0
     assert "view" in capsys.readouterr().err
     assert not Path("run/flight.rrd").exists()

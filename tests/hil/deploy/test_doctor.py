@@ -5,11 +5,15 @@ from pathlib import Path
 
 import pytest
 
+from firmware_py.export.profile_c import profile_hash
 from firmware_py.wire.core_port import Hil
-from firmware_py.wire.supervisor import State
 from ground_station.links import packets
+from ground_station.links.core_client import CoreClient
+from hil.config import load_config
+from hil.deploy import doctor
 from support.app_packets import AppPackets
 from support.command import floaty
+from support.core_streams import MEMORY
 from support.crazyflie_app import App, build_app
 
 URI = "udp://127.0.0.1:9"
@@ -45,11 +49,6 @@ class Board(AppPackets):
         super().send(data)
 
 
-@pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_app(tmp_path_factory.mktemp("app"))
-
-
 @pytest.fixture
 def board(library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Board:
     app = App(library, tmp_path / "copy.so")
@@ -77,7 +76,7 @@ def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(
     assert found["profile"].endswith("as here")
     assert found["state"] == "calibrating"
     assert "packets/s each way, 0 of 600 repeated" in found["link"]
-    assert found["memory"] == "4868 B written and read back, 0 of them wrong"
+    assert found["memory"] == f"{MEMORY} B written and read back, 0 of them wrong"
     assert (found["battery"], found["RAM"]) == ("3.90 V", "7000 B free")
     assert found["gyro"].startswith("alive: zero at ")
     assert (
@@ -154,7 +153,7 @@ def test_another_profile_than_here_is_told(
     board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert floaty(monkeypatch, "board", "doctor", URI, "--profile", "as-flown") == 1
-    assert findings(capsys)["profile"].startswith("!1a557b31, ")
+    assert findings(capsys)["profile"].startswith(f"!{profile_hash(load_config())[:8]}, ")
 
 
 @pytest.mark.long
@@ -169,12 +168,17 @@ def test_a_core_that_computes_otherwise_is_found(
 
 
 @pytest.mark.parametrize(
-    ("state", "silent", "said"), [(State.FLYING, False, "it flies"), (0, True, "silent for 3 s")]
+    ("flown", "silent", "said"), [(True, False, "it may be in the air"), (False, True, "silent for 3 s")]
 )
 def test_a_board_that_flies_or_says_nothing_is_left_alone_in_one_line(
-    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], state: int, silent: bool, said: str,
+    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], flown: bool, silent: bool, said: str,
 ) -> None:  # fmt: skip
-    board.app.supervisor.state, board.silent = state, silent
+    board.app.supervisor.flown, board.silent = flown, silent
+    monkeypatch.setattr("hil.deploy.doctor.VERSION_TIMEOUT_S", 0.02)
+    if silent:
+        board.services = []
+    for step in range(1, 11):
+        board.app.step(step)
     assert floaty(monkeypatch, "board", "doctor", URI) == 2
     assert f"floaty: {URI}: {said}" in capsys.readouterr().err
 
@@ -184,3 +188,32 @@ def test_a_cable_without_a_board_is_told_in_one_line(
 ) -> None:
     assert floaty(monkeypatch, "board", "doctor", "usb://0") == 2
     assert capsys.readouterr().err == "floaty: LINK usb://0: Could not open usb://0\n"
+
+
+def test_a_firmware_without_the_app_is_told_from_a_board_that_is_silent(
+    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    board.silent = True
+    assert floaty(monkeypatch, "board", "doctor", URI) == 1
+    found = findings(capsys)
+    assert found["firmware"] == "2026.08 +2"
+    assert found["app"].startswith("!missing: the firmware answers, Floaty's app does not")
+
+
+@pytest.mark.parametrize(
+    ("poses_hz", "verdict", "text"),
+    [
+        (1.0, "", ": poses are lost or late in a flight"),
+        (1e9, "!", ": too slow to fly with 1000000000 poses/s"),
+    ],
+)
+def test_a_link_that_repeats_half_of_all_packets_is_judged(
+    library: Path, tmp_path: Path, poses_hz: float, verdict: str, text: str
+) -> None:
+    app = App(library, tmp_path / "copy.so")
+    app.boot()
+    client = CoreClient(AppPackets(app, mess=0.25), "board")
+    client.begin()
+    found = doctor._link(client, poses_hz)
+    assert found.good == (not verdict)
+    assert text in found.text

@@ -83,7 +83,7 @@ def test_a_parameter_that_is_set_in_flight_reaches_every_target(project: Path) -
     core.data.fields.mode = MODE_FLY
     core.named["controller_own"].memory["gain_iy"] = 1.5
     core.parameters.fields.target[1] = 0.1
-    core.run.control()
+    core.run.call("control")
     assert made[0].targets[0].calls == 1
     assert made[0].targets[0].divergence is None
 
@@ -121,10 +121,10 @@ def test_the_original_law_is_the_original_firmwares_with_both_integrators_and_wi
     core = CoreBlocks(parameters_of(config), PythonRunner, load_logic(config.logic))
     for row in rows:
         core.data.fields.mode = 0
-        core.run.control()
+        core.run.call("control")
         core.data.fields.mode = MODE_FLY
         core.estimator.fields.now[:12] = row["state"]
-        core.run.control()
+        core.run.call("control")
         c = row["compound_c0_c3"]
         # the original interpolates a table of 512 sines: 1.9e-5, times the gains
         assert core.control.fields.u == pytest.approx((-c[1], -c[0], c[3], c[2]), abs=4e-5)
@@ -167,7 +167,7 @@ def discrete_model() -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.long
 def test_the_lqr_s_gains_are_the_optimum_of_all_16_states_for_the_weights_that_its_tool_states() -> None:
     tool = runpy.run_path(str(ROOT / "tools" / "lqr_gains.py"))
-    computed = tool["gains"](tool["regulator"](load_config()))
+    computed = tool["gains"](load_config())
     declared = logic_of("lqr").values
     assert declared == pytest.approx(computed, rel=1e-3)
     A, B = discrete_model()
@@ -194,7 +194,7 @@ def test_the_lqr_feeds_all_16_states_back(roll: float) -> None:
         if state == 8:
             x[8] = 0.03
         core.estimator.fields.now[:] = x
-        core.run.control()
+        core.run.call("control")
         assert core.control.fields.u == pytest.approx(-K @ x, abs=2e-6), state
         assert core.control.fields.command == pytest.approx(MIX @ (-K @ x), abs=5e-6), state
 

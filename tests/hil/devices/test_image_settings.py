@@ -10,8 +10,8 @@ from firmware_py.config import parameters_of
 from firmware_py.links.parameters import TYPE_READ_ONLY
 from firmware_py.wire.scalars import PARAMETER_SCALARS
 from hil.config import LabConfig, load_config
-from hil.devices.stm32f405.log_table import ImageParameter
-from hil.devices.stm32f405.settings import ImageSettings
+from hil.crazyflie.log_table import ImageParameter
+from hil.devices.image_settings import ImageSettings
 from support.crtp_client import CrtpClient
 
 OTHER = (
@@ -68,9 +68,11 @@ def test_a_board_that_is_told_a_profile_has_its_constants_bit_for_bit() -> None:
     assert board.constants.bytes() != parameters_of(config).bytes()
     board.listen(100_000)
     assert board.constants.bytes() == parameters_of(config).bytes()
-    assert board.firmware.signals.supervisor.pose_timeout_us == 700_000
+    assert board.constants.fields.pose_timeout_us == 700_000
     assert board.writes_up == len(OTHER) + 3  # one packet each, four for the trims
-    (said,) = board.said
+    differs, said = board.said
+    assert differs.startswith("the image was built with other constants: ")
+    assert {"opening_min", "limit_u3", "trim"} <= set(differs.split(": ")[1].split(", "))
     assert said.startswith("set over the radio: ")
     assert "RandConsts.openMin -0.192" in said
 
@@ -101,13 +103,18 @@ def test_a_board_that_is_as_the_profile_says_is_told_nothing() -> None:
 def test_what_no_parameter_sets_is_said_in_one_line() -> None:
     board = Told(load_config("floaty", ["predictor.age=fixed", "controller.limit_u3=0.6"]))
     board.listen(50_000)
-    assert board.said == ["set over the radio: extCtrl.limU3 0.6", "the image keeps its own age_measured"]
+    assert board.said == [
+        "the image was built with other constants: age_measured, limit_u3",
+        "set over the radio: extCtrl.limU3 0.6",
+        "the image keeps its own age_measured",
+    ]
 
 
 @pytest.mark.parametrize("packet", [b"\x2e", struct.pack("<BHf", 0x2E, 9999, 1.0), b"\x3c hello"])
 def test_packets_that_answer_nothing_change_nothing(packet: bytes) -> None:
     board = Told(load_config("floaty", ["controller.limit_u3=0.6"]))
+    before = list(board.said)
     board.settings.hear(board.now_us, packet)
-    assert board.said == []
+    assert board.said == before
     board.listen(50_000)
     assert board.constants.fields.limit_u3 == pytest.approx(0.6)

@@ -20,6 +20,7 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.run import Request
 from hil.world.body import MIRRORS
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import axis_of
@@ -368,7 +369,7 @@ def test_markers_leave_all_other_randomness_as_it_was() -> None:
     seen: list[list[object]] = []
     for on in ("false", "true"):
         settings = [f"markers.enabled={on}", "mocap.dropout=0.5"]
-        flight = lockstep_flight(load_config("floaty", settings), EXPERIMENTS["hover"], 0.1, 1, None)
+        flight = lockstep_flight(Request.of(EXPERIMENTS["hover"], overrides=settings, duration_s=0.1))
         rows: list[object] = []
         for moment_us in range(10_000, 1_000_000, 45_000):
             flight.events.at(moment_us, lambda _, flight=flight, rows=rows: rows.append(random_parts(flight)))

@@ -8,10 +8,10 @@ import pytest
 from cflib.crtp.radiodriver import _RadioDriverThread
 from cflib.drivers.crazyradio import _radio_ack
 
-from hil.devices.config import RadioConfig
+from hil.crazyflie.config import RadioConfig
+from hil.crazyflie.nrf51 import RESET_DELAY_US, Nrf51, Power, RadioSettings
+from hil.crazyflie.shockburst import Air, air_us, exchange_us, syslink_us
 from hil.devices.dongle import VirtualDongle
-from hil.devices.nrf51 import RESET_DELAY_US, Nrf51, Power, RadioSettings
-from hil.devices.shockburst import Air, air_us, exchange_us, syslink_us
 from hil.events import EventQueue
 
 ADDRESS = bytes.fromhex("E7E7E7E7E7")
@@ -40,6 +40,9 @@ class Stm:
 
     def catch_up(self, now_us: int) -> None:
         pass
+
+    def retuned(self, now_us: int) -> None:
+        """Nothing."""
 
     def greet(self, now_us: int) -> None:
         pass
@@ -232,8 +235,8 @@ def test_without_acknowledgements_a_packet_is_sent_once() -> None:
 
 @pytest.mark.parametrize(
     ("command", "value", "channel", "rate"),
-    [(1, 90, 90, 2), (2, 0, 80, 0), (2, 1, 80, 1), (2, 3, 80, 2), (3, 2, 80, 2)],
-    ids=["channel", "250K", "1M", "no rate", "power"],
+    [(1, 90, 90, 2), (1, 126, 80, 2), (2, 0, 80, 0), (2, 1, 80, 1), (2, 3, 80, 2), (3, 2, 80, 2)],
+    ids=["channel", "no channel", "250K", "1M", "no rate", "power"],
 )
 def test_the_radio_chip_is_tuned_by_a_command_until_the_next_start(
     command: int, value: int, channel: int, rate: int

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ground_station.config import StationConfig
-from hil.devices.config import RadioConfig
+from hil.crazyflie.config import RadioConfig
+from hil.crazyflie.shockburst import air_us, exchange_us, syslink_us
 from hil.devices.radio import VirtualRadio
-from hil.devices.shockburst import air_us, exchange_us, syslink_us
 from hil.events import EventQueue
 
 QUIET = {"uplink_loss": 0.0, "downlink_loss": 0.0, "usb_jitter_us": 0}

@@ -10,6 +10,7 @@ from scipy.signal import cont2discrete, lfilter, ss2tf
 
 from ground_station.telemetry_log import POSE_COLUMNS, TIME_COLUMN
 from hil.config import load_config
+from hil.design.axes import PITCH as PITCH_AXIS
 from hil.errors import LabError
 from hil.identify.identify import IDENTIFIED, UNKNOWN, Identification, identify
 from hil.identify.prediction import one_step
@@ -194,7 +195,7 @@ def test_the_papers_arithmetic_gives_230_and_minus_14_where_its_text_prints_minu
 
 def test_the_papers_equations_find_no_damping_whatever_the_robot_has(tmp_path: Path) -> None:
     record = load_record(written(tmp_path, flight(8, 60.0)), "floaty")
-    loop = closed_loop(record, "pitch")
+    loop = closed_loop(record, PITCH_AXIS)
     assert abs(loop.starred[0]) < 0.1 * abs(PITCH["pitch_rate"])
     assert np.median((loop.acceleration / loop.angle).real / -(loop.w**2)) == pytest.approx(1.0, abs=0.15)
 

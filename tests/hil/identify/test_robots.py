@@ -8,11 +8,12 @@ import pytest
 from scipy.signal import cont2discrete, dlsim
 
 from hil.config import load_config
-from hil.design.loop import AXES, DELAY, FREQUENCIES, dynamics, robot_of
+from hil.design.axes import DELAY, PITCH, dynamics, robot_of
+from hil.design.loop import FREQUENCIES
 from hil.errors import LabError
 from hil.identify.flow import flow_of
 from hil.identify.record import Record
-from hil.identify.robots import UNKNOWN_SHARE, Known, beside, robots_of
+from hil.identify.robots import UNKNOWN_SHARE, KnownModel, beside, robots_of
 
 CONFIG = load_config()
 MS = 1e-3
@@ -22,7 +23,7 @@ def written(folder: Path, **changes: object) -> str:
     """A profile with a file beside it, in which a and b of yaw hang together."""
     profile = folder / "mine.toml"
     profile.write_text('base = "floaty"\n')
-    known = Known(
+    known = KnownModel(
         values=CONFIG.model.model_dump(),
         half_widths={"yaw_u3": 11.0, "yaw_rate": 0.8, "lag": 0.004, "delay": 0.002},
         covariance=np.diag([30.0, 0.16, 4e-6, 1e-6]).tolist(),
@@ -71,7 +72,7 @@ def test_a_file_that_does_not_fit_is_refused(
 def hover(seconds: float) -> tuple[Record, float]:
     """A record of pitch and x in white gusts that the law of `floaty` does not answer, and their spectrum [1/Hz]."""
     rng = np.random.default_rng(5)
-    axis, robot = AXES[1], robot_of(CONFIG)
+    axis, robot = PITCH, robot_of(CONFIG)
     flow, columns = dynamics(axis, robot)
     A, B, *_ = cont2discrete((flow, columns, np.eye(5), np.zeros((5, 3))), MS)
     count = round(seconds / MS)
@@ -95,7 +96,7 @@ def hover(seconds: float) -> tuple[Record, float]:
 @pytest.mark.long
 def test_what_the_model_does_not_explain_is_the_flow() -> None:
     record, per_hz = hover(60.0)
-    found = flow_of(record, AXES[1], robot_of(CONFIG)).spectrum
+    found = flow_of(record, PITCH, robot_of(CONFIG)).spectrum
     band = (FREQUENCIES > 0.3) & (FREQUENCIES < 8.0)
     assert np.mean(found[band, 1, 1].real) == pytest.approx(per_hz, rel=0.25)
     assert np.mean(found[band & (FREQUENCIES < 1.0), 0, 0].real) < 0.05
@@ -103,4 +104,4 @@ def test_what_the_model_does_not_explain_is_the_flow() -> None:
 
 def test_a_hover_too_short_to_tell_the_flow_is_refused() -> None:
     with pytest.raises(LabError, match="15 s after the first 2 s are needed"):
-        flow_of(hover(14.0)[0], AXES[1], robot_of(CONFIG))
+        flow_of(hover(14.0)[0], PITCH, robot_of(CONFIG))

@@ -13,6 +13,7 @@ ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 OK, OFF, STUCK, GARBAGE, WRONG, SLOW, DELAYED, INTERMITTENT = range(8)  # FAILURE_TYPE
 GYRO, ACCEL, VIO, BATTERY, MOTOR, SERVO, SIGNAL = 0, 1, 6, 100, 101, 102, 105  # FAILURE_UNIT
 EXPECTED: dict[tuple[int, int], list[str]] = {
+    **{(unit, OFF): ["imu.silent"] for unit in (GYRO, ACCEL)},
     **{(unit, STUCK): ["imu.freeze"] for unit in (GYRO, ACCEL)},
     **{(unit, GARBAGE): ["imu.noise"] for unit in (GYRO, ACCEL)},
     (GYRO, WRONG): ["imu.bias.p", "imu.bias.q", "imu.bias.r"],

@@ -1,6 +1,7 @@
 """Whole flights: the limits of the hover, determinism, what the predictor saves, how flights end."""
 
 import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,13 +9,14 @@ import pytest
 
 from ground_station.tracker import Quality
 from hil.clock import FreeRunning, Paced
+from hil.commands.tables import print_result, print_seeds
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import LOCKSTEP
-from hil.laboratory.metrics import METRICS, column, judge
+from hil.laboratory.metrics import ALWAYS, METRICS, column, judge
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import Request, fly, prepare
@@ -40,7 +42,7 @@ def explain(result: Result) -> str:
 def test_hover_holds_its_limits(tmp_path: Path, seed: int) -> None:
     result = hover(tmp_path / "run", seed=seed)
     assert result.passed, explain(result)
-    assert {verdict.metric for verdict in result.verdicts} == set(HOVER.limits)
+    assert {verdict.metric for verdict in result.verdicts} == {*HOVER.limits, *ALWAYS}
 
 
 @pytest.mark.long
@@ -163,7 +165,7 @@ def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -
     prepare(tmp_path / "run")
     result = fly(request, tmp_path / "run", progress=sabotage)
     assert result.outcome == "error"
-    assert "task KALMAN at 1" in str(result.cause)
+    assert "task SENSORS at 1" in str(result.cause)
     assert load_log(result.folder).num_rows > 140
 
 
@@ -237,3 +239,54 @@ def test_judge_fails_what_is_not_a_number_and_refuses_unknown_metrics() -> None:
     assert not judge({**values, "in_box": 0.98}, {"in_box": 0.99}, {})[0].holds
     with pytest.raises(LabError, match="no such metric; did you mean rms_"):
         judge(values, {"rms_q": 1.0}, {})
+
+
+def test_a_lost_flight_holds_no_limit_unless_its_limit_on_the_loss_admits_it() -> None:
+    values = {"lost": 1.0, "in_box": 1.0, "flown": 2.0}
+    lost, in_box = judge(values, {"lost": 0.0, "in_box": 0.9}, {})
+    assert (lost.holds, lost.mark) == (False, "FAILS")
+    assert (in_box.holds, in_box.mark) == (False, "lost")
+    assert str(in_box) == "in_box = 100 % until the robot was lost (limit >= 90 %)"
+    assert not judge(values, {"in_box": 0.9}, {})[0].holds
+    assert all(verdict.holds for verdict in judge(values, {"lost": 1.0, "flown": 1.0}, {}))
+
+
+def test_a_lost_flight_says_so_in_every_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    request = Request.of(HOVER, duration_s=3.0, faults=[parse("wind.fan@0.5=0.3")])
+    prepare(tmp_path / "run")
+    result = fly(request, tmp_path / "run")
+    assert {verdict.metric for verdict in result.verdicts if verdict.holds} == set()
+    assert [verdict.metric for verdict in result.failed] == ["lost"]
+    print_result(result)
+    print_seeds([result])
+    shown = capsys.readouterr().out
+    share = next(line for line in shown.splitlines() if "within_6cm_x" in line)
+    assert f"100 % of {result.metrics['flown']:.4g} s" in share
+    assert "lost" in share
+    assert "ok" not in shown
+
+
+@dataclass(frozen=True)
+class Reboots:
+    """Reboots the board again and again from 1 s after the release on."""
+
+    count: int
+
+    def __call__(self, flight: Flight) -> None:
+        for number in range(self.count):
+            at_us = flight.release_us + 1_000_000 + 100_000 * number
+            flight.events.at(at_us, lambda now_us: flight.robot.board.reset())
+
+
+def test_a_board_that_is_reset_has_not_completed_its_flight(tmp_path: Path) -> None:
+    experiment = replace(HOVER, name="reboots", script=Reboots(3), duration_s=1.5)
+    prepare(tmp_path / "run")
+    result = fly(Request.of(experiment), tmp_path / "run")
+    assert (result.outcome, result.cause) == ("reset", "the board was reset 3 times")
+    assert result.metrics["resets"] == 3.0
+    assert result.metrics["uncontrolled"] == pytest.approx(0.5, abs=0.02)
+    assert {"resets", "uncontrolled"} <= {verdict.metric for verdict in result.failed}
+    assert not result.passed
+    patient = replace(experiment, limits={"resets": 3.0, "uncontrolled": 0.6})
+    prepare(tmp_path / "patient")
+    assert fly(Request.of(patient), tmp_path / "patient").passed

@@ -7,8 +7,9 @@ from struct import pack
 import pytest
 
 pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
 
-from hil.devices.stm32f405 import firmware
+from hil.devices import image_firmware
 from hil.experiments import find_experiment
 from hil.laboratory.flight import Flight
 from hil.laboratory.recorder import load_events
@@ -23,7 +24,7 @@ NOTHING, BUS_FAULT, _, ASSERTION, HUNGRY_WATCHDOG = range(5)
 def flown(folder: Path, planted: int, duration_s: float, monkeypatch: pytest.MonkeyPatch) -> Result:
     """A flight in which something goes wrong from its beginning on."""
     elf = build()
-    monkeypatch.setattr(firmware, "WARM_UP_US", 20_000)
+    monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
     request = Request.of(
         find_experiment("hover"),
         duration_s=duration_s,

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("unicorn")
+pytest.importorskip("cffi")
 
 from hil.errors import LabError
 from hil.experiments import find_experiment
@@ -15,7 +16,7 @@ from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import load_schedule, runs
-from hil.pictures.compare import load_run
+from hil.pictures.compare import load_flown
 from hil.studies.two_boards import two_boards
 
 ELF = os.environ.get("FLOATY_CF2_ELF", "")
@@ -75,7 +76,7 @@ def test_the_image_answers_a_push_as_the_python_board_does(tmp_path: Path) -> No
 def test_what_sets_the_image_apart_from_the_python_board_is_measured(tmp_path: Path) -> None:
     for name, board in (("python", "python"), ("binary", ELF)):
         flown(tmp_path / name, 1.0, board=board)
-    found = two_boards(*(load_run(tmp_path / name) for name in ("python", "binary")))
+    found = two_boards(*(load_flown(tmp_path / name) for name in ("python", "binary")))
     assert found.first is not None
     assert found.first.why == "boot time"
     assert [cause.split(":")[0] for cause in found.causes] == [
@@ -101,11 +102,11 @@ def test_an_experiments_settings_reach_the_image_before_its_release(tmp_path: Pa
 def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hil.devices.stm32f405 import firmware
+    from hil.devices import image_firmware
     from hil.laboratory import run
     from support.stm32_firmware import BUILD, build
 
-    monkeypatch.setattr(firmware, "WARM_UP_US", 20_000)
+    monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
     monkeypatch.setattr(run, "BUILD", BUILD)
     elf = build("clang")
     request = Request.of(HOVER, duration_s=0.1, board=str(elf), overrides=("flight.release_us=50000",))
@@ -155,15 +156,15 @@ def test_an_elf_beside_another_board_is_refused() -> None:
 def test_without_a_compiler_an_image_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from firmware_py.export import arm_image
+    from firmware_py.export import compilers
     from support.stm32_firmware import build
 
     def missing(name: str) -> str:
-        raise arm_image.PackageNotFoundError(name)
+        raise compilers.PackageNotFoundError(name)
 
     elf = build("clang")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(arm_image, "version", missing)
+    monkeypatch.setattr(compilers, "version", missing)
     with pytest.raises(LabError, match=r"--board .*: the compiler ziglang is missing"):
         flown(tmp_path / "run", 1.0, board=str(elf))
     shutil.rmtree(tmp_path / "run")

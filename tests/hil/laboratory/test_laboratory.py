@@ -8,11 +8,12 @@ import pytest
 from firmware_py.wire.crtp import PORT_CONSOLE
 from hil.clock import FreeRunning, Paced
 from hil.config import load_config
-from hil.devices.nrf51 import Power
+from hil.crazyflie.nrf51 import Power
+from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.laboratory.faults import Fault, Switchboard, parse
 from hil.laboratory.laboratory import Laboratory
-from hil.laboratory.robot import Robot, Streams
+from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 from hil.servers.holder import Holder
 from hil.servers.live_faults import LiveFaults
 from hil.servers.served_robot import ServedRobot
@@ -35,7 +36,7 @@ class Bench:
         """Go on for a while; returns what was said meanwhile."""
         before = len(self.said)
         lab = self.server.lab
-        lab.end_us = lab.now_us + round(duration_s * SECOND_US)
+        lab.end_at(lab.now_us + round(duration_s * SECOND_US))
         lab.run()
         return self.said[before:]
 
@@ -54,6 +55,21 @@ def test_a_robot_is_let_go_when_it_has_flown_in_its_holder_for_a_second_and_hove
     assert bench.robot().free
     assert not any("lost" in text for text in said)
     assert np.abs(bench.robot().plant.p_WB - np.array([0.0, 0.0, 1.15])).max() < 0.1
+
+
+def test_a_robot_flies_in_its_holder_for_a_second_before_each_release() -> None:
+    bench = Bench(1, 1, (parse("push.x@0:0.1=5"),))
+
+    def heard_s(words: str) -> float:
+        while not any(words in text for text in bench.fly(0.01)):
+            assert bench.server.lab.now_us < 10 * SECOND_US
+        return bench.server.lab.now_us / SECOND_US
+
+    flying_s, released_s = heard_s("supervisor: flying"), heard_s("released")
+    assert released_s - flying_s == pytest.approx(1.0, abs=0.03)
+    lost_s, released_s = heard_s("it is put back"), heard_s("released")
+    assert released_s - lost_s == pytest.approx(2.0, abs=0.03)
+    assert sum("supervisor" in text for text in bench.said) == 1
 
 
 @pytest.mark.long
@@ -150,7 +166,46 @@ def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
     type_line("clear")
     assert bench.robot(1).plant.tunnel.side_wind[1] == 0.0
     assert answers == []
-    assert any("fault push.y" in text and "ends" in text for text in bench.said)
+    assert any(text.endswith("fault push.y:0.2=0.5 ends") for text in bench.said)
+
+
+def test_a_typed_status_lists_the_faults_in_force_and_a_held_robot_says_that_it_does_not_move() -> None:
+    bench = Bench()
+    type_line, answers = live(bench)
+    bench.fly(0.5)
+    type_line("mocap.dropout:inf")
+    assert answers == ["robot 1 is held: what moves it has no effect before it is released"]
+    type_line("status")
+    assert answers[1].startswith("robot 1: held, ")
+    assert answers[1].endswith("; faults: mocap.dropout:inf=1; radio://0/80/2M/E7E7E7E7E7")
+    bench.robot().cut_power()
+    type_line("status")
+    assert answers[2].startswith("robot 1: without power")
+
+
+def test_a_radio_that_a_client_has_moved_is_reported_where_it_stays_and_returns_with_a_restart() -> None:
+    bench = Bench()
+    type_line, answers = live(bench)
+    served = bench.server.ends.robots[0]
+    bench.fly(1.0)
+    for channel in (3, 37):  # as a program that scans
+        served.nrf51.hear(bench.server.lab.now_us, bytes((0xFF, 3, 1, channel)))
+        bench.fly(0.1)
+    bench.fly(2.0)
+    moved = [text for text in bench.said if "moved the radio" in text]
+    assert moved == ["board 1: a client moved the radio to radio://0/37/2M/E7E7E7E7E7; restart moves it back"]
+    served.nrf51.hear(bench.server.lab.now_us, bytes((0xFF, 3, 1, 80)))
+    bench.fly(2.0)
+    assert bench.said[-1] == "board 1: a client moved the radio back to radio://0/80/2M/E7E7E7E7E7"
+    served.nrf51.hear(bench.server.lab.now_us, bytes((0xFF, 3, 1, 37)))
+    bench.fly(0.1)
+    type_line("status")
+    assert answers[-1].endswith("radio://0/37/2M/E7E7E7E7E7")
+    type_line("restart")
+    assert served.uri == "radio://0/80/2M/E7E7E7E7E7"
+    assert sum("gyro zero found" in text for text in bench.said) == 1
+    bench.fly(6.0)  # it booted in flight: lost, put back
+    assert sum("gyro zero found" in text for text in bench.said) == 2
 
 
 @pytest.mark.parametrize(
@@ -158,7 +213,14 @@ def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
     [
         ("push.w=2", "unknown kind 'push.w'; did you mean push"),
         ("push.y=200", "size 200: expected -20..20 N"),
-        ("push.y=a", "start, duration and size are numbers"),
+        ("push.y=a", "fault 'push.y=a': duration and size are numbers; help lists"),
+        ("push.y@3=2", "expected KIND[:DURATION][=SIZE], like mocap.dropout:0.5"),
+        ("push.y:-1=2", "fault push.y: duration -1 s: expected more than 0, or inf"),
+        ("push.y:nan", "fault push.y: duration nan s"),
+        ("statos", "'statos' is unknown; did you mean status?"),
+        ("\\xff\\x00", "unknown kind"),
+        ("status", "robot 1: held, calibrating; faults: none"),
+        ("1 status", "robot 1: held"),
         ("3 push.y", "robot 3: expected 1..1"),
         ("serial.cut", "acts on a serial line; this robot has none"),
         ("marker.swap", "needs --set markers.enabled=true"),
@@ -191,32 +253,47 @@ def test_a_packet_to_a_board_without_power_is_lost() -> None:
     assert bench.fly(0.1) == []
 
 
+def test_an_experiment_that_plans_events_at_one_instant_without_end_is_one_clear_line() -> None:
+    lab = Laboratory(FreeRunning())
+
+    def push(now_us: int) -> None:
+        lab.events.at(now_us, push)
+
+    lab.events.at(SECOND_US, push)
+    lab.end_at(2 * SECOND_US)
+    with pytest.raises(LabError, match=r"push at 1\.000000 s of simulated time: .* plan the next one later"):
+        lab.run()
+
+
+def site_in(lab: Laboratory) -> Site:
+    return Site(load_config(), lab.events, Streams.of_seed(1), lambda source, text: None)
+
+
 def test_a_holder_lets_nobody_go_who_does_not_fly() -> None:
     lab = Laboratory(FreeRunning())
-    robot = Robot(load_config(), lab.events, Streams.of_seed(1), lambda source, text: None)
-    ServedRobot(1, robot, np.random.default_rng(1), print)
+    robot = ServedRobot(1, site_in(lab), print).robot
     robot.plant.hold()
     lab.robots.append(robot)
     gone: list[int] = []
     Holder(robot, gone.append)
     robot.watch(0)
-    lab.end_us = 3 * SECOND_US
+    lab.end_at(3 * SECOND_US)
     lab.run()
     assert gone == []
 
 
 def test_a_rebooted_board_talks_on_its_serial_line_by_the_laboratorys_clock() -> None:
     lab = Laboratory(FreeRunning())
-    robot = Robot(load_config(), lab.events, Streams.of_seed(1), lambda source, text: None, mavlink=True)
+    site = site_in(lab)
+    uart = VirtualSerial(site.config.serial, lab.events, site.streams.serial)
+    robot = Robot(site, Ports(nobody_listens, uart=uart))
     heard: list[int] = []
-    assert robot.uart is not None
-    robot.uart.connect(robot.uart_ready, lambda now_us, data: heard.append(now_us))
+    uart.connect(robot.uart_ready, lambda now_us, data: heard.append(now_us))
     lab.robots.append(robot)
-    robot.boot(0)
     robot.watch(0)
     lab.events.at(2 * SECOND_US, lambda _: robot.cut_power())
     lab.events.at(3 * SECOND_US, robot.boot)
-    lab.end_us = 5 * SECOND_US
+    lab.end_at(5 * SECOND_US)
     lab.run()
     assert sum(now_us < 2 * SECOND_US for now_us in heard) > 20
     assert [now_us for now_us in heard if 2_010_000 < now_us < 3 * SECOND_US] == []

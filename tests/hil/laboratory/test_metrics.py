@@ -30,7 +30,7 @@ def test_errors_are_the_pose_in_the_goal_frame(flight) -> None:
 
 
 def test_metrics_count_from_the_release_to_the_end() -> None:
-    """Held for 4 s, then free for 10 s, 2 s of them in failsafe; on the serial line, with a tracker."""
+    """Held for 4 s, then free for 10 s: 2 s in failsafe, 2 s with a dead estimate; on the serial line, with a tracker."""
     free = [*4 * [0], *11 * [1]]
     log: dict[str, object] = {
         "t": [1_000_000 * second for second in range(15)],
@@ -52,7 +52,8 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
         "truth.qw": [1.0] * 15
     }
     goal = {f"goal.{name}": [0.0] * 15 for name in ("x", "y", "z", "yaw")}
-    values = measure(pa.table(log | still | goal), lost=False)
+    estimate = {f"estimate.{name}": [*range(10), *3 * [10], 13, 14] for name in "xyzpqr"}
+    values = measure(pa.table(log | still | goal | estimate), lost=False)
     told = {name: value for name, value in values.items() if not np.isnan(value)}
     assert told == pytest.approx(
         {
@@ -72,6 +73,9 @@ def test_metrics_count_from_the_release_to_the_end() -> None:
             "y_over_x": 0.01 / np.sqrt((10 * 0.05**2 + 0.3**2) / 11),
             "age_mean": 0.04,
             "failsafe": 10.0 * 2 / 11,
+            "resets": 0.0,
+            "uncontrolled": 10.0 * 4 / 11,
+            "unseen": 0.0,
             "line_up": 0.1,
             "line_down": 0.5,
             "line_overrun": 7.0,

@@ -9,11 +9,11 @@ from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapFrame
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.natnet_stream import NatnetStream
-from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import judge, measure
 from hil.laboratory.recorder import Recorder, load_log
+from hil.laboratory.run import Request
 from support import natnet_packets as packets
 
 V = (4, 1)
@@ -29,7 +29,7 @@ class NatnetFlight:
 
     def __init__(self, network: Network, duration_s: float, *overrides: str) -> None:
         self.flight = lockstep_flight(
-            load_config("floaty", overrides), EXPERIMENTS["hover"], duration_s, 1, None
+            Request.of(EXPERIMENTS["hover"], overrides=overrides, duration_s=duration_s)
         )
         self.stream = NatnetStream("floaty", Alignment(CaptureConfig(axes="z-up")))
         self.stream.on_packet(packets.server_info(V), 0)
@@ -73,8 +73,8 @@ class NatnetFlight:
 
     def fly(self, folder: Path) -> list[str]:
         """Fly, and return the limits that fail."""
-        self.flight.recorder = recorder = Recorder(folder, self.flight.channels(), {})
-        outcome = self.flight.run()
+        recorder = Recorder(folder, self.flight.channels(), {})
+        outcome = self.flight.run(recorder=recorder)
         recorder.close()
         values = measure(load_log(folder), outcome.lost is not None)
         return [
@@ -129,7 +129,7 @@ def test_a_body_that_is_taken_out_in_flight_is_failsafe_and_one_line(tmp_path: P
     lab = NatnetFlight(lambda now_us, data: [data], 3.0, "flight.release_us=5000000")
     rename = packets.model_definition({"wand": 3}, V)
     lab.flight.events.at(2_000_000, lambda now_us: lab.stream.on_packet(rename, now_us) and None)
-    lab.flight.lab.end_us = 3_000_000
+    lab.flight.lab.end_at(3_000_000)
     lab.fly(tmp_path)
     assert lab.states[-1][1] == FAILSAFE
     assert lab.stream.notices == ["motion capture: no body 'floaty'; there are: wand"]

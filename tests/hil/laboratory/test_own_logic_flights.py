@@ -74,6 +74,19 @@ def test_a_law_that_puts_out_nan_is_a_failed_flight_that_names_it(failed: Result
     assert np.isfinite(flaps).all()
 
 
+def test_a_law_with_an_endless_loop_is_a_failed_flight_that_names_file_and_line(tmp_path: Path) -> None:
+    old = "    memory.ticks = i32(memory.ticks + 1)\n"
+    loop = "    for i in range(memory.ticks * 4000000):\n        memory.hidden = memory.hidden + DT\n"
+    law = LAW.replace(old, old + loop)
+    result = go(tmp_path / "run", make_project(tmp_path, law), 0.1, board="c")
+    line = law[: law.index("    for i in range(memory")].count("\n") + 1
+    assert result.outcome == "error"
+    assert result.cause is not None
+    where = f"controller.py:{line}: the loop up to 4000000 exceeds the 672000 cycles of a call at "
+    assert where in result.cause
+    assert any(event["source"] == "lab" and where in event["text"] for event in load_events(result.folder))
+
+
 def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
     log = load_log(failed.folder)
     own = {field.name: field.metadata[b"unit"] for field in log.schema if field.name.startswith("logic.")}

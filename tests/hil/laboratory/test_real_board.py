@@ -18,11 +18,6 @@ from support.crazyflie_app import App, build_app
 URI = "udp://127.0.0.1:9"
 
 
-@pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_app(tmp_path_factory.mktemp("app"))
-
-
 @pytest.fixture
 def plugged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Path], AppPackets]:
     """Puts an app at the end of every link."""

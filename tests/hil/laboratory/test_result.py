@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from firmware_py.export.cortex_m4 import Load, Usage
+from firmware_py.export.usage import Load, Usage
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
 from hil.errors import LabError
@@ -66,6 +66,7 @@ def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_n
     assert content["metrics"] == {"rms_x": 0.01, "settle": None, "rise": "inf", "lap": 9.5}
     assert content["verdicts"][1] == {
         "metric": "settle", "value": None, "bound": 0.5, "holds": False, "unit": "s", "sense": "max",
+        "applies": True,
     }  # fmt: skip
     assert content["usage"]["entries"]["estimate"]["worst_cycles"] == 60
 

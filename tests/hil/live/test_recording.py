@@ -14,7 +14,7 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.live.recording import Links
 from hil.live.window import free_port
 from hil.pictures.links import HOST, link_to
-from hil.pictures.viewer import Recording
+from hil.pictures.viewer.recording import ServedRecording
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_a_port_that_is_taken_is_one_line(links: Links, run: Path) -> None:
 
 
 def test_a_recording_is_served_with_the_time_at_an_instant(run: Path) -> None:
-    recording = Recording(run)
+    recording = ServedRecording(run)
     assert (run / "flight.rrd").is_file()
     at = recording.at(0.25)
     assert at.startswith("rerun+http://127.0.0.1:")

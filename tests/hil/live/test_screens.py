@@ -34,7 +34,8 @@ def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp
         monkeypatch.delenv(name, raising=False)
     for opens in (open_window, lambda: show(str(tmp_path / "flight.rrd"))):
         with pytest.raises(
-            LabError, match=r"^the viewer needs a display, and this computer has none; --view web"
+            LabError,
+            match=r"^the viewer needs a display, and this computer has none; in a browser: floaty view RUN --web",
         ):
             opens()
 

@@ -20,7 +20,7 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import free_flight, measure, position_error
 from hil.laboratory.recorder import load_log
 from hil.laboratory.run import Request, fly, prepare
-from hil.pictures.compare import Run, compare, load_run, pair, write_comparison
+from hil.pictures.compare import FlownRun, compare, load_flown, pair, write_comparison
 from support.command import floaty
 from support.html_page import Page
 
@@ -42,17 +42,17 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
 
 
-def changed(run: Run, row: int, column: str, value: float) -> Run:
+def changed(run: FlownRun, row: int, column: str, value: float) -> FlownRun:
     """The run with one cell changed."""
     place = run.log.column_names.index(column)
     field = run.log.schema.field(place)
     values = run.log.column(place).to_numpy().copy()
     values[row] = value
-    return Run(run.log.set_column(place, field, pa.array(values, field.type)), run.result)
+    return FlownRun(run.log.set_column(place, field, pa.array(values, field.type)), run.result)
 
 
 def test_the_same_seed_is_identical(runs: dict[str, Path]) -> None:
-    comparison = compare(load_run(runs["one"]), load_run(runs["again"]))
+    comparison = compare(load_flown(runs["one"]), load_flown(runs["again"]))
     assert comparison.identical
     assert comparison.first is None
     assert comparison.settings == ()
@@ -60,7 +60,7 @@ def test_the_same_seed_is_identical(runs: dict[str, Path]) -> None:
 
 
 def test_the_first_difference_is_the_first_by_row_then_by_column(runs: dict[str, Path]) -> None:
-    a, b = load_run(runs["one"]), load_run(runs["two"])
+    a, b = load_flown(runs["one"]), load_flown(runs["two"])
     found = next(  # slow and plain: Python rows instead of numpy columns
         (row, name, x[name], y[name])
         for row, (x, y) in enumerate(zip(a.log.to_pylist(), b.log.to_pylist(), strict=True))
@@ -78,7 +78,7 @@ def test_the_first_difference_is_the_first_by_row_then_by_column(runs: dict[str,
 @given(data=st.data())
 @pytest.mark.long
 def test_any_changed_cell_is_found(runs: dict[str, Path], data: st.DataObject) -> None:
-    run = load_run(runs["one"])
+    run = load_flown(runs["one"])
     column = data.draw(st.sampled_from([name for name in run.log.column_names if name.startswith("truth.")]))
     row = data.draw(st.integers(0, run.log.num_rows - 1))
     value = data.draw(st.sampled_from([math.nan, math.inf, -1e300, 5e-324]))
@@ -92,8 +92,8 @@ def test_any_changed_cell_is_found(runs: dict[str, Path], data: st.DataObject) -
 
 
 def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) -> None:
-    run = load_run(runs["one"])
-    short = Run(run.log.slice(0, 20), run.result)
+    run = load_flown(runs["one"])
+    short = FlownRun(run.log.slice(0, 20), run.result)
     for a, b, ended in ((run, short, 1), (short, run, 0)):
         first = compare(a, b).first
         assert first is not None
@@ -103,8 +103,8 @@ def test_a_log_that_ends_earlier_differs_where_it_ends(runs: dict[str, Path]) ->
 
 
 def test_a_missing_column_is_told(runs: dict[str, Path]) -> None:
-    run = load_run(runs["one"])
-    less = Run(run.log.drop_columns(["truth.x"]), run.result)
+    run = load_flown(runs["one"])
+    less = FlownRun(run.log.drop_columns(["truth.x"]), run.result)
     comparison = compare(run, less)
     assert comparison.missing == ((), ("truth.x",))
     assert comparison.first is None
@@ -112,7 +112,7 @@ def test_a_missing_column_is_told(runs: dict[str, Path]) -> None:
 
 
 def test_what_was_set_otherwise_is_told_and_nothing_else(runs: dict[str, Path]) -> None:
-    comparison = compare(load_run(runs["one"]), load_run(runs["strong"]))
+    comparison = compare(load_flown(runs["one"]), load_flown(runs["strong"]))
     gain = load_config().controller.gain_z
     assert ("controller.gain_z", str(gain), "3.5") in comparison.settings
     assert {name for name, _, _ in comparison.settings} <= {"controller.gain_z", "overrides", "commit"}
@@ -120,7 +120,7 @@ def test_what_was_set_otherwise_is_told_and_nothing_else(runs: dict[str, Path]) 
 
 def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Path]) -> None:
     a, b = (json.loads((runs[name] / "result.json").read_text())["metrics"] for name in ("one", "two"))
-    told = {pair.name: pair for pair in compare(load_run(runs["one"]), load_run(runs["two"])).metrics}
+    told = {pair.name: pair for pair in compare(load_flown(runs["one"]), load_flown(runs["two"])).metrics}
     assert told["rms_x"].values == pytest.approx((100 * a["rms_x"], 100 * b["rms_x"]))
     assert told["rms_x"].unit == "cm"
     assert told["rms_x"].difference == pytest.approx(100 * (b["rms_x"] - a["rms_x"]))
@@ -129,9 +129,9 @@ def test_metrics_stand_side_by_side_in_the_unit_of_the_table(runs: dict[str, Pat
 def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_both_flew(
     runs: dict[str, Path],
 ) -> None:
-    long = load_run(runs["one"])
+    long = load_flown(runs["one"])
     rows = long.log.num_rows - 30  # 0.3 s less
-    short = Run(
+    short = FlownRun(
         long.log.slice(0, rows),
         replace(long.result, metrics=measure(long.log.slice(0, rows), lost=False)),
     )
@@ -148,13 +148,15 @@ def test_metrics_of_flights_of_different_length_are_taken_over_the_time_that_bot
 def test_flights_that_are_released_at_other_instants_are_compared_by_the_time_since_then(
     runs: dict[str, Path],
 ) -> None:
-    a, b = load_run(runs["one"]), load_run(runs["two"])
+    a, b = load_flown(runs["one"]), load_flown(runs["two"])
     assert compare(a, b).apart == (), "row by row"
     t = b.log.column_names.index("t")
     release_us = load_config().flight.release_us + 2_000_000
     metadata = {**b.log.schema.metadata, b"release_us": str(release_us).encode()}
     later = b.log.set_column(t, b.log.schema.field(t), pa.array(b.log.column("t").to_numpy() + 2_000_000))
-    told = {one.name: one for one in compare(a, Run(later.replace_schema_metadata(metadata), b.result)).apart}
+    told = {
+        one.name: one for one in compare(a, FlownRun(later.replace_schema_metadata(metadata), b.result)).apart
+    }
     free = [free_flight(run.log) for run in (a, b)]
     miss = np.subtract(*(100 * position_error(log)[:, 1] for log in reversed(free)))
     assert (told["y"].unit, told["y"].largest) == ("cm", pytest.approx(np.abs(miss).max(), rel=1e-6))
@@ -163,7 +165,7 @@ def test_flights_that_are_released_at_other_instants_are_compared_by_the_time_si
 
 @pytest.mark.long
 def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
-    a, b = load_run(runs["one"]), load_run(runs["two"])
+    a, b = load_flown(runs["one"]), load_flown(runs["two"])
     figure = pair((a.log, b.log), ("a", "b"))
     hues = [colorsys.rgb_to_hsv(*to_rgb(line.colour))[0] * 360 for line in figure.panels[0].series]
     assert [line.name for line in figure.panels[0].series] == ["a", "b"]

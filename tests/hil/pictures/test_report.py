@@ -22,7 +22,7 @@ from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory import ages
-from hil.laboratory.metrics import METRICS, judge
+from hil.laboratory.metrics import ALWAYS, METRICS, judge
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import read_result, write_result
 from hil.laboratory.run import Request, fly, prepare
@@ -89,7 +89,7 @@ def test_the_report_tells_every_metric_and_every_limit(folder: Path) -> None:
     told = {row[0]: row for row in rows}
     for verdict in result.verdicts:
         name, value, _, limit, holds, _ = told[verdict.metric]
-        scale = {"lost": 1, "attitude_max": math.degrees(1)}.get(name, 100)
+        scale = {**dict.fromkeys(("lost", *ALWAYS), 1), "attitude_max": math.degrees(1)}.get(name, 100)
         assert float(value) == pytest.approx(verdict.value * scale, rel=1e-3)
         assert float(limit[1:]) == pytest.approx(verdict.bound * scale, rel=1e-3)
         assert limit[0] == ("≤" if METRICS[name].bound == "max" else "≥")
@@ -219,7 +219,8 @@ def test_the_report_begins_with_what_was_asked_for_what_failed_and_what_happened
     assert "--set a.b=c" in story
     assert "--fault push.y@0.3=2" in story
     assert "--board" not in story  # it was the laboratory's own
-    assert story.count(">fails<") == 2
+    assert story.count(">fails<") == 1
+    assert "(limit &lt;= 0): the robot was lost, and so no limit holds" in story
     told = [(moment.t_s, moment.text) for moment in story_of(changed, lost)]
     assert [(pytest.approx(t_s, abs=2e-3), text) for t_s, text in told] == [
         (0.0, "released"),
@@ -319,7 +320,7 @@ def test_what_never_happened_reads_never_and_holds_the_limit(folder: Path) -> No
     assert told.metrics["controller_late_from"] == math.inf
     assert math.isnan(told.metrics["rms_x"])
     (row,) = metric_rows(told)
-    assert (row.value, row.holds) == ("never", True)
+    assert (row.value, row.mark) == ("never", "ok")
     assert str(told.verdicts[0]).startswith("controller_late_from = never")
 
 
@@ -327,5 +328,5 @@ def test_a_metric_without_a_value_is_a_dash_and_fails(folder: Path) -> None:
     verdict = {"metric": "rms_x", "value": None, "bound": 0.1, "holds": False, "unit": "m", "sense": "max"}
     change_result(folder, metrics={"rms_x": None}, verdicts=[verdict])
     rows = {row.name: row for row in metric_rows(read_result(folder))}
-    assert (rows["rms_x"].value, rows["rms_x"].holds) == ("–", False)
+    assert (rows["rms_x"].value, rows["rms_x"].mark) == ("–", "FAILS")
     assert "rms_y" not in rows  # neither a value nor a limit

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+import rerun
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -32,7 +33,12 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import SCHEMA
 from hil.live import window
 from hil.live.feed import open_view
-from hil.pictures import curves, monitor, scene, viewer
+from hil.pictures import curves, monitor, scene
+from hil.pictures.viewer.layout import views_of
+from hil.pictures.viewer.plots import PLOTS
+from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
+from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
+from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
 from hil.world import layout as at
 from hil.world.body import place_plates
 from hil.world.config import GeometryConfig, GroundConfig
@@ -54,8 +60,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def chunks(path: Path, entity: str) -> list[pa.RecordBatch]:
     """The batches of an entity that move with time, in its order."""
     found = [chunk.to_record_batch() for chunk in RrdReader(path).stream() if chunk.entity_path == entity]
-    moving = [batch for batch in found if viewer.FROM_RELEASE in batch.schema.names]
-    return sorted(moving, key=lambda batch: batch.column(viewer.FROM_RELEASE)[0].value)
+    moving = [batch for batch in found if FROM_RELEASE in batch.schema.names]
+    return sorted(moving, key=lambda batch: batch.column(FROM_RELEASE)[0].value)
 
 
 def values(path: Path, entity: str, component: str) -> NDArray[np.float64]:
@@ -67,15 +73,15 @@ def moments(path: Path, entity: str) -> list[int]:
     return [
         moment.value + 1000 * RELEASE_US
         for batch in chunks(path, entity)
-        for moment in batch.column(viewer.FROM_RELEASE)
+        for moment in batch.column(FROM_RELEASE)
     ]
 
 
 def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:
-    log, path = load_log(folder), viewer.write_run_rrd(folder)
+    log, path = load_log(folder), write_run_rrd(folder)
     assert log.num_rows == 150
     fast = ["robot", "robot/plates/flap_1", "robot/plates/flap_4", "goal", "goal/estimate", "drag", "flow"]
-    plots = [name for name, plot in viewer.PLOTS.items() if plot.needs in log.column_names]
+    plots = [name for name, plot in PLOTS.items() if plot.needs in log.column_names]
     assert "link/loss/radio" in plots
     for entity in (*(f"/world/{name}" for name in fast), *(f"/plot/{name}" for name in plots)):
         assert moments(path, entity) == [1000 * t for t in log.column("t").to_pylist()], entity
@@ -89,7 +95,7 @@ def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:
 
 
 def test_texts_and_changes_of_state_are_recorded_once(folder: Path) -> None:
-    path = viewer.write_run_rrd(folder)
+    path = write_run_rrd(folder)
     states = values(path, "/state/supervisor", "StateChange:state")[:, 0].tolist()
     assert states == ["calibrating", "flying"] or states == ["calibrating", "waiting", "flying"]
     assert values(path, "/state/robot", "StateChange:state")[:, 0].tolist() == ["held", "free"]
@@ -106,9 +112,9 @@ def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) 
         faults=[parse("marker.hidden@0.2:0.1=3")],
     )
     fly(request, tmp_path / "run")
-    log, path = load_log(tmp_path / "run"), viewer.write_run_rrd(tmp_path / "run")
+    log, path = load_log(tmp_path / "run"), write_run_rrd(tmp_path / "run")
     colours = values(path, "/world/robot/markers", "Points3D:colors")
-    expected = [[viewer.HIDDEN] * n + [viewer.SEEN] * (8 - n) for n in (8, 0, 3, 0)]  # no exposure yet; all
+    expected = [[HIDDEN] * n + [SEEN] * (8 - n) for n in (8, 0, 3, 0)]  # no exposure yet; all
     assert colours.tolist() == expected
     times_us = [250, 10_250, 1_210_250, 1_310_250]
     assert moments(path, "/world/robot/markers") == [1000 * t for t in times_us]
@@ -124,9 +130,9 @@ def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) 
         atol=1e-7,
     )
     split = tmp_path / "split.rrd"
-    recording = viewer.rr.RecordingStream("test")
+    recording = rerun.RecordingStream("test")
     recording.save(split)
-    stage = viewer.Stage(recording, log.schema)
+    stage = RerunFlight(recording, log.schema)
     for start in range(0, log.num_rows, 40):  # as live: nothing twice, nothing missing
         stage.add_rows(log.slice(start, 40))
     recording.disconnect()
@@ -151,7 +157,7 @@ def live_sink(path: Path, port: int) -> "subprocess.Popen[bytes]":
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the sink is interrupted
 def test_a_live_flight_sends_what_the_file_holds(folder: Path, tmp_path: Path) -> None:
-    whole, path = rows_by_entity(viewer.write_run_rrd(folder)), tmp_path / "live.rrd"
+    whole, path = rows_by_entity(write_run_rrd(folder)), tmp_path / "live.rrd"
     assert "/state/task/KALMAN" in whole
     # The schedule and the station's record are there only after the flight.
     later = ("/state/task/", "/plot/age/stages")
@@ -182,7 +188,7 @@ def test_a_live_flight_sends_what_the_file_holds(folder: Path, tmp_path: Path) -
 
 
 def test_an_empty_log_has_a_recording(folder: Path, tmp_path: Path) -> None:
-    viewer.write_rrd(iter([load_log(folder).slice(0, 0)]), [], SCHEMA.empty_table(), tmp_path / "empty.rrd")
+    write_rrd(iter([load_log(folder).slice(0, 0)]), [], SCHEMA.empty_table(), tmp_path / "empty.rrd")
     assert rows_by_entity(tmp_path / "empty.rrd")["/world/robot/plates/flap_1"] == 1  # its mesh
 
 
@@ -292,7 +298,7 @@ def test_states_have_the_supervisors_names() -> None:
 
 
 def staged(path: Path, table: pa.Table, events: list[dict] | None = None) -> Path:
-    viewer.write_rrd(iter([table]), events or [], SCHEMA.empty_table(), path)
+    write_rrd(iter([table]), events or [], SCHEMA.empty_table(), path)
     return path
 
 
@@ -328,7 +334,7 @@ def real_log(rows: int = 30) -> pa.Table:
 
 def test_a_real_flight_has_the_same_scene_and_what_nobody_knows_is_not_drawn(tmp_path: Path) -> None:
     path = staged(tmp_path / "real.rrd", real_log())
-    assert viewer.timeline_of(real_log().schema.metadata) == (viewer.FROM_START, 0)
+    assert timeline_of(real_log().schema.metadata) == (FROM_START, 0)
     counted = rows_by_entity(path)
     for name in ("robot", "robot/plates/flap_1", "goal/estimate"):
         assert counted[f"/world/{name}"] - (name != "robot" and "flap" in name) == 20, name
@@ -359,7 +365,7 @@ def test_the_stages_of_the_age_lie_on_one_another(folder: Path) -> None:
     )
     table = ages.rename_columns([f"age.{name}" for name in ages.column_names])
     np.testing.assert_allclose(monitor.AGE_STAGES.read(table), [[20.0, 38.0, 39.0, 39.1, 41.1]])
-    counted = rows_by_entity(viewer.write_run_rrd(folder))
+    counted = rows_by_entity(write_run_rrd(folder))
     assert counted["/plot/age/stages"] > 60  # by the station's own record, and their names
 
 
@@ -381,25 +387,17 @@ def test_faults_share_a_lane_and_a_push_is_an_arrow_that_can_be_seen(folder: Pat
         batch for batch in chunks(path, "/world/held/push_y") if "Arrows3D:vectors" in batch.schema.names
     ]
     assert arrow.column("Arrows3D:vectors").to_pylist()[0] == [
-        [0.0, pytest.approx(2 * viewer.METRES_PER_NEWTON), 0.0]
+        [0.0, pytest.approx(2 * METRES_PER_NEWTON), 0.0]
     ]
     begun, gone = moments(path, "/world/held/push_y")
-    assert gone - begun == 1000 * viewer.PUSH_SHOWN_US
+    assert gone - begun == 1000 * PUSH_SHOWN_US
 
 
 def test_a_view_stands_in_the_blueprint_when_the_log_has_its_curves(folder: Path) -> None:
     simulated = load_log(folder).schema
-    known = {path for _, path in viewer.VIEWS if _has(path, simulated)}
+    known = {path for _, path in views_of(simulated)}
     assert {"position", "processor", "battery", "link/rate", "queue"} <= known
     assert "link/air" not in known
-    real = {path for _, path in viewer.VIEWS if _has(path, real_log().schema)}
+    real = {path for _, path in views_of(real_log().schema)}
     assert {"position", "flaps", "age", "link/rate", "link/loss"} <= real
     assert not {"processor", "battery", "queue"} & real
-
-
-def _has(path: str, schema: pa.Schema) -> bool:
-    return any(
-        viewer._is_known(name, schema)
-        for name in (*viewer.PLOTS, *viewer.RATES, "processor")
-        if name == path or name.startswith(f"{path}/")
-    )

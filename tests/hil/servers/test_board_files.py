@@ -27,14 +27,17 @@ def test_eeprom_and_deck_memory_of_each_board_are_kept_over_a_restart(tmp_path: 
     for served, before in zip(again.ends.robots, (one, two), strict=True):
         assert served.robot.board.eeprom == before.eeprom
         assert served.robot.board.deck_memory == before.deck_memory
-    assert again.ends.robots[0].robot.firmware.signals.supervisor.pose_timeout_us == 321_000
+    values = {
+        parameter.name: parameter.read() for parameter in again.ends.robots[0].robot.firmware.parameters
+    }
+    assert values["supervisor.poseTimeout"] == 321
     again.ends.close()
 
 
 def test_what_changes_while_the_server_runs_is_written_at_once(tmp_path: Path) -> None:
     server = serve(tmp_path)
     server.ends.robots[0].robot.board.eeprom[8000:8003] = b"new"
-    server.lab.end_us = 30_000
+    server.lab.end_at(30_000)
     server.lab.run()
     assert (tmp_path / "board-1.eeprom").read_bytes()[8000:8003] == b"new"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["board-1.deck", "board-1.eeprom"]

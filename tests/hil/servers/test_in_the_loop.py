@@ -1,6 +1,5 @@
 """A board flies with the host's gyro samples: the exported app and the laboratory on one time line, with a bad link."""
 
-import ctypes
 from pathlib import Path
 
 import pytest
@@ -23,6 +22,7 @@ from ground_station.errors import LinkError
 from ground_station.links import packets
 from ground_station.links.core_client import CoreClient
 from hil.clock import FreeRunning, Paced
+from hil.devices.real_firmware import RealBoard
 from hil.devices.sample_window import WINDOW
 from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
@@ -38,11 +38,6 @@ from support.crazyflie_app import App, build_app
 
 URI = "udp://127.0.0.1:9"
 POSE = encode_ext_pose((0.01, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 40_000)[1:]
-
-
-@pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_app(tmp_path_factory.mktemp("app"))
 
 
 @pytest.fixture
@@ -77,7 +72,7 @@ class Host:
     def run(self, steps: int, *, sending: bool = True, poses: bool = False) -> None:
         for _ in range(steps):
             if sending:
-                self.send()
+                self.send((3, -2, self.step % 2))
             self.step += 1
             if poses and self.step % 20 == 0:
                 self.app.radio(POSE)
@@ -116,14 +111,53 @@ def test_samples_are_taken_one_a_step_when_enough_wait(host: Host) -> None:
 
 def test_the_gyro_is_the_hosts_and_its_zero_is_found_anew(host: Host) -> None:
     host.app.gyro[:] = (1000, 1000, 1000)
-    assert not host.app.supervisor.calibrated
+    assert not host.app.sampling.calibrated
     host.run(560, poses=True)
-    assert host.app.supervisor.calibrated
+    assert host.app.sampling.calibrated
     assert host.looped[-1].state == State.FLYING
-    assert (
-        max(map(abs, (host.app.log(f"stateEstimate.{axis}_rate") for axis in ("roll", "pitch", "yaw"))))
-        < 0.01
+    assert max(rates(host.app)) < 0.01
+
+
+def rates(app: App) -> list[float]:
+    return [abs(app.log(f"stateEstimate.{axis}_rate")) for axis in ("roll", "pitch", "yaw")]
+
+
+def test_the_zero_of_the_boards_own_gyro_does_not_act_in_the_loop(app: App) -> None:
+    app.gyro[:] = (1000, 1000, 1000)
+    for step in range(1, 601):
+        app.step(step)
+    assert app.supervisor.state == State.WAITING
+    host = Host(app)
+    host.step = 600
+    host.run(200, poses=True)
+    assert not app.sampling.calibrated
+    assert max(rates(app)) < 0.01
+
+
+def test_a_board_that_leaves_the_loop_waits_for_a_pose_of_its_own(host: Host) -> None:
+    host.run(1000, poses=True)
+    assert host.app.supervisor.state == State.FLYING
+    host.run(1000 + HIL_WAITING + 600, sending=False)
+    assert (host.app.supervisor.state, host.app.supervisor.cause) == (State.WAITING, Cause.NONE)
+
+
+def test_a_mode_that_begins_while_a_sample_is_filed_begins_without_it(tmp_path: Path) -> None:
+    """The stabilizer task preempts the receiving task between its reading `received` and its writing it."""
+    preempted = (
+        "{ const uint16_t before = received; extern int stub_locked; if (stub_locked) { stub_locked = 0; "
+        "floaty_hil_switched(); } received = (uint16_t)(before + 1); }"
     )
+    library = build_app(tmp_path / "app", plant=("floaty_hil.c", "received += 1;", preempted))
+    app = App(library, tmp_path / "copy.so")
+    app.boot()
+    host = Host(app)
+    host.run(100)
+    app.c.floaty_hil_ask(int(Hil.MOVING))
+    app.locked.value = 1
+    host.send()
+    host.looped.clear()
+    host.run(30, sending=False)
+    assert [(told.used, told.waiting) for told in host.looped] == [(0, 0)] * 3
 
 
 def test_servos_stay_at_hover_unless_they_are_to_move(library: Path, tmp_path: Path) -> None:
@@ -143,14 +177,15 @@ def test_a_board_that_flies_is_not_taken_into_the_loop(app: App) -> None:
             app.radio(POSE)
         app.step(step)
     assert app.supervisor.state == State.FLYING
-    with pytest.raises(LinkError, match=r"^app: it flies"):
+    with pytest.raises(LinkError, match=r"^app: it may be in the air: disarm it"):
         Host(app)
     assert app.sent() == b""
 
 
-def gyro_sums(app: App) -> tuple[int, ...]:
-    """What the estimator will take in with its next step."""
-    return tuple((ctypes.c_int32 * 3).in_dll(app.c, "floaty_input"))
+def gyro_sums(app: App) -> tuple[int, int, int]:
+    """Return what the core has summed since the estimator's last tick."""
+    x, y, z = app.data.gyro_sum.tolist()
+    return x, y, z
 
 
 def test_without_a_sample_the_flight_stands_still_and_is_counted(host: Host) -> None:
@@ -169,6 +204,17 @@ def test_without_a_sample_the_flight_stands_still_and_is_counted(host: Host) -> 
     assert host.app.estimator() == stood != state
     host.run(100, poses=True)
     assert (host.looped[-1].state, host.looped[-1].late, host.looped[-1].fresh) == (State.FLYING, 0, 1)
+
+
+def test_what_is_counted_counts_from_the_beginning_of_the_loop(host: Host) -> None:
+    host.run(100)
+    host.run(200, sending=False)
+    assert host.looped[-1].held > 100
+    host.client.execute([loop(Hil.OFF)])
+    host.run(10, sending=False)
+    host.client.execute([loop(Hil.STILL)])
+    host.run(100)
+    assert host.looped[-1].held == HIL_WAITING
 
 
 def test_while_the_flight_stands_still_poses_grow_no_older(host: Host) -> None:
@@ -192,6 +238,7 @@ def test_a_flight_stands_still_for_a_time_and_goes_on_with_the_last_sample(host:
     host.run(100)
     host.run(HIL_HOLD + 100, sending=False)
     told = host.looped[-1]
+    assert told.held == HIL_WAITING + HIL_HOLD
     assert told.late in range(80, 101)
     assert told.used == host.count
     host.run(50)
@@ -297,14 +344,17 @@ def test_a_board_that_is_asked_into_the_loop_and_gets_no_sample_leaves_it(host: 
 # Flights
 
 
+def board_on(air: AppAir) -> RealBoard:
+    return RealBoard(CoreClient(air, "app"), False, air)
+
+
 def flown(
     folder: Path, app: App, duration_s: float, faults: tuple[str, ...] = (), **link: float
 ) -> tuple[Result, AppAir]:
     air = AppAir(app, **link)
 
-    def flight_of(request: Request, telemetry: Path, clock: object, trace_all: bool) -> Flight:
-        client = CoreClient(air, "app")
-        flight = flight_in_the_loop(request, client, FreeRunning(), air, telemetry=telemetry)
+    def flight_of(request: Request, telemetry: Path, *_: object) -> Flight:
+        flight = flight_in_the_loop(request, board_on(air), FreeRunning(), telemetry)
         air.join(flight.events)
         return flight
 
@@ -396,8 +446,8 @@ def test_faults_of_plant_and_cameras_act_in_the_loop(app: App, tmp_path: Path) -
 def test_a_board_that_dies_in_the_loop_ends_the_flight_in_one_line(app: App, tmp_path: Path) -> None:
     air = AppAir(app)
 
-    def flight_of(request: Request, telemetry: Path, clock: object, trace_all: bool) -> Flight:
-        flight = flight_in_the_loop(request, CoreClient(air, "app"), FreeRunning(), air)
+    def flight_of(request: Request, telemetry: Path, *_: object) -> Flight:
+        flight = flight_in_the_loop(request, board_on(air), FreeRunning())
         air.join(flight.events)
         flight.events.at(2_500_000, lambda now_us: setattr(air, "dead", True))
         return flight
@@ -413,7 +463,7 @@ def test_a_board_that_dies_in_the_loop_ends_the_flight_in_one_line(app: App, tmp
 def test_the_plants_clock_follows_the_boards(app: App, tmp_path: Path, drift: float, slower: bool) -> None:
     air = AppAir(app, drift=drift)
     request = Request.of(find_experiment("hover"), duration_s=4.0, board=URI)
-    flight = flight_in_the_loop(request, CoreClient(air, "app"), FreeRunning(), air)
+    flight = flight_in_the_loop(request, board_on(air), FreeRunning())
     air.join(flight.events)
     flight.run()
     assert (sum(air.slewed[-100:]) > 0) == slower
@@ -433,7 +483,7 @@ def test_processor_time_of_a_real_board_cannot_be_taken(app: App) -> None:
     request = Request.of(find_experiment("overload"), duration_s=1.0, board=URI)
     air = AppAir(app)
     with pytest.raises(Exception, match="the processor time of a real board cannot be taken"):
-        flight_in_the_loop(request, CoreClient(air, "app"), FreeRunning(), air)
+        flight_in_the_loop(request, board_on(air), FreeRunning())
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from hil.commands import app
 from hil.config import load_config
-from hil.studies.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, SimplifiedModel, measure
+from hil.design.authority import pressure_at, wrenches
+from hil.studies.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, measure
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 
@@ -64,7 +65,11 @@ def test_model_and_plant_are_the_papers_equations(kink: float, flaps: NDArray[np
     hover = np.radians((25.0, -25.0, 25.0, -25.0))
     drag_coefficient = WEIGHT / by_the_paper(hover, kink, 1.0)[2]
     expected = by_the_paper(flaps, kink, drag_coefficient)
-    assert np.allclose(SimplifiedModel(*robot(kink)).wrench(flaps), expected, rtol=1e-9, atol=1e-9)
+    geometry, body = robot(kink)
+    found = wrenches(
+        geometry, np.array([1, -1, 1, -1]) * flaps[None], pressure_at(geometry, body.hover_angle)
+    )
+    assert np.allclose(found[0], expected, rtol=1e-9, atol=1e-9)
     plant = Plant(*robot(kink), TunnelConfig(), ServoConfig(), np.random.default_rng(1))
     assert np.allclose(np.concatenate(plant.mounted_wrench(flaps)), expected, rtol=1e-9, atol=1e-9)
 

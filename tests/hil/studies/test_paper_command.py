@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from hil.config import load_config
-from hil.design.analysis import analyse, point_of
+from hil.design.analysis import analyse
+from hil.design.sweeps import point_of
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS, Verdict
 from hil.laboratory.result import Result
@@ -23,7 +24,7 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_report import write_paper
-from hil.studies.paper_rows import OUTSIDE, ROWS, Claim, Row
+from hil.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
 from hil.studies.study import Change, Expected, Study, Variant
 from hil.studies.study_run import Cell, Curve, StudyResult
 from support.command import floaty
@@ -147,11 +148,11 @@ def test_every_seed_of_the_default_profile_must_hold(result: Result) -> None:
 
 
 def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -> None:
-    row = Row(
+    row = PaperRow(
         "t",
         "c",
         "p",
-        {"settle": Claim("< 0.5 s", 0.5), "peak_rate": Claim("> 80 deg/s", math.radians(80))},
+        {"settle": MetricClaim("< 0.5 s", 0.5), "peak_rate": MetricClaim("> 80 deg/s", math.radians(80))},
         "why",
     )
     slow, fast = (
@@ -171,7 +172,7 @@ def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -
 @pytest.mark.long
 def test_the_badges_say_which_kind_of_verdict_they_are(result: Result, tmp_path: Path) -> None:
     good = trials(result, True, True)
-    row = Row("t", "c", "p", {"rms_x": Claim("0", 0.0)}, "why")
+    row = PaperRow("t", "c", "p", {"rms_x": MetricClaim("0", 0.0)}, "why")
     study = StudyResult(
         Study("s", "q", "a", "", (0.0, 1.0), ()),
         (
@@ -187,7 +188,7 @@ def test_the_badges_say_which_kind_of_verdict_they_are(result: Result, tmp_path:
             ["limits of floaty: all hold", "the paper's values: 2 missed", "studies: 1 expectation failed"],
         ),
         (
-            Paper((("t", Row("t", "c", "p", {}), (trials(result, False),)),), (), True),
+            Paper((("t", PaperRow("t", "c", "p", {}), (trials(result, False),)),), (), True),
             ["interrupted", "limits of floaty: some fail", "the paper's values: none missed"],
         ),
     ):

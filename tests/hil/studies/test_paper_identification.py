@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from hil.studies.paper import Paper
-from hil.studies.paper_identification import COLUMNS, WHY, Constant, fly_identification
+from hil.studies.paper_identification import COLUMNS, WHY, PaperConstant, fly_identification
 from hil.studies.paper_report import write_paper
 from support.html_page import Page
 
@@ -31,7 +31,7 @@ def test_the_papers_method_misses_what_the_others_find(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_the_report_has_the_rows_of_the_identification(tmp_path: Path) -> None:
-    rows = [Constant("a", "230 ± 66", "230", "230", "43 ± 131", "211 ± 12", "226 ± 10")]
+    rows = [PaperConstant("a", "230 ± 66", "230", "230", "43 ± 131", "211 ± 12", "226 ± 10")]
     text = write_paper(tmp_path, Paper((), (), False), (), None, rows).read_text(encoding="utf-8")
     page = Page(text)
     assert WHY.split(":")[0].replace("'", "&#39;") in text

@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from hil.config import load_config
-from hil.design.analysis import point_of
 from hil.design.claims import AGREES
+from hil.design.sweeps import point_of
 from hil.studies.paper_scaling import PROFILES, fly_scaling
 from hil.world.geometry import weigh
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hil.config import load_config
-from hil.design.loop import AXES, FREQUENCIES, Timing, build, gains_in, robot_of
-from hil.design.tune import Task
+from hil.design.axes import ROLL, gains_in, robot_of
+from hil.design.loop import FREQUENCIES, Timing, build
+from hil.design.tune import Flow, GainTask, judged, refuse_late
 from hil.errors import LabError
 from hil.laboratory.robot import Streams
-from hil.studies.tuning import judged, refuse_late
 from hil.world.plant import Plant
 from support.command import floaty
 
@@ -47,10 +47,11 @@ def test_bad_input_is_one_line_and_exit_code_two(
 
 
 def test_a_loop_that_bears_less_delay_than_the_link_has_is_refused_with_both_numbers() -> None:
-    config, axis = load_config(), AXES[0]
-    robot, timing, gains = robot_of(config), Timing.of(config, 0.04), gains_in(config, axis)
-    task = Task(axis, np.zeros((len(FREQUENCIES), 2, 2), complex), 0.0, 0.0, 0.43, 0.15, 0.0)
-    one = judged(task, [build(axis, robot, config, timing)], [robot], config, timing, gains, gains)
+    config = load_config()
+    robot, timing, gains = robot_of(config), Timing.of(config, 0.04), gains_in(config, ROLL)
+    still = Flow(np.zeros((len(FREQUENCIES), 2, 2), complex), 0.0, 0.0)
+    task = GainTask(ROLL, still, config, timing, 0.0)
+    one = judged(task, [robot], [build(ROLL, robot, config, timing)], gains, gains)
     least = min(one.least.delay, one.least_late)
     refuse_late([one], 0.99 * least)
     with pytest.raises(

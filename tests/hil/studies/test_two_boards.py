@@ -16,7 +16,7 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.result import read_result, write_result
 from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import SCHEMA
-from hil.pictures.compare import Run, load_run
+from hil.pictures.compare import FlownRun, load_flown
 from hil.studies.two_boards import CLOCK, RATES, comparable, seeds_of, two_boards
 from support.command import floaty
 
@@ -32,15 +32,15 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def other(flown: Path, folder: Path, change: Callable[[Columns], None], board: str = "cf2.elf") -> Run:
+def other(flown: Path, folder: Path, change: Callable[[Columns], None], board: str = "cf2.elf") -> FlownRun:
     """The same flight by a board whose log is changed."""
     shutil.copytree(flown, folder)
-    log = load_run(folder).log
+    log = load_flown(folder).log
     columns = {name: log.column(name).to_numpy().copy() for name in log.column_names}
     change(columns)
     pq.write_table(pa.table(columns).replace_schema_metadata(log.schema.metadata), folder / "log.parquet")
     write_result(replace(read_result(folder), board=board))
-    return load_run(folder)
+    return load_flown(folder)
 
 
 def bumped(columns: Columns) -> None:
@@ -57,7 +57,7 @@ def test_a_board_that_closes_its_loop_earlier_differs_by_its_boot_time(flown: Pa
         columns["motor.m2"][begin - 4] += 7
         columns["cpu.IDLE"] += 3_100_000
 
-    a, b = load_run(flown), other(flown, tmp_path / "b", change)
+    a, b = load_flown(flown), other(flown, tmp_path / "b", change)
     begin = int(np.argmax(a.log.column("supervisor.state").to_numpy() == 2))
     found = two_boards(a, b)
     assert found.first is not None
@@ -75,7 +75,7 @@ def test_another_gyro_zero_is_measured_before_the_flights_part(flown: Path, tmp_
             columns[name] += np.float32(offset)
             columns[name][RELEASE + 2 :] += np.float32(0.5)  # what comes of the other counts is no cause
 
-    found = two_boards(load_run(flown), other(flown, tmp_path / "b", change))
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", change))
     assert found.first is not None
     assert (found.first.row, found.first.why) == (RELEASE + 1, "sensor start")
     assert any("-0.400 +0.100 +0.000 mrad/s (p q r)" in cause for cause in found.causes)
@@ -93,7 +93,7 @@ def test_an_estimator_that_begins_later_differs_by_its_phase(flown: Path, tmp_pa
         pa.array(values, field.type) for values, field in zip(zip(*rows, strict=True), SCHEMA, strict=True)
     ]
     pq.write_table(pa.table(columns, schema=SCHEMA), b.result.folder / "schedule.parquet")
-    found = two_boards(load_run(flown), b)
+    found = two_boards(load_flown(flown), b)
     assert found.first is not None
     assert found.first.why == "task phases"
     (cause,) = (cause for cause in found.causes if cause.startswith("task phases"))
@@ -108,33 +108,33 @@ def test_a_clock_with_long_microseconds_is_measured_through_its_carries(flown: P
         columns[CLOCK] = (3_100_000 + columns["t"] * 84 / 85).astype(np.int64)
         columns[CLOCK][40] -= 1 << 16  # read while the timer carried
 
-    found = two_boards(load_run(flown), other(flown, tmp_path / "b", change))
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", change))
     assert found.first is not None
     assert found.first.why == "long microsecond"
     assert found.causes == ("long microsecond: a microsecond of the boards' clocks lasts 1.0000 | 1.0119 us",)
 
 
 def test_what_no_known_cause_explains_is_said_so(flown: Path, tmp_path: Path) -> None:
-    found = two_boards(load_run(flown), other(flown, tmp_path / "b", bumped))
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", bumped))
     assert found.first is not None
     assert found.first.why == "none of the known causes"
     assert found.causes == ()
 
 
 def test_boards_with_the_same_counts_need_no_cause(flown: Path, tmp_path: Path) -> None:
-    found = two_boards(load_run(flown), other(flown, tmp_path / "b", lambda columns: None, "c"))
+    found = two_boards(load_flown(flown), other(flown, tmp_path / "b", lambda columns: None, "c"))
     assert (found.first, found.causes) == (None, ())
 
 
 def test_only_flights_of_two_boards_that_were_asked_for_alike_are_comparable(
     flown: Path, tmp_path: Path
 ) -> None:
-    a = load_run(flown)
+    a = load_flown(flown)
     b = other(flown, tmp_path / "b", lambda columns: None)
     assert comparable(a, b)
     assert not comparable(a, a)
     for change in ({"seed": 2}, {"seed": None}, {"overrides": ("a.b=1",)}, {"faults": ("push.y@1=1",)}):
-        assert not comparable(a, Run(b.log, replace(b.result, **change)))  # type: ignore[arg-type]
+        assert not comparable(a, FlownRun(b.log, replace(b.result, **change)))  # type: ignore[arg-type]
 
 
 @pytest.mark.long

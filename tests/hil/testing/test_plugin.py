@@ -19,6 +19,7 @@ from hil.testing.choices import Choice, Marked, Wanted, choices_of, why_not
 from hil.testing.flights import folder_of
 from support.command import floaty
 from support.examples import FILE, blocks
+from support.own_logic import LAW, make_project
 
 PAGE = Path(hil.__file__).parent.parent / "docs" / "howto" / "tests.md"
 FLY = "def test_it(floaty):\n    assert floaty.fly(duration_s=0.3).passed\n"
@@ -52,6 +53,46 @@ def kept(pytester: pytest.Pytester) -> list[str]:
 
 
 # Failures
+
+BROKEN = """
+import pytest
+from hil.errors import LabError
+
+def test_one(floaty):
+    assert floaty.fly(profile="profile.toml").passed
+
+def test_two(floaty):
+    assert floaty.fly("y-square", profile="profile.toml").passed
+
+def test_board(floaty):
+    floaty.board(profile="profile.toml")
+
+def test_other(floaty):
+    floaty.fly("no-such")
+
+def test_expected(floaty):
+    with pytest.raises(LabError):
+        floaty.fly(profile="profile.toml")
+"""
+
+
+def test_a_broken_controller_is_one_message_and_no_traceback_of_the_library(
+    pytester: pytest.Pytester,
+) -> None:
+    make_project(pytester.path, LAW.replace("DT * memory", "sum([v for v in control.u]) * memory"))
+    tests = pytester.makepyfile(BROKEN).name
+    result = pytester.runpytest_inprocess()
+    result.assert_outcomes(failed=4, passed=1)
+    shown, _, _ = result.stdout.str().partition(
+        "short test summary info"
+    )  # it repeats whole messages where the variable CI is set
+    [line] = re.findall(".*list comprehension.*", shown)
+    assert line.startswith(f"{tests}:5: ")
+    assert re.search(r"controller\.py:\d+: list comprehension: write a loop over range", line)
+    assert shown.count(f"as in {tests}::test_one") == 2
+    assert f"{tests}:14: experiment 'no-such': unknown" in shown
+    assert "hil/" not in shown
+    assert "LabError" not in shown
 
 
 @pytest.mark.long
@@ -244,7 +285,7 @@ def test_paths_begin_at_the_root_folder_and_the_ini_file_names_the_usual_profile
     pytester.makepyfile("""
         def test_it(floaty, monkeypatch, tmp_path):
             monkeypatch.chdir(tmp_path)
-            assert [verdict.metric for verdict in floaty.fly(duration_s=0.1).verdicts] == ["rms_x"]
+            assert floaty.fly(duration_s=0.1).verdicts[0].metric == "rms_x"
             assert floaty.fly("flights.py:mine").passed
             assert floaty.board().firmware is not None
         """)

@@ -1,15 +1,14 @@
 /* Floaty as out-of-tree estimator and controller of the Crazyflie firmware.
  *
- * The stabilizer task calls both 1000 times per second, after each IMU sample. As in firmware_py/tasks.py the estimator
- * runs in steps 9, 19, 29 ..., the controller in steps 10, 20, 30 ...; poses are filed as they come. All of the core is
- * called from this one task. Everything is float32 and int32 except time, which is int64 microseconds.
+ * The stabilizer task calls both 1000 times per second, after each IMU sample, and all of the core from there. What is decided
+ * in flight the core decides; here it gets samples, poses, requests and the time, and its counts go to the timers.
  *
  * Gyro: the core takes raw counts. The BMI088 driver shows them as the log variables gyro.xRaw, yRaw, zRaw, of which
  * there is a new one in each step; neither the firmware's low-pass nor its bias is in between, so that the core computes
  * what it computes in the laboratory, bit for bit, from the same counts, poses and instants.
  *
  * Time: what is decided by time counts ticks, which nobody can set. How long a pose waited is measured in microseconds,
- * by a clock that the parameter usec.reset sets to zero. With hardware in the loop, neither counts while a sample of the
+ * by a clock that the parameter usec.reset sets to zero. Both are handed on as 32 bits, which wrap. With hardware in the loop, neither counts while a sample of the
  * host is missing: floaty_hil.h.
  *
  * What receives poses and requests, and talks on the console, is floaty_task.c.
@@ -34,23 +33,17 @@
 #include "motors.h"
 #include "platform.h"
 #include "pm.h"
+#include "power_distribution.h"
 #include "supervisor.h"
 #include "usec_time.h"
 
-#include "floaty_gyro_zero.h"
 #include "floaty_hil.h"
 #include "floaty_servos.h"
 #include "floaty_settings.h"
 
-#define STEPS 10 /* of the stabilizer per step of the core */
-#define ESTIMATOR_PHASE 9
-#define CONTROL_PHASE 0
 #define STEP_US 1000
 #define BATTERY_STEPS 100
 #define POSE_QUEUE 8
-#define POSE_ON_TIME 0
-#define MODE_HOVER 0
-#define MODE_MANUAL 2
 #define DEGREES 57.2957795f /* per radian */
 #define TURN 6.28318531f
 
@@ -58,29 +51,36 @@ FloatyParameters floaty_parameters;
 FloatyInput floaty_input;
 FloatyEstimator floaty_estimator;
 FloatyControl floaty_control;
+FloatySampling floaty_sampling;
 FloatySupervisor floaty_supervisor;
 FloatyObserved floaty_observed;
 FloatyRequests floaty_requests;
-uint8_t floaty_absolute;
+uint8_t floaty_absolute = 1;
+FloatyBox floaty_box = {FLOATY_BOX_RADIUS, FLOATY_BOX_BELOW, FLOATY_BOX_ABOVE, FLOATY_HOME};
 
-static FloatyGyroZero gyro_zero;
 static logVarId_t gyro_raw[3];
 static bool gyro_found;
 static FloatyGoal goal;  /* of absolute poses */
 static FloatyGoal frame; /* that the estimate is in: the last pose's goal; W itself for corrections */
 static volatile TickType_t controlled_tick;
-static bool holding; /* in this step the flight stands still */
+static bool holding;    /* in this step the flight stands still */
+static bool controlled; /* in this step the controller runs */
 
 /* In ordinary memory: the macros of static_mem.h would put it into CCM, which is full. */
 static StaticQueue_t pose_queue_buffer;
 static uint8_t pose_queue_storage[POSE_QUEUE * sizeof(FloatyPose)];
 static QueueHandle_t pose_queue;
 
+static void request(int32_t wanted) {
+  floaty_input.request = wanted;
+  call_request();
+}
+
 void floaty_begin(void) {
   pose_queue = xQueueCreateStatic(POSE_QUEUE, sizeof(FloatyPose), pose_queue_storage, &pose_queue_buffer);
   floaty_core_init(&floaty_parameters);
   call_reset();
-  floaty_supervisor_init(&floaty_supervisor, FLOATY_POSE_TIMEOUT_US, FLOATY_LOW_BATTERY_MV);
+  request(FLOATY_REQUEST_ARM);
   call_control(); /* mode 0: hover */
   floaty_servos_init(floaty_control.count);
 }
@@ -90,6 +90,11 @@ void floaty_hover(void) {
   memset(&control, 0, sizeof control);
   call_hover(&control);
   floaty_servos_write(control.count);
+}
+
+void floaty_lose_control(void) {
+  call_lose_control();
+  floaty_hover();
 }
 
 uint32_t floaty_controlled_tick(void) {
@@ -105,19 +110,16 @@ void floaty_queue_pose(const FloatyPose *pose) {
   }
 }
 
-int64_t floaty_pose_clock_us(void) {
-  return (int64_t)usecTimestamp() - (int64_t)floaty_hil_held() * STEP_US;
+bool floaty_poses_absolute(void) {
+  return floaty_absolute && floaty_hil_mode() == FLOATY_HIL_OFF; /* a host in the loop sends corrections */
 }
 
-/* Only the stabilizer task asks. The sum of differences does not run back when the tick count passes 2^32; by a tick it
- * does where two steps fall into one and the flight stands still. */
-static int64_t loop_us(void) {
-  static TickType_t last;
-  static int64_t us;
-  const TickType_t tick = xTaskGetTickCount() - floaty_hil_held();
-  us += (int64_t)(int32_t)(tick - last) * STEP_US;
-  last = tick;
-  return us;
+int32_t floaty_pose_clock_us(void) {
+  return (int32_t)((uint32_t)usecTimestamp() - floaty_hil_held() * STEP_US);
+}
+
+static int32_t loop_us(void) {
+  return (int32_t)((xTaskGetTickCount() - floaty_hil_held()) * STEP_US);
 }
 
 /* The estimator, in the stabilizer task */
@@ -128,32 +130,20 @@ static bool asked(volatile bool *request) {
   return was;
 }
 
-static void hand_pose_to_core(FloatyPose *pose, stabilizerStep_t step) {
-  /* Negative only when usec.reset has been written since the pose came: then as if it came now. */
-  const int64_t since_us = floaty_pose_clock_us() - pose->arrival_us;
-  const int64_t waited_us = since_us > 0 ? since_us : 0;
-  if (floaty_absolute) {
+static void hand_pose_to_core(FloatyPose *pose) {
+  if (floaty_poses_absolute()) {
     floaty_goal_see(&goal, pose);
     frame = goal;
   } else {
     memset(&goal, 0, sizeof goal); /* not known */
     memset(&frame, 0, sizeof frame);
   }
-  for (int i = 0; i < 3; i++) {
-    floaty_input.pose_position[i] = pose->position[i];
-  }
-  for (int i = 0; i < 4; i++) {
-    floaty_input.pose_quaternion[i] = pose->quaternion[i];
-  }
-  floaty_input.pose_age_us = FLOATY_AGE_UNKNOWN;
-  if (pose->age_us != FLOATY_AGE_UNKNOWN) {
-    const int32_t steps_to_go = (int32_t)((ESTIMATOR_PHASE + STEPS - step % STEPS) % STEPS);
-    floaty_input.pose_age_us = (int32_t)waited_us + pose->age_us + steps_to_go * STEP_US;
-  }
-  if (call_file_pose() == POSE_ON_TIME) {
-    floaty_supervisor.last_pose_us = loop_us() - waited_us;
-    floaty_supervisor.pose_seen = true;
-  }
+  memcpy(floaty_input.pose_position, pose->position, sizeof floaty_input.pose_position);
+  memcpy(floaty_input.pose_quaternion, pose->quaternion, sizeof floaty_input.pose_quaternion);
+  floaty_input.pose_age_us = pose->age_us;
+  floaty_input.pose_waited_us = (int32_t)((uint32_t)floaty_pose_clock_us() - (uint32_t)pose->arrival_us);
+  floaty_input.now_us = loop_us();
+  call_file_pose();
 }
 
 void floaty_gyro(int32_t counts[3]) {
@@ -164,22 +154,17 @@ void floaty_gyro(int32_t counts[3]) {
 
 static void take_measurements(stabilizerStep_t step) {
   FloatyPose pose;
-  int32_t counts[3];
-
-  floaty_gyro(counts);
-  floaty_hil_sample(counts);
-  for (int axis = 0; axis < 3; axis++) {
-    floaty_input.gyro_sum[axis] += counts[axis];
-  }
-  floaty_input.gyro_samples += 1;
-  if (floaty_gyro_zero_add(&gyro_zero, counts, floaty_input.gyro_bias)) {
-    floaty_supervisor.calibrated = true;
-  }
-  if (step % STEPS == CONTROL_PHASE) {
+  floaty_gyro(floaty_input.gyro);
+  floaty_input.gyro_again = !floaty_hil_sample(floaty_input.gyro);
+  memcpy(floaty_input.gyro_sample, floaty_input.gyro, sizeof floaty_input.gyro_sample);
+  floaty_input.tick = (int32_t)step;
+  controlled = call_begin_step() != 0;
+  call_take_sample();
+  if (controlled) {
     return; /* poses wait until the controller has run, as they do in the laboratory: it may see them in 1 to 11 ms */
   }
   while (xQueueReceive(pose_queue, &pose, 0) == pdTRUE) {
-    hand_pose_to_core(&pose, step);
+    hand_pose_to_core(&pose);
   }
 }
 
@@ -217,7 +202,8 @@ static void observe(void) {
   for (int i = 0; i < 4; i++) {
     floaty_observed.flap[i] = e->now[12 + i] + (floaty_control.flap[i] - floaty_control.command[i]);
   }
-  floaty_observed.age = (uint16_t)(e->pose_age_us / 100);
+  const int32_t age = e->pose_age_us / 100;
+  floaty_observed.age = (uint16_t)(age < UINT16_MAX ? age : UINT16_MAX);
   floaty_observed.rejected = (uint16_t)rejected;
   floaty_observed.poses = (uint16_t)(e->fused + e->jumps + rejected);
 }
@@ -257,12 +243,7 @@ static void begin_afresh(void) {
   while (xQueueReceive(pose_queue, &pose, 0) == pdTRUE) {
     /* of another flight */
   }
-  memset(&gyro_zero, 0, sizeof gyro_zero);
-  memset(floaty_input.gyro_bias, 0, sizeof floaty_input.gyro_bias);
-  memset(floaty_input.gyro_sum, 0, sizeof floaty_input.gyro_sum);
-  floaty_input.gyro_samples = 0;
-  floaty_supervisor.calibrated = false;
-  floaty_supervisor.pose_seen = false;
+  call_begin_afresh();
   call_reset();
   floaty_hover();
 }
@@ -282,41 +263,41 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (holding) {
     return;
   }
-  const stabilizerStep_t step = stabilizerStep - floaty_hil_held();
   if (asked(&floaty_requests.reset)) {
     call_reset();
   }
-  if (floaty_absolute && floaty_supervisor.state == FLOATY_FLYING) {
-    /* Less than one step of the motors' PWM: no pulse. But the firmware's supervisor, which looks at this next, sees
-     * that the robot flies; else it would disarm and stop its commander 30 s after arming. */
-    motorsSetRatio(MOTOR_M4, 1);
+  if (floaty_poses_absolute() && floaty_supervisor.state == FLOATY_STATE_FLYING) {
+    /* The firmware's supervisor, which looks at this next, takes more than the idle thrust for a flight; else it would
+     * disarm and stop its commander 30 s after arming. One more is less than a step of the motors' PWM: no pulse. */
+    const uint32_t idle = powerDistributionGetIdleThrust();
+    motorsSetRatio(MOTOR_M4, (uint16_t)(idle < UINT16_MAX ? idle + 1 : UINT16_MAX));
   }
-  take_measurements(step);
-  if (step % STEPS != ESTIMATOR_PHASE) {
-    return;
+  take_measurements(stabilizerStep - floaty_hil_held());
+  if (floaty_sampling.estimate_due) {
+    call_estimate();
+    tell_state(state, stabilizerStep);
+    observe();
   }
-  call_estimate();
-  memset(floaty_input.gyro_sum, 0, sizeof floaty_input.gyro_sum);
-  floaty_input.gyro_samples = 0;
-  tell_state(state, stabilizerStep);
-  observe();
 }
 
 /* The controller, in the stabilizer task */
 
-static void serve_requests(int64_t now) {
+static void serve_requests(void) {
   if (asked(&floaty_requests.recover)) {
-    floaty_supervisor_recover(&floaty_supervisor, now);
+    request(FLOATY_REQUEST_RECOVER);
   }
   if (asked(&floaty_requests.arm)) {
-    floaty_supervisor_arm(&floaty_supervisor, true);
+    request(FLOATY_REQUEST_ARM);
   }
   if (asked(&floaty_requests.disarm)) {
-    floaty_supervisor_arm(&floaty_supervisor, false);
+    request(FLOATY_REQUEST_DISARM);
   }
-  /* The firmware's own stop, by ports 6 and 9, their watchdogs or stabilizer.stop, holds until a reboot. */
-  if (asked(&floaty_requests.stop) || crtpSupervisorIsEmergencyStopRequested() || supervisorIsLocked()) {
-    floaty_supervisor.stopped = true;
+  if (asked(&floaty_requests.stop)) {
+    request(FLOATY_REQUEST_STOP);
+  }
+  /* The firmware's own stop, by ports 6 and 9, their watchdogs or stabilizer.stop. */
+  if (crtpSupervisorIsEmergencyStopRequested() || supervisorIsLocked()) {
+    request(FLOATY_REQUEST_LOCK);
   }
 }
 
@@ -328,23 +309,20 @@ bool controllerOutOfTreeTest(void) {
 
 void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const sensorData_t *sensors,
                          const state_t *state, const stabilizerStep_t stabilizerStep) {
-  const int64_t now = loop_us();
   (void)sensors;
   (void)state;
   memset(control, 0, sizeof *control); /* no motors */
-  serve_requests(now);
+  floaty_input.now_us = loop_us();
+  serve_requests();
   floaty_observed.setpoint = floaty_setpoint_kind(setpoint);
-  if (floaty_observed.setpoint == FLOATY_SETPOINT_POSITION) {
-    floaty_goal_move(&goal, setpoint);
+  if (floaty_observed.setpoint == FLOATY_SETPOINT_POSITION && !floaty_goal_move(&goal, setpoint, &floaty_box)) {
+    floaty_observed.setpoint = FLOATY_SETPOINT_OUTSIDE;
   }
   if (holding) {
     controlled_tick = xTaskGetTickCount(); /* nothing is wrong with the loop */
-  } else if ((stabilizerStep - floaty_hil_held()) % STEPS == CONTROL_PHASE) {
-    call_guard();
-    floaty_input.mode = floaty_supervisor_mode(&floaty_supervisor, now, floaty_estimator.bounded);
-    if (floaty_input.mode == MODE_MANUAL && !crtpIsConnected()) {
-      floaty_input.mode = MODE_HOVER; /* nobody is there who could take the angles back */
-    }
+  } else if (controlled) {
+    floaty_input.connected = crtpIsConnected();
+    call_supervise();
     call_control();
     if (floaty_hil_mode() != FLOATY_HIL_STILL) {
       floaty_servos_write(floaty_control.count);
@@ -353,6 +331,6 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     controlled_tick = xTaskGetTickCount();
   }
   if (stabilizerStep % BATTERY_STEPS == 0) {
-    floaty_supervisor_see_battery(&floaty_supervisor, now, (int32_t)(1000.0f * pmGetBatteryVoltage()));
+    floaty_input.battery_mv = (int32_t)(1000.0f * pmGetBatteryVoltage());
   }
 }

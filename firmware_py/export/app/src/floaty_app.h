@@ -7,12 +7,11 @@
 #include "floaty_core.h"
 #include "floaty_goal.h"
 #include "floaty_poses.h"
-#include "floaty_supervisor.h"
 
 /* What an observer sees and the core does not hold in this form. */
 typedef struct {
   float flap[4];     /* [rad] estimated flap angles */
-  uint16_t age;      /* [0.1 ms] of the last pose */
+  uint16_t age;      /* [0.1 ms] of the last pose, 65535 at most */
   uint16_t poses;    /* received, modulo 65536 */
   uint16_t rejected; /* of these, refused */
   uint32_t malformed;     /* packets on the pose channels that no one could read */
@@ -25,8 +24,10 @@ extern FloatyParameters floaty_parameters;
 extern FloatyInput floaty_input;
 extern FloatyEstimator floaty_estimator;
 extern FloatyControl floaty_control;
+extern FloatySampling floaty_sampling;
 extern FloatySupervisor floaty_supervisor;
 extern FloatyObserved floaty_observed;
+extern FloatyBox floaty_box;
 extern uint8_t floaty_absolute; /* 1: poses are in W, the commander says where to fly; 0: they are corrections, in G */
 
 /* What other tasks ask of the stabilizer task, which alone touches the supervisor's instants and the estimator. */
@@ -46,14 +47,20 @@ void floaty_begin(void);
 /* floaty_app.c: the raw counts of the board's own gyro, zero where there is none that is known. */
 void floaty_gyro(int32_t counts[3]);
 
-/* floaty_app.c: the clock by which poses arrive [us]. */
-int64_t floaty_pose_clock_us(void);
+/* floaty_app.c: what poses are that come now: in W, or corrections. */
+bool floaty_poses_absolute(void);
+
+/* floaty_app.c: the clock by which poses arrive [us]; it wraps. */
+int32_t floaty_pose_clock_us(void);
 
 /* floaty_app.c: hands a pose to the stabilizer task; when the queue is full the oldest one goes. */
 void floaty_queue_pose(const FloatyPose *pose);
 
 /* floaty_app.c: puts the servos to hover whatever the stabilizer task does. */
 void floaty_hover(void);
+
+/* floaty_app.c: the same, and the state says that nobody controls. */
+void floaty_lose_control(void);
 
 /* floaty_app.c: the tick of the last controller step; 0: none yet. */
 uint32_t floaty_controlled_tick(void);

@@ -22,7 +22,16 @@ FloatySetpoint floaty_setpoint_kind(const setpoint_t *setpoint) {
   return none ? FLOATY_SETPOINT_NONE : FLOATY_SETPOINT_OTHER;
 }
 
-void floaty_goal_move(FloatyGoal *goal, const setpoint_t *setpoint) {
+static float excess(const FloatyBox *box, const float place[3]) {
+  const float x = place[0] - box->home[0], y = place[1] - box->home[1], z = place[2] - box->home[2];
+  return fmaxf(fmaxf(sqrtf(x * x + y * y) - box->radius, 0.0f), fmaxf(-z - box->below, z - box->above));
+}
+
+bool floaty_goal_move(FloatyGoal *goal, const setpoint_t *setpoint, const FloatyBox *box) {
+  const float place[3] = {setpoint->position.x, setpoint->position.y, setpoint->position.z};
+  if (excess(box, place) > (goal->known ? excess(box, goal->position) : 0.0f)) {
+    return false;
+  }
   const quaternion_t *q = &setpoint->attitudeQuaternion;
   float yaw = goal->yaw;
   if (setpoint->mode.quat == modeAbs) {
@@ -30,11 +39,12 @@ void floaty_goal_move(FloatyGoal *goal, const setpoint_t *setpoint) {
   } else if (setpoint->mode.yaw == modeAbs) {
     yaw = RADIANS * setpoint->attitude.yaw;
   }
-  goal->position[0] = setpoint->position.x;
-  goal->position[1] = setpoint->position.y;
-  goal->position[2] = setpoint->position.z;
+  for (int i = 0; i < 3; i++) {
+    goal->position[i] = place[i];
+  }
   goal->yaw = isfinite(yaw) ? yaw : goal->yaw;
   goal->known = true;
+  return true;
 }
 
 void floaty_goal_see(FloatyGoal *goal, FloatyPose *pose) {

@@ -20,12 +20,20 @@ typedef enum {
   FLOATY_SETPOINT_NONE = 0,     /* nothing is commanded, the goal stays */
   FLOATY_SETPOINT_POSITION = 1, /* a position, perhaps with a yaw */
   FLOATY_SETPOINT_OTHER = 2,    /* attitude, rates, velocity, thrust: Floaty cannot follow */
+  FLOATY_SETPOINT_OUTSIDE = 3,  /* a position outside the box */
 } FloatySetpoint;
+
+/* Where goals may be, an upright cylinder around home; firmware_py/box.py. */
+typedef struct {
+  float radius, below, above; /* [m] */
+  float home[3];              /* [m] W */
+} FloatyBox;
 
 FloatySetpoint floaty_setpoint_kind(const setpoint_t *setpoint);
 
-/* Moves the goal to a set-point that is FLOATY_SETPOINT_POSITION; a yaw that it does not command stays. */
-void floaty_goal_move(FloatyGoal *goal, const setpoint_t *setpoint);
+/* Moves the goal to a set-point that is FLOATY_SETPOINT_POSITION; a yaw that it does not command stays. False, and the goal
+ * stays, when that would be further outside the box than the goal is. */
+bool floaty_goal_move(FloatyGoal *goal, const setpoint_t *setpoint, const FloatyBox *box);
 
 /* Turns a pose in W into the pose in G; geometry.in_goal_frame. */
 void floaty_goal_see(FloatyGoal *goal, FloatyPose *pose);

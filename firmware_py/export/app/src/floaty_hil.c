@@ -1,7 +1,9 @@
 /* See floaty_hil.h.
  *
- * Samples wait in a buffer that one task fills and another empties, each with a counter of its own. The first one is taken
- * when enough of them wait for the link's jitter; the host keeps its clock so that about as many go on waiting.
+ * Samples wait in a buffer that one task fills and another empties. Each variable is written by one task only: the
+ * receiving task begins a new stream when it sees that the stabilizer task has begun another mode, and the stabilizer task
+ * looks at no stream but that of its mode. The first sample is taken when enough of them wait for the link's jitter; the
+ * host keeps its clock so that about as many go on waiting.
  */
 #include "floaty_hil.h"
 
@@ -20,18 +22,24 @@ typedef struct {
 } Sample;
 
 static volatile uint8_t wanted;
-static uint8_t mode;
 static Sample buffer[BUFFER];
-static volatile uint16_t received; /* number of the next sample to come */
-static volatile uint16_t used;     /* number of the next one to take */
+
+/* Of the receiving task */
+static uint16_t first;             /* number of the stream's first sample */
+static volatile uint16_t received; /* samples of the stream */
 static volatile uint16_t lost, doubled;
 static uint16_t gap;               /* `received` when the last sample came that was not the next one */
+static volatile uint8_t stream;    /* the modes that had begun when the stream did; the last to be written */
+
+/* Of the stabilizer task */
+static volatile uint8_t mode;
+static volatile uint8_t modes;     /* begun so far */
+static volatile uint16_t used;     /* samples taken of the stream */
 static Sample taken;               /* last */
 static uint16_t late;              /* steps that took the last sample again */
 static volatile uint32_t held;     /* steps in which the flight stood still, ever */
 static uint32_t held_before;       /* this mode */
 static uint16_t silent_steps;
-static volatile bool begun;        /* a first sample has come */
 static bool running;               /* samples are taken */
 
 void floaty_hil_ask(uint8_t asked) {
@@ -47,9 +55,14 @@ uint32_t floaty_hil_held(void) {
   return held;
 }
 
+/* Whether a sample of this mode has come. */
+static bool begun(void) {
+  return stream == modes;
+}
+
 /* What is not the next sample is not taken: the host sends what is missing, and all behind it, again. */
 static bool put(uint16_t number, const Sample *sample) {
-  const int16_t ahead = (int16_t)(number - received);
+  const int16_t ahead = (int16_t)(number - first - received);
   if (ahead < 0) {
     doubled += 1;
     return true;
@@ -94,10 +107,12 @@ void floaty_hil_receive(const CRTPPacket *packet) {
   if (head.width != FLOATY_NARROW && head.width != FLOATY_WIDE) {
     return;
   }
-  if (!begun) {
-    received = used = head.number;
-    gap = (uint16_t)(received - 1);
-    begun = true;
+  const uint8_t present = modes;
+  if (stream != present) {
+    first = head.number;
+    received = lost = doubled = 0;
+    gap = UINT16_MAX;
+    stream = present;
   }
   Sample sample = {{head.x, head.y, head.z}};
   const uint8_t *step = packet->data + sizeof head;
@@ -115,16 +130,17 @@ bool floaty_hil_switched(void) {
   if (mode == wanted) {
     return false;
   }
-  received = used = lost = doubled = late = silent_steps = 0;
+  used = late = silent_steps = 0;
   held_before = held;
   memset(&taken, 0, sizeof taken);
-  running = begun = false;
+  running = false;
   mode = wanted;
+  modes += 1;
   return true;
 }
 
 bool floaty_hil_holds(void) {
-  const uint16_t waiting = (uint16_t)(received - used);
+  const uint16_t waiting = begun() ? (uint16_t)(received - used) : 0;
   if (mode == FLOATY_HIL_OFF) {
     return false;
   }
@@ -144,11 +160,12 @@ bool floaty_hil_holds(void) {
   return true;
 }
 
-void floaty_hil_sample(int32_t counts[3]) {
+bool floaty_hil_sample(int32_t counts[3]) {
   if (mode == FLOATY_HIL_OFF) {
-    return;
+    return true;
   }
-  if (silent_steps == 0) {
+  const bool fresh = silent_steps == 0;
+  if (fresh) {
     taken = buffer[used % BUFFER];
     used += 1;
   } else {
@@ -157,6 +174,7 @@ void floaty_hil_sample(int32_t counts[3]) {
   for (int axis = 0; axis < AXES; axis++) {
     counts[axis] = taken.counts[axis];
   }
+  return fresh;
 }
 
 void floaty_hil_tell(bool fresh) {
@@ -164,16 +182,17 @@ void floaty_hil_tell(bool fresh) {
   if (mode == FLOATY_HIL_OFF) {
     return;
   }
+  const bool come = begun();
   const FloatyWireLoop loop = {
-      .used = used,
-      .waiting = (uint8_t)(received - used),
-      .state = floaty_supervisor.state,
-      .cause = floaty_supervisor.cause,
+      .used = come ? (uint16_t)(first + used) : 0,
+      .waiting = come ? (uint8_t)(received - used) : 0,
+      .state = (uint8_t)floaty_supervisor.state,
+      .cause = (uint8_t)floaty_supervisor.cause,
       .fresh = fresh,
       .held = (uint16_t)(held - held_before),
       .late = late,
-      .lost = lost,
-      .doubled = doubled,
+      .lost = come ? lost : 0,
+      .doubled = come ? doubled : 0,
       .m1 = (uint16_t)floaty_control.count[0],
       .m2 = (uint16_t)floaty_control.count[1],
       .m3 = (uint16_t)floaty_control.count[2],

@@ -28,8 +28,9 @@ bool floaty_hil_holds(void);
 /* Any task: for how many steps the flight has stood still since the start. They count neither as steps nor as time. */
 uint32_t floaty_hil_held(void);
 
-/* The stabilizer task, once per step of the flight: puts the host's sample in place of the sensor's, if the mode says so. */
-void floaty_hil_sample(int32_t counts[3]);
+/* The stabilizer task, once per step of the flight: puts the host's sample in place of the sensor's, if the mode asks for it.
+ * False when that is the last one again, because the next one is late: the link's fault, not the gyro's. */
+bool floaty_hil_sample(int32_t counts[3]);
 
 /* The stabilizer task: tells the host; `fresh`: the controller has just run. */
 void floaty_hil_tell(bool fresh);

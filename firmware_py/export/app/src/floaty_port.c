@@ -1,7 +1,8 @@
 /* See floaty_port.h.
  *
- * Requests arrive in the task CRTP-RX, and are executed there. What flies is not touched, and while it flies nothing is
- * executed. A call is measured with the scheduler suspended: no other task runs in it, interrupts do.
+ * Requests arrive in the task CRTP-RX, and are executed there. What flies is not touched, and nothing is executed unless the
+ * robot is at rest. A call is measured with the scheduler suspended, 1.2 ms at most: no other task runs in it, interrupts
+ * do. So none is executed with hardware in the loop, whose flight would be late.
  */
 #include "floaty_port.h"
 
@@ -45,7 +46,7 @@ static uint32_t digest(void) {
 }
 
 static uint8_t hello(uint8_t wanted, uint8_t *body) {
-  FloatyWireAbout about = {FLOATY_VERSION, floaty_supervisor.state, sizeof memory, 0, CLOCK_MHZ, "", ""};
+  FloatyWireAbout about = {FLOATY_VERSION, (uint8_t)floaty_supervisor.state, sizeof memory, 0, CLOCK_MHZ, "", ""};
   if (wanted != session) {
     session = wanted;
     done = 0;
@@ -108,7 +109,7 @@ static int read_memory(const uint8_t *data, uint32_t length, uint8_t *body) {
 }
 
 static int call(const uint8_t *data, uint32_t length, uint16_t number, bool is_new, uint8_t *body) {
-  if (length < sizeof(FloatyWireCall) || data[0] > FLOATY_CALL_CONTROL) {
+  if (length < sizeof(FloatyWireCall) || data[0] >= FLOATY_CALLS) {
     return REFUSED(OUTSIDE);
   }
   if (is_new) {
@@ -138,7 +139,7 @@ static int health(uint8_t *body) {
       .gyro_x = (int16_t)gyro[0],
       .gyro_y = (int16_t)gyro[1],
       .gyro_z = (int16_t)gyro[2],
-      .calibrated = floaty_supervisor.calibrated,
+      .calibrated = (uint8_t)floaty_sampling.calibrated,
       .battery_mv = (uint16_t)(1000.0f * pmGetBatteryVoltage()),
       .heap_free = (uint32_t)xPortGetFreeHeapSize(),
       .m1 = (uint16_t)floaty_control.count[0],
@@ -160,9 +161,12 @@ static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t lengt
   if (head->session != session || session == 0) {
     return REFUSED(NO_SESSION);
   }
-  if (floaty_supervisor.state == FLOATY_FLYING && floaty_hil_mode() == FLOATY_HIL_OFF &&
-      head->kind != FLOATY_KIND_HEALTH) {
+  const bool in_the_loop = floaty_hil_mode() != FLOATY_HIL_OFF;
+  if (!in_the_loop && floaty_supervisor.aloft && head->kind != FLOATY_KIND_HEALTH) {
     return REFUSED(FLYING);
+  }
+  if (in_the_loop && head->kind == FLOATY_KIND_CALL) {
+    return REFUSED(LOOP);
   }
   if (ahead > 0) {
     return NO_ANSWER; /* one before it was lost: the host sends both again */

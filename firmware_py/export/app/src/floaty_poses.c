@@ -8,12 +8,15 @@
 #define AGE_UNIT_US 500
 #define AGE_UNKNOWN_CODE 255
 #define FAR 1000.0f /* [m] no pose, and false for NaN, too */
+#define SIDEWAYS 0.9f /* [m] from the goal */
+#define BELOW 2.0f
+#define ABOVE 1.0f
 #define NORM2_MIN (0.9f * 0.9f)
 #define NORM2_MAX (1.1f * 1.1f)
 
-bool floaty_pose_decode(const uint8_t *data, uint32_t length, int64_t arrival_us, FloatyPose *pose) {
+bool floaty_pose_decode(const uint8_t *data, uint32_t length, int32_t arrival_us, FloatyPose *pose) {
   float value[7];
-  if (length < POSE_SIZE || data[0] != FLOATY_EXT_POSE) {
+  if ((length != POSE_SIZE && length != POSE_SIZE + 1) || data[0] != FLOATY_EXT_POSE) {
     return false;
   }
   memcpy(value, data + 1, sizeof value);
@@ -35,4 +38,9 @@ bool floaty_pose_decode(const uint8_t *data, uint32_t length, int64_t arrival_us
   pose->age_us = code == AGE_UNKNOWN_CODE ? FLOATY_AGE_UNKNOWN : code * AGE_UNIT_US;
   pose->arrival_us = arrival_us;
   return true;
+}
+
+bool floaty_pose_is_correction(const FloatyPose *pose) {
+  const float x = pose->position[0], y = pose->position[1], z = pose->position[2];
+  return sqrtf(x * x + y * y) <= SIDEWAYS && -BELOW <= z && z <= ABOVE;
 }

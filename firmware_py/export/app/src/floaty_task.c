@@ -33,6 +33,7 @@
 #define EMERGENCY_STOP_WATCHDOG 4
 #define STALE_MS 50 /* without a controller step: servos to hover */
 #define LOOK_MS 20  /* how often the task looks at that */
+#define POSE_LINE_MS 10000 /* between lines about poses that are refused */
 #define SELF_TEST_MS 100
 #define SELF_TEST_LOOKS 50 /* 5 s; the self-test ends 2.4 s after a reset, later with decks */
 
@@ -40,12 +41,17 @@ static bool restarted; /* by the watchdog or a failed assert */
 static StackType_t stack[CONFIG_APP_STACKSIZE]; /* in ordinary memory: CCM is full */
 static StaticTask_t task;
 
+static volatile bool impossible; /* a pose came that cannot be a correction */
+
 static void receive_pose(const uint8_t *data, uint32_t length) {
   FloatyPose pose;
-  if (floaty_pose_decode(data, length, floaty_pose_clock_us(), &pose)) {
-    floaty_queue_pose(&pose);
-  } else {
+  if (!floaty_pose_decode(data, length, floaty_pose_clock_us(), &pose)) {
     floaty_observed.malformed += 1;
+  } else if (!floaty_poses_absolute() && !floaty_pose_is_correction(&pose)) {
+    floaty_observed.malformed += 1;
+    impossible = true;
+  } else {
+    floaty_queue_pose(&pose);
   }
 }
 
@@ -53,9 +59,9 @@ static void receive_localisation(CRTPPacket *packet) {
   if (packet->channel != CHANNEL_GENERIC || packet->size < 1) {
     return; /* a position without attitude is no pose */
   }
-  if (packet->data[0] == EMERGENCY_STOP) {
+  if (packet->data[0] == EMERGENCY_STOP && packet->size == 1) {
     crtpSupervisorSetEmergencyStop(); /* as port 9 */
-  } else if (packet->data[0] == EMERGENCY_STOP_WATCHDOG) {
+  } else if (packet->data[0] == EMERGENCY_STOP_WATCHDOG && packet->size == 1) {
     crtpSupervisorNotifyEmergencyStopWatchdog();
   } else {
     receive_pose(packet->data, packet->size);
@@ -66,9 +72,9 @@ static void announce_state(void) {
   static const char *const STATES[] = {"calibrating", "waiting", "flying", "failsafe"};
   static const char *const CAUSES[] = {"",           ", silence",  ", out of bounds", ", emergency stop",
                                        ", low battery", ", disarmed", ", no control",
-                                       ", controller not finite", ", estimator not finite"};
-  static uint8_t state = FLOATY_CALIBRATING, cause = FLOATY_NONE;
-  const uint8_t new_state = floaty_supervisor.state, new_cause = floaty_supervisor.cause;
+                                       ", controller not finite", ", estimator not finite", ", imu stale"};
+  static int32_t state = FLOATY_STATE_CALIBRATING, cause = FLOATY_CAUSE_NONE;
+  const int32_t new_state = floaty_supervisor.state, new_cause = floaty_supervisor.cause;
   if (new_state != state || new_cause != cause) {
     state = new_state;
     cause = new_cause;
@@ -77,14 +83,30 @@ static void announce_state(void) {
 }
 
 static void announce_setpoint(void) {
-  static bool refused;
+  static const char *refused;
   const uint8_t setpoint = floaty_observed.setpoint;
-  const bool refuse = setpoint == FLOATY_SETPOINT_OTHER || (setpoint == FLOATY_SETPOINT_POSITION && !floaty_absolute);
-  if (refuse && !refused) {
-    DEBUG_PRINT("set-point not followed: %s\n",
-                floaty_absolute ? "only positions are" : "poses are corrections, see extPose.absolute");
+  const char *why = NULL;
+  if (setpoint != FLOATY_SETPOINT_NONE && !floaty_poses_absolute()) {
+    why = "poses are corrections, see extPose.absolute";
+  } else if (setpoint == FLOATY_SETPOINT_OTHER) {
+    why = "only positions are";
+  } else if (setpoint == FLOATY_SETPOINT_OUTSIDE) {
+    why = "it leaves the box, see box.radius, box.below and box.above";
   }
-  refused = refuse;
+  if (why != NULL && why != refused) {
+    DEBUG_PRINT("set-point not followed: %s\n", why);
+  }
+  refused = why;
+}
+
+static void announce_poses(void) {
+  static TickType_t announced;
+  const TickType_t now = xTaskGetTickCount();
+  if (impossible && (announced == 0 || now - announced >= M2T(POSE_LINE_MS))) {
+    DEBUG_PRINT("pose refused: no correction is that large; for absolute poses set extPose.absolute 1\n");
+    announced = now;
+  }
+  impossible = false;
 }
 
 /* A loop that stands still, or a controller that is not Floaty's. */
@@ -96,8 +118,7 @@ static void watch_control(void) {
   } else if (!stale) {
     stale = true;
     floaty_observed.stale_hovers += 1;
-    floaty_supervisor_lose_control(&floaty_supervisor);
-    floaty_hover();
+    floaty_lose_control();
   }
 }
 
@@ -135,6 +156,7 @@ static void app_task(void *unused) {
     watch_control();
     announce_state();
     announce_setpoint();
+    announce_poses();
   }
 }
 
@@ -144,5 +166,6 @@ void appInit(void) {
   const bool after_watchdog = !watchdogNormalStartTest();
   const bool after_assert = !cfAssertNormalStartTest();
   restarted = after_watchdog || after_assert;
+  floaty_supervisor.flown = restarted; /* perhaps in the air */
   xTaskCreateStatic(app_task, "APP", CONFIG_APP_STACKSIZE, NULL, CONFIG_APP_PRIORITY, stack, &task);
 }

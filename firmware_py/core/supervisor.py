@@ -1,0 +1,296 @@
+"""The supervisor decides, before every step of the controller, whether the loop may be closed.
+
+Whatever forbids it leads to the same defined flap state, the hover angles. How it ends depends on the cause:
+
+    imu stale       no new counts of the gyro for 20 ms: ends after 100 ms with new ones
+    silence         no accepted pose for 500 ms (parameter): the next accepted pose ends it
+    out of bounds   the estimator was held at its bounds for 200 ms: ends after 500 ms inside them
+    disarmed        by request: ends with the request to arm
+    not finite      own logic returned NaN or infinity, the controller or the estimator: ends with a request to recover
+    emergency stop  by request, or because a started emergency stop watchdog was not fed for 1 s: ends only with a reboot.
+                    A stop that is not locked ends with a request to recover, too
+    low battery     below the limit for 5 s: ends only with a request to recover when the voltage is back above it
+    no control      nobody has asked for the mode: ends when somebody does
+
+Before the first pose, and while there is nothing to fly to, it waits. One outlier pose is refused by the estimator's gate
+and has no effect here. Times are counted from look to look, so that a clock that wraps does no harm.
+"""
+
+from firmware_py.core.poses import LONG_US, waited_us
+from firmware_py.core.structs import (
+    CAUSE_DISARMED,
+    CAUSE_EMERGENCY_STOP,
+    CAUSE_IMU_STALE,
+    CAUSE_LOW_BATTERY,
+    CAUSE_NO_CONTROL,
+    CAUSE_NONE,
+    CAUSE_OUT_OF_BOUNDS,
+    CAUSE_SILENCE,
+    MANUAL_ANGLES,
+    MANUAL_HOVER,
+    MODE_FLY,
+    MODE_HOVER,
+    MODE_MANUAL,
+    REQUEST_ARM,
+    REQUEST_DISARM,
+    REQUEST_FEED,
+    REQUEST_LOCK,
+    REQUEST_RECOVER,
+    REQUEST_STOP,
+    STATE_CALIBRATING,
+    STATE_FAILSAFE,
+    STATE_FLYING,
+    STATE_WAITING,
+    Estimator,
+    Input,
+    Parameters,
+    Sampling,
+    Supervisor,
+)
+from firmware_py.core.subset import Integer, elapsed, i32, kernel
+
+WATCHDOG_US = 1000000  # Crazyflie firmware
+BATTERY_LOW_US = 5000000  # original firmware
+EPISODE_GAP_US = 50000  # two bounded steps no further apart belong to one episode
+EPISODE_LIMIT_US = 200000
+BOUNDS_RECOVERY_US = 500000
+DOWN_US = 5000000  # disarmed or stopped for so long, the robot lies in the net or is held
+
+
+@kernel
+def longer(time_us: Integer, by_us: Integer) -> i32:
+    """Return a time that has grown, up to the longest."""
+    if time_us + by_us > LONG_US:
+        return i32(LONG_US)
+    return i32(time_us + by_us)
+
+
+@kernel
+def shorter(time_us: Integer, by_us: Integer) -> i32:
+    """Return a time that runs out; below 0 it is over."""
+    if time_us < by_us:
+        return i32(-1)
+    return i32(time_us - by_us)
+
+
+@kernel
+def since_last_look(data: Input, supervisor: Supervisor) -> i32:
+    """Return by how much an instant is behind the last look, negative when it is before it."""
+    if supervisor.begun == 0:
+        return i32(0)
+    time_us = elapsed(data.now_us, supervisor.now_us)
+    if time_us > LONG_US:
+        return i32(LONG_US)
+    if time_us < -LONG_US:
+        return i32(-LONG_US)
+    return time_us
+
+
+@kernel
+def pass_time(data: Input, supervisor: Supervisor) -> None:
+    """Let the time since the last look pass."""
+    by_us = since_last_look(data, supervisor)
+    if by_us < 0:
+        by_us = i32(0)
+    supervisor.begun = i32(1)
+    supervisor.now_us = data.now_us
+    supervisor.silent_us = longer(supervisor.silent_us, by_us)
+    supervisor.low_us = longer(supervisor.low_us, by_us)
+    supervisor.down_us = longer(supervisor.down_us, by_us)
+    supervisor.watchdog_us = longer(supervisor.watchdog_us, by_us)
+    supervisor.episode_us = longer(supervisor.episode_us, by_us)
+    supervisor.gap_us = shorter(supervisor.gap_us, by_us)
+    supervisor.outside_us = shorter(supervisor.outside_us, by_us)
+
+
+@kernel
+def watch_bounds(estimator: Estimator, supervisor: Supervisor) -> None:
+    """Notice when the estimator has been held at its bounds for too long."""
+    if estimator.bounded == supervisor.bounded:
+        return
+    supervisor.bounded = estimator.bounded
+    if supervisor.gap_us < 0:
+        supervisor.episode_us = i32(0)
+    supervisor.gap_us = i32(EPISODE_GAP_US)
+    if supervisor.episode_us >= EPISODE_LIMIT_US or supervisor.outside_us > 0:
+        supervisor.outside_us = i32(BOUNDS_RECOVERY_US)
+
+
+@kernel
+def watch_battery(parameters: Parameters, data: Input, supervisor: Supervisor) -> None:
+    """Notice a voltage that has been too low for too long."""
+    if data.battery_mv >= parameters.low_battery_mv:
+        supervisor.low_us = i32(0)
+    elif supervisor.low_us >= BATTERY_LOW_US:
+        supervisor.battery_empty = i32(1)
+
+
+@kernel
+def lasting_cause(supervisor: Supervisor) -> i32:
+    """Return what neither poses nor arming end."""
+    if supervisor.stopped != 0:
+        return i32(CAUSE_EMERGENCY_STOP)
+    if supervisor.not_finite != CAUSE_NONE:
+        return i32(supervisor.not_finite)
+    if supervisor.battery_empty != 0:
+        return i32(CAUSE_LOW_BATTERY)
+    return i32(CAUSE_NONE)
+
+
+@kernel
+def look_whether_ready(sampling: Sampling, supervisor: Supervisor) -> None:
+    """Note what lasts, and whether the robot would fly with poses and an IMU."""
+    supervisor.lasting = lasting_cause(supervisor)
+    supervisor.ready = i32(0)
+    if sampling.calibrated != 0 and supervisor.armed != 0 and supervisor.lasting == CAUSE_NONE:
+        supervisor.ready = i32(1)
+
+
+@kernel
+def is_waiting(data: Input, supervisor: Supervisor) -> bool:
+    """Return whether there is no pose yet, or nothing to fly to."""
+    return bool(supervisor.pose_seen == 0 or data.idle != 0)
+
+
+@kernel
+def cause_of_failsafe(parameters: Parameters, data: Input, sampling: Sampling, supervisor: Supervisor) -> i32:
+    """Return what forbids to close the loop, `CAUSE_NONE` while that is only what the robot waits for."""
+    if supervisor.lasting != CAUSE_NONE:
+        return i32(supervisor.lasting)
+    if supervisor.armed == 0:
+        return i32(CAUSE_DISARMED)
+    if sampling.calibrated == 0 or is_waiting(data, supervisor):
+        return i32(CAUSE_NONE)
+    if sampling.recovering > 0:
+        return i32(CAUSE_IMU_STALE)
+    if supervisor.silent_us >= parameters.pose_timeout_us:
+        return i32(CAUSE_SILENCE)
+    if supervisor.outside_us > 0:
+        return i32(CAUSE_OUT_OF_BOUNDS)
+    return i32(CAUSE_NONE)
+
+
+@kernel
+def state_of(data: Input, sampling: Sampling, supervisor: Supervisor, cause: Integer) -> i32:
+    """Return the state that a cause leads to."""
+    if cause != CAUSE_NONE:
+        return i32(STATE_FAILSAFE)
+    if sampling.calibrated == 0:
+        return i32(STATE_CALIBRATING)
+    if is_waiting(data, supervisor):
+        return i32(STATE_WAITING)
+    return i32(STATE_FLYING)
+
+
+@kernel
+def mode_of(data: Input, supervisor: Supervisor) -> i32:
+    """Return the mode that follows from state, cause and who moves the flaps."""
+    if supervisor.cause > CAUSE_OUT_OF_BOUNDS or data.manual_mode == MANUAL_HOVER:
+        return i32(MODE_HOVER)
+    if data.manual_mode == MANUAL_ANGLES:
+        if data.connected != 0:
+            return i32(MODE_MANUAL)
+        return i32(MODE_HOVER)  # nobody is there who could take the angles back
+    if supervisor.state == STATE_FLYING:
+        return i32(MODE_FLY)
+    return i32(MODE_HOVER)
+
+
+@kernel
+def watch_rest(data: Input, supervisor: Supervisor) -> None:
+    """Notice when the robot is at rest: it has not flown, or was taken out of the flight long enough to be down."""
+    if supervisor.state == STATE_FLYING:
+        supervisor.flown = i32(1)
+    if supervisor.armed != 0 and supervisor.stopped == 0:
+        supervisor.down_us = i32(0)
+    supervisor.aloft = i32(1)
+    if data.mode == MODE_HOVER and (supervisor.flown == 0 or supervisor.down_us >= DOWN_US):
+        supervisor.aloft = i32(0)
+
+
+@kernel
+def supervise(
+    parameters: Parameters, data: Input, estimator: Estimator, sampling: Sampling, supervisor: Supervisor
+) -> i32:
+    """Decide the controller's mode at this instant; returns whether state or cause has changed. Call it every tick."""
+    pass_time(data, supervisor)
+    watch_bounds(estimator, supervisor)
+    watch_battery(parameters, data, supervisor)
+    if supervisor.watchdog_on != 0 and supervisor.watchdog_us >= WATCHDOG_US:
+        supervisor.stopped = i32(1)
+        supervisor.locked = i32(1)
+    look_whether_ready(sampling, supervisor)
+    cause = cause_of_failsafe(parameters, data, sampling, supervisor)
+    state = state_of(data, sampling, supervisor, cause)
+    changed = i32(0)
+    if state != supervisor.state or cause != supervisor.cause:
+        changed = i32(1)
+    supervisor.state = state
+    supervisor.cause = cause
+    data.mode = mode_of(data, supervisor)
+    watch_rest(data, supervisor)
+    return changed
+
+
+@kernel
+def see_pose(data: Input, supervisor: Supervisor) -> None:
+    """Note that a pose was accepted."""
+    supervisor.pose_seen = i32(1)
+    supervisor.silent_us = i32(waited_us(data) - since_last_look(data, supervisor))
+
+
+@kernel
+def recover(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
+    """Leave what lasts: a stop that is not locked, logic that failed, and with a good voltage the low battery."""
+    supervisor.stopped = supervisor.locked
+    supervisor.not_finite = i32(CAUSE_NONE)
+    if data.battery_mv >= parameters.low_battery_mv:
+        supervisor.battery_empty = i32(0)
+        supervisor.low_us = i32(0)
+    if supervisor.battery_empty != 0:
+        return i32(0)
+    return i32(1)
+
+
+@kernel
+def obey(parameters: Parameters, data: Input, supervisor: Supervisor) -> i32:
+    """Do what is requested; returns whether that was possible."""
+    if data.request == REQUEST_RECOVER:
+        return recover(parameters, data, supervisor)
+    if data.request == REQUEST_ARM and lasting_cause(supervisor) != CAUSE_NONE:
+        return i32(0)
+    if data.request == REQUEST_STOP:
+        supervisor.stopped = i32(1)
+    elif data.request == REQUEST_LOCK:
+        supervisor.stopped = i32(1)
+        supervisor.locked = i32(1)
+    elif data.request == REQUEST_ARM:
+        supervisor.armed = i32(1)
+    elif data.request == REQUEST_DISARM:
+        supervisor.armed = i32(0)
+    elif data.request == REQUEST_FEED:
+        supervisor.watchdog_on = i32(1)
+        supervisor.watchdog_us = i32(-since_last_look(data, supervisor))
+    return i32(1)
+
+
+@kernel
+def serve(parameters: Parameters, data: Input, sampling: Sampling, supervisor: Supervisor) -> i32:
+    """Serve a request; returns whether it was obeyed."""
+    obeyed = obey(parameters, data, supervisor)
+    look_whether_ready(sampling, supervisor)
+    return obeyed
+
+
+@kernel
+def lose_control(supervisor: Supervisor) -> None:
+    """Note that nobody asks for the mode any more; the next look says otherwise."""
+    supervisor.state = i32(STATE_FAILSAFE)
+    supervisor.cause = i32(CAUSE_NO_CONTROL)
+
+
+@kernel
+def begin_flight(supervisor: Supervisor) -> None:
+    """Forget the last flight: its poses, and that there was one."""
+    supervisor.pose_seen = i32(0)
+    supervisor.flown = i32(0)

@@ -1,0 +1,100 @@
+"""The C compilers of this machine, and what they make of texts, which is kept by a hash of all that it was made from."""
+
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from firmware_py.export.errors import ExportError
+from firmware_py.extras import install_command
+
+SYSTEM_COMPILERS = ("gcc", "clang", "cc")
+HOST_FLAGS = ("-O2", "-shared", "-fPIC", "-std=c99", "-fno-sanitize=all", "-Wall", "-Wextra", "-Werror")
+
+
+@dataclass(frozen=True, slots=True)
+class Compiler:
+    """A C compiler: its short name, the words of its command, and what it says about its version."""
+
+    name: str
+    command: tuple[str, ...]
+    version: str
+
+
+def zig() -> Compiler:
+    """Return the clang inside the package `ziglang`. Raises `ExportError` when that is missing."""
+    try:
+        return Compiler("zig", (sys.executable, "-m", "ziglang", "cc"), version("ziglang"))
+    except PackageNotFoundError:
+        raise ExportError(f"the compiler ziglang is missing: {install_command('deploy')}") from None
+
+
+def compilers() -> Iterator[Compiler]:
+    """Yield the C compilers of this machine, ziglang first."""
+    if importlib.util.find_spec("ziglang"):
+        yield zig()
+    for name in SYSTEM_COMPILERS:
+        path = shutil.which(name)
+        if path:
+            yield Compiler(name, (path,), _version(path))
+
+
+def find_compiler(name: str = "") -> Compiler:
+    """Return the compiler of that name, or the first one; raises `ExportError` if there is none."""
+    for compiler in compilers():
+        if name in ("", compiler.name):
+            return compiler
+    raise ExportError(
+        f"no C compiler{' ' + name if name else ''} on this machine: {install_command('deploy')}"
+    )
+
+
+def compile_texts(
+    texts: dict[str, str],
+    inputs: Sequence[str],
+    flags: Sequence[str],
+    output: str,
+    folder: Path,
+    compiler: Compiler,
+) -> Path:
+    """Compile texts in a folder of their own, unless that was done before; returns the path of the output.
+
+    Raises `ExportError` with the compiler's first complaint.
+    """
+    folder, command = folder.absolute(), (*compiler.command, *flags)
+    made_from = repr((compiler.version, sys.platform, command, sorted(texts.items()), inputs))
+    place = folder / hashlib.sha256(made_from.encode()).hexdigest()[:16]
+    result = place / output
+    if result.is_file():
+        return result
+    partial = f"{output}.{os.getpid()}"  # another process may be at it
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            (place / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ExportError(f"{place}: cannot be written ({error.strerror or error})") from None
+    caches = {name: str(folder / "zig") for name in ("ZIG_LOCAL_CACHE_DIR", "ZIG_GLOBAL_CACHE_DIR")}
+    done = _run((*command, "-o", partial, *inputs), cwd=place, env=os.environ | caches)
+    if done.returncode:
+        complaints = [line for line in done.stderr.splitlines() if "error" in line]
+        raise ExportError(f"{compiler.name}: {(complaints or [f'exit {done.returncode}'])[0]}")
+    (place / partial).replace(result)
+    return result
+
+
+@cache
+def _version(path: str) -> str:
+    return _run((path, "--version")).stdout.strip()
+
+
+def _run(command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)

@@ -1,0 +1,158 @@
+"""Goals from MAVLink clients, and the board's two modes; runs in the receiving task.
+
+Hold: the robot flies at the last goal; a target of any client moves it.
+Offboard: started by a client, whose targets alone are then obeyed. When none has arrived for 0.5 s, the board returns to
+Hold and stays at the last goal.
+
+Goals are in W. Poses from MAVLink are compared with `goal` itself. Poses from CRTP pass the pilot, which is led then; its
+origin is home while they are corrections.
+"""
+
+from collections.abc import Sequence
+
+from firmware_py.geometry import Vector
+from firmware_py.links.mavlink_stack import INFO, WARNING, MavlinkStack, Task
+from firmware_py.pilot import Pilot
+from firmware_py.planner import stay
+from firmware_py.rtos import FOREVER, TICK_US
+from firmware_py.wire import WireError, mavlink
+from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.mavlink_numbers import Command, Mode, Result
+
+SILENCE_US = 500_000  # of set-points, which ends offboard; PX4: COM_OF_LOSS_T is 1 s
+
+Source = tuple[int, int]  # system and component
+Goal = tuple[Vector, float]  # position in W [m] and yaw [rad]
+
+
+class SetpointService:
+    """`mode` is the one in force."""
+
+    def __init__(self, stack: MavlinkStack, pilot: Pilot, home: Vector) -> None:
+        self.mode = Mode.HOLD
+        self._goal: Goal = (home, 0.0)
+        self._seen_from = self._goal  # by the last pose from MAVLink
+        self._seen_us = -1  # when that came
+        self._stack = stack
+        self._pilot = pilot
+        self._home = home
+        self._leader: Source | None = None  # in offboard
+        self._led_us = 0  # when its last set-point came
+        self._started = stack.kernel.create_binary_semaphore("mavOffboard")
+        stack.handle(mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED, self._take_target)
+        stack.handle(mavlink.MSG_SET_MODE, self._take_mode)
+        stack.kernel.create_task("MAV-MODE", 1, self._watch)
+
+    def choose(self, command: Message) -> tuple[Result, Sequence[Message]]:
+        """Obey MAV_CMD_DO_SET_MODE: the custom mode as one number or, as for PX4, as main and sub-mode.
+
+        A mode that the board lacks is a wrong parameter of a command that it serves.
+        """
+        main, sub = command.param2, command.param3
+        for mode in Mode:
+            if main == mode or (main, sub) == (mode >> 16 & 0xFF, mode >> 24):
+                return Result.ACCEPTED, self._enter(mode, _source(command))
+        return Result.DENIED, ()
+
+    def see_pose(self) -> Goal:
+        """Return the goal that a pose from MAVLink, which has just arrived, is to be seen from."""
+        self._seen_from, self._seen_us = self._goal, self._stack.kernel.now_us
+        return self._goal
+
+    @property
+    def goal(self) -> Goal:
+        """Where to fly."""
+        return self.frame if self._piloted else self._goal
+
+    @property
+    def frame(self) -> Goal:
+        """The origin of the estimate: the goal that the last pose was seen from."""
+        if not self._piloted:
+            return self._seen_from
+        motion = self._pilot.frame(self._stack.kernel.now_us)
+        if motion is None:
+            return self._home, 0.0
+        x, y, z = motion.position
+        ox, oy, oz = self._origin
+        return (x + ox, y + oy, z + oz), motion.yaw
+
+    @property
+    def _piloted(self) -> bool:
+        """Whether poses come from CRTP."""
+        return self._pilot.seen_us > self._seen_us
+
+    def _take_target(self, message: Message) -> None:
+        target, source, now_us = mavlink.read_target(message), _source(message), self._stack.kernel.now_us
+        if self._leader not in (None, source):
+            raise WireError("target refused: another client is in offboard")
+        p_WG, yaw = self._goal
+        if target.p_WG is not None and self._excess(target.p_WG) > self._excess(p_WG):
+            raise WireError("target refused: outside the box, see BOX_RADIUS, BOX_BELOW and BOX_ABOVE")
+        self._goal = (
+            p_WG if target.p_WG is None else target.p_WG,
+            yaw if target.yaw is None else target.yaw,
+        )
+        self._led_us = now_us
+        if self._piloted:
+            self._lead(now_us)
+        if target.moves:
+            self._stack.notice(message, "only position and yaw of targets are flown")
+
+    def _excess(self, p_WG: Vector) -> float:
+        """How far a goal is outside the box [m]: from there the robot may return."""
+        return self._pilot.box.excess(p_WG, self._home)
+
+    def _lead(self, now_us: int) -> None:
+        """Let the pilot fly to the goal."""
+        (x, y, z), yaw = self._goal
+        ox, oy, oz = self._origin
+        self._pilot.follow(stay((x - ox, y - oy, z - oz), yaw), now_us)
+
+    @property
+    def _origin(self) -> Vector:
+        """Where the origin of the pilot's frame is in W."""
+        return (0.0, 0.0, 0.0) if self._pilot.absolute else self._home
+
+    def _take_mode(self, message: Message) -> None:
+        """SET_MODE, which MAV_CMD_DO_SET_MODE has replaced."""
+        number, source = message.custom_mode, _source(message)
+        known = number in tuple(Mode)
+        result = Result.ACCEPTED if known else Result.DENIED
+        self._stack.reply(mavlink.command_ack(Command.DO_SET_MODE, result, *source))
+        for answer in self._enter(Mode(number), source) if known else ():
+            self._stack.reply(answer)
+
+    def _enter(self, mode: Mode, source: Source) -> Sequence[Message]:
+        if mode is Mode.OFFBOARD:
+            self._leader, self._led_us = source, self._stack.kernel.now_us
+            self._started.give_nowait()
+        else:
+            self._leader = None
+        return self._change(mode, INFO, f"mode: {mode.name.lower()}")
+
+    def _change(self, mode: Mode, severity: int, text: str) -> Sequence[Message]:
+        """Change the mode; returns the news for all clients."""
+        texts = () if mode is self.mode else mavlink.status_text(severity, text)
+        self.mode = mode
+        return (*texts, mavlink.current_mode(mode))
+
+    def _watch(self) -> Task:
+        """Leave offboard when its set-points stop."""
+        kernel = self._stack.kernel
+        while True:
+            if self._leader is None:
+                yield from self._started.take(FOREVER)
+                continue
+            left_us = self._led_us + SILENCE_US - kernel.now_us
+            if left_us > 0:
+                yield from kernel.delay(-(-left_us // TICK_US))
+            else:
+                self._leader = None
+                for news in self._change(
+                    Mode.HOLD, WARNING, "offboard left: no set-points for 0.5 s, holding"
+                ):
+                    yield from self._stack.offer(news)
+
+
+def _source(message: Message) -> Source:
+    return message.get_srcSystem(), message.get_srcComponent()

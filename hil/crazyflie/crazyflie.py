@@ -1,0 +1,198 @@
+"""A Crazyflie from power-on: the microcontroller with an image, the parts around it, and its radio chip's end of the line.
+
+Of the image it knows what all of Bitcraze's firmware has: a console, the clock of usec_time.c, `assertFail`.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from hil.crazyflie import syslink
+from hil.crazyflie.parts import RADIO_BUSY, SYSLINK_USART, Parts
+from hil.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why
+from hil.stm32f405.crash import Crash, CrashReports
+from hil.stm32f405.freertos import FreeRtos
+from hil.stm32f405.gdb import DebuggedChip, GdbServer
+from hil.stm32f405.image import Image
+from hil.stm32f405.processor import Processor
+
+BATTERY_PERIOD_US = 100_000
+LOOK_PERIOD_US = 100_000  # for tasks that do not wait
+# So long is a hang (a start waits busily for 0.2 s); so long explains a crash.
+HANG_US, AT_CRASH_US = 1_000_000, 5_000
+# On an idle radio link; the nRF51 passes every packet on, also an empty one. Not between the packets of a busy link: a host
+# polls once per exchange, and more than one frame per tick overflows the queue of a Crazyflie that starts, whose firmware
+# switches to SYSLINK only at its tick after a transfer (its DMA interrupt gives a semaphore and does not yield).
+POLL_PERIOD_US = 2_000
+CONSOLE, CONSOLE_MASK = 0x00, 0xF3
+CLOCK_HIGH, TIM7_COUNT = "usecTimerHighCount", 0x4000_1424  # of the firmware's usec_time.c
+ASSERTION = "assertFail"
+SERVOS = ((4, 2), (2, 0), (2, 1), (4, 3))  # M1 to M4: TIM5_CH3, TIM3_CH1, TIM3_CH2, TIM5_CH4, counted from 0
+
+
+class Surroundings(Protocol):
+    """Where the board's pins lead to."""
+
+    eeprom: bytearray
+
+    def read_battery_mv(self) -> int:
+        """Return the supply voltage."""
+
+    def write_compare(self, counts: Sequence[int]) -> None:
+        """Take the compare counts of the timers of M1 to M4."""
+
+    def radio_send(self, data: bytes) -> bool:
+        """Take a packet to the host; False while the radio's queue is full."""
+
+    def debug_write(self, text: str) -> None:
+        """Take a line of the console, or what happened to the processor."""
+
+
+class Crazyflie:
+    """One board; `polls`: radio packets without contents come by themselves, as with a host that only listens."""
+
+    def __init__(
+        self,
+        image: Image,
+        library: Path,
+        outside: Surroundings,
+        polls: bool,
+        debugger: GdbServer | None = None,
+    ) -> None:
+        self.image = image
+        self.chip = chip = Chip(image.code, image.base, library, image.constants)
+        self.parts = Parts(chip, np.frombuffer(outside.eeprom, np.uint8))
+        self.tasks = FreeRtos.of(image, chip.read)
+        run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
+        self.processor = Processor(chip, self.tasks, self._act, run)
+        self.resets = {WATCHDOG: 0, SOFTWARE: 0}  # by cause, since power-on
+        self._outside = outside
+        self._crashes = CrashReports(image, chip, self.tasks, ASSERTION)
+        chip.crash_points |= self._crashes.addresses
+        self._crashed = False  # since the reset
+        self._hanging: set[int] = set()  # tasks, since the reset
+        self._decoder = syslink.Decoder()
+        self._waiting: list[bytes] = []  # for the nRF51, whose queue is full
+        self._line = b""
+        self._counts: tuple[int, ...] = ()
+        self._unknown = 0
+        self._heard_us = 0  # the last packet of the radio, by the chip's time
+        self.processor.every(BATTERY_PERIOD_US, self._report_battery)
+        self.processor.every(LOOK_PERIOD_US, lambda now_us: self._look_for_hang(HANG_US))
+        if polls:
+            self.processor.every(POLL_PERIOD_US, self._poll_idle_link)
+
+    def radio_received(self, data: bytes, broadcast: bool = False) -> None:
+        """The radio chip has a packet: it comes over the serial line, and fetches one."""
+        self._flush()
+        self._heard_us = self.chip.now_us
+        kind = syslink.RAW_BROADCAST if broadcast else syslink.RAW
+        self.chip.feed(SYSLINK_USART, syslink.encode(kind, data))
+
+    def _poll_idle_link(self, now_us: int) -> None:
+        if now_us - self._heard_us >= POLL_PERIOD_US:
+            self.radio_received(syslink.EMPTY)
+
+    def report_unknown(self) -> None:
+        """Say which peripherals the image has used that are not there."""
+        state = self.chip.state
+        for address in state.unknown[self._unknown : state.unknown_count]:
+            self._outside.debug_write(
+                f"the image uses a peripheral that is not modelled, at 0x{address:08x}: it reads as 0"
+            )
+        self._unknown = state.unknown_count
+
+    @property
+    def clock_us(self) -> int | None:
+        """Return the firmware's own microseconds, a 16-bit timer and how often it has overflowed; None without it.
+
+        A read while the timer carries may be 65 ms short.
+        """
+        if not self.image.has(CLOCK_HIGH):
+            return None
+        high, low = (self.chip.read(at, 4) for at in (self.image.symbol(CLOCK_HIGH).address, TIM7_COUNT))
+        return (int.from_bytes(high, "little") << 16) + int.from_bytes(low, "little")
+
+    # What the chip does to the outside
+
+    def _act(self, why: Why) -> None:
+        if why & Why.SERIAL:
+            for kind, data in self._decoder.take(self.chip.sent(SYSLINK_USART)):
+                self._answer(kind, data)
+        if why & Why.COMPARE:
+            counts = tuple(self.chip.state.compare[timer][channel] for timer, channel in SERVOS)
+            if all(counts) and counts != self._counts:
+                self._counts = counts
+                self._outside.write_compare(counts)
+        if why & (Why.LOW_READ | Why.LOW_WRITE):
+            self._report(self._crashes.low_access(self.chip.state.fault_address, bool(why & Why.LOW_WRITE)))
+        if why & Why.DIVISION:
+            self._report(self._crashes.division())
+        if why & Why.OVERFLOW:
+            self._report(self._crashes.overflow(self.chip.state.overflow))
+        if why & Why.BREAK:
+            self._look_for_hang(AT_CRASH_US)
+            self._report(self._crashes.here())
+            self._crashed = True
+            self.chip.crash_points.clear()  # a handler may be a loop of one instruction
+        if why & Why.LOCKUP:
+            self._report(self._crashes.lockup())
+            self._crashed = True
+        if why & Why.WATCHDOG:
+            self._look_for_hang(AT_CRASH_US)
+            self._report(self._crashes.watchdog())
+            self._reset(WATCHDOG)
+        elif why & Why.RESET:
+            self._outside.debug_write("reset by software")
+            self._reset(SOFTWARE)
+
+    def _report(self, crash: Crash) -> None:
+        self._outside.debug_write(str(crash))
+
+    def _look_for_hang(self, least_us: int) -> None:
+        """Report a task that keeps the others from running, once, before anything else has gone wrong."""
+        busy = self.processor.longest_busy(least_us)
+        if busy is not None and not self._crashed and busy[0] not in self._hanging:
+            self._hanging.add(busy[0])
+            self._report(self._crashes.hang(*busy))
+
+    def _reset(self, cause: int) -> None:
+        self._crashed = False
+        self._hanging.clear()
+        self.resets[cause] += 1
+        self.chip.reset(cause)
+        self.chip.crash_points |= self._crashes.addresses
+
+    def _answer(self, kind: int, data: bytes) -> None:
+        """Do what the nRF51 does with a frame of the STM32."""
+        if kind == syslink.RAW and data:
+            if data[0] & CONSOLE_MASK == CONSOLE:
+                self._print(data[1:])
+            self._waiting.append(data)
+            self._flush()
+        elif kind == syslink.SCAN_MEMORIES:
+            self.chip.feed(SYSLINK_USART, syslink.encode(kind, b"\0"))
+        elif kind == syslink.VERSION:
+            self.chip.feed(SYSLINK_USART, syslink.encode(kind, b"\0emulated\0"))
+
+    def _flush(self) -> None:
+        """Hand packets to the radio; while its queue is full it takes no more bytes of the STM32."""
+        while self._waiting and self._outside.radio_send(self._waiting[0]):
+            self._waiting.pop(0)
+        self.chip.pin(*RADIO_BUSY, bool(self._waiting))
+
+    def _print(self, text: bytes) -> None:
+        *lines, self._line = (self._line + text).split(b"\n")
+        for line in lines:
+            self._outside.debug_write(line.decode(errors="replace"))
+
+    def _report_battery(self, now_us: int) -> None:
+        volts = self._outside.read_battery_mv() / 1000
+        self.chip.feed(
+            SYSLINK_USART, syslink.encode(syslink.BATTERY, struct.pack("<Bfff", 0, volts, 0.0, 25.0))
+        )

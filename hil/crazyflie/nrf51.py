@@ -1,0 +1,285 @@
+"""The board's radio chip, which is also the master of its power: safelink on the wire, power switch, reset.
+
+Every packet heard is acknowledged with the head of a queue of 8. Safelink's counters stand in the headers' two spare bits:
+a packet that repeats the last one is not passed on again, and an answer is repeated until the host's counter confirms it.
+With an empty queue the firmware acknowledges with its signal strength, the bootloader with an empty packet.
+The firmware also receives packets to all boards on its channel, which are not acknowledged.
+Facts: Bitcraze's nRF51 crazyflie2-nrf-firmware and crazyflie2-nrf-bootloader.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, auto
+from functools import partial
+from typing import Protocol
+
+from hil.crazyflie.bootloader import HEADER, NRF51, Bootloader
+from hil.crazyflie.shockburst import Air, BoardEnd, Waiting, syslink_us
+from hil.events import EventQueue
+
+NULL, NULL_MASK = 0xF3, 0xF3  # an empty packet's header; the other bits are safelink's
+SIGNAL_STRENGTH = 1  # type of the answer that carries it
+SIGNAL_DBM = 40  # below 0 dBm: a board in the same room
+SAFELINK = 5  # type of the packet that switches it
+RADIO = 3  # type of the packets that set channel, data rate and power of the radio itself
+RESET_DELAY_US = 100_000
+RETUNE_DELAY_US = 1_000  # the answer leaves first
+BROADCAST = bytes.fromhex("FFE7E7E7E7")  # address of all boards
+CHANNEL_MAX = 125  # higher ones are ignored; the nRF51's firmware compares the old channel by mistake
+# [bit/s] by number, in vendor requests, commands and the configuration block.
+RATES = (250_000, 1_000_000, 2_000_000)
+
+ALL_OFF, SYSTEM_OFF, SYSTEM_ON, BATTERY, RESET, RESET_INIT = 0x01, 0x02, 0x03, 0x04, 0xF0, 0xFF
+SET_CHANNEL, SET_RATE = 1, 2  # commands of the type RADIO; that for the power changes nothing here
+
+
+@dataclass(frozen=True, slots=True)
+class RadioSettings:
+    """The settings that two radios must share to hear each other."""
+
+    channel: int  # 0..CHANNEL_MAX, 2400 MHz + channel
+    bits_per_second: int
+    address: bytes  # 5 bytes
+
+
+class Power(Enum):
+    """Which parts of the board are powered, and what runs."""
+
+    OFF = auto()
+    RADIO_ONLY = auto()  # the STM32 is off
+    RUNNING = auto()
+    BOOTLOADER = auto()  # both processors
+
+
+class Processor(Protocol):
+    """The STM32 behind the radio chip."""
+
+    @property
+    def battery_V(self) -> float:
+        """Supply voltage."""
+        ...
+
+    def start(self, now_us: int) -> None:
+        """Boot the firmware."""
+        ...
+
+    def stop(self, now_us: int) -> None:
+        """Lose power."""
+        ...
+
+    def greet(self, now_us: int) -> None:
+        """Note that a new client is on the radio."""
+        ...
+
+    def received(self, now_us: int, data: bytes, broadcast: bool) -> None:
+        """Take a packet from the radio."""
+        ...
+
+    def polled(self, now_us: int) -> None:
+        """Note an empty packet from the radio."""
+        ...
+
+    def retuned(self, now_us: int) -> None:
+        """Note that a client has moved the radio to another channel or data rate."""
+        ...
+
+
+class Nrf51:
+    """One board's radio chip; `settings` are those of its firmware, `chip` the 6 bytes of its factory address.
+
+    `air` has the losses of packets between it and its partner.
+    """
+
+    def __init__(
+        self,
+        settings: RadioSettings,
+        chip: bytes,
+        queue: int,
+        events: EventQueue,
+        processor: Processor,
+        air: Air,
+        wire_us: Callable[[bytes], int] = syslink_us,
+    ) -> None:
+        self.air = air
+        self._wire_us = wire_us  # how long a packet takes to the STM32, or from it
+        self.power = Power.RUNNING
+        self.settings = settings  # while the firmware runs, which may change them
+        self.bootloader = Bootloader()
+        self.heard_us = 0  # the last packet
+        self._bootloader_settings = RadioSettings(0, 2_000_000, bytes((0xB1, *chip[3::-1])))
+        self._chip = chip
+        self._capacity = queue
+        self._events = events
+        self._processor = processor
+        self._forget()
+
+    def _forget(self) -> None:
+        """Clear the memory."""
+        self._end = BoardEnd(self._capacity)
+        self._service = b""
+        self._answer = b""  # sent last, to be repeated
+        self._reset_armed = False
+
+    def tune(self, settings: RadioSettings) -> None:
+        """Set its radio, as a firmware that boots does."""
+        self.settings = settings
+
+    def hears(self, settings: RadioSettings) -> bool:
+        """Whether a packet sent with these settings reaches this board."""
+        if self.power is Power.OFF:
+            return False
+        booting = self.power is Power.BOOTLOADER
+        return settings == (self._bootloader_settings if booting else self.settings)
+
+    def hears_all(self, settings: RadioSettings) -> bool:
+        """Whether a packet to all boards sent with these settings reaches this board."""
+        own = self.settings
+        firmware = self.power in (Power.RADIO_ONLY, Power.RUNNING)
+        return firmware and settings == RadioSettings(own.channel, own.bits_per_second, BROADCAST)
+
+    def send(self, now_us: int, data: bytes) -> bool:
+        """Take a packet of the STM32 for the ground; False when the queue is full."""
+        return self._end.put(Waiting(now_us + self._wire_us(data), now_us, data))
+
+    def _reply(self, now_us: int, data: bytes) -> None:
+        """Put a packet of its own into the queue."""
+        self._end.put(Waiting(now_us, now_us, data))
+
+    def hear(self, now_us: int, data: bytes) -> bytes:
+        """Take a packet from the air and return the acknowledgement's payload."""
+        self.heard_us, end = now_us, self._end
+        if self.power is Power.BOOTLOADER:
+            answer = self._next_answer(now_us)
+            self._bootload(now_us, data)
+            return answer
+        kind = _kind(data)
+        if kind == NRF51:
+            answer = self._next_answer(now_us)
+            self._command(now_us, data)
+            return answer
+        if kind == SAFELINK and len(data) == 3:
+            self._service = data
+            answer = self._next_answer(now_us)
+            end.switch(bool(data[2]))
+            self._processor.greet(now_us)
+            return answer
+        if end.takes(data[0] >> 3 & 1):
+            self._take(now_us, data, broadcast=False)
+        return self._next_answer(now_us) if end.answered(data[0] >> 2 & 1) else self._answer
+
+    def overhear(self, now_us: int, data: bytes) -> None:
+        """Take a packet to all boards from the air."""
+        if _kind(data) == NRF51:
+            self._command(now_us, data)
+        else:
+            self._take(now_us, data, broadcast=True)
+
+    def _take(self, now_us: int, data: bytes, broadcast: bool) -> None:
+        """Execute a packet of the firmware."""
+        if _kind(data) == RADIO and len(data) > 3:
+            self._events.at(now_us + RETUNE_DELAY_US, partial(self._retune, data[2], data[3]))
+        elif len(data) > 1 or data[0] & NULL_MASK != NULL:
+            self._events.at(now_us + self._wire_us(data), partial(self._pass_on, data, broadcast))
+        elif self.power is Power.RUNNING:
+            self._processor.polled(now_us)
+
+    def _retune(self, command: int, value: int, now_us: int) -> None:
+        """Set the radio until the next start of the processor, which sets it to the values in its EEPROM."""
+        own = self.settings
+        if command == SET_CHANNEL and value <= CHANNEL_MAX:
+            self.settings = RadioSettings(value, own.bits_per_second, own.address)
+        elif command == SET_RATE and value < len(RATES):
+            self.settings = RadioSettings(own.channel, RATES[value], own.address)
+        if self.settings != own:
+            self._processor.retuned(now_us)
+
+    def _next_answer(self, now_us: int) -> bytes:
+        """Return the answer after the one that has arrived."""
+        end = self._end
+        end.confirm()
+        if self._service:
+            self._answer, self._service = self._service, b""
+        elif packet := end.answer(now_us):
+            counted = bytes((packet[0] & NULL_MASK | end.down << 2,)) + packet[1:]
+            self._answer = counted if end.safelink else packet
+        elif self.power is Power.BOOTLOADER:
+            self._answer = b""
+        else:
+            self._answer = bytes((NULL | end.down << 2, SIGNAL_STRENGTH, SIGNAL_DBM))
+        return self._answer
+
+    def _pass_on(self, data: bytes, broadcast: bool, now_us: int) -> None:
+        if self.power is Power.RUNNING:
+            self._processor.received(now_us, data, broadcast)
+
+    # Power and resets
+
+    def _command(self, now_us: int, data: bytes) -> None:
+        """Execute a command to the nRF51 itself."""
+        command = data[2] if len(data) > 2 else None
+        if command == RESET_INIT:
+            self._reset_armed = True
+            self._reply(now_us, bytes((HEADER, NRF51, RESET_INIT)) + self._chip)
+        elif command == RESET and len(data) == 4 and self._reset_armed:
+            self._reset_later(now_us, data)
+        elif command == ALL_OFF:
+            self._stop_processor(now_us)
+            self.power = Power.OFF
+        elif command == SYSTEM_OFF and self.power is Power.RUNNING:
+            self._stop_processor(now_us)
+            self.power = Power.RADIO_ONLY
+        elif command == SYSTEM_ON and self.power is Power.RADIO_ONLY:
+            self._start(now_us)
+        elif command == BATTERY:
+            volts = struct.pack("<f", self._processor.battery_V)
+            self._reply(now_us, bytes((HEADER, NRF51, BATTERY)) + volts)
+
+    def _bootload(self, now_us: int, data: bytes) -> None:
+        """Execute a packet in the bootloader."""
+        if data[:3] == bytes((HEADER, NRF51, RESET_INIT)):
+            self._reply(now_us, data[:3] + self._chip)
+        elif data[:3] == bytes((HEADER, NRF51, RESET)):
+            self._reset_later(now_us, data)
+        elif (reply := self.bootloader.answer(data)) is not None:
+            self._reply(now_us, reply)
+
+    def _reset_later(self, now_us: int, data: bytes) -> None:
+        """Reset, into the bootloader if the command's argument is 0."""
+        into_bootloader = len(data) > 3 and data[3] == 0
+        self._events.at(now_us + RESET_DELAY_US, partial(self._reset, into_bootloader))
+
+    def _reset(self, into_bootloader: bool, now_us: int) -> None:
+        if self.power is Power.OFF:
+            return
+        self._stop_processor(now_us)
+        self._forget()
+        if into_bootloader:
+            self.power = Power.BOOTLOADER
+        else:
+            self._start(now_us)
+
+    def _stop_processor(self, now_us: int) -> None:
+        if self.power is Power.RUNNING:
+            self._processor.stop(now_us)
+
+    def _start(self, now_us: int) -> None:
+        self.power = Power.RUNNING
+        self._processor.start(now_us)
+
+    def power_cycle(self, now_us: int) -> None:
+        """Switch off and on, which brings the radio back to the settings in the EEPROM."""
+        self._stop_processor(now_us)
+        self._forget()
+        self._start(now_us)
+
+    def press_button(self, now_us: int) -> None:
+        """Start the firmware of a board that is off or in its bootloader."""
+        if self.power in (Power.OFF, Power.BOOTLOADER):
+            self._forget()
+            self._start(now_us)
+
+
+def _kind(data: bytes) -> int | None:
+    """Return the type of a packet to the radio chip, None for one to the processor."""
+    return data[1] if len(data) > 1 and data[0] & NULL_MASK == NULL else None

@@ -1,0 +1,65 @@
+"""What a Crazyflie 2.1 has around its STM32F405: BMI088 and BMP388 on I2C3, EEPROM on I2C1, pins.
+
+The sensors are register files, as their data sheets number them; the IMU's counts are put in from outside at every
+data-ready, which is the gyro's interrupt on PC14.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.stm32f405.chip import OTP, Chip
+
+GYRO_ADDRESSES, ACCEL_ADDRESSES, PRESSURE_ADDRESS, EEPROM_ADDRESS = (0x68, 0x69), (0x18, 0x19), 0x77, 0x50
+EEPROM_SIZE = 8192  # [bytes]
+DECK_BUS, SENSOR_BUS = 1, 3
+SYSLINK_USART = 6
+GYRO_ID, ACCEL_ID, PRESSURE_ID = 0x0F, 0x1E, 0x50
+GYRO_RATES, GYRO_SELF_TEST, GYRO_FINE = 0x02, 0x3C, 0x12  # data sheet: rate_ok and bist_rdy
+ACCEL_STATUS, ACCEL_READY, ACCELERATIONS = 0x03, 0x80, 0x12
+PRESSURE_STATUS, PRESSURE_READY, PRESSURE_DATA, PRESSURE_TRIM = 0x03, 0x70, 0x04, 0x31
+PRESSURE_NOW = bytes((0x00, 0x00, 0x70, 0x00, 0x00, 0x80))  # counts of pressure and temperature, 24 bits each
+TRIM = bytes.fromhex("0a6bb848f9ba06e80f1ef9d4619c77f3f610440c00")  # calibration of a specimen, 21 bytes
+DEVICE_TYPE = b"0;CF21\0"
+DATA_READY = ("C", 14)
+RADIO_BUSY = ("A", 4)  # the nRF51 holds it high while it takes no bytes
+
+
+class Parts:
+    """The parts around a chip; `eeprom` (8192,) uint8 may be shared with what keeps it."""
+
+    def __init__(self, chip: Chip, eeprom: NDArray[np.uint8]) -> None:
+        if eeprom.size != EEPROM_SIZE:
+            raise ValueError(f"an EEPROM of {eeprom.size} bytes: it has {EEPROM_SIZE}")
+        self._chip = chip
+        self.gyro, self.accel, self.pressure = (np.zeros(256, np.uint8) for _ in range(3))
+        self.gyro[0], self.gyro[GYRO_SELF_TEST] = GYRO_ID, GYRO_FINE
+        self.accel[0], self.accel[ACCEL_STATUS] = ACCEL_ID, ACCEL_READY
+        self.pressure[0], self.pressure[PRESSURE_STATUS] = PRESSURE_ID, PRESSURE_READY
+        _put(self.pressure, PRESSURE_TRIM, TRIM)
+        _put(self.pressure, PRESSURE_DATA, PRESSURE_NOW)
+        for address in GYRO_ADDRESSES:
+            chip.add_device(SENSOR_BUS, address, self.gyro)
+        for address in ACCEL_ADDRESSES:
+            chip.add_device(SENSOR_BUS, address, self.accel)
+        chip.add_device(SENSOR_BUS, PRESSURE_ADDRESS, self.pressure)
+        chip.add_device(DECK_BUS, EEPROM_ADDRESS, eeprom, address_bytes=2)
+        chip.set_system(OTP, DEVICE_TYPE)
+        for port in "ABCDE":
+            for number in range(16):
+                chip.pin(port, number, (port, number) not in (DATA_READY, RADIO_BUSY))
+
+    def sample(self, counts: Sequence[int]) -> None:
+        """Put a sample into the IMU's registers and tell the processor."""
+        _put(self.gyro, GYRO_RATES, struct.pack("<3h", *counts[:3]))
+        _put(self.accel, ACCELERATIONS, struct.pack("<3h", *counts[3:]))
+        self._chip.pin(*DATA_READY, True)
+        self._chip.pin(*DATA_READY, False)
+
+
+def _put(registers: NDArray[np.uint8], first: int, contents: bytes) -> None:
+    registers[first : first + len(contents)] = np.frombuffer(contents, np.uint8)

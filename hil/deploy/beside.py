@@ -1,0 +1,137 @@
+"""An image flies beside the Python board from one seed: what may differ, by how much, and what does.
+
+The two are never equal bit for bit: boot time, gyro zero, the estimator's phase and the board's microsecond differ
+(`hil.studies.two_boards`). The bounds are about four times what these make of an image that is right, in a hover of 4 s with
+a push and a link that is cut; the position then differs by 0.4 mm, the servo counts by 330 (rms).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.export.boards import PYTHON
+from hil.experiments import find_experiment
+from hil.laboratory.faults import parse
+from hil.laboratory.flight import Flight
+from hil.laboratory.metrics import column, free_flight
+from hil.laboratory.result import Result
+from hil.laboratory.run import Request, fly, prepare
+from hil.pictures.compare import FlownRun, load_flown
+
+SECONDS, SEED = 4.0, 1
+FAULTS = ("push.y@0.5=1", "radio.cut@2:0.8")
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """How much a column may differ: `size` of the differences, in `unit`, at most `limit`."""
+
+    name: str
+    columns: tuple[str, ...]
+    size: Callable[[NDArray[np.float64]], float]
+    limit: float
+    unit: str = ""
+    factor: float = 1.0
+
+
+def _rms(difference: NDArray[np.float64]) -> float:
+    return float(np.sqrt((difference**2).mean()))
+
+
+def _mean(difference: NDArray[np.float64]) -> float:
+    return abs(float(difference.mean()))
+
+
+def _end(difference: NDArray[np.float64]) -> float:
+    return abs(float(difference[-1]))
+
+
+def _share(difference: NDArray[np.float64]) -> float:
+    return float((difference != 0).mean())
+
+
+BOUNDS = (
+    Bound("position, rms", ("truth.x", "truth.y", "truth.z"), _rms, 2.0, "mm", 1e3),
+    Bound("body rates, rms", ("truth.p", "truth.q", "truth.r"), _rms, 0.15, "rad/s"),
+    Bound("estimated position, rms", ("estimate.x", "estimate.y", "estimate.z"), _rms, 2.0, "mm", 1e3),
+    Bound("estimated rates, mean", ("estimate.p", "estimate.q", "estimate.r"), _mean, 0.004, "rad/s"),
+    Bound("servo counts, rms", tuple(f"motor.m{servo}" for servo in range(1, 5)), _rms, 1300.0),
+    Bound("servo counts, mean", tuple(f"motor.m{servo}" for servo in range(1, 5)), _mean, 60.0),
+    Bound("age of poses, mean", ("estimator.pose_age_us",), _mean, 1.5, "ms", 1e-3),
+    Bound("poses fused", ("estimator.fused",), _end, 2.0),
+    Bound("poses not fused", tuple(f"estimator.{name}" for name in ("refused", "jumps", "too_old", "invalid")), _end, 0.0),
+    Bound("supervisor's state, share of time", ("supervisor.state",), _share, 3.0, "%", 100.0),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """A bound, the column that differs most, and by how much."""
+
+    bound: Bound
+    column: str
+    found: float
+
+    @property
+    def held(self) -> bool:
+        """Whether the difference is within the bound; NaN is not."""
+        return self.found <= self.bound.limit
+
+    def __str__(self) -> str:
+        unit = f" {self.bound.unit}" if self.bound.unit else ""
+        return f"{self.bound.name}: {self.found:.3g}{unit} apart ({self.column}), at most {self.bound.limit:g}{unit}"
+
+
+def compare_flights(first: FlownRun, second: FlownRun) -> Iterator[Compared]:
+    """Yield what differs between the free flights of two runs, each beside its bound."""
+    flights = [free_flight(run.log) for run in (first, second)]
+    rows = min(flight.num_rows for flight in flights)
+    for bound in BOUNDS:
+        sizes = {}
+        for name in bound.columns:
+            a, b = (column(flight, name)[:rows] for flight in flights)
+            sizes[name] = bound.factor * bound.size(b - a) if rows else float("nan")
+        worst = max(sizes, key=lambda name: np.inf if np.isnan(sizes[name]) else sizes[name])
+        yield Compared(bound, worst, sizes[worst])
+
+
+def fly_beside_python(
+    image: Path, profile: str, overrides: tuple[str, ...], progress: Callable[[str, int, Flight], None]
+) -> tuple[list[Compared], list[str]]:
+    """Fly an image and the Python board; return the differences, and what ended one of the flights otherwise."""
+    with TemporaryDirectory(prefix="floaty-") as folder:
+        results: list[Result] = []
+        for name, board in (("python", PYTHON), ("image", str(image))):
+            request = Request.of(
+                find_experiment("hover"),
+                profile,
+                overrides,
+                SEED,
+                SECONDS,
+                faults=list(map(parse, FAULTS)),
+                board=board,
+            )
+            prepare(Path(folder) / name)
+
+            def show(now_us: int, flight: Flight, name: str = name) -> None:
+                progress(name, now_us, flight)
+
+            results.append(fly(request, Path(folder) / name, progress=show))
+            if results[-1].outcome == "interrupted":
+                raise KeyboardInterrupt
+        runs = [load_flown(result.folder) for result in results]
+        return list(compare_flights(*runs)), list(_ends(*results))
+
+
+def _ends(python: Result, image: Result) -> Iterator[str]:
+    if (python.outcome, python.cause) != (image.outcome, image.cause):
+        ends = (f"{one.outcome}{f' ({one.cause})' if one.cause else ''}" for one in (python, image))
+        yield "the flight ends otherwise: python {}, image {}".format(*ends)
+    if image.image is not None and (resets := image.image.watchdog_resets + image.image.software_resets):
+        yield f"the board reset {resets} times in flight"

@@ -1,0 +1,249 @@
+"""An image on the bench: the emulated chip at rest, a client on its radio, and its memory in view.
+
+What a client can write is compared with the table of parameters that the profile exports; the servo outputs with the
+registers that make 400 Hz of them. Nothing flies here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from firmware_py.board import ImuCounts
+from firmware_py.config import FirmwareConfig
+from firmware_py.export.app_toc import AppParameter
+from firmware_py.wire.crtp import PORT_PARAMETERS, Packet, decode, encode
+from firmware_py.wire.parameters import CHANNEL_WRITE, encode_ident
+from firmware_py.wire.scalars import Scalar
+from firmware_py.wire.supervisor import Cause
+from hil.config import LabConfig
+from hil.devices.board import VirtualBoard
+from hil.devices.image_firmware import ChipImage, ImageFirmware
+from hil.devices.imu import VirtualImu
+from hil.errors import LabError
+from hil.events import EventQueue
+from hil.laboratory.robot import BENCH_NOISE, Streams
+from hil.world.plant import Plant
+
+STEP_US = 1_000
+ANSWER_US = 200_000  # within which a client gets the answer to a write
+ACT_US = 20_000  # from a request until the stabilizer task has served it
+STALE_US = 150_000  # from a controller's last step until the app has put the servos to hover, and more
+CONTROLLER, OTHER_CONTROLLER = "stabilizer.controller", 1
+TARGET = re.compile(r"(\w+)(?:\.(\w+))?(?:\[(\d+)\])?$")  # of an `AppParameter`
+TIMERS = {"TIM3": 0x4000_0400, "TIM5": 0x4000_0C00}  # RM0090 section 2.3
+PORTS = {"GPIOA": 0x4002_0000, "GPIOB": 0x4002_0400}
+TIMER_REGISTERS = {"CR1": 0x00, "CCMR1": 0x18, "CCMR2": 0x1C, "CCER": 0x20, "PSC": 0x28, "ARR": 0x2C}
+PORT_REGISTERS = {"MODER": 0x00, "OTYPER": 0x04, "AFRL": 0x20}
+# 84 MHz / 4 / 52501 = 400 Hz; PWM mode 1 with preload, active high; alternate function 2, open drain.
+SERVO_OUTPUTS: tuple[tuple[str, str, int, int], ...] = (  # register, of, mask, value
+    *((timer, name, 0xFFFF, value) for timer in TIMERS for name, value in (("CR1", 0x81), ("PSC", 3), ("ARR", 52_500))),
+    ("TIM3", "CCMR1", 0xFFFF, 0x6868), ("TIM3", "CCER", 0xFF, 0x11),
+    ("TIM5", "CCMR2", 0xFFFF, 0x6868), ("TIM5", "CCER", 0xFF00, 0x1100),
+    ("GPIOA", "MODER", 0xF0, 0xA0), ("GPIOA", "OTYPER", 0xC, 0xC), ("GPIOA", "AFRL", 0xFF00, 0x2200),
+    ("GPIOB", "MODER", 0xF00, 0xA00), ("GPIOB", "OTYPER", 0x30, 0x30), ("GPIOB", "AFRL", 0xFF_0000, 0x22_0000),
+)  # fmt: skip
+
+
+class ParameterBoard(Protocol):
+    """A board whose parameters a client writes, and whose memory can be read."""
+
+    def scalar(self, name: str) -> Scalar | None:
+        """Return the type of a parameter, None when the board has none of that name."""
+        ...
+
+    def value(self, name: str) -> float:
+        """Return a parameter as a client reads it."""
+        ...
+
+    def write(self, name: str, value: float) -> None:
+        """Write a parameter as a client does."""
+        ...
+
+    def field(self, parameter: AppParameter) -> float:
+        """Return the number in memory that a parameter acts on."""
+        ...
+
+
+def check_parameters(
+    table: Sequence[AppParameter], board: ParameterBoard, progress: Callable[[int], None] = lambda done: None
+) -> Iterator[str]:
+    """Yield every way in which a board's parameters differ from the table; the board is left as it was."""
+    for done, parameter in enumerate(table):
+        yield from _check_parameter(parameter, board)
+        progress(done + 1)
+
+
+def _check_parameter(parameter: AppParameter, board: ParameterBoard) -> Iterator[str]:
+    name, expected_type = parameter.name, parameter.scalar
+    scalar = board.scalar(name)
+    if scalar is None:
+        yield f"{name}: the image has no such parameter"
+        return
+    if scalar is not expected_type:
+        yield f"{name}: type {scalar.name}, expected {expected_type.name}"
+        return
+    default = scalar.cast(parameter.initial)
+    if board.value(name) != default:
+        yield f"{name}: default {board.value(name):.7g}, in the profile {default:.7g}"
+    if (field := board.field(parameter)) != (expected := _behind(parameter, default)):
+        yield f"{name}: default {parameter.target} = {field:.7g}, in the profile {expected:.7g}"
+    before = board.value(name)
+    inside, *outside = _values(parameter, scalar)
+    board.write(name, inside)
+    if (field := board.field(parameter)) != (expected := _behind(parameter, inside)):
+        yield f"{name} = {inside:.7g} writes {parameter.target} = {field:.7g}, expected {expected:.7g}"
+    for value in outside:
+        board.write(name, value)
+        if board.value(name) == value:
+            limits = f"{parameter.low:.7g} to {parameter.high:.7g}"
+            yield f"{name} = {value:.7g} is accepted, outside {limits}"
+    board.write(name, before)
+
+
+def _behind(parameter: AppParameter, value: float) -> float:
+    """Return the number in memory for a client's value, rounded as the board does."""
+    product = float(np.float32(parameter.scale) * np.float32(value))
+    return parameter.memory.cast(product)
+
+
+def _values(parameter: AppParameter, scalar: Scalar) -> list[float]:
+    """Return a value inside the limits, not the default, and those right outside that the type can hold."""
+    low, high = (float(np.float32(limit)) for limit in (parameter.low, parameter.high))
+    if scalar.is_float:
+        inside = [scalar.cast(low + share * (high - low)) for share in (0.625, 0.375)]
+        outside = [
+            float(np.nextafter(np.float32(limit), np.float32(to)))
+            for limit, to in ((low, -np.inf), (high, np.inf))
+        ]
+    else:
+        inside, outside = [float(int(high)), float(int(high)) - 1.0], [low - 1.0, high + 1.0]
+    other = next(value for value in inside if value != scalar.cast(parameter.initial))
+    return [other, *(value for value in outside if scalar.cast(value) == value)]
+
+
+class ImageBench:
+    """An image at rest in its holder; `parameters` of the radio and memory by name."""
+
+    def __init__(self, flashed: ChipImage, config: LabConfig) -> None:
+        self.console: list[str] = []
+        self._answers: list[bytes] = []
+        board = VirtualBoard(
+            lambda now_us, counts: None, self._take, lambda now_us, text: self.console.append(text)
+        )
+        streams = Streams.of_seed(1)
+        self._imu = VirtualImu(config.imu, streams.imu)
+        self._imu.set_noise_scale(BENCH_NOISE)
+        self._plant = Plant(
+            config.geometry, config.plant, config.tunnel, config.actuators, streams.gusts, config.flight.home
+        )
+        self._firmware = ImageFirmware(flashed, board, self._sample)
+        board.run_on(self._firmware.kernel, EventQueue())
+        self._table = self._firmware.parameters
+        self._now_us = 0
+        self._of_parameters = flashed.image.symbol("floaty_toc_apply").address
+
+    def constants(self, config: FirmwareConfig) -> str:
+        """Return in which constants the image differs from a profile; empty: in none."""
+        return self._firmware.differences(config)
+
+    def scalar(self, name: str) -> Scalar | None:
+        """Return the type of a parameter."""
+        return self._table[name].scalar if name in self._table else None
+
+    def value(self, name: str) -> float:
+        """Return a parameter as a client reads it."""
+        return self._table[name].read()
+
+    def write(self, name: str, value: float) -> None:
+        """Write a parameter over the radio. Raises `LabError` when no answer comes."""
+        entry = self._table[name]
+        ident = encode_ident(entry.number)
+        data = encode(Packet(PORT_PARAMETERS, CHANNEL_WRITE, ident + entry.scalar.pack(value)))
+        self._answers.clear()
+        self._firmware.radio_received(data)
+        for _ in range(ANSWER_US // STEP_US):
+            self.run(STEP_US)
+            for answer in map(decode, self._answers):
+                if (answer.port, answer.channel, answer.data[:2]) == (PORT_PARAMETERS, CHANNEL_WRITE, ident):
+                    return
+        raise LabError(
+            f"{self._firmware.image.path}: does not answer to {name} = {value:g} within {ANSWER_US // 1000} ms"
+        )
+
+    def field(self, parameter: AppParameter) -> float:
+        """Return the number in memory that a parameter acts on."""
+        return self.memory(parameter.target, parameter.memory)
+
+    def memory(self, target: str, scalar: Scalar) -> float:
+        """Return a number by its expression in C, like `floaty_parameters.trim[2]`."""
+        image = self._firmware.image
+        matched = TARGET.match(target)
+        assert matched is not None
+        name, member, index = matched.groups()
+        address = image.symbol(name).address + scalar.size * int(index or 0)
+        if member:
+            address += image.debug.variable(name, self._of_parameters)[member].offset
+        return scalar.unpack(self._firmware.chip.read(address, scalar.size))
+
+    def check_switches(self) -> Iterator[str]:
+        """Yield what the parameters that are requests do not do: stop, disarm, start the estimator afresh."""
+        for name, value, target in (
+            ("stop", 1, "floaty_supervisor.stopped"), ("stop", 0, "floaty_supervisor.stopped"),
+            ("armed", 0, "floaty_supervisor.armed"), ("armed", 1, "floaty_supervisor.armed"),
+        ):  # fmt: skip
+            self._request(name, value)
+            if (found := self.memory(target, Scalar.U8)) != value:
+                yield f"floaty.{name} = {value}: {target} = {found:g}, expected {value}"
+        before = self.memory("floaty_estimator.tick", Scalar.I32)
+        self._request("reset", 1)
+        if (ticks := self.memory("floaty_estimator.tick", Scalar.I32)) >= before:
+            yield f"floaty.reset = 1: floaty_estimator.tick = {ticks:g} goes on, expected from 0 again"
+
+    def check_watch(self) -> Iterator[str]:
+        """Yield what is wrong with the watch over the controller: it acts when another one runs, and only then."""
+        hovers = self.memory("floaty_observed.stale_hovers", Scalar.U32)
+        if hovers:
+            yield f"servos put to hover {hovers:g} times for a controller that stands still, expected 0: none does"
+        controller = self.value(CONTROLLER)
+        self.write(CONTROLLER, OTHER_CONTROLLER)
+        self.run(STALE_US)
+        cause = Cause(int(self.memory("floaty_supervisor.cause", Scalar.U8)))
+        if cause is not Cause.NO_CONTROL:
+            yield f"{CONTROLLER} = {OTHER_CONTROLLER}: cause {cause.name}, expected {Cause.NO_CONTROL.name}"
+        self.write(CONTROLLER, controller)
+        self.run(STALE_US)
+
+    def _request(self, name: str, value: int) -> None:
+        if self.scalar(f"floaty.{name}") is not None:
+            self.write(f"floaty.{name}", value)
+            self.run(ACT_US)
+
+    def check_servo_outputs(self) -> Iterator[str]:
+        """Yield the registers of timers and pins that are not as the servos need them."""
+        for unit, name, mask, expected in SERVO_OUTPUTS:
+            base, offset = (
+                (TIMERS[unit], TIMER_REGISTERS[name])
+                if unit in TIMERS
+                else (PORTS[unit], PORT_REGISTERS[name])
+            )
+            found = int.from_bytes(self._firmware.chip.read(base + offset, 4), "little") & mask
+            if found != expected:
+                yield f"servo outputs: {unit}.{name} = 0x{found:x}, expected 0x{expected:x}"
+
+    def run(self, us: int) -> None:
+        """Let time pass, with a sample of the IMU each millisecond."""
+        for _ in range(us // STEP_US):
+            self._now_us += STEP_US
+            self._firmware.kernel.run(self._now_us)
+            self._firmware.parts.sample(self._sample())
+
+    def _sample(self) -> ImuCounts:
+        return self._imu.sample(self._plant)
+
+    def _take(self, now_us: int, data: bytes) -> bool:
+        self._answers.append(data)
+        return True

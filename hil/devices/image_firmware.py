@@ -1,0 +1,223 @@
+"""An image that flies: a Crazyflie that executes it, and what is read of the exported app in its memory.
+
+Power comes on `WARM_UP_US` before the laboratory's time begins, because an image needs seconds to start;
+the robot rests in its holder meanwhile. A reset in flight takes as long as it takes.
+
+Of the robot's state there is what the exported app has, found by symbols; an image without the app has none of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.board import Board, ImuCounts
+from firmware_py.config import FirmwareConfig, parameters_of
+from firmware_py.rtos import TaskReport
+from firmware_py.signals import CONTROL, ESTIMATOR, Signals
+from firmware_py.wire.supervisor import Cause, State
+from hil.crazyflie import syslink
+from hil.crazyflie.crazyflie import Crazyflie
+from hil.crazyflie.log_table import LogVariable, log_numbers, log_table, parameter_table
+from hil.devices.board_firmware import ImageReport, PowerOn
+from hil.errors import LabError
+from hil.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
+from hil.stm32f405.freertos import HEAP, HEAP_LEAST
+from hil.stm32f405.gdb import GdbServer
+from hil.stm32f405.image import Image
+from hil.stm32f405.processor import Processor
+
+# The stock firmware's self-test and gyro calibration take 3.06 s. The rest lets the app's estimator step at the phase of the
+# cameras' frames at which ours does, 2 to 3 ms after a pose: in reality it is any.
+WARM_UP_US = 3_104_000
+IMU_PERIOD_US = 1_000
+OWN_LOGIC = "floaty_guard"  # there is one in images with logic of the user's own
+
+
+class ChipSupervisor:
+    """State and cause of the app's supervisor, calibrating for ever without the app."""
+
+    def __init__(self, variables: dict[str, LogVariable]) -> None:
+        self._state, self._cause = (variables.get(f"supervisor.{name}") for name in ("state", "cause"))
+
+    @property
+    def state(self) -> State:
+        """What it does."""
+        number = int(self._state.read()) if self._state else State.CALIBRATING
+        return (
+            State(number) if number in tuple(State) else State.CALIBRATING
+        )  # a crash may have overwritten it
+
+    @property
+    def cause(self) -> Cause:
+        """Why it is in its failsafe."""
+        number = int(self._cause.read()) if self._cause else Cause.NONE
+        return Cause(number) if number in tuple(Cause) else Cause.NONE
+
+
+class ImageStatistics:
+    """How long the image's tasks have run."""
+
+    def __init__(self, kernel: Processor) -> None:
+        self._kernel = kernel
+
+    def reports(self) -> list[TaskReport]:
+        """The tasks in the order in which they first ran."""
+        kernel = self._kernel
+        counted = zip(kernel.tasks, kernel.run_times_us(), kernel.activations(), strict=True)
+        return [
+            TaskReport(
+                name=task.name, priority=task.priority, run_time_us=run_time_us, activations=activations,
+                worst_response_us=0, worst_latency_us=0, latency_histogram=(), deadline_us=None, deadline_misses=0,
+            )
+            for task, run_time_us, activations in counted
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ChipImage:
+    """What is flashed, and the compiled machine that executes it."""
+
+    image: Image
+    library: Path
+    debugger: GdbServer | None = None
+    needs_polls: ClassVar[bool] = True
+
+    @classmethod
+    def load(cls, path: Path, elf: Path | None, folder: Path, debugger: GdbServer | None = None) -> ChipImage:
+        """Read an image and compile the machine into a folder. Raises `LabError` and `ExportError`."""
+        return cls(Image(path, elf), build_machine(folder), debugger)
+
+    def wire_us(self, data: bytes) -> int:
+        """Take no time: the chip's own serial line does."""
+        return 0
+
+    def boot(self, start: PowerOn) -> ImageFirmware:
+        """Switch it on."""
+        return ImageFirmware(self, start.board, start.rest, polls=not start.polled)
+
+
+class ImageFirmware:
+    """An image at power-on. `rest` gives the IMU's counts while the robot is at rest, before the laboratory's time begins.
+
+    `polls`: whether radio packets without contents come by themselves, as with a host that only listens.
+    """
+
+    usage: ClassVar[None] = None
+    mavlink: ClassVar[None] = None
+    overrun: ClassVar[str] = ""
+
+    def __init__(
+        self, flashed: ChipImage, board: Board, rest: Callable[[], ImuCounts] | None, polls: bool = True
+    ) -> None:
+        self._crazyflie = Crazyflie(flashed.image, flashed.library, board, polls, flashed.debugger)
+        self.image, self.chip, self.parts = flashed.image, self._crazyflie.chip, self._crazyflie.parts
+        self.kernel = self.scheduler = self._crazyflie.processor
+        self._board = board
+        table = {variable.name: variable for variable in log_table(self.image, self.chip)}
+        self.variables = [v for v in table.values() if v.name.startswith("excite.")]
+        self.log_numbers = log_numbers(self.image, self.chip)
+        self.parameters = parameter_table(self.image, self.chip)
+        self.signals = self._signals(table)
+        self.statistics = ImageStatistics(self.kernel)
+        if rest is not None:
+            self._warm_up(rest)
+
+    def _warm_up(self, rest: Callable[[], ImuCounts]) -> None:
+        for now_us in range(IMU_PERIOD_US, WARM_UP_US + 1, IMU_PERIOD_US):
+            self.kernel.run(now_us)
+            self.parts.sample(rest())
+        self.kernel.begin(WARM_UP_US)
+
+    def differences(self, config: FirmwareConfig) -> str:
+        """Return in what the core of an image with the app differs from a profile, in one line; empty if in nothing."""
+        if not self.image.has("floaty_parameters"):
+            return ""
+        parameters = parameters_of(config).memory
+        built = self._struct("floaty_parameters", parameters.dtype)
+        found = [
+            f"{name} = {built[name][0].tolist()}, in the profile {parameters[name][0].tolist()}"
+            for name in parameters.dtype.names or ()
+            if not np.array_equal(built[name], parameters[name])
+        ]
+        own = bool(config.logic.controller or config.logic.estimator)
+        if own != self.image.has(OWN_LOGIC):
+            found.append("control law, the profile has " + ("one of the user's" if own else "the core's"))
+        return "; ".join(found)
+
+    # Interrupts and time
+
+    def imu_ready(self) -> None:
+        """The IMU has a new sample."""
+        self.parts.sample(self._board.read_imu())
+
+    def radio_received(self, data: bytes, broadcast: bool = False) -> None:
+        """The radio chip has a packet."""
+        self._crazyflie.radio_received(data, broadcast)
+
+    def radio_polled(self) -> None:
+        """The radio chip has an empty packet."""
+        self.radio_received(syslink.EMPTY)
+
+    def uart_ready(self) -> None:
+        """Nothing: no serial line leads to the image."""
+
+    def check_watchdog(self) -> None:
+        """Say which peripherals the image has used that are not there; the watchdog acts by itself."""
+        self._crazyflie.report_unknown()
+
+    @property
+    def clock_us(self) -> int | None:
+        """Return the firmware's own microseconds; None without a Crazyflie's clock."""
+        return self._crazyflie.clock_us
+
+    @property
+    def flashed(self) -> ImageFirmware:
+        """Itself: its constants were compiled."""
+        return self
+
+    @property
+    def resets(self) -> int:
+        """How often it has begun anew."""
+        return sum(self._crazyflie.resets.values())
+
+    def report(self) -> ImageReport:
+        """Return what is left of its memory, and how often it has begun anew."""
+        kernel, code = self._crazyflie.tasks, hashlib.sha256(self.image.code).hexdigest()
+        try:
+            tasks = [] if kernel is None or not kernel.running else kernel.tasks()
+        except LabError:  # it has overwritten its own lists
+            tasks = []
+        stacks, free, least = {task.name: task.stack_free_bytes for task in tasks}, None, None
+        if kernel is not None and self.image.has(HEAP) and self.image.has(HEAP_LEAST):
+            free, least = kernel.heap_free_bytes, kernel.heap_least_free_bytes
+        resets = self._crazyflie.resets
+        return ImageReport(code, stacks, free, least, resets[WATCHDOG], resets[SOFTWARE])
+
+    # What is read of the app
+
+    def _signals(self, table: dict[str, LogVariable]) -> Signals:
+        estimator, control = (
+            self._struct("floaty_estimator", ESTIMATOR),
+            self._struct("floaty_control", CONTROL),
+        )
+        supervisor = ChipSupervisor(table if self.image.has("floaty_supervisor") else {})
+        return Signals.of(estimator, control, supervisor)
+
+    def _struct(self, name: str, layout: np.dtype[Any]) -> NDArray[Any]:
+        """Return a view on a struct of the core, (1,); one of zeros for an image without the app."""
+        if not self.image.has(name):
+            return np.zeros(1, layout)
+        symbol = self.image.symbol(name)
+        if symbol.size != layout.itemsize:
+            raise LabError(
+                f"{self.image.path}: {name} has {symbol.size} bytes where this laboratory's core has "
+                f"{layout.itemsize}: it was exported by another version"
+            )
+        return self.chip.view(symbol.address, symbol.size).view(layout)

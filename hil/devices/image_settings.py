@@ -1,0 +1,99 @@
+"""What a profile and an experiment say reaches an image as it reaches a real board: as parameters, over the radio.
+
+An image has the constants of the profile that it was exported with. Before the release those that differ are written one by
+one, as an operator writes them. Constants that differ are reported first, those without a parameter again when they stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from firmware_py.config import FirmwareConfig
+from firmware_py.table import OF_PROFILE, value_in
+from firmware_py.wire.crtp import decode
+from ground_station.controls import Action, Request
+from ground_station.links.crtp_controls import PORTS, CrtpControls, Entry
+from hil.crazyflie.log_table import ImageParameter
+from hil.events import EventQueue
+
+TURN_US = 10_000  # between looks whether an answer is overdue
+
+
+def board_values(config: FirmwareConfig) -> dict[str, float]:
+    """Return what a profile says as values of a board's parameters, by their names there."""
+    return {one.name: value_in(config, key) / one.scale for key, one in OF_PROFILE.items()}
+
+
+def to_set(table: Mapping[str, ImageParameter], config: FirmwareConfig) -> list[tuple[str, float]]:
+    """Return what an image has to be told, by its own names: what it can be told and does not have yet."""
+    return [
+        (name, value)
+        for name, value in board_values(config).items()
+        if name in table and table[name].scalar.cast(value) != table[name].read()
+    ]
+
+
+class ImageSettings:
+    """`begin` at an instant of the laboratory, `hear` what the board sends; `say` tells what was set, and what not.
+
+    `table` has the image's parameters by name; `differences` says in one line in what it is not as a configuration is.
+    """
+
+    def __init__(
+        self,
+        table: Mapping[str, ImageParameter],
+        differences: Callable[[FirmwareConfig], str],
+        config: FirmwareConfig,
+        events: EventQueue,
+        uplink: Callable[[int, bytes], object],
+        say: Callable[[str], None],
+    ) -> None:
+        self._differences, self._config, self._events, self._say = differences, config, events, say
+        entries = {name: Entry(one.number, one.scalar, one.writable, False) for name, one in table.items()}
+        self._controls = CrtpControls(lambda data: uplink(events.now_us, data), lambda: entries)
+        self._left = to_set(table, config)
+        self._set: list[str] = []
+
+    def begin(self, now_us: int) -> None:
+        """Report the constants that differ from the profile, and write the first parameter that does."""
+        if differs := self._differences(self._config):
+            self._say(f"the image was built with other constants: {differs}")
+        if self._left:
+            self._ask(now_us)
+            self._turn(now_us)
+        else:
+            self._finish()
+
+    def hear(self, now_us: int, data: bytes) -> None:
+        """Take what the board sends; nothing but answers is looked at."""
+        if self._left and (packet := decode(data)).port in PORTS and self._controls.hear(now_us, packet):
+            self._go_on(now_us)
+
+    def _turn(self, now_us: int) -> None:
+        self._go_on(now_us)
+        if self._left:
+            self._events.at(now_us + TURN_US, self._turn)
+
+    def _ask(self, now_us: int) -> None:
+        name, value = self._left[0]
+        self._controls.ask(now_us, Request(Action.WRITE, name, value))
+
+    def _go_on(self, now_us: int) -> None:
+        answer = self._controls.answer(now_us)
+        if answer is None:
+            return
+        name, value = self._left.pop(0)
+        if answer.error:
+            self._say(answer.error)
+        else:
+            self._set.append(f"{name} {value:.6g}")
+        if self._left:
+            self._ask(now_us)
+        else:
+            self._finish()
+
+    def _finish(self) -> None:
+        if self._set:
+            self._say(f"set over the radio: {', '.join(self._set)}")
+        if stays := self._differences(self._config):
+            self._say(f"the image keeps its own {stays}")

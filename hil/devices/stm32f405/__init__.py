@@ -1,1 +1,0 @@
-"""The microcontroller of the Crazyflie, which executes an image as it is flashed, and what is read of it while it runs."""

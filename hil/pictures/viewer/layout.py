@@ -1,0 +1,99 @@
+"""The layout of the viewer's window: the scene and the states on the left, the curves on the right."""
+
+import pyarrow as pa
+import rerun.blueprint as rrb
+
+from hil.pictures.viewer.plots import ShownCurves
+from hil.pictures.viewer.track import timeline_of
+
+FOLLOWED_S = 20.0  # shown by the curves of a live flight
+TRAIL_S = 4.0
+# Title and origin of each plot; the first two have their own place, the rest are tabs.
+VIEWS = (
+    ("Position error [cm]", "position"),
+    ("Attitude error [deg]", "attitude"),
+    ("Flap angles, commands pale; colours of the scene [deg]", "flaps"),
+    ("Inputs [deg]", "inputs"),
+    ("Estimate - truth [cm, deg]", "miss"),
+    ("Age of the pose, by stage [ms]", "age"),
+    ("Link: rates [1/s]", "link/rate"),
+    ("Link: losses", "link/loss"),
+    ("Link: air", "link/air"),
+    ("Battery [V]", "battery"),
+    ("Queue", "queue"),
+    ("Processor [%]", "processor"),
+)
+LEGEND = """
+| drawn | what |
+|---|---|
+| plates, flaps 1 to 4 | the true robot, of a real flight by the cameras; flaps in the colours of their curves |
+| white outline | the board's estimate |
+| red box and cross | 20 cm around the goal |
+| white line | the path of the last 4 s |
+| yellow arrows | drag of the plates, 15 cm per newton |
+| blue arrow | the air's movement in 0.02 s; pale: its sideways part in 0.1 s |
+| pink arrow | a push, 15 cm per newton, shown for half a second at least |
+| grey line, grid | tether, net |
+| red, green, blue axes | x, y, z of W at the exit, and of the body |
+| points on the zero line | poses refused, faults, an operator's actions |
+"""
+
+
+def views_of(schema: pa.Schema) -> list[tuple[str, str]]:
+    """Return title and origin of the plots that a flight with such a log has."""
+    known = ShownCurves.of(schema).paths
+    return [
+        (title, origin)
+        for title, origin in VIEWS
+        if any(path == origin or path.startswith(f"{origin}/") for path in known)
+    ]
+
+
+def blueprint(schema: pa.Schema, live: bool = False) -> rrb.Blueprint:
+    """Return the layout for a flight.
+
+    A live flight is followed, with the curves of its last seconds, until the user pauses or zooms.
+    """
+    timeline, _ = timeline_of(schema.metadata)
+    begin = rrb.TimeRangeBoundary.cursor_relative(seconds=-FOLLOWED_S)
+    now = rrb.TimeRangeBoundary.cursor_relative()
+    shown = [rrb.VisibleTimeRange(timeline, start=begin, end=now)] if live else None
+    plots = [
+        rrb.TimeSeriesView(
+            name=name, origin=f"plot/{path}", plot_legend=rrb.PlotLegend(visible=path != "flaps"), time_ranges=shown
+        )
+        for name, path in views_of(schema)
+    ]  # fmt: skip
+    columns = rrb.TextLogColumns(timeline_columns=[timeline], text_log_columns=["Body"])
+    texts = rrb.Tabs(
+        rrb.TextLogView(name="Text", origin="text", columns=columns),
+        rrb.TextDocumentView(name="Legend", origin="legend"),
+    )
+    states = rrb.StateTimelineView(name="States", origin="state", time_ranges=shown)
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(_tunnel(timeline), rrb.Horizontal(states, texts), row_shares=[3, 1]),
+            rrb.Vertical(*plots[:2], rrb.Tabs(*plots[2:])),
+            column_shares=[5, 4],
+        ),
+        rrb.TimePanel(timeline=timeline, play_state="following" if live else "playing", state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _tunnel(timeline: str) -> rrb.Spatial3DView:
+    before = rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S)
+    now = rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.Spatial3DView(
+        name="Wind tunnel",
+        origin="world",
+        eye_controls=rrb.EyeControls3D(
+            position=(0.62, -0.48, 1.45), look_target=(0.0, 0.0, 1.12), tracking_entity="world/robot"
+        ),
+        background=(14, 18, 22),  # pale lines stay visible in a light theme, too
+        line_grid=False,
+        overrides={
+            "world/trail": [rrb.VisibleTimeRanges(rrb.VisibleTimeRange(timeline, start=before, end=now))]
+        },
+    )

@@ -1,0 +1,199 @@
+"""The 3-D scene below `/world`, in metres and W: tunnel, robot, goal, estimate, drag, flow, tether, markers and pushes."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from firmware_py.geometry import from_euler_zyx, yaw_quaternion
+from hil.devices.markers import DIAMETER, marker_places
+from hil.laboratory.faults import parse
+from hil.laboratory.metrics import BOX, body, column, is_real
+from hil.pictures import curves, scene
+from hil.pictures.viewer.track import Times, Track, rgba
+from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
+from hil.world.geometry import weigh
+
+METRES_PER_NEWTON = 0.15  # length of the drag arrows, and of pushes
+SECONDS_OF_FLOW = 0.02  # length of the flow's arrow: the distance that the air moves in that time
+SECONDS_OF_WIND = 0.1  # likewise of its sideways part, which is small
+PUSH_SHOWN_US = 500_000  # at least, because a push is too short to be seen
+NOZZLE_RADIUS = 0.6  # [m] paper, Experimental platform: 1.2 m wide
+NOZZLE_TOP = 1.8  # [m] where the drawing of the tunnel ends
+FLOW_RADIUS = 0.2  # [m] docs/explanation/plant.md, Tunnel
+AXIS = 0.08  # [m] length of drawn axes
+MARKERS_SEEN = "markers.visible"
+SEEN, HIDDEN = 0xFFFFFFFF, 0xFF3030FF  # colours of markers
+STEEL = 0x707880FF
+PARTS = ("base", "flap1", "flap2", "flap3", "flap4")
+
+
+class Scene:
+    """Draws what has a place, from the rows of a log whose schema holds the configuration."""
+
+    def __init__(self, track: Track, schema: pa.Schema) -> None:
+        config = json.loads((schema.metadata or {}).get(b"config", b"{}"))
+        plant = {
+            key: value for key, value in config.get("plant", {}).items() if key in PlantConfig.model_fields
+        }
+        self._track = track
+        self._geometry = GeometryConfig.model_validate(config.get("geometry", {}))
+        self._plant = PlantConfig.model_validate(plant)  # older logs have the shape in [plant]
+        self._tunnel = TunnelConfig.model_validate(config.get("tunnel", {}))
+        self._flap_axes = scene.flap_axes(self._geometry)
+        self._markers = (
+            marker_places(self._geometry, self._plant.ground) if MARKERS_SEEN in schema.names else ()
+        )
+        self._build_tunnel()
+        self._build_goal()
+        self._build_robot()
+        self._build_arrows()
+
+    def add_rows(self, joined: pa.Table, fresh: int) -> None:
+        """Draw the rows from `fresh` on; those before are known already."""
+        rows = joined.slice(fresh)
+        times, p_WB, q_WB = column(rows, "t"), body(rows, "x", "y", "z"), body(rows, "qw", "qx", "qy", "qz")
+        flaps = np.radians(curves.FLAPS.read(rows))
+        self._place("robot", times, p_WB, q_WB)
+        self._place("held", times, p_WB, np.broadcast_to((1.0, 0.0, 0.0, 0.0), q_WB.shape))
+        for flap in range(4):
+            turn = scene.turn_quaternion(self._flap_axes[flap], flaps[:, flap])
+            self._place(f"robot/plates/flap_{flap + 1}", times, np.zeros_like(p_WB), turn)
+        goal = column(rows, "goal.x", "goal.y", "goal.z")
+        self._place("goal", times, goal, np.array([yaw_quaternion(yaw) for yaw in column(rows, "goal.yaw")]))
+        pose = column(rows, *(f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")))
+        known = np.isfinite(pose).all(axis=1)  # a real board may not have reported it yet
+        q_GE = [from_euler_zyx(*angles) for angles in pose[known, 3:].tolist()]
+        self._place("goal/estimate", times[known], pose[known, :3], np.array(q_GE).reshape(-1, 4))
+        if not is_real(rows):  # of a real flight no forces are known
+            origins = scene.drag_origins(self._geometry, p_WB, q_WB, flaps)
+            self._add_forces(rows, p_WB, origins)
+        if len(self._markers):
+            self._colour_markers(joined, fresh)
+        self._add_trail(joined)
+
+    def add_tether(self, rows: pa.Table) -> None:
+        """Draw the tether of a simulated robot."""
+        if "truth.x" not in rows.column_names:
+            return
+        top = scene.tops(self._geometry, body(rows, "x", "y", "z"), body(rows, "qw", "qx", "qy", "qz"))
+        anchor = (0.0, 0.0, self._tunnel.hover_height + self._plant.tether.anchor_height)
+        lines = np.stack((np.broadcast_to(anchor, top.shape), top), axis=1).astype(np.float32)
+        self._track.send("world/tether", column(rows, "t"), rr.LineStrips3D.columns(strips=lines))
+
+    def add_push(self, t_us: int, text: str) -> None:
+        """Draw a fault that is a push. Raises `LabError` for a kind of the user's own."""
+        fault = parse(text)
+        group, _, axis = fault.kind.partition(".")
+        if group != "push" or axis not in "xyz":
+            return
+        force = METRES_PER_NEWTON * fault.size * np.eye(3)["xyz".index(axis)]
+        path = f"world/held/push_{axis}"
+        arrow = rr.Arrows3D(vectors=[force], origins=[-force], colors=0xCC79A7FF, radii=0.006)
+        self._track.at(t_us, path, arrow)
+        shown_us = max(PUSH_SHOWN_US, int(1e6 * min(fault.duration_s, 1e6)))
+        self._track.at(t_us + shown_us, path, rr.Clear(recursive=False))
+
+    def _add_forces(self, rows: pa.Table, p_WB: NDArray[np.float64], origins: NDArray[np.float64]) -> None:
+        """Draw drag and flow."""
+        times = column(rows, "t")
+        forces = column(rows, *(f"force.{part}_{axis}" for part in PARTS for axis in "xyz"))
+        drag = METRES_PER_NEWTON * forces.reshape(-1, 3)
+        arrows = rr.Arrows3D.columns(vectors=drag, origins=origins.reshape(-1, 3))
+        self._track.send("world/drag", times, arrows.partition(np.full(len(times), len(PARTS))))
+        flow = column(rows, "flow.x", "flow.y", "flow.z")
+        shift, wind = SECONDS_OF_FLOW * flow, SECONDS_OF_WIND * flow * (1.0, 1.0, 0.0)
+        for name, vectors, below in (("flow", shift, 0.1), ("wind", wind, 0.0)):
+            arrows = rr.Arrows3D.columns(vectors=vectors, origins=p_WB - vectors - (0, 0, below))
+            self._track.send(f"world/{name}", times, arrows)
+
+    def _add_trail(self, joined: pa.Table) -> None:
+        """Draw the path from each row to the next where the robot was seen in both."""
+        path = body(joined, "x", "y", "z")
+        steps = np.stack((path[:-1], path[1:]), axis=1).astype(np.float32)
+        seen = np.isfinite(steps).all(axis=(1, 2))
+        strips = rr.LineStrips3D.columns(strips=steps[seen])
+        self._track.send("world/trail", column(joined, "t")[1:][seen], strips)
+
+    def _colour_markers(self, rows: pa.Table, fresh: int) -> None:
+        """Colour the markers where they appear or vanish, from row `fresh` on."""
+        bits = column(rows, MARKERS_SEEN).astype(np.int64)
+        changed = np.flatnonzero(np.diff(bits, prepend=-1))
+        changed = changed[changed >= fresh]
+        count = len(self._markers)
+        seen = bits[changed, None] >> np.arange(count) & 1
+        colours = rr.Points3D.columns(colors=np.where(seen, SEEN, HIDDEN).astype(np.uint32).ravel())
+        self._track.send(
+            "world/robot/markers", column(rows, "t")[changed], colours.partition(np.full(len(seen), count))
+        )
+
+    def _place(self, name: str, times: Times, p: NDArray[np.float64], q: NDArray[np.float64]) -> None:
+        """Send poses, q as w x y z; where they are unknown, the last one stays."""
+        known = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
+        poses = rr.Transform3D.columns(translation=p[known], quaternion=np.roll(q[known], -1, axis=1))
+        self._track.send(f"world/{name}", times[known], poses)
+
+    def _build_tunnel(self) -> None:
+        static = self._track.static
+        static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        static("world/tunnel/axes", rr.TransformAxes3D(2 * AXIS))
+        net = scene.net_lines(NOZZLE_RADIUS, self._plant.ground.height)
+        static("world/tunnel/net", rr.LineStrips3D(net, colors=0x8899AA50, radii=0.001))
+        angle = np.linspace(0, 2 * np.pi, 73)
+        ring = np.column_stack((np.cos(angle), np.sin(angle), np.zeros_like(angle)))
+        rings = [NOZZLE_RADIUS * ring, NOZZLE_RADIUS * ring + (0, 0, NOZZLE_TOP)]
+        posts = [np.array([rings[0][index], rings[1][index]]) for index in range(0, 72, 18)]
+        static("world/tunnel/nozzle", rr.LineStrips3D([*rings, *posts], colors=0x8899AA90, radii=0.004))
+        flow = rr.Cylinders3D(
+            lengths=[NOZZLE_TOP], radii=[FLOW_RADIUS], centers=[(0, 0, NOZZLE_TOP / 2)], colors=0x56B4E918,
+            fill_mode="solid",
+        )  # fmt: skip
+        static("world/tunnel/flow", flow)
+
+    def _build_goal(self) -> None:
+        cross = [np.array([-line, line]) for line in BOX / 5 * np.eye(3)]
+        static = self._track.static
+        static("world/goal/cross", rr.LineStrips3D(cross, colors=0xD55E00FF, radii=0.0025))
+        static("world/goal/box", rr.LineStrips3D(scene.box_lines(BOX), colors=0xD55E00A0, radii=0.0012))
+        ghost = rr.LineStrips3D(scene.outline(self._geometry), colors=0xFFFFFF90, radii=0.0012)
+        static("world/goal/estimate/ghost", ghost)
+
+    def _build_robot(self) -> None:
+        static, geometry = self._track.static, self._geometry
+        height = weigh(geometry).axis_height
+        case = rr.Boxes3D(half_sizes=[(0.022, 0.016, 0.012)], colors=0x404850FF, fill_mode="solid")
+        static("world/robot/body", case)
+        rod = [[(0, 0, 0), (0, 0, height)]]
+        static("world/robot/rod", rr.LineStrips3D(rod, colors=STEEL, radii=0.003))
+        stand = scene.stand_lines(geometry, self._plant.ground)
+        static("world/robot/stand", rr.LineStrips3D(stand, colors=STEEL, radii=0.0015))
+        static("world/robot/axes", rr.TransformAxes3D(AXIS))
+        static("world/robot/plates", rr.Transform3D(translation=(0, 0, height)))
+        self._build_plate("base", scene.base_mesh(geometry), "#c8ccd0")
+        for flap, colour in enumerate(curves.FLAP_COLOURS):
+            mesh, name = scene.flap_mesh(geometry, flap), f"flap_{flap + 1}"
+            self._build_plate(name, mesh, colour)
+            number = rr.Points3D([scene.mesh_centre(mesh)], radii=0.002, colors=rgba(colour), labels=name[-1])
+            static(f"world/robot/plates/{name}/number", number)
+        if len(self._markers):
+            static("world/robot/markers", rr.Points3D(self._markers, radii=DIAMETER / 2))
+
+    def _build_plate(self, name: str, mesh: scene.Mesh, colour: str) -> None:
+        surface = rr.Mesh3D(
+            vertex_positions=mesh.vertices, triangle_indices=mesh.triangles, vertex_normals=mesh.normals(),
+            albedo_factor=rgba(colour),
+        )  # fmt: skip
+        self._track.static(f"world/robot/plates/{name}", surface)
+
+    def _build_arrows(self) -> None:
+        for name, colour, radius in (
+            ("drag", 0xF0E442FF, 0.0035),
+            ("flow", 0x56B4E9FF, 0.005),
+            ("wind", 0xA6DDF5FF, 0.005),
+        ):
+            self._track.static(f"world/{name}", rr.Arrows3D.from_fields(colors=[colour], radii=[radius]))
+        for name, colour, radius in (("tether", 0x99A3ADFF, 0.0015), ("trail", 0xFFFFFFC0, 0.0018)):
+            line = rr.LineStrips3D.from_fields(colors=[colour], radii=[radius])
+            self._track.static(f"world/{name}", line)

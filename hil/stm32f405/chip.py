@@ -1,0 +1,311 @@
+"""An STM32F405 that executes an image: unicorn for the instructions, `native/` for everything around them.
+
+Time is that of the chip: cycles of 168 MHz since power-on. `run` goes on until an instant or until something outside is to
+be done; what is compiled calls no Python. Cycles are those of `firmware_py.export.cycles`, plus three for every jump; flash
+is taken to keep up with the core.
+"""
+
+from __future__ import annotations
+
+import mmap
+from enum import IntFlag
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.export.compilers import HOST_FLAGS, compile_texts, zig
+from firmware_py.export.cortex_m4 import find_emulator
+from firmware_py.export.cycles import count
+from firmware_py.export.elf import CCM, CCM_SIZE, FLASH, FLASH_SIZE, RAM, RAM_SIZE
+from firmware_py.export.errors import ExportError
+from firmware_py.extras import install_command
+from hil.errors import LabError
+
+CYCLES_PER_US = 168
+SYSTEM, SYSTEM_SIZE = 0x1FFF_0000, 0x1_0000
+OTP, UNIQUE_ID, FLASH_KBYTES = 0x1FFF_7800, 0x1FFF_7A10, 0x1FFF_7A22
+WINDOWS = (
+    (0x4000_0000, 0x8_0000, "peripheral"), (0x5000_0000, 0x8_0000, "usb"), (0xE000_0000, 0x10_0000, "system"),
+)  # fmt: skip
+SOURCES = Path(__file__).parent / "native"
+# Causes of a reset in RCC_CSR, with the pin's.
+POWER_ON, SOFTWARE, WATCHDOG = 0x0C00_0000, 0x1400_0000, 0x2400_0000
+
+
+class Why(IntFlag):
+    """Why a run ended before its time: `WHY_...` of machine.h."""
+
+    TIME = 0
+    SERIAL = 1  # a USART has sent something and is silent now
+    COMPARE = 2  # a timer's compare register has changed
+    RESET = 4  # software asks for a reset
+    WATCHDOG = 8  # the independent watchdog does
+    BREAK = 16
+    LOCKUP = 32  # a fault inside the handler of a fault
+    STEP = 64
+    OVERFLOW = 128  # a task has written below its stack
+    LOW_READ = 256  # the first read near address 0
+    DIVISION = 512  # the first integer division by zero
+    WATCHPOINT = 1024  # an access that the debugger waits for, at most a block of instructions ago
+    LOW_WRITE = 2048  # the first write of an instruction near address 0
+
+
+def build_machine(folder: Path) -> Path:
+    """Compile `native/` for this machine; `folder` keeps it. Raises `ExportError`."""
+    texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(SOURCES.glob("*.[ch]"))}
+    return compile_texts(
+        texts, [name for name in texts if name.endswith(".c")], HOST_FLAGS, "machine.so", folder, zig()
+    )
+
+
+@cache
+def declared() -> Any:
+    """Return what machine.h declares, as cffi knows it. Raises `ExportError` when cffi is missing."""
+    try:
+        from cffi import FFI
+    except ImportError:
+        raise ExportError(f"cffi is missing: {install_command('deploy')}") from None
+    lines = (SOURCES / "machine.h").read_text(encoding="utf-8").splitlines()
+    ffi = FFI()
+    ffi.cdef("\n".join(line for line in lines if not line.startswith("#")))
+    ffi.cdef("".join(f"void uc_{name}();" for name, _ in ffi.typeof("struct engine").fields[1:]))
+    return ffi
+
+
+class Chip:
+    """One microcontroller with an image in flash, in reset; `state` has the clock and what has happened.
+
+    `code` begins with the vector table, which `base` is the address of; `constants` are its half words that are no
+    instructions, counted from there. Raises `ExportError` when unicorn is missing.
+    """
+
+    def __init__(
+        self, code: bytes, base: int, library: Path, constants: frozenset[int] = frozenset()
+    ) -> None:
+        unicorn = find_emulator()
+        from unicorn import arm_const, unicorn_const
+        from unicorn.unicorn_py3.unicorn import uclib
+
+        self.flash, self.ram, self.ccm = _memory(FLASH_SIZE), _memory(RAM_SIZE), _memory(CCM_SIZE)
+        self.flash[:] = 0xFF
+        self.vectors = base
+        self.flash[base - FLASH : base - FLASH + len(code)] = np.frombuffer(code, np.uint8)
+        self._cpu = unicorn.Uc(
+            unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB | unicorn_const.UC_MODE_MCLASS
+        )
+        self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
+        self._numbers = _register_numbers(arm_const)
+        self._map(unicorn_const)
+        self._sums = _sums(code, base, constants)
+        self._ffi = declared()
+        self._library: Any = self._ffi.dlopen(str(library))
+        self.state: Any = self._ffi.new("struct machine *")
+        if self._ffi.sizeof(self.state[0]) != self._library.machine_size():
+            raise LabError(f"{library} was not compiled from the machine.h that lies here")
+        arrays: tuple[NDArray[Any], ...] = (self.flash, self.ram, self.ccm, *self._sums)
+        memories = [self._pointer(array) for array in arrays]
+        if self._library.machine_attach(self.state, self._engine(uclib), *memories):
+            raise LabError("unicorn refuses the machine's hooks")
+        self._registers = [
+            (base, base + size, *(getattr(self._library, f"{name}_{access}") for access in ("read", "write")))
+            for base, size, name in WINDOWS
+        ]
+        self._sent = self._ffi.new("uint8_t[]", self._library.LINE_BYTES)
+        self._kept: list[NDArray[np.uint8]] = []  # memory of devices
+        self.breakpoints: set[int] = set()  # of a debugger: addresses before whose instructions a run stops
+        self.crash_points: set[int] = set()  # of who reports crashes
+        self._planted: set[int] = set()
+        self.reset(POWER_ON)
+
+    def _map(self, const: Any) -> None:
+        """Map flash, RAM, CCM and the system's memory. The alias of flash at 0 is mapped when it is used (`run`)."""
+        read, write, execute = const.UC_PROT_READ, const.UC_PROT_WRITE, const.UC_PROT_EXEC
+        self._system = _memory(SYSTEM_SIZE)
+        self._system[:] = 0xFF
+        for place, array, rights in (
+            (FLASH, self.flash, read | execute),
+            (RAM, self.ram, read | write | execute),
+            (CCM, self.ccm, read | write),
+            (SYSTEM, self._system, read),
+        ):
+            self._cpu.mem_map_ptr(place, array.size, rights, array.ctypes.data)
+        self.set_system(UNIQUE_ID, bytes(range(1, 13)))
+        self.set_system(FLASH_KBYTES, (FLASH_SIZE // 1024).to_bytes(2, "little"))
+
+    def _engine(self, loaded: Any) -> Any:
+        """Return unicorn's functions, out of the library that its package has loaded."""
+        engine = self._ffi.new("struct engine *", {"uc": self._ffi.cast("uc_engine *", self._cpu._uch.value)})
+        unicorn = self._ffi.dlopen(loaded._name)
+        for name, field in self._ffi.typeof(engine[0]).fields[1:]:
+            setattr(engine, name, self._ffi.cast(field.type, getattr(unicorn, f"uc_{name}")))
+        return engine
+
+    def _pointer(self, array: NDArray[Any]) -> Any:
+        """Return the address of an array, which must live as long as the chip."""
+        return self._ffi.from_buffer("uint32_t[]" if array.itemsize == 4 else "uint8_t[]", array)
+
+    # Time
+
+    @property
+    def in_block(self) -> bool:
+        """Whether it stands where it would not have stood by itself, in the middle of a block of instructions."""
+        return bool(self.state.resume == self.state.pc)
+
+    @property
+    def now_us(self) -> int:
+        """Microseconds since power-on."""
+        return int(self.state.now) // CYCLES_PER_US
+
+    def run(self, until_cycles: int) -> Why:
+        """Run up to an instant, or until something outside is to be done."""
+        if self.breakpoints | self.crash_points != self._planted:
+            self._plant(self.breakpoints | self.crash_points)
+        why = self._library.machine_run(self.state, until_cycles)
+        if why & Why.LOW_READ:
+            self._map_alias()
+        return Why(why) if why else Why.TIME
+
+    def _map_alias(self) -> None:
+        """Let flash be seen at 0 as well, as it is from a start on."""
+        from unicorn import unicorn_const as const
+
+        rights = const.UC_PROT_READ | const.UC_PROT_EXEC
+        self._cpu.mem_map_ptr(0, self.flash.size, rights, self.flash.ctypes.data)
+
+    def step(self) -> Why:
+        """Execute one instruction."""
+        self._cpu.ctl_flush_tb()  # hooks act on what is translated after them, and until it is forgotten
+        why = Why(self._library.machine_step(self.state))
+        if why & Why.LOW_READ:
+            self._map_alias()
+        self._cpu.ctl_flush_tb()
+        return why
+
+    def reset(self, cause: int) -> None:
+        """Reset the processor: memory stays, time goes on."""
+        self._library.machine_reset(self.state, self.vectors, cause)
+
+    # Pins
+
+    def pin(self, port: str, number: int, high: bool) -> None:
+        """Give a pin a level from outside."""
+        self._library.machine_pin(self.state, ord(port) - ord("A"), number, int(high))
+
+    def feed(self, usart: int, data: bytes) -> int:
+        """Let bytes arrive at USART 1..6, from now on; returns how many found room on the line."""
+        return int(self._library.usart_feed(self.state, usart - 1, data, len(data)))
+
+    def sent(self, usart: int) -> bytes:
+        """Return what USART 1..6 has sent since the last time."""
+        size = self._library.machine_sent(self.state, usart - 1, self._sent)
+        return bytes(self._ffi.buffer(self._sent, size)) if size else b""
+
+    def add_device(self, bus: int, address: int, memory: NDArray[np.uint8], address_bytes: int = 1) -> None:
+        """Put memory behind a 7-bit address on I2C 1..3."""
+        self._kept.append(memory)
+        place = self._pointer(memory)
+        if not self._library.machine_device(self.state, bus - 1, address, place, memory.size, address_bytes):
+            raise LabError("more I2C devices than there is room for")
+
+    def set_system(self, address: int, contents: bytes) -> None:
+        """Write what stands in the chip's own memory: OTP, unique id."""
+        begin = address - SYSTEM
+        self._system[begin : begin + len(contents)] = np.frombuffer(contents, np.uint8)
+
+    # Debugging
+
+    def read(self, address: int, size: int) -> bytes:
+        """Return memory, or registers as the core would read them. Raises `LabError` where there is neither."""
+        for base, end, read, _ in self._registers:
+            if base <= address and address + size <= end:
+                words = range(address & ~3, address + size, 4)
+                found = b"".join(
+                    read(self._ffi.NULL, at - base, 4, self.state).to_bytes(8, "little")[:4] for at in words
+                )
+                return found[address & 3 :][:size]
+        return self.view(address, size).tobytes()
+
+    def view(self, address: int, size: int) -> NDArray[np.uint8]:
+        """Return memory that goes on to change. Raises `LabError` where there is none."""
+        array, begin = self._place(address, size)
+        return array[begin : begin + size]
+
+    def write(self, address: int, data: bytes) -> None:
+        """Change memory, code too, or registers. Raises `LabError` where there is none."""
+        for base, end, _, write in self._registers:
+            if base <= address and address + len(data) <= end:
+                for at in range(0, len(data), 4):
+                    word = data[at : at + 4]
+                    write(
+                        self._ffi.NULL,
+                        address + at - base,
+                        len(word),
+                        int.from_bytes(word, "little"),
+                        self.state,
+                    )
+                return
+        self.view(address, len(data))[:] = np.frombuffer(data, np.uint8)
+        if FLASH <= address < FLASH + FLASH_SIZE:
+            self._cpu.ctl_flush_tb()
+
+    def _place(self, address: int, size: int) -> tuple[NDArray[np.uint8], int]:
+        for base, array in (
+            (RAM, self.ram), (CCM, self.ccm), (FLASH, self.flash), (0, self.flash), (SYSTEM, self._system)
+        ):  # fmt: skip
+            if base <= address and address + size <= base + array.size:
+                return array, address - base
+        raise LabError(f"0x{address:08x}, {size} bytes: no memory there")
+
+    def register(self, name: str) -> int:
+        """Return a register: r0..r12, sp, lr, pc, xpsr, msp, psp, primask, basepri, control, s0..s31, d0..d15, fpscr."""
+        return int(self.state.pc) if name == "pc" else int(self._cpu.reg_read(self._numbers[name]))
+
+    @property
+    def task_return(self) -> int:
+        """Return EXC_RETURN of the last exception that has interrupted a task."""
+        return int(self.state.task_return)
+
+    def set_register(self, name: str, value: int) -> None:
+        """Change a register."""
+        if name == "pc":
+            self.state.pc = value & ~1
+        else:
+            self._cpu.reg_write(self._numbers[name], value)
+
+    def watch(self, kind: int, address: int, size: int, on: bool) -> None:
+        """Stop a run after writes (2), reads (3) or both (4) of memory, or no longer. Raises `LabError` without room."""
+        if not self._library.machine_watch(self.state, kind, address, size, int(on)):
+            raise LabError("more watchpoints than there is room for, or none there")
+        self._cpu.ctl_flush_tb()
+
+    def _plant(self, addresses: set[int]) -> None:
+        """Tell the machine of the breakpoints."""
+        for address in addresses ^ self._planted:
+            if not self._library.machine_break(self.state, address, int(address in addresses)):
+                raise LabError("more breakpoints than there is room for")
+        self._planted = addresses
+        self._cpu.ctl_flush_tb()  # hooks act on what is translated after them
+
+
+def _memory(size: int) -> NDArray[np.uint8]:
+    """Return zeroed memory that begins at a page of this machine."""
+    return np.frombuffer(mmap.mmap(-1, size), np.uint8)
+
+
+def _sums(code: bytes, base: int, constants: frozenset[int]) -> list[NDArray[np.uint32]]:
+    """Return how many instructions and cycles begin before each half word of flash."""
+    before = (base - FLASH) // 2
+    counted = count(code, constants)
+    after = FLASH_SIZE // 2 + 1 - before - counted.cycles.size
+    return [np.pad(sums, (before, after), "edge") for sums in (counted.instructions, counted.cycles)]
+
+
+def _register_numbers(arm_const: Any) -> dict[str, int]:
+    names = (
+        *(f"r{i}" for i in range(13)), *(f"s{i}" for i in range(32)), *(f"d{i}" for i in range(16)),
+        "sp", "lr", "xpsr", "msp", "psp", "primask", "basepri", "faultmask", "control", "fpscr",
+    )  # fmt: skip
+    return {name: getattr(arm_const, f"UC_ARM_REG_{name.upper()}") for name in names}

@@ -1,0 +1,252 @@
+"""What a firmware died of, in words: a fault, an assertion or its watchdog, with task, function, line and who called.
+
+A hang and a stack overflow are reported when they are seen, because what they lead to names somebody else.
+
+A handler of faults, and the function that a failed assertion calls, are looked at when their first instruction is about to
+run: `addresses` are the breakpoints of that. The bits are those of the ARMv7-M Architecture Reference Manual, B3.2.15 and
+B3.2.16.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import PurePath
+from struct import unpack, unpack_from
+from typing import Protocol
+
+from hil.errors import LabError
+from hil.stm32f405.call_frames import LR, PC, SP
+from hil.stm32f405.freertos import FreeRtos, stacked_registers
+from hil.stm32f405.image import Image
+
+CFSR, HFSR, MMFAR, BFAR = 0xE000_ED28, 0xE000_ED2C, 0xE000_ED34, 0xE000_ED38
+USES_PSP = 1 << 2  # in EXC_RETURN
+NOT_STACKED = 1 << 12  # in CFSR: there is no frame of who was interrupted
+FAULTS = {3: "HardFault", 4: "MemManage fault", 5: "BusFault", 6: "UsageFault"}
+FIRST_INTERRUPT = 16
+LONGEST_TEXT = 128
+NULL_SIZE = 0x400  # of what is reached through a null pointer: a member of a structure, an item of an array
+NAMES = (*(f"r{n}" for n in range(13)), "sp", "lr", "pc")
+CFSR_WORDS = {
+    0: "an instruction fetched where none may be executed", 1: "access to protected memory",
+    3: "protected memory while returning from an exception", 4: "protected memory while entering an exception",
+    5: "protected memory while storing floats", 8: "an instruction fetched where there is no memory",
+    9: "access to where there is no memory", 10: "a write to where there is no memory, some instructions ago",
+    11: "no memory at the stack pointer while returning from an exception",
+    12: "no memory at the stack pointer while entering an exception",
+    13: "no memory at the stack pointer while storing floats",
+    16: "undefined instruction", 17: "jump to an even address: not Thumb code", 18: "invalid return from an exception",
+    19: "the floating-point unit is switched off", 24: "unaligned access", 25: "division by zero",
+}  # fmt: skip
+MMFAR_VALID, BFAR_VALID = 1 << 7, 1 << 15
+VECTOR_UNREADABLE = 1 << 1  # in HFSR
+
+
+class Machine(Protocol):
+    """A machine that stands still; memory includes the registers of the system control block."""
+
+    @property
+    def task_return(self) -> int:
+        """EXC_RETURN of the last exception that has interrupted a task."""
+        ...
+
+    def read(self, address: int, size: int) -> bytes:
+        """Return memory; raises `LabError` where there is none."""
+        ...
+
+    def register(self, name: str) -> int:
+        """Return r0 to r12, sp, lr, pc, xpsr, msp or psp."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Crash:
+    """Why the firmware did not go on."""
+
+    what: str  # what happened
+    who: str  # the task or interrupt in which it happened
+    trace: tuple[str, ...]  # where, in its caller, and so on: each `function (file.c:12)`
+
+    def __str__(self) -> str:
+        runs = [(place, len(list(same))) for place, same in groupby(self.trace)]
+        places = [place if times == 1 else f"{place}, {times} times" for place, times in runs]
+        return f"{self.what}, in {self.who}" + (f": {' < '.join(places)}" if places else "")
+
+
+class CrashReports:
+    """The crashes of one image on one machine."""
+
+    def __init__(self, image: Image, machine: Machine, kernel: FreeRtos | None, assertion: str) -> None:
+        """`assertion` is a function of three arguments: expression, file and line."""
+        self._image, self._machine, self._kernel = image, machine, kernel
+        self._handlers = {self._vector(number) & ~1 for number in FAULTS}
+        self._assertion = image.symbol(assertion).address if image.has(assertion) else 0
+
+    @property
+    def addresses(self) -> frozenset[int]:
+        """Return where the machine has to stop for `here`, once: a handler may be a loop of one instruction."""
+        return frozenset({*self._handlers, self._assertion} - {0})
+
+    def here(self) -> Crash:
+        """Return what happened, at one of `addresses`."""
+        if self._machine.register("pc") == self._assertion:
+            return self._assertion_failed()
+        return self._fault()
+
+    def watchdog(self) -> Crash:
+        """Return who ran when the watchdog had waited long enough."""
+        return self._here("watchdog reset: nobody fed it in time; this ran then")
+
+    def lockup(self) -> Crash:
+        """Return where the processor gave up: at a fault inside the handler of a fault, or on the way there."""
+        return self._here(f"lock-up, no fault handler could run: {self._reasons()}")
+
+    def overflow(self, task: int) -> Crash:
+        """Return whose stack has overflowed, and where it is now: it may have returned."""
+        registers, what = self._registers_of(task), "stack overflow"
+        if self._kernel is not None and registers[SP] >= self._kernel.stack_begin(task):
+            what += ", some calls before this place"
+        return Crash(what, self._task(task), self._trace(registers))
+
+    def hang(self, task: int, busy_us: int) -> Crash:
+        """Return where a task is that lets no other one of its priority or below run."""
+        what = f"hang: busy for {busy_us // 1000} ms without waiting for anything"
+        return Crash(what, self._task(task), self._trace(self._registers_of(task)))
+
+    def low_access(self, address: int, writes: bool) -> Crash:
+        """Return who uses a pointer that is 0, or an offset from it."""
+        pointer = "null pointer" if address < NULL_SIZE else "wild pointer"
+        if writes:
+            return self._here(f"{pointer}: write to 0x{address:08x}, which has no effect and causes no fault")
+        what = f"{pointer}: read at 0x{address:08x}, where the chip has its flash again; no fault follows"
+        return self._here(f"{what}, and the next reads are not reported")
+
+    def division(self) -> Crash:
+        """Return who divides by zero."""
+        return self._here(
+            "division by zero: its result is 0; no fault follows, and the next ones are not reported"
+        )
+
+    def _here(self, what: str) -> Crash:
+        number = self._machine.register("xpsr") & 0x1FF
+        return Crash(what, self._who(number), self._trace(self._registers()))
+
+    def _assertion_failed(self) -> Crash:
+        expression, file = (self._text(self._machine.register(name)) for name in ("r0", "r1"))
+        line = self._machine.register("r2")
+        crash = self._here(f"assertion {expression} failed at {file}:{line}")
+        return Crash(
+            crash.what, crash.who, self._with_place(f"{PurePath(file).name}:{line}", crash.trace[1:])
+        )
+
+    def _with_place(self, line: str, trace: tuple[str, ...]) -> tuple[str, ...]:
+        """Return a trace that begins at a line: a function's last call leaves no frame behind, or another line."""
+        place = self._image.place(code) if (code := self._image.debug.address_of(line)) else ""
+        if not place or place in trace[:1]:
+            return trace
+        same = bool(trace) and trace[0].split()[0] == place.split()[0]
+        return (place, *trace[1 if same else 0 :])
+
+    def _fault(self) -> Crash:
+        exc_return = self._machine.register("lr")
+        frame = self._machine.register("psp" if exc_return & USES_PSP else "msp")
+        number = self._machine.register("xpsr") & 0x1FF
+        what = (
+            f"{FAULTS[number]}: {self._reasons()}"
+            if number in FAULTS
+            else f"{self._who(number)} is not handled"
+        )
+        try:
+            stacked = stacked_registers(self._machine.read, frame, exc_return)
+        except LabError:
+            return Crash(f"{what}; there is no memory at its stack pointer, 0x{frame:08x}", self._who(0), ())
+        if self._word(CFSR) & NOT_STACKED:
+            return Crash(what, self._who(0), ())
+        return Crash(what, self._who(stacked["xpsr"] & 0x1FF), self._trace(self._numbered(stacked)))
+
+    def _reasons(self) -> str:
+        """Return the bits of the fault status registers in words."""
+        status, hard = self._word(CFSR), self._word(HFSR)
+        reasons = [words for bit, words in CFSR_WORDS.items() if status >> bit & 1]
+        if hard & VECTOR_UNREADABLE:
+            reasons.append("the vector of an exception could not be read")
+        where = ""
+        if status & (BFAR_VALID | MMFAR_VALID):
+            where = f" at 0x{self._word(BFAR if status & BFAR_VALID else MMFAR):08x}"
+        return (" and ".join(reasons) or "for a reason that its registers do not say") + where
+
+    def _who(self, number: int) -> str:
+        """Return the task, or the handler of the exception with that number."""
+        if number:
+            name = self._image.function_at(self._vector(number) & ~1) or "no handler"
+            what = (
+                f"interrupt {number - FIRST_INTERRUPT}"
+                if number >= FIRST_INTERRUPT
+                else f"exception {number}"
+            )
+            return f"{what} ({name})"
+        if self._kernel is None or not self._kernel.running:
+            return "main, before the scheduler ran"
+        return self._task(self._kernel.current_block)
+
+    def _task(self, task: int) -> str:
+        assert self._kernel is not None
+        return f"task {self._kernel.name(task)}"
+
+    def _registers_of(self, task: int) -> dict[int, int]:
+        """Return the registers of a task: saved by the scheduler, interrupted, or running."""
+        assert self._kernel is not None
+        if task != self._kernel.current_block:
+            return self._numbered(self._kernel.saved_registers(task))
+        if not self._machine.register("xpsr") & 0x1FF:
+            return self._registers()
+        psp, exc_return = self._machine.register("psp"), self._machine.task_return
+        return self._numbered(stacked_registers(self._machine.read, psp, exc_return))
+
+    def _trace(self, registers: dict[int, int]) -> tuple[str, ...]:
+        """Return the places of a backtrace, as far as the stack can be read and functions were called."""
+        pcs: list[int] = []
+        with suppress(LabError):
+            for pc in self._image.debug.frames.backtrace(registers, self._word):
+                if pcs and not self._follows_call(pc + 1):
+                    break  # nobody calls the function of a task
+                pcs.append(pc)
+        # Compilers forget where a function's early end has its frame. Then the link register still knows the caller.
+        caller = (registers[LR] & ~1) - 1
+        elsewhere = self._image.function_at(caller) != self._image.function_at(registers[PC])
+        if len(pcs) == 1 and elsewhere and self._follows_call(caller + 1):
+            pcs.append(caller)
+        return tuple(self._image.place(pc) for pc in pcs)
+
+    def _follows_call(self, address: int) -> bool:
+        """Return whether the instruction before an address of the image is BL or BLX."""
+        at = address - 4 - self._image.base
+        if not 0 <= at <= len(self._image.code) - 4:
+            return False
+        first, second = unpack_from("<2H", self._image.code, at)
+        return bool((first & 0xF800 == 0xF000 and second & 0xD000 == 0xD000) or second & 0xFF87 == 0x4780)
+
+    def _registers(self) -> dict[int, int]:
+        """Return r0 to pc as they are, by number."""
+        return {number: self._machine.register(name) for number, name in enumerate(NAMES)}
+
+    def _numbered(self, registers: dict[str, int]) -> dict[int, int]:
+        """Return r0 to pc by number; what was not kept is as it is now."""
+        return {n: registers.get(name, self._machine.register(name)) for n, name in enumerate(NAMES)}
+
+    def _vector(self, exception: int) -> int:
+        offset = 4 * exception
+        return (
+            int(unpack_from("<I", self._image.code, offset)[0]) if offset + 4 <= len(self._image.code) else 0
+        )
+
+    def _text(self, address: int) -> str:
+        """Return a string of the image's constants; its address when there is none."""
+        try:
+            text = self._machine.read(address, LONGEST_TEXT).partition(b"\0")[0].decode("ascii")
+        except (LabError, UnicodeDecodeError):
+            return f"0x{address:08x}"
+        return text
+
+    def _word(self, address: int) -> int:
+        return int(unpack("<I", self._machine.read(address, 4))[0])

@@ -1,0 +1,212 @@
+"""What the compiler wrote down about an image (DWARF): lines of addresses and members of structures.
+
+Each compilation unit is read when something of it is asked for the first time.
+"""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from hil.errors import LabError, hint
+from hil.stm32f405.call_frames import CallFrames
+
+AGGREGATES = ("DW_TAG_structure_type", "DW_TAG_union_type")
+TRANSPARENT = ("DW_TAG_typedef", "DW_TAG_volatile_type", "DW_TAG_const_type")
+POINTER_SIZE = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """Where a member lies in its structure."""
+
+    offset: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """A structure as the compiler laid it out; members of members by dotted names, those of anonymous ones directly."""
+
+    name: str
+    size: int
+    members: dict[str, Member]
+
+    def __getitem__(self, name: str) -> Member:
+        try:
+            return self.members[name]
+        except KeyError:
+            raise LabError(f"struct {self.name} has no member {name}; {hint(name, self.members)}") from None
+
+
+class DebugInfo:
+    """Answers by address and by name. `path` is for messages."""
+
+    def __init__(self, dwarf: Any, path: Path) -> None:
+        self._dwarf, self._path = dwarf, path
+        self._lines: dict[int, list[tuple[int, str]]] = {}
+
+    @cached_property
+    def frames(self) -> CallFrames:
+        """Return what tells the callers of a function."""
+        return CallFrames(self._dwarf)
+
+    def line_at(self, address: int) -> str:
+        """Return file and line of an address of code as `file.c:12`, empty when the compiler did not say."""
+        unit = self._unit_at(address)
+        if unit is None:
+            return ""
+        table = self._table(unit)
+        index = bisect_right(table, (address, "\U0010ffff")) - 1
+        return table[index][1] if index >= 0 else ""
+
+    def address_of(self, line: str) -> int:
+        """Return the first address of the code of `file.c:12`, 0 when there is none in that file itself."""
+        file = line.partition(":")[0]
+        for _, _, unit in self._units:
+            if Path(_name(unit.get_top_DIE())).name == file:
+                found = [address for address, place in self._table(unit) if place == line]
+                if found:
+                    return found[0]
+        return 0
+
+    def structure(self, name: str, address: int) -> Structure:
+        """Return `struct name` as the file around a function's address knows it; raises `LabError` when it does not."""
+        unit = self._unit_at(address)
+        for entry in unit.iter_DIEs() if unit is not None else ():
+            if entry.tag in AGGREGATES and "DW_AT_byte_size" in entry.attributes and _name(entry) == name:
+                return Structure(
+                    name, entry.attributes["DW_AT_byte_size"].value, dict(_members(entry, "", 0))
+                )
+        raise LabError(f"{self._path}: struct {name} is not described around 0x{address:08x}")
+
+    def variable(self, name: str, address: int) -> Structure:
+        """Return the structure that a variable has in the file around a function; raises `LabError` for no variable."""
+        unit = self._unit_at(address)
+        for entry in unit.iter_DIEs() if unit is not None else ():
+            if entry.tag == "DW_TAG_variable" and _name(entry) == name and "DW_AT_type" in entry.attributes:
+                kind = _stripped(entry.get_DIE_from_attribute("DW_AT_type"))
+                return Structure(name, _size(kind), dict(_members(kind, "", 0)))
+        raise LabError(f"{self._path}: variable {name} is not described around 0x{address:08x}")
+
+    @cached_property
+    def _units(self) -> list[tuple[int, int, Any]]:
+        """Return start, end and compilation unit of every piece of code."""
+        lists = self._dwarf.range_lists()
+        pieces = []
+        for unit in self._dwarf.iter_CUs():
+            for low, high in _ranges(unit, lists):
+                if low:  # what the linker dropped lies at 0
+                    pieces.append((low, high, unit))
+        return sorted(pieces, key=lambda piece: piece[0])
+
+    @cached_property
+    def _unit_starts(self) -> list[int]:
+        return [start for start, _, _ in self._units]
+
+    @cached_property
+    def _index(self) -> Any:
+        """Return what GCC writes so that not every unit has to be looked at; other compilers leave it out."""
+        return self._dwarf.get_aranges()
+
+    def _unit_at(self, address: int) -> Any:
+        offset = self._index.cu_offset_at_addr(address) if self._index is not None else None
+        if offset is not None:
+            return self._dwarf.get_CU_at(offset)
+        index = bisect_right(self._unit_starts, address) - 1
+        return self._units[index][2] if index >= 0 and address < self._units[index][1] else None
+
+    def _table(self, unit: Any) -> list[tuple[int, str]]:
+        if unit.cu_offset not in self._lines:
+            self._lines[unit.cu_offset] = self._line_table(unit)
+        return self._lines[unit.cu_offset]
+
+    def _line_table(self, unit: Any) -> list[tuple[int, str]]:
+        program = self._dwarf.line_program_for_CU(unit)
+        if program is None:
+            return []
+        first = 0 if program["version"] >= 5 else 1
+        files = [Path(entry.name.decode(errors="replace")).name for entry in program["file_entry"]]
+        table = []
+        for entry in program.get_entries():
+            state = entry.state
+            if state is None or not state.address:
+                continue
+            index = state.file - first
+            known = not state.end_sequence and 0 <= index < len(files) and state.line
+            table.append((state.address, f"{files[index]}:{state.line}" if known else ""))
+        # At one address the last row counts, but the end of one piece yields to the beginning of the next.
+        return sorted(table, key=lambda row: (row[0], bool(row[1])))
+
+
+def _ranges(unit: Any, lists: Any) -> list[tuple[int, int]]:
+    """Return begin and end of the code of a compilation unit."""
+    top = unit.get_top_DIE()
+    attributes = top.attributes
+    low = attributes["DW_AT_low_pc"].value if "DW_AT_low_pc" in attributes else 0
+    if "DW_AT_ranges" in attributes:
+        if unit["version"] >= 5:
+            ranges = lists.get_range_list_at_offset(attributes["DW_AT_ranges"].value, unit)
+        else:
+            ranges = lists.get_range_list_at_offset(attributes["DW_AT_ranges"].value)
+        found, base = [], low
+        for entry in ranges:
+            if hasattr(entry, "base_address"):
+                base = entry.base_address
+            elif entry.is_absolute:
+                found.append((entry.begin_offset, entry.end_offset))
+            else:
+                found.append((base + entry.begin_offset, base + entry.end_offset))
+        return found
+    if "DW_AT_high_pc" not in attributes:
+        return []
+    high = attributes["DW_AT_high_pc"]
+    return [(low, high.value if high.form == "DW_FORM_addr" else low + high.value)]
+
+
+def _name(entry: Any) -> str:
+    attribute = entry.attributes.get("DW_AT_name")
+    return attribute.value.decode(errors="replace") if attribute else ""
+
+
+def _members(entry: Any, prefix: str, base: int) -> list[tuple[str, Member]]:
+    """Return the members of a structure and of the structures in it, each with its full name."""
+    found = []
+    for child in entry.iter_children():
+        if child.tag != "DW_TAG_member":
+            continue
+        location = child.attributes.get("DW_AT_data_member_location")
+        offset = base + (location.value if location else 0)
+        kind = _stripped(child.get_DIE_from_attribute("DW_AT_type"))
+        name = prefix + _name(child)
+        if _name(child):
+            found.append((name, Member(offset, _size(kind))))
+        if kind.tag in AGGREGATES:
+            found += _members(kind, f"{name}." if _name(child) else prefix, offset)
+    return found
+
+
+def _stripped(kind: Any) -> Any:
+    """Return a type without its typedefs and qualifiers."""
+    while kind.tag in TRANSPARENT and "DW_AT_type" in kind.attributes:
+        kind = kind.get_DIE_from_attribute("DW_AT_type")
+    return kind
+
+
+def _size(kind: Any) -> int:
+    """Return the size of a type in bytes, 0 when it is not known."""
+    kind = _stripped(kind)
+    if "DW_AT_byte_size" in kind.attributes:
+        return int(kind.attributes["DW_AT_byte_size"].value)
+    if kind.tag == "DW_TAG_pointer_type":
+        return POINTER_SIZE
+    if kind.tag != "DW_TAG_array_type":
+        return 0
+    count = 1
+    for dimension in kind.iter_children():
+        if "DW_AT_count" in dimension.attributes:
+            count *= dimension.attributes["DW_AT_count"].value
+        elif "DW_AT_upper_bound" in dimension.attributes:
+            count *= dimension.attributes["DW_AT_upper_bound"].value + 1
+    return count * _size(kind.get_DIE_from_attribute("DW_AT_type"))

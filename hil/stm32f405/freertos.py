@@ -1,0 +1,166 @@
+"""FreeRTOS as it stands in the memory of a running image: tasks, stacks and heap, by symbols and debugging information.
+
+The names are those of FreeRTOS V10 (tasks.c, list.h, heap_4.c); where its members lie is read from the image, because that
+depends on its configuration. A look in the middle of a critical section sees what the kernel sees there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from struct import unpack
+
+from hil.stm32f405.image import Image
+
+Read = Callable[[int, int], bytes]  # (address, size)
+
+NO_FLOATS = 1 << 4  # in EXC_RETURN
+FRAME, FLOATS, PADDED = 0x20, 0x48, 1 << 9  # of an exception, ARMv7-M Architecture Reference Manual, B1.5.7
+UNUSED = 0xA5  # what a stack is filled with
+WAITING_FOR_NOTIFICATION = 1
+STACK_CHUNK, MOST_TASKS = 64, 256
+RUNNING_TASK = "pxCurrentTCB"
+SWITCH = "vTaskSwitchContext"
+HEAP, HEAP_LEAST = "xFreeBytesRemaining", "xMinimumEverFreeBytesRemaining"  # of heap_4
+
+
+@dataclass(frozen=True, slots=True)
+class TaskView:
+    """One task; `stack_free_bytes` were never used since it was created."""
+
+    name: str
+    state: str  # running, ready, blocked, suspended or deleted
+    priority: int
+    base_priority: int  # without what it inherits of a mutex
+    stack_free_bytes: int
+    block: int  # address of its control block
+
+
+class FreeRtos:
+    """The kernel of an image; `read` reads the machine's memory. Raises `LabError` for an image without FreeRTOS."""
+
+    def __init__(self, image: Image, read: Read) -> None:
+        self._image, self._read = image, read
+        kernel = image.symbol(SWITCH).address
+        self._task = image.debug.structure("tskTaskControlBlock", kernel)
+        self._list = image.debug.structure("xLIST", kernel)
+        self._item = image.debug.structure("xLIST_ITEM", kernel)
+        self._container = "pvContainer" if "pvContainer" in self._item.members else "pxContainer"
+        self._current = image.symbol(RUNNING_TASK).address
+
+    @classmethod
+    def of(cls, image: Image, read: Read) -> FreeRtos | None:
+        """Return the kernel of an image that has one."""
+        return cls(image, read) if image.has(RUNNING_TASK) else None
+
+    @property
+    def places(self) -> tuple[int, int, int, int, int]:
+        """Return where the current task's pointer, in a task its stack and its list, and the ready lists begin and end."""
+        ready = self._image.symbol("pxReadyTasksLists")
+        stack, container = self._task["pxStack"], self._task[f"xStateListItem.{self._container}"]
+        return (
+            self._current, stack.offset, container.offset, ready.address, ready.address + ready.size,
+        )  # fmt: skip
+
+    @property
+    def running(self) -> bool:
+        """Return whether the scheduler was started."""
+        return self._word(self._image.symbol("xSchedulerRunning").address) != 0
+
+    @property
+    def heap_free_bytes(self) -> int:
+        """Return what heap_4 has left."""
+        return self._word(self._image.symbol(HEAP).address)
+
+    @property
+    def heap_least_free_bytes(self) -> int:
+        """Return what it had left when it was fullest."""
+        return self._word(self._image.symbol(HEAP_LEAST).address)
+
+    def tasks(self) -> list[TaskView]:
+        """Return all tasks, by priority and name."""
+        states: dict[int, str] = {}
+        for name, state in (
+            ("xDelayedTaskList1", "blocked"), ("xDelayedTaskList2", "blocked"), ("xSuspendedTaskList", "suspended"),
+            ("xTasksWaitingTermination", "deleted"), ("pxReadyTasksLists", "ready"), ("xPendingReadyList", "ready"),
+        ):  # fmt: skip
+            if self._image.has(name):
+                states |= dict.fromkeys(self._members(name), state)
+        states = {
+            task: "blocked" if state == "suspended" and self._waits(task) else state
+            for task, state in states.items()
+        }
+        states |= {task: "running" for task in (self._word(self._current),) if task}
+        views = [self.task(task, state) for task, state in states.items()]
+        return sorted(views, key=lambda view: (-view.priority, view.name))
+
+    def _members(self, name: str) -> Iterator[int]:
+        """Yield the tasks in a list, or in an array of lists."""
+        symbol = self._image.symbol(name)
+        for address in range(symbol.address, symbol.address + symbol.size, self._list.size):
+            item = self._word(address + self._list["xListEnd.pxNext"].offset)
+            count = self._word(address + self._list["uxNumberOfItems"].offset)
+            for _ in range(min(count, MOST_TASKS)):
+                yield self._word(item + self._item["pvOwner"].offset)
+                item = self._word(item + self._item["pxNext"].offset)
+
+    def _waits(self, task: int) -> bool:
+        """Return whether a task without a time-out waits for an event; FreeRTOS has it in the list of the suspended."""
+        event = self._word(task + self._task[f"xEventListItem.{self._container}"].offset)
+        notified = self._read(task + self._task["ucNotifyState"].offset, 1)[0]
+        return event != 0 or notified == WAITING_FOR_NOTIFICATION
+
+    def task(self, task: int, state: str) -> TaskView:
+        """Return the task with the control block at an address."""
+        text = self.name(task)
+        priority = self._word(task + self._task["uxPriority"].offset)
+        base = (
+            self._word(task + self._task["uxBasePriority"].offset)
+            if "uxBasePriority" in self._task.members
+            else priority
+        )
+        stack = self._word(task + self._task["pxStack"].offset)
+        return TaskView(text, state, priority, base, self._unused(stack), task)
+
+    def name(self, task: int) -> str:
+        """Return the name of the task with the control block at an address."""
+        name = self._task["pcTaskName"]
+        return self._read(task + name.offset, name.size).partition(b"\0")[0].decode(errors="replace")
+
+    @property
+    def current_block(self) -> int:
+        """Return the address of the running task's control block, 0 before the first one runs."""
+        return self._word(self._current)
+
+    def stack_begin(self, task: int) -> int:
+        """Return the lowest address of a task's stack."""
+        return self._word(task + self._task["pxStack"].offset)
+
+    def saved_registers(self, task: int) -> dict[str, int]:
+        """Return the registers of a task that does not run, as its port keeps them on its stack: those of the Cortex-M4F."""
+        place = self._word(task + self._task["pxTopOfStack"].offset)
+        *saved, exc_return = unpack("<9I", self._read(place, 36))
+        place += 36 + (0 if exc_return & NO_FLOATS else 64)
+        registers = stacked_registers(self._read, place, exc_return)
+        return registers | {f"r{4 + number}": value for number, value in enumerate(saved)}
+
+    def _unused(self, stack: int) -> int:
+        """Return how many bytes from the far end of a stack on were never written."""
+        unused = 0
+        while True:
+            chunk = self._read(stack + unused, STACK_CHUNK)
+            used = len(chunk.lstrip(bytes((UNUSED,))))
+            unused += len(chunk) - used
+            if used:
+                return unused
+
+    def _word(self, address: int) -> int:
+        return int(unpack("<I", self._read(address, 4))[0])
+
+
+def stacked_registers(read: Read, frame: int, exc_return: int) -> dict[str, int]:
+    """Return what an exception has put on a stack, with the stack pointer before it; raises `LabError` without memory."""
+    stacked = unpack("<8I", read(frame, FRAME))
+    size = FRAME + (0 if exc_return & NO_FLOATS else FLOATS) + (4 if stacked[7] & PADDED else 0)
+    names = ("r0", "r1", "r2", "r3", "r12", "lr", "pc", "xpsr")
+    return dict(zip(names, stacked, strict=True)) | {"sp": frame + size}

@@ -1,0 +1,167 @@
+"""`--gdb PORT`: a debugger on 127.0.0.1 at the chip in lockstep.
+
+While the chip stands at a breakpoint nothing else of the laboratory runs, so that no time passes in tunnel and radio, and
+the flight goes on as if it had never stood. Ctrl-C is seen each time the laboratory lets the chip run.
+"""
+
+import select
+import socket
+from collections.abc import Callable
+
+from hil.errors import LabError
+from hil.stm32f405.chip import Chip, Why
+from hil.stm32f405.freertos import FreeRtos
+from hil.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol, Threads, Wish
+
+HOST = "127.0.0.1"
+READ_SIZE = 4096
+
+
+class GdbServer:
+    """One debugger at a time. Raises `LabError` when the port cannot be had."""
+
+    def __init__(self, port: int, waiting: Callable[[int], None] = lambda _: None) -> None:
+        """Listen; port 0 takes a free one. `waiting` gets the port when the machine stands and waits for a debugger."""
+        self._waiting = waiting
+        self._client: socket.socket | None = None
+        try:
+            self._listener = socket.create_server((HOST, port))
+        except OSError as error:
+            raise LabError(f"--gdb {port}: {error.strerror or error}") from None
+        self._listener.setblocking(True)
+
+    def attach(self, debuggee: Debuggee, threads: Threads | None = None) -> None:
+        """Let it be this machine from now on; who debugged another one has to come again."""
+        self._part()
+        self._debuggee, self._threads = debuggee, threads
+        self._protocol = RemoteProtocol(debuggee, threads)
+
+    @property
+    def port(self) -> int:
+        """Return the port that clients connect to."""
+        return int(self._listener.getsockname()[1])
+
+    def hold(self, signal: int = SIGTRAP, watched: int | None = None) -> Wish:
+        """Let the machine stand until the debugger wants it to run, step, be left alone, or end; waits for one at first."""
+        if self._client is None:
+            self._welcome()
+        elif self._protocol.wish in (Wish.RUN, Wish.STEP):
+            self._send(self._protocol.stopped(signal, watched))
+        while self._client is not None and self._protocol.wish is Wish.STAND:
+            self._receive()
+        wish = self._protocol.wish
+        if wish in (Wish.DETACH, Wish.KILL):
+            self._part()
+        return wish
+
+    def wants_to_stop(self) -> bool:
+        """Return whether the debugger pressed Ctrl-C, or a new one has come, while the machine ran. Never blocks."""
+        waiting = self._listener if self._client is None else self._client
+        if not select.select([waiting], [], [], 0)[0]:
+            return False
+        if self._client is None:
+            return True
+        self._receive()
+        return self._protocol.interrupted
+
+    def stops_at(self, address: int) -> bool:
+        """Return whether the debugger has a breakpoint there."""
+        return self._protocol.has_breakpoint(address)
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._part()
+        self._listener.close()
+
+    def _welcome(self) -> None:
+        self._waiting(self.port)
+        self._client, _ = self._listener.accept()
+        self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._protocol = RemoteProtocol(self._debuggee, self._threads)
+
+    def _receive(self) -> None:
+        """Answer what comes next; who hangs up has let the machine go."""
+        assert self._client is not None
+        try:
+            data = self._client.recv(READ_SIZE)
+        except OSError:
+            data = b""
+        if data:
+            self._send(self._protocol.receive(data))
+        else:
+            self._protocol.leave(Wish.DETACH)
+            self._part()
+
+    def _send(self, data: bytes) -> None:
+        assert self._client is not None
+        try:
+            self._client.sendall(data)
+        except OSError:
+            return  # the next `recv` says that it has gone
+
+    def _part(self) -> None:
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+
+class TaskThreads:
+    """The tasks of FreeRTOS as a debugger's threads, by the addresses of their control blocks."""
+
+    def __init__(self, kernel: FreeRtos) -> None:
+        self._kernel = kernel
+
+    @property
+    def running(self) -> int:
+        """The task that has the processor, 1 before the scheduler has begun."""
+        return self._kernel.current_block if self._kernel.running else 1
+
+    def all(self) -> dict[int, str]:
+        """Return name, state and priority of each."""
+        tasks = self._kernel.tasks() if self._kernel.running else []
+        return {task.block: f"{task.name}, {task.state}, priority {task.priority}" for task in tasks}
+
+    def registers(self, thread: int) -> dict[str, int]:
+        """Return what lies on a task's stack."""
+        return self._kernel.saved_registers(thread)
+
+
+class DebuggedChip:
+    """Runs a chip as its debugger wants it; at first it waits for one."""
+
+    def __init__(self, chip: Chip, server: GdbServer, kernel: FreeRtos | None = None) -> None:
+        server.attach(chip, None if kernel is None else TaskThreads(kernel))
+        self._chip, self._server = chip, server
+        self._wish = Wish.STAND
+
+    def run(self, until_cycles: int) -> Why:
+        """Run up to an instant, or until something outside is to be done, as `Chip.run`.
+
+        Raises `KeyboardInterrupt` when the debugger ends it.
+        """
+        if self._wish is Wish.STAND or self._server.wants_to_stop():
+            self._hold(SIGINT)
+        seen = Why.TIME
+        while True:
+            stands = self._wish is Wish.STEP
+            # What is to be done outside is done between two blocks, as without a debugger.
+            until = int(self._chip.state.now) if seen else until_cycles
+            seen |= self._chip.step() & ~Why.STEP if stands else self._chip.run(until)
+            pc = self._chip.register("pc")
+            if seen & Why.BREAK and self._server.stops_at(pc):
+                seen &= seen if pc in self._chip.crash_points else ~Why.BREAK
+                stands = True
+            if seen & Why.WATCHPOINT:
+                seen &= ~Why.WATCHPOINT
+                self._hold(SIGTRAP, self._chip.state.watch_address)
+            elif stands:
+                self._hold(SIGTRAP)
+            if seen & Why.BREAK or (
+                not self._chip.in_block and (seen or self._chip.state.now >= until_cycles)
+            ):
+                return seen
+
+    def _hold(self, signal: int, watched: int | None = None) -> None:
+        self._wish = self._server.hold(signal, watched)
+        if self._wish is Wish.KILL:
+            raise KeyboardInterrupt

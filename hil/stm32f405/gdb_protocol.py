@@ -1,0 +1,406 @@
+"""GDB's remote serial protocol for a Cortex-M4F: packets in, packets out, without a socket or a clock.
+
+The machine stands still while packets are answered; `GdbServer` (gdb.py) carries the bytes.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Protocol
+
+from hil.errors import LabError
+
+PACKET_SIZE = 0x4000
+SIGINT, SIGTRAP = 2, 5
+INTERRUPT = 0x03
+ESCAPE, ESCAPED_WITH = 0x7D, 0x20
+MALFORMED, FAULT = b"E01", b"E0e"  # the numbers of EPERM and EFAULT
+# Name and bytes, in the order of the target description: its number is the number of the register on the wire.
+CORE = tuple((name, 4) for name in (*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"))
+FLOATING = (*((f"d{n}", 8) for n in range(16)), ("fpscr", 4))
+SYSTEM = tuple((name, 4) for name in ("msp", "psp", "primask", "basepri", "faultmask", "control"))
+REGISTERS = (*CORE, *FLOATING, *SYSTEM)
+TYPES = {"sp": "data_ptr", "pc": "code_ptr", "msp": "data_ptr", "psp": "data_ptr"}
+
+
+class Debuggee(Protocol):
+    """A machine that stands still. Its registers have the names of `REGISTERS`; addresses in `breakpoints` are even."""
+
+    breakpoints: set[int]
+
+    def watch(self, kind: int, address: int, size: int, on: bool) -> None:
+        """Stop after writes (2), reads (3) or both (4) of memory, or no longer; raises `LabError` where it cannot."""
+        ...
+
+    def read(self, address: int, size: int) -> bytes:
+        """Return memory; raises `LabError` where there is none."""
+        ...
+
+    def write(self, address: int, data: bytes) -> None:
+        """Change memory, code too; raises `LabError` where there is none."""
+        ...
+
+    def register(self, name: str) -> int:
+        """Return a register, without its sign."""
+        ...
+
+    def set_register(self, name: str, value: int) -> None:
+        """Change a register."""
+        ...
+
+
+class Threads(Protocol):
+    """The tasks of a scheduler, by numbers above 0."""
+
+    @property
+    def running(self) -> int:
+        """The one whose registers are the machine's."""
+        ...
+
+    def all(self) -> dict[int, str]:
+        """Return what GDB shows of each; empty while there is no scheduler."""
+        ...
+
+    def registers(self, thread: int) -> dict[str, int]:
+        """Return what is kept of the registers of one that does not run; raises `LabError` where nothing is."""
+        ...
+
+
+class NoThreads:
+    """A machine without a scheduler."""
+
+    running = 1
+
+    def all(self) -> dict[int, str]:
+        """Return nothing."""
+        return {}
+
+    def registers(self, thread: int) -> dict[str, int]:
+        """Raise `LabError`."""
+        raise LabError(f"no thread {thread}")
+
+
+class Wish(Enum):
+    """What the debugger wants of the machine."""
+
+    STAND = auto()
+    RUN = auto()
+    STEP = auto()
+    DETACH = auto()
+    KILL = auto()
+
+
+class MalformedError(Exception):
+    """A packet that does not say what its command needs."""
+
+
+def target_description() -> str:
+    """Return the registers as GDB wants to be told of them."""
+
+    def feature(name: str, registers: tuple[tuple[str, int], ...]) -> str:
+        lines = "".join(
+            f'<reg name="{register}" bitsize="{8 * size}" '
+            f'type="{"ieee_double" if size == 8 else TYPES.get(register, "uint32")}"/>'
+            for register, size in registers
+        )
+        return f'<feature name="org.gnu.gdb.arm.{name}">{lines}</feature>'
+
+    features = feature("m-profile", CORE) + feature("vfp", FLOATING) + feature("m-system", SYSTEM)
+    return (
+        '<?xml version="1.0"?><!DOCTYPE target SYSTEM "gdb-target.dtd">'
+        f'<target version="1.0"><architecture>arm</architecture>{features}</target>'
+    )
+
+
+def framed(payload: bytes) -> bytes:
+    """Return a packet: escaped, with its checksum."""
+    escaped = b"".join(bytes((ESCAPE, b ^ ESCAPED_WITH)) if b in b"#$}*" else bytes((b,)) for b in payload)
+    return b"$%s#%02x" % (escaped, sum(escaped) & 0xFF)
+
+
+def unescaped(payload: bytes) -> bytes:
+    """Return the content of a packet, without the escapes of binary data."""
+    content, escaping = bytearray(), False
+    for byte in payload:
+        if escaping:
+            content.append(byte ^ ESCAPED_WITH)
+        elif byte != ESCAPE:
+            content.append(byte)
+        escaping = byte == ESCAPE and not escaping
+    return bytes(content)
+
+
+@dataclass(slots=True)
+class Framing:
+    """Cuts what arrives into packets; what is longer than `2 * PACKET_SIZE` without an end is dropped."""
+
+    _waiting: bytearray
+
+    def take(self, data: bytes) -> list[bytes]:
+        """Return what is whole: `$payload` of good packets, `!` for each with a wrong checksum, `+`, `-` and Ctrl-C."""
+        self._waiting += data
+        found = []
+        while self._waiting:
+            if self._waiting[0] != ord("$"):
+                byte = self._waiting.pop(0)
+                if byte in (ord("+"), ord("-"), INTERRUPT):
+                    found.append(bytes((byte,)))
+                continue
+            end = self._waiting.find(b"#")
+            if end < 0 or len(self._waiting) < end + 3:
+                if len(self._waiting) > 2 * PACKET_SIZE:
+                    self._waiting.clear()
+                break
+            payload, checksum = bytes(self._waiting[1:end]), bytes(self._waiting[end + 1 : end + 3])
+            del self._waiting[: end + 3]
+            found.append(b"$" + payload if checksum.lower() == b"%02x" % (sum(payload) & 0xFF) else b"!")
+        return found
+
+
+class RemoteProtocol:
+    """One debugger at one machine: what it asks is answered, what it wants of the machine stands in `wish`."""
+
+    def __init__(self, debuggee: Debuggee, threads: Threads | None = None) -> None:
+        self._debuggee = debuggee
+        self._threads: Threads = threads or NoThreads()
+        self._thread = 0  # whose registers are asked for; 0: those of the machine
+        self._framing = Framing(bytearray())
+        self._items: list[bytes] = []
+        self._watched: set[tuple[int, int, int]] = set()
+        self._acknowledging = True
+        self._signal = SIGTRAP
+        self._last = b""
+        self.wish = Wish.STAND
+        self.interrupted = False  # Ctrl-C came while the machine ran
+        self._commands: dict[bytes, Callable[[bytes], bytes]] = {
+            b"?": lambda _: self._stop_reply(),
+            b"g": lambda _: self._registers(range(len(REGISTERS))),
+            b"G": self._set_all_registers,
+            b"p": lambda rest: self._registers((_hex(rest),)),
+            b"P": self._set_one_register,
+            b"m": self._read,
+            b"M": lambda rest: self._write(rest, _unhex),
+            b"X": lambda rest: self._write(rest, unescaped),
+            b"Z": lambda rest: self._breakpoint(rest, True),
+            b"z": lambda rest: self._breakpoint(rest, False),
+            b"c": lambda rest: self._resume(Wish.RUN, rest),
+            b"s": lambda rest: self._resume(Wish.STEP, rest),
+            b"C": lambda rest: self._resume(Wish.RUN, rest.partition(b";")[2]),
+            b"S": lambda rest: self._resume(Wish.STEP, rest.partition(b";")[2]),
+            b"v": self._verbose,
+            b"q": self._query,
+            b"Q": self._set,
+            b"H": self._select,
+            b"T": lambda rest: b"OK" if _hex(rest) in self._all_threads() else MALFORMED,
+            b"D": lambda _: self._leave(Wish.DETACH, b"OK"),
+            b"k": lambda _: self._leave(Wish.KILL, b""),
+        }
+
+    def receive(self, data: bytes) -> bytes:
+        """Return the bytes that answer what arrived. While the machine runs, packets wait until it stands."""
+        self._items += self._framing.take(data)
+        answers, waiting = b"", []
+        for item in self._items:
+            if self.wish is Wish.STAND or not item.startswith(b"$"):
+                answers += self._answered(item)
+            else:
+                waiting.append(item)
+        self._items = waiting
+        return answers
+
+    def stopped(self, signal: int, watched: int | None = None) -> bytes:
+        """Return the bytes that tell the debugger that the machine, which it let run, stands again; what it accessed."""
+        self.wish, self._signal, self.interrupted, self._thread = Wish.STAND, signal, False, 0
+        self._last = framed(self._stop_reply(watched))
+        return self._last + self.receive(b"")
+
+    def has_breakpoint(self, address: int) -> bool:
+        """Return whether the debugger has set one there."""
+        return address in self._debuggee.breakpoints
+
+    def leave(self, wish: Wish) -> None:
+        """Leave no breakpoint behind at the machine."""
+        self._debuggee.breakpoints.clear()
+        for watched in self._watched:
+            self._debuggee.watch(*watched, on=False)
+        self._watched.clear()
+        self.wish = wish
+
+    def _answered(self, item: bytes) -> bytes:
+        if item == bytes((INTERRUPT,)):
+            self.interrupted = self.wish in (Wish.RUN, Wish.STEP)
+            return b""
+        if item == b"!":
+            return b"-" if self._acknowledging else b""
+        if item == b"-":
+            return self._last
+        if item == b"+":
+            return b""
+        acknowledgement = b"+" if self._acknowledging else b""
+        reply = self._reply(item[1:])
+        self._last = reply
+        return acknowledgement + reply
+
+    def _reply(self, payload: bytes) -> bytes:
+        """Return the packet that answers one; nothing while the machine runs, or when it was killed."""
+        command = self._commands.get(payload[:1])
+        if command is None:
+            return framed(b"")
+        try:
+            answer = command(payload[1:])
+        except MalformedError:
+            return framed(MALFORMED)
+        except LabError:
+            return framed(FAULT)
+        return b"" if self.wish in (Wish.RUN, Wish.STEP, Wish.KILL) else framed(answer)
+
+    def _stop_reply(self, watched: int | None = None) -> bytes:
+        why = b"" if watched is None else b"watch:%x;" % watched
+        return b"T%02x%sthread:%x;" % (self._signal, why, self._threads.running)
+
+    def _registers(self, numbers: Iterable[int]) -> bytes:
+        """Return registers of the selected thread; `x` for what is not kept of it."""
+        kept = None if self._is_machine() else self._threads.registers(self._thread)
+        found = b""
+        for name, size in map(_known, numbers):
+            if kept is None or (name, size) in SYSTEM:  # what the processor has only once
+                value: int | None = self._debuggee.register(name)
+            else:
+                value = kept.get(name)
+            found += b"xx" * size if value is None else value.to_bytes(size, "little").hex().encode()
+        return found
+
+    def _is_machine(self) -> bool:
+        return self._thread in (0, self._threads.running)
+
+    def _all_threads(self) -> dict[int, str]:
+        """Return all, the running one first, which alone is there without a scheduler."""
+        running, every = self._threads.running, self._threads.all()
+        return {running: every.get(running, "")} | every
+
+    def _select(self, rest: bytes) -> bytes:
+        """Take the thread whose registers are meant; which one runs on is not chosen."""
+        if rest[:1] == b"g":
+            self._thread = 0 if rest[1:] in (b"0", b"-1") else _hex(rest[1:])
+            if self._thread and self._thread not in self._all_threads():
+                self._thread = 0
+                return MALFORMED
+        return b"OK"
+
+    def _set_all_registers(self, rest: bytes) -> bytes:
+        data = _unhex(rest)
+        if len(data) != sum(size for _, size in REGISTERS):
+            raise MalformedError
+        self._check_machine()
+        # From the last on, so that `sp` counts and not the old value of the stack pointer that is in use.
+        for name, size in reversed(REGISTERS):
+            data, value = data[:-size], data[-size:]
+            self._debuggee.set_register(name, int.from_bytes(value, "little"))
+        return b"OK"
+
+    def _set_one_register(self, rest: bytes) -> bytes:
+        number, _, value = rest.partition(b"=")
+        name, size = _known(_hex(number))
+        data = _unhex(value)
+        if len(data) != size:
+            raise MalformedError
+        self._check_machine()
+        self._debuggee.set_register(name, int.from_bytes(data, "little"))
+        return b"OK"
+
+    def _check_machine(self) -> None:
+        if not self._is_machine():
+            raise LabError("the registers of a task that does not run cannot be changed")
+
+    def _read(self, rest: bytes) -> bytes:
+        address, size = _pair(rest)
+        return self._debuggee.read(address, min(size, PACKET_SIZE // 2)).hex().encode()
+
+    def _write(self, rest: bytes, decoded: Callable[[bytes], bytes]) -> bytes:
+        where, _, content = rest.partition(b":")
+        address, size = _pair(where)
+        data = decoded(content)
+        if len(data) != size:
+            raise MalformedError
+        if data:  # X of no bytes asks whether X is known
+            self._debuggee.write(address, data)
+        return b"OK"
+
+    def _breakpoint(self, rest: bytes, on: bool) -> bytes:
+        kind, _, place = rest.partition(b",")
+        if kind not in (b"0", b"1", b"2", b"3", b"4"):
+            return b""
+        address, size = _pair(place) if b"," in place else (_hex(place), 2)
+        if kind in (b"0", b"1"):
+            change = self._debuggee.breakpoints.add if on else self._debuggee.breakpoints.discard
+            change(address & ~1)
+            return b"OK"
+        watched = (int(kind), address, size)
+        if on != (watched in self._watched):
+            self._debuggee.watch(*watched, on=on)
+            self._watched ^= {watched}
+        return b"OK"
+
+    def _resume(self, wish: Wish, address: bytes) -> bytes:
+        if address:
+            self._debuggee.set_register("pc", _hex(address) & ~1)
+        self.wish = wish
+        return b""
+
+    def _verbose(self, rest: bytes) -> bytes:
+        if rest == b"Cont?":
+            return b"vCont;c;C;s;S"
+        if not rest.startswith(b"Cont;"):
+            return b""
+        action = rest[5:6]  # that of the first thread is for all: one processor
+        if action not in b"cCsS" or not action:
+            raise MalformedError
+        return self._resume(Wish.RUN if action in b"cC" else Wish.STEP, b"")
+
+    def _query(self, rest: bytes) -> bytes:
+        if rest.startswith(b"Supported"):
+            return b"PacketSize=%x;qXfer:features:read+;QStartNoAckMode+;vContSupported+" % PACKET_SIZE
+        if rest.startswith(b"Xfer:features:read:target.xml:"):
+            offset, size = _pair(rest.rpartition(b":")[2])
+            text = target_description().encode()
+            return (b"m" if offset + size < len(text) else b"l") + text[offset : offset + size]
+        if rest.startswith(b"ThreadExtraInfo,"):
+            return self._all_threads().get(_hex(rest.partition(b",")[2]), "").encode().hex().encode()
+        if rest == b"fThreadInfo":
+            return b"m" + b",".join(b"%x" % thread for thread in self._all_threads())
+        fixed = {b"Attached": b"1", b"C": b"QC%x" % self._threads.running, b"sThreadInfo": b"l"}
+        return fixed.get(rest, b"")
+
+    def _set(self, rest: bytes) -> bytes:
+        if rest != b"StartNoAckMode":
+            return b""
+        self._acknowledging = False
+        return b"OK"
+
+    def _leave(self, wish: Wish, answer: bytes) -> bytes:
+        self.leave(wish)
+        return answer
+
+
+def _known(number: int) -> tuple[str, int]:
+    if number >= len(REGISTERS):
+        raise MalformedError
+    return REGISTERS[number]
+
+
+def _hex(digits: bytes) -> int:
+    if not digits or not all(byte in b"0123456789abcdefABCDEF" for byte in digits):
+        raise MalformedError
+    return int(digits, 16)
+
+
+def _unhex(digits: bytes) -> bytes:
+    try:
+        return bytes.fromhex(digits.decode("ascii"))
+    except ValueError:
+        raise MalformedError from None
+
+
+def _pair(text: bytes) -> tuple[int, int]:
+    first, _, second = text.partition(b",")
+    return _hex(first), _hex(second)

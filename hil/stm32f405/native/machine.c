@@ -1,0 +1,522 @@
+/* The machine as a whole: it runs code from block to block, lets what is due happen in between, and stops for the outside. */
+#include "machine.h"
+
+#include <string.h>
+
+enum { HOOK_INTR = 1, HOOK_CODE = 4, HOOK_BLOCK = 8, HOOK_READ = 0x400, HOOK_WRITE = 0x800, HOOK_INVALID = 0x3F0 }; /* of unicorn: accesses where nothing is */
+enum { READ_UNMAPPED = 6, WRITE_UNMAPPED, FETCH_UNMAPPED, INVALID = 10, WRITE_PROTECTED = 12, FETCH_PROTECTED = 14 };
+enum { TRAP_SVC = 2, TRAP_BREAKPOINT = 7, TRAP_RETURN = 8, TRAP_NO_FLOATS = 17, TRAP_STATE = 18 };
+enum { R_LR = 10, R_PC = 11, R_SP = 12, R_R0 = 66, R_MSP = 115, R_XPSR = 120, REFILL = 3, NOWHERE = 0xFFFFFFFE, THUMB = 1 << 24 };
+
+void tick_due(struct machine *m);
+
+static void look_ahead(struct machine *m)
+{
+    m->next_due = NEVER;
+    for (unsigned slot = 0; slot < SLOTS; slot++)
+        if (m->due[slot] < m->next_due)
+            m->next_due = m->due[slot];
+}
+
+void plan(struct machine *m, unsigned slot, uint64_t due)
+{
+    uint64_t was = m->due[slot];
+    m->due[slot] = due;
+    if (due < m->next_due)
+        m->next_due = due;
+    else if (was == m->next_due)
+        look_ahead(m);
+}
+
+static void happen(struct machine *m, unsigned slot)
+{
+    if (slot == DUE_SYSTICK) {
+        tick_due(m);
+    } else if (slot < DUE_BUS) {
+        timer_due(m, slot - DUE_TIMER);
+    } else if (slot < DUE_SEND) {
+        bus_due(m, slot - DUE_BUS);
+    } else if (slot < DUE_RECEIVE) {
+        usart_send_due(m, slot - DUE_SEND);
+    } else if (slot < DUE_WATCHDOG) {
+        usart_receive_due(m, slot - DUE_RECEIVE);
+    } else {
+        m->due[slot] = NEVER;
+        m->why |= WHY_WATCHDOG;
+    }
+}
+
+static void let_happen(struct machine *m)
+{
+    while (m->next_due <= m->now) {
+        for (unsigned slot = 0; slot < SLOTS; slot++)
+            if (m->due[slot] == m->next_due) {
+                happen(m, slot);
+                break;
+            }
+        look_ahead(m);
+    }
+}
+
+static void stop(struct machine *m, uint32_t pc)
+{
+    m->pc = pc;
+    m->stopping = 1;
+    m->engine.emu_stop(m->engine.uc);
+}
+
+static void count(struct machine *m, uint64_t address, uint32_t size)
+{
+    uint64_t begin = address < FLASH_SIZE ? address : address - FLASH_BASE;
+    if (begin + size <= FLASH_SIZE) {
+        uint64_t first = begin / 2, last = (begin + size) / 2;
+        m->instructions += m->instructions_before[last] - m->instructions_before[first];
+        m->now += m->cycles_before[last] - m->cycles_before[first];
+    } else { /* in RAM: as if all were narrow */
+        m->instructions += size / 2;
+        m->now += size / 2;
+    }
+    if (address != m->next_address)
+        m->now += REFILL;
+    m->next_address = address + size;
+}
+
+static int in_task(const struct machine *m)
+{
+    return !m->active[0] && !m->active[1];
+}
+
+/* In a task; exceptions have a stack of their own. */
+static void look_at_stack_pointer(struct machine *m)
+{
+    uint32_t sp = 0;
+    m->engine.reg_read(m->engine.uc, R_SP, &sp);
+    if (sp < m->stack_begin)
+        note_overflow(m);
+}
+
+static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
+{
+    struct machine *m = user;
+    uint32_t resumed = m->resume;
+    (void)uc;
+    m->resume = NOWHERE;
+    if (m->stepping && m->stepping++ > 1) { /* the instruction was the last of its block */
+        stop(m, (uint32_t)address);
+        return;
+    }
+    if (resumed == (uint32_t)address) /* in the middle of a block, all of which was counted when it began */
+        return;
+    if (m->stack_begin && !m->overflow && in_task(m))
+        look_at_stack_pointer(m);
+    if (m->next_due <= m->now)
+        let_happen(m);
+    if (m->now >= m->until || m->why) {
+        if (!m->stepping) {
+            stop(m, (uint32_t)address);
+            return;
+        }
+    }
+    if (m->attention) {
+        unsigned exception = next_exception(m, 0);
+        if (exception) {
+            enter(m, exception, (uint32_t)address);
+            return;
+        }
+    }
+    count(m, address, size);
+}
+
+static void on_trap(uc_engine *uc, uint32_t number, void *user)
+{
+    struct machine *m = user;
+    uint32_t pc = 0;
+    m->engine.reg_read(uc, R_PC, &pc);
+    switch (number) {
+    case TRAP_SVC: enter(m, SVC, pc); break;
+    case TRAP_RETURN:
+        leave(m, pc | 1);
+        if (m->owed && in_task(m) && !m->stepping)
+            stop(m, m->pc);
+        break;
+    case TRAP_BREAKPOINT: m->hfsr |= 1u << 31; raise_fault(m, HARD_FAULT, 0, pc); break;
+    case TRAP_NO_FLOATS: raise_fault(m, USAGE_FAULT, 1 << 19, pc); break;
+    case TRAP_STATE: raise_fault(m, USAGE_FAULT, 1 << 17, pc); break;
+    default: raise_fault(m, USAGE_FAULT, 1 << 16, pc); break;
+    }
+}
+
+static int on_invalid(uc_engine *uc, int type, uint64_t address, int size, int64_t value, void *user)
+{
+    struct machine *m = user;
+    (void)uc;
+    (void)type;
+    (void)size;
+    (void)value;
+    m->fault_address = (uint32_t)address;
+    return 0;
+}
+
+static void on_break(uc_engine *uc, uint64_t address, uint32_t size, void *user)
+{
+    struct machine *m = user;
+    (void)uc;
+    (void)size;
+    if (m->skip_at == (uint32_t)address) {
+        m->skip_at = NOWHERE;
+        return;
+    }
+    m->skip_at = m->resume = (uint32_t)address;
+    m->why |= WHY_BREAK;
+    stop(m, (uint32_t)address);
+}
+
+/* Sleep until something wakes the core, without leaving the engine: WFI comes ten thousand times a second. */
+static void on_sleep(uc_engine *uc, uint64_t address, uint32_t size, void *user)
+{
+    struct machine *m = user;
+    uint32_t after = (uint32_t)address + size;
+    if (m->stepping)
+        return;
+    for (;;) {
+        if (m->next_due <= m->now)
+            let_happen(m);
+        if (m->now >= m->until || m->why) {
+            m->asleep = 1;
+            stop(m, after);
+            return;
+        }
+        if (next_exception(m, 1))
+            break;
+        uint64_t next = m->next_due < m->until ? m->next_due : m->until;
+        m->sleeping += next - m->now;
+        m->now = next;
+    }
+    unsigned exception = next_exception(m, 0);
+    if (exception) {
+        enter(m, exception, after);
+    } else { /* masked: it goes on behind the instruction */
+        m->pc = after;
+        after |= 1;
+        m->engine.reg_write(uc, R_PC, &after);
+    }
+}
+
+/* A division by zero has the result 0 (unless CCR.DIV_0_TRP is set): stop in front of the first one. */
+static void on_division(uc_engine *uc, uint64_t address, uint32_t size, void *user)
+{
+    struct machine *m = user;
+    uint32_t divisor = 0, at = (uint32_t)address & (FLASH_SIZE - 1), number = m->flash[at + 2] & 15;
+    (void)size;
+    m->engine.reg_read(uc, number == 14 ? R_LR : R_R0 + (int)number, &divisor);
+    if (divisor || m->divided || m->stepping)
+        return;
+    m->divided = 1;
+    m->resume = (uint32_t)address;
+    m->why |= WHY_DIVISION;
+    stop(m, (uint32_t)address);
+}
+
+/* Have the instructions looked at that sleep or divide; elsewhere than at an instruction nothing comes of it. */
+static int look_at_code(struct machine *m)
+{
+    uint16_t at[2];
+    uint64_t hook;
+    int failed = 0;
+    for (uint64_t i = 0; i + sizeof at <= FLASH_SIZE; i += sizeof *at) {
+        memcpy(at, m->flash + i, sizeof at);
+        int divides = (at[0] & 0xFFD0) == 0xFB90 && (at[1] & 0xF0F0) == 0xF0F0; /* SDIV and UDIV, A7.7.127 and A7.7.195 */
+        if (at[0] == 0xBF30 || divides) /* WFI */
+            failed |= m->engine.hook_add(m->engine.uc, &hook, HOOK_CODE, divides ? (void *)on_division : (void *)on_sleep, m,
+                                         FLASH_BASE + i, FLASH_BASE + i);
+    }
+    return failed;
+}
+
+uint64_t machine_size(void)
+{
+    return sizeof(struct machine);
+}
+
+/* Lay out a machine in zeroed memory, its buses mapped and its hooks set; the engine and the memories are there. */
+int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flash, uint8_t *ram, uint8_t *ccm,
+                   const uint32_t *instructions_before, const uint32_t *cycles_before)
+{
+    const uint64_t everywhere[2] = {1, 0};
+    uint64_t hook;
+    m->engine = *engine;
+    m->flash = flash;
+    m->ram = ram;
+    m->ccm = ccm;
+    m->instructions_before = instructions_before;
+    m->cycles_before = cycles_before;
+    uc_engine *uc = engine->uc;
+    int failed = engine->mmio_map(uc, 0x40000000, PERIPHERALS_SIZE, peripheral_read, m, peripheral_write, m);
+    failed |= engine->mmio_map(uc, 0x50000000, PERIPHERALS_SIZE, usb_read, m, usb_write, m);
+    failed |= engine->mmio_map(uc, 0xE0000000, 0x100000, system_read, m, system_write, m);
+    failed |= engine->hook_add(uc, &hook, HOOK_BLOCK, (void *)on_block, m, everywhere[0], everywhere[1]);
+    failed |= engine->hook_add(uc, &hook, HOOK_INTR, (void *)on_trap, m, everywhere[0], everywhere[1]);
+    failed |= engine->hook_add(uc, &hook, HOOK_INVALID, (void *)on_invalid, m, everywhere[0], everywhere[1]);
+    return failed | look_at_code(m);
+}
+
+/* Reset the processor; time and the pins' levels go on. `cause` stands in RCC's register of causes. */
+void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
+{
+    uint32_t words[2], zero = 0, thumb = 1u << 24;
+    memset(m->enabled, 0, sizeof m->enabled);
+    memset(m->pending, 0, sizeof m->pending);
+    memset(m->active, 0, sizeof m->active);
+    memset(m->line, 0, sizeof m->line);
+    memset(m->priority, 0, sizeof m->priority);
+    memset(m->timer, 0, sizeof m->timer);
+    memset(m->bus, 0, sizeof m->bus);
+    memset(m->dma, 0, sizeof m->dma);
+    memset(m->plain, 0, sizeof m->plain);
+    memset(m->exti, 0, sizeof m->exti);
+    memset(m->output, 0, sizeof m->output);
+    memset(m->compare, 0, sizeof m->compare);
+    for (unsigned slot = 0; slot < SLOTS; slot++)
+        m->due[slot] = NEVER;
+    m->next_due = NEVER;
+    for (unsigned n = 0; n < USARTS; n++) {
+        memset(&m->usart[n], 0, sizeof m->usart[n]);
+        m->usart[n].sr = 0xC0;
+    }
+    for (unsigned n = 0; n < TIMERS; n++)
+        m->timer[n].arr = n == 1 || n == 4 ? 0xFFFFFFFF : 0xFFFF;
+    m->enabled[0] = 0xFFFF; /* the system's own exceptions */
+    m->stack_begin = m->canary = m->overflow = 0;
+    for (unsigned i = 0; i < m->task_count; i++)
+        m->task[i].busy_since = 0;
+    m->attention = m->asleep = m->locked = m->why = m->watchdog_on = m->watchdog_prescaler = 0;
+    m->watchdog_reload = 0xFFF;
+    m->vtor = vectors;
+    m->aircr = m->shcsr = m->cfsr = m->hfsr = m->bfar = m->scr = m->cpacr = m->tick_ctrl = m->tick_load = 0;
+    m->ccr = 0x200;
+    m->fpccr = 0xC0000000;
+    m->random = 0x2545F491;
+    m->plain[0x23874 / 4] = cause;
+    m->plain[0x23800 / 4] = 0x83;
+    memcpy(words, m->flash + (vectors - FLASH_BASE), sizeof words);
+    words[0] &= ~3u; /* as the register does, B1.4.7 */
+    m->resume = m->skip_at = NOWHERE;
+    for (int i = 0; i < 13; i++)
+        m->engine.reg_write(m->engine.uc, 66 + i, &zero);
+    m->engine.reg_write(m->engine.uc, 120, &thumb);
+    m->engine.reg_write(m->engine.uc, 123, &zero);
+    m->engine.reg_write(m->engine.uc, 124, &zero);
+    m->engine.reg_write(m->engine.uc, 126, &zero);
+    m->engine.reg_write(m->engine.uc, 117, &zero);
+    m->engine.reg_write(m->engine.uc, R_MSP, &words[0]);
+    m->pc = words[1] & ~1u;
+}
+
+/* The first sixteen are. */
+static int is_new_low_writer(struct machine *m)
+{
+    for (uint32_t i = 0; i < m->low_writer_count; i++)
+        if (m->low_writers[i] == m->pc)
+            return 0;
+    if (m->low_writer_count == LOW_WRITERS)
+        return 0;
+    m->low_writers[m->low_writer_count++] = m->pc;
+    return 1;
+}
+
+static void fault_of(struct machine *m, int error)
+{
+    uint32_t pc = 0, xpsr = 0;
+    m->engine.reg_read(m->engine.uc, R_PC, &pc);
+    m->engine.reg_read(m->engine.uc, R_XPSR, &xpsr);
+    m->pc = pc & ~1u;
+    if (!(xpsr & THUMB)) { /* whatever is at that address */
+        raise_fault(m, USAGE_FAULT, 1 << 17, pc);
+    } else if ((error == READ_UNMAPPED || error == FETCH_UNMAPPED) && m->fault_address < FLASH_SIZE) {
+        m->resume = m->pc; /* the alias of flash, which is mapped when this has been reported */
+        m->why |= WHY_LOW_READ;
+    } else if (error == WRITE_PROTECTED || (error == WRITE_UNMAPPED && m->fault_address < FLASH_SIZE)) {
+        /* Flash that is not being programmed takes no store, and nothing else comes of it. */
+        uint16_t first;
+        if (m->fault_address < FLASH_SIZE && is_new_low_writer(m)) {
+            m->resume = m->pc;
+            m->why |= WHY_LOW_WRITE;
+            return;
+        }
+        memcpy(&first, m->flash + (m->pc & (FLASH_SIZE - 1)), sizeof first);
+        m->pc += first >> 11 > 0x1C ? 4 : 2;
+    } else if (error == FETCH_UNMAPPED || error == FETCH_PROTECTED) {
+        raise_fault(m, BUS_FAULT, 1 << 8, pc);
+    } else if (error == INVALID || error == 21) {
+        raise_fault(m, USAGE_FAULT, 1 << 16, pc);
+    } else {
+        m->bfar = m->fault_address;
+        raise_fault(m, BUS_FAULT, 1 << 9 | 1 << 15, pc);
+    }
+}
+
+static void execute(struct machine *m, uint64_t count_of)
+{
+    m->stopping = 0;
+    int error = m->engine.emu_start(m->engine.uc, m->pc | 1, NOWHERE, 0, count_of);
+    if (error && !m->stopping) {
+        fault_of(m, error);
+    } else if (!m->stopping) {
+        m->engine.reg_read(m->engine.uc, R_PC, &m->pc);
+        m->pc &= ~1u;
+        m->asleep = !m->stepping; /* nothing else ends it */
+    }
+}
+
+/* Run up to an instant, or until something outside has to be done; returns why (`WHY_...`, 0: it is `until`). */
+uint32_t machine_run(struct machine *m, uint64_t until)
+{
+    m->until = until;
+    m->why = 0;
+    m->stepping = 0;
+    if (m->skip_at != m->pc) /* somebody has gone elsewhere since */
+        m->skip_at = NOWHERE;
+    for (;;) {
+        if (m->resume != m->pc) {
+            m->resume = NOWHERE;
+            let_happen(m);
+            if (m->why || m->now >= until)
+                return m->why;
+        }
+        uint64_t next = m->next_due < until ? m->next_due : until;
+        if (m->owed && m->resume != m->pc && in_task(m) && !next_exception(m, 0)) {
+            uint64_t part = next - m->now < m->owed ? next - m->now : m->owed;
+            m->owed -= part;
+            m->taken += part;
+            m->running_since += part;
+            m->now += part;
+            continue;
+        }
+        if (m->asleep || m->locked) {
+            if (m->locked || !next_exception(m, 1)) {
+                m->sleeping += next - m->now;
+                m->now = next;
+                continue;
+            }
+            m->asleep = 0;
+        }
+        execute(m, 0);
+        if (m->why & (WHY_BREAK | WHY_LOW_READ | WHY_LOW_WRITE | WHY_DIVISION))
+            return m->why;
+    }
+}
+
+/* Stop in front of the second instruction of a step, in the middle of its block. */
+static void on_step(uc_engine *uc, uint64_t address, uint32_t size, void *user)
+{
+    struct machine *m = user;
+    (void)uc;
+    (void)size;
+    if (!m->first_step && !m->stopping) {
+        m->resume = (uint32_t)address;
+        stop(m, (uint32_t)address);
+    }
+    m->first_step = 0;
+}
+
+/* Execute one instruction, or enter one exception. */
+uint32_t machine_step(struct machine *m)
+{
+    m->why = 0;
+    if (m->resume != m->pc) {
+        m->resume = NOWHERE;
+        let_happen(m);
+    }
+    if (m->asleep) {
+        while (!next_exception(m, 1) && m->next_due != NEVER) {
+            m->now = m->next_due;
+            let_happen(m);
+        }
+        m->asleep = 0;
+    }
+    uint32_t pc = m->pc;
+    m->stepping = 1;
+    m->skip_at = pc;
+    uint64_t hook;
+    m->engine.hook_add(m->engine.uc, &hook, HOOK_CODE, (void *)on_step, m, (uint64_t)1, (uint64_t)0);
+    m->first_step = 1;
+    execute(m, 0);
+    m->engine.hook_del(m->engine.uc, hook);
+    m->stepping = 0;
+    m->skip_at = m->pc;
+    if (m->pc == pc + 2 && !m->why)
+        m->asleep = m->flash[(pc - FLASH_BASE) % FLASH_SIZE] == 0x30 && m->flash[(pc + 1 - FLASH_BASE) % FLASH_SIZE] == 0xBF;
+    return m->why | WHY_STEP;
+}
+
+/* Set or take away a breakpoint; returns 0 where there is no room. */
+int machine_break(struct machine *m, uint32_t address, int on)
+{
+    for (unsigned i = 0; i < BREAKPOINTS; i++) {
+        if (on ? m->break_hook[i] != 0 : m->break_address[i] != address || !m->break_hook[i])
+            continue;
+        if (on) {
+            m->break_address[i] = address;
+            m->engine.hook_add(m->engine.uc, &m->break_hook[i], HOOK_CODE, (void *)on_break, m, (uint64_t)address,
+                               (uint64_t)address);
+        } else {
+            m->engine.hook_del(m->engine.uc, m->break_hook[i]);
+            m->break_hook[i] = 0;
+        }
+        return 1;
+    }
+    return 0;
+}
+
+/* The chip stops behind the block of instructions that has the access; the real one's watchpoints are late as well. */
+static void on_access(uc_engine *uc, int type, uint64_t address, int size, int64_t value, void *user)
+{
+    struct watchpoint *w = user;
+    uint32_t first = (uint32_t)address;
+    (void)uc;
+    (void)type;
+    (void)value;
+    if (first >= w->address + w->size || first + (uint32_t)size <= w->address)
+        return;
+    w->machine->watch_address = first > w->address ? first : w->address;
+    w->machine->why |= WHY_WATCHPOINT;
+}
+
+/* Set or take away a watchpoint of a kind as GDB numbers it: 2 writes, 3 reads, 4 both; returns 0 where there is no room. */
+int machine_watch(struct machine *m, uint32_t kind, uint32_t address, uint32_t size, int on)
+{
+    static const int hooks[3] = {HOOK_WRITE, HOOK_READ, HOOK_READ | HOOK_WRITE};
+    for (unsigned i = 0; i < WATCHPOINTS; i++) {
+        struct watchpoint *w = &m->watchpoint[i];
+        if (on ? w->hook != 0 : !w->hook || w->address != address || w->size != size || w->kind != kind)
+            continue;
+        if (on) {
+            *w = (struct watchpoint){.machine = m, .address = address, .size = size, .kind = kind};
+            m->engine.hook_add(m->engine.uc, &w->hook, hooks[kind - 2], (void *)on_access, w, (uint64_t)address - 7,
+                               (uint64_t)address + size - 1); /* a wide access may begin before it */
+        } else {
+            m->engine.hook_del(m->engine.uc, w->hook);
+            w->hook = 0;
+        }
+        return 1;
+    }
+    return 0;
+}
+
+int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes)
+{
+    if (m->devices == DEVICES)
+        return 0;
+    m->device[m->devices++] = (struct device){.memory = memory, .size = size, .bus = bus, .address = address,
+                                              .address_bytes = address_bytes};
+    return 1;
+}
+
+/* Hand out what a USART has sent; returns how many bytes. */
+uint32_t machine_sent(struct machine *m, uint32_t n, uint8_t *bytes)
+{
+    uint32_t size = m->usart[n].filled;
+    memcpy(bytes, m->usart[n].sent, size);
+    m->usart[n].filled = 0;
+    return size;
+}

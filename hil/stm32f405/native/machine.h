@@ -1,0 +1,231 @@
+/* The STM32F405 around the instruction emulator unicorn: what all parts of the machine share.
+
+Time counts in cycles of the 168 MHz core clock since power-on. A part that will act by itself plans that in its slot of
+`due`; a part whose interrupt request changes calls `set_line`. Code runs from basic block to basic block, and between two
+of them whatever is due happens, exceptions are entered, and the machine stops for the outside. Chapters are those of
+ST's reference manual RM0090; B1 is that of ARM's ARMv7-M Architecture Reference Manual.
+
+Python reads this file as well (chip.py): layouts, prototypes and numbers are declared here alone. It does not see lines
+that begin with #. */
+#ifndef MACHINE_H
+#define MACHINE_H
+
+#include <stdint.h>
+
+enum {
+    CLOCK_HZ = 168000000,
+    FLASH_BASE = 0x08000000, FLASH_SIZE = 0x100000,
+    RAM_BASE = 0x20000000, RAM_SIZE = 0x20000,
+    CCM_BASE = 0x10000000, CCM_SIZE = 0x10000,
+    PERIPHERALS_SIZE = 0x80000,
+    TIMERS = 14, BUSES = 3, USARTS = 6, PORTS = 9, DMAS = 2, STREAMS = 8,
+    EXCEPTIONS = 128, IRQ = 16, /* exception number of interrupt 0 */
+    DEVICES = 8, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
+};
+
+/* Exceptions, B1.5.2. */
+enum { RESET = 1, NMI, HARD_FAULT, MEMORY_FAULT, BUS_FAULT, USAGE_FAULT, SVC = 11, PENDSV = 14, SYSTICK };
+
+/* What may be due. */
+enum {
+    DUE_SYSTICK,
+    DUE_TIMER,
+    DUE_BUS = DUE_TIMER + TIMERS,
+    DUE_SEND = DUE_BUS + BUSES,
+    DUE_RECEIVE = DUE_SEND + USARTS,
+    DUE_WATCHDOG = DUE_RECEIVE + USARTS,
+    SLOTS,
+};
+
+/* Why a run stopped before its time. */
+enum {
+    WHY_SERIAL = 1, WHY_COMPARE = 2, WHY_RESET = 4, WHY_WATCHDOG = 8, WHY_BREAK = 16, WHY_LOCKUP = 32, WHY_STEP = 64,
+    WHY_OVERFLOW = 128, WHY_LOW_READ = 256, WHY_DIVISION = 512, WHY_WATCHPOINT = 1024,
+    WHY_LOW_WRITE = 2048,
+};
+
+#define NEVER UINT64_MAX
+
+typedef struct uc_engine uc_engine;
+typedef uint64_t (*read_call)(uc_engine *, uint64_t, unsigned, void *);
+typedef void (*write_call)(uc_engine *, uint64_t, unsigned, uint64_t, void *);
+
+/* Functions of libunicorn, which is loaded already when this library is. */
+struct engine {
+    uc_engine *uc;
+    int (*reg_read)(uc_engine *, int, void *);
+    int (*reg_write)(uc_engine *, int, const void *);
+    int (*emu_start)(uc_engine *, uint64_t, uint64_t, uint64_t, uint64_t);
+    int (*emu_stop)(uc_engine *);
+    int (*mmio_map)(uc_engine *, uint64_t, uint64_t, read_call, void *, write_call, void *);
+    int (*hook_add)(uc_engine *, uint64_t *, int, void *, void *, uint64_t, uint64_t, ...);
+    int (*hook_del)(uc_engine *, uint64_t);
+    int (*ctl)(uc_engine *, uint32_t, ...);
+};
+
+struct timer {
+    uint64_t since; /* when the counter was `base` */
+    uint64_t seen;  /* overflows that have set the flag already */
+    uint32_t base, cr1, dier, sr, psc, arr, prescaler; /* `prescaler` acts from the last update on */
+    uint32_t others[32];
+};
+
+struct device { /* an I2C device that is memory: registers, or an EEPROM */
+    uint8_t *memory;
+    uint32_t size, pointer, address_bytes, left; /* `left`: bytes of the address that are still to come */
+    uint32_t bus, address, writes;
+    uint8_t burst[256]; /* what a read in progress sees */
+};
+
+struct bus {
+    uint32_t cr1, cr2, sr1, sr2, ccr, dr, shift, action, holding, others[10];
+    struct device *device;
+};
+
+struct usart {
+    uint32_t sr, dr, brr, cr1, cr2, cr3, held, shift, sending, overruns;
+    uint8_t received[LINE_BYTES], sent[LINE_BYTES];
+    uint32_t first, last, filled; /* of `received`, a ring; of `sent` */
+};
+
+struct stream {
+    uint32_t cr, ndtr, par, m0ar, m1ar, fcr, initial, place;
+};
+
+struct dma {
+    uint32_t flags[2];
+    struct stream stream[STREAMS];
+};
+
+struct task { /* by its control block: cycles that it had the processor for, interrupts included */
+    uint64_t cycles, busy_since; /* since when it has not waited for anything; 0: it waits */
+    uint32_t block, times;
+};
+
+struct kernel { /* of FreeRTOS: where members and lists lie; 0: unknown */
+    uint32_t current_place; /* address of the pointer to the running task's control block */
+    uint32_t stack_offset, container_offset; /* in a control block: its stack's begin, the list that it is in */
+    uint32_t ready_begin, ready_end; /* the lists of tasks that are ready */
+};
+
+struct watchpoint { /* memory that a debugger waits for an access to */
+    struct machine *machine;
+    uint64_t hook; /* 0: free */
+    uint32_t address, size, kind;
+};
+
+struct task_switch {
+    uint64_t now;
+    uint32_t block;
+};
+
+struct machine {
+    uint64_t now, instructions, exceptions, sleeping; /* `sleeping`: cycles spent in WFI */
+    uint64_t next_due;
+    uint32_t pc, why, asleep, watchdog_on;
+    uint32_t fault_address, unknown_count;
+    uint32_t unknown[16];
+    uint32_t compare[TIMERS][4];
+    uint64_t owed, taken; /* cycles that something outside takes before all tasks, but not before interrupts; has taken */
+    uint32_t tracing, task_count, switch_count;
+    struct kernel kernel;
+    uint64_t running_since;
+    struct task task[TASKS]; /* the running one is `task[running]` */
+    uint32_t running, locked;
+    uint32_t resume;  /* where the middle of a block goes on that was counted as a whole */
+    uint32_t skip_at; /* the breakpoint at which somebody has stood already */
+    uint32_t stack_begin; /* of the running task, 0: unknown */
+    uint32_t overflow;    /* the task whose stack has overflowed first since the reset, 0: none */
+    uint32_t divided;     /* a division by zero was reported */
+    uint32_t watch_address; /* what a watchpoint has seen last */
+    uint32_t task_return;   /* EXC_RETURN of the last exception that has interrupted a task */
+    struct task_switch task_switch[SWITCHES];
+    struct engine engine;
+    uint64_t until, due[SLOTS];
+    const uint32_t *instructions_before, *cycles_before; /* of every half word of flash */
+    uint64_t next_address;
+    uint8_t *flash, *ram, *ccm;
+    uint32_t stopping, attention, fault, stepping, first_step;
+    uint64_t break_hook[BREAKPOINTS];
+    uint32_t break_address[BREAKPOINTS];
+    struct watchpoint watchpoint[WATCHPOINTS];
+    uint32_t low_writers[LOW_WRITERS], low_writer_count; /* instructions that were reported */
+    uint32_t canary; /* the last word of the running task's stack was never used when it got the processor */
+
+    /* Exceptions */
+    uint64_t enabled[2], pending[2], active[2], line[2];
+    uint8_t priority[EXCEPTIONS];
+    uint32_t vtor, aircr, shcsr, cfsr, hfsr, bfar, scr, ccr, cpacr, fpccr;
+
+    uint32_t tick_ctrl, tick_load;
+    uint64_t tick_since;
+    uint32_t exti[6]; /* IMR EMR RTSR FTSR SWIER PR */
+    uint32_t input[PORTS], output[PORTS];
+    uint32_t watchdog_prescaler, watchdog_reload, random;
+    struct timer timer[TIMERS];
+    struct bus bus[BUSES];
+    struct usart usart[USARTS];
+    struct dma dma[DMAS];
+    struct device device[DEVICES];
+    uint32_t devices;
+    uint32_t plain[PERIPHERALS_SIZE / 4]; /* registers that only keep what is written */
+};
+
+/* What Python calls. */
+uint64_t machine_size(void);
+int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flash, uint8_t *ram, uint8_t *ccm,
+                   const uint32_t *instructions_before, const uint32_t *cycles_before);
+int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes);
+void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause);
+uint32_t machine_run(struct machine *m, uint64_t until);
+uint32_t machine_step(struct machine *m);
+int machine_break(struct machine *m, uint32_t address, int on);
+int machine_watch(struct machine *m, uint32_t kind, uint32_t address, uint32_t size, int on);
+uint32_t machine_sent(struct machine *m, uint32_t n, uint8_t *bytes);
+void machine_pin(struct machine *m, uint32_t port, uint32_t pin, uint32_t high);
+uint32_t usart_feed(struct machine *m, unsigned n, const uint8_t *bytes, uint32_t size);
+
+/* exceptions.c */
+void set_line(struct machine *m, unsigned irq, int high);
+void set_pending(struct machine *m, unsigned exception);
+unsigned next_exception(struct machine *m, int waking);
+void enter(struct machine *m, unsigned exception, uint32_t return_address);
+void leave(struct machine *m, uint32_t exc_return);
+void note_overflow(struct machine *m);
+void raise_fault(struct machine *m, unsigned exception, uint32_t status, uint32_t pc);
+uint64_t system_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
+void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
+
+void tick_due(struct machine *m);
+
+/* machine.c */
+void plan(struct machine *m, unsigned slot, uint64_t due);
+
+/* timers.c */
+uint32_t timer_read(struct machine *m, unsigned n, uint32_t offset);
+void timer_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
+void timer_due(struct machine *m, unsigned n);
+
+/* serial.c: I2C, USART and the DMA between them and memory */
+uint32_t bus_read(struct machine *m, unsigned n, uint32_t offset);
+void bus_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
+void bus_due(struct machine *m, unsigned n);
+uint32_t usart_read(struct machine *m, unsigned n, uint32_t offset);
+void usart_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
+void usart_send_due(struct machine *m, unsigned n);
+void usart_receive_due(struct machine *m, unsigned n);
+void usart_kick(struct machine *m);
+
+/* dma.c */
+uint32_t dma_read(struct machine *m, unsigned n, uint32_t offset);
+void dma_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
+int dma_put(struct machine *m, uint32_t peripheral, uint8_t byte, int *last);
+int dma_take(struct machine *m, uint32_t peripheral, uint8_t *byte);
+
+/* peripherals.c */
+uint64_t peripheral_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
+void peripheral_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
+uint64_t usb_read(uc_engine *uc, uint64_t offset, unsigned size, void *user);
+void usb_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t value, void *user);
+
+#endif

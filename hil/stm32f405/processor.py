@@ -1,0 +1,200 @@
+"""The chip as the laboratory's time line sees it, and the tasks of the scheduler in its image.
+
+Run times and switches are counted by the machine itself, whenever the scheduler's pointer to the running task has moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from hil.events import EventQueue
+from hil.stm32f405.chip import CYCLES_PER_US, Chip, Why
+from hil.stm32f405.freertos import FreeRtos
+
+NEVER_US = 1 << 62
+SLICE_US = 100  # as short as a millisecond's work wants it, and no more than the wall clock's own jitter
+IDLE = "IDLE"
+TICK_US = 1_000
+INTERRUPTS = 6  # above the priorities of all tasks
+
+
+@dataclass(slots=True)
+class ChipTask:
+    """A task of the image's scheduler. Deadlines are not known of it."""
+
+    name: str
+    priority: int
+    block: int
+    deadline_misses: int = 0
+
+
+T = TypeVar("T")
+Trace = Callable[[int, str, str, int, int], None]
+
+
+class Processor:
+    """The chip's time as `firmware_py.rtos.Kernel` shows it: microseconds since the firmware's boot."""
+
+    queues: tuple[Any, ...] = ()
+
+    def __init__(
+        self, chip: Chip, kernel: FreeRtos | None, act: Callable[[Why], None], run: Callable[[int], Why]
+    ) -> None:
+        """`run` lets the chip run as `Chip.run` does, and `act` gets why it ended before its time."""
+        self.chip = chip
+        self.trace: Trace | None = None
+        self.ahead_us = 0  # of the chip's time before the boot's
+        self._act = act
+        self._run_chip = run
+        self._names: dict[int, ChipTask] = {}
+        self._target_us = 0
+        self._limit_us = NEVER_US
+        self._own = EventQueue()  # by the chip's time
+        self._kernel = kernel
+        self._outside: ChipTask | None = None  # what occupies the processor
+        self._place = 0  # among the tasks, in the order in which they first ran
+        if kernel is not None:
+            chip.state.kernel = kernel.places
+
+    def every(self, period_us: int, do: Callable[[int], object]) -> None:
+        """Do something again and again by the chip's time."""
+        self._own.every(period_us, self.chip.now_us + period_us, do)
+
+    def begin(self, us: int) -> None:
+        """Let an instant be the one from which time counts."""
+        self.ahead_us += us
+        self._target_us -= us
+
+    @property
+    def now_us(self) -> int:
+        """The present instant; the chip itself may have finished a block of code beyond it."""
+        return min(self.chip.now_us - self.ahead_us, self._target_us)
+
+    @property
+    def next_wake_us(self) -> int:
+        """The next instant at which the chip is to run on without the outside; a busy one runs in slices.
+
+        A flight in lockstep runs it from event to event and does not ask. Where many take turns, or the wall clock has its
+        turn, what it sends within a slice counts as sent at the slice's end.
+        """
+        own_us = NEVER_US if self._own.next_us is None else self._own.next_us - self.ahead_us
+        state, ready_us = self.chip.state, self.chip.now_us - self.ahead_us + SLICE_US
+        if state.asleep or state.locked:
+            ready_us = -(-int(state.next_due) // CYCLES_PER_US) - self.ahead_us
+        return min(own_us, ready_us)
+
+    def advance(self, now_us: int) -> None:
+        """Bring the chip to an instant."""
+        self.run(now_us)
+
+    def run(self, now_us: int, until_us: int = 0) -> None:
+        """Run the chip up to an instant, and on to a later one, if given; less far where hardware acts before."""
+        now_us = max(now_us, until_us)
+        self._target_us, self._limit_us = now_us, NEVER_US
+        own, state = self._own, self.chip.state
+        while True:
+            until_us = min(now_us, self._limit_us) + self.ahead_us
+            own_is_due = own.next_us is not None and own.next_us <= until_us
+            if own_is_due and own.next_us is not None:
+                until_us = own.next_us
+            until = until_us * CYCLES_PER_US
+            if state.now < until:
+                why = self._run_chip(until)
+                if why:
+                    self._act(why)
+            elif own_is_due:
+                own.run(until_us)
+            else:
+                break
+        self._pass_switches_on()
+
+    def stop_before(self, us: int) -> None:
+        """Let the chip run no further than to the microsecond before that one."""
+        self._limit_us = min(self._limit_us, us - 1)
+
+    def occupy(self, name: str, taken_us: Callable[[], int]) -> None:
+        """Let something outside take the processor at every tick, before all tasks, for as long as it says then."""
+        state = self.chip.state
+        self._outside, self._place = ChipTask(name, INTERRUPTS, 0), state.task_count
+
+        def take(now_us: int) -> None:
+            state.owed += taken_us() * CYCLES_PER_US
+
+        self.every(TICK_US, take)
+
+    # Tasks
+
+    @property
+    def tasks(self) -> list[ChipTask]:
+        """Return the tasks that have run, in the order in which they first did, with what occupies the processor."""
+        state = self.chip.state
+        return self._with_outside(
+            [self._task(task.block) for task in state.task[0 : state.task_count]], self._outside
+        )
+
+    @property
+    def current(self) -> ChipTask:
+        """Return the task that has the processor."""
+        state = self.chip.state
+        if not state.task_count:
+            return ChipTask("-", 0, 0)
+        return self._task(state.task[state.running].block)
+
+    def run_times_us(self) -> list[int]:
+        """Return how long each task has had the processor, interrupts and the idle task's sleep included, over resets."""
+        state = self.chip.state
+        cycles = [task.cycles for task in state.task[0 : state.task_count]]
+        if cycles:
+            cycles[state.running] += state.now - state.running_since
+        return [own // CYCLES_PER_US for own in self._with_outside(cycles, state.taken)]
+
+    def activations(self) -> list[int]:
+        """Return how often each task got the processor."""
+        state = self.chip.state
+        return self._with_outside([task.times for task in state.task[0 : state.task_count]], 0)
+
+    def _with_outside(self, of_tasks: list[T], of_outside: T | None) -> list[T]:
+        """Return what is known of each task, and of what occupies the processor where it came between them."""
+        if self._outside is None or of_outside is None:
+            return of_tasks
+        return [*of_tasks[: self._place], of_outside, *of_tasks[self._place :]]
+
+    def longest_busy(self, least_us: int) -> tuple[int, int] | None:
+        """Return the task of the highest priority that has not waited for so long, and its microseconds; None without one.
+
+        Those below it may only wait for it. The idle task never waits.
+        """
+        state = self.chip.state
+        busy = [
+            (self._task(one.block).priority, (state.now - one.busy_since) // CYCLES_PER_US, one.block)
+            for one in state.task[0 : state.task_count]
+            if one.busy_since and self._task(one.block).name != IDLE
+        ]
+        _, us, block = max((one for one in busy if one[1] >= least_us), default=(0, 0, 0))
+        return (block, us) if block else None
+
+    def set_trace(self, trace: Trace | None) -> None:
+        """Report every task that gets the processor, or no longer."""
+        self.trace = trace
+        self.chip.state.tracing = trace is not None
+        self.chip.state.switch_count = 0
+
+    def _pass_switches_on(self) -> None:
+        state = self.chip.state
+        if self.trace is None:
+            return
+        for switch in state.task_switch[0 : state.switch_count]:
+            task = self._task(switch.block)
+            self.trace(switch.now // CYCLES_PER_US - self.ahead_us, "IN", task.name, task.priority, 0)
+        state.switch_count = 0
+
+    def _task(self, block: int) -> ChipTask:
+        if block not in self._names:
+            assert self._kernel is not None
+            view = self._kernel.task(block, "running")
+            name = view.name.replace(" ", "_")
+            taken = sum(task.name.split("#")[0] == name for task in self._names.values())
+            self._names[block] = ChipTask(f"{name}#{taken + 1}" if taken else name, view.priority, block)
+        return self._names[block]

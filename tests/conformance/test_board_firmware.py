@@ -1,0 +1,248 @@
+"""Laws of every `BoardFirmware`: the firmware in Python, an image on the emulated chip, a board in the loop on a link.
+
+The image is the tests' own firmware, which knows no flight; the board in the loop is the exported app on this machine.
+"""
+
+import random
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.signals import COUNTERS
+from firmware_py.wire.supervisor import Cause, State
+from ground_station.links.core_client import CoreClient
+from hil.config import load_config
+from hil.devices.board import VirtualBoard
+from hil.devices.board_firmware import BoardFirmware, Executor, PowerOn, PythonBoard
+from hil.devices.real_firmware import RealBoard
+from hil.events import EventQueue
+from support.app_air import AppAir
+from support.crazyflie_app import App
+from support.stm32_firmware import BUILD, build
+
+CONFIG = load_config()
+SAMPLE_US = 1_000
+LEVEL = (0, 0, 0, 0, 0, 2731)
+POSE = bytes((0x61, 8)) + np.array((0.01, 0, 0, 0, 0, 0, 1), "<f4").tobytes()
+NOISE = random.Random(5)
+
+Make = Callable[[EventQueue], Executor]
+
+
+def image() -> Executor:
+    pytest.importorskip("unicorn")
+    pytest.importorskip("cffi")
+    from hil.devices.image_firmware import ChipImage
+
+    return ChipImage.load(build(), None, BUILD)
+
+
+@pytest.fixture(params=["python", "image", "real"])
+def make(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Make]:
+    if request.param == "python":
+        yield lambda events: PythonBoard()
+    elif request.param == "image":
+        yield lambda events: image()
+    else:
+        app = App(request.getfixturevalue("library"), tmp_path / "copy.so")
+        app.boot()
+        air = AppAir(app)
+
+        def real(events: EventQueue) -> Executor:
+            air.join(events)
+            return RealBoard(CoreClient(air, "app"), False, air)
+
+        yield real
+
+
+class Bench:
+    """A board at rest and level, whose gyro's last bit is never still."""
+
+    def __init__(self, make: Make) -> None:
+        self.events = EventQueue()
+        self.counts: list[tuple[int, ...]] = []
+        self.said: list[str] = []
+        self.pins = VirtualBoard(
+            self._move, lambda now_us, data: True, lambda now_us, text: self.said.append(text)
+        )
+        self.executor = make(self.events)
+        self.now_us = self.booted_us = 0
+        self.boot()
+
+    def boot(self) -> BoardFirmware:
+        self.booted_us = self.now_us
+        self.pins.boot(self.now_us)
+        self.firmware = self.executor.boot(PowerOn(self.pins, CONFIG, False, False, None))
+        self.pins.run_on(self.firmware.kernel, self.events)
+        return self.firmware
+
+    def run(self, us: int, packets: Sequence[bytes] = ()) -> None:
+        waiting = list(packets)
+        for _ in range(us // SAMPLE_US):
+            self.firmware.kernel.run(
+                self.now_us - self.booted_us, self.now_us - self.booted_us + SAMPLE_US - 1
+            )
+            self.now_us += SAMPLE_US
+            self.firmware.kernel.advance(self.now_us - self.booted_us)
+            self.events.run(self.now_us)
+            self.pins.measure((*LEVEL[:2], NOISE.choice((-1, 0, 1)), *LEVEL[3:]))
+            self.firmware.imu_ready()
+            if waiting:
+                self.firmware.radio_received(waiting.pop(0))
+            self.firmware.kernel.run(self.now_us - self.booted_us)
+
+    def _move(self, now_us: int, counts: Sequence[int]) -> None:
+        self.counts.append(tuple(counts))
+
+
+@pytest.fixture
+def bench(make: Make) -> Bench:
+    return Bench(make)
+
+
+def test_time_counts_from_the_boot_and_goes_where_it_is_led(bench: Bench) -> None:
+    kernel = bench.firmware.kernel
+    assert kernel.now_us == 0
+    bench.run(20_000)
+    assert kernel.now_us == 20_000
+    assert kernel.next_wake_us is None or kernel.next_wake_us > 20_000 - SAMPLE_US
+    kernel.run(20_000, 20_900)
+    kernel.advance(20_950)
+    assert kernel.now_us == 20_950
+
+
+def test_views_have_the_shapes_of_the_core_and_follow_it(bench: Bench) -> None:
+    signals = bench.firmware.signals
+    views = (signals.estimate, signals.counters, signals.u, signals.flap, signals.count)
+    assert [view.shape for view in views] == [(16,), (len(COUNTERS),), (4,), (4,), (4,)]
+    assert [str(view.dtype) for view in views] == ["float32", "int32", "float32", "float32", "int32"]
+    bench.run(30_000)
+    assert bench.firmware.signals is signals
+    if bench.counts and signals.count.any():
+        assert tuple(signals.count.tolist()) == bench.counts[-1]
+
+
+def test_a_supervisor_calibrates_first_and_has_no_cause(bench: Bench) -> None:
+    supervisor = bench.firmware.signals.supervisor
+    assert (supervisor.state, supervisor.cause) == (State.CALIBRATING, Cause.NONE)
+    bench.run(30_000)
+    assert supervisor.state in State
+    assert supervisor.cause in Cause
+
+
+def test_variables_have_names_of_their_own_and_numbers_of_their_types(bench: Bench) -> None:
+    bench.run(50_000)
+    names = [variable.name for variable in bench.firmware.variables]
+    assert len(set(names)) == len(names)
+    for variable in bench.firmware.variables:
+        assert all(variable.name.partition("."))
+        value = variable.read()
+        assert variable.scalar.is_float or value == variable.scalar.cast(value), variable.name
+
+
+def test_tasks_are_told_alike_by_scheduler_and_statistics(bench: Bench) -> None:
+    bench.run(100_000)
+    scheduler, reports = bench.firmware.scheduler, bench.firmware.statistics.reports()
+    if scheduler is None:
+        assert not reports
+        return
+    names = [task.name for task in scheduler.tasks]
+    assert len(set(names)) == len(names) == len(scheduler.run_times_us())
+    assert {report.name for report in reports} <= set(names)
+    times = dict(zip(names, scheduler.run_times_us(), strict=True))
+    assert all(times[report.name] == report.run_time_us for report in reports)
+    assert 90_000 < sum(times.values()) < 101_000
+    assert all(task.deadline_misses == 0 for task in scheduler.tasks)
+    assert scheduler.current.name in names
+    assert all(queue.dropped == 0 <= queue.high_water <= queue.length for queue in scheduler.queues)
+
+
+def test_what_occupies_the_processor_is_counted_beside_the_tasks(bench: Bench) -> None:
+    scheduler = bench.firmware.scheduler
+    if scheduler is None:
+        return
+    bench.run(30_000)
+    scheduler.occupy("LOAD", lambda: 300)
+    bench.run(50_000)
+    times = dict(zip((task.name for task in scheduler.tasks), scheduler.run_times_us(), strict=True))
+    assert times["LOAD"] == pytest.approx(50 * 300, abs=300)
+    assert 70_000 < sum(times.values()) < 81_000
+
+
+def test_a_trace_goes_forward_and_ends(bench: Bench) -> None:
+    scheduler = bench.firmware.scheduler
+    if scheduler is None:
+        return
+    bench.run(30_000)
+    rows: list[tuple[int, str, str, int, int]] = []
+    scheduler.set_trace(lambda *row: rows.append(row))
+    bench.run(20_000)
+    scheduler.set_trace(None)
+    assert scheduler.trace is None
+    times = [row[0] for row in rows]
+    assert times == sorted(times)
+    assert 30_000 <= times[0] <= times[-1] <= 50_000
+    assert {row[2] for row in rows if row[1] == "IN"} <= {task.name for task in scheduler.tasks}
+    count = len(rows)
+    bench.run(20_000)
+    assert len(rows) == count
+
+
+def test_whatever_the_radio_brings_the_board_goes_on(bench: Bench) -> None:
+    packets = [bytes((0x61, *NOISE.randbytes(NOISE.randrange(31)))) for _ in range(40)]
+    bench.run(60_000, [*packets, *(NOISE.randbytes(NOISE.randrange(1, 32)) for _ in range(20))])
+    bench.firmware.radio_polled()
+    bench.firmware.uart_ready()
+    bench.firmware.radio_received(POSE, broadcast=True)
+    bench.run(60_000)
+    bench.firmware.check_watchdog()
+    assert bench.firmware.kernel.now_us == 120_000
+
+
+def test_servos_get_four_counts_of_a_pulse(bench: Bench) -> None:
+    bench.run(100_000)
+    assert all(len(counts) == 4 for counts in bench.counts)
+    assert all(0 < count <= 52_501 for counts in bench.counts for count in counts)
+
+
+def test_what_a_board_cannot_report_is_absent(bench: Bench) -> None:
+    firmware = bench.firmware
+    assert firmware.mavlink is None
+    assert firmware.overrun == ""
+    assert firmware.usage is None
+    before = firmware.clock_us
+    bench.run(20_000)
+    after = firmware.clock_us
+    assert (before is None) == (after is None)
+    assert before is None or after is None or after >= before
+    if firmware.flashed is not None:
+        assert firmware.flashed.resets == 0
+        assert "\n" not in firmware.flashed.differences(CONFIG)
+        report = firmware.flashed.report()
+        assert len(report.sha256) == 64
+        assert len(report.stack_free_bytes) >= len(firmware.scheduler.tasks) > 1
+        assert (report.watchdog_resets, report.software_resets) == (0, 0)
+
+
+def test_a_boot_begins_anew_with_the_same_face(bench: Bench) -> None:
+    bench.run(30_000)
+    first = bench.firmware
+    again = bench.boot()
+    assert again is not first
+    assert again.kernel.now_us == 0
+    assert [one.name for one in again.variables] == [one.name for one in first.variables]
+    assert [view.shape for view in (again.signals.estimate, again.signals.counters)] == [
+        (16,),
+        (len(COUNTERS),),
+    ]
+    assert again.signals.supervisor.state is State.CALIBRATING
+    bench.run(30_000)
+    assert again.kernel.now_us == 30_000
+
+
+def test_a_packet_takes_no_negative_time_to_the_processor(bench: Bench) -> None:
+    times = [bench.executor.wire_us(bytes(size)) for size in range(1, 32)]
+    assert times == sorted(times)
+    assert times[0] >= 0

@@ -1,0 +1,216 @@
+"""The budget of a call of own logic: loops that exceed it are refused, or stopped alike on every target."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from firmware_py.config import parameters_of
+from firmware_py.core.budget import CALL_CYCLES
+from firmware_py.core.structs import MODE_FLY
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.export.boards import BOARDS, runner_of
+from firmware_py.export.cortex_m4 import CortexM4Runner
+from firmware_py.export.plain import PlainRunner
+from firmware_py.logic.budget import CLOCK_MHZ
+from firmware_py.logic.loading import load_logic
+from hil.errors import LabError
+from support.own_logic import ESTIMATOR, LAW, own_config
+from support.paths import ROOT
+
+IN_LAW = "    memory.ticks = i32(memory.ticks + 1)\n"
+SLOT_MS = 4
+
+
+def law(body: str, before: str = "") -> str:
+    lines = "".join(f"    {line}\n" for line in body.splitlines())
+    return LAW.replace(IN_LAW, IN_LAW + lines).replace(
+        "\n\n@kernel\ndef reset_law", f"\n\n{before}@kernel\ndef reset_law"
+    )
+
+
+def line_of(text: str, part: str) -> int:
+    return text[: text.index(part)].count("\n") + 1
+
+
+Make = Callable[..., CoreBlocks]
+
+
+@pytest.fixture
+def blocks_of(tmp_path: Path) -> Iterator[Make]:
+    """Return the memory of a core with own logic in flight, and what executes it on a board."""
+    with ExitStack() as stack:
+
+        def make(text: str, board: str = "python", estimator: str = "") -> CoreBlocks:
+            config = own_config(tmp_path, text, estimator)
+            runner = (
+                PlainRunner if board == "plain" else runner_of(board, ROOT / "runs" / "build", config.logic)
+            )
+            blocks = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
+            if isinstance(blocks.run, PlainRunner):
+                stack.callback(blocks.run.close)
+            blocks.data.fields.mode = MODE_FLY
+            return blocks
+
+        yield make
+
+
+def overrun(blocks: CoreBlocks) -> str:
+    assert blocks.logic is not None
+    return blocks.logic.overrun(blocks.named)
+
+
+def test_the_budget_is_the_part_of_the_control_slot_that_the_pages_state() -> None:
+    assert CALL_CYCLES == SLOT_MS * 1000 * CLOCK_MHZ
+    page = (ROOT / "docs" / "howto" / "own-logic.md").read_text(encoding="utf-8")
+    assert f"{CALL_CYCLES:,}".replace(",", " ") in page
+
+
+SUM = "for i in range({}):\n    memory.hidden = memory.hidden + DT"
+
+
+@pytest.mark.parametrize(
+    ("body", "before", "at"),
+    [
+        (SUM.format("2000000000"), "", "    for i in range(2000000000)"),
+        (SUM.format("LONG"), "LONG = 2000000000\n\n\n", "    for i in range(LONG)"),
+        (SUM.format("i32(2000000000)"), "", "    for i in range(i32"),
+        (SUM.format("-2000000000, 4"), "", "    for i in range(-2000000000"),
+        ("for k in range(2000):\n    for i in range(2000):\n        memory.hidden = DT", "", "    for k in"),
+        ("for k in range(2000):\n    for i in range(k):\n        memory.hidden = DT", "", "    for k in"),
+        (
+            "if memory.ticks == 0:\n    " + SUM.format("2000000").replace("\n", "\n    "),
+            "",
+            "        for i in",
+        ),
+        (SUM.format("100000"), "", ""),
+    ],
+)
+def test_a_loop_of_known_length_is_refused_where_it_exceeds_the_budget(
+    tmp_path: Path, body: str, before: str, at: str
+) -> None:
+    text = law(body, before)
+    if not at:
+        load_logic(own_config(tmp_path, text).logic)
+        return
+    with pytest.raises(LabError) as error:
+        own_config(tmp_path, text)
+    assert str(error.value).startswith(f"{tmp_path / 'controller.py'}:{line_of(text, at)}: for ")
+    assert str(error.value).endswith("cycles: a call has 672000 (4 ms of a Cortex-M4)")
+
+
+def test_loops_that_fit_alone_but_not_together_are_refused_where_the_function_begins(tmp_path: Path) -> None:
+    text = law("\n".join([SUM.format("100000"), SUM.format("100000").replace(" i ", " k ")]))
+    with pytest.raises(LabError, match=rf"py:{line_of(text, 'def control_law')}: control_law takes at least"):
+        own_config(tmp_path, text)
+
+
+SLOW = dict.fromkeys(("python", "cortex-m4", "plain"), pytest.mark.long)  # all but c
+EVERY = [pytest.param(board, marks=SLOW.get(board, ())) for board in (*BOARDS, "plain")]
+# the body of the law, the function with the loop, and a value of `after` with which it does not exceed its budget
+DATA = [
+    (SUM.format("own.after"), "", 3),
+    (SUM.format("-5, own.after"), "", 3),
+    (SUM.format("i32(memory.ticks - 2000000000), own.after"), "", None),
+    (
+        "n = i32(own.after + 1000)\nfor k in range(1000):\n    " + SUM.format("n").replace("\n", "\n    "),
+        "",
+        None,
+    ),
+    (
+        "memory.hidden = total(own.after)",
+        "@kernel\ndef total(n: i32) -> f32:\n    y = ZERO\n    for i in range(n):\n        y = y + DT\n    return y\n\n\n",
+        100,
+    ),
+    (
+        "fill(memory, own)",
+        "@kernel\ndef fill(  # of several lines\n    memory: Memory,\n    own: Gains,\n) -> None:\n"
+        "    for i in range(\n        own.after  # in all\n    ):\n        memory.hidden = sqrt(memory.hidden + DT)\n\n\n",
+        1000,
+    ),
+]
+
+
+@pytest.mark.parametrize("board", EVERY)
+@pytest.mark.parametrize(("body", "before", "harmless"), DATA, ids=[body.split("\n")[0] for body, *_ in DATA])
+def test_a_loop_whose_length_depends_on_data_is_stopped_alike_on_every_target(
+    blocks_of: Make, board: str, body: str, before: str, harmless: int | None
+) -> None:
+    text = law(body, before).replace("high=1000000)", "high=2000000000)")
+    blocks = blocks_of(text, board)
+    own: Any = blocks.named["controller_own"].fields
+    budget: Any = blocks.named["controller_loop_budget"].fields
+    guard = blocks.named["guard"].fields
+    if harmless is not None:
+        own.after = harmless
+        blocks.run.call("control")
+        assert (guard.controller_faults, overrun(blocks)) == (0, "")
+    own.after = 2000000000
+    blocks.run.call("control")
+    assert guard.controller_faults == 1
+    hover = float(blocks.parameters.fields.hover_angle)
+    assert blocks.control.fields.flap.tolist() == pytest.approx([hover, -hover, hover, -hover])
+    assert blocks.control.fields.u.tolist() == [0.0] * 4
+    assert 0 < budget.cycles <= CALL_CYCLES
+    line = line_of(text, "    for i in range")
+    where = f"controller.py:{line}: the loop up to {budget.end} exceeds the 672000 cycles of a call"
+    assert overrun(blocks).endswith(where)
+    if harmless is not None:
+        own.after = harmless
+        blocks.run.call("control")
+        assert (guard.controller_faults, overrun(blocks)[-len(where) :]) == (1, where)
+
+
+@pytest.mark.parametrize("board", EVERY)
+def test_an_estimator_that_exceeds_its_budget_has_no_estimate(blocks_of: Make, board: str) -> None:
+    old = "    memory.ticks = i32(memory.ticks + 1)\n"
+    text = ESTIMATOR.replace(
+        old, f"{old}    for i in range(memory.ticks * 20000):\n        memory.nothing = f32(0.0)\n"
+    )
+    blocks = blocks_of(LAW, board, text)
+    guard = blocks.named["guard"].fields
+    blocks.run.call("reset")
+    while not guard.estimator_faults:
+        blocks.run.call("estimate")
+    place = f"estimator.py:{line_of(text, '    for i in')}"
+    budget: Any = blocks.named["estimator_loop_budget"].fields
+    assert 60000 <= budget.end <= 140000
+    assert overrun(blocks).endswith(
+        f"{place}: the loop up to {budget.end} exceeds the 672000 cycles of a call"
+    )
+    assert guard.estimator_faults == 1
+    assert blocks.estimator.fields.now[0] == 0.0
+
+
+def test_a_call_with_a_loop_in_an_expression_is_refused(tmp_path: Path) -> None:
+    total = DATA[4][1]
+    text = law("memory.hidden = ZERO + total(own.after)", total)
+    with pytest.raises(
+        LabError, match=r"total has a loop whose length depends on data: write x = total\(\.\.\) on a line"
+    ):
+        own_config(tmp_path, text)
+
+
+def test_logic_without_such_loops_flies_as_it_is_written(blocks_of: Make) -> None:
+    blocks = blocks_of(law(SUM.format("100000")), estimator=ESTIMATOR)
+    assert blocks.logic is not None
+    assert "charged" not in blocks.logic.loaded.translation.source
+    assert not any("budget" in name for name in blocks.named)
+
+
+@pytest.mark.parametrize("body", [DATA[0][0], DATA[5][0]])
+def test_the_cycles_counted_are_at_most_those_of_the_machine_code(blocks_of: Make, body: str) -> None:
+    before = DATA[5][1] if "fill" in body else ""
+    blocks = blocks_of(law(body, before), "cortex-m4")
+    own: Any = blocks.named["controller_own"].fields
+    budget: Any = blocks.named["controller_loop_budget"].fields
+    assert isinstance(blocks.run, CortexM4Runner)
+    taken = []
+    for steps in (10, 10010):
+        own.after = steps
+        blocks.run.call("control")
+        taken.append((int(budget.cycles), blocks.run.load["control"].worst_cycles))
+    counted, measured = (taken[1][index] - taken[0][index] for index in (0, 1))
+    assert counted <= measured <= 5 * counted

@@ -1,0 +1,154 @@
+"""Edges of a campaign: when it ends, which flights have a fault, what counts as worst, how a figure is ranked."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hil.campaigns.config import Distribution
+from hil.campaigns.dataset import Dataset, read_flights, schema_of, table_of
+from hil.campaigns.findings import Limited, Rate, find
+from hil.campaigns.flying import Campaign, CampaignRow
+from hil.campaigns.run import STOP_FROM, Progress, interval
+from hil.campaigns.sampling import as_flown, axes, draw, points_of, value_at
+from hil.laboratory.metrics import METRICS
+from support.campaigns import BAD_PUSH, planted, spec_of
+
+
+def half(failed: int, flown: int) -> float:
+    low, high = interval(failed, flown)
+    return (high - low) / 2.0
+
+
+def ended(passed: list[bool], order: list[int], flights: int, half_width: float | None) -> object:
+    """What a campaign has found when its rows arrive in an order."""
+    progress = Progress(SimpleNamespace(flights=flights, half_width=half_width))  # type: ignore[arg-type]
+    for index in order:
+        progress.add(index, passed[index])
+    return progress.end, progress.standing
+
+
+@settings(max_examples=20)
+@given(st.data())
+def test_a_campaign_ends_at_the_same_flight_whatever_order_its_rows_arrive_in(data: st.DataObject) -> None:
+    passed = data.draw(st.lists(st.booleans(), min_size=40, max_size=40))
+    order = data.draw(st.permutations(range(40)))
+    half_width = data.draw(st.sampled_from([None, 0.05, 0.1, 0.15, 0.2]))
+    assert ended(passed, order, 40, half_width) == ended(passed, list(range(40)), 40, half_width)
+
+
+def test_a_campaign_may_end_from_its_thirtieth_flight_on_and_at_the_width_itself() -> None:
+    all_hold = [True] * 60
+    end, standing = ended(all_hold, list(range(60)), 60, half(0, STOP_FROM))
+    assert end == STOP_FROM
+    assert (standing.flown, standing.failed, standing.complete) == (STOP_FROM, 0, True)  # type: ignore[attr-defined]
+    assert ended(all_hold, list(range(60)), 60, half(0, STOP_FROM + 1))[0] == STOP_FROM + 1  # type: ignore[index]
+    last_fails = [*all_hold[:-1], False]  # and comes first
+    _, standing = ended(last_fails, [59, *range(59)], 60, half(0, STOP_FROM))
+    assert (standing.flown, standing.failed) == (STOP_FROM, 0)  # type: ignore[attr-defined]
+    assert ended(all_hold, list(range(60)), 60, 0.5)[0] == STOP_FROM  # type: ignore[index]
+
+
+def test_a_campaign_of_n_flights_ends_with_the_last_of_them_and_not_before() -> None:
+    progress = Progress(SimpleNamespace(flights=3, half_width=None))  # type: ignore[arg-type]
+    for index, end in ((2, None), (1, None), (0, 3)):
+        progress.add(index, index != 1)
+        assert progress.end == end
+    assert (progress.standing.failed, progress.standing.flown) == (1, 3)
+
+
+@pytest.mark.parametrize("probability", [0.2, 0.8])
+def test_a_fault_happens_with_its_probability_and_is_marked_where_it_does(probability: float) -> None:
+    (push,) = spec_of().faults
+    spec = spec_of(flights=200, faults=[push.model_dump() | {"probability": probability}])
+    happened = np.array([bool(draw(spec, index).faults) for index in range(200)])
+    assert happened.mean() == pytest.approx(probability, abs=0.08)
+    column = [axis.name for axis in axes(spec)].index("fault 1 push.y happens")
+    flown = as_flown(spec, points_of(spec))
+    assert flown[:, column].tolist() == happened.astype(float).tolist()
+    size = [axis.name for axis in axes(spec)].index("fault 1 push.y size")
+    assert (flown[~happened, size] == 0.5).all()
+    assert (flown[happened, size] != 0.5).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])
+def test_a_logarithmic_axis_goes_from_end_to_end_by_equal_factors(share: float) -> None:
+    varies = Distribution(log_uniform=(2.0, 32.0))
+    assert value_at(varies, share) == pytest.approx(2.0 * 16.0**share)
+
+
+def test_points_of_several_seeds_have_seeds_of_their_own() -> None:
+    spec = spec_of(flights=12, seeds=3, seed=100)
+    assert [draw(spec, index).seed for index in range(12)] == list(range(100, 112))
+
+
+@pytest.mark.parametrize(("bound", "good", "bad"), [("max", "1", "4"), ("min", "4", "1")])
+def test_quantiles_count_from_good_to_bad(bound: str, good: str, bad: str) -> None:
+    metric = replace(METRICS["poses_refused"], bound=bound)
+    limited = Limited("hover", "floaty", "x", metric, 2.0, Rate(0, 4), np.array([3.0, 1.0, 4.0, 2.0]))
+    assert (limited.quantile(0.0), limited.quantile(1.0)) == (good, bad)
+
+
+def rows_of(*changes: dict[str, object]) -> list[CampaignRow]:
+    campaign = Campaign.of(spec_of(flights=len(changes)))
+    rows = []
+    for index, change in enumerate(changes):
+        row = planted(campaign, index)
+        metrics = {**row.metrics, **change.pop("metrics", {})}  # type: ignore[dict-item]
+        rows.append(replace(row, passed=False, metrics=metrics, **change))
+    return rows
+
+
+def test_the_worst_flights_are_those_lost_first_then_those_far_beyond_a_limit() -> None:
+    spec = spec_of(flights=5)
+    limits = {"in_box": False}
+    rows = rows_of(
+        {"metrics": {"in_box": 0.5}, "holds": limits},
+        {"outcome": "lost", "error": "late", "metrics": {"flown": 9.0}},
+        {"metrics": {"in_box": 0.1}, "holds": limits},
+        {"outcome": "lost", "error": "early", "metrics": {"flown": 2.0}},
+        {"metrics": {"rms_x": 0.5}, "holds": {"in_box": True}},
+    )
+    spec = spec_of(flights=5, settings=["limits.hover.in_box=0.9"])
+    table = table_of([asdict(row) for row in rows], schema_of(Campaign.of(spec)))
+    found = find(spec, table)
+    assert [one.index for one in found.worst] == [3, 1, 2, 0, 4]
+    assert (found.rate.failed, found.rate.flown) == (5, 5)
+
+
+def test_rows_beyond_the_end_are_dropped_and_a_row_that_came_twice_counts_once(tmp_path: Path) -> None:
+    campaign = Campaign.of(spec_of())
+    rows = Dataset(tmp_path, campaign, False)
+    for index in (3, 0, 1, 1, 2, 0, 4):
+        rows.add(planted(campaign, index))
+    rows.close(4)
+    assert read_flights(tmp_path, rows.schema, ["index"])["index"].to_pylist() == [0, 1, 2, 3]
+    assert rows.indices == {0, 1, 2, 3}
+
+
+def test_a_campaign_of_one_flight_has_one_row(tmp_path: Path) -> None:
+    campaign = Campaign.of(spec_of(flights=1))
+    rows = Dataset(tmp_path, campaign, False)
+    rows.add(planted(campaign, 0))
+    rows.close(1)
+    assert read_flights(tmp_path, rows.schema, ["index"])["index"].to_pylist() == [0]
+
+
+def test_every_point_has_the_row_of_its_flight() -> None:
+    """Two profiles fly each point: flights 2 n and 2 n + 1."""
+    spec = spec_of(flights=120, profiles=["floaty", "as-flown"])
+    campaign = Campaign.of(spec)
+    table = table_of([asdict(planted(campaign, index)) for index in range(120)], schema_of(campaign))
+    mapped = find(spec, table).failure_map
+    assert mapped is not None
+    size = [axis.name for axis in mapped.axes].index("fault 1 push.y size")
+    happens = [axis.name for axis in mapped.axes].index("fault 1 push.y happens")
+    bad = (BAD_PUSH - 1.0) / 11.0
+    assert (
+        mapped.failed.tolist()
+        == ((mapped.points[:, happens] == 1.0) & (mapped.points[:, size] >= bad)).tolist()
+    )

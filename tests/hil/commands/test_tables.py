@@ -1,0 +1,96 @@
+"""What `floaty fly` and `compare` print and return for several seeds: means, verdicts, exit codes."""
+
+from dataclasses import replace
+from math import radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.commands.compare import _print_seeds
+from hil.commands.tables import SEED_COLUMNS, print_result, print_seeds
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.metrics import METRICS, Verdict
+from hil.laboratory.result import Result, read_result
+from hil.laboratory.run import Request, fly, prepare
+from hil.studies.two_boards import FirstCount, Seed
+from support.command import floaty
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    folder = tmp_path_factory.mktemp("tables") / "run"
+    prepare(folder)
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.1), folder)
+    return read_result(folder)
+
+
+def made(flown: Result, rms: float, holds: bool, outcome: str = "completed") -> Result:
+    """A flight with the same error on every axis and one limit."""
+    names = [name for _, group, _, _ in SEED_COLUMNS for name in group]
+    metrics = {
+        **dict.fromkeys(names, 0.5),
+        **{f"rms_{axis}": rms for axis in "xyz"},
+        "attitude_max": radians(9.0),
+    }
+    metrics |= {"flown": 0.1} | {f"within_6cm_{axis}": 0.9 if holds else 0.5 for axis in "xyz"}
+    verdict = Verdict("rms_x", rms, 0.02, holds, "m", "max")
+    return replace(flown, outcome=outcome, metrics=metrics, verdicts=(verdict,), cause=None)  # type: ignore[arg-type]
+
+
+def test_means_are_those_of_the_completed_flights(flown: Result, capsys: pytest.CaptureFixture[str]) -> None:
+    print_seeds([made(flown, 0.01, True), made(flown, 0.03, False), made(flown, 0.5, False, "lost")])
+    shown = capsys.readouterr().out
+    assert "3 seeds: 1 hold all limits, 1 lost" in shown
+    assert (
+        "mean of the completed: rms x 2.00 y 2.00 z 2.00 cm; < 6 cm x 70.0 y 70.0 z 70.0 % of the time"
+        in shown
+    )
+    assert " 9.0 " in shown, "degrees"
+    assert "fails: rms_x" in shown
+
+
+def test_a_limit_that_holds_is_ok_and_one_that_does_not_fails(
+    flown: Result, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for holds, mark in ((True, "ok"), (False, "FAILS")):
+        print_result(made(flown, 0.01, holds))
+        (line,) = [line for line in capsys.readouterr().out.splitlines() if "rms_x" in line]
+        assert [cell.strip() for cell in line.split("│")[-3:-1]] == ["<= 2 cm", mark]
+
+
+def test_every_metric_of_the_tables_exists() -> None:
+    assert {name for _, names, _, _ in SEED_COLUMNS for name in names} <= METRICS.keys()
+
+
+@pytest.mark.parametrize(
+    ("passed", "code"), [((True, True, True), 0), ((True, False, True), 1), ((False,) * 3, 1)]
+)
+def test_seeds_count_up_and_one_that_fails_is_exit_code_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, flown: Result, passed: tuple[bool, ...], code: int
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    jobs: list[Any] = []
+
+    def fly_all(wanted: list[Any], notices: object) -> tuple[list[Result], bool]:
+        jobs.extend(wanted)
+        return [made(flown, 0.01, holds) for holds in passed], False
+
+    monkeypatch.setattr("hil.studies.sweep.fly_all", fly_all)
+    assert floaty(monkeypatch, "fly", "hover", "--seeds", "3", "--seed", "5") == code
+    assert [job.request.seed for job in jobs] == [5, 6, 7]
+    assert len({job.folder for job in jobs}) == 3
+
+
+@pytest.mark.parametrize(("differ", "code"), [((False, False), 0), ((True, False), 1), ((True, True), 1)])
+def test_boards_of_which_one_seed_differs_are_not_the_same(
+    differ: tuple[bool, ...], code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = FirstCount(7, 0.07, "motor.m1", (1, 2), "radio")
+    rms = (np.full(3, 0.01), np.full(3, 0.011))
+    seeds = [
+        Seed(number, first if one else None, rms, 0.002, (50, 50)) for number, one in enumerate(differ, 1)
+    ]
+    assert _print_seeds(Path("a"), Path("b"), seeds) == code
+    assert "rms errors within 10.0 % of the first's, bodies within 2.00 mm" in capsys.readouterr().out

@@ -1,0 +1,163 @@
+"""`floaty deploy check --elf`: what is compared of an app around the core, tried on the app and in flights."""
+
+import ctypes
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from firmware_py.core.structs import Input, Parameters
+from firmware_py.export.app_toc import AppParameter, app_parameters
+from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
+from hil.config import load_config
+from hil.deploy.beside import compare_flights
+from hil.deploy.image_bench import TARGET, check_parameters
+from hil.deploy.image_check import check_image, check_memory
+from hil.experiments import find_experiment
+from hil.laboratory.faults import parse
+from hil.laboratory.run import Request, fly, prepare
+from hil.pictures.compare import FlownRun, load_flown
+from hil.stm32f405.image import MemoryUse
+from support.crazyflie_app import App
+
+ELF = os.environ.get("FLOATY_CF2_ELF", "")
+flies = pytest.mark.skipif(
+    not ELF, reason="FLOATY_CF2_ELF names no build of the Crazyflie firmware: no image was checked"
+)
+TABLE = app_parameters(load_config())
+
+
+class AppBoard:
+    """The exported app on a board of memory, as `ParameterBoard`."""
+
+    def __init__(self, app: App) -> None:
+        self.app = app
+
+    def scalar(self, name: str) -> Scalar | None:
+        if name not in self.app.params:
+            return None
+        return PARAMETER_SCALARS[self.app.c.stub_param_type(self.app.params[name])]
+
+    def value(self, name: str) -> float:
+        return self.app.get(name)
+
+    def write(self, name: str, value: float) -> None:
+        self.app.set(name, value)
+
+    def field(self, parameter: AppParameter) -> float:
+        name, member, index = TARGET.match(parameter.target).groups()
+        offsets = {"floaty_parameters": Parameters.dtype.fields, "floaty_input": Input.dtype.fields}
+        offset = 0
+        if name == "floaty_box":
+            offset = 4 * ("radius", "below", "above").index(member)
+        elif member:
+            offset = offsets[name][member][1]
+        scalar = parameter.memory
+        place = (
+            ctypes.addressof(ctypes.c_char.in_dll(self.app.c, name)) + offset + scalar.size * int(index or 0)
+        )
+        return scalar.unpack(ctypes.string_at(place, scalar.size))
+
+
+@pytest.fixture
+def board(library: Path, tmp_path: Path) -> AppBoard:
+    app = App(library, tmp_path / "copy.so")
+    app.boot()
+    app.set("extPose.absolute", 1)  # as before anybody has connected
+    return AppBoard(app)
+
+
+def test_every_parameter_of_the_app_is_as_in_the_table_and_is_left_as_it_was(board: AppBoard) -> None:
+    before = [board.value(one.name) for one in TABLE]
+    done: list[int] = []
+    assert list(check_parameters(TABLE, board, done.append)) == []
+    assert [board.value(one.name) for one in TABLE] == before
+    assert done == list(range(1, len(TABLE) + 1))
+
+
+def changed(name: str, **fields: object) -> tuple[AppParameter, ...]:
+    """The table with one parameter that the app has otherwise."""
+    return tuple(replace(one, **fields) if one.name == name else one for one in TABLE)
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "found"),
+    [
+        ("extCtrl.z_P", {"initial": 3.1}, "extCtrl.z_P: default 3, in the profile 3.1"),
+        ("extCtrl.z_P", {"scale": -1.0}, "extCtrl.z_P: default floaty_parameters.gain_z = 3, in the profile -3"),
+        ("extCtrl.z_P", {"target": "floaty_parameters.gain_x"}, "writes floaty_parameters.gain_x = "),
+        ("extCtrl.z_P", {"high": 10.0}, "is accepted, outside -20 to 10"),
+        ("extCtrl.z_P", {"low": -10.0}, "is accepted, outside -10 to 20"),
+        ("motorShifts.m2", {"scalar": Scalar.F32}, "motorShifts.m2: type I16, expected F32"),
+        ("delayComp.horizon", {"high": 7}, "delayComp.horizon = 8 is accepted"),
+        ("supervisor.poseTimeout", {"scale": 100.0}, "floaty_parameters.pose_timeout_us = 500000, in the profile 50000"),
+    ],
+)  # fmt: skip
+def test_a_parameter_that_is_otherwise_is_found(
+    board: AppBoard, name: str, fields: dict[str, object], found: str
+) -> None:
+    assert any(found in line for line in check_parameters(changed(name, **fields), board))
+
+
+def test_a_parameter_that_is_missing_is_found(board: AppBoard) -> None:
+    missing = replace(TABLE[0], name="extCtrl.none")
+    assert list(check_parameters((missing,), board)) == ["extCtrl.none: the image has no such parameter"]
+
+
+@pytest.mark.parametrize(("used", "good"), [(64_512, True), (64_513, False)])
+def test_less_than_a_kilobyte_left_of_a_memory_is_a_warning(used: int, good: bool) -> None:
+    finding = check_memory((MemoryUse("flash", 300_000, 1_032_192), MemoryUse("CCM", used, 65_536)))
+    assert finding.good == good
+    assert f"CCM {used} B of 65536, {65_536 - used} B free" in finding.text
+    assert ("CCM has less than 1024 B left" in finding.text) != good
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., FlownRun]:
+    """Fly half a second of hover."""
+
+    def fly_hover(*faults: str) -> FlownRun:
+        folder = tmp_path_factory.mktemp("run") / "run"
+        prepare(folder)
+        chosen = [parse(text) for text in faults]
+        fly(Request.of(find_experiment("hover"), duration_s=0.5, faults=chosen), folder)
+        return load_flown(folder)
+
+    return fly_hover
+
+
+def test_flights_are_compared_by_what_their_bounds_say(flown: Callable[..., FlownRun]) -> None:
+    right = flown()
+    assert [one.found for one in compare_flights(right, right)] == [0.0] * 10
+    late = {one.bound.name: one for one in compare_flights(right, flown("mocap.latency@0.1:0.4=43"))}
+    age = late["age of poses, mean"]
+    assert 1.5 < age.found < 43
+    assert not age.held
+    assert str(age).endswith("ms apart (estimator.pose_age_us), at most 1.5 ms")
+    place = right.log.column_names.index("motor.m3")
+    counts = pa.array(right.log.column("motor.m3").to_numpy() + np.int32(61))
+    moved = replace(right, log=right.log.set_column(place, "motor.m3", counts))
+    broken = [one for one in compare_flights(right, moved) if not one.held]
+    assert [(one.bound.name, one.column, one.found) for one in broken] == [
+        ("servo counts, mean", "motor.m3", 61.0)
+    ]
+    empty = replace(right, log=right.log.slice(0, 0))
+    assert not any(one.held for one in compare_flights(right, empty))
+
+
+@pytest.mark.long
+@flies
+def test_an_image_of_the_profile_passes_and_one_of_another_does_not() -> None:
+    shown: list[str] = []
+    findings = list(check_image(Path(ELF), "floaty", (), lambda what, done, total: shown.append(what)))
+    assert [one for one in findings if not one.good] == []
+    assert {"params", "switches", "watch", "servos", "flight"} <= {one.subject for one in findings}
+    assert {"boot", "parameters", "flight, python", "flight, image"} <= set(shown)
+    other = check_image(Path(ELF), "floaty", ("controller.gain_z=3.1",), lambda *_: None)
+    found = {one.subject: one.text for one in other if not one.good}
+    assert found["constants"].startswith("gain_z = 3.0, in the profile 3.0999999")
+    assert "extCtrl.z_P" in found["params"]

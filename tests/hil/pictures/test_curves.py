@@ -1,0 +1,153 @@
+"""The arithmetic of curves, spells and pictures: half turns, gaps, states, ends of ranges."""
+
+import json
+from collections.abc import Sequence
+from math import nan
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from firmware_py.geometry import yaw_quaternion
+from hil.pictures import compare, curves
+from hil.pictures.compare import FlownRun, MetricPair
+from hil.pictures.panels import TOGETHER_S, marks_of_flight, saturated
+from hil.pictures.trials import openings
+
+RELEASE = {b"release_us": b"0"}
+
+
+def flight(yaw: Sequence[float], period_us: int = 10_000, **columns: Sequence[float]) -> pa.Table:
+    """Rows of a flight at home that looks along `yaw` [deg], wanted is 180."""
+    count = len(yaw)
+    zero = np.zeros(count)
+    q = np.array([yaw_quaternion(np.radians(angle)) for angle in yaw])
+    table = {
+        "t": period_us * np.arange(count),
+        "flight.free": zero + 1,
+        "supervisor.state": np.full(count, 2),
+    }
+    table |= {f"truth.q{part}": q[:, index] for index, part in enumerate("wxyz")}
+    names = [f"{where}.{axis}" for where in ("truth", "goal", "estimate") for axis in "xyz"]
+    names += [
+        *(f"truth.flap_{flap}" for flap in (1, 2, 3, 4)),
+        "estimate.roll",
+        "estimate.pitch",
+        "estimate.yaw",
+    ]
+    table |= dict.fromkeys(names, zero) | {"goal.yaw": zero + np.pi}
+    return pa.table(
+        table | {name: np.asarray(values) for name, values in columns.items()}
+    ).replace_schema_metadata(RELEASE)
+
+
+@pytest.mark.parametrize(("yaw", "error"), [(179.0, -1.0), (-179.0, 1.0), (180.0, 0.0), (90.0, -90.0)])
+def test_the_attitude_error_goes_the_short_way_round(yaw: float, error: float) -> None:
+    assert curves.ATTITUDE.read(flight([yaw]))[0] == pytest.approx([0.0, 0.0, error], abs=1e-9)
+
+
+def test_an_estimate_across_half_a_turn_misses_by_the_difference() -> None:
+    rows = flight([1.0, -1.0], **{"estimate.yaw": np.radians([179.0, -178.0])})
+    missed = curves.ATTITUDE_MISS.read(rows)[:, 2]
+    assert missed == pytest.approx([-2.0, 3.0], abs=1e-9)
+
+
+def test_the_time_since_the_last_fused_pose_grows_until_the_next_one() -> None:
+    rows = flight([0.0] * 6, **{"estimator.fused": [0, 1, 1, 1, 2, 2]})
+    assert curves.since_fusion(rows)[:, 0].tolist() == pytest.approx([nan, 0, 10, 20, 0, 10], nan_ok=True)
+    assert curves.row_of_last_fusion(rows)["t"].to_pylist() == [40_000]
+    assert curves.row_of_last_fusion(rows.slice(0, 1)).num_rows == 0
+
+
+def test_the_first_row_begins_a_state_whatever_it_is() -> None:
+    for first in (0, 2):
+        rows = flight([0.0] * 3, **{"supervisor.state": [first, first, 3]})
+        begins, names = curves.changes(rows, curves.SUPERVISOR)
+        assert begins.tolist() == [0, 20_000]
+        assert names == [curves.SUPERVISOR.names[first], "failsafe"]
+
+
+LIMITS = {"opening_min": 0.0, "opening_max": 0.9}
+
+
+def commanded(*angles: float) -> pa.Table:
+    """One row per angle of flap 2; the others stay inside."""
+    count = len(angles)
+    names = {f"control.flap_{flap}": [0.4 * sign] * count for flap, sign in ((1, 1), (3, 1), (4, -1))}
+    table = flight([0.0] * count, **names, **{"control.flap_2": list(angles)})
+    return table.replace_schema_metadata(
+        RELEASE | {b"config": json.dumps({"allocation": LIMITS, "flight": {"release_us": 0}}).encode()}
+    )
+
+
+@pytest.mark.parametrize(("angle", "at_limit"), [(-0.9, True), (0.0, True), (-0.4, False), (-0.8999, False)])
+def test_a_flap_that_opens_the_other_way_is_at_its_limit_at_both_ends(angle: float, at_limit: bool) -> None:
+    found = {flap: rows.tolist() for flap, rows in saturated(commanded(-0.4, angle))}
+    assert found == ({2: [False, True]} if at_limit else {})
+
+
+@pytest.mark.parametrize(("gap", "spells"), [(9, 1), (11, 2)])
+def test_a_failsafe_that_ends_for_less_than_a_tenth_of_a_second_is_one_spell(gap: int, spells: int) -> None:
+    states = [2, *[3] * 30, *[2] * gap, *[3] * 30, 2]
+    marks = marks_of_flight(flight([0.0] * len(states), **{"supervisor.state": states}))
+    found = [(one.begin_s, one.end_s) for one in marks.spells if one.kind == "failsafe"]
+    assert len(found) == spells, TOGETHER_S
+    assert found[0][0] == pytest.approx(0.01)
+    assert found[-1][1] == pytest.approx(0.01 * (len(states) - 1))
+    if spells == 2:
+        assert found[0][1] == pytest.approx(0.31), "to the first row without it"
+
+
+def test_a_spell_to_the_end_ends_with_the_last_row() -> None:
+    marks = marks_of_flight(flight([0.0] * 3, **{"supervisor.state": [2, 3, 3]}))
+    assert [(one.begin_s, one.end_s) for one in marks.spells] == [(0.01, 0.02)]
+
+
+def test_the_mean_opening_counts_every_flap_in_its_own_sense() -> None:
+    flaps = {1: 0.1, 2: -0.2, 3: 0.3, 4: -0.4}
+    angles = {f"{kind}.flap_{n}": [angle] * 30 for kind in ("truth", "control") for n, angle in flaps.items()}
+    value, command = openings(flight([0.0] * 30, **angles))
+    assert value == pytest.approx(np.full(30, np.degrees(0.25)))
+    assert command == pytest.approx(value)
+
+
+def run(table: pa.Table) -> FlownRun:
+    origin = dict.fromkeys((*compare.SETTINGS, "source", "folder"), "")
+    result = SimpleNamespace(**origin, metrics={}, own_metrics={}, overrides=(), faults=())
+    return FlownRun(table, result)  # type: ignore[arg-type]
+
+
+def test_logs_differ_first_where_they_do_a_gap_equals_a_gap_and_a_longer_one_goes_on() -> None:
+    a = flight([0.0] * 5, **{"truth.x": [0.0, nan, 1.0, 2.0, 3.0], "truth.y": [0.0, 0, 0, 0, 1]})
+    b = flight([0.0] * 5, **{"truth.x": [0.0, nan, 1.0, 2.0, 4.0], "truth.y": [0.0, 0, 0, 9, 1]})
+    names = a.column_names
+    assert compare._first_difference(a, a, names) is None
+    found = compare._first_difference(a, b, names)
+    assert found is not None
+    assert (found.row, found.t_s, found.column, found.values) == (
+        3,
+        pytest.approx(0.03),
+        "truth.y",
+        (0.0, 9.0),
+    )
+    for first, second, values in ((a, a.slice(0, 4), (40_000, None)), (a.slice(0, 4), a, (None, 40_000))):
+        found = compare._first_difference(first, second, names)
+        assert found is not None
+        assert (found.row, found.column, found.values) == (4, "t", values)
+
+
+def test_a_difference_is_the_second_less_the_first() -> None:
+    assert MetricPair("rms_x", "cm", (1.0, 3.5)).difference == 2.5
+
+
+def test_two_flights_along_half_a_turn_are_as_far_apart_as_elsewhere() -> None:
+    """The second is released 5 ms later in its rows, so that its attitude is taken between two of them."""
+    turn = np.linspace(-3.0, 3.0, 61)
+    first = flight((180.0 + 180.0 + turn).tolist())  # error of 180 degrees: a robot that looks the wrong way
+    second = flight((180.0 + 182.0 + turn).tolist()).replace_schema_metadata({b"release_us": b"5000"})
+    behind = {one.name: one for one in compare._apart(second, first)}
+    assert behind["yaw"].largest == pytest.approx(2.0, abs=0.1)
+    apart = {one.name: one for one in compare._apart(first, second)}
+    assert apart["yaw"].largest == pytest.approx(2.0, abs=0.1)
+    assert apart["roll"].largest == pytest.approx(0.0, abs=1e-6)

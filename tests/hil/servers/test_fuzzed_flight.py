@@ -1,0 +1,72 @@
+"""A robot that is flown by its station while another client sends random bytes: nothing is lost.
+
+The client sends 5,000 packets per second, some 85 kB/s, as fast as the radio's queue takes them. What is left out are
+requests that are a client's right, see `support.random_requests`.
+"""
+
+import struct
+
+import numpy as np
+import pytest
+
+from firmware_py.wire import crtp, high_level
+from hil.clock import FreeRunning
+from hil.config import load_config
+from hil.servers.server import Server
+from support.random_requests import random_packet
+
+PERIOD_US = 200
+
+
+class Fuzzed:
+    """One robot and a client on its UDP radio: its own station flies it, or a command by absolute poses."""
+
+    def __init__(self, seed: int, absolute: bool) -> None:
+        self.said: list[str] = []
+        config = load_config("floaty", [f"predictor.absolute={absolute}"])
+        self.server = Server(config, 1, 1, self.said.append)
+        self.server.lab.clock = FreeRunning()
+        (self.served,) = self.server.ends.robots
+        self.served.fly(absolute)
+        self.rng = np.random.default_rng(seed)
+        if absolute:
+            self.wait(1.0)
+            self.served.robot.packet_received(self.server.lab.now_us, go_to(config.flight.home))
+        self.wait(3.5)
+
+    def wait(self, duration_s: float) -> float:
+        """Fly on and return how far the robot was from home at most [m]."""
+        lab, robot, furthest = self.server.lab, self.served.robot, 0.0
+        for _ in range(round(duration_s * 10)):
+            lab.end_at(lab.now_us + 100_000)
+            lab.run()
+            furthest = max(furthest, float(np.abs(robot.plant.p_WB - robot.config.flight.home).max()))
+        return furthest
+
+    def flood(self, now_us: int) -> None:
+        """Send one random packet."""
+        self.served.udp_radio.uplink(now_us, random_packet(self.rng))
+
+
+def go_to(place: tuple[float, float, float]) -> bytes:
+    """cflib's command, to be there within a second."""
+    fields = struct.pack("<BB2?5f", high_level.Command.GO_TO, 0, False, False, *place, 0.0, 1.0)
+    return crtp.encode(crtp.Packet(high_level.PORT, 0, fields))
+
+
+@pytest.mark.parametrize("absolute", [False, True], ids=["corrections", "absolute poses"])
+@pytest.mark.parametrize(
+    ("seed", "duration_s"), [(1, 5.0), *(pytest.param(s, 60.0, marks=pytest.mark.long) for s in (2, 3, 4))]
+)
+def test_random_packets_of_a_connected_client_lose_nothing(
+    seed: int, duration_s: float, absolute: bool
+) -> None:
+    fuzzed = Fuzzed(seed, absolute)
+    robot = fuzzed.served.robot
+    assert robot.free
+    robot.events.every(PERIOD_US, robot.events.now_us + 1, fuzzed.flood)
+    assert fuzzed.wait(duration_s) < 0.15, fuzzed.said[-5:]
+    assert robot.firmware.link.malformed > 50 * duration_s
+    assert not any("lost" in line or "failsafe" in line for line in fuzzed.said)
+    lines = [line for line in fuzzed.said if "commander" in line]
+    assert len(lines) < 40 + 4 * duration_s  # throttled: there are some twenty kinds

@@ -1,0 +1,168 @@
+"""The tests' own firmware runs on the emulated microcontroller as on the chip: kernel, floats, queue, peripherals."""
+
+from itertools import pairwise
+
+import pytest
+
+from hil.stm32f405.chip import Why
+from support.stm32_machine import FirmwareOnChip
+
+MS = 1000
+ASSERTION, HUNGRY_WATCHDOG = 3, 4
+COMPILERS = pytest.mark.parametrize("compiler", ["clang", pytest.param("gcc", marks=pytest.mark.long)])
+
+
+def run(machine: FirmwareOnChip, begin_ms: int, end_ms: int, gyro: bool = True) -> bytes:
+    """Run, the gyro's pin pulsing each millisecond; returns what was sent."""
+    sent = b""
+    for ms in range(begin_ms, end_ms):
+        if gyro:
+            machine.chip.pin("C", 14, True)
+            machine.chip.pin("C", 14, False)
+        while (why := machine.run((ms + 1) * MS)) != Why.TIME:
+            assert why in (Why.SERIAL, Why.COMPARE), why
+            if why == Why.SERIAL:
+                sent += machine.chip.sent(6)
+    return sent
+
+
+@COMPILERS
+def test_two_tasks_with_floats_keep_them_while_they_are_switched(compiler: str) -> None:
+    machine = FirmwareOnChip(compiler)
+    run(machine, 0, 100)
+    assert machine.peek("fp_errors") == 0
+    assert min(machine.peek_all("fp_rounds", 2)) > 100
+
+
+@COMPILERS
+def test_every_sample_of_a_kilohertz_passes_the_queue(compiler: str) -> None:
+    machine = FirmwareOnChip(compiler)
+    run(machine, 0, 20)
+    before = machine.peek("samples_taken")
+    run(machine, 20, 120)
+    assert machine.peek("samples_taken") - before == 100
+    assert machine.peek("samples_lost") == 0
+
+
+def test_the_tick_is_a_millisecond() -> None:
+    machine = FirmwareOnChip()
+    run(machine, 0, 20)
+    before = machine.peek("xTickCount")
+    run(machine, 20, 220)
+    assert machine.peek("xTickCount") - before in (199, 200, 201)
+
+
+@COMPILERS
+def test_the_eeprom_is_written_and_read_back_by_dma(compiler: str) -> None:
+    machine = FirmwareOnChip(compiler)
+    run(machine, 0, 100)
+    assert bytes(machine.eeprom[0x140:0x144]) == bytes.fromhex("f10a771e")
+    assert machine.chip.read(machine.image.symbol("eeprom").address, 4) == bytes.fromhex("f10a771e")
+    assert machine.peek("i2c_reads") == machine.peek("dma_interrupts") >= 6
+
+
+def test_lines_leave_the_usart_by_dma_and_bytes_arrive_by_interrupt() -> None:
+    machine = FirmwareOnChip()
+    sent = run(machine, 0, 60)
+    machine.chip.feed(6, b"hello")
+    sent += run(machine, 60, 100)
+    lines = sent.splitlines()
+    assert len(lines) == machine.peek("lines_sent") >= 6
+    ticks = [int(line.removeprefix(b"tick "), 16) for line in lines]
+    assert all(10 <= later - earlier <= 13 for earlier, later in pairwise(ticks))
+    assert (machine.peek("bytes_received"), machine.peek("last_received")) == (5, ord("o"))
+
+
+def test_a_hungry_watchdog_resets() -> None:
+    machine = FirmwareOnChip(planted=HUNGRY_WATCHDOG)
+    why = Why.TIME
+    while why in (Why.TIME, Why.SERIAL, Why.COMPARE) and machine.chip.now_us < 400 * MS:
+        why = machine.run(400 * MS)
+    assert why & Why.WATCHDOG
+    assert 190 * MS < machine.chip.now_us < 215 * MS  # 200 periods of 32 / 32 kHz after the start
+
+
+def test_a_failed_assertion_keeps_its_snapshot_over_the_reset() -> None:
+    machine = FirmwareOnChip(planted=ASSERTION)
+    why = Why.TIME
+    while why in (Why.TIME, Why.SERIAL, Why.COMPARE) and machine.chip.now_us < 100 * MS:
+        why = machine.run(100 * MS)
+    assert why & Why.RESET
+    assert machine.peek("snapshot") == 0x2F8A_001F
+
+
+def test_a_step_into_an_interrupt_ends_in_front_of_its_handler() -> None:
+    machine = FirmwareOnChip()
+    chip, handler = machine.chip, machine.image.symbol("EXTI15_10_Handler").address
+    run(machine, 0, 20)
+    while chip.register("xpsr") & 0x1FF:
+        chip.step()
+    chip.pin("C", 14, True)
+    before = chip.state.exceptions
+    while chip.state.exceptions == before:
+        chip.step()
+    assert (chip.register("pc"), chip.register("xpsr") & 0x1FF) == (handler, 16 + 40)
+    instructions = chip.state.instructions
+    chip.step()
+    assert chip.register("pc") - handler in (2, 4)
+    assert chip.state.instructions > instructions
+
+
+def test_a_busy_chip_wants_its_turn_ten_times_a_millisecond() -> None:
+    machine = FirmwareOnChip()
+    processor = machine.processor()
+    processor.run(20_000)
+    turns = 0
+    while processor.now_us < 30_000:
+        assert not machine.chip.state.asleep  # two of its tasks never wait
+        processor.run(processor.next_wake_us)
+        turns += 1
+    assert turns <= 101
+
+
+@pytest.mark.parametrize("taken_us", [0, 400, 900])
+def test_what_occupies_the_processor_takes_its_time_from_the_tasks_alone(taken_us: int) -> None:
+    machine = FirmwareOnChip()
+    processor, state = machine.processor(), machine.chip.state
+    processor.run(20_000)
+
+    def spent() -> tuple[int, int, dict[str, int]]:
+        times = dict(zip((task.name for task in processor.tasks), processor.run_times_us(), strict=True))
+        return state.instructions, machine.peek("xTickCount"), times
+
+    before = spent()
+    processor.run(120_000)
+    free = spent()
+    processor.occupy("LOAD", lambda: taken_us)
+    processor.run(121_000)  # it begins a tick later
+    occupied = spent()
+    processor.run(221_000)
+    after = spent()
+    share = (after[0] - occupied[0]) / (free[0] - before[0])
+    assert share == pytest.approx(1 - taken_us / 1000, abs=0.01)
+    assert after[1] - occupied[1] == free[1] - before[1] == 100
+    assert after[2]["LOAD"] - occupied[2]["LOAD"] == 100 * taken_us
+    assert sum(after[2].values()) - sum(occupied[2].values()) == pytest.approx(100_000, abs=len(after[2]))
+    assert list(after[2]) == [task.name for task in processor.tasks]
+    assert len(processor.activations()) == len(processor.tasks)
+
+
+def test_a_processor_that_is_occupied_whole_serves_interrupts_and_no_task() -> None:
+    machine = FirmwareOnChip()
+    processor = machine.processor()
+    processor.run(20_000)
+    processor.occupy("LOAD", lambda: 1000)
+    processor.run(22_000)
+    before, counted = (
+        processor.run_times_us(),
+        [machine.peek(name) for name in ("xTickCount", "bytes_received")],
+    )
+    machine.chip.feed(6, bytes(100))
+    processor.run(50_000)
+    after = processor.run_times_us()
+    assert machine.peek("xTickCount") - counted[0] == 28
+    assert machine.peek("bytes_received") - counted[1] == 100
+    tasks = [task.name for task in processor.tasks]
+    taken = dict(zip(tasks, (b - a for a, b in zip(before, after, strict=True)), strict=True))
+    assert taken.pop("LOAD") > 27_500
+    assert sum(taken.values()) < 500  # the interrupts

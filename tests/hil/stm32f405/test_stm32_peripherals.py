@@ -1,0 +1,221 @@
+"""The chip's peripherals by their registers, as ST's reference manual RM0090 has them; code only sleeps."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("unicorn")
+
+from hil.errors import LabError
+from hil.stm32f405.chip import FLASH, Why
+from support.stm32_bench import Bench
+
+TIM3, TIM7, I2C1, IWDG = 0x4000_0400, 0x4000_1400, 0x4000_5400, 0x4000_3000
+USART6, DMA1, EXTI = 0x4001_1400, 0x4002_6000, 0x4001_3C00
+GPIOA, SYSCFG, SPI1, NVIC_PENDING = 0x4002_0000, 0x4001_3800, 0x4001_3000, 0xE000_E200
+START, STOP, ACK, ENABLED = 1 << 8, 1 << 9, 1 << 10, 1
+SB, ADDR, BTF, RXNE, TXE, AF = 1, 2, 4, 1 << 6, 1 << 7, 1 << 10
+BYTE_US = 10  # of a USART at 1 Mbaud
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_counter_counts_its_prescaled_clock(bench: Bench) -> None:
+    bench[TIM7 + 0x28], bench[TIM7 + 0x2C] = 83, 0xFFFF  # 84 MHz: microseconds
+    bench[TIM7 + 0x14] = 1  # the prescaler is taken over at an update
+    bench[TIM7] = ENABLED
+    bench.wait(1000)
+    assert bench[TIM7 + 0x24] == 1000
+
+
+def test_an_overflow_sets_the_flag_and_asks_for_its_interrupt(bench: Bench) -> None:
+    bench[TIM7 + 0x28], bench[TIM7 + 0x2C] = 83, 99
+    bench[TIM7 + 0x14] = 1
+    bench[TIM7 + 0x10] = 0
+    bench[TIM7 + 0x0C], bench[TIM7] = 1, ENABLED
+    bench.wait(99)
+    assert bench[TIM7 + 0x10] & 1 == 0
+    bench.wait(2)
+    assert bench[TIM7 + 0x10] & 1 == 1
+    assert bench[NVIC_PENDING + 4] >> (55 - 32) & 1
+
+
+def test_a_compare_register_is_seen_from_outside(bench: Bench) -> None:
+    bench[TIM3 + 0x34] = 25522
+    assert bench.chip.state.compare[2][0] == 25522
+
+
+def test_who_is_not_on_the_bus_does_not_acknowledge(bench: Bench) -> None:
+    bench[I2C1 + 0x1C], bench[I2C1] = 35, ENABLED
+    bench[I2C1] = START | ENABLED
+    bench.until(I2C1 + 0x14, SB)
+    bench[I2C1 + 0x10] = 0x41 << 1
+    bench.wait(100)
+    assert bench[I2C1 + 0x14] & (AF | ADDR) == AF
+
+
+def test_a_byte_takes_nine_bits_on_the_bus(bench: Bench) -> None:
+    bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
+    bench[I2C1 + 0x1C], bench[I2C1] = 35, ENABLED  # 600 kHz: 1.67 us per bit
+    bench[I2C1] = START | ENABLED
+    bench.until(I2C1 + 0x14, SB)
+    bench[I2C1 + 0x10] = 0x50 << 1
+    bench.wait(14)
+    assert bench[I2C1 + 0x14] & ADDR == 0
+    bench.wait(2)
+    assert bench[I2C1 + 0x14] & ADDR
+
+
+def test_what_is_written_to_a_device_is_read_back(bench: Bench) -> None:
+    memory = np.zeros(256, np.uint8)
+    bench.chip.add_device(1, 0x50, memory)
+    bench[I2C1 + 0x1C] = 35
+    bench[I2C1] = START | ENABLED
+    bench.until(I2C1 + 0x14, SB)
+    bench[I2C1 + 0x10] = 0x50 << 1
+    bench.until(I2C1 + 0x14, ADDR)
+    bench[I2C1 + 0x18]  # clears ADDR
+    for byte in (0x20, 0xAB, 0xCD):
+        bench.until(I2C1 + 0x14, TXE)
+        bench[I2C1 + 0x10] = byte
+    bench.until(I2C1 + 0x14, BTF)
+    assert memory[0x20:0x22].tolist() == [0xAB, 0xCD]
+    bench[I2C1] = STOP | ENABLED
+    bench.wait(10)
+    assert bench[I2C1 + 0x18] == 0  # no longer master, bus free
+
+
+def test_a_byte_that_is_not_fetched_in_time_is_overrun(bench: Bench) -> None:
+    bench[USART6 + 0x08], bench[USART6 + 0x0C] = 84, 1 << 13 | 4
+    bench.chip.feed(6, b"ab")
+    bench.wait(BYTE_US + 1)
+    assert bench[USART6] & (RXNE >> 1 | 8) == RXNE >> 1
+    bench.wait(BYTE_US)
+    assert bench[USART6] & 8
+    assert bench[USART6 + 4] == ord("a")
+    assert bench[USART6] & 8 == 0
+
+
+def test_dma_does_not_reach_the_core_coupled_memory(bench: Bench) -> None:
+    stream = DMA1 + 0x10
+    bench[stream + 0x04], bench[stream + 0x08], bench[stream + 0x0C] = 1, I2C1 + 0x10, 0x1000_0000
+    bench[stream] = ENABLED
+    bench.chip.add_device(1, 0x50, np.zeros(256, np.uint8))
+    bench[I2C1 + 0x1C], bench[I2C1 + 4] = 35, 1 << 11
+    bench[I2C1] = START | ENABLED
+    bench.until(I2C1 + 0x14, SB)
+    bench[I2C1 + 0x10] = 0x50 << 1 | 1
+    bench.until(I2C1 + 0x14, ADDR)
+    bench[I2C1 + 0x18]  # clears ADDR
+    bench.wait(20)
+    assert bench[DMA1] & 8  # transfer error
+
+
+@pytest.mark.parametrize(("rising", "falling", "edges"), [(1, 0, (True, False)), (0, 1, (False, True))])
+def test_a_pin_interrupts_on_the_edge_that_is_chosen(
+    bench: Bench, rising: int, falling: int, edges: tuple[bool, bool]
+) -> None:
+    bench[SYSCFG + 0x14] = 2 << 8  # EXTI14 on port C
+    bench[EXTI], bench[EXTI + 8], bench[EXTI + 12] = 1 << 14, rising << 14, falling << 14
+    seen = []
+    for high in (True, False):
+        bench.chip.pin("C", 14, high)
+        seen.append(bool(bench[EXTI + 0x14] >> 14 & 1))
+        bench[EXTI + 0x14] = 1 << 14
+    assert tuple(seen) == edges
+
+
+@pytest.mark.parametrize("pin", range(16))
+def test_each_pin_has_its_line_its_source_and_its_interrupt(bench: Bench, pin: int) -> None:
+    bench[SYSCFG + 0x08 + pin // 4 * 4] = 2 << pin % 4 * 4  # port C; all other lines are port A's
+    bench[EXTI] = bench[EXTI + 8] = 0xFFFF
+    bench.chip.pin("C", pin, True)
+    assert bench[EXTI + 0x14] == 1 << pin
+    irq = 6 + pin if pin < 5 else 23 if pin < 10 else 40
+    assert [one for one in (*range(6, 11), 23, 40) if bench.is_pending(one)] == [irq]
+    bench.chip.pin("A", (pin + 1) % 16, True)
+    assert bench[EXTI + 0x14] == 1 << pin | 1 << (pin + 1) % 16
+
+
+def test_where_a_pin_is_set_and_reset_at_once_it_is_set(bench: Bench) -> None:
+    bench[GPIOA + 0x14] = 0b0110
+    bench[GPIOA + 0x18] = 0b1010 << 16 | 0b1001
+    assert bench[GPIOA + 0x14] == 0b1101
+
+
+def test_a_pin_of_another_port_does_not_interrupt(bench: Bench) -> None:
+    bench[SYSCFG + 0x14] = 2 << 8
+    bench[EXTI], bench[EXTI + 8] = 1 << 14, 1 << 14
+    bench.chip.pin("A", 14, True)
+    assert bench[EXTI + 0x14] == 0
+
+
+def test_an_output_is_read_back_and_an_input_is_what_the_pin_has(bench: Bench) -> None:
+    bench[GPIOA] = 1  # pin 0 is an output
+    bench[GPIOA + 0x18] = 3  # both are set
+    bench.chip.pin("A", 1, False)
+    assert bench[GPIOA + 0x10] & 3 == 1
+    bench[GPIOA + 0x18] = 1 << 16
+    assert bench[GPIOA + 0x10] & 1 == 0
+
+
+def test_the_watchdog_bites_when_its_period_is_over(bench: Bench) -> None:
+    bench[IWDG] = 0x5555
+    bench[IWDG + 4], bench[IWDG + 8] = 0, 31  # 32 kHz / 4: 4 ms
+    bench[IWDG] = 0xCCCC
+    assert bench.wait(3900) == Why.TIME
+    assert bench.wait(200) & Why.WATCHDOG
+
+
+def test_a_watchdog_that_is_fed_does_not_bite(bench: Bench) -> None:
+    bench[IWDG] = 0x5555
+    bench[IWDG + 4], bench[IWDG + 8] = 0, 31
+    bench[IWDG] = 0xCCCC
+    for _ in range(3):
+        assert bench.wait(3900) == Why.TIME
+        bench[IWDG] = 0xAAAA
+    assert bench.wait(3900) == Why.TIME
+    assert bench.wait(200) & Why.WATCHDOG
+
+
+def test_a_store_into_flash_changes_nothing_and_the_next_instruction_follows() -> None:
+    bench = Bench(
+        bytes.fromhex("c0f80010 0132 0160 0132")
+    )  # str.w r1, [r0]; adds r2, #1; str r1, [r0]; adds r2, #1
+    bench.chip.set_register("r0", FLASH + 0x100)
+    bench.chip.set_register("r1", 0x1234)
+    bench.wait(10)
+    assert [bench.chip.register(name) for name in ("r0", "r1", "r2")] == [FLASH + 0x100, 0x1234, 2]
+    assert bench[FLASH + 0x100] == 0xFFFF_FFFF
+
+
+def test_only_a_jump_that_is_taken_refills_the_pipeline() -> None:
+    def cycles(branch: str) -> int:  # cmp r0, r0; the branch over the nop; nop; subs r1, #1; bne to cmp
+        bench = Bench(bytes.fromhex(f"8042 {branch} 00bf 0139 fad1"))
+        bench.chip.set_register("r1", 100)
+        bench.wait(100)
+        return int(bench.chip.state.now - bench.chip.state.sleeping)
+
+    assert cycles("00d0") - cycles("00d1") == 100 * (3 - 1)  # beq is taken and skips the nop, bne is not
+
+
+def test_an_unknown_peripheral_reads_as_0_and_is_named_once(bench: Bench) -> None:
+    bench[SPI1] = 0x55
+    assert bench[SPI1] == 0
+    assert list(bench.chip.state.unknown[0 : bench.chip.state.unknown_count]) == [SPI1]
+
+
+def test_where_nothing_is_nothing_can_be_read(bench: Bench) -> None:
+    with pytest.raises(LabError, match="0x60000000, 4 bytes: no memory there"):
+        bench.chip.read(0x6000_0000, 4)
+
+
+def test_a_register_that_changes_stays_until_reset(bench: Bench) -> None:
+    bench.chip.set_register("r7", 0x1234)
+    bench.wait(10)
+    assert bench.chip.register("r7") == 0x1234
+    bench.chip.reset(0x0C00_0000)
+    assert bench.chip.register("r7") == 0
+    assert bench.chip.register("pc") == FLASH + 8

@@ -1,0 +1,129 @@
+"""A flight replaces no flight of another request, and shares its folder with no other flight."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hil import LabError, fly, load_run
+from hil.api import request_of
+from hil.laboratory.recorder import PARQUET
+from hil.run_folder import folder_of, reserved
+from support.command import floaty
+
+SHORT = 0.05  # [s]
+HOLDER = """
+import sys
+from pathlib import Path
+from hil.api import request_of
+from hil.run_folder import reserved
+with reserved(request_of("hover", duration_s=0.05), Path(sys.argv[1])):
+    print("reserved", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture(autouse=True)
+def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def stored(folder: str) -> list[tuple[str, bytes]]:
+    """Return the files of a folder with their content."""
+    return [(path.name, path.read_bytes()) for path in sorted(Path(folder).iterdir())]
+
+
+def test_a_flight_replaces_the_same_request_alone() -> None:
+    first = fly("hover", duration_s=SHORT)
+    (first.folder / "note.txt").write_text("mine")
+    again = fly("hover", duration_s=SHORT)
+    assert (again.folder, again.hash) == (first.folder, first.hash)
+    assert not (again.folder / "note.txt").exists()
+    kept = stored("runs/hover-1")
+    longer = fly("hover", duration_s=0.1)
+    assert longer.folder == Path("runs/hover-1-2")
+    assert stored("runs/hover-1") == kept
+    assert fly("hover", duration_s=0.1).folder == longer.folder
+
+
+def test_every_part_of_the_request_counts() -> None:
+    fly("hover", duration_s=SHORT)
+    for options in (
+        {"profile": "lqr"}, {"duration_s": 0.1}, {"overrides": {"controller.gain_z": 3.1}}, {"faults": ["push.y@0=1"]},
+        {"link": "mavlink"}, {"board": "c"},
+    ):  # fmt: skip
+        request = request_of("hover", **{"duration_s": SHORT, **options})  # type: ignore[arg-type]
+        assert folder_of(request) == Path("runs/hover-1-2"), options
+    assert folder_of(request_of("hover", duration_s=SHORT)) == Path("runs/hover-1")
+    assert folder_of(request_of("hover", seed=2, duration_s=SHORT)) == Path("runs/hover-2")
+
+
+def test_a_folder_that_was_asked_for_keeps_another_flight_unless_it_may_be_replaced() -> None:
+    fly("hover", "mine", duration_s=SHORT)
+    kept = stored("mine")
+    with pytest.raises(LabError) as error:
+        fly("hover", "mine", duration_s=0.1, profile="lqr")
+    assert str(error.value) == (
+        "--out mine: holds another flight (duration 0.05 s; profile floaty): choose another folder, or delete this one"
+    )
+    assert stored("mine") == kept
+    assert fly("hover", "mine", replace=True, duration_s=0.1, profile="lqr").result.profile == "lqr"
+
+
+def test_what_cannot_be_read_is_not_replaced() -> None:
+    run = fly("hover", duration_s=SHORT)
+    result = json.loads((run.folder / "result.json").read_text())
+    (run.folder / "result.json").write_text(json.dumps({**result, "seed": "one"}))
+    assert folder_of(request_of("hover", duration_s=SHORT)) == Path("runs/hover-1-2")
+    Path("runs/hover-2").write_text("a file")
+    assert folder_of(request_of("hover", seed=2)) == Path("runs/hover-2-2")
+
+
+def test_a_flight_whose_process_was_killed_is_known_by_its_log() -> None:
+    run = fly("hover", duration_s=SHORT)
+    (run.folder / "result.json").unlink()
+    assert (run.folder / PARQUET).exists()
+    assert folder_of(request_of("hover", duration_s=SHORT)) == Path("runs/hover-1")
+    assert folder_of(request_of("hover", duration_s=0.1)) == Path("runs/hover-1-2")
+
+
+def test_a_refused_flight_leaves_no_folder() -> None:
+    with pytest.raises(LabError), reserved(request_of("hover"), Path("new")):
+        raise LabError("no board")
+    assert not Path("new").exists()
+
+
+def test_the_command_names_the_folder_that_stays(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fly("hover", duration_s=SHORT)
+    kept = stored("runs/hover-1")
+    monkeypatch.setattr("hil.commands.fly.write_pictures", lambda folder, experiment: None)
+    floaty(monkeypatch, "fly", "hover", "--duration", "0.1")
+    captured = capsys.readouterr()
+    assert captured.err.splitlines() == [
+        "runs/hover-1 holds another flight (duration 0.05 s); this flight is in runs/hover-1-2"
+    ]
+    assert "runs/hover-1-2/log.parquet" in captured.out
+    assert stored("runs/hover-1") == kept
+    assert load_run("runs/hover-1-2").result.duration_s == 0.1
+    assert floaty(monkeypatch, "fly", "hover", "--duration", "0.1", "--out", "runs/hover-1") == 2
+    assert capsys.readouterr().err == (
+        "floaty: --out runs/hover-1: holds another flight (duration 0.05 s): choose another folder, or delete this one\n"
+    )
+
+
+def test_a_second_flight_into_a_folder_is_refused_until_the_first_ends_or_is_killed() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, "shared"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "reserved\n"
+        with pytest.raises(LabError, match="--out shared: another flight is writing there: wait for its end"):
+            fly("hover", "shared", duration_s=SHORT)
+        assert os.listdir("shared") == []
+        other.kill()
+    assert fly("hover", "shared", duration_s=SHORT).folder == Path("shared")
