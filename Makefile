@@ -14,10 +14,10 @@ test test-all: export FLOATY_PURE = 1
 test: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto
 
-# Real-time tests run one at a time and beside nothing else; one that failed on a machine that stood still is repeated.
+# Real-time tests run one at a time and beside nothing else; one that fails is repeated and listed as RERUN: repair what appears there.
 test-all: .venv/test.stamp
 	$(BIN)/python -m pytest -n auto -m 'not realtime' --durations 20
-	$(BIN)/python -m pytest -m realtime --reruns 2 --only-rerun InconclusiveError --durations 20
+	$(BIN)/python -m pytest -m realtime --reruns 2 -rfER --durations 20
 
 check: .venv/test.stamp
 	$(BIN)/floaty deploy check

@@ -186,12 +186,13 @@ class Nrf51:
 
     def _retune(self, command: int, value: int, now_us: int) -> None:
         """Set the radio until the next start of the processor, which sets it to the values in its EEPROM."""
-        own = self.settings
+        wanted = own = self.settings
         if command == SET_CHANNEL and value <= CHANNEL_MAX:
-            self.settings = RadioSettings(value, own.bits_per_second, own.address)
+            wanted = RadioSettings(value, own.bits_per_second, own.address)
         elif command == SET_RATE and value < len(RATES):
-            self.settings = RadioSettings(own.channel, RATES[value], own.address)
-        if self.settings != own:
+            wanted = RadioSettings(own.channel, RATES[value], own.address)
+        if wanted != own:
+            self.settings = wanted
             self._processor.retuned(now_us)
 
     def _next_answer(self, now_us: int) -> bytes:
