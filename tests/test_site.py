@@ -54,7 +54,7 @@ def test_the_reference_is_that_of_the_code(site: Path) -> None:
     assert "--perfetto" in (reference / "cli.html").read_text(encoding="utf-8")
     assert "mocap.dropout" in (reference / "faults.html").read_text(encoding="utf-8")
     assert "controller.gain_y" in (reference / "profile.html").read_text(encoding="utf-8")
-    assert "extCtrl.y_P" in (reference / "variables.html").read_text(encoding="utf-8")
+    assert "extCtrl.y_P" in (reference / "parameters.html").read_text(encoding="utf-8")
     assert "truth.qw" in (reference / "log.html").read_text(encoding="utf-8")
     assert "load_run" in (reference / "api.html").read_text(encoding="utf-8")
 

@@ -78,7 +78,7 @@ def pages() -> dict[str, str]:
     return {
         **split(COMMANDS, list(app.commands), command_line),
         **split(SECTIONS, list(LabConfig.model_fields), profile_keys),
-        "reference/variables.md": board_variables(),
+        **board_variables(),
         "reference/log.md": log_columns(),
         "reference/faults.md": fault_kinds(),
     }
@@ -161,27 +161,31 @@ def allowed_of(field: FieldInfo) -> str:
     return ", ".join(bounds) or " \\| ".join(choices)
 
 
-def board_variables() -> str:
-    """Return the tables of contents of a board that boots with the default profile."""
+def board_variables() -> dict[str, str]:
+    """Return the tables of contents of a board that boots with the default profile: parameters and log variables."""
     firmware = Firmware(load_config(), VirtualBoard(lambda *_: None, lambda *_: True, lambda *_: None))
     keys = {parameter.name: key for key, parameter in OF_PROFILE.items()}
-    lines = [
-        "# Variables of the board\n",
-        "Parameters and log variables of the Python board. The exported app has those of the core under the same names,",
-        "unless its firmware has the name already. Read from a board that boots with the profile `floaty`.",
-        "\n## Parameters\n",
+    scope = (
+        "The table of the Python board, which boots with the profile `floaty`. The exported app has the variables of\n"
+        "the core under the same names, unless its firmware has the name already."
+    )
+    parameters = [
+        f"# Parameters of the board\n\n{scope}\n",
         "| parameter | type | unit | allowed | key of the profile | stored |",
         "|---|---|---|---|---|---|",
     ]
     for one in firmware.parameters:
         allowed = "read only" if one.write is None else f"{one.minimum:g} to {one.maximum:g}"
         key, stored = f"`{keys[one.name]}`" if one.name in keys else "", "yes" if one.persistent else ""
-        lines.append(
+        parameters.append(
             f"| `{one.name}` | {one.scalar.name} | {cell(one.unit)} | {allowed} | {key} | {stored} |"
         )
-    lines += ["\n## Log variables\n", "| variable | type | unit |", "|---|---|---|"]
-    lines += [f"| `{one.name}` | {one.scalar.name} | {cell(one.unit)} |" for one in firmware.variables]
-    return "\n".join(lines) + "\n"
+    variables = [f"# Log variables of the board\n\n{scope}\n", "| variable | type | unit |", "|---|---|---|"]
+    variables += [f"| `{one.name}` | {one.scalar.name} | {cell(one.unit)} |" for one in firmware.variables]
+    return {
+        "reference/parameters.md": "\n".join(parameters) + "\n",
+        "reference/variables.md": "\n".join(variables) + "\n",
+    }
 
 
 def log_columns() -> str:
