@@ -1,9 +1,9 @@
-"""Plants the mistakes of `planted_mistakes.toml` one at a time in a copy of the working tree, and says which tests see them.
+"""Plant the mistakes of `planted_mistakes.toml` one at a time in a copy of the working tree, and report which tests see them.
 
     python tools/planted_mistakes.py [--only PATTERN] [--jobs N]
 
-A row of the table is a text that occurs once in its file, the text of a tired developer in its place, and the tests that
-should fail then (those of its file unless it names its own). `hangs = true` says that the mistake makes a loop endless:
+The table lists by file, then by the tests that should fail, rows of a text that occurs once in the file and the text of a
+tired developer in its place; a row may name other tests. `hangs = true` says that the mistake makes a loop endless:
 only then does a run without an end count as caught. A mistake has to get past the compiler: a file in Python is compiled,
 a file in C names the function that builds it in a folder (`build = "module:function"`). A test that is named with `::` may
 be a long one. Exit code 0: at least 95 % are caught in every room, 1: fewer, 2: the table or the tests are not in order, and
@@ -62,15 +62,17 @@ def read(table: Path) -> list[Mistake]:
     """Return the rows of a table."""
     return [
         Mistake(
-            file["path"],
+            path,
             row["old"],
             row["new"],
-            tuple(row.get("tests", file["tests"]).split()),
+            tuple(row.get("tests", tests).split()),
             row.get("hangs", False),
             file.get("build", ""),
         )
-        for file in tomllib.loads(table.read_text(encoding="utf-8"))["file"]
-        for row in file["mistakes"]
+        for path, file in tomllib.loads(table.read_text(encoding="utf-8")).items()
+        for tests, mistakes in file.items()
+        if tests != "build"
+        for row in mistakes
     ]
 
 

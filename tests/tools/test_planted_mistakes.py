@@ -58,7 +58,7 @@ def project(tmp_path: Path) -> Path:
 def plant(project: Path, *rows: str, options: tuple[str, ...] = ()) -> int:
     table = project / "table.toml"
     mistakes = ", ".join(rows)
-    table.write_text(f'[[file]]\npath = "steps.py"\ntests = "test_steps.py"\nmistakes = [{mistakes}]\n')
+    table.write_text(f'["steps.py"]\n"test_steps.py" = [{mistakes}]\n')
     return planted_mistakes.main(options, project, table)
 
 
@@ -92,9 +92,7 @@ def plant_c(project: Path, *rows: str, build: str = "build = 'native.building:bu
     (project / "native" / "building.py").write_text(C_BUILD)
     (project / "test_c.py").write_text(C_TESTS)
     table = project / "table.toml"
-    table.write_text(
-        f'[[file]]\npath = "native/steps.c"\ntests = "test_c.py"\n{build}\nmistakes = [{", ".join(rows)}]\n'
-    )
+    table.write_text(f'["native/steps.c"]\n{build}\n"test_c.py" = [{", ".join(rows)}]\n')
     return planted_mistakes.main((), project, table)
 
 
@@ -153,10 +151,8 @@ def test_one_room_with_too_many_survivors_is_not_made_up_for_by_the_others(
     (project / "room" / "quiet.py").write_text("LOUD = 1\n")
     table = project / "table.toml"
     table.write_text(
-        '[[file]]\npath = "steps.py"\ntests = "test_steps.py"\nmistakes = ['
-        + ", ".join([CAUGHT] * 2)
-        + ']\n[[file]]\npath = "room/quiet.py"\ntests = "test_steps.py"\n'
-        + "mistakes = [{ old = '1', new = '2' }]\n"
+        f'["steps.py"]\n"test_steps.py" = [{CAUGHT}, {CAUGHT}]\n'
+        "[\"room/quiet.py\"]\n'test_steps.py' = [{ old = '1', new = '2' }]\n"
     )
     assert planted_mistakes.main(("--jobs", "2"), project, table) == 1
     said = capsys.readouterr().out
