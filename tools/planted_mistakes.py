@@ -1,4 +1,4 @@
-"""Plant the mistakes of `planted_mistakes.toml` one at a time in a copy of the working tree, and report which tests see them.
+"""Plant the mistakes of `planted_mistakes.toml` one at a time in a copy of the working tree; report which tests see them.
 
     python tools/planted_mistakes.py [--only PATTERN] [--jobs N]
 
