@@ -12,17 +12,12 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from firmware_py.core.structs import Parameters
 from firmware_py.core.subset import Block, f32, i32
 from firmware_py.drivers.imu import GYRO_SCALE
+from firmware_py.section import Section
 from firmware_py.table import CORE_PARAMETERS, ProfileKey, profile_keys, value_in
 
 SIGNALS = ("off", "multisine", "chirp")  # by their numbers in excite.signal
 
 S = TypeVar("S", bound="Section")
-
-
-class Section(BaseModel):
-    """A strict, immutable part of the configuration."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def _declared(section: str) -> Callable[[type[S]], type[S]]:

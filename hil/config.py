@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from firmware_py.config import FirmwareConfig, LogicConfig
 from firmware_py.errors import FirmwareError
 from firmware_py.logic.loading import load_logic
+from firmware_py.section import Section, number
 from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
 from hil.arguments import shown
 from hil.crazyflie.config import RadioConfig
@@ -31,10 +32,8 @@ Overrides = Sequence[str] | Mapping[str, Any]  # "section.key=value", or the val
 _FOLDERS = (Path(__file__).parent.parent / "profiles", Path(__file__).parent / "profiles")
 
 
-class FlightConfig(BaseModel):
+class FlightConfig(Section):
     """Where and when the flight begins."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     home: tuple[float, float, float] = Field(
         (0.0, 0.0, 1.15), description="home goal and start, W [m]; paper: 115 cm above the tunnel's centre"
@@ -42,11 +41,8 @@ class FlightConfig(BaseModel):
     start_offset: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="start relative to home, W [m]"
     )
-    release_us: int = Field(
-        1_000_000,
-        ge=0,
-        le=60_000_000,
-        description="the robot is held until then: gyro zero, first poses [us]",
+    release_us: int = number(
+        1_000_000, "[0, 60_000_000]", "the robot is held until then: gyro zero, first poses [us]"
     )
 
 

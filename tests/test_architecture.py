@@ -19,19 +19,21 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "firmware_py.compiling": (),
     "firmware_py.extras": (),
     "firmware_py.fast": (),
+    "firmware_py.section": (),
     "firmware_py": ("firmware_py",),
     "ground_station": (
         "ground_station", "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.extras",
-        "firmware_py.fast", "firmware_py.table",
+        "firmware_py.fast", "firmware_py.section", "firmware_py.table",
     ),
     "hil.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
-    "hil.crazyflie": ("hil", "firmware_py.wire.scalars", "firmware_py.elementary"),
+    "hil.crazyflie": ("hil", "firmware_py.wire.scalars", "firmware_py.elementary", "firmware_py.section"),
     "hil": (
         "hil", "ground_station",
         "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
         "firmware_py.config", "firmware_py.signals", "firmware_py.rtos",
         "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.compiling",
-        "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic", "firmware_py.table",
+        "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic", "firmware_py.section",
+        "firmware_py.table",
     ),
 }  # fmt: skip
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 from scipy.stats import qmc
 
+from firmware_py.section import Section
 from hil.config import LabConfig
 from hil.design.axes import DELAY, NUISANCES, robot_of
 from hil.errors import LabError
@@ -26,10 +27,8 @@ UNKNOWN_SHARE = 0.2  # half a 95 % interval over the value, of a constant of unk
 FLAP_RATE = "flap_rate"
 
 
-class KnownModel(BaseModel):
+class KnownModel(Section):
     """The file beside a profile."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     values: dict[str, float]  # of the profile's [model]
     half_widths: dict[str, float]  # of the 95 % intervals, in the order of the covariance

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from firmware_py.section import Section, number
 from hil.world.servos import WORDS_PER_RADIAN
 
 Positive = Annotated[float, Field(gt=0)]
@@ -25,63 +26,45 @@ ConstantName = Literal[
 ]  # fmt: skip
 
 
-class TetherConfig(BaseModel):
+class TetherConfig(Section):
     """The safety line from an anchor above: slack in flight, a spring and damper that only pulls when taut."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    anchor_height: float = Field(
-        1.5, gt=0, le=5, description="above the hover point [m]; chosen (paper: thread over pulleys)"
+    anchor_height: float = number(
+        1.5, "(0, 5]", "above the hover point [m]; chosen (paper: thread over pulleys)"
     )
-    length: float = Field(
-        2.3, gt=0, le=8, description="to the base plate [m]; catches 0.87 m below hover; chosen"
-    )
-    stiffness: float = Field(100.0, gt=0, le=2000, description="[N/m]; chosen: 3 cm under the weight")
-    damping: float = Field(
-        5.0, ge=0, le=50, description="[N s/m]; chosen: about critical with the counter-weight"
-    )
+    length: float = number(2.3, "(0, 8]", "to the base plate [m]; catches 0.87 m below hover; chosen")
+    stiffness: float = number(100.0, "(0, 2000]", "[N/m]; chosen: 3 cm under the weight")
+    damping: float = number(5.0, "[0, 50]", "[N s/m]; chosen: about critical with the counter-weight")
 
 
-class GroundConfig(BaseModel):
+class GroundConfig(Section):
     """The net over the tunnel's exit and the robot's four feet on it; the paper names neither: all chosen."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    height: float = Field(0.0, ge=-2, le=2, description="z of the net in W [m]; the tunnel's exit; chosen")
-    foot_spread: float = Field(
-        0.06, gt=0, le=0.3, description="|x| = |y| of each foot in B [m]; beyond the base plate; chosen"
+    height: float = number(0.0, "[-2, 2]", "z of the net in W [m]; the tunnel's exit; chosen")
+    foot_spread: float = number(
+        0.06, "(0, 0.3]", "|x| = |y| of each foot in B [m]; beyond the base plate; chosen"
     )
-    foot_below: float = Field(
-        0.05, gt=0, le=0.3, description="feet below the centre of mass [m]; under the batteries; chosen"
+    foot_below: float = number(
+        0.05, "(0, 0.3]", "feet below the centre of mass [m]; under the batteries; chosen"
     )
-    stiffness: float = Field(
-        800.0, gt=0, le=5000, description="under one foot [N/m]; chosen: 1 mm under the weight"
-    )
-    damping: float = Field(8.0, ge=0, le=50, description="under one foot [N s/m]; chosen: half of critical")
-    friction: float = Field(0.5, ge=0, le=2, description="coefficient [1]; chosen")
+    stiffness: float = number(800.0, "(0, 5000]", "under one foot [N/m]; chosen: 1 mm under the weight")
+    damping: float = number(8.0, "[0, 50]", "under one foot [N s/m]; chosen: half of critical")
+    friction: float = number(0.5, "[0, 2]", "coefficient [1]; chosen")
 
 
-class LimitsConfig(BaseModel):
+class LimitsConfig(Section):
     """Where a flight counts as lost."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    radius: float = Field(0.45, gt=0, le=0.6, description="from the tunnel's axis [m]; half the flow is left")
-    below: float = Field(
-        0.8, gt=0, le=1.2, description="below the hover point [m]; assumed: recoveries from 0.65 were flown"
+    radius: float = number(0.45, "(0, 0.6]", "from the tunnel's axis [m]; half the flow is left")
+    below: float = number(
+        0.8, "(0, 1.2]", "below the hover point [m]; assumed: recoveries from 0.65 were flown"
     )
-    above: float = Field(
-        0.85, gt=0, le=5, description="above the hover point [m]; paper: cameras see 2 m over the tunnel"
-    )
-    tilt: float = Field(
-        math.pi / 2, gt=0, lt=math.pi, description="of the body's z from the vertical [rad]; chosen"
-    )
+    above: float = number(0.85, "(0, 5]", "above the hover point [m]; paper: cameras see 2 m over the tunnel")
+    tilt: float = number(math.pi / 2, f"(0, {math.pi})", "of the body's z from the vertical [rad]; chosen")
 
 
-class MassConfig(BaseModel):
+class MassConfig(Section):
     """A box of even density; `place` is that of its centre from the point above B where the flap axes meet."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     mass: float = Field(gt=0, le=5, description="[kg]")
     place: Three = Field((0.0, 0.0, 0.0), description="x, y, z in B from where the flap axes meet [m]")
@@ -89,55 +72,40 @@ class MassConfig(BaseModel):
     mirrored: bool = Field(False, description="four of them, at (+-x, +-y)")
 
 
-class GeometryConfig(BaseModel):
+class GeometryConfig(Section):
     """The robot's shape and masses: that of docs/explanation/plant.md. Statements about a
     flap hold for flap 2, in the quadrant (+,+) of B, at flap angle 0; the other three are its mirror images.
 
     Mass and centre of mass follow from `flap_mass` and `masses`, the moments of inertia too where none are given.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    footprint: float = Field(
-        0.23, gt=0.02, le=2, description="side of the square of four quadrants [m]; paper"
-    )
-    base_side: float = Field(
-        0.08, gt=0, le=1, description="side of the base plate [m]; original firmware, baseArea"
-    )
+    footprint: float = number(0.23, "(0.02, 2]", "side of the square of four quadrants [m]; paper")
+    base_side: float = number(0.08, "(0, 1]", "side of the base plate [m]; original firmware, baseArea")
     outline: Annotated[tuple[tuple[float, float], ...], Field(max_length=12)] = Field(
         (),
         description="corners of the unfolded flap in turn, a convex trapezoid or the like [m]; "
         "without: its quadrant of the footprint less the base plate; paper, Setup specifications",
     )
-    strip_width: float = Field(
+    strip_width: float = number(
         0.0198,
-        gt=0,
-        le=0.5,
-        description="width of the kinked strip at the flap's outer edge [m]; tuned to the Table's roll stiffness",
+        "(0, 0.5]",
+        "width of the kinked strip at the flap's outer edge [m]; tuned to the Table's roll stiffness",
     )
-    kink_angle: float = Field(
-        math.radians(42.5), ge=0, le=math.pi / 2, description="upward bend of the strip [rad]; paper"
+    kink_angle: float = number(
+        math.radians(42.5), f"[0, {math.pi / 2}]", "upward bend of the strip [rad]; paper"
     )
     kink_side: Literal["x", "y"] = Field(
         "y", description="edge with the strip: the one outwards in y or in x"
     )
-    axis_azimuth: float = Field(
-        math.radians(45),
-        ge=0,
-        le=math.pi / 2,
-        description="of the flap's axis from x [rad]; original firmware",
+    axis_azimuth: float = number(
+        math.radians(45), f"[0, {math.pi / 2}]", "of the flap's axis from x [rad]; original firmware"
     )
-    dihedral: float = Field(
-        0.0,
-        ge=-1.2,
-        le=1.2,
-        description="by which axis and flap rise outwards [rad]; paper, Supplement: horizontal",
+    dihedral: float = number(
+        0.0, "[-1.2, 1.2]", "by which axis and flap rise outwards [rad]; paper, Supplement: horizontal"
     )
-    flow_point: float = Field(
-        0.0627, gt=0, le=0.5, description="|x| = |y| where a flap's flow is taken [m]; assumed"
-    )
-    flap_mass: float = Field(
-        0.025, gt=0, le=2, description="of each flap, even over its surface [kg]; paper, Setup specifications"
+    flow_point: float = number(0.0627, "(0, 0.5]", "|x| = |y| where a flap's flow is taken [m]; assumed")
+    flap_mass: float = number(
+        0.025, "(0, 2]", "of each flap, even over its surface [kg]; paper, Setup specifications"
     )
     masses: tuple[MassConfig, ...] = Field(
         (MassConfig(mass=0.240, place=(0.0, 0.0, -0.0991666667), size=(0.0636, 0.0636, 0.0809)),),
@@ -150,24 +118,22 @@ class GeometryConfig(BaseModel):
     )
 
 
-class PlantConfig(BaseModel):
+class PlantConfig(Section):
     """The geometry's plates in the flow, corrected to a set of identified constants (docs/explanation/plant.md, Correction).
 
     The drag coefficient is not a free constant: it is trimmed so that the robot hovers at `airspeed` and `hover_angle`
     (of G0 C_D = 1.353 at 1.225 kg/m3). Model errors are the factors, true over design: they act after the trim.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
     variant: Variant = Field(
         "methods",
         description="plate: isolated plates; else their linearisation is corrected to the paper's Table",
     )
-    airspeed: float = Field(
-        10.0, gt=1, le=60, description="design airspeed of the hover [m/s]; paper, Setup specifications"
+    airspeed: float = number(
+        10.0, "(1, 60]", "design airspeed of the hover [m/s]; paper, Setup specifications"
     )
-    hover_angle: float = Field(
-        math.radians(25), gt=-0.5, le=1.2, description="flap angle of the design hover [rad]; paper: 25 deg"
+    hover_angle: float = number(
+        math.radians(25), "(-0.5, 1.2]", "flap angle of the design hover [rad]; paper: 25 deg"
     )
     mass_factor: Factor = Field(1.0, description="true mass over design mass")
     inertia_factor: Factor = Field(1.0, description="true inertia over design inertia")
@@ -186,10 +152,8 @@ class PlantConfig(BaseModel):
         return self
 
 
-class ServoConfig(BaseModel):
+class ServoConfig(Section):
     """The four servos of the world, as the board was trimmed for them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     zero_offset: Four = Field(
         (
@@ -200,15 +164,12 @@ class ServoConfig(BaseModel):
         ),
         description="pulse of a level flap, from the middle pulse of 1.5 ms [rad]; original firmware, motorShifts",
     )
-    tau: float = Field(
-        0.050, gt=0.001, le=0.5, description="first-order lag [s]; original firmware, flapTimeConst = 20 1/s"
+    tau: float = number(
+        0.050, "(0.001, 0.5]", "first-order lag [s]; original firmware, flapTimeConst = 20 1/s"
     )
-    rate_limit: float = Field(10.5, gt=0, le=100, description="[rad/s]; assumed: 0.1 s for 60 deg")
-    dead_band: float = Field(
-        math.radians(0.1),
-        ge=0,
-        le=0.1,
-        description="error below which the servo does not move [rad]; assumed",
+    rate_limit: float = number(10.5, "(0, 100]", "[rad/s]; assumed: 0.1 s for 60 deg")
+    dead_band: float = number(
+        math.radians(0.1), "[0, 0.1]", "error below which the servo does not move [rad]; assumed"
     )
     trim_error: Four = Field(
         (0.0, 0.0, 0.0, 0.0), description="wrong mounting: flap angle minus intended angle [rad]"
@@ -221,57 +182,44 @@ class ServoConfig(BaseModel):
     )
 
 
-class TunnelConfig(BaseModel):
+class TunnelConfig(Section):
     """The flow of one flight; where no source is named it is a choice (docs/explanation/plant.md, Tunnel)."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    speed: float = Field(
-        10.0, gt=0, le=60, description="mean flow at the hover point [m/s]; paper, Setup specifications"
+    speed: float = number(10.0, "(0, 60]", "mean flow at the hover point [m/s]; paper, Setup specifications")
+    profile_radius: float = number(
+        0.45, "(0.05, 5]", "w(r) = speed / (1 + (r / profile_radius)^6) [m]; assumed"
     )
-    profile_radius: float = Field(
-        0.45, gt=0.05, le=5, description="w(r) = speed / (1 + (r / profile_radius)^6) [m]; assumed"
-    )
-    height_slope: float = Field(0.05, ge=0, le=0.5, description="loss of speed with height [1/m]; assumed")
-    hover_height: float = Field(
-        1.15, gt=0, le=3, description="hover point above the exit [m]; paper, Hover: 115 cm"
-    )
+    height_slope: float = number(0.05, "[0, 0.5]", "loss of speed with height [1/m]; assumed")
+    hover_height: float = number(1.15, "(0, 3]", "hover point above the exit [m]; paper, Hover: 115 cm")
     turbulence: Literal["none", "T0", "T1"] = Field(
         "T0", description="gust level; T0 gives the paper's hover"
     )
-    gust_scale: float = Field(1.0, ge=0, le=5, description="factor on the gusts of that level")
+    gust_scale: float = number(1.0, "[0, 5]", "factor on the gusts of that level")
     side_wind: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="added everywhere, x y z of W [m/s]"
     )
-    fan_factor: float = Field(1.0, ge=0, le=2, description="factor on everything that the fans blow")
+    fan_factor: float = number(1.0, "[0, 2]", "factor on everything that the fans blow")
 
 
-class BatteryConfig(BaseModel):
+class BatteryConfig(Section):
     """Two small lithium polymer cells, and their loads.
 
     The paper gives 0.925 Wh per cell (3.7 V) and 7.6 V for both (3.8 V each). Both are true of one cell here: 3.80 V is the
     mean open-circuit voltage, and 0.925 Wh of 0.951 Wh are usable at the paper's 3.4 W.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    cells: int = Field(2, ge=1, le=6, description="in series; paper, Robot design and fabrication")
-    capacity: float = Field(
-        900.0, gt=1, le=1e5, description="charge of a full cell [A s]; paper: 250 mAh, single cell"
+    cells: int = number(2, "[1, 6]", "in series; paper, Robot design and fabrication")
+    capacity: float = number(900.0, "(1, 1e5]", "charge of a full cell [A s]; paper: 250 mAh, single cell")
+    resistance: float = number(
+        0.22, "[0, 2]", "of a cell with its leads [ohm]; chosen: 0.925 Wh per cell at 3.4 W"
     )
-    resistance: float = Field(
-        0.22, ge=0, le=2, description="of a cell with its leads [ohm]; chosen: 0.925 Wh per cell at 3.4 W"
+    charge: float = number(1.0, "[0, 1]", "at the start, as a share of the capacity")
+    electronics_power: float = number(
+        0.3, "[0, 50]", "board and inertial sensors [W]; paper, Energy efficiency"
     )
-    charge: float = Field(1.0, ge=0, le=1, description="at the start, as a share of the capacity")
-    electronics_power: float = Field(
-        0.3, ge=0, le=50, description="board and inertial sensors [W]; paper, Energy efficiency"
+    servo_power: float = number(
+        0.50, "[0, 10]", "of each servo at rest, holding [W]; calibrated on the paper's 3.4 W"
     )
-    servo_power: float = Field(
-        0.50, ge=0, le=10, description="of each servo at rest, holding [W]; calibrated on the paper's 3.4 W"
-    )
-    servo_energy: float = Field(
-        0.33,
-        ge=0,
-        le=10,
-        description="of each servo per angle turned [J/rad]; calibrated on the paper's 3.4 W",
+    servo_energy: float = number(
+        0.33, "[0, 10]", "of each servo per angle turned [J/rad]; calibrated on the paper's 3.4 W"
     )
