@@ -36,6 +36,7 @@ GENERATED = {
         "profile-board",
         "profile-world",
         "profile-devices",
+        "parameters",
         "variables",
         "log",
         "faults",
