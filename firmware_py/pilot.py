@@ -10,7 +10,7 @@ from firmware_py.box import GoalBox
 from firmware_py.config import PredictorConfig
 from firmware_py.geometry import Vector, in_goal_frame, to_euler_zyx
 from firmware_py.planner import Motion, Path, Phase, Planner, stay
-from firmware_py.wire.crtp import PoseMessage
+from firmware_py.wire.crtp import Correction
 
 ORIGIN = Motion((0.0, 0.0, 0.0), 0.0)
 SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHUTDOWN
@@ -87,7 +87,7 @@ class Pilot:
         """Where the origin of the estimate is in X now; None while they are the same."""
         return self.planner.at(now_us) if self.planner.phase(now_us) is not Phase.IDLE else self.goal
 
-    def error(self, pose: PoseMessage, now_us: int) -> PoseMessage:
+    def error(self, pose: Correction, now_us: int) -> Correction:
         """Return the error that the estimator takes for a pose that has just arrived."""
         self.seen_us = now_us
         age_us = self._default_age_us if pose.age_us is None else pose.age_us
@@ -99,6 +99,6 @@ class Pilot:
             self.goal = self.here if self.absolute else None
         if self.goal is None:
             return pose
-        return PoseMessage(
+        return Correction(
             *in_goal_frame(pose.p_GB, pose.q_GB, self.goal.position, self.goal.yaw), pose.age_us
         )

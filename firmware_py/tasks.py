@@ -11,9 +11,10 @@ from firmware_py.board import Board
 from firmware_py.config import CpuConfig
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts
-from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement, PoseMeasurement
+from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement
 from firmware_py.rtos import Kernel, Queue, Semaphore
 from firmware_py.supervisor import Supervisor, wrapped
+from firmware_py.wire.crtp import Correction
 
 Task = Generator[int, None, None]
 
@@ -91,7 +92,7 @@ def estimator_task(
                     zero_found()
                     yield from kernel.yield_if_pending()
             elif measurement[0] == POSE:
-                hand_pose_to_core(kernel, measurement[1], core)
+                hand_pose_to_core(kernel, *measurement[1], core)
         if sampling.estimate_due:
             yield from kernel.work(costs.estimate_us())
             core.run.call("estimate")
@@ -106,12 +107,12 @@ def power_task(kernel: Kernel, board: Board, core: CoreBlocks) -> Task:
         yield from kernel.delay_until(wake_tick)
 
 
-def hand_pose_to_core(kernel: Kernel, measurement: PoseMeasurement, core: CoreBlocks) -> None:
+def hand_pose_to_core(kernel: Kernel, arrived_us: int, pose: Correction, core: CoreBlocks) -> None:
     """Hand a pose to the core."""
-    data, message = core.data.fields, measurement.message
+    data = core.data.fields
     data.now_us = wrapped(kernel.now_us)
-    data.pose_waited_us = i32(kernel.now_us - measurement.t_us)
-    data.pose_position[:] = message.p_GB
-    data.pose_quaternion[:] = message.q_GB
-    data.pose_age_us = i32(-1 if message.age_us is None else message.age_us)
+    data.pose_waited_us = i32(kernel.now_us - arrived_us)
+    data.pose_position[:] = pose.p_GB
+    data.pose_quaternion[:] = pose.q_GB
+    data.pose_age_us = i32(-1 if pose.age_us is None else pose.age_us)
     core.run.call("file_pose")

@@ -5,13 +5,13 @@ the origin of G; over CRTP goals and absolute positions never leave the ground.
 """
 
 from firmware_py.geometry import in_goal_frame
-from firmware_py.wire.crtp import PoseMessage
+from firmware_py.wire.crtp import Correction
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 
 
-def correct(frame: MocapFrame, goal: Goal, arrival_us: int) -> PoseMessage:
+def correct(frame: MocapFrame, goal: Goal, arrival_us: int) -> Correction:
     """The correction of `frame` with respect to `goal`, which the board has at `arrival_us`."""
-    return PoseMessage(
+    return Correction(
         *in_goal_frame(frame.p_WB, frame.q_WB, goal.p_WG, goal.yaw), age_us=arrival_us - frame.t_us
     )

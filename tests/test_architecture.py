@@ -366,6 +366,22 @@ def test_a_planted_circle_is_found() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == [{"b", "c"}]
 
 
+def test_a_pose_has_the_shapes_that_the_architecture_names() -> None:
+    """A class that holds a pose has a rotation, a frame or a correction among its fields."""
+    shapes = {
+        node.name
+        for path in sources()
+        if path.relative_to(ROOT).parts[0] != "hil"
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ClassDef)
+        for field in node.body
+        if isinstance(field, ast.AnnAssign)
+        and re.match(r"(q_\w\w|pose_quaternion): |\w+: (MocapFrame|Correction|Pose)$", ast.unparse(field))
+    }
+    assert shapes == {"MocapFrame", "Track", "Correction", "Pose", "Input"}
+    assert {shape for shape in shapes if f"`{shape}`" not in ARCHITECTURE} == set()
+
+
 def asks_which_board(source: str) -> list[str]:
     """The places that choose by the class of a firmware; what a board cannot report is None instead."""
     return [

@@ -7,12 +7,12 @@ carry the last byte of the board's radio address. The pilot turns poses into err
 from firmware_py.box import is_correction
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.links.notices import Notices
-from firmware_py.measurements import POSE, Measurement, PoseMeasurement
+from firmware_py.measurements import POSE, Measurement
 from firmware_py.pilot import Pilot
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import WireError, crtp, localisation
-from firmware_py.wire.crtp import Packet, PoseMessage
+from firmware_py.wire.crtp import Correction, Packet
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -29,7 +29,7 @@ class LocalisationService:
         address: int,
         notices: Notices,
     ) -> None:
-        self.last = PoseMessage((0.0, 0.0, 0.0), UPRIGHT, None)
+        self.last = Correction((0.0, 0.0, 0.0), UPRIGHT, None)
         self.positions = 0
         self._stack = stack
         self._measurements = measurements
@@ -65,9 +65,9 @@ class LocalisationService:
 
     def _see_position(self, p_GB: tuple[float, float, float]) -> None:
         self.positions += 1
-        self.last = PoseMessage(p_GB, self.last.q_GB, None)
+        self.last = Correction(p_GB, self.last.q_GB, None)
 
-    def _measure(self, now_us: int, pose: PoseMessage) -> Task:
+    def _measure(self, now_us: int, pose: Correction) -> Task:
         if not self._pilot.absolute and not is_correction(pose.p_GB):
             place = "{:.2f} {:.2f} {:.2f}".format(*pose.p_GB)
             self._notices.refuse(
@@ -76,4 +76,4 @@ class LocalisationService:
             raise WireError(f"a correction of {place} m")
         self.last = pose
         error = self._pilot.error(pose, now_us)
-        yield from self._measurements.send((POSE, PoseMeasurement(now_us, error)), 0)
+        yield from self._measurements.send((POSE, (now_us, error)), 0)

@@ -10,10 +10,10 @@ from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.links.timesync import RemoteClock
-from firmware_py.measurements import POSE, Measurement, PoseMeasurement
+from firmware_py.measurements import POSE, Measurement
 from firmware_py.rtos import Queue
 from firmware_py.wire import mavlink
-from firmware_py.wire.crtp import PoseMessage
+from firmware_py.wire.crtp import Correction
 from firmware_py.wire.mavlink_frames import Message
 
 # An older pose is of no use, so a greater age is taken as unknown.
@@ -55,8 +55,8 @@ class PoseService:
         now_us = self._stack.kernel.now_us
         p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self._setpoints.see_pose())
         self.age_us = self._age_us(now_us, pose.t_us)
-        self._localisation.last = PoseMessage(p_GB, q_GB, self.age_us)
-        self._measurements.send_nowait((POSE, PoseMeasurement(now_us, self._localisation.last)))
+        self._localisation.last = Correction(p_GB, q_GB, self.age_us)
+        self._measurements.send_nowait((POSE, (now_us, self._localisation.last)))
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """How long ago the sender's clock showed `t_us`; None when that is not known."""

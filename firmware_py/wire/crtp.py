@@ -8,6 +8,7 @@ compare with cflib's own bytes.
 
 import struct
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from firmware_py.wire import WireError, check_size
 
@@ -46,9 +47,11 @@ class Packet:
     data: bytes
 
 
-@dataclass(slots=True)
-class PoseMessage:
-    """The body's pose in the goal frame as it was `age_us` before the message arrived."""
+class Correction(NamedTuple):
+    """The body's pose in the goal frame, at both ends of a link: it was true `age_us` before it arrived.
+
+    An absolute pose is the correction with respect to the origin of the world.
+    """
 
     p_GB: tuple[float, float, float]  # [m]
     q_GB: tuple[float, float, float, float]  # w x y z, length 0.9..1.1
@@ -89,7 +92,7 @@ def encode_ext_pose(
     return _POSE_WITH_AGE.pack(_POSE_HEADER, EXT_POSE, x, y, z, qx, qy, qz, qw, _age_code(age_us))
 
 
-def decode_ext_pose(data: bytes) -> PoseMessage:
+def decode_ext_pose(data: bytes) -> Correction:
     """The pose in the data of a generic localisation packet; without an age byte the age is unknown."""
     check_size("an external pose", data, _POSE.size, _POSE.size + 1)
     if data[0] != EXT_POSE:
@@ -98,7 +101,7 @@ def decode_ext_pose(data: bytes) -> PoseMessage:
     p_GB, q_GB = (x, y, z), (qw, qx, qy, qz)
     check_pose(p_GB, q_GB)
     code = data[_POSE.size] if len(data) > _POSE.size else AGE_UNKNOWN_CODE
-    return PoseMessage(p_GB, q_GB, None if code == AGE_UNKNOWN_CODE else code * AGE_UNIT_US)
+    return Correction(p_GB, q_GB, None if code == AGE_UNKNOWN_CODE else code * AGE_UNIT_US)
 
 
 def _age_code(age_us: int | None) -> int:

@@ -8,7 +8,7 @@ import struct
 from math import sqrt
 
 from firmware_py.wire import WireError, check_size
-from firmware_py.wire.crtp import PoseMessage, check_place, check_pose
+from firmware_py.wire.crtp import Correction, check_place, check_pose
 
 CHANNEL_POSITION = 0
 CHANNEL_PACKED = 2
@@ -43,7 +43,7 @@ def decode_packed_positions(data: bytes) -> list[tuple[int, Vector]]:
     ]
 
 
-def decode_packed_poses(data: bytes) -> list[tuple[int, PoseMessage]]:
+def decode_packed_poses(data: bytes) -> list[tuple[int, Correction]]:
     """Pairs of address byte and pose in the data of a generic packet of type 9; the age is unknown."""
     items = data[1:]
     if data[:1] != bytes((EXT_POSE_PACKED,)) or not items or len(items) % _PACKED_POSE.size:
@@ -53,7 +53,7 @@ def decode_packed_poses(data: bytes) -> list[tuple[int, PoseMessage]]:
         p_GB = (x * _MILLIMETRE, y * _MILLIMETRE, z * _MILLIMETRE)
         q_GB = unpack_quaternion(packed)
         check_pose(p_GB, q_GB)
-        poses.append((address, PoseMessage(p_GB, q_GB, None)))
+        poses.append((address, Correction(p_GB, q_GB, None)))
     return poses
 
 

@@ -189,9 +189,8 @@ class CrazyradioLink(LiveLink):
     # Uplink
 
     def _send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        correction = correct(frame, goal, now_us + self.latency.us)
         self._sent_us = now_us
-        self._transmit(encode_ext_pose(correction.p_GB, correction.q_GB, correction.age_us))
+        self._transmit(encode_ext_pose(*correct(frame, goal, now_us + self.latency.us)))
 
     def _send_echo(self) -> None:
         self._transmit(bytes((ECHO_HEADER,)) + ECHO.pack(OWN_ECHO, clock_us()))

@@ -33,8 +33,7 @@ class LoopbackLink:
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         """Hand the correction to the carrier."""
-        correction = correct(frame, goal, now_us + self.latency.us)
-        self._transmit(now_us, encode_ext_pose(correction.p_GB, correction.q_GB, correction.age_us))
+        self._transmit(now_us, encode_ext_pose(*correct(frame, goal, now_us + self.latency.us)))
         self._logs.tend(now_us)
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:

@@ -10,7 +10,6 @@ from firmware_py.wire.memories import CONFIG_SIZE, decode_config, encode_config
 from firmware_py.wire.memories import RadioSettings as EepromSettings
 from firmware_py.wire.parameters import encode_pose_kind
 from ground_station.links.loopback import LoopbackLink
-from ground_station.mocap import MocapFrame
 from ground_station.station import GroundStation
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal, Hold
@@ -43,7 +42,7 @@ def address_of(number: int) -> bytes:
 WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # seen from here a pose is absolute
 
 
-class _Wire(LoopbackLink):
+class _PosesOnly(LoopbackLink):
     """Carries corrections, or absolute poses; telemetry belongs to the clients."""
 
     def __init__(self, transmit: Callable[[int, bytes], object], latency_us: int, absolute: bool) -> None:
@@ -53,10 +52,6 @@ class _Wire(LoopbackLink):
     def start_telemetry(self, now_us: int) -> None:
         """Set what the poses are instead: an image that has booted begins with absolute ones."""
         self._transmit(now_us, encode_pose_kind(self._absolute))
-
-    def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
-        """Hand a pose to the board: seen from the goal, or as the cameras saw it."""
-        super().send(now_us, frame, WORLD if self._absolute else goal)
 
 
 class ServedRobot:
@@ -145,10 +140,10 @@ class ServedRobot:
         With absolute poses the goal is the clients' matter.
         """
         config = self.robot.config
-        link = _Wire(self._wire, config.station.link_latency_us, absolute)
+        link = _PosesOnly(self._wire, config.station.link_latency_us, absolute)
         tracker = tracker_of(config.tracker, config.mocap.period_us)
-        home = Hold(Goal(config.flight.home, 0.0))
-        ground = GroundStation(link, home, None, config.station, tracker)
+        goal = WORLD if absolute else Goal(config.flight.home, 0.0)
+        ground = GroundStation(link, Hold(goal), None, config.station, tracker)
         self.robot.seen_by(lambda frame, now_us, _: ground.on_frame(frame, now_us))
 
     def _wire(self, now_us: int, data: bytes) -> None:
