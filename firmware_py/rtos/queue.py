@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 class Queue(Generic[T]):
-    """A queue of at most `length` items; made by `Kernel.create_queue`. With length 1 it is also a mailbox."""
+    """A queue of at most `length` items; made by `Kernel.create_queue`."""
 
     __slots__ = (
         "_items",
@@ -135,27 +135,6 @@ class Queue(Generic[T]):
             kernel.wake_first(self._senders)
         return item
 
-    def overwrite(self, item: T) -> Iterable[int]:
-        """Puts `item` into a mailbox in place of what is there.
-
-        `yield from mailbox.overwrite(item)` lets a reader of higher priority run at once; the plain call lets it run
-        at the caller's next `yield from` that blocks, yields or works.
-        """
-        if self.length != 1:
-            raise KernelError(
-                f"queue {self.name}: overwrite needs a queue of length 1, this one holds {self.length}"
-            )
-        if item is None:
-            raise self._null_item()
-        kernel = self._kernel
-        kernel.count_call()
-        if kernel.trace is not None:
-            kernel.record("Q_SEND", self.number, len(self._items))
-        self._items.clear()
-        self._items.append(item)
-        self.high_water = 1
-        return kernel.wake_first(self._receivers) if self._receivers else GO_ON
-
     def reset(self) -> Iterable[int]:
         """Empties the queue; one sender that waited for space goes on, as with xQueueReset.
 
@@ -168,10 +147,6 @@ class Queue(Generic[T]):
         kernel.count_call()
         self._items.clear()
         return kernel.wake_first(self._senders) if self._senders else GO_ON
-
-    def peek(self) -> T | None:
-        """The oldest item, left in place; None when there is none."""
-        return self._items[0] if self._items else None
 
     def wait_for_item(self, wake_tick: int) -> None:
         """Blocks the running task until an item comes or, unless negative, `wake_tick`; for the timer service."""
