@@ -35,25 +35,14 @@ STYLE: Any = {
 }
 
 
-def drawn(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> Plot | bytes:
-    """Return what `draw` returns for flight logs or a schedule: panels, or the PNG of a figure."""
+def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
+    """Return what `draw` returns for flight logs as PNG; panels are marked as the first flight was."""
+    file = io.BytesIO()
     with matplotlib.rc_context(STYLE):
         made = draw(*flights)
-        return made if isinstance(made, Plot) else _png(made)
-
-
-def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
-    """Return it as PNG in any case; panels are marked as the first flight was."""
-    made = drawn(draw, *flights)
-    if isinstance(made, bytes):
-        return made
-    with matplotlib.rc_context(STYLE):
-        return _png(figure_of(made, marks_of_flight(flights[0]) if flights else Marks()))
-
-
-def _png(figure: Figure) -> bytes:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=DPI)
+        if isinstance(made, Plot):
+            made = figure_of(made, marks_of_flight(flights[0]) if flights else Marks())
+        made.savefig(file, format="png", dpi=DPI)
     return file.getvalue()
 
 
@@ -123,6 +112,12 @@ def draw_marks(axes: Sequence[Axes], marks: Marks) -> None:
             begins, 0.98, short, transform=axes[0].get_xaxis_transform(), color=colour, fontsize=6.5,
             rotation=90, ha="left", va="top", clip_on=True,
         )  # fmt: skip
+
+
+def beside(*widths: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure of axes beside one another, with the ratio of their widths."""
+    figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
+    return figure, figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0].tolist()
 
 
 def stack(heights: Sequence[float]) -> tuple[Figure, list[Axes]]:

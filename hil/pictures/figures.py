@@ -1,66 +1,34 @@
 """The figures of a flight, after the paper's figure Hover_figure; also of a flight that was lost or never began.
 
-Axes carry cm, degrees, ms and seconds from the release. Over time they are panels, which a page can zoom; what has no time
-axis, or one of 20 ms, is drawn by matplotlib.
+Axes carry cm, degrees, ms and seconds from the release. What has a time axis are panels, which a page can zoom.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ground_station.latency import STAGES, reported_stages
 from hil.laboratory.metrics import BOX, free_flight
 from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
-from hil.pictures import curves, monitor, scene
+from hil.pictures import curves, monitor
 from hil.pictures.curves import since_release
-from hil.pictures.drawing import WIDTH
-from hil.pictures.panels import INK, Panel, Plot, Series, lanes, panel
+from hil.pictures.panels import INK, Bar, Panel, Plot, Series, Still, lanes, panel
+from hil.pictures.path import path_around
 from hil.pictures.picture import Picture
 
 TENTH, SECOND = 10, 100  # rows
-DRAWN = 50_000  # rows at most of a path, which matplotlib holds several times over
 BUSY_PERCENT = 0.02  # of the processor, above which a task gets a colour
 SCHEDULE_US = 20_000  # of the scheduler's picture
-BOX_CM = 100 * BOX
+LANE_INCH = 0.25  # a task's row there
 
 
-def track(rows: pa.Table) -> Figure:
+def track(rows: pa.Table) -> Still:
     """Draw the path around the target: in space, from above, from the side."""
-    points = curves.POSITION.read(free_flight(rows))
-    points = points[:: len(points) // DRAWN + 1]
-    x, y, z = points.T
-    figure = Figure(figsize=(WIDTH, 3.3), layout="constrained")
-    grid = figure.add_gridspec(1, 3, width_ratios=(1.3, 1, 1), wspace=0.12)
-    space: Any = figure.add_subplot(grid[0], projection="3d")
-    space.plot(x, y, z, color=curves.BLUE, linewidth=0.6)
-    space.plot([0.0], [0.0], [0.0], "+", color="red", markersize=9, markeredgewidth=1.8)
-    for line in scene.box_lines(BOX_CM):
-        space.plot(*line.T, color="black", linewidth=0.7)
-    space.set(xlabel="x [cm]", ylabel="y [cm]", zlabel="z [cm]")
-    reach = max(1.1 * BOX_CM, float(np.abs(points).max(initial=0.0)))
-    space.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
-    space.locator_params(nbins=5)
-    space.set_box_aspect((1, 1, 1), zoom=0.9)
-    square = BOX_CM * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
-    for place, across, up, label in ((grid[1], x, y, "y"), (grid[2], x, z, "z")):
-        axes = figure.add_subplot(place)
-        axes.plot(across, up, color=curves.BLUE, linewidth=0.6)
-        axes.plot(*square.T, color="black", linewidth=0.9)
-        axes.plot(0.0, 0.0, "+", color="red", markersize=9, markeredgewidth=1.8)
-        axes.set(
-            xlabel="x [cm]",
-            ylabel=f"{label} [cm]",
-            aspect="equal",
-            xlim=(-reach, reach),
-            ylim=(-reach, reach),
-        )
-    return figure
+    return path_around(curves.POSITION.read(free_flight(rows)), 100 * BOX)
 
 
 def errors(rows: pa.Table) -> Plot:
@@ -198,27 +166,17 @@ def own_logic(rows: pa.Table) -> Plot:
     return Plot(tuple(panel(plot, rows, "own logic") for plot in curves.own_logic(rows)))
 
 
-def schedule(table: pa.Table) -> Figure:
+def schedule(table: pa.Table) -> Plot:
     """Draw which task has the processor, over the first 20 ms of a schedule."""
-    figure = Figure(figsize=(WIDTH, 2.4), layout="constrained")
-    axes = figure.subplots()
-    stretches = [run for run in runs(table) if run.task != "IDLE"]
-    begin_us = table.column("us")[0].as_py()
-    begin_s = 1e-6 * (begin_us - release_of(table.schema.metadata))
-    stretches = [run for run in stretches if run.start_us < begin_us + SCHEDULE_US]
-    names = sorted({run.task for run in stretches}, reverse=True)
-    for height, name in enumerate(names):
-        bars = [
-            (1e-3 * (r.start_us - begin_us), 1e-3 * (r.end_us - r.start_us))
-            for r in stretches
-            if r.task == name
-        ]
-        axes.broken_barh(bars, (height - 0.4, 0.8), color=curves.task_colour(name))
-    axes.set_yticks(range(len(names)), names)
-    axes.set_xlim(0.0, 1e-3 * SCHEDULE_US)
-    axes.set_xticks(range(0, SCHEDULE_US // 1000 + 1))
-    axes.set_xlabel(f"time from {begin_s:.3f} s after the release [ms]; a line per tick")
-    return figure
+    release_us, begin_us = release_of(table.schema.metadata), table.column("us")[0].as_py()
+    window_s = (1e-6 * (begin_us - release_us), 1e-6 * (begin_us - release_us + SCHEDULE_US))
+    busy = [run for run in runs(table) if run.task != "IDLE" and run.start_us < begin_us + SCHEDULE_US]
+    bars = tuple(
+        Bar(run.task, "", curves.task_colour(run.task), *(1e-6 * (us - release_us) for us in (run.start_us, run.end_us)))
+        for run in sorted(busy, key=lambda run: run.task, reverse=True)
+    )  # fmt: skip
+    height = LANE_INCH * len({bar.lane for bar in bars})
+    return Plot((Panel("processor", height=max(height, LANE_INCH), bars=bars),), window_s)
 
 
 PICTURES = (
@@ -284,4 +242,4 @@ LATENCY_BUDGET = Picture(
     "Where poses spent their time from the exposure to the board, as the ground station reported for each that it sent.",
     latency_budget,
 )
-SCHEDULE = Picture("Scheduler", "Which task had the processor, for 20 ms.", schedule)
+SCHEDULE = Picture("Scheduler", "Which task had the processor, for 20 ms.", schedule, alone=True)

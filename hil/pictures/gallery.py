@@ -9,7 +9,7 @@ from hil.errors import LabError, blame
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.metrics import free_flight
 from hil.pictures import trials
-from hil.pictures.picture import Picture
+from hil.pictures.picture import Picture, painted
 from hil.pictures.power import COMPARISON, DISCHARGE
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def pictures_of(experiment: Experiment) -> tuple[Picture, ...]:
     if experiment.draw is None:
         return shared
     title = experiment.name.replace("-", " ").capitalize()
-    return (*shared, Picture(title, experiment.summary, partial(_draw, experiment)))
+    return (*shared, Picture(title, experiment.summary, partial(painted, partial(_draw, experiment))))
 
 
 def _draw(experiment: Experiment, log: pa.Table) -> Figure:

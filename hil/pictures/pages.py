@@ -7,7 +7,7 @@ intervals, which is more than a screen shows at once.
 
 import base64
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from numpy.typing import NDArray
 from youplot.vendor import uplot_css, uplot_js
 
-from hil.pictures.panels import Marks, Panel, Plot, Series, Signal
+from hil.pictures.panels import Marks, Panel, Plot, Series, Signal, Still
 from hil.pictures.picture import Picture
 
 if TYPE_CHECKING:
@@ -49,20 +49,18 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
     return path
 
 
-def data_uri(png: bytes) -> str:
+def data_uri(content: bytes, kind: str = "png") -> str:
     """Return a picture as the text that embeds it in a page."""
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> PageFigure:
     """Return a picture of flights for a page."""
-    from hil.pictures.drawing import drawn
-
-    name = picture.title.lower().replace(" ", "-")
-    shown = drawn(picture.draw, *flights)
-    if isinstance(shown, Plot):
-        return PageFigure(name, picture.title, picture.caption, plot=embedded(shown), marks=marks)
-    return PageFigure(name, picture.title, picture.caption, data_uri(shown))
+    figure = PageFigure(picture.title.lower().replace(" ", "-"), picture.title, picture.caption)
+    shown = picture.draw(*flights)
+    if isinstance(shown, Still):
+        return replace(figure, source=data_uri(shown.content, shown.kind))
+    return replace(figure, plot=embedded(shown), alone=picture.alone, marks=marks)
 
 
 def zoomable(shown: Iterable[PageFigure]) -> dict[str, Any]:

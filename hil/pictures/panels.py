@@ -69,6 +69,14 @@ class Plot:
 
 
 @dataclass(frozen=True, slots=True)
+class Still:
+    """A picture that cannot be zoomed."""
+
+    content: bytes
+    kind: str  # png or svg+xml
+
+
+@dataclass(frozen=True, slots=True)
 class Spell:
     """An interval of a flight that every figure shades."""
 

@@ -1,4 +1,4 @@
-"""A picture of the report; drawing code is loaded when the first one is drawn."""
+"""A picture of the report, and how matplotlib, which is slow to load, is loaded for the few that need it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from hil.pictures.panels import Plot, Still
+
 if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
-
-    from hil.pictures.panels import Plot
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,11 +19,13 @@ class Picture:
 
     title: str
     caption: str
-    draw: Callable[..., Plot | Figure]  # of the log of a flight, of several, or of a schedule
+    draw: Callable[..., Plot | Still]  # of the log of a flight, of several, or of a schedule
     needs: str = "t"  # the column that it needs
+    alone: bool = False  # panels with a time axis of their own
 
-    def png(self, *flights: pa.Table) -> bytes:
-        """Return the figure, marked as the first flight was."""
-        from hil.pictures.drawing import png
 
-        return png(self.draw, *flights)
+def painted(draw: Callable[..., Figure], *flights: pa.Table) -> Still:
+    """Return the figure that `draw` makes of flights with matplotlib."""
+    from hil.pictures.drawing import png
+
+    return Still(png(draw, *flights), "png")

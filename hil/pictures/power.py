@@ -1,10 +1,13 @@
 """Figures of power: the comparison of vehicles (paper, figure robustness a and b) and the discharge of the battery."""
 
+from __future__ import annotations
+
 import json
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hil.experiments.measures import seconds
@@ -12,11 +15,13 @@ from hil.experiments.power import power
 from hil.experiments.specific_power import CONVENTIONAL_W_PER_KG, VEHICLES
 from hil.laboratory.metrics import column, free_flight
 from hil.pictures import curves
-from hil.pictures.drawing import WIDTH
 from hil.pictures.figures import SECOND
 from hil.pictures.panels import Panel, Plot, Series
-from hil.pictures.picture import Picture
+from hil.pictures.picture import Picture, painted
 from hil.pictures.trials import DARK, LIGHT
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 KIND_COLOURS = {"quadcopter": curves.SKY, "drone": curves.BLUE, "helicopter": curves.GREEN}
 
@@ -32,8 +37,9 @@ def compare(*flights: pa.Table) -> Figure:
 
 def _beside_others(power: float, mass: float) -> Figure:
     """Draw the comparison with `power` [W] and `mass` [kg] of Floaty."""
-    figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
-    bars, scatter = figure.subplots(1, 2, width_ratios=(1.15, 1))
+    from hil.pictures.drawing import beside
+
+    figure, (bars, scatter) = beside(1.15, 1.0)
     names = ["Floaty", *(vehicle.name for vehicle in VEHICLES)]
     values = [power / mass, *(vehicle.specific_power for vehicle in VEHICLES)]
     spreads = [0.0, *(np.ptp(vehicle.power_range) / 2 / vehicle.mass for vehicle in VEHICLES)]
@@ -105,7 +111,7 @@ COMPARISON = Picture(
     "Specific power",
     "Left: power in hover per mass. Right: power over mass; grey: 100 to 250 W/kg, which the paper calls typical. Stars: in "
     "an updraft. Bars on helicopters: the paper's range of hover power, as a share of the rated one. Red: this flight.",
-    compare,
+    partial(painted, compare),
     needs="battery.power",
 )
 DISCHARGE = Picture(

@@ -28,7 +28,7 @@ from hil.experiments.take_off import (
 from hil.laboratory.metrics import BOX, column, free_flight, position_error
 from hil.pictures.curves import AXIS_COLOURS, BLUE, GREEN, GREY, ORANGE, SKY, task_colour
 from hil.pictures.panels import INK, Panel, Plot, Series, Signal, lanes
-from hil.pictures.picture import Picture
+from hil.pictures.picture import Picture, painted
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -235,6 +235,6 @@ OVERLOAD = Picture(
     "Overload",
     "Missed deadlines per second and largest position error while a task above all others takes a share of every tick. "
     "Dashed: the 20 cm box. A starved task completes no activation, late or not.",
-    overload,
+    partial(painted, overload),
     needs="cpu.THIEF",
 )

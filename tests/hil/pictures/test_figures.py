@@ -73,11 +73,14 @@ def test_a_task_has_one_colour_in_every_figure_whatever_tasks_are_there() -> Non
             "b": [0] * 4,
         }
     )
-    (axes,) = figures.schedule(schedule).axes
-    drawn = [tuple(bars.get_facecolor()[0][:3]) for bars in axes.collections]
-    shown = [label.get_text() for label in axes.get_yticklabels()]
-    assert sorted(shown) == ["KALMAN", "SENSORS"]
-    assert drawn == [to_rgb(curves.task_colour(name)) for name in shown]
+    (processor,) = figures.schedule(schedule).panels
+    drawn = [
+        (bar.lane, round(1e6 * bar.begin_s), round(1e6 * bar.end_s), bar.colour) for bar in processor.bars
+    ]
+    kalman, sensors = map(curves.task_colour, ("KALMAN", "SENSORS"))
+    assert sorted(drawn) == [
+        ("KALMAN", 0, 100, kalman), ("KALMAN", 300, 400, kalman), ("SENSORS", 100, 300, sensors),
+    ]  # fmt: skip
 
 
 def test_the_time_since_the_last_fused_pose_shows_a_dropout_and_nothing_before_the_first_pose() -> None:

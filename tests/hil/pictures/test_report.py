@@ -268,6 +268,7 @@ def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_sh
         "close-up-1": [exact(-0.2), exact(1.4)],
         "close-up-2": [exact(0.5), exact(2.99)],
         "close-up-3": [exact(-1.01), exact(2.49)],
+        "scheduler": [exact(0.0), exact(0.02)],
     }
     flown = read_result(folder)
     assert page.links == [link_to(flown, at_s) for at_s in (0.3, 1.0, 1.99)]

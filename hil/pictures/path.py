@@ -1,0 +1,95 @@
+"""The path of the body around its target as SVG, which needs no drawing library: in space, from above, from the side.
+
+Lengths in cm in the goal frame. A view turns points of that frame into its plane: (2, 3), across and up.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.pictures import scene
+from hil.pictures.curves import BLUE
+from hil.pictures.panels import Still
+
+Points = NDArray[np.float64]
+
+POINTS = 5000  # drawn at most of a path
+WIDTH, HEIGHT = 920, 310  # of the picture; the units of what follows
+REACH = 100  # from the middle of a view to its edge
+STEPS_CM = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # between two ticks
+TITLES = 1.4  # distance of an axis's title from the middle, as a share of that of its numbers
+TICKS = 2.5  # at most on either side of zero
+AZIMUTH, ELEVATION = np.radians(-60.0), np.radians(30.0)  # of the eye in space
+SPACE = 0.62 * np.array([
+    (-np.sin(AZIMUTH), np.cos(AZIMUTH), 0.0),
+    (-np.sin(ELEVATION) * np.cos(AZIMUTH), -np.sin(ELEVATION) * np.sin(AZIMUTH), np.cos(ELEVATION)),
+])  # fmt: skip
+ABOVE = np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
+SIDE = np.array([(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+
+
+@dataclass(frozen=True, slots=True)
+class _Wall:
+    """A plane with a grid: two axes, and the place of the plane along the third one, as a share of the reach.
+
+    The first axis is labelled beside its grid lines, at `labels` of the reach along the second one; 0: not at all.
+    """
+
+    axis: int
+    other: int
+    place: float
+    labels: float
+
+
+def path_around(points: Points, half: float) -> Still:
+    """Draw the path (N, 3) around the origin, a red cross, with the box whose edges are `half` away."""
+    points = points[:: len(points) // POINTS + 1]
+    reach = max(1.1 * half, float(np.abs(points).max(initial=0.0)))
+    behind = (_Wall(0, 2, 1.0, 0.0), _Wall(1, 2, -1.0, 0.0), _Wall(2, 1, -1.0, 0.0))
+    views = (
+        (150, SPACE, (_Wall(0, 1, -1.0, -1.25), _Wall(1, 0, -1.0, 1.25), _Wall(2, 0, 1.0, 1.25), *behind)),
+        (470, ABOVE, (_Wall(0, 1, 0.0, -1.15), _Wall(1, 0, 0.0, -1.2))),
+        (780, SIDE, (_Wall(0, 2, 0.0, -1.15), _Wall(2, 0, 0.0, -1.2))),
+    )
+    parts = []
+    for middle, turned, walls in views:
+        view = turned * REACH / reach * ((1.0,), (-1.0,))
+        inside = [mark for wall in walls for mark in _grid(view, wall, reach)]
+        inside += [_line(view, line, "black", 0.9) for line in scene.box_lines(half)]
+        inside += [
+            _line(view, points, BLUE, 0.8),
+            '<path d="M-6 0h12M0-6v12" stroke="red" stroke-width="1.8"/>',
+        ]
+        parts.append(f'<g transform="translate({middle} 135)">{"".join(inside)}</g>')
+    svg = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" fill="none" font-size="11" '
+        f'font-family="sans-serif"><rect width="{WIDTH}" height="{HEIGHT}" fill="white"/>{"".join(parts)}</svg>'
+    )
+    return Still(svg.encode(), "svg+xml")
+
+
+def _grid(view: Points, wall: _Wall, reach: float) -> Iterator[str]:
+    """Yield the grid lines of a wall with the numbers beside them, and the label of its axis."""
+    step = next((step for step in STEPS_CM if reach / step <= TICKS), STEPS_CM[-1])
+    for tick in np.arange(-(reach // step), reach // step + 1) * step:
+        ends = np.full((2, 3), wall.place * reach)
+        ends[:, wall.axis], ends[:, wall.other] = tick, (-reach, reach)
+        yield _line(view, ends, "#cccccc", 0.7)
+        if wall.labels:
+            yield _text(view, wall, reach, (tick, wall.labels * reach), f"{tick:g}")
+    if wall.labels:
+        yield _text(view, wall, reach, (0.0, TITLES * wall.labels * reach), f"{'xyz'[wall.axis]} [cm]")
+
+
+def _text(view: Points, wall: _Wall, reach: float, place: tuple[float, float], text: str) -> str:
+    point = np.full(3, wall.place * reach)
+    point[[wall.axis, wall.other]] = place
+    x, y = view @ point
+    return f'<text x="{x:.1f}" y="{y + 4:.1f}" fill="#333333" text-anchor="middle">{text}</text>'
+
+
+def _line(view: Points, line: Points, colour: str, width: float) -> str:
+    places = " ".join(f"{x:.1f},{y:.1f}" for x, y in (line @ view.T).tolist())
+    return f'<polyline points="{places}" stroke="{colour}" stroke-width="{width}"/>'
