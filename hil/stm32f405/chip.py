@@ -97,6 +97,7 @@ class Chip:
             unicorn_const.UC_ARCH_ARM, unicorn_const.UC_MODE_THUMB | unicorn_const.UC_MODE_MCLASS
         )
         self._cpu.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
+        self._cpu.ctl_set_tlb_mode(unicorn_const.UC_TLB_VIRTUAL)  # machine.c says who may execute
         self._numbers = _register_numbers(arm_const)
         self._map(unicorn_const)
         self._sums = _sums(code, base, constants)

@@ -4,7 +4,7 @@
  */
 #include "registers.h"
 
-enum scenario { FRAMES = 1, MASKING, ORDER, SYSTICK, SLEEP, IT_BLOCKS };
+enum scenario { FRAMES = 1, MASKING, ORDER, SYSTICK, SLEEP, IT_BLOCKS, CODE_IN_RAM };
 
 #define NUMBERS "0,1,2,3,4,5,6,7,8,9,10,11,12"
 #define FP_NUMBERS NUMBERS ",13,14,15,16,17,18,19,20,21,22,23,24,25,26,27,28,29,30,31"
@@ -202,9 +202,24 @@ static void it_blocks(void) {
   note(ticks), note(ticks_in_it_blocks);
 }
 
+/* Calls `movs r0, #n; bx lr` from RAM, where n changes between the calls, beside data in the same page. */
+static void code_in_ram(void) {
+  static volatile uint16_t code[8] __attribute__((aligned(16)));
+  uint32_t (*call)(void) = (uint32_t(*)(void))((uint32_t)code | 1);
+  code[1] = 0x4770;
+  for (uint32_t n = 0; n < 6; n++) {
+    code[0] = 0x2000 | n;
+    __asm volatile("dsb\n isb" ::: "memory");
+    note(call());
+    code[7] = n;
+    note(call());
+  }
+}
+
 void run_scenario(uint32_t number) {
   static void (*const scenarios[])(void) = {
       [FRAMES] = frames, [MASKING] = masking, [ORDER] = order, [SYSTICK] = systick, [SLEEP] = sleep, [IT_BLOCKS] = it_blocks,
+      [CODE_IN_RAM] = code_in_ram,
   };
   scenarios[number]();
   finished = 1;

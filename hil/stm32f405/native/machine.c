@@ -3,12 +3,16 @@
 
 #include <string.h>
 
-enum { HOOK_INTR = 1, HOOK_CODE = 4, HOOK_BLOCK = 8, HOOK_READ = 0x400, HOOK_WRITE = 0x800, HOOK_INVALID = 0x3F0 }; /* of unicorn: accesses where nothing is */
+enum { HOOK_INTR = 1, HOOK_CODE = 4, HOOK_BLOCK = 8, HOOK_READ = 0x400, HOOK_WRITE = 0x800, HOOK_TLB = 0x20000, HOOK_INVALID = 0x3F0 /* accesses where nothing is */ };
 enum { READ_UNMAPPED = 6, WRITE_UNMAPPED, FETCH_UNMAPPED, INVALID = 10, WRITE_PROTECTED = 12, FETCH_PROTECTED = 14 };
+enum { ACCESS_FETCH = 18, RIGHT_READ = 1, RIGHT_WRITE = 2, RIGHT_EXECUTE = 4, FLUSH_TLB = 11 | 1 << 30 };
 enum { TRAP_SVC = 2, TRAP_BREAKPOINT = 7, TRAP_RETURN = 8, TRAP_NO_FLOATS = 17, TRAP_STATE = 18 };
 enum { R_LR = 10, R_PC = 11, R_SP = 12, R_R0 = 66, R_MSP = 115, R_XPSR = 120, REFILL = 3, NOWHERE = 0xFFFFFFFE, THUMB = 1 << 24 };
 
-void tick_due(struct machine *m);
+struct page { /* uc_tlb_entry */
+    uint64_t address;
+    uint32_t rights;
+};
 
 static void look_ahead(struct machine *m)
 {
@@ -157,6 +161,23 @@ static int on_invalid(uc_engine *uc, int type, uint64_t address, int size, int64
     return 0;
 }
 
+/* Map a page for data alone until something there is executed: unicorn stores slowly to a page with code, which it watches. */
+static int on_page(uc_engine *uc, uint64_t address, int type, struct page *page, void *user)
+{
+    struct machine *m = user;
+    uint64_t place = address - RAM_BASE;
+    int executed = type == ACCESS_FETCH;
+    if (place < RAM_SIZE) {
+        uint8_t *known = &m->executed[place / PAGE_SIZE];
+        if (executed && !*known)
+            m->engine.ctl(uc, FLUSH_TLB); /* forget that its data alone were mapped */
+        executed = *known |= executed;
+    }
+    page->address = address;
+    page->rights = RIGHT_READ | RIGHT_WRITE | (executed ? RIGHT_EXECUTE : 0);
+    return 1;
+}
+
 static void on_break(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
@@ -243,6 +264,7 @@ int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flas
                    const uint32_t *instructions_before, const uint32_t *cycles_before)
 {
     const uint64_t everywhere[2] = {1, 0};
+    const uint64_t not_memory[3][2] = {{0, CCM_BASE - 1}, {CCM_BASE + CCM_SIZE, RAM_BASE - 1}, {RAM_BASE + RAM_SIZE, UINT32_MAX}};
     uint64_t hook;
     m->engine = *engine;
     m->flash = flash;
@@ -256,7 +278,9 @@ int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flas
     failed |= engine->mmio_map(uc, 0xE0000000, 0x100000, system_read, m, system_write, m);
     failed |= engine->hook_add(uc, &hook, HOOK_BLOCK, (void *)on_block, m, everywhere[0], everywhere[1]);
     failed |= engine->hook_add(uc, &hook, HOOK_INTR, (void *)on_trap, m, everywhere[0], everywhere[1]);
-    failed |= engine->hook_add(uc, &hook, HOOK_INVALID, (void *)on_invalid, m, everywhere[0], everywhere[1]);
+    failed |= engine->hook_add(uc, &hook, HOOK_TLB, (void *)on_page, m, everywhere[0], everywhere[1]);
+    for (unsigned i = 0; i < 3; i++)
+        failed |= engine->hook_add(uc, &hook, HOOK_INVALID, (void *)on_invalid, m, not_memory[i][0], not_memory[i][1]);
     return failed | look_at_code(m);
 }
 

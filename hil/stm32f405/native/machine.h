@@ -17,7 +17,7 @@ enum {
     FLASH_BASE = 0x08000000, FLASH_SIZE = 0x100000,
     RAM_BASE = 0x20000000, RAM_SIZE = 0x20000,
     CCM_BASE = 0x10000000, CCM_SIZE = 0x10000,
-    PERIPHERALS_SIZE = 0x80000,
+    PERIPHERALS_SIZE = 0x80000, PAGE_SIZE = 1024, /* unicorn's pages of memory */
     TIMERS = 14, BUSES = 3, USARTS = 6, PORTS = 9, DMAS = 2, STREAMS = 8,
     EXCEPTIONS = 128, IRQ = 16, /* exception number of interrupt 0 */
     DEVICES = 8, BREAKPOINTS = 64, LOW_WRITERS = 16, WATCHPOINTS = 8, LINE_BYTES = 4096, TASKS = 32, SWITCHES = 4096,
@@ -145,6 +145,7 @@ struct machine {
     const uint32_t *instructions_before, *cycles_before; /* of every half word of flash */
     uint64_t next_address;
     uint8_t *flash, *ram, *ccm;
+    uint8_t executed[RAM_SIZE / PAGE_SIZE]; /* pages of RAM from which code was executed */
     uint32_t stopping, attention, fault, stepping, first_step;
     uint64_t break_hook[BREAKPOINTS];
     uint32_t break_address[BREAKPOINTS];

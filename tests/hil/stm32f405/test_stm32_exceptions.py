@@ -8,7 +8,7 @@ import pytest
 
 from support.stm32_machine import FirmwareOnChip
 
-FRAMES, MASKING, ORDER, SYSTICK, SLEEP, IT_BLOCKS = range(1, 7)
+FRAMES, MASKING, ORDER, SYSTICK, SLEEP, IT_BLOCKS, CODE_IN_RAM = range(1, 8)
 SVC = 11
 FPCA = 4
 PADDED, ALL_FLAGS, THUMB = 1 << 9, 0xF800_0000, 1 << 24
@@ -147,3 +147,9 @@ def test_it_blocks_survive_interrupts(compiler: str) -> None:
     (first, second, third, fourth, ticks, _), _ = recorded(IT_BLOCKS, compiler)
     assert (first, second, third, fourth) == (40_000, 0, 40_000, 0)
     assert ticks > 100
+
+
+@COMPILERS
+def test_code_in_ram_is_executed_as_it_was_written_last(compiler: str) -> None:
+    returned, _ = recorded(CODE_IN_RAM, compiler)
+    assert returned == [n for n in range(6) for _ in range(2)]
