@@ -405,6 +405,31 @@ def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
     assert complaint in str(caught.value)
 
 
+def test_what_need_not_wait_is_allowed_while_the_scheduler_is_suspended():
+    kernel = Kernel()
+    queue = kernel.create_queue(1, "queue")
+    semaphore = kernel.create_binary_semaphore("semaphore")
+    mutex = kernel.create_mutex("mutex")
+    results = []
+
+    def body():
+        kernel.suspend_all()
+        results.append((yield from queue.receive(0)))
+        results.append((yield from queue.send("item", 0)))
+        results.append((yield from semaphore.take(0)))
+        results.append((yield from mutex.take(0)))
+        results.append((yield from mutex.give()))
+        yield from kernel.current.notify()
+        results.append((yield from kernel.notify_take(True, 5)))
+        yield from kernel.delay(0)
+        yield from kernel.resume_all()
+
+    kernel.create_task("task", 1, body)
+    kernel.start()
+    kernel.run(0)
+    assert results == [None, True, False, True, True, 1]
+
+
 def test_a_free_mutex_cannot_be_given():
     kernel = Kernel()
     mutex = kernel.create_mutex("mutex")
