@@ -60,20 +60,15 @@ class Mistake:
 
 def read(table: Path) -> list[Mistake]:
     """Return the rows of a table."""
-    return [
-        Mistake(
-            path,
-            row["old"],
-            row["new"],
-            tuple(row.get("tests", tests).split()),
-            row.get("hangs", False),
-            file.get("build", ""),
-        )
-        for path, file in tomllib.loads(table.read_text(encoding="utf-8")).items()
-        for tests, mistakes in file.items()
-        if tests != "build"
-        for row in mistakes
-    ]
+    rows = []
+    for path, groups in tomllib.loads(table.read_text(encoding="utf-8")).items():
+        build = groups.pop("build", "")
+        for tests, mistakes in groups.items():
+            for old, wrong in mistakes.items():
+                row = wrong if isinstance(wrong, dict) else {"new": wrong}
+                chosen = tuple(row.get("tests", tests).split())
+                rows.append(Mistake(path, old, row["new"], chosen, row.get("hangs", False), build))
+    return rows
 
 
 def planted(mistake: Mistake, root: Path) -> str:

@@ -41,10 +41,15 @@ from native.building import build
 def test_three_steps_are_counted(tmp_path):
     assert ctypes.CDLL(str(build(tmp_path))).steps(-3) == 3
 """
-CAUGHT = "{ old = 'left, steps = abs(n), 0', new = 'left, steps = abs(n), 1' }"
-SURVIVES = "{ old = 'abs(n)', new = 'n' }"
-HANGS = "{ old = 'left - 1', new = 'left', hangs = true }"
-TOO_SLOW = "{ old = 'left - 1', new = 'left' }"
+CAUGHT = "'left, steps = abs(n), 0' = 'left, steps = abs(n), 1'"
+SURVIVES = "'abs(n)' = 'n'"
+HANGS = "'left - 1' = { new = 'left', hangs = true }"
+TOO_SLOW = "'left > 0' = 'left == left'"
+
+
+def named_by(test: str) -> str:
+    old, new = CAUGHT.split(" = '")
+    return f"{old} = {{ new = '{new}, tests = '{test}' }}"
 
 
 @pytest.fixture
@@ -57,8 +62,7 @@ def project(tmp_path: Path) -> Path:
 
 def plant(project: Path, *rows: str, options: tuple[str, ...] = ()) -> int:
     table = project / "table.toml"
-    mistakes = ", ".join(rows)
-    table.write_text(f'["steps.py"]\n"test_steps.py" = [{mistakes}]\n')
+    table.write_text("\n".join(['["steps.py"."test_steps.py"]', *rows]))
     return planted_mistakes.main(options, project, table)
 
 
@@ -92,35 +96,35 @@ def plant_c(project: Path, *rows: str, build: str = "build = 'native.building:bu
     (project / "native" / "building.py").write_text(C_BUILD)
     (project / "test_c.py").write_text(C_TESTS)
     table = project / "table.toml"
-    table.write_text(f'["native/steps.c"]\n{build}\n"test_c.py" = [{", ".join(rows)}]\n')
+    table.write_text("\n".join(['["native/steps.c"]', build, '["native/steps.c"."test_c.py"]', *rows]))
     return planted_mistakes.main((), project, table)
 
 
 @pytest.mark.long
 def test_a_mistake_in_c_is_caught_by_a_test_that_fails(project, capsys) -> None:
-    assert plant_c(project, "{ old = '-n', new = 'n' }", "{ old = 'n < 0', new = 'n <= 0' }") == 1
+    assert plant_c(project, "'-n' = 'n'", "'n < 0' = 'n <= 0'") == 1
     assert "1 of 2 caught, 50.0 %; survived:\n  native/steps.c: n < 0 -> n <= 0\n" in capsys.readouterr().out
     assert (project / "native" / "steps.c").read_text() == C_SOURCE
 
 
 @pytest.mark.long
 def test_c_that_does_not_compile_is_a_mistake_of_the_table(project, capsys) -> None:
-    assert plant_c(project, "{ old = '-n', new = 'm' }") == 2
+    assert plant_c(project, "'-n' = 'm'") == 2
     said = capsys.readouterr()
     assert said.err.startswith("native/steps.c: 'm' does not build: ")
     assert said.err.count("\n") == 1
     assert "caught" not in said.out
-    assert plant_c(project, "{ old = '-n', new = 'n' }", build="") == 2
+    assert plant_c(project, "'-n' = 'n'", build="") == 2
     assert 'native/steps.c: `build = "module:function"` is missing' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("row", "complaint"),
     [
-        ("{ old = 'right', new = 'left' }", "steps.py: 'right' occurs 0 times, not once"),
-        ("{ old = 'left', new = 'right' }", "steps.py: 'left' occurs 4 times, not once"),
-        ("{ old = 'steps + 1', new = 'steps +' }", "steps.py: 'steps +' is no Python: invalid syntax"),
-        ("{ old = 'abs(n)', new = 'n', tests = 'test_x.py' }", "steps.py: no such tests: test_x.py"),
+        ("'right' = 'left'", "steps.py: 'right' occurs 0 times, not once"),
+        ("'left' = 'right'", "steps.py: 'left' occurs 4 times, not once"),
+        ("'steps + 1' = 'steps +'", "steps.py: 'steps +' is no Python: invalid syntax"),
+        ("'abs(n)' = { new = 'n', tests = 'test_x.py' }", "steps.py: no such tests: test_x.py"),
     ],
 )
 def test_a_bad_row_is_one_line_and_exit_code_two_before_anything_is_planted(
@@ -151,8 +155,8 @@ def test_one_room_with_too_many_survivors_is_not_made_up_for_by_the_others(
     (project / "room" / "quiet.py").write_text("LOUD = 1\n")
     table = project / "table.toml"
     table.write_text(
-        f'["steps.py"]\n"test_steps.py" = [{CAUGHT}, {CAUGHT}]\n'
-        "[\"room/quiet.py\"]\n'test_steps.py' = [{ old = '1', new = '2' }]\n"
+        f'["steps.py"."test_steps.py"]\n{CAUGHT}\n\'abs(n), 0\' = "abs(n), 1"\n'
+        "['room/quiet.py'.'test_steps.py']\n'1' = '2'\n"
     )
     assert planted_mistakes.main(("--jobs", "2"), project, table) == 1
     said = capsys.readouterr().out
@@ -167,7 +171,7 @@ def test_a_long_test_that_a_row_names_counts(project, capsys) -> None:
     (project / "test_steps.py").write_text(
         TESTS.replace("def test", "import pytest\n\n@pytest.mark.long\ndef test")
     )
-    named = CAUGHT.replace("}", ", tests = 'test_steps.py::test_three_steps_are_counted' }")
+    named = named_by("test_steps.py::test_three_steps_are_counted")
     assert plant(project, named) == 0
 
 
@@ -178,7 +182,7 @@ def test_a_pattern_that_no_row_matches_is_exit_code_two(project, capsys) -> None
 
 @pytest.mark.long
 def test_tests_that_fail_or_are_not_there_without_a_mistake_catch_nothing(project, capsys) -> None:
-    assert plant(project, CAUGHT.replace("}", ", tests = 'test_steps.py::test_x' }")) == 2
+    assert plant(project, named_by("test_steps.py::test_x")) == 2
     assert capsys.readouterr().err == "without any mistake pytest ends with 4: test_steps.py::test_x\n"
     (project / "test_steps.py").write_text(TESTS.replace("== 3", "== 4"))
     assert plant(project, CAUGHT) == 2
