@@ -76,9 +76,11 @@ static void count(struct machine *m, uint64_t address, uint32_t size)
         uint64_t first = begin / 2, last = (begin + size) / 2;
         m->instructions += m->instructions_before[last] - m->instructions_before[first];
         m->now += m->cycles_before[last] - m->cycles_before[first];
+        m->stacks = m->stackers_before[last] != m->stackers_before[first];
     } else { /* in RAM: as if all were narrow */
         m->instructions += size / 2;
         m->now += size / 2;
+        m->stacks = 1;
     }
     if (address != m->next_address)
         m->now += REFILL;
@@ -111,7 +113,7 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
     }
     if (resumed == (uint32_t)address) /* in the middle of a block, all of which was counted when it began */
         return;
-    if (m->stack_begin && !m->overflow && in_task(m))
+    if (m->stacks && m->stack_begin && !m->overflow && in_task(m))
         look_at_stack_pointer(m);
     if (m->next_due <= m->now)
         let_happen(m);
@@ -238,7 +240,15 @@ static void on_division(uc_engine *uc, uint64_t address, uint32_t size, void *us
     stop(m, (uint32_t)address);
 }
 
-/* Have the instructions looked at that sleep or divide; elsewhere than at an instruction nothing comes of it. */
+/* Whether an instruction may lower the stack pointer, by its first half word: PUSH, SUB, MOV or ADD to SP, and stores and
+   floats with write-back to it. */
+static int lowers_stack(uint16_t first)
+{
+    return (first & 0xFE00) == 0xB400 || (first & 0xFF80) == 0xB080 || (first & 0xFC87) == 0x4485 || (first & 0xFE0F) == 0xE80D ||
+           (first & 0xFE0F) == 0xEC0D || (first & 0xF80F) == 0xF00D || (first & 0xFE0F) == 0xEA0D || (first & 0xFE0F) == 0xF80D;
+}
+
+/* Find the instructions that sleep, divide or stack; elsewhere than at an instruction nothing comes of it. */
 static int look_at_code(struct machine *m)
 {
     uint16_t at[2];
@@ -250,7 +260,9 @@ static int look_at_code(struct machine *m)
         if (at[0] == 0xBF30 || divides) /* WFI */
             failed |= m->engine.hook_add(m->engine.uc, &hook, HOOK_CODE, divides ? (void *)on_division : (void *)on_sleep, m,
                                          FLASH_BASE + i, FLASH_BASE + i);
+        m->stackers_before[i / 2 + 1] = m->stackers_before[i / 2] + lowers_stack(at[0]);
     }
+    m->stackers_before[FLASH_SIZE / 2] = m->stackers_before[FLASH_SIZE / 2 - 1];
     return failed;
 }
 

@@ -143,6 +143,7 @@ struct machine {
     struct engine engine;
     uint64_t until, due[SLOTS];
     const uint32_t *instructions_before, *cycles_before; /* of every half word of flash */
+    uint32_t stackers_before[FLASH_SIZE / 2 + 1], stacks; /* of what may lower a stack pointer; whether the last block has it */
     uint64_t next_address;
     uint8_t *flash, *ram, *ccm;
     uint8_t executed[RAM_SIZE / PAGE_SIZE]; /* pages of RAM from which code was executed */
