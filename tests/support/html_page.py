@@ -41,7 +41,7 @@ class Page(HTMLParser):
             self.places.append(values["id"])
         self._reads_plots = values.get("type") == "application/json"
         for name in ("src", "href"):
-            if values.get(name, "").startswith("data:image/png;base64,"):
+            if values.get(name, "").startswith("data:image/"):
                 self.pictures.append(base64.b64decode(values[name].partition(",")[2]))
             elif name in values and not values[name].startswith("#"):
                 self.links.append(values[name])
