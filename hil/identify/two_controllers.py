@@ -5,7 +5,7 @@ squares over the low frequencies of windows of 4 s, as in the author's script. F
 (roll_dynamics_input_const): a = (c1* - c2*) / (c1 - c2) with the controllers' own c, then b, c and d.
 
 It does not recover a known plant. A' is the derivative of the same A, so that jw A' = -w^2 A holds in every bin whatever the
-robot does: least squares find b* near 0 and c* near the mean of -w^2 over the spectrum (`hil.identify.pictures` shows it).
+robot does: least squares find b* near 0 and c* near the mean of -w^2 over the spectrum (`hil.identify.pages` shows it).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What Motive says on the network, as bytes: the other direction of `ground_station.sources.natnet`, whose values it packs.
 
-Pure functions; sockets: `virtual_motive`. Layouts: those of `ground_station.sources.natnet`.
+Pure functions; sockets: `hil.servers.motive`. Layouts: those of `ground_station.sources.natnet`.
 """
 
 import struct

@@ -118,18 +118,6 @@ def framed(payload: bytes) -> bytes:
     return b"$%s#%02x" % (escaped, sum(escaped) & 0xFF)
 
 
-def unescaped(payload: bytes) -> bytes:
-    """Return the content of a packet, without the escapes of binary data."""
-    content, escaping = bytearray(), False
-    for byte in payload:
-        if escaping:
-            content.append(byte ^ ESCAPED_WITH)
-        elif byte != ESCAPE:
-            content.append(byte)
-        escaping = byte == ESCAPE and not escaping
-    return bytes(content)
-
-
 @dataclass(slots=True)
 class Framing:
     """Cuts what arrives into packets; what is longer than `2 * PACKET_SIZE` without an end is dropped."""
@@ -175,19 +163,16 @@ class RemoteProtocol:
         self._commands: dict[bytes, Callable[[bytes], bytes]] = {
             b"?": lambda _: self._stop_reply(),
             b"g": lambda _: self._registers(range(len(REGISTERS))),
-            b"G": self._set_all_registers,
             b"p": lambda rest: self._registers((_hex(rest),)),
             b"P": self._set_one_register,
             b"m": self._read,
-            b"M": lambda rest: self._write(rest, _unhex),
-            b"X": lambda rest: self._write(rest, unescaped),
+            b"M": self._write,
             b"Z": lambda rest: self._breakpoint(rest, True),
             b"z": lambda rest: self._breakpoint(rest, False),
             b"c": lambda rest: self._resume(Wish.RUN, rest),
             b"s": lambda rest: self._resume(Wish.STEP, rest),
             b"C": lambda rest: self._resume(Wish.RUN, rest.partition(b";")[2]),
             b"S": lambda rest: self._resume(Wish.STEP, rest.partition(b";")[2]),
-            b"v": self._verbose,
             b"q": self._query,
             b"Q": self._set,
             b"H": self._select,
@@ -287,43 +272,28 @@ class RemoteProtocol:
                 return MALFORMED
         return b"OK"
 
-    def _set_all_registers(self, rest: bytes) -> bytes:
-        data = _unhex(rest)
-        if len(data) != sum(size for _, size in REGISTERS):
-            raise MalformedError
-        self._check_machine()
-        # From the last on, so that `sp` counts and not the old value of the stack pointer that is in use.
-        for name, size in reversed(REGISTERS):
-            data, value = data[:-size], data[-size:]
-            self._debuggee.set_register(name, int.from_bytes(value, "little"))
-        return b"OK"
-
     def _set_one_register(self, rest: bytes) -> bytes:
         number, _, value = rest.partition(b"=")
         name, size = _known(_hex(number))
         data = _unhex(value)
         if len(data) != size:
             raise MalformedError
-        self._check_machine()
-        self._debuggee.set_register(name, int.from_bytes(data, "little"))
-        return b"OK"
-
-    def _check_machine(self) -> None:
         if not self._is_machine():
             raise LabError("the registers of a task that does not run cannot be changed")
+        self._debuggee.set_register(name, int.from_bytes(data, "little"))
+        return b"OK"
 
     def _read(self, rest: bytes) -> bytes:
         address, size = _pair(rest)
         return self._debuggee.read(address, min(size, PACKET_SIZE // 2)).hex().encode()
 
-    def _write(self, rest: bytes, decoded: Callable[[bytes], bytes]) -> bytes:
+    def _write(self, rest: bytes) -> bytes:
         where, _, content = rest.partition(b":")
         address, size = _pair(where)
-        data = decoded(content)
-        if len(data) != size:
+        data = _unhex(content)
+        if not data or len(data) != size:
             raise MalformedError
-        if data:  # X of no bytes asks whether X is known
-            self._debuggee.write(address, data)
+        self._debuggee.write(address, data)
         return b"OK"
 
     def _breakpoint(self, rest: bytes, on: bool) -> bytes:
@@ -347,19 +317,9 @@ class RemoteProtocol:
         self.wish = wish
         return b""
 
-    def _verbose(self, rest: bytes) -> bytes:
-        if rest == b"Cont?":
-            return b"vCont;c;C;s;S"
-        if not rest.startswith(b"Cont;"):
-            return b""
-        action = rest[5:6]  # that of the first thread is for all: one processor
-        if action not in b"cCsS" or not action:
-            raise MalformedError
-        return self._resume(Wish.RUN if action in b"cC" else Wish.STEP, b"")
-
     def _query(self, rest: bytes) -> bytes:
         if rest.startswith(b"Supported"):
-            return b"PacketSize=%x;qXfer:features:read+;QStartNoAckMode+;vContSupported+" % PACKET_SIZE
+            return b"PacketSize=%x;qXfer:features:read+;QStartNoAckMode+" % PACKET_SIZE
         if rest.startswith(b"Xfer:features:read:target.xml:"):
             offset, size = _pair(rest.rpartition(b":")[2])
             text = target_description().encode()

@@ -208,7 +208,7 @@ uint32_t timer_read(struct machine *m, unsigned n, uint32_t offset);
 void timer_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
 void timer_due(struct machine *m, unsigned n);
 
-/* serial.c: I2C, USART and the DMA between them and memory */
+/* i2c.c, usart.c */
 uint32_t bus_read(struct machine *m, unsigned n, uint32_t offset);
 void bus_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value);
 void bus_due(struct machine *m, unsigned n);

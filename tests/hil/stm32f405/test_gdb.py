@@ -24,7 +24,6 @@ from hil.stm32f405.gdb_protocol import (
     RemoteProtocol,
     Wish,
     framed,
-    unescaped,
 )
 from hil.stm32f405.image import Image
 from support import stm32_firmware
@@ -56,7 +55,7 @@ def ask(protocol: RemoteProtocol, payload: bytes) -> bytes:
     answer = protocol.receive(framed(payload))
     assert answer[:2] == b"+$", answer
     assert answer[-3:] == b"#%02x" % (sum(answer[2:-3]) % 256)
-    return unescaped(answer[2:-3])
+    return re.sub(rb"}(.)", lambda escaped: bytes((escaped[1][0] ^ 0x20,)), answer[2:-3], flags=re.DOTALL)
 
 
 def test_a_packet_has_the_checksum_of_its_bytes() -> None:
@@ -64,14 +63,6 @@ def test_a_packet_has_the_checksum_of_its_bytes() -> None:
     assert framed(b"") == b"$#00"
     assert framed(b"OK") == b"$OK#9a"
     assert framed(b"a#b") == b"$a}\x03b#43"
-
-
-@given(st.binary(max_size=300))
-def test_binary_data_survives_its_escapes(data: bytes) -> None:
-    packet = framed(data)
-    assert packet.count(b"#") == 1
-    assert b"$" not in packet[1:]
-    assert unescaped(packet[1:-3]) == data
 
 
 @settings(max_examples=25)
@@ -105,13 +96,15 @@ def test_without_acknowledgements_only_answers_are_sent(protocol: RemoteProtocol
 
 
 def test_what_is_not_known_is_answered_with_nothing(protocol: RemoteProtocol) -> None:
-    for packet in (b"vMustReplyEmpty", b"qTStatus", b"R00", b"b", b"Z5,20000000,4", b"QPassSignals:", b"_"):
+    for (
+        packet
+    ) in b"vMustReplyEmpty vCont? X20000000,0: G00 qTStatus R00 b Z5,20000000,4 QPassSignals: _".split():
         assert ask(protocol, packet) == b""
 
 
 @pytest.mark.parametrize(
-    "packet", [b"m", b"m,", b"m20000000", b"mxyz,4", b"p", b"pff", b"P0", b"P0=12", b"G00", b"M20000000,4:00",
-               b"X20000000,4:0", b"Z0", b"Z1,", b"vCont;", b"vCont;x", b"c-1", b"M20000000,1:zz"],
+    "packet", [b"m", b"m,", b"m20000000", b"mxyz,4", b"p", b"pff", b"P0", b"P0=12", b"M20000000,4:00",
+               b"M20000000,0:", b"Z0", b"Z1,", b"c-1", b"M20000000,1:zz"],
 )  # fmt: skip
 def test_a_malformed_packet_changes_nothing(
     protocol: RemoteProtocol, machine: BareCortex, packet: bytes
@@ -124,7 +117,7 @@ def test_a_malformed_packet_changes_nothing(
 
 
 @settings(max_examples=25)
-@given(st.lists(st.binary(max_size=30) | st.sampled_from([b"$", b"#", b"m", b"vCont;", b"}"]), max_size=8))
+@given(st.lists(st.binary(max_size=30) | st.sampled_from([b"$", b"#", b"m", b"}"]), max_size=8))
 def test_nothing_that_arrives_raises(image: Image, pieces: list[bytes]) -> None:
     protocol = RemoteProtocol(BareCortex(image))
     for piece in pieces:
@@ -135,8 +128,7 @@ def test_nothing_that_arrives_raises(image: Image, pieces: list[bytes]) -> None:
 def test_the_supported_features_are_those_that_are_there(protocol: RemoteProtocol) -> None:
     features = ask(protocol, b"qSupported:multiprocess+;swbreak+;hwbreak+").split(b";")
     assert b"PacketSize=%x" % PACKET_SIZE in features
-    assert {b"QStartNoAckMode+", b"qXfer:features:read+", b"vContSupported+"} <= set(features)
-    assert ask(protocol, b"vCont?") == b"vCont;c;C;s;S"
+    assert {b"QStartNoAckMode+", b"qXfer:features:read+"} <= set(features)
     assert (ask(protocol, b"qfThreadInfo"), ask(protocol, b"qsThreadInfo"), ask(protocol, b"qC")) == (
         b"m1",
         b"l",
@@ -158,7 +150,7 @@ def test_the_target_description_numbers_the_registers_as_they_are_sent(protocol:
     assert [name for name, _ in registers[:17]] == [*(f"r{n}" for n in range(13)), "sp", "lr", "pc", "xpsr"]
 
 
-def test_registers_are_read_and_written_one_by_one_and_all_at_once(
+def test_registers_are_read_all_at_once_and_written_one_by_one(
     protocol: RemoteProtocol, machine: BareCortex
 ) -> None:
     number = {name: index for index, (name, _) in enumerate(REGISTERS)}
@@ -169,22 +161,15 @@ def test_registers_are_read_and_written_one_by_one_and_all_at_once(
         unpack_from("<Q", pack("<d", -1.5))[0],
     )
     assert ask(protocol, b"p%x" % number["r7"]) == b"78563412"
-    everything = bytearray.fromhex(ask(protocol, b"g").decode())
+    everything = bytes.fromhex(ask(protocol, b"g").decode())
     assert len(everything) == sum(size for _, size in REGISTERS)
     assert everything[28:32] == bytes.fromhex("78563412")
-    everything[28:32] = bytes(4)
-    everything[13 * 4 : 14 * 4] = pack("<I", 0x2000_1230)
-    assert ask(protocol, b"G" + everything.hex().encode()) == b"OK"
-    assert (machine.register("r7"), machine.register("sp")) == (0, 0x2000_1230)
 
 
-@pytest.mark.parametrize("command", [b"M", b"X"])
-def test_memory_is_read_and_written(protocol: RemoteProtocol, command: bytes) -> None:
+def test_memory_is_read_and_written(protocol: RemoteProtocol) -> None:
     data = bytes(range(0x20, 0x30)) + b"}}*$#"
-    written = data.hex().encode() if command == b"M" else data
-    assert ask(protocol, b"%s20000100,%x:%s" % (command, len(data), written)) == b"OK"
+    assert ask(protocol, b"M20000100,%x:%s" % (len(data), data.hex().encode())) == b"OK"
     assert bytes.fromhex(ask(protocol, b"m20000100,%x" % len(data)).decode()) == data
-    assert ask(protocol, command + b"20000100,0:") == b"OK"
 
 
 def test_memory_that_is_not_there_is_an_error(protocol: RemoteProtocol) -> None:
