@@ -48,7 +48,7 @@ ROTORPY_S = 5.0
 
 
 def best(measure: Callable[[], float]) -> float:
-    """The smallest of a few measurements: the one that was disturbed least."""
+    """Return the smallest of a few measurements: the one that was disturbed least."""
     return min(measure() for _ in range(REPEATS))
 
 

@@ -22,7 +22,7 @@ WORK_US = (30, 50, 50, 200)
 
 
 def kernel_run(ticks: int, work: bool = False) -> int:
-    """Runs the pattern for `ticks` milliseconds of simulated time; returns the number of samples that arrived."""
+    """Run the pattern for `ticks` milliseconds of simulated time; return the number of samples that arrived."""
     kernel = Kernel()
     imu_ready = kernel.create_binary_semaphore("imu_ready")
     sample_ready = kernel.create_binary_semaphore("sample_ready")
@@ -67,7 +67,7 @@ def kernel_run(ticks: int, work: bool = False) -> int:
 
 
 def _drive(kernel: Kernel, imu_ready: Semaphore, ticks: int) -> None:
-    """The harness's loop, with the IMU as the only hardware."""
+    """Run the harness's loop, with the IMU as the only hardware."""
     imu_us = IMU_PHASE_US
     end_us = ticks * TICK_US
     while imu_us < end_us:
@@ -80,7 +80,7 @@ def _drive(kernel: Kernel, imu_ready: Semaphore, ticks: int) -> None:
 
 
 def simpy_run(ticks: int) -> int:
-    """The same pattern with simpy's stores and timeouts."""
+    """Run the same pattern with simpy's stores and timeouts."""
     environment = simpy.Environment()
     imu_ready = simpy.Store(environment)
     sample_ready = simpy.Store(environment)
@@ -120,12 +120,12 @@ def simpy_run(ticks: int) -> int:
 
 
 def kernel_us_per_activation(ticks: int = 20_000, work: bool = False) -> float:
-    """The best of three runs of our kernel [us]."""
+    """Return the best of three runs of our kernel [us]."""
     return _best_us(lambda: kernel_run(ticks, work), ticks)
 
 
 def simpy_us_per_activation(ticks: int = 20_000) -> float:
-    """The best of three runs of simpy [us]."""
+    """Return the best of three runs of simpy [us]."""
     return _best_us(lambda: simpy_run(ticks), ticks)
 
 

@@ -1,4 +1,4 @@
-"""Puts the commit into every wheel and sdist, and into a wheel that is built with FLOATY_COMPILED set (`make wheel`) also
+"""Put the commit into every wheel and sdist, and into a wheel that is built with FLOATY_COMPILED set (`make wheel`) also
 the compiled modules."""
 
 import os

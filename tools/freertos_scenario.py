@@ -66,7 +66,7 @@ class Scenario:
     tasks: list[tuple[str, int, bool, list[Operation]]] = field(default_factory=list)
 
     def kinds(self) -> dict[str, Any]:
-        """What each operand may name."""
+        """Return what each operand may name."""
         semaphores = set(self.semaphores)
         return {
             "q": set(self.queues),
@@ -77,7 +77,7 @@ class Scenario:
 
 
 def parse(text: str) -> Scenario:
-    """Reads a scenario; raises ScenarioError."""
+    """Read a scenario; raise ScenarioError."""
     scenario = Scenario()
     unchecked: list[tuple[int, Operation, dict[str, str]]] = []
     for line_number, line in enumerate(text.splitlines(), 1):
@@ -128,7 +128,7 @@ def _parse_line(scenario: Scenario, words: list[str]) -> list[tuple[Operation, d
 
 
 def _check(line: int, name: str, operands: list[Any], known: dict[str, str], kinds: dict[str, Any]) -> None:
-    """Checks an operation and turns its numbers into ints, in place."""
+    """Check an operation and turn its numbers into ints, in place."""
     if name not in known:
         raise ScenarioError(f"line {line}: {name!r} is none of {', '.join(known)}")
     signature = known[name]
@@ -175,7 +175,7 @@ class Run:
             self.tasks[name] = kernel.create_task(name, priority, self._scripted_task, name, operations, once)
 
     def run(self) -> None:
-        """Runs to the end; the instant of the end itself is not run."""
+        """Run to the end; the instant of the end itself is not run."""
         kernel = self.kernel
         end_us = self.scenario.ticks * TICK_US
         kernel.start()
@@ -222,7 +222,7 @@ class Run:
         return callback
 
     def _perform(self, operation: Operation, wake_tick: list[int]) -> Generator[int, None, int]:
-        """Does one operation in the running task; `wake_tick` holds the task's latest planned wake-up."""
+        """Do one operation in the running task; `wake_tick` holds the task's latest planned wake-up."""
         kernel = self.kernel
         name, operands = operation
         match name:
@@ -280,7 +280,7 @@ class Run:
 
 
 def trace(text: str, preemption: bool, write: Callable[[str], Any]) -> None:
-    """Runs the scenario `text` and calls `write` with every line of its trace."""
+    """Run the scenario `text` and call `write` with every line of its trace."""
     Run(parse(text), preemption, lambda us, event, who, a, b: write(f"{us},{event},{who},{a},{b}\n")).run()
 
 

@@ -38,7 +38,7 @@ class Kernel(Scheduler):
         function: Callable[[*Arguments], Generator[int, None, object]],
         *args: *Arguments,
     ) -> Task:
-        """Makes a ready task that runs the generator `function(*args)`; higher numbers are more urgent."""
+        """Make a ready task that runs the generator `function(*args)`; higher numbers are more urgent."""
         task = Task(self, name, priority, function(*args))
         self.tasks.append(task)
         self.make_ready(task)
@@ -53,25 +53,25 @@ class Kernel(Scheduler):
         self.create_task(name, MAX_PRIORITIES - 1, self._occupied, taken_us)
 
     def create_queue(self, length: int, name: str) -> Queue[T]:
-        """Makes an empty queue for at most `length` items."""
+        """Make an empty queue for at most `length` items."""
         queue: Queue[T] = Queue(self, length, name)
         self.queues.append(queue)
         return queue
 
     def create_binary_semaphore(self, name: str) -> Semaphore:
-        """Makes a semaphore of maximum 1 that must be given before it can be taken."""
+        """Make a semaphore of maximum 1 that must be given before it can be taken."""
         return Semaphore(self, 1, 0, name)
 
     def create_counting_semaphore(self, maximum: int, initial: int, name: str) -> Semaphore:
-        """Makes a semaphore that counts from `initial` up to `maximum`."""
+        """Make a semaphore that counts from `initial` up to `maximum`."""
         return Semaphore(self, maximum, initial, name)
 
     def create_mutex(self, name: str) -> Mutex:
-        """Makes a free mutex."""
+        """Make a free mutex."""
         return Mutex(self, name)
 
     def create_timer(self, name: str, period_ticks: int, autoreload: bool, callback: Callback) -> Timer:
-        """Makes a dormant timer whose `callback(timer)` runs in the timer service task."""
+        """Make a dormant timer whose `callback(timer)` runs in the timer service task."""
         return Timer(self._timers, name, period_ticks, autoreload, callback)
 
     def _occupied(self, taken_us: Callable[[], int]) -> Generator[int, None, None]:
@@ -82,7 +82,7 @@ class Kernel(Scheduler):
             yield from self.work(taken_us())
 
     def start(self) -> None:
-        """Creates the idle and the timer service task; the tasks begin at the first `run`."""
+        """Create the idle and the timer service task; the tasks begin at the first `run`."""
         if self._started:
             raise KernelError("the scheduler was started already")
         self._idle = self.create_task("IDLE", 0, self._idle_task)
@@ -101,7 +101,7 @@ class Kernel(Scheduler):
         return self.run_times_us()[self.tasks.index(task)]
 
     def run_times_us(self) -> list[int]:
-        """The same of all tasks, in the order of their creation."""
+        """Return the run time of every task, in the order of their creation."""
         idle, current, current_left_us = self._idle, self.current, self._work_end_us - self.now_us
         times_us = [
             0 if task is idle else task.work_us - (current_left_us if task is current else task.work_left_us)
@@ -111,7 +111,7 @@ class Kernel(Scheduler):
         return [rest_us if task is idle else us for task, us in zip(self.tasks, times_us, strict=True)]
 
     def work(self, duration_us: int) -> Iterable[int]:
-        """Takes processor time; others may run in between."""
+        """Take processor time; others may run in between."""
         if duration_us <= 0:
             self.count_call()
             return GO_ON
@@ -133,7 +133,7 @@ class Kernel(Scheduler):
         return SWITCH if self._switch_pending and not self.suspended else GO_ON
 
     def delay(self, ticks: int) -> Iterable[int]:
-        """Waits until the tick count has risen by `ticks`; 0 is `task_yield`."""
+        """Wait until the tick count has risen by `ticks`; 0 is `task_yield`."""
         if ticks > 0:
             if self.suspended:
                 self.check_may_wait()
@@ -143,7 +143,7 @@ class Kernel(Scheduler):
         return SWITCH
 
     def delay_until(self, wake_tick: int) -> Iterable[int]:
-        """Waits until the tick count is `wake_tick`; when that is past it is `task_yield`."""
+        """Wait until the tick count is `wake_tick`; when that is past it is `task_yield`."""
         if self.suspended:
             self.check_may_wait()
         if wake_tick > self.tick_count:
@@ -153,9 +153,9 @@ class Kernel(Scheduler):
         return SWITCH
 
     def notify_take(self, clear: bool, timeout: int) -> Generator[int, None, int]:
-        """Waits up to `timeout` ticks for the running task's notification value to be above zero and returns it.
+        """Wait up to `timeout` ticks for the running task's notification value to be above zero and return it.
 
-        Then sets it to zero (`clear`) or lowers it by one. 0 means that no notification came.
+        Then set it to zero (`clear`) or lower it by one. 0 means that no notification came.
         """
         task = self.current
         if task.notification or timeout == 0:
@@ -176,7 +176,7 @@ class Kernel(Scheduler):
         return value
 
     def enter_critical(self) -> None:
-        """Keeps the running task running and, until `exit_critical`, interrupts waiting.
+        """Keep the running task running and, until `exit_critical`, interrupts waiting.
 
         Hardware looks at `interrupts_off`. Ticks are caught up afterwards, where a real processor loses all but one.
         """
@@ -184,17 +184,17 @@ class Kernel(Scheduler):
         self.interrupts_off = True
 
     def exit_critical(self) -> Iterable[int]:
-        """Ends `enter_critical`, which must not be nested; what pended happens now."""
+        """End `enter_critical`, which must not be nested; what pended happens now."""
         self.interrupts_off = False
         return self.resume_all()
 
     def suspend_all(self) -> None:
-        """Keeps the running task running, ticks pend, until as many calls of `resume_all`."""
+        """Keep the running task running, ticks pend, until as many calls of `resume_all`."""
         self.count_call()
         self.suspended += 1
 
     def resume_all(self) -> Iterable[int]:
-        """Ends the innermost `suspend_all`; after the outermost what pended happens now."""
+        """End the innermost `suspend_all`; after the outermost what pended happens now."""
         if self.suspended == 0:
             raise KernelError("resume_all without suspend_all")
         self.suspended -= 1

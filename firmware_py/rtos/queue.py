@@ -49,7 +49,7 @@ class Queue(Generic[T]):
         return len(self._items)
 
     def send(self, item: T, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """Appends `item`, waiting up to `timeout` ticks for space; False when it was dropped."""
+        """Append `item`, waiting up to `timeout` ticks for space; False when it was dropped."""
         kernel = self._kernel
         items = self._items
         if item is None:
@@ -73,7 +73,7 @@ class Queue(Generic[T]):
         return True
 
     def send_nowait(self, item: T) -> Iterable[int]:
-        """Appends `item`, or drops and counts it when there is no space.
+        """Append `item`, or drop and count it when there is no space.
 
         `yield from` it lets a receiver of higher priority run at once; the plain call lets it run at the caller's next
         `yield from` that blocks, yields or works.
@@ -96,7 +96,7 @@ class Queue(Generic[T]):
         return kernel.wake_first(self._receivers) if self._receivers else GO_ON
 
     def receive(self, timeout: int = FOREVER) -> Generator[int, None, T | None]:
-        """Takes the oldest item, waiting up to `timeout` ticks for one; None when none came."""
+        """Take the oldest item, waiting up to `timeout` ticks for one; None when none came."""
         kernel = self._kernel
         items = self._items
         if timeout and kernel.suspended:
@@ -117,7 +117,7 @@ class Queue(Generic[T]):
         return item
 
     def receive_nowait(self) -> T | None:
-        """Takes the oldest item, None when there is none; a plain call.
+        """Take the oldest item, None when there is none; a plain call.
 
         A sender of higher priority that waited for the space runs at the caller's next `yield from` that blocks,
         yields or works, not here: use `receive(0)` where that matters.
@@ -136,7 +136,7 @@ class Queue(Generic[T]):
         return item
 
     def reset(self) -> Iterable[int]:
-        """Empties the queue; one sender that waited for space goes on, as with xQueueReset.
+        """Empty the queue; one sender that waited for space goes on, as with xQueueReset.
 
         `yield from queue.reset()` lets it run at once if its priority is higher; the plain call, at the caller's next
         `yield from` that blocks, yields or works.
@@ -154,7 +154,7 @@ class Queue(Generic[T]):
         self._kernel.block(self._receivers, wake_tick)
 
     def send_from_isr(self, item: T) -> bool:
-        """Appends `item` from an interrupt; False when the queue was full and it was dropped."""
+        """Append `item` from an interrupt; False when the queue was full and it was dropped."""
         if item is None:
             raise self._null_item()
         kernel = self._kernel

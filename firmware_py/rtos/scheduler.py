@@ -74,7 +74,7 @@ class Scheduler:
         self._until_us = 0  # how far `run` goes
 
     def run(self, now_us: int, until_us: int = 0) -> None:
-        """Does all that falls due up to and including `now_us`, until every task waits or works.
+        """Do all that falls due up to and including `now_us`, until every task waits or works.
 
         Then it goes on by itself up to and including `until_us`, where that is later. Hardware that a task sets going may
         `stop_before` an instant meanwhile: then the run ends there.
@@ -113,7 +113,7 @@ class Scheduler:
         self.trace = trace
 
     def advance(self, now_us: int) -> None:
-        """Sets the clock before the interrupts of `now_us` are raised, so that they are recorded at the right time.
+        """Set the clock before the interrupts of `now_us` are raised, so that they are recorded at the right time.
 
         Without it their traces and the tasks' response times are too early. Nothing may fall due before `now_us`.
         """
@@ -122,7 +122,7 @@ class Scheduler:
         self.now_us = now_us
 
     def block(self, waiters: list[ControlBlock] | None, wake_tick: int) -> None:
-        """Takes the running task off the ready ring until it is woken or, unless negative, `wake_tick` comes.
+        """Take the running task off the ready ring until it is woken or, unless negative, `wake_tick` comes.
 
         The caller has checked that it may wait.
         """
@@ -155,7 +155,7 @@ class Scheduler:
             task.deadline_misses += 1
 
     def deadline(self, timeout: int) -> int:
-        """Returns the tick at which a wait of `timeout` ticks from now ends, or FOREVER."""
+        """Return the tick at which a wait of `timeout` ticks from now ends, or FOREVER."""
         return FOREVER if timeout < 0 else self.tick_count + timeout
 
     def wait_in(self, waiters: list[ControlBlock], deadline: int, call: str, number: int) -> bool:
@@ -169,12 +169,12 @@ class Scheduler:
         return True
 
     def check_may_wait(self) -> None:
-        """Raises KernelError if the running task would wait while no other may run."""
+        """Raise KernelError if the running task would wait while no other may run."""
         if self.suspended:
             raise KernelError(f"task {self.current.name} must not wait while the scheduler is suspended")
 
     def wake(self, task: ControlBlock) -> bool:
-        """Makes a waiting task ready, later if the scheduler is suspended; True when it outranks the running one."""
+        """Make a waiting task ready, later if the scheduler is suspended; True when it outranks the running one."""
         if self.suspended:
             self._pending_ready.append(task)
             task.waiting_in = self._pending_ready
@@ -184,7 +184,7 @@ class Scheduler:
         return task.priority > self.current.priority
 
     def unblock(self, task: ControlBlock) -> None:
-        """Takes the task off whatever list holds it and puts it behind the others of its ready ring.
+        """Take the task off whatever list holds it and put it behind the others of its ready ring.
 
         It may be ready already: a notification can reach a task whose wait timed out and that has not run since.
         """
@@ -201,7 +201,7 @@ class Scheduler:
         self._ready_bits |= task.ready_bit
 
     def make_ready(self, task: ControlBlock) -> None:
-        """Puts a task that is in no list behind the others of the ring of its priority."""
+        """Put a task that is in no list behind the others of the ring of its priority."""
         if self.trace is not None:
             self.trace(self.now_us, "READY", task.name, task.priority, 0)
         task.place = READY
@@ -209,7 +209,7 @@ class Scheduler:
         self._ready_bits |= task.ready_bit
 
     def change_priority(self, task: ControlBlock, priority: int) -> None:
-        """Sets the effective priority of the task, which goes behind the others there when it is ready."""
+        """Set the effective priority of the task, which goes behind the others there when it is ready."""
         ready = task.place == READY
         if ready:
             self.unlink(task)
@@ -220,7 +220,7 @@ class Scheduler:
             self.make_ready(task)
 
     def unlink(self, task: ControlBlock) -> None:
-        """Removes the task from the ring or the delayed list."""
+        """Remove the task from the ring or the delayed list."""
         if task.place == READY:
             self._leave_ring(task)
         elif task.place == DELAYED:
@@ -244,20 +244,20 @@ class Scheduler:
         return GO_ON
 
     def switch_if(self, outranked: bool) -> Iterable[int]:
-        """What a plain call returns after it made another task ready that may outrank the running one."""
+        """Return what a plain call returns after it made another task ready that may outrank the running one."""
         if outranked and self.preemption:
             self._switch_pending = True
             return SWITCH
         return GO_ON
 
     def misplaced(self, call: str) -> KernelError:
-        """The error for a call for interrupts that came from a task, or vice versa."""
+        """Return the error for a call for interrupts that came from a task, or vice versa."""
         if self.context == IN_TASK:
             return KernelError(f"{call} is for interrupts, and was called by task {self.current.name}")
         return KernelError(f"{call} is for tasks, and was called from an interrupt")
 
     def interrupted(self, task_woken: bool) -> None:
-        """Ends every call from an interrupt."""
+        """End every call from an interrupt."""
         self._interrupted = True
         self.task_woken = task_woken
         if task_woken:
@@ -280,7 +280,7 @@ class Scheduler:
         self.count_call()
 
     def count_call(self) -> None:
-        """Counts a call that returns at once, because a task might make it for ever while no time passes.
+        """Count a call that returns at once, because a task might make it for ever while no time passes.
 
         Of two calls that can only follow each other, like giving and taking, the one that takes is counted. Interrupts
         have no calls of this kind: there the first one is one too many.
@@ -293,7 +293,7 @@ class Scheduler:
             raise StuckTaskError(self.current.name, self.now_us, what)
 
     def _pass_ticks(self) -> None:
-        """Takes the tick that is due now, if one is; jumps over those before at which nothing could happen."""
+        """Take the tick that is due now, if one is; jump over those before at which nothing could happen."""
         tick = self.now_us // TICK_US
         self._next_tick_us = tick * TICK_US + TICK_US
         if self.suspended:
@@ -325,7 +325,7 @@ class Scheduler:
             self._switch_pending = True
 
     def _dispatch(self) -> None:
-        """Runs tasks from this instant on until the running one has work to do during which something may happen."""
+        """Run tasks from this instant on until the running one has work to do during which something may happen."""
         task = self.current
         switch = self._switch_pending and not self.suspended
         self._calls = 0
@@ -370,7 +370,7 @@ class Scheduler:
         self._set_next_wake(task)
 
     def _switch(self) -> ControlBlock:
-        """Makes the next task of the highest ready ring the running one and returns it."""
+        """Make the next task of the highest ready ring the running one and return it."""
         self._switch_pending = False
         ring = self.rings[self._ready_bits.bit_length() - 1]
         task: ControlBlock
@@ -410,7 +410,7 @@ class Scheduler:
         self.next_wake_us = wake_us
 
     def _end(self, task: ControlBlock) -> int:
-        """Deletes the running task, whose function returned; gives up the processor for it."""
+        """Delete the running task, whose function returned; give up the processor for it."""
         if self.suspended:
             raise TaskError(task.name, self.now_us, "ended while the scheduler was suspended") from None
         self.unlink(task)

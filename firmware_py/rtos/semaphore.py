@@ -49,7 +49,7 @@ class Semaphore:
         return True
 
     def give(self) -> Generator[int, None, bool]:
-        """Raises the count by one and wakes the first taker; False when the count is at its maximum."""
+        """Raise the count by one and wake the first taker; False when the count is at its maximum."""
         kernel = self._kernel
         if self.count >= self.maximum:
             self.overruns += 1
@@ -63,7 +63,7 @@ class Semaphore:
         return True
 
     def give_nowait(self) -> Iterable[int]:
-        """Raises the count by one and wakes the first taker, unless the count is at its maximum.
+        """Raise the count by one and wake the first taker, unless the count is at its maximum.
 
         `yield from` it lets a taker of higher priority run at once; after the plain call it runs at the caller's next
         `yield from` that blocks, yields or works, at the latest at `Kernel.yield_if_pending`.
@@ -142,7 +142,7 @@ class Mutex:
         return True
 
     def give(self) -> Generator[int, None, bool]:
-        """Sets the mutex free and, with the last one held, returns to the task's own priority.
+        """Set the mutex free and, with the last one held, return to the task's own priority.
 
         False when it was free already.
         """
@@ -167,7 +167,7 @@ class Mutex:
         return True
 
     def give_from_isr(self) -> bool:
-        """Finds a free mutex, and is False; that a task holds it is an error, because only that task may give it."""
+        """Return False for a free mutex; raise `KernelError` for a held one, because only its holder may give it."""
         kernel = self._kernel
         if kernel.context == IN_TASK:
             raise kernel.misplaced(f"mutex {self.name}: give_from_isr")
@@ -179,7 +179,7 @@ class Mutex:
         return False
 
     def _lend_priority(self, holder: ControlBlock, waiter: ControlBlock) -> bool:
-        """Raises the holder to the waiter's priority; True when it owes its priority to a waiter like this one."""
+        """Raise the holder to the waiter's priority; True when it owes its priority to a waiter like this one."""
         if holder.priority >= waiter.priority:
             return holder.base_priority < waiter.priority
         kernel = self._kernel
@@ -190,7 +190,7 @@ class Mutex:
         return True
 
     def _lower_after_timeout(self, holder: ControlBlock) -> None:
-        """Takes back what a waiter lent that gave up; a holder of several mutexes keeps it until it gives them."""
+        """Take back what a waiter lent that gave up; a holder of several mutexes keeps it until it gives them."""
         priority = holder.base_priority
         if self._takers and self._takers[0].event_priority > priority:
             priority = self._takers[0].event_priority

@@ -69,11 +69,11 @@ class Statistics:
             task.deadline_us = deadlines_us.get(task.name, NO_DEADLINE_US)
 
     def reports(self) -> list[TaskReport]:
-        """The tasks in the order of their creation, between two runs."""
+        """Return the tasks in the order of their creation, between two runs."""
         return [self._report(task) for task in self._tasks]
 
     def load(self) -> float:
-        """The share of processor time that the tasks consumed since the start, 0 to 1."""
+        """Return the share of processor time that the tasks consumed since the start, 0 to 1."""
         busy_us = sum(self._kernel.run_time_us(task) for task in self._tasks)
         return busy_us / self._kernel.now_us if self._kernel.now_us else 0.0
 

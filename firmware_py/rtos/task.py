@@ -28,7 +28,7 @@ class Task(ControlBlock):
         self.kernel = kernel
 
     def notify(self) -> Generator[int, None, bool]:
-        """Adds one to this task's notification value and wakes it if it waits for that; always True."""
+        """Add one to this task's notification value and wake it if it waits for that; always True."""
         kernel = self.kernel
         if kernel.trace is not None:
             kernel.trace(kernel.now_us, "NOTIFY", self.name, 0, 2)
@@ -56,7 +56,7 @@ class Task(ControlBlock):
         kernel.interrupted(woken)
 
     def suspend(self) -> Iterable[int]:
-        """Stops this task until `resume`, whatever it is doing or waiting for."""
+        """Stop this task until `resume`, whatever it is doing or waiting for."""
         kernel = self.kernel
         if self is kernel.current:
             kernel.check_may_wait()
@@ -86,7 +86,7 @@ class Task(ControlBlock):
         return kernel.switch_if(self.priority >= kernel.current.priority)
 
     def priority_set(self, priority: int) -> Iterable[int]:
-        """Changes the base priority; an inherited priority stays until the mutex is given."""
+        """Change the base priority; an inherited priority stays until the mutex is given."""
         _check_priority(self.name, priority)
         kernel = self.kernel
         kernel.count_call()

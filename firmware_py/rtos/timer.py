@@ -47,11 +47,11 @@ class Timer:
         return self._service.send(START, self, self._service.kernel.tick_count, timeout)
 
     def reset(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """The same as `start`."""
+        """Start the timer again, as `start` does."""
         return self._service.send(RESET, self, self._service.kernel.tick_count, timeout)
 
     def stop(self, timeout: int = FOREVER) -> Generator[int, None, bool]:
-        """Makes the timer dormant."""
+        """Make the timer dormant."""
         return self._service.send(STOP, self, 0, timeout)
 
     def change_period(self, period_ticks: int, timeout: int = FOREVER) -> Generator[int, None, bool]:
@@ -90,7 +90,7 @@ class TimerService:
         return sent
 
     def run(self) -> Generator[int, None, None]:
-        """The body of the service task."""
+        """Run the service task."""
         while True:
             now = self.kernel.tick_count
             if self._running and self._running[0].expiry_tick <= now:

@@ -88,7 +88,7 @@ class Crazyflie:
             self.processor.every(POLL_PERIOD_US, self._poll_idle_link)
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
-        """The radio chip has a packet: it comes over the serial line, and fetches one."""
+        """Deliver a packet of the radio chip over the serial line, and fetch one."""
         self._flush()
         self._heard_us = self.chip.now_us
         kind = syslink.RAW_BROADCAST if broadcast else syslink.RAW

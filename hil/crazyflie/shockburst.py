@@ -49,7 +49,7 @@ def syslink_us(data: bytes) -> int:
 
 
 def packet_loss(loss: float, bit_error_rate: float, size: int) -> float:
-    """The chance that a packet with `size` bytes of payload is lost as a whole or by a wrong bit."""
+    """Return the chance that a packet with `size` bytes of payload is lost as a whole or by a wrong bit."""
     if not bit_error_rate:
         return loss
     return 1.0 - (1.0 - loss) * power(1.0 - bit_error_rate, FRAME_BITS + 8 * size)
@@ -72,11 +72,11 @@ class Air:
         return cls(*(getattr(config, field.name) for field in fields(cls)))
 
     def lost_up(self, size: int) -> float:
-        """The chance that a packet of `size` bytes to the board is lost."""
+        """Return the chance that a packet of `size` bytes to the board is lost."""
         return packet_loss(self.uplink_loss, self.uplink_bit_error_rate, size)
 
     def lost_down(self, size: int) -> float:
-        """The chance that an answer of `size` bytes is lost."""
+        """Return the chance that an answer of `size` bytes is lost."""
         return packet_loss(self.downlink_loss, self.downlink_bit_error_rate, size)
 
 
@@ -129,7 +129,7 @@ class Transmitter:
         self._give_up(exchange, given_up_us)
 
     def _heard(self, exchange: Exchange, first: int, given_up_us: int, now_us: int) -> None:
-        """The board hears the packet and answers; the outcome of that and of all further tries is drawn at once."""
+        """Let the board hear the packet and answer; draw the outcome of that and of all further tries at once."""
         ack_size = exchange.hear(now_us)
         if ack_size is None:
             self._give_up(exchange, given_up_us)
@@ -210,7 +210,7 @@ class BoardEnd:
         return True
 
     def confirm(self) -> Waiting | None:
-        """The last answer has arrived: forget and return the packet that it carried."""
+        """Forget and return the packet of the last answer, which has arrived."""
         self._answering, was_answering = False, self._answering
         return self.queue.popleft() if was_answering else None
 

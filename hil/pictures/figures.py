@@ -32,7 +32,7 @@ def track(rows: pa.Table) -> Still:
 
 
 def errors(rows: pa.Table) -> Plot:
-    """Position and attitude errors over time with the paper's limits."""
+    """Draw position and attitude errors over time with the paper's limits."""
     near, level = (
         (-curves.NEAR_CM, curves.NEAR_CM),
         (-curves.ATTITUDE_DEG, curves.ATTITUDE_DEG),
@@ -46,7 +46,7 @@ def errors(rows: pa.Table) -> Plot:
 
 
 def flaps(rows: pa.Table) -> Plot:
-    """The commanded and the actual flap angles; of a real board, its estimate of the actual ones."""
+    """Draw the commanded and the actual flap angles; of a real board, its estimate of the actual ones."""
     times, angles = since_release(rows), curves.FLAPS.read(rows)
     commanded = curves.FLAPS_COMMAND.needs in rows.column_names
     commands = curves.FLAPS_COMMAND.read(rows) if commanded else None
@@ -59,7 +59,7 @@ def flaps(rows: pa.Table) -> Plot:
 
 
 def age(rows: pa.Table) -> Plot:
-    """How old poses are when the estimator takes them, and for how long there were none, where that is reported."""
+    """Draw the age of each pose at the estimator and, where it is reported, the time without one."""
     plots = [plot for plot in (curves.AGE, curves.HORIZON) if plot.needs in rows.column_names]
     series = [line for plot in plots for line in panel(plot, rows, "").series]
     panels = [Panel("on board [ms]", tuple(series))]
@@ -69,7 +69,7 @@ def age(rows: pa.Table) -> Plot:
 
 
 def latency_budget(ages: pa.Table) -> Plot:
-    """Where the poses of `ages.ages_in_time_of` spent their time, stage on stage."""
+    """Draw where the poses of `ages.ages_in_time_of` spent their time, stage on stage."""
     columns = {name: ages.column(name).to_numpy() for name in STAGES}
     times = since_release(ages)
     stages = [
@@ -79,7 +79,7 @@ def latency_budget(ages: pa.Table) -> Plot:
 
 
 def radio(rows: pa.Table) -> Plot:
-    """The time in the air and the packets that were lost."""
+    """Draw the time in the air and the packets that were lost."""
     return Plot(
         (
             _up_and_down(rows, SECOND, curves.latency, "mean latency [ms]"),
@@ -89,7 +89,7 @@ def radio(rows: pa.Table) -> Plot:
 
 
 def serial_line(rows: pa.Table) -> Plot:
-    """The load of the line, the time on it and what was lost or damaged."""
+    """Draw the load of the line, the time on it and what was lost or damaged."""
     load = _up_and_down(rows, TENTH, curves.line_load, "load of the line [%]")
     return Plot(
         (
@@ -103,7 +103,7 @@ def serial_line(rows: pa.Table) -> Plot:
 def _up_and_down(
     rows: pa.Table, step: int, read: Callable[[pa.Table], NDArray[np.float64]], label: str
 ) -> Panel:
-    """The curves of `read` on every `step`-th row, for both directions of the link."""
+    """Draw the curves of `read` on every `step`-th row, for both directions of the link."""
     thinned = rows.take(np.arange(0, rows.num_rows, step))
     times, values = since_release(thinned)[1:], read(thinned)
     return Panel(
@@ -116,7 +116,7 @@ def _up_and_down(
 
 
 def station(rows: pa.Table) -> Plot:
-    """What a real link and its station could not use, battery and load where the board reports them, the states."""
+    """Draw what a real link and its station could not use, reported battery and load, and the states."""
     health = [
         panel(plot, rows, label, height=1.2)
         for plot, label in ((monitor.BATTERY, "battery"), (monitor.LOAD, "processor"))
@@ -126,7 +126,7 @@ def station(rows: pa.Table) -> Plot:
 
 
 def board(rows: pa.Table) -> Plot:
-    """The load of the processor by task, the measurement queue and the states."""
+    """Draw the load of the processor by task, the measurement queue and the states."""
     load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
     times, shares = since_release(tenths)[1:], load.read(tenths).T
     busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT] or [0]
@@ -141,7 +141,7 @@ def board(rows: pa.Table) -> Plot:
 
 
 def _states(rows: pa.Table) -> Panel:
-    """The states of supervisor and robot, or real flight, as bars."""
+    """Draw the states of supervisor and robot, or real flight, as bars."""
     release_us, end_s = release_of(rows.schema.metadata), since_release(rows)[-1:]
     rows_of_bars = []
     for lane, states in reversed(curves.lanes_of(rows.column_names).items()):
@@ -152,7 +152,7 @@ def _states(rows: pa.Table) -> Panel:
 
 
 def estimate(rows: pa.Table) -> Plot:
-    """The estimate less the truth, in the goal frame."""
+    """Draw the estimate less the truth, in the goal frame."""
     return Plot(
         (
             panel(curves.POSITION_MISS, rows, "position", height=1.8),
@@ -162,7 +162,7 @@ def estimate(rows: pa.Table) -> Plot:
 
 
 def own_logic(rows: pa.Table) -> Plot:
-    """What the user's own logic logs, one axis for each unit."""
+    """Draw what the user's own logic logs, one axis for each unit."""
     return Plot(tuple(panel(plot, rows, "own logic") for plot in curves.own_logic(rows)))
 
 

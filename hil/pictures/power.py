@@ -78,7 +78,7 @@ def _beside_others(power: float, mass: float) -> Figure:
 
 
 def discharge(*flights: pa.Table) -> Plot:
-    """Voltage, power and charge; the first flight dark, further ones light."""
+    """Draw voltage, power and charge; the first flight dark, further ones light."""
     voltages, powers, charges = [], [], []
     for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
         times, power = seconds(flight), column(flight, "battery.power")

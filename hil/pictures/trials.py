@@ -81,7 +81,7 @@ OPENING = TrialCurve("mean opening [deg]", openings)
 
 
 def follow(quantities: tuple[TrialCurve, ...], window_s: tuple[float, float], *flights: pa.Table) -> Plot:
-    """Quantities and their goals, one panel each, of one flight or of several trials, inside a window of time."""
+    """Draw quantities and their goals, one panel each, of one flight or of several trials, inside a window of time."""
     panels = []
     for quantity in quantities:
         read = [(measures.seconds(flight), *quantity.read(flight)) for flight in map(free_flight, flights)]
@@ -102,7 +102,7 @@ def follow(quantities: tuple[TrialCurve, ...], window_s: tuple[float, float], *f
 
 
 def disturbed(*flights: pa.Table) -> Plot:
-    """The position error of one flight with the 20 cm box; trials light."""
+    """Draw the position error of one flight with the 20 cm box; trials light."""
     read = [(measures.seconds(flight), 100 * position_error(flight)) for flight in map(free_flight, flights)]
     (times, error), *others = read
     box_cm = 100 * BOX
@@ -131,7 +131,7 @@ def _light(trials: Iterable[tuple[Signal, Signal]]) -> list[Series]:
 
 
 def take_off(*flights: pa.Table) -> Plot:
-    """Height, vertical speed and the air at the robot over time; the first flight dark, further ones light."""
+    """Draw height, vertical speed and the air at the robot over time; the first flight dark, further ones light."""
     heights, climbs, flows = [], [], []
     for index, flight in reversed(list(enumerate(map(free_flight, flights)))):
         times, colour = measures.seconds(flight), LIGHT if index else DARK

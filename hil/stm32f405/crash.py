@@ -77,7 +77,7 @@ class CrashReports:
     """The crashes of one image on one machine."""
 
     def __init__(self, image: Image, machine: Machine, kernel: FreeRtos | None, assertion: str) -> None:
-        """`assertion` is a function of three arguments: expression, file and line."""
+        """Watch the fault handlers and `assertion`, a function of three arguments: expression, file and line."""
         self._image, self._machine, self._kernel = image, machine, kernel
         self._handlers = {self._vector(number) & ~1 for number in FAULTS}
         self._assertion = image.symbol(assertion).address if image.has(assertion) else 0

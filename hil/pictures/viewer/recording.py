@@ -135,7 +135,7 @@ class ServedRecording:
     """Serves the recording of a run folder while this object lives."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises `LabError` when there is no log."""
+        """Raise `LabError` when there is no log."""
         path = recording_of(folder)
         schema = next(log_pieces(folder)).schema
         self._timeline, _ = timeline_of(schema.metadata)
