@@ -18,7 +18,6 @@ from ground_station.mocap import judged
 from ground_station.sources.alignment import Alignment
 from ground_station.sources.natnet import Echo, Frame, ModelDefinition, Other, ServerInfo, decode
 from ground_station.sources.natnet_stream import NatnetStream
-from hil.servers.natnet_bytes import encode_frame
 from support import natnet_packets as packets
 from support.natnet_packets import VERSIONS
 
@@ -37,13 +36,6 @@ def test_a_frame_is_read_in_every_version(version: Version) -> None:
     assert (body.id, body.p, body.q, body.valid) == (7, (1.0, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5), True)
     assert frame.unlabelled == ((4.0, 5.0, 6.0),)
     assert [(marker.id, marker.p) for marker in frame.labelled] == [(0x70001, (1.0, 2.0, 3.0))]
-
-
-@pytest.mark.parametrize("version", VERSIONS)
-def test_a_frame_of_the_virtual_server_says_what_was_put_into_it(version: Version) -> None:
-    frame = decode(packets.frame(41, version, TICKS, parameters=2), version)
-    assert isinstance(frame, Frame)
-    assert decode(encode_frame(frame, version), version) == frame
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -1,15 +1,9 @@
 """Poses out of a NatNet stream: their age, what is no pose, and what goes wrong with the server."""
 
-import socket
-import struct
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 
-from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
@@ -19,7 +13,7 @@ from ground_station.sources.natnet_stream import MISTIMED_FRAMES, NatnetStream
 from ground_station.sources.server_clock import ServerClock
 from ground_station.sources.silence import SILENCE_US, Silence
 from support import natnet_packets as packets
-from support.natnet_packets import VERSIONS
+from support.motive_bench import moving
 
 V = (4, 1)
 TICKS_PER_US = packets.CLOCK_HZ // 1_000_000
@@ -260,77 +254,11 @@ def test_silence_begins_with_a_frame_and_each_one_is_told_twice() -> None:
     ]  # fmt: skip
 
 
-@contextmanager
-def served(version: tuple[int, int], multicast: bool) -> Iterator[int]:
-    """A server with one body at 200 Hz; gives its command port."""
-    with socket.socket(type=socket.SOCK_DGRAM) as probe:
-        probe.bind(("", 0))
-        data_port = probe.getsockname()[1]
-    with socket.socket(type=socket.SOCK_DGRAM) as commands:
-        commands.bind(("127.0.0.1", 0))
-        commands.settimeout(0.005)
-        commands.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
-        stop = threading.Event()
-        thread = threading.Thread(target=_serve, args=(commands, data_port, version, multicast, stop))
-        thread.start()
-        try:
-            yield commands.getsockname()[1]
-        finally:
-            stop.set()
-            thread.join()
-
-
-def _serve(
-    commands: socket.socket, port: int, version: tuple[int, int], multicast: bool, stop: threading.Event
-) -> None:
-    number, client = 0, None
-    while not stop.is_set():
-        number += 1
-        now = clock_us() * TICKS_PER_US
-        data = packets.frame(
-            number, version, (now - 80_000, now, now), pose=((number, 2, 3), packets.POSE[1])
-        )
-        if multicast:
-            commands.sendto(data, ("239.255.42.99", port))
-        elif client is not None:
-            commands.sendto(data, client)
-        try:
-            asked, client = commands.recvfrom(1000)
-        except TimeoutError:
-            continue
-        if asked[0] == 0:
-            commands.sendto(packets.server_info(version, multicast, port), client)
-        elif asked[0] == 4:
-            commands.sendto(packets.model_definition({"floaty": 7}, version), client)
-        elif asked[0] == 12:
-            (asked_us,) = struct.unpack("<Q", asked[4:])
-            commands.sendto(packets.echo(asked_us, clock_us() * TICKS_PER_US), client)
-
-
-@pytest.mark.realtime
-@pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize("multicast", [False, True], ids=["unicast", "multicast"])
-def test_poses_come_over_real_sockets(version: tuple[int, int], multicast: bool) -> None:
-    with served(version, multicast) as port:
-        source = find_source(
-            f"optitrack:127.0.0.1:{port}{',multicast' if multicast else ''},body=floaty", CaptureConfig()
-        )
-        source.open()
-        frames = [source.receive(1.0) for _ in range(10)]
-        way = "multicast" if multicast else "unicast"
-        told = f"mocap Motive at 127.0.0.1, NatNet {version[0]}.{version[1]}, {way}, y-up"
-        assert source.notices() == [told]
-        source.close()
-    assert all(frame is not None and frame.valid and frame.p_WB[1:] == (-3.0, 2.0) for frame in frames)
-    assert frames[-1] is not None
-    assert 7000 <= clock_us() - frames[-1].t_us < 2_000_000
-
-
 @pytest.mark.realtime
 def test_a_server_that_is_not_there_or_not_so_is_one_line_within_four_seconds() -> None:
     begin_s = time.monotonic()
     with pytest.raises(MocapError, match=r"^127\.0\.0\.1:9: no NatNet server answers\Z"):
         find_source("optitrack:127.0.0.1:9", CaptureConfig()).open()
     assert time.monotonic() - begin_s < 4
-    with served(V, False) as port, pytest.raises(MocapError, match="does not stream by multicast"):
-        find_source(f"optitrack:127.0.0.1:{port},multicast", CaptureConfig()).open()
+    with moving() as lab, pytest.raises(MocapError, match="does not stream by multicast"):
+        find_source(f"optitrack:127.0.0.1:{lab.motive.port},multicast", CaptureConfig()).open()

@@ -3,8 +3,6 @@
 import itertools
 import math
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -224,20 +222,3 @@ def test_a_reboot_by_radio_keeps_the_end_and_forgets_what_came_while_the_board_w
         client.wait("ATTITUDE", lambda message: message.time_boot_ms < before_ms)
         assert client.parameters()[GAIN].param_value == 3.0
         client.close()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        (["--mavlink", "usb"], "--mavlink usb: expected pty"),
-        (["--mavlink", "udp:70000"], "--mavlink udp:70000: port 70000"),
-        (["--mavlink", "pty:/no/folder"], "mavlink pty /no/folder: No such file"),
-        (["--baud", "57600"], "--baud 57600: there is no serial line without --mavlink"),
-        (["--mavlink", "pty", "--set", "mavlink.system=255", "--boards", "2"], "mavlink.system = 256"),
-    ],
-)
-def test_bad_values_end_in_one_line(arguments: list[str], complaint: str) -> None:
-    command = [sys.executable, "-m", "hil.commands", "serve", *arguments]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert ended.returncode == 2
-    assert complaint in ended.stderr.splitlines()[-1]

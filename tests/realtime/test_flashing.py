@@ -1,22 +1,23 @@
 """Flashing through the virtual dongle: byte for byte, with progress, verified, and one line for whatever goes wrong."""
 
+import os
 import random
 import struct
+import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-import cflib.crtp
-import libusb_package
 import pytest
 from cflib.bootloader import Bootloader
 from cflib.bootloader.boottypes import TargetTypes
 from cflib.bootloader.cloader import Cloader
-from cflib.crtp.radiodriver import RadioManager
 
 from ground_station.errors import LinkError
 from ground_station.flashing import check_image, flash
-from hil.servers.dongle_plugin import VARIABLE, Backend
-from support.serving import Served, serve
+from support.paths import ROOT
+from support.plugged_dongle import plug
+from support.serving import FLOATY, Served, serve
 
 START = 0x0800_4000
 LOSSES = ["0", pytest.param("0.1", marks=pytest.mark.long)]
@@ -34,11 +35,7 @@ def served(request: pytest.FixtureRequest) -> Iterator[Served]:
         "0",
         *(f"--set=radio.{way}_loss={request.param}" for way in ("uplink", "downlink")),
     ) as served:
-        backend = Backend(served.environment[VARIABLE])
-        libusb_package.get_libusb1_backend = lambda: backend
-        RadioManager._radios.clear()
-        if not cflib.crtp.CLASSES:
-            cflib.crtp.init_drivers()
+        plug(served)
         yield served
 
 
@@ -59,6 +56,18 @@ def test_an_image_is_there_byte_for_byte_and_the_board_starts(served: Served) ->
     assert there[: len(image)] == image
     assert tool.reset_to_firmware()
     tool.close()
+
+
+def test_the_command_says_what_it_has_written_and_read_back(served: Served, tmp_path: Path) -> None:
+    (tmp_path / "cf2.bin").write_bytes(image_of(2 * 1024 + 77))
+    served.forget()
+    command = [*FLOATY, "deploy", "flash", "--uri", served.radio_uris[0], str(tmp_path / "cf2.bin")]
+    environment = served.environment
+    environment["PYTHONPATH"] = os.pathsep.join((environment["PYTHONPATH"], str(ROOT)))
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "2125 bytes written and read back; the board starts\n"
+    served.wait_for("gyro zero", 30.0)
 
 
 def test_a_flash_that_forgets_a_byte_is_noticed(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:

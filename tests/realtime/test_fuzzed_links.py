@@ -1,4 +1,4 @@
-"""One minute of random and structured-random bytes on every real link beside a robot in flight, and the link serves on.
+"""Random and structured-random bytes on every real link beside a robot in flight, and the link serves on.
 
 The built-in station flies the robot on a wire that no client sees; a Motive server reports its position.
 Requests that a client may rightly make are left out: see `support.random_requests`.
@@ -29,7 +29,7 @@ from support.plugged_dongle import plug
 from support.random_requests import harmless_message, random_packet, spoilt
 from support.serving import Served, serve
 
-DURATION_S = 60.0
+DURATION_S = 20.0
 PATIENCE_S = 30.0
 SETTLED_S = 2.0
 PERIOD_S = 0.002

@@ -19,7 +19,7 @@ from ground_station.sources.address import find_source
 from support.mavproxy_program import MavProxy, mavproxy_here
 from support.motive_bench import FROM_MOTIVE, needs
 from support.paths import SUPPORT
-from support.serving import Served, free_port, serve
+from support.serving import Served, free_port, serve, station
 
 START_S = 20.0
 HOVER = 0.1  # off home at most [m]; the paper hovers within centimetres
@@ -177,27 +177,22 @@ class Network:
 def test_a_station_in_another_process_flies_and_flies_again_when_motive_is_back() -> None:
     with serve("--mavlink", "pty", motive=True) as lab:
         uri = "mavlink:" + lab.line("mavlink ")[0]
-        network = Network(int(lab.line("motive ")[0].split(":")[2]))
-        command = [sys.executable, "-m", "hil.commands", "station", "--link", uri]
-        command += ["--mocap", f"optitrack:127.0.0.1:{network.port}"]
-        station = Served(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT))
+        network = Network(int(lab.motive.split(":")[2]))
         try:
-            lab.wait_for("board 1: released", START_S)
-            shown = station.wait_for("^pose ", START_S)
-            assert not any("lost" in line for line in lab.lines)
-            lab.forget()
-            network.cut = True
-            station.wait_for("^motion capture: no frames; calling the server again$", START_S)
-            lab.wait_for("failsafe, silence", START_S)
-            network.cut = False
-            station.wait_for("^motion capture: frames again after", START_S)
-            lab.wait_for("supervisor: flying", START_S)
-            assert station.interrupt() == 0
-            lab.wait_for("failsafe, silence", START_S)
+            with station(lab, uri, mocap=f"optitrack:127.0.0.1:{network.port}") as typed:
+                lab.wait_for("board 1: released", START_S)
+                shown = typed.wait_for("^pose ", START_S)
+                assert not any("lost" in line for line in lab.lines)
+                lab.forget()
+                network.cut = True
+                typed.wait_for("^motion capture: no frames; calling the server again$", START_S)
+                lab.wait_for("failsafe, silence", START_S)
+                network.cut = False
+                typed.wait_for("^motion capture: frames again after", START_S)
+                lab.wait_for("supervisor: flying", START_S)
+                assert typed.interrupt() == 0
+                lab.wait_for("failsafe, silence", START_S)
         finally:
-            station.process.kill()
-            station.process.wait()
-            station.process.stdout.close()
             network.close()
     age = re.fullmatch(
         r"pose (\S+) ms old on board \(99 %: \S+\): camera 20.0 \+ processing 18.0 \+ network \S+ \+ station \S+ "
@@ -206,45 +201,23 @@ def test_a_station_in_another_process_flies_and_flies_again_when_motive_is_back(
     )
     assert age is not None, shown
     assert float(age[1]) == pytest.approx(40.0, abs=AGE_MS)
-    assert not any("Traceback" in line for line in station.lines)
+    assert not any("Traceback" in line for line in typed.lines)
 
 
-@pytest.mark.parametrize("body", ["wand", None])
-def test_a_wrong_body_or_no_motive_is_one_line_and_exit_code_two(body: str | None) -> None:
+def test_a_wrong_body_or_no_motive_is_one_line_and_exit_code_two() -> None:
+    nobody = f"127.0.0.1:{free_port()}"
     with serve("--udp", "0", motive=True) as lab:
-        mocap = f"optitrack:127.0.0.1:{free_port()}"
-        message = f"{mocap.removeprefix('optitrack:')}: no NatNet server answers"
-        if body is not None:
-            mocap = f"{lab.line('motive ')[0]},body={body}"
-            message = "no body 'wand'; there are: floaty"
-        command = [
-            sys.executable,
-            "-m",
-            "hil.commands",
-            "station",
-            "--link",
-            lab.udp_uris[0],
-            "--mocap",
-            mocap,
-        ]
-        shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert (shown.returncode, shown.stdout) == (2, "")
-    assert shown.stderr == f"floaty: --mocap {mocap}: {message}\n"
+        for mocap, message in (
+            (f"optitrack:{nobody}", f"{nobody}: no NatNet server answers"),
+            (f"{lab.motive},body=wand", "no body 'wand'; there are: floaty"),
+        ):
+            with station(lab, lab.udp_uris[0], mocap=mocap) as typed:
+                assert typed.process.wait(60) == 2
+                typed.listen()
+            assert typed.lines == [f"floaty: --mocap {mocap}: {message}"]
 
 
 def assert_still_flying(lab: Served, duration_s: float) -> None:
     """Nothing is lost in this time."""
     with pytest.raises(AssertionError, match="no line"):
         lab.wait_for("lost", duration_s)
-
-
-def test_a_taken_natnet_port_is_one_line_and_exit_code_two() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = str(taken.getsockname()[1])
-        command = [sys.executable, "-m", "hil.commands", "serve", "--udp", "0", "--natnet-port", port]
-        shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert shown.returncode == 2
-    assert shown.stderr.strip().endswith(
-        f"natnet port {port}: Address already in use; --natnet-port 0 takes a free one, --no-motive none"
-    )

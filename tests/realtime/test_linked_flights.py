@@ -13,6 +13,11 @@ from hil.laboratory.recorder import load_events, load_log
 from support.serving import free_port, serve
 
 DONGLE = "radio://0/80/2M/E7E7E7E7E7"
+HOVER = (
+    "hover",
+    "--seed",
+    "2",
+)  # stays well within the limits whenever it is released; that depends on the machine
 
 
 def fly(folder: Path, *arguments: str) -> dict[str, object]:
@@ -22,6 +27,40 @@ def fly(folder: Path, *arguments: str) -> dict[str, object]:
     result: dict[str, object] = json.loads((folder / "result.json").read_text())
     assert result["outcome"] in ("completed", "lost"), result["cause"]
     return result
+
+
+def test_the_complete_laboratory_flies_hover_within_its_limits(tmp_path: Path) -> None:
+    """Motive, station process and virtual dongle for 8 s; the limits leave a busy machine room, the ages less."""
+    result = fly(tmp_path / "run", *HOVER, "--link", DONGLE, "--duration", "8")
+    assert result["passed"]
+    assert result["metrics"]["flown"] == pytest.approx(8.0, abs=0.1)
+    assert 0.1 < result["real_time_factor"] < 1.1
+    assert len((tmp_path / "run" / "telemetry.csv").read_text().splitlines()) > 240
+    ages_ms = {stage["name"]: stage["mean_us"] / 1000 for stage in result["ages"]}
+    assert list(ages_ms) == ["pose", "camera", "processing", "network", "station", "radio"]
+    assert (ages_ms["camera"], ages_ms["processing"]) == pytest.approx((20.0, 18.0), abs=0.1)
+    assert 38.5 < ages_ms["pose"] < 50.0
+    said = [event["text"] for event in load_events(tmp_path / "run")]
+    budgets = [line for line in said if line.startswith("pose ")]
+    assert budgets
+    assert all("camera 20.0 + processing 18.0" in line and "assumed" not in line for line in budgets)
+    assert not any("Traceback" in line or "connecting again" in line for line in said)
+    assert "<h2>Age of the poses</h2>" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_hover_holds_its_limits_when_a_third_of_the_packets_is_lost(tmp_path: Path) -> None:
+    """On a profile that describes other cameras than the virtual ones."""
+    losses = ("--set=radio.uplink_loss=0.3", "--set=radio.downlink_loss=0.3")
+    cameras = "system=optitrack multicast=true body=robot axes=z-up origin=[1,2,0] yaw=1 body_yaw=1"
+    others = [f"--set=capture.{setting}" for setting in cameras.split()]
+    assert fly(tmp_path / "run", *HOVER, "--link", DONGLE, "--duration", "6", *losses, *others)["passed"]
+
+
+def test_hover_over_udp_holds_its_limits(tmp_path: Path) -> None:
+    link = ("--link", f"udp://127.0.0.1:{free_port()}")
+    result = fly(tmp_path / "run", *HOVER, *link, "--duration", "6")
+    assert result["passed"]
+    assert [stage["name"] for stage in result["ages"]][-1] == "udp"
 
 
 @pytest.mark.parametrize("link", [DONGLE, pytest.param("mavlink:pty", marks=pytest.mark.long)])

@@ -5,7 +5,6 @@ import hashlib
 import os
 import re
 import select
-import signal
 import socket
 import subprocess
 import sys
@@ -29,7 +28,7 @@ from ground_station.links.mavlink import MavlinkLinkConfig
 from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
-from support.serving import CAMERAS, Served, serve
+from support.serving import CAMERAS, Served, serve, station
 from support.telemetry_rows import is_whole
 
 FLOATY = (sys.executable, "-m", "hil.commands")
@@ -55,30 +54,6 @@ Talk = Callable[["Peer"], None]
 )
 def test_a_uri_names_device_and_baud_rate(uri: str, expected: tuple[str, int]) -> None:
     assert parse_uri(uri, 921_600) == expected
-
-
-# What cannot work
-
-
-@pytest.mark.parametrize(
-    ("link", "message"),
-    [
-        ("mavlink:/nowhere/tty", "mavlink:/nowhere/tty: No such file or directory"),
-        ("mavlink:/dev/null", "mavlink:/dev/null: not a serial port"),
-        ("mavlink:/dev/null,fast", "baud rate 'fast': expected 9600..3000000"),
-        ("mavlink:/dev/null,300", "baud rate '300': expected 9600..3000000"),
-        ("mavlink:/dev/null,9600", "9600 baud: 50 poses/s need 2.63 kB/s"),
-        ("mavlink:", "mavlink:: expected mavlink:DEVICE[,BAUD]"),
-        ("mavlink", "mavlink: expected mavlink:DEVICE[,BAUD]"),
-        ("mavlink:carrier-pigeon://coop", "expected mavlink:DEVICE[,BAUD]"),
-        ("mavlink:socket://127.0.0.1", "expected mavlink:DEVICE[,BAUD]"),
-        ("mavlink:socket://127.0.0.1:99999", "expected mavlink:DEVICE[,BAUD]"),
-        ("mavlink:socket://127.0.0.1:9", "mavlink:socket://127.0.0.1:9: Connection refused"),
-        ("mavlink:rfc2217://127.0.0.1:9", "mavlink:rfc2217://127.0.0.1:9: Connection refused"),
-    ],
-)
-def test_what_cannot_work_is_one_line_and_exit_code_two(link: str, message: str) -> None:
-    refused(link, message)
 
 
 def refused(link: str, message: str, *arguments: str) -> None:
@@ -365,26 +340,6 @@ class Cable:
             self.pull()
 
 
-@contextmanager
-def station(link: str, poses: str, *arguments: str) -> Iterator[Served]:
-    command = [*FLOATY, "station", "--link", link, "--mocap", poses, *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    try:
-        yield Served(process)
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
-
-
-def finish(station: Served) -> int:
-    """Press Ctrl-C and read to the end."""
-    station.process.send_signal(signal.SIGINT)
-    out, _ = station.process.communicate(timeout=30)
-    station.lines += out.decode().splitlines()
-    return station.process.returncode
-
-
 def end_of(served: Served) -> str:
     """What pyserial calls the end of a served line."""
     (master,) = served.line("mavlink ")
@@ -396,7 +351,7 @@ def test_a_pulled_cable_is_failsafe_on_board_and_the_flight_goes_on_when_it_is_b
     with serve("--mavlink", "pty", motive=True) as served:
         cable = Cable(end_of(served), tmp_path / "ttyUSB0")
         try:
-            with station(f"mavlink:{cable.device}", served.motive, "--log", str(log)) as ground:
+            with station(served, f"mavlink:{cable.device}", "--log", log) as ground:
                 served.wait_for("board 1: released", PATIENCE_S)
                 served.forget()
                 cable.pull()
@@ -408,7 +363,7 @@ def test_a_pulled_cable_is_failsafe_on_board_and_the_flight_goes_on_when_it_is_b
                 ground.wait_for("^connected to ", PATIENCE_S)
                 served.wait_for("supervisor: flying", PATIENCE_S)
                 ground.wait_for(" 0 bad  round trip ", PATIENCE_S)
-                assert finish(ground) == 0
+                assert ground.interrupt() == 0
         finally:
             cable.close()
     assert ground.lines[-1] == "the board is in failsafe, flaps at hover"
@@ -437,11 +392,11 @@ def test_it_flies_over_tcp_signed_at_57600_baud(tmp_path: Path) -> None:
     log = tmp_path / "telemetry.csv"
     profile = (f"--set=mavlink.signing_key={KEY}", "--set=serial.baud=57600")
     with serve("--mavlink", "tcp:0", *profile, motive=True) as served:
-        with station(f"mavlink:{end_of(served)}", served.motive, "--log", str(log), *profile) as ground:
+        with station(served, f"mavlink:{end_of(served)}", "--log", log, *profile) as ground:
             ground.wait_for("^57600 baud: uplink ", PATIENCE_S)
             served.wait_for("board 1: released", PATIENCE_S)
             ground.wait_for(" 0 lost, .* round trip ", PATIENCE_S)
-            assert finish(ground) == 0
+            assert ground.interrupt() == 0
         refused(
             f"mavlink:{end_of(served)}", "system 1 answers no command within 4 s: does it want signed frames"
         )

@@ -3,17 +3,14 @@
 import json
 import os
 import pty
-import signal
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from hil.laboratory.recorder import load_events, load_log
-from support.serving import FLOATY, Served, serve, started
+from support.serving import FLOATY, Served, serve, station
 
 PATIENCE_S = 30.0
 ENDS: dict[str, tuple[str, ...]] = {
@@ -24,20 +21,9 @@ ENDS: dict[str, tuple[str, ...]] = {
 GAIN = {"radio": "extCtrl.z_P", "udp": "extCtrl.z_P", "mavlink": "EXT_Z_P"}
 
 
-def link_of(lab: Served, end: str) -> tuple[str, dict[str, str]]:
-    """URI and environment for a program that is to reach the board."""
-    if end == "radio":
-        return lab.radio_uris[0], lab.environment
-    return (lab.udp_uris[0] if end == "udp" else "mavlink:" + lab.line("mavlink ")[0]), dict(os.environ)
-
-
-@contextmanager
-def station(lab: Served, end: str, *arguments: str | Path) -> Iterator[Served]:
-    """The ground station as a process of its own, whose terminal is a pipe."""
-    uri, environment = link_of(lab, end)
-    arguments = ("station", "--link", uri, "--mocap", lab.motive, *arguments)
-    with started(*arguments, environment=environment) as typed:
-        yield typed
+def link_of(lab: Served, end: str) -> str:
+    """The URI for a program that is to reach the board."""
+    return f"mavlink:{lab.line('mavlink ')[0]}" if end == "mavlink" else lab.line(f"{end} ")[0]
 
 
 def wait_for_event(folder: Path, text: str) -> None:
@@ -51,7 +37,7 @@ def wait_for_event(folder: Path, text: str) -> None:
 @pytest.mark.parametrize("end", ENDS)
 def test_a_dialogue_flies_and_every_change_is_an_event(end: str, tmp_path: Path) -> None:
     folder, gain = tmp_path / "run", GAIN[end]
-    with serve(*ENDS[end], motive=True) as lab, station(lab, end, "--out", folder) as typed:
+    with serve(*ENDS[end], motive=True) as lab, station(lab, link_of(lab, end), "--out", folder) as typed:
         typed.wait_for("^connected", PATIENCE_S)
         wait_for_event(folder, "hover begins")
         for line, answer in (
@@ -70,8 +56,7 @@ def test_a_dialogue_flies_and_every_change_is_an_event(end: str, tmp_path: Path)
             typed.wait_for(answer, PATIENCE_S)
             if line == "stop":
                 wait_for_event(folder, "supervisor: failsafe")
-        typed.process.send_signal(signal.SIGINT)
-        assert typed.process.wait(timeout=60) in (0, 1, 130)
+        assert typed.interrupt() in (0, 1, 130)
     operated = [event["text"].split(",")[0] for event in load_events(folder) if event["source"] == "operator"]
     kinds = [text.split()[0] for text in operated]
     assert kinds == ["goal", "set", "fly", "mark", "reset", "stop", "stopped"]
@@ -94,7 +79,7 @@ def test_a_dialogue_flies_and_every_change_is_an_event(end: str, tmp_path: Path)
 
 def test_a_station_that_is_killed_leaves_a_flight_that_can_be_reported(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    with serve("--udp", "0", motive=True) as lab, station(lab, "udp", "--out", folder) as typed:
+    with serve("--udp", "0", motive=True) as lab, station(lab, lab.udp_uris[0], "--out", folder) as typed:
         typed.wait_for("^connected", PATIENCE_S)
         wait_for_event(folder, "hover begins")
         typed.type("mark before the end")
@@ -113,7 +98,7 @@ def test_a_station_that_is_killed_leaves_a_flight_that_can_be_reported(tmp_path:
 def test_parameters_are_set_and_saved_without_flying() -> None:
     for end in ("udp", "mavlink"):
         with serve(*ENDS[end]) as lab:
-            uri, environment = link_of(lab, end)
+            uri, environment = link_of(lab, end), lab.environment
 
             def param(*arguments: str) -> subprocess.CompletedProcess[str]:
                 command = [*FLOATY, "param", *arguments, "--link", uri]  # noqa: B023 - used at once
@@ -139,7 +124,7 @@ def test_parameters_are_set_and_saved_without_flying() -> None:
 def test_at_a_terminal_lines_are_edited_and_ctrl_c_ends_the_flight(tmp_path: Path) -> None:
     """Tab completes, the answer stands above the prompt, and the terminal is given back as it was."""
     with serve("--udp", "0", motive=True) as lab:
-        uri, environment = link_of(lab, "udp")
+        uri, environment = lab.udp_uris[0], lab.environment
         master, slave = pty.openpty()
         before = subprocess.run(
             ["stty", "-a"], stdin=slave, capture_output=True, text=True, check=True

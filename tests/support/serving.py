@@ -42,8 +42,8 @@ class Served:
 
     @property
     def environment(self) -> dict[str, str]:
-        """What the printed line says to put before a program's name."""
-        words = self.line("use ")
+        """The variables that a program needs to find the virtual dongle, if there is one."""
+        words = [word for line in self.lines if line.startswith("use ") for word in line.split()]
         return {**os.environ, **dict(word.split("=", 1) for word in words if "=" in word)}
 
     def line(self, start: str) -> list[str]:
@@ -98,8 +98,12 @@ class Served:
         ]
 
     def interrupt(self) -> int:
-        """Press Ctrl-C and return the exit code."""
+        """Press Ctrl-C, read what it says in the end, and return the exit code."""
         self.process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while select.select([self.process.stdout], [], [], max(0.0, deadline - time.monotonic()))[0]:
+            if not self._read():
+                break
         return self.process.wait(timeout=20)
 
 
@@ -139,3 +143,11 @@ def serve(*arguments: str, motive: bool = False) -> Iterator[Served]:
         SERVED.append(served)
         served.wait_for("^serving", START_TIMEOUT_S)
         yield served
+
+
+@contextmanager
+def station(lab: Served, uri: str, *arguments: str | Path, mocap: str = "") -> Iterator[Served]:
+    """The ground station as a process of its own, with any link and a laboratory's cameras or others."""
+    command = ("station", "--link", uri, "--mocap", mocap or lab.motive, *arguments)
+    with started(*command, environment=lab.environment) as typed:
+        yield typed

@@ -97,10 +97,26 @@ def test_a_prober_is_answered_and_changes_nothing(board: Board, clients: list[so
     assert (board.received, board.server.ignored, board.said) == ([b"\xf0a"], 0, [])
 
 
-@pytest.mark.parametrize("size", [0, 32, 2048, 9000])
-def test_datagrams_that_are_no_packet_are_dropped(
-    board: Board, clients: list[socket.socket], size: int
+@pytest.mark.parametrize(
+    ("size", "is_packet"), [(0, False), (1, True), (31, True), (32, False), (2048, False), (60_000, False)]
+)
+def test_a_datagram_longer_than_a_packet_or_empty_is_none(
+    board: Board, clients: list[socket.socket], size: int, is_packet: bool
 ) -> None:
-    clients[0].send(b"\xf0" * size)
+    clients[0].send(bytes([0x30] * size))
+    board.read(7)
+    assert board.received == [bytes([0x30] * size)] * is_packet
+    assert board.server.has_session(7) == is_packet
+    clients[0].send(b"\x30next")
+    board.read(8)
+    assert board.received[-1] == b"\x30next"
+
+
+def test_a_session_ends_after_a_second_of_silence_and_not_before(
+    board: Board, clients: list[socket.socket]
+) -> None:
+    clients[0].send(b"\x30a")
     board.read(0)
-    assert board.received == []
+    assert board.server.has_session(SESSION_TIMEOUT_US)
+    assert not board.server.has_session(SESSION_TIMEOUT_US + 1)
+    assert not board.server.has_session(0)

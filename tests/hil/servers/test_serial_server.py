@@ -1,6 +1,7 @@
 """The ends of a served serial line: bytes pass both ways, nobody who comes, leaves or sleeps holds the server up."""
 
 import os
+from pathlib import Path
 
 import pytest
 import serial
@@ -10,7 +11,7 @@ from hil.servers.serial_server import Address, parse_addresses
 from support.line_clients import OpenEnd, TcpClient
 
 
-def test_several_tcp_clients_all_hear_the_board_and_are_heard():
+def test_several_tcp_clients_all_hear_the_board_and_are_heard() -> None:
     bench = OpenEnd(Address("tcp").open)
     first, second, third = (TcpClient(bench) for _ in range(3))
     for number, client in enumerate((first, second, third)):
@@ -28,7 +29,7 @@ def test_several_tcp_clients_all_hear_the_board_and_are_heard():
     third.close()
 
 
-def test_a_tcp_client_that_does_not_read_takes_nothing_from_another():
+def test_a_tcp_client_that_does_not_read_takes_nothing_from_another() -> None:
     bench = OpenEnd(Address("tcp").open)
     asleep, awake = TcpClient(bench), TcpClient(bench)
     sent = b""
@@ -44,7 +45,7 @@ def test_a_tcp_client_that_does_not_read_takes_nothing_from_another():
     bench.close()
 
 
-def test_what_one_tcp_client_sent_at_once_is_not_torn_by_another():
+def test_what_one_tcp_client_sent_at_once_is_not_torn_by_another() -> None:
     bench = OpenEnd(Address("tcp").open)
     first, second = TcpClient(bench), TcpClient(bench)
     long, short = bytes(range(256)) * 64, b"between"
@@ -57,7 +58,7 @@ def test_what_one_tcp_client_sent_at_once_is_not_torn_by_another():
     bench.close()
 
 
-def test_the_link_to_a_pty_is_made_and_removed(tmp_path):
+def test_the_link_to_a_pty_is_made_and_removed(tmp_path: Path) -> None:
     path = tmp_path / "floaty"
     bench = OpenEnd(Address("pty", path=path).open)
     assert bench.end.master == str(path)
@@ -68,7 +69,7 @@ def test_the_link_to_a_pty_is_made_and_removed(tmp_path):
     assert not os.path.lexists(path)
 
 
-def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path):
+def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path: Path) -> None:
     stale, file, other = tmp_path / "stale", tmp_path / "file", tmp_path / "other"
     stale.symlink_to("/dev/pts/99999")
     OpenEnd(Address("pty", path=stale).open).close()
@@ -81,7 +82,7 @@ def test_the_link_of_a_killed_server_is_replaced_but_nothing_else(tmp_path):
     assert other.is_symlink()
 
 
-def test_a_port_in_use_is_named():
+def test_a_port_in_use_is_named() -> None:
     bench = OpenEnd(Address("tcp").open)
     port = bench.end._listener.getsockname()[1]
     with pytest.raises(LabError, match=f"mavlink tcp 127.0.0.1:{port}: Address already in use"):
@@ -90,30 +91,30 @@ def test_a_port_in_use_is_named():
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("text", "host", "ends"),
     [
-        ("pty", [("pty", 0, None), ("pty", 0, None)]),
-        ("pty:/tmp/a:b", [("pty", 0, "/tmp/a:b"), ("pty", 0, "/tmp/a:b-2")]),
-        ("udp", [("udp", 14550, None), ("udp", 14551, None)]),
-        ("udp:1234", [("udp", 1234, None), ("udp", 1235, None)]),
-        ("udp:10.0.0.7:1234", [("udp", 1234, None), ("udp", 1235, None)]),
-        ("tcp", [("tcp", 5760, None), ("tcp", 5761, None)]),
-        ("tcp:0", [("tcp", 0, None), ("tcp", 0, None)]),
-        ("tcp:localhost:", [("tcp", 5760, None), ("tcp", 5761, None)]),
+        ("pty", "127.0.0.1", ["pty", "pty"]),
+        ("pty:/tmp/a:b", "127.0.0.1", ["pty:/tmp/a:b", "pty:/tmp/a:b-2"]),
+        ("udp", "127.0.0.1", ["udp:14550", "udp:14551"]),
+        ("udp:1234", "127.0.0.1", ["udp:1234", "udp:1235"]),
+        ("udp:10.0.0.7:1234", "10.0.0.7", ["udp:1234", "udp:1235"]),
+        ("tcp", "127.0.0.1", ["tcp:5760", "tcp:5761"]),
+        ("tcp:0", "127.0.0.1", ["tcp:0", "tcp:0"]),
+        ("tcp:localhost:", "localhost", ["tcp:5760", "tcp:5761"]),
+        ("tcp:65535", "127.0.0.1", ["tcp:65535"]),
+        ("tcp:65534", "127.0.0.1", ["tcp:65534", "tcp:65535"]),
     ],
 )
-def test_addresses_count_up(text, expected):
-    addresses = parse_addresses(text, 2)
-    found = [(end.kind, end.port, None if end.path is None else str(end.path)) for end in addresses]
-    assert found == expected
-    host = {"udp:10.0.0.7:1234": "10.0.0.7", "tcp:localhost:": "localhost"}.get(text, "127.0.0.1")
-    assert [end.host for end in addresses] == [host, host]
+def test_addresses_count_up_to_the_last_port(text: str, host: str, ends: list[str]) -> None:
+    addresses = parse_addresses(text, len(ends))
+    assert {end.host for end in addresses} == {host}
+    where = [end.path or "" if end.kind == "pty" else end.port for end in addresses]
+    assert [f"{end.kind}:{place}".rstrip(":") for end, place in zip(addresses, where, strict=True)] == ends
 
 
 @pytest.mark.parametrize(
-    "text", ["", "usb", "udp:x", "udp:0", "udp:127.0.0.1:x", "tcp:-1", "tcp:65535", "udp:²"]
+    "text", ["", "usb", "udp:x", "udp:0", "udp:127.0.0.1:x", "tcp:-1", "tcp:65535", "tcp:65536", "udp:²"]
 )
-def test_other_addresses_are_refused_in_one_line(text):
-    with pytest.raises(LabError, match=r"^--mavlink ") as caught:
+def test_other_addresses_are_refused_in_one_line(text: str) -> None:
+    with pytest.raises(LabError, match=r"^--mavlink [^\n]*\Z"):
         parse_addresses(text, 2)
-    assert "\n" not in str(caught.value)

@@ -1,0 +1,122 @@
+"""A link, a server or an image that cannot work ends a command in one line with exit code 2, before anything moves."""
+
+import socket
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import libusb_package
+import pytest
+from cflib.crtp.radiodriver import RadioManager
+
+from hil.servers.dongle_plugin import Backend
+from support.command import floaty
+from support.serving import CAMERAS, free_port
+
+RADIO = "radio://0/80/2M/E7E7E7E7E7"
+NOBODY = "radio://0/11/2M/E7E7E7E7AA"
+EXPECTED = "expected mavlink:DEVICE[,BAUD]"
+
+
+@pytest.fixture(autouse=True)
+def without_a_dongle(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An empty folder, and a computer without a Crazyradio."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(libusb_package, "get_libusb1_backend", lambda: Backend("127.0.0.1:9"))
+    monkeypatch.setattr(RadioManager, "_radios", [])
+
+
+def assert_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
+) -> str:
+    """Return the line in which a command says why it does nothing."""
+    assert floaty(monkeypatch, *arguments) == 2
+    shown = capsys.readouterr()
+    assert all(line.startswith(("mocap ", "udp ")) for line in shown.out.splitlines())
+    assert shown.err.startswith("floaty: ")
+    assert shown.err.count("\n") == 1
+    return shown.err
+
+
+@pytest.mark.parametrize(
+    ("link", "message"),
+    [
+        (RADIO, "Cannot find a Crazyradio Dongle"),
+        ("radio://0/80/3M/E7E7E7E7E7", "radio://0/80/3M/E7E7E7E7E7: expected radio://"),
+        ("udp://127.0.0.1", "udp://127.0.0.1: expected radio://"),
+        ("carrier-pigeon://coop", "expected radio://"),
+        ("mavlink:/nowhere/tty", "mavlink:/nowhere/tty: No such file or directory"),
+        ("mavlink:/dev/null", "mavlink:/dev/null: not a serial port"),
+        ("mavlink:/dev/null,fast", "baud rate 'fast': expected 9600..3000000"),
+        ("mavlink:/dev/null,300", "baud rate '300': expected 9600..3000000"),
+        ("mavlink:/dev/null,9600", "9600 baud: 50 poses/s need 2.63 kB/s"),
+        ("mavlink:", f"mavlink:: {EXPECTED}"),
+        ("mavlink", f"mavlink: {EXPECTED}"),
+        ("mavlink:carrier-pigeon://coop", EXPECTED),
+        ("mavlink:socket://127.0.0.1", EXPECTED),
+        ("mavlink:socket://127.0.0.1:99999", EXPECTED),
+        ("mavlink:socket://127.0.0.1:9", "mavlink:socket://127.0.0.1:9: Connection refused"),
+        ("mavlink:rfc2217://127.0.0.1:9", "mavlink:rfc2217://127.0.0.1:9: Connection refused"),
+    ],
+)
+def test_a_station_refuses_a_link_that_cannot_work(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], link: str, message: str
+) -> None:
+    assert message in assert_refused(monkeypatch, capsys, "station", "--link", link, "--mocap", CAMERAS)
+
+
+def test_a_station_refuses_a_port_on_which_no_board_listens(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    uri = f"udp://127.0.0.1:{free_port()}"
+    assert uri in assert_refused(monkeypatch, capsys, "station", "--link", uri, "--mocap", CAMERAS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["station", "--link", RADIO, "--mocap", "vicon"], "--mocap vicon: expected optitrack:HOST"),
+        (["station", "--link", RADIO, "--trajectory", "loop"], "experiment 'loop': unknown"),
+        (["station", "--link", RADIO, "--log", "/nowhere/a.csv"], "--log /nowhere/a.csv: there is no folder /nowhere"),
+        (["fly", "hover", "--link", "radio://0/81/2M/E7E7E7E7E7"], f"expected radio, mavlink, {RADIO}"),
+        (["fly", "hover", "--link", RADIO, "--seeds", "2"], "--seeds is for flights in lockstep"),
+        (["serve", "--set", "radio.uplink_loss=2"], "radio.uplink_loss = 2"),
+        (["serve", "--boards", "11"], "11"),
+        (["serve", "--udp", "65530", "--boards", "10"], "--udp 65530"),
+        (["serve", "--mavlink", "usb"], "--mavlink usb: expected pty"),
+        (["serve", "--mavlink", "udp:70000"], "--mavlink udp:70000: port 70000"),
+        (["serve", "--mavlink", "pty:/no/folder", "--no-motive"], "mavlink pty /no/folder: No such file"),
+        (["serve", "--baud", "57600"], "--baud 57600: there is no serial line without --mavlink"),
+        (["serve", "--mavlink", "pty", "--set", "mavlink.system=255", "--boards", "2"], "mavlink.system = 256"),
+        (["deploy", "flash", "--uri", NOBODY, "cf2.bin"], "Cannot find a Crazyradio Dongle"),
+        (["deploy", "flash", "--uri", "udp://127.0.0.1:19850", "cf2.bin"], "udp://127.0.0.1:19850: expected radio://"),
+        (["deploy", "flash", "--uri", NOBODY, "nowhere.bin"], "nowhere.bin: No such file"),
+        (["deploy", "flash", "--uri", NOBODY, "cf2.elf"], "cf2.elf: not an image for the board"),
+        (["deploy", "flash", "cf2.bin"], "Missing option '--uri'"),
+    ],
+)  # fmt: skip
+def test_what_cannot_work_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    Path("cf2.bin").write_bytes(struct.pack("<II", 0x2002_0000, 0x0800_41C1) + bytes(2000))
+    Path("cf2.elf").write_bytes(b"\x7fELF" + bytes(500))
+    assert message in assert_refused(monkeypatch, capsys, *arguments)
+
+
+@pytest.fixture
+def taken() -> Iterator[str]:
+    """A UDP port of the loopback interface that another program has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+        held.bind(("127.0.0.1", 0))
+        yield str(held.getsockname()[1])
+
+
+def test_a_server_names_the_port_that_another_program_has(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], taken: str
+) -> None:
+    said = assert_refused(monkeypatch, capsys, "serve", "--no-motive", "--udp", taken)
+    assert said == f"floaty: udp port {taken}: Address already in use\n"
+    said = assert_refused(monkeypatch, capsys, "serve", "--udp", "0", "--natnet-port", taken)
+    assert said.startswith(
+        f"floaty: natnet port {taken}: Address already in use; --natnet-port 0 takes a free one"
+    )
