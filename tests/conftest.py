@@ -15,12 +15,15 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
 
 from support.serving import SERVED, STANDSTILL
+
+if TYPE_CHECKING:
+    from support.command import Cli
 
 settings.register_profile("reproducible", derandomize=True, deadline=None)  # a first call compiles
 if "FLOATY_FUZZ" not in os.environ:
@@ -179,3 +182,18 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from support.crazyflie_app import build_app
 
     return build_app(tmp_path_factory.mktemp("app"))
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> "Cli":
+    """The command line in this process."""
+    from support.command import Cli
+
+    return Cli(capsys)
+
+
+@pytest.fixture
+def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A new folder, which is the current one."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path

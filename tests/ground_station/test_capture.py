@@ -16,7 +16,7 @@ from ground_station.frame_rate import FrameRate
 from ground_station.sources.address import find_source, override
 from ground_station.sources.alignment import Alignment
 from hil.config import load_config
-from support.command import floaty
+from support.command import Cli
 
 QUARTER = math.pi / 2
 
@@ -156,12 +156,6 @@ def test_a_stream_with_another_rate_than_the_profile_s_is_told_once() -> None:
     (("--set", "capture.system=qualisys", "--set", "capture.port=1"), "capture.system = qualisys: qualisys: its client"),
 ])  # fmt: skip
 def test_what_cannot_be_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: tuple[str, ...],
-    message: str,
+    cli: Cli, arguments: tuple[str, ...], message: str
 ) -> None:
-    assert floaty(monkeypatch, "station", "--link", "udp://127.0.0.1:1", *arguments) == 2
-    shown = capsys.readouterr().err
-    assert message in shown
-    assert shown.count("\n") == 1
+    assert message in cli.refusal("station", "--link", "udp://127.0.0.1:1", *arguments)

@@ -14,7 +14,7 @@ from hil import Along, Experiment, LabError, Metric, Request, fly, load_run
 from hil.api import command_of, request_of
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS
-from support.command import floaty
+from support.command import Cli
 from support.examples import run_examples
 
 PAGE = Path(hil.__file__).parent.parent / "docs" / "howto" / "python.md"
@@ -135,14 +135,12 @@ def test_bad_options_are_one_line(options: dict[str, object], told: str) -> None
         ),
     ],
 )
-def test_the_command_of_a_request_flies_it_again_bit_for_bit(
-    monkeypatch: pytest.MonkeyPatch, options: dict[str, object]
-) -> None:
+def test_the_command_of_a_request_flies_it_again_bit_for_bit(cli: Cli, options: dict[str, object]) -> None:
     request = request_of("yaw-step", duration_s=SHORT, **options)  # type: ignore[arg-type]
     flown = fly(request, "one")
     command = command_of(request)
     assert command is not None
-    floaty(monkeypatch, *shell_words(command)[1:], "--out", "two")
+    cli(*shell_words(command)[1:], "--out", "two")
     assert load_run("two").hash == flown.hash
 
 

@@ -12,7 +12,9 @@ from hil import LabError, fly, load_run
 from hil.api import request_of
 from hil.laboratory.recorder import PARQUET
 from hil.run_folder import folder_of, reserved
-from support.command import floaty
+from support.command import Cli
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 SHORT = 0.05  # [s]
 HOLDER = """
@@ -24,11 +26,6 @@ with reserved(request_of("hover", duration_s=0.05), Path(sys.argv[1])):
     print("reserved", flush=True)
     sys.stdin.read()
 """
-
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
 
 
 def stored(folder: str) -> list[tuple[str, bytes]]:
@@ -96,22 +93,19 @@ def test_a_refused_flight_leaves_no_folder() -> None:
     assert not Path("new").exists()
 
 
-def test_the_command_names_the_folder_that_stays(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_names_the_folder_that_stays(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     fly("hover", duration_s=SHORT)
     kept = stored("runs/hover-1")
     monkeypatch.setattr("hil.commands.fly.write_pictures", lambda folder, experiment: None)
-    floaty(monkeypatch, "fly", "hover", "--duration", "0.1")
-    captured = capsys.readouterr()
-    assert captured.err.splitlines() == [
+    cli("fly", "hover", "--duration", "0.1")
+    assert cli.err.splitlines() == [
         "runs/hover-1 holds another flight (duration 0.05 s); this flight is in runs/hover-1-2"
     ]
-    assert "runs/hover-1-2/log.parquet" in captured.out
+    assert "runs/hover-1-2/log.parquet" in cli.out
     assert stored("runs/hover-1") == kept
     assert load_run("runs/hover-1-2").result.duration_s == 0.1
-    assert floaty(monkeypatch, "fly", "hover", "--duration", "0.1", "--out", "runs/hover-1") == 2
-    assert capsys.readouterr().err == (
+    assert cli("fly", "hover", "--duration", "0.1", "--out", "runs/hover-1") == 2
+    assert cli.err == (
         "floaty: --out runs/hover-1: holds another flight (duration 0.05 s): choose another folder, or delete this one\n"
     )
 

@@ -15,7 +15,7 @@ from hil.laboratory.recorder import load_log
 from hil.laboratory.result import read_result
 from hil.laboratory.run import Request, fly, prepare
 from support.app_board import board
-from support.command import floaty
+from support.command import Cli
 from support.plugged_dongle import plug
 from support.serving import START_TIMEOUT_S, Served, started
 
@@ -48,18 +48,18 @@ def served(request: pytest.FixtureRequest, library: Path) -> Iterator[Served]:
 
 @pytest.mark.parametrize("medium", ["radio", "udp"])
 def test_a_flight_on_a_board_behind_a_link_is_the_flight_of_python(
-    served: Served, medium: str, python: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    cli: Cli, served: Served, medium: str, python: str, tmp_path: Path
+) -> None:
     (uri,) = served.line(f"{medium} ")
     out = tmp_path / "run"
-    assert floaty(monkeypatch, "fly", "hover", "--duration", "1", "--board", uri, "--out", out) == 0
+    assert cli("fly", "hover", "--duration", "1", "--board", uri, "--out", out) == 0
     result = read_result(out)
     assert (result.board, result.hash) == (uri, python)
     assert result.usage.entries["control"].calls == 200
 
 
 def test_a_board_that_is_killed_in_flight_ends_it_in_one_line_with_what_was_flown(
-    library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    library: Path, tmp_path: Path
 ) -> None:
     with board(library) as served:
         (uri,) = served.line("udp ")
@@ -82,17 +82,13 @@ def test_a_board_that_is_killed_in_flight_ends_it_in_one_line_with_what_was_flow
     ids=["good-radio", "lossy-radio", "good-udp", "lossy-udp"],
 )
 def test_hover_with_the_board_in_the_loop_holds_all_limits(
-    library: Path,
-    medium: str,
-    overrides: tuple[str, ...],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    cli: Cli, library: Path, medium: str, overrides: tuple[str, ...], tmp_path: Path
 ) -> None:
     with board(library, *overrides) as served:
         plug(served)
         (uri,) = served.line(f"{medium} ")
         out = tmp_path / "run"
-        code = floaty(monkeypatch, "fly", "hover", "--duration", "8", "--board", uri, "--hil", "--out", out)
+        code = cli("fly", "hover", "--duration", "8", "--board", uri, "--hil", "--out", out)
     result = read_result(out)
     assert (code, result.outcome) == (0, "completed"), result.verdicts
     assert SERVO_S < result.metrics["loop_delay"] < BEARABLE_S
@@ -100,7 +96,7 @@ def test_hover_with_the_board_in_the_loop_holds_all_limits(
 
 
 def test_with_a_third_of_all_packets_lost_the_board_in_the_loop_stays_in_the_box_or_ends_in_the_failsafe(
-    library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cli: Cli, library: Path, tmp_path: Path
 ) -> None:
     lossy = (
         *LOSSY,
@@ -111,7 +107,7 @@ def test_with_a_third_of_all_packets_lost_the_board_in_the_loop_stays_in_the_box
         plug(served)
         (uri,) = served.line("radio ")
         out = tmp_path / "run"
-        floaty(monkeypatch, "fly", "hover", "--duration", "6", "--board", uri, "--hil", "--out", out)
+        cli("fly", "hover", "--duration", "6", "--board", uri, "--hil", "--out", out)
     result = read_result(out)
     assert result.outcome == "completed"
     assert result.metrics["in_box"] == 1.0 or result.metrics["failsafe"] > 0

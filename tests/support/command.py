@@ -8,10 +8,31 @@ import pytest
 from hil.commands.app import main
 
 
-def floaty(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+def floaty(*arguments: str | Path) -> int:
     """Run `floaty` with arguments and return its exit code."""
-    monkeypatch.setattr(sys, "argv", ["floaty", *map(str, arguments)])
-    with pytest.raises(SystemExit) as left:
-        main()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["floaty", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
     assert isinstance(left.value.code, int)
     return left.value.code
+
+
+class Cli:
+    """Call it with the arguments of `floaty`: it returns the exit code and keeps what was printed."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+        self.out = self.err = ""
+
+    def __call__(self, *arguments: str | Path) -> int:
+        code = floaty(*arguments)
+        self.out, self.err = self._capsys.readouterr()
+        return code
+
+    def refusal(self, *arguments: str | Path) -> str:
+        """Return the one line in which a command refuses bad input, with exit code 2."""
+        assert self(*arguments) == 2, self.out + self.err
+        assert self.err.startswith("floaty: ")
+        assert self.err.count("\n") == 1
+        return self.err

@@ -10,7 +10,7 @@ from firmware_py.export.errors import ExportError
 from firmware_py.logic.loading import load_logic
 from hil.config import load_config
 from hil.errors import LabError
-from support.command import floaty
+from support.command import Cli
 from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, make_project, own_config
 
 
@@ -325,24 +325,22 @@ def test_a_value_without_own_logic_is_refused() -> None:
         load_config(overrides=["logic.gain_y=1.0"])
 
 
-def test_a_file_that_is_not_there_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_file_that_is_not_there_is_one_line_and_exit_code_two(cli: Cli, tmp_path: Path) -> None:
     profile = make_project(tmp_path)
     (tmp_path / "controller.py").unlink()
-    assert floaty(monkeypatch, "fly", "hover", "--profile", profile) == 2
-    said = capsys.readouterr().err
+    assert cli("fly", "hover", "--profile", profile) == 2
+    said = cli.err
     assert said == f"floaty: logic.controller = {tmp_path / 'controller.py'}: No such file or directory\n"
 
 
 def test_a_mistake_in_a_module_is_one_line_and_exit_code_two_wherever_it_would_fly(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
     make_project(tmp_path, changed(LAW, "f32(0.01)", "0.01"))
     for command in (("fly", "hover"), ("deploy", "check"), ("deploy", "export", "app")):
-        assert floaty(monkeypatch, *command, "--profile", "profile.toml") == 2
-        said = capsys.readouterr().err
+        assert cli(*command, "--profile", "profile.toml") == 2
+        said = cli.err
         at = f"controller.py:{line_of(LAW, 'DT =')}"
         assert said == f"floaty: {at}: constant DT is neither f32(number) nor a 32-bit integer\n"
 

@@ -12,7 +12,7 @@ from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, parse
 from support.campaigns import spec_of
-from support.command import floaty
+from support.command import Cli
 
 FAULTS = (
     "mocap.dropout@1:2=1",
@@ -130,7 +130,9 @@ def test_what_is_harmless_can_be_written() -> None:
 
 @pytest.mark.long
 def test_the_command_shrinks_a_flight_that_is_lost_and_says_how_to_fly_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: pytest.TempPathFactory
+    cli: Cli,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: pytest.TempPathFactory,
 ) -> None:
     monkeypatch.chdir(str(tmp_path))
     text = """
@@ -150,17 +152,16 @@ size = 2.0
 """
     with open("spec.toml", "w") as file:
         file.write(text)
-    assert floaty(monkeypatch, "campaign", "spec.toml", "--shrink", "0") == 0
-    said = capsys.readouterr()
-    command = said.out.splitlines()[-1].split()
+    assert cli("campaign", "spec.toml", "--shrink", "0") == 0
+    command = cli.out.splitlines()[-1].split()
     assert command[:3] == ["floaty", "fly", "hover"]
     assert "--set" not in command
     assert command.count("--fault") == 1
     fault = parse(command[command.index("--fault") + 1])
     assert fault.kind == "push.x"
     assert fault.size * fault.duration_s < 1.0
-    assert "holds: " in said.err
-    assert floaty(monkeypatch, *command[1:]) == 1, "it fails"
+    assert "holds: " in cli.err
+    assert cli(*command[1:]) == 1, "it fails"
 
 
 def test_what_is_shrunk_is_the_flight_that_was_drawn() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from hil.campaigns.config import find_spec, read_spec
 from hil.campaigns.sampling import check_spec, draw, request_of
-from support.command import floaty
+from support.command import Cli
 
 HOVER = 'experiments = ["hover"]\nflights = 64\n'
 
@@ -75,18 +75,11 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
     ],
 )
 def test_a_bad_spec_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    text: str,
-    message: str,
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("bad.toml").write_text(text, encoding="utf-8")
-    assert floaty(monkeypatch, "campaign", "bad.toml") == 2
-    told = capsys.readouterr().err
-    assert message in told
-    assert told.count("\n") == 1
+    assert message in cli.refusal("campaign", "bad.toml")
     assert list(tmp_path.iterdir()) == [tmp_path / "bad.toml"], "nothing was begun"
 
 
@@ -103,15 +96,11 @@ def test_a_bad_spec_is_one_line_and_exit_code_two(
     ],
 )
 def test_a_bad_option_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    arguments: list[str],
-    message: str,
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert floaty(monkeypatch, "campaign", *arguments) == 2
-    assert message in capsys.readouterr().err
+    assert cli("campaign", *arguments) == 2
+    assert message in cli.err
 
 
 def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
@@ -122,11 +111,9 @@ def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
     assert spec.profiles == (f"{tmp_path}/lab.toml",)
 
 
-def test_a_missing_extra_says_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_extra_says_how_to_install_it(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.errors.find_spec", lambda name: None)
-    assert floaty(monkeypatch, "campaign", "table") == 2
-    told = capsys.readouterr().err
+    assert cli("campaign", "table") == 2
+    told = cli.err
     assert "floaty campaign: distributed is missing: " in told
     assert "pip install 'dask[distributed]" in told

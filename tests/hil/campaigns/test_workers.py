@@ -19,7 +19,7 @@ from hil.campaigns.flying import Campaign, CampaignRow, fly_flight
 from hil.campaigns.run import Standing, conduct
 from hil.errors import LabError
 from support.campaigns import hanging, killing, planted, raising, spec_of
-from support.command import floaty
+from support.command import Cli
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("default")]
 
@@ -128,19 +128,19 @@ def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_command_flies_reports_and_resumes(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("tiny.toml").write_text(
         'experiments = ["hover"]\nduration_s = 0.3\nflights = 3\n'
         '[parameters]\n"actuators.tau" = { uniform = [0.04, 0.06] }\n'
     )
-    assert floaty(monkeypatch, "campaign", "tiny.toml", "--workers", "1") == 0
+    assert cli("campaign", "tiny.toml", "--workers", "1") == 0
     out = Path("runs/campaign-tiny")
     assert {path.name for path in out.iterdir()} == {"campaign.json", "flights", "report.html", "result.json"}
-    assert "of 3: " in capsys.readouterr().out
+    assert "of 3: " in cli.out
     before = (out / "flights" / "all.parquet").read_bytes()
-    assert floaty(monkeypatch, "campaign", "tiny.toml", "--resume", "--cluster", "tcp://127.0.0.1:9") == 0
+    assert cli("campaign", "tiny.toml", "--resume", "--cluster", "tcp://127.0.0.1:9") == 0
     assert (out / "flights" / "all.parquet").read_bytes() == before, "nothing was left to fly"
-    assert floaty(monkeypatch, "campaign", "tiny.toml") == 2
-    assert "--resume continues it" in capsys.readouterr().err
+    assert cli("campaign", "tiny.toml") == 2
+    assert "--resume continues it" in cli.err

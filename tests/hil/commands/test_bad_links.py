@@ -10,7 +10,7 @@ import pytest
 from cflib.crtp.radiodriver import RadioManager
 
 from hil.servers.dongle_plugin import Backend
-from support.command import floaty
+from support.command import Cli
 from support.serving import CAMERAS, free_port
 
 RADIO = "radio://0/80/2M/E7E7E7E7E7"
@@ -19,23 +19,10 @@ EXPECTED = "expected mavlink:DEVICE[,BAUD]"
 
 
 @pytest.fixture(autouse=True)
-def without_a_dongle(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def without_a_dongle(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
     """An empty folder, and a computer without a Crazyradio."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(libusb_package, "get_libusb1_backend", lambda: Backend("127.0.0.1:9"))
     monkeypatch.setattr(RadioManager, "_radios", [])
-
-
-def assert_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: str
-) -> str:
-    """Return the line in which a command says why it does nothing."""
-    assert floaty(monkeypatch, *arguments) == 2
-    shown = capsys.readouterr()
-    assert all(line.startswith(("mocap ", "udp ")) for line in shown.out.splitlines())
-    assert shown.err.startswith("floaty: ")
-    assert shown.err.count("\n") == 1
-    return shown.err
 
 
 @pytest.mark.parametrize(
@@ -59,17 +46,13 @@ def assert_refused(
         ("mavlink:rfc2217://127.0.0.1:9", "mavlink:rfc2217://127.0.0.1:9: Connection refused"),
     ],
 )
-def test_a_station_refuses_a_link_that_cannot_work(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], link: str, message: str
-) -> None:
-    assert message in assert_refused(monkeypatch, capsys, "station", "--link", link, "--mocap", CAMERAS)
+def test_a_station_refuses_a_link_that_cannot_work(cli: Cli, link: str, message: str) -> None:
+    assert message in cli.refusal("station", "--link", link, "--mocap", CAMERAS)
 
 
-def test_a_station_refuses_a_port_on_which_no_board_listens(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_station_refuses_a_port_on_which_no_board_listens(cli: Cli) -> None:
     uri = f"udp://127.0.0.1:{free_port()}"
-    assert uri in assert_refused(monkeypatch, capsys, "station", "--link", uri, "--mocap", CAMERAS)
+    assert uri in cli.refusal("station", "--link", uri, "--mocap", CAMERAS)
 
 
 @pytest.mark.parametrize(
@@ -95,12 +78,10 @@ def test_a_station_refuses_a_port_on_which_no_board_listens(
         (["deploy", "flash", "cf2.bin"], "Missing option '--uri'"),
     ],
 )  # fmt: skip
-def test_what_cannot_work_is_refused(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
+def test_what_cannot_work_is_refused(cli: Cli, arguments: list[str], message: str) -> None:
     Path("cf2.bin").write_bytes(struct.pack("<II", 0x2002_0000, 0x0800_41C1) + bytes(2000))
     Path("cf2.elf").write_bytes(b"\x7fELF" + bytes(500))
-    assert message in assert_refused(monkeypatch, capsys, *arguments)
+    assert message in cli.refusal(*arguments)
 
 
 @pytest.fixture
@@ -111,12 +92,10 @@ def taken() -> Iterator[str]:
         yield str(held.getsockname()[1])
 
 
-def test_a_server_names_the_port_that_another_program_has(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], taken: str
-) -> None:
-    said = assert_refused(monkeypatch, capsys, "serve", "--no-motive", "--udp", taken)
+def test_a_server_names_the_port_that_another_program_has(cli: Cli, taken: str) -> None:
+    said = cli.refusal("serve", "--no-motive", "--udp", taken)
     assert said == f"floaty: udp port {taken}: Address already in use\n"
-    said = assert_refused(monkeypatch, capsys, "serve", "--udp", "0", "--natnet-port", taken)
+    said = cli.refusal("serve", "--udp", "0", "--natnet-port", taken)
     assert said.startswith(
         f"floaty: natnet port {taken}: Address already in use; --natnet-port 0 takes a free one"
     )

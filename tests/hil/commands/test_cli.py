@@ -14,26 +14,21 @@ from firmware_py.extras import install_command
 from hil.errors import LabError
 from hil.laboratory.recorder import load_log
 from hil.live.window import DISPLAYS
-from support.command import floaty
+from support.command import Cli
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 FLOATY = (sys.executable, "-m", "hil.commands")
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
-def test_fly_writes_everything_and_says_where(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert floaty(monkeypatch, "fly", "hover", "--duration", "3", "--seed", "5") == 0
+def test_fly_writes_everything_and_says_where(cli: Cli, tmp_path: Path) -> None:
+    assert cli("fly", "hover", "--duration", "3", "--seed", "5") == 0
     folder = tmp_path / "runs" / "hover-5"
     expected = {
         "log.parquet", "events.jsonl", "telemetry.csv", "schedule.parquet", "result.json", "flight.rrd", "report.html",
     }  # fmt: skip
     assert {path.name for path in folder.iterdir()} == expected
-    shown = capsys.readouterr().out
+    shown = cli.out
     assert "within_6cm_x" in shown
     assert "runs/hover-5/report.html" in shown
     assert re.search(r"completed; \d+ times real time; \d+\.\d s from start to end; hash \w{16}\n", shown)
@@ -41,12 +36,10 @@ def test_fly_writes_everything_and_says_where(
 
 
 @pytest.mark.long
-def test_a_failed_limit_is_exit_code_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code = floaty(monkeypatch, "fly", "hover", "--set", "tunnel.speed=7", "--out", "crash")
+def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
+    code = cli("fly", "hover", "--set", "tunnel.speed=7", "--out", "crash")
     assert code == 1
-    assert "lost" in capsys.readouterr().out
+    assert "lost" in cli.out
 
 
 @pytest.mark.parametrize(
@@ -86,21 +79,13 @@ def test_a_failed_limit_is_exit_code_one(
         (["flyy"], "No such command"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    assert floaty(monkeypatch, *arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.startswith("floaty: ")
-    assert error.count("\n") == 1
+def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
+    assert message in cli.refusal(*arguments)
 
 
-def test_list_names_experiments_and_profiles(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "list") == 0
-    shown = capsys.readouterr().out
+def test_list_names_experiments_and_profiles(cli: Cli) -> None:
+    assert cli("list") == 0
+    shown = cli.out
     assert shown.startswith("hover  ")
     assert {"as-flown", "design-best", "floaty (default)", "lqr"} <= set(
         shown.partition("profiles: ")[2].partition("\n")[0].split(", ")
@@ -108,29 +93,25 @@ def test_list_names_experiments_and_profiles(
 
 
 @pytest.mark.long
-def test_perfetto_writes_its_trace(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--perfetto", "--out", "run") == 0
-    assert "run/flight.perfetto-trace" in capsys.readouterr().out
+def test_perfetto_writes_its_trace(cli: Cli) -> None:
+    assert cli("fly", "hover", "--duration", "0.5", "--perfetto", "--out", "run") == 0
+    assert "run/flight.perfetto-trace" in cli.out
     assert Path("run/flight.perfetto-trace").stat().st_size > 10_000
 
 
 @pytest.mark.long
-def test_report_can_be_written_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--out", "run")
+def test_report_can_be_written_again(cli: Cli) -> None:
+    cli("fly", "hover", "--duration", "0.5", "--out", "run")
     Path("run/report.html").unlink()
-    assert floaty(monkeypatch, "report", "run") == 0
+    assert cli("report", "run") == 0
     assert Path("run/report.html").stat().st_size > 10_000
 
 
 @pytest.mark.long
-def test_seeds_fly_in_other_processes_with_the_same_hash(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "fly", "hover", "--duration", "1", "--seed", "4", "--seeds", "2") == 0
-    assert "2 seeds: 2 hold all limits, 0 lost" in capsys.readouterr().out
-    assert floaty(monkeypatch, "fly", "hover", "--duration", "1", "--seed", "4", "--out", "here") == 0
+def test_seeds_fly_in_other_processes_with_the_same_hash(cli: Cli) -> None:
+    assert cli("fly", "hover", "--duration", "1", "--seed", "4", "--seeds", "2") == 0
+    assert "2 seeds: 2 hold all limits, 0 lost" in cli.out
+    assert cli("fly", "hover", "--duration", "1", "--seed", "4", "--out", "here") == 0
     elsewhere, here = (json.loads(Path(p, "result.json").read_text()) for p in ("runs/hover-4", "here"))
     assert elsewhere["hash"] == here["hash"]
 
@@ -165,13 +146,13 @@ def test_ctrl_c_leaves_log_report_and_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_killed_flight_can_still_be_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_killed_flight_can_still_be_reported(cli: Cli, tmp_path: Path) -> None:
     process = start("fly", "hover", "--realtime", "--duration", "600", "--out", "run")
     process.kill()
     process.communicate(timeout=60)
     assert not Path("run/log.parquet").exists()
     assert load_log(tmp_path / "run").num_rows >= 100
-    assert floaty(monkeypatch, "report", "run") == 0
+    assert cli("report", "run") == 0
 
 
 @pytest.mark.parametrize(
@@ -196,19 +177,12 @@ def test_a_killed_flight_can_still_be_reported(monkeypatch: pytest.MonkeyPatch, 
     ],
 )
 def test_a_missing_package_is_one_line_before_anything_is_flown_or_deleted(
-    arguments: list[str],
-    module: str,
-    extra: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    cli: Cli, arguments: list[str], module: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path("runs/hover-1").mkdir(parents=True)
     Path("runs/hover-1/log.parquet").write_bytes(b"an older flight")
     monkeypatch.setitem(sys.modules, module, None)
-    assert floaty(monkeypatch, *arguments) == 2
-    said = capsys.readouterr().err
-    assert said.endswith(f": {module} is missing: {install_command(extra)}\n")
-    assert said.count("\n") == 1
+    assert cli.refusal(*arguments).endswith(f": {module} is missing: {install_command(extra)}\n")
     assert Path("runs/hover-1/log.parquet").is_file()
 
 
@@ -219,25 +193,23 @@ def test_listing_the_studies_loads_neither_an_extra_nor_what_draws() -> None:
 
 
 @pytest.mark.parametrize("option", ["--board", "--link"])
-def test_an_older_run_is_kept_where_no_board_answers(
-    option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_older_run_is_kept_where_no_board_answers(cli: Cli, option: str) -> None:
     Path("runs/hover-1").mkdir(parents=True)
     Path("runs/hover-1/result.json").write_bytes(b"of an older flight")
-    assert floaty(monkeypatch, "fly", "hover", option, "radio://7/80/2M/E7E7E7E7E7") == 2
-    assert "radio://7" in capsys.readouterr().err
+    assert cli("fly", "hover", option, "radio://7/80/2M/E7E7E7E7E7") == 2
+    assert "radio://7" in cli.err
     assert [path.name for path in Path("runs/hover-1").iterdir()] == ["result.json"]
 
 
 @pytest.mark.long
 def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     for module in ("hil.pictures.viewer", "hil.pictures.viewer.recording"):
         monkeypatch.delitem(sys.modules, module, raising=False)
-    assert floaty(monkeypatch, "fly", "hover", "--duration", "0.5", "--out", "run") == 0
-    assert "view" in capsys.readouterr().err
+    assert cli("fly", "hover", "--duration", "0.5", "--out", "run") == 0
+    assert "view" in cli.err
     assert not Path("run/flight.rrd").exists()
     assert Path("run/report.html").exists()
 
@@ -245,11 +217,11 @@ def test_without_rerun_the_flight_is_flown_and_says_what_is_missing(
 @pytest.mark.long
 @pytest.mark.parametrize("view", [["--view", "--realtime"], ["--view", "wbe"]])
 def test_a_viewer_that_cannot_open_is_one_line_and_leaves_no_folder(
-    view: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cli: Cli, view: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in DISPLAYS:
         monkeypatch.delenv(name, raising=False)
-    assert floaty(monkeypatch, "fly", "hover", *view, "--out", "run") == 2
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("floaty: ")]
+    assert cli("fly", "hover", *view, "--out", "run") == 2
+    (line,) = [line for line in cli.err.splitlines() if line.startswith("floaty: ")]
     assert "--view web" in line or "--view wbe: expected" in line
     assert not Path("run").exists()

@@ -10,8 +10,10 @@ import hil
 from hil.experiments import find_experiment
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import read_result
-from support.command import floaty
+from support.command import Cli
 from support.installed_wheel import install, run
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 ROOT = Path(hil.__file__).parent.parent
 FILES = [
@@ -25,39 +27,32 @@ FILES = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 def files_in(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
-def test_a_project_has_everything_that_a_flight_and_a_test_need(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "new", "deep/My Law") == 0
+def test_a_project_has_everything_that_a_flight_and_a_test_need(cli: Cli) -> None:
+    assert cli("new", "deep/My Law") == 0
     project = Path("deep/My Law")
     assert files_in(project) == sorted(FILES)
-    assert "cd deep/My Law; floaty fly hover --profile profile.toml" in capsys.readouterr().out
+    assert "cd deep/My Law; floaty fly hover --profile profile.toml" in cli.out
     assert 'name = "my-law"' in (project / "pyproject.toml").read_text()
     assert all("{{" not in (project / name).read_text(encoding="utf-8") for name in FILES)
     assert find_experiment(f"{project}/experiments.py:figure_eight").duration_s == 12.0
 
 
-def test_an_empty_folder_becomes_a_project(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_folder_becomes_a_project(cli: Cli) -> None:
     Path("law").mkdir()
-    assert floaty(monkeypatch, "new", "law") == 0
+    assert cli("new", "law") == 0
     assert files_in(Path("law")) == sorted(FILES)
 
 
 def test_the_present_folder_becomes_a_project_of_its_name(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    assert floaty(monkeypatch, "new", ".") == 0
+    assert cli("new", ".") == 0
     assert 'name = "here"' in Path("pyproject.toml").read_text()
 
 
@@ -71,29 +66,25 @@ def test_the_present_folder_becomes_a_project_of_its_name(
     ],
 )
 def test_a_folder_that_cannot_be_is_one_line_and_nothing_is_written(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    folder: str,
-    told: str,
+    cli: Cli, tmp_path: Path, folder: str, told: str
 ) -> None:
     Path("taken").mkdir()
     Path("taken/controller.py").write_text("years of work")
     Path("file").touch()
-    assert floaty(monkeypatch, "new", "--", folder) == 2
-    assert capsys.readouterr().err == told
+    assert cli("new", "--", folder) == 2
+    assert cli.err == told
     assert files_in(tmp_path) == ["file", "taken/controller.py"]
     assert Path("taken/controller.py").read_text() == "years of work"
 
 
 @pytest.mark.long
 def test_a_project_flies_and_its_tests_pass(
-    monkeypatch: pytest.MonkeyPatch, pytester: pytest.Pytester
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, pytester: pytest.Pytester
 ) -> None:
     monkeypatch.chdir(pytester.path)
-    assert floaty(monkeypatch, "new", "law") == 0
+    assert cli("new", "law") == 0
     monkeypatch.chdir("law")
-    assert floaty(monkeypatch, "fly", "hover", "--profile", "profile.toml", "--duration", "3") == 0
+    assert cli("fly", "hover", "--profile", "profile.toml", "--duration", "3") == 0
     flown = read_result(Path("runs/hover-1"))
     assert flown.logic  # the hash of the controller that flew
     assert "logic.integral" in load_log(Path("runs/hover-1")).column_names

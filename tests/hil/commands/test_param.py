@@ -7,7 +7,7 @@ import pytest
 from firmware_py.table import on_board
 from ground_station.controls import Action, Request
 from hil.commands import param
-from support.command import floaty
+from support.command import Cli
 
 LINK = ("--link", "udp://127.0.0.1:1")
 
@@ -28,29 +28,27 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Request]:
 
 
 def test_a_profile_s_name_has_the_profile_s_sign_and_a_board_s_the_board_s(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], asked: list[Request]
+    cli: Cli, asked: list[Request]
 ) -> None:
     name, factor = on_board("controller.gain_y")
     assert (name, factor) == ("extCtrl.y_P", -1.0)
-    assert floaty(monkeypatch, "param", "get", "controller.gain_y", "extCtrl.y_P", *LINK) == 0
-    assert capsys.readouterr().out == "controller.gain_y -1.5\nextCtrl.y_P 1.5\n"
-    assert floaty(monkeypatch, "param", "set", "controller.gain_y=-2.5", "extCtrl.y_P=2.25", *LINK) == 0
-    assert capsys.readouterr().out == "controller.gain_y -2.5\nextCtrl.y_P 2.25\n"
+    assert cli("param", "get", "controller.gain_y", "extCtrl.y_P", *LINK) == 0
+    assert cli.out == "controller.gain_y -1.5\nextCtrl.y_P 1.5\n"
+    assert cli("param", "set", "controller.gain_y=-2.5", "extCtrl.y_P=2.25", *LINK) == 0
+    assert cli.out == "controller.gain_y -2.5\nextCtrl.y_P 2.25\n"
     assert [(one.name, one.value) for one in asked[2:]] == [("extCtrl.y_P", 2.5), ("extCtrl.y_P", 2.25)]
 
 
 @pytest.mark.parametrize("group", ["extctrl", "extCtrl.", "EXTCTRL"])
-def test_a_group_is_found_however_it_is_written(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], asked: list[Request], group: str
-) -> None:
-    assert floaty(monkeypatch, "param", "list", group, *LINK) == 0
-    assert capsys.readouterr().out == "extCtrl.y_P 1.5\nextCtrl.z_P 2\n"
+def test_a_group_is_found_however_it_is_written(cli: Cli, asked: list[Request], group: str) -> None:
+    assert cli("param", "list", group, *LINK) == 0
+    assert cli.out == "extCtrl.y_P 1.5\nextCtrl.z_P 2\n"
 
 
 @pytest.mark.parametrize("setting", ["extCtrl.y_P", "=1", "extCtrl.y_P=", "extCtrl.y_P=two"])
 def test_what_is_no_setting_is_one_line_and_nothing_is_asked(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], asked: list[Request], setting: str
+    cli: Cli, asked: list[Request], setting: str
 ) -> None:
-    assert floaty(monkeypatch, "param", "set", setting, *LINK) == 2
-    assert f"{setting}: expected NAME=VALUE with a number" in capsys.readouterr().err
+    assert cli("param", "set", setting, *LINK) == 2
+    assert f"{setting}: expected NAME=VALUE with a number" in cli.err
     assert asked == []

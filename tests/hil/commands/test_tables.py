@@ -15,7 +15,7 @@ from hil.laboratory.metrics import METRICS, Verdict
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import Request, fly, prepare
 from hil.studies.two_boards import FirstCount, Seed
-from support.command import floaty
+from support.command import Cli
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,12 @@ def test_every_metric_of_the_tables_exists() -> None:
     ("passed", "code"), [((True, True, True), 0), ((True, False, True), 1), ((False,) * 3, 1)]
 )
 def test_seeds_count_up_and_one_that_fails_is_exit_code_one(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, flown: Result, passed: tuple[bool, ...], code: int
+    cli: Cli,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    flown: Result,
+    passed: tuple[bool, ...],
+    code: int,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     jobs: list[Any] = []
@@ -78,7 +83,7 @@ def test_seeds_count_up_and_one_that_fails_is_exit_code_one(
         return [made(flown, 0.01, holds) for holds in passed], False
 
     monkeypatch.setattr("hil.studies.sweep.fly_all", fly_all)
-    assert floaty(monkeypatch, "fly", "hover", "--seeds", "3", "--seed", "5") == code
+    assert cli("fly", "hover", "--seeds", "3", "--seed", "5") == code
     assert [job.request.seed for job in jobs] == [5, 6, 7]
     assert len({job.folder for job in jobs}) == 3
 

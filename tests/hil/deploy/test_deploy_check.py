@@ -23,13 +23,10 @@ from hil.devices.board_firmware import PythonBoard
 from hil.laboratory.faults import parse
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.run import Request
-from support.command import floaty
+from support.command import Cli
 from support.core_streams import MEMORY
 
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 @pytest.fixture(scope="module")
@@ -131,11 +128,11 @@ SOMETHING_OF_EACH = ("--duration", "0.8", "--fault", "mocap.latency@0.2:0.4=150"
 
 @pytest.mark.long
 def test_all_targets_are_equal_in_a_short_flight_with_faults(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path
 ) -> None:
     monkeypatch.chdir(built)
-    assert floaty(monkeypatch, "deploy", "check", "yaw-step", *SOMETHING_OF_EACH) == 0
-    shown = capsys.readouterr().out
+    assert cli("deploy", "check", "yaw-step", *SOMETHING_OF_EACH) == 0
+    shown = cli.out
     assert [line.split()[0] for line in shown.splitlines() if line.endswith("equal")] == list(TARGETS)
     assert "180 ticks, numba beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
     assert re.search(rf"flash \d+ B, RAM {MEMORY} B, stack \d+ B\n", shown)
@@ -145,11 +142,11 @@ def test_all_targets_are_equal_in_a_short_flight_with_faults(
 
 @pytest.mark.long
 def test_ten_thousand_ticks_of_hover_yaw_step_and_faults_do_not_differ_in_a_bit(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path
 ) -> None:
     monkeypatch.chdir(built)
-    assert floaty(monkeypatch, "deploy", "check") == 0
-    sums = re.search(r"^(\d+) ticks, .*: no bit differs$", capsys.readouterr().out, re.MULTILINE)
+    assert cli("deploy", "check") == 0
+    sums = re.search(r"^(\d+) ticks, .*: no bit differs$", cli.out, re.MULTILINE)
     assert int(sums[1]) >= 10_000
 
 
@@ -171,7 +168,7 @@ class Watch(PythonRunner):
 
 @pytest.mark.parametrize("target", ["c-O2", pytest.param("cortex-m4", marks=pytest.mark.long)])
 def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path, target: str
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path, target: str
 ) -> None:
     monkeypatch.chdir(built)
     text = translate().source
@@ -182,8 +179,8 @@ def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
     assert text.count(right) == 1
     Path("changed.c").write_text(text.replace(right, wrong), encoding="utf-8")
     options = ("--targets", target, "--source", "changed.c")
-    assert floaty(monkeypatch, "deploy", "check", "hover", *SOMETHING_OF_EACH, *options) == 1
-    shown = capsys.readouterr().out
+    assert cli("deploy", "check", "hover", *SOMETHING_OF_EACH, *options) == 1
+    shown = cli.out
     [request] = plan("hover", False, "floaty", (), 1, 0.8, [parse(text) for text in SOMETHING_OF_EACH[3::2]])
     Watch.first.clear()
     flight = lockstep_flight(request, executor=PythonBoard(Watch))
@@ -196,7 +193,7 @@ def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
 
 @pytest.mark.long
 def test_machine_code_that_leaves_its_memory_is_exit_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path
 ) -> None:
     monkeypatch.chdir(built)
     text, right = translate().source, "const int32_t row = estimator->tick % FLOATY_HISTORY;"
@@ -204,8 +201,8 @@ def test_machine_code_that_leaves_its_memory_is_exit_one(
     wild = "const int32_t row = estimator->tick == 23 ? 0x8000000 : estimator->tick % FLOATY_HISTORY;"
     Path("wild.c").write_text(text.replace(right, wild), encoding="utf-8")
     options = ("--duration", "0.1", "--targets", "cortex-m4", "--source", "wild.c")
-    assert floaty(monkeypatch, "deploy", "check", "hover", *options) == 1
-    assert "tick 23, in estimate: " in capsys.readouterr().out
+    assert cli("deploy", "check", "hover", *options) == 1
+    assert "tick 23, in estimate: " in cli.out
 
 
 def test_a_plain_python_that_has_ended_is_a_difference() -> None:
@@ -225,14 +222,13 @@ def test_a_plain_python_that_has_ended_is_a_difference() -> None:
 
 @pytest.mark.parametrize("package", ["unicorn", "elftools.elf.elffile"])
 def test_a_missing_package_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], built: Path, package: str
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path, package: str
 ) -> None:
     monkeypatch.chdir(built)
     monkeypatch.setitem(sys.modules, package, None)
-    assert floaty(monkeypatch, "deploy", "check", "hover", "--targets", "cortex-m4") == 2
-    error = capsys.readouterr().err
-    assert error.endswith(f"is missing: {install_command('deploy')}\n")
-    assert error.count("\n") == 1
+    assert cli.refusal("deploy", "check", "hover", "--targets", "cortex-m4").endswith(
+        f"is missing: {install_command('deploy')}\n"
+    )
 
 
 FIRMWARE = """
@@ -283,12 +279,7 @@ CRAZYFLIE_FLAGS = (
 )
 @pytest.mark.long
 def test_the_core_inside_a_linked_firmware_is_checked(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    built: Path,
-    right: str,
-    wrong: str,
-    code: int,
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path, right: str, wrong: str, code: int
 ) -> None:
     monkeypatch.chdir(built)
     core = translate()
@@ -300,22 +291,17 @@ def test_the_core_inside_a_linked_firmware_is_checked(
     link = ("-nostartfiles", "-Wl,--gc-sections", "-T", "map.ld", "-o", "cf2.elf", "main.c", "floaty_core.c")
     subprocess.run(["arm-none-eabi-gcc", *CRAZYFLIE_FLAGS, *link], check=True, timeout=60)
     options = ("--duration", "0.5", "--targets", "cortex-m4", "--elf", "cf2.elf")
-    assert floaty(monkeypatch, "deploy", "check", "yaw-step", *options) == code
-    shown = capsys.readouterr().out
+    assert cli("deploy", "check", "yaw-step", *options) == code
+    shown = cli.out
     if code:
         assert "tick 0, after control: Control.count[0]" in shown
     else:
         assert "150 ticks, numba beside cortex-m4: no bit differs" in shown
 
 
-def test_c_that_does_not_compile_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_c_that_does_not_compile_is_one_line_and_exit_code_two(cli: Cli) -> None:
     Path("broken.c").write_text("int x = ;\n", encoding="utf-8")
-    assert floaty(monkeypatch, "deploy", "check", "hover", "--targets", "c-O2", "--source", "broken.c") == 2
-    error = capsys.readouterr().err
-    assert error.startswith("floaty: ")
-    assert error.count("\n") == 1
+    cli.refusal("deploy", "check", "hover", "--targets", "c-O2", "--source", "broken.c")
 
 
 @pytest.mark.parametrize(
@@ -336,20 +322,14 @@ def test_c_that_does_not_compile_is_one_line_and_exit_code_two(
     ],
 )
 def test_bad_input_of_check_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+    cli: Cli, arguments: list[str], message: str
 ) -> None:
-    assert floaty(monkeypatch, "deploy", "check", *arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.startswith("floaty: ")
-    assert error.count("\n") == 1
+    assert message in cli.refusal("deploy", "check", *arguments)
 
 
-def test_the_exported_app_holds_the_c_that_is_checked(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "deploy", "export", "app", "--profile", "as-flown") == 0
-    shown = [Path(line) for line in capsys.readouterr().out.splitlines()]
+def test_the_exported_app_holds_the_c_that_is_checked(cli: Cli) -> None:
+    assert cli("deploy", "export", "app", "--profile", "as-flown") == 0
+    shown = [Path(line) for line in cli.out.splitlines()]
     assert {path for path in Path("app").rglob("*") if path.is_file()} == set(shown)
     assert Path("app/src/floaty_core.c").read_text(encoding="utf-8") == translate().source
     assert Path("app/Makefile") in shown
@@ -365,13 +345,10 @@ def test_the_exported_app_holds_the_c_that_is_checked(
     ],
 )
 def test_bad_input_of_export_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+    cli: Cli, arguments: list[str], message: str
 ) -> None:
     Path("other").mkdir()
     Path("other/thesis.tex").write_text("mine", encoding="utf-8")
-    assert floaty(monkeypatch, "deploy", "export", *arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
+    assert message in cli.refusal("deploy", "export", *arguments)
     assert [path.name for path in Path("other").iterdir()] == ["thesis.tex"]
     assert not Path("app").exists()

@@ -12,7 +12,7 @@ from ground_station.links.core_client import CoreClient
 from hil.config import load_config
 from hil.deploy import doctor
 from support.app_packets import AppPackets
-from support.command import floaty
+from support.command import Cli
 from support.core_streams import MEMORY
 from support.crazyflie_app import App, build_app
 
@@ -58,17 +58,15 @@ def board(library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Boa
     return board
 
 
-def findings(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
-    lines = capsys.readouterr().out.splitlines()
+def findings(cli: Cli) -> dict[str, str]:
+    lines = cli.out.splitlines()
     return {line[2:12].strip(): line[:2].strip() + line[12:] for line in lines}
 
 
-def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(
-    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_board_that_is_well_is_described_and_gets_its_own_gyro_back(cli: Cli, board: Board) -> None:
     board.app.cycles.value = 5000
-    assert floaty(monkeypatch, "board", "doctor", URI) == 0
-    found = findings(capsys)
+    assert cli("board", "doctor", URI) == 0
+    found = findings(cli)
     subjects = "firmware core profile state link memory battery RAM gyro servos computes loop"
     assert " ".join(found) == subjects
     assert found["firmware"] == "2026.08 +2"
@@ -121,81 +119,75 @@ def forget(board: Board) -> None:
     ],
 )  # fmt: skip
 def test_what_is_not_well_is_marked_and_is_exit_code_one(
-    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    ail: Callable[[Board], None], subject: str, said: str,
-) -> None:  # fmt: skip
+    cli: Cli,
+    board: Board,
+    monkeypatch: pytest.MonkeyPatch,
+    ail: Callable[[Board], None],
+    subject: str,
+    said: str,
+) -> None:
     ail(board)
     monkeypatch.setattr("hil.deploy.doctor.VERSION_TIMEOUT_S", 0.02)
-    assert floaty(monkeypatch, "board", "doctor", URI) == 1
-    found = findings(capsys)
+    assert cli("board", "doctor", URI) == 1
+    found = findings(cli)
     assert found[subject].startswith(said)
     assert [text for text in found.values() if text.startswith("!")] == [found[subject]]
 
 
 def test_a_board_that_gets_no_samples_is_told_after_a_time(
-    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     board.deaf = True
     monkeypatch.setattr("hil.deploy.doctor.LOOP_TIMEOUT_US", 50_000)
-    assert floaty(monkeypatch, "board", "doctor", URI) == 1
-    assert findings(capsys)["loop"].startswith("!carries 0 samples/s of 1000: ")
+    assert cli("board", "doctor", URI) == 1
+    assert findings(cli)["loop"].startswith("!carries 0 samples/s of 1000: ")
 
 
-def test_a_board_in_someones_hand_moves_and_is_well(
-    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_board_in_someones_hand_moves_and_is_well(cli: Cli, board: Board) -> None:
     shake(board)
-    assert floaty(monkeypatch, "board", "doctor", URI) == 0
-    assert findings(capsys)["gyro"].startswith("alive; the board moves")
+    assert cli("board", "doctor", URI) == 0
+    assert findings(cli)["gyro"].startswith("alive; the board moves")
 
 
-def test_another_profile_than_here_is_told(
-    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "board", "doctor", URI, "--profile", "as-flown") == 1
-    assert findings(capsys)["profile"].startswith(f"!{profile_hash(load_config())[:8]}, ")
+def test_another_profile_than_here_is_told(cli: Cli, board: Board) -> None:
+    assert cli("board", "doctor", URI, "--profile", "as-flown") == 1
+    assert findings(cli)["profile"].startswith(f"!{profile_hash(load_config())[:8]}, ")
 
 
 @pytest.mark.long
-def test_a_core_that_computes_otherwise_is_found(
-    tmp_path: Path, board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_core_that_computes_otherwise_is_found(cli: Cli, tmp_path: Path, board: Board) -> None:
     plant = ("floaty_core.c", "control->count[flap] =", "control->count[flap] = 1 ^")
     board.app = App(build_app(tmp_path / "app", plant=plant), tmp_path / "other.so")
     board.app.boot()
-    assert floaty(monkeypatch, "board", "doctor", URI) == 1
-    assert findings(capsys)["computes"].startswith("!OTHER bits than here in 20 calls")
+    assert cli("board", "doctor", URI) == 1
+    assert findings(cli)["computes"].startswith("!OTHER bits than here in 20 calls")
 
 
 @pytest.mark.parametrize(
     ("flown", "silent", "said"), [(True, False, "it may be in the air"), (False, True, "silent for 3 s")]
 )
 def test_a_board_that_flies_or_says_nothing_is_left_alone_in_one_line(
-    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], flown: bool, silent: bool, said: str,
-) -> None:  # fmt: skip
+    cli: Cli, board: Board, monkeypatch: pytest.MonkeyPatch, flown: bool, silent: bool, said: str
+) -> None:
     board.app.supervisor.flown, board.silent = flown, silent
     monkeypatch.setattr("hil.deploy.doctor.VERSION_TIMEOUT_S", 0.02)
     if silent:
         board.services = []
     for step in range(1, 11):
         board.app.step(step)
-    assert floaty(monkeypatch, "board", "doctor", URI) == 2
-    assert f"floaty: {URI}: {said}" in capsys.readouterr().err
+    assert cli("board", "doctor", URI) == 2
+    assert f"floaty: {URI}: {said}" in cli.err
 
 
-def test_a_cable_without_a_board_is_told_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "board", "doctor", "usb://0") == 2
-    assert capsys.readouterr().err == "floaty: LINK usb://0: Could not open usb://0\n"
+def test_a_cable_without_a_board_is_told_in_one_line(cli: Cli) -> None:
+    assert cli("board", "doctor", "usb://0") == 2
+    assert cli.err == "floaty: LINK usb://0: Could not open usb://0\n"
 
 
-def test_a_firmware_without_the_app_is_told_from_a_board_that_is_silent(
-    board: Board, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_firmware_without_the_app_is_told_from_a_board_that_is_silent(cli: Cli, board: Board) -> None:
     board.silent = True
-    assert floaty(monkeypatch, "board", "doctor", URI) == 1
-    found = findings(capsys)
+    assert cli("board", "doctor", URI) == 1
+    found = findings(cli)
     assert found["firmware"] == "2026.08 +2"
     assert found["app"].startswith("!missing: the firmware answers, Floaty's app does not")
 

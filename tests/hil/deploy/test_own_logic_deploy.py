@@ -18,7 +18,7 @@ from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
 from firmware_py.export.side_by_side import SideBySide
 from firmware_py.logic.loading import Logic, load_logic, translation_of
 from hil.config import load_config
-from support.command import floaty
+from support.command import Cli
 from support.own_logic import LAW, make_project
 from support.paths import ROOT, VECTORS
 
@@ -34,11 +34,9 @@ def project(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
-def test_all_targets_are_equal_with_own_logic(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], project: Path
-) -> None:
-    assert floaty(monkeypatch, "deploy", "check", *SHORT, "--set", "logic.after=60") == 0
-    shown = capsys.readouterr().out
+def test_all_targets_are_equal_with_own_logic(cli: Cli, project: Path) -> None:
+    assert cli("deploy", "check", *SHORT, "--set", "logic.after=60") == 0
+    shown = cli.out
     assert "130 ticks, numba beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
 
 
@@ -56,18 +54,13 @@ def test_all_targets_are_equal_with_own_logic(
     ],
 )
 def test_one_changed_operator_in_the_c_of_own_logic_is_exit_one_and_named(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    project: Path,
-    right: str,
-    wrong: str,
-    where: str,
+    cli: Cli, project: Path, right: str, wrong: str, where: str
 ) -> None:
     text = translation_of(LogicConfig(controller=str(project / "controller.py"))).source
     assert text.count(right) == 1
     (project / "changed.c").write_text(text.replace(right, wrong), encoding="utf-8")
-    assert floaty(monkeypatch, "deploy", "check", *SHORT, "--targets", "c-O2", "--source", "changed.c") == 1
-    shown = capsys.readouterr().out
+    assert cli("deploy", "check", *SHORT, "--targets", "c-O2", "--source", "changed.c") == 1
+    shown = cli.out
     assert re.search(rf"c-O2 .* DIFFERS first in tick \d+, after control: {re.escape(where)}", shown)
 
 
@@ -89,14 +82,9 @@ def test_a_parameter_that_is_set_in_flight_reaches_every_target(project: Path) -
 
 
 def test_export_from_a_folder_of_the_users_writes_an_app_with_the_c_that_is_checked(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], project: Path
+    cli: Cli, project: Path
 ) -> None:
-    assert (
-        floaty(
-            monkeypatch, "deploy", "export", "app", "--profile", "profile.toml", "--set", "logic.gain_iy=0.5"
-        )
-        == 0
-    )
+    assert cli("deploy", "export", "app", "--profile", "profile.toml", "--set", "logic.gain_iy=0.5") == 0
     core = (project / "app" / "src" / "floaty_core.c").read_text(encoding="utf-8")
     assert core == translation_of(LogicConfig(controller=str(project / "controller.py"))).source
     assert str(project) not in core  # the same law is the same C wherever it lies

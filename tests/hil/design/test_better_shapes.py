@@ -26,7 +26,7 @@ from hil.world.body import SIGNS
 from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import weigh
 from hil.world.plant import Plant
-from support.command import floaty
+from support.command import Cli
 
 CONFIG = load_config()
 PAPER = Point(CONFIG.geometry, coefficient_of(CONFIG), math.radians(28.0), 0.0, 0.9)
@@ -201,19 +201,17 @@ def test_agility_measured_in_flight_goes_with_one_over_the_size(tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_command_writes_the_pareto_picture_and_a_profile_that_flies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_the_pareto_picture_and_a_profile_that_flies(cli: Cli, tmp_path: Path) -> None:
     profile = tmp_path / "best.toml"
     arguments = ["optimise", "--profile", "design-paper", "--generations", "3", "--out", str(tmp_path)]
-    assert floaty(monkeypatch, "design", *arguments, "--write", str(profile)) == 0
+    assert cli("design", *arguments, "--write", str(profile)) == 0
     assert (tmp_path / "pareto-least-authority.png").read_bytes().startswith(b"\x89PNG")
-    assert "1.375 are needed" in capsys.readouterr().out
+    assert "1.375 are needed" in cli.out
     prepare(tmp_path / "flight")
     result = fly(Request.of(EXPERIMENTS["hover"], str(profile), seed=1, duration_s=4.0), tmp_path / "flight")
     assert result.metrics["lost"] == 0.0
-    assert floaty(monkeypatch, "design", *arguments, "--updrafts", "11", "8") == 2
-    assert "expected the least first" in capsys.readouterr().err
+    assert cli("design", *arguments, "--updrafts", "11", "8") == 2
+    assert "expected the least first" in cli.err
 
 
 @pytest.mark.parametrize("name", DESIGNS)

@@ -22,7 +22,7 @@ from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelCon
 from hil.world.geometry import weigh
 from hil.world.paper_table import PAPER_TABLE
 from hil.world.plant import Plant
-from support.command import floaty
+from support.command import Cli
 from support.geometries import geometries
 
 G0, COEFFICIENT = load_config().geometry, coefficient_of(load_config())
@@ -199,10 +199,8 @@ def test_the_slowest_pole_is_never_hidden() -> None:
 
 
 @pytest.mark.long
-def test_command_writes_pictures_a_page_and_all_claims(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert floaty(monkeypatch, "design", "--out", tmp_path, "--angle", "22") == 0
+def test_command_writes_pictures_a_page_and_all_claims(cli: Cli, tmp_path: Path) -> None:
+    assert cli("design", "--out", tmp_path, "--angle", "22") == 0
     content = json.loads((tmp_path / "design.json").read_text())
     assert len(content["claims"]) > 35
     assert content["robot"]["hover"].startswith("22.0° at 9.78 m/s")
@@ -220,8 +218,6 @@ def test_command_writes_pictures_a_page_and_all_claims(
         (["--speed", "10", "--angle", "25"], "one follows from the other"),
     ],
 )
-def test_what_cannot_be_is_one_line(
-    arguments: list[str], text: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "design", *arguments) == 2
-    assert text in capsys.readouterr().err
+def test_what_cannot_be_is_one_line(cli: Cli, arguments: list[str], text: str) -> None:
+    assert cli("design", *arguments) == 2
+    assert text in cli.err

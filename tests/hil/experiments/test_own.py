@@ -24,16 +24,13 @@ from hil.laboratory.result import read_result
 from hil.laboratory.run import Request
 from hil.pictures.report import write_report
 from hil.servers.linked import linked_flight
-from support.command import floaty
+from support.command import Cli
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 HEAD = "from hil import Along, Experiment, Fault, Kind, Metric, declare\n"
 PLAIN = 'Experiment("mine", "a summary", 0.3, {"lost": 0.0}%s)'
 HOME = Goal((0.0, 0.0, 1.15), 0.5)
-
-
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
 
 
 def write(text: str, path: str = "mine.py") -> None:
@@ -107,29 +104,25 @@ def test_an_experiment_of_a_file_is_flown_and_its_run_names_the_file_and_its_has
 
 
 @pytest.mark.long
-def test_experiments_of_a_file_fly_in_other_processes_with_the_same_hash(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_experiments_of_a_file_fly_in_other_processes_with_the_same_hash(cli: Cli) -> None:
     Path("neighbour.py").write_text("REACH = 0.05\n")
     write(
         "from neighbour import REACH\nwide = " + PLAIN % ", Along(lambda t: (0.0, REACH * t, 0.0))",
         "mine.py",
     )
     write("other = " + PLAIN % "", "other.py")
-    assert floaty(monkeypatch, "list", "other.py") == 0
+    assert cli("list", "other.py") == 0
     Path("other.py").unlink()  # what nobody flies is no matter
-    assert floaty(monkeypatch, "fly", "mine.py:wide", "--seeds", "2") == 0
-    assert floaty(monkeypatch, "fly", "mine.py:wide", "--seed", "2", "--out", "here") == 0
+    assert cli("fly", "mine.py:wide", "--seeds", "2") == 0
+    assert cli("fly", "mine.py:wide", "--seed", "2", "--out", "here") == 0
     assert read_result(Path("here")).hash == read_result(Path("runs/mine-2")).hash
 
 
 @pytest.mark.long
-def test_a_file_that_changes_between_the_flights_of_a_sweep_ends_it_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_that_changes_between_the_flights_of_a_sweep_ends_it_in_one_line(cli: Cli) -> None:
     write("from pathlib import Path\nPath(__file__).write_text('')\nwide = " + PLAIN % "")
-    assert floaty(monkeypatch, "fly", "mine.py:wide", "--seeds", "2") == 2
-    assert "mine.py:wide: its file has changed while it was flown" in capsys.readouterr().err
+    assert cli("fly", "mine.py:wide", "--seeds", "2") == 2
+    assert "mine.py:wide: its file has changed while it was flown" in cli.err
 
 
 def test_a_file_is_executed_once_for_every_content() -> None:
@@ -177,38 +170,28 @@ def test_the_only_experiment_of_a_file_needs_no_name() -> None:
     ],
 )  # fmt: skip
 def test_what_is_wrong_in_a_file_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], text: str, name: str, told: str
+    cli: Cli, text: str, name: str, told: str
 ) -> None:
     write(text)
-    assert floaty(monkeypatch, "fly", f"mine.py{name}") == 2
-    error = capsys.readouterr().err
-    assert told in error
-    assert error.startswith("floaty: ")
-    assert error.count("\n") == 1
+    assert told in cli.refusal("fly", f"mine.py{name}")
 
 
-def test_a_file_that_is_not_there_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "fly", "nowhere.py:wide") == 2
-    assert capsys.readouterr().err == "floaty: experiment nowhere.py: No such file or directory\n"
+def test_a_file_that_is_not_there_is_one_line(cli: Cli) -> None:
+    assert cli("fly", "nowhere.py:wide") == 2
+    assert cli.err == "floaty: experiment nowhere.py: No such file or directory\n"
 
 
-def test_the_experiments_of_a_file_are_listed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_experiments_of_a_file_are_listed(cli: Cli) -> None:
     write("wide = " + PLAIN % "")
-    assert floaty(monkeypatch, "list", "mine.py") == 0
-    assert capsys.readouterr().out == "mine.py:wide  a summary\n"
+    assert cli("list", "mine.py") == 0
+    assert cli.out == "mine.py:wide  a summary\n"
 
 
 # Kinds of faults
 
 
 @pytest.mark.long
-def test_an_own_kind_of_fault_acts_is_listed_and_shown(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_own_kind_of_fault_acts_is_listed_and_shown(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(KINDS, "wind.both", KINDS["push.y"])  # is replaced, and ends with the test
     write(
         "from hil.laboratory.fault_kinds import KINDS\n"
@@ -216,14 +199,11 @@ def test_an_own_kind_of_fault_acts_is_listed_and_shown(
         "declare('wind.both', Kind('both', 'm/s', 0.2, -5.0, 5.0, knobs))\n"
         "wide = " + PLAIN % ", faults=(Fault('wind.both', 0.1, 0.1, 0.3),)"
     )
-    assert floaty(monkeypatch, "fly", "mine.py:wide", "--fault", "wind.both@0.1=0.2") == 0
+    assert cli("fly", "mine.py:wide", "--fault", "wind.both@0.1=0.2") == 0
     assert read_result(Path("runs/mine-1")).faults == ("wind.both@0.1:0.1=0.3", "wind.both@0.1=0.2")
     assert "wind.both" in Path("runs/mine-1/report.html").read_text(encoding="utf-8")
-    capsys.readouterr()
-    assert floaty(monkeypatch, "list", "mine.py", "--faults") == 0
-    assert re.search(
-        r"^wind\.both +0\.2 m/s +-5\.\.5 +to the end +both", capsys.readouterr().out, re.MULTILINE
-    )
+    assert cli("list", "mine.py", "--faults") == 0
+    assert re.search(r"^wind\.both +0\.2 m/s +-5\.\.5 +to the end +both", cli.out, re.MULTILINE)
     monkeypatch.delitem(KINDS, "wind.both")
     Path("mine.py").unlink()
     write_report(Path("runs/mine-1"))
@@ -256,19 +236,17 @@ def install(text: str, entry: str = "wide-eight = eights.flights:wide", folder: 
 
 
 @pytest.fixture
-def site(monkeypatch: pytest.MonkeyPatch) -> None:
+def site(monkeypatch: pytest.MonkeyPatch, empty_folder: Path) -> None:
     monkeypatch.syspath_prepend(str(Path("site").absolute()))
     for name in ("eights", "eights.flights"):
         monkeypatch.delitem(sys.modules, name, raising=False)
 
 
 @pytest.mark.usefixtures("site")
-def test_an_installed_experiment_is_listed_with_its_package_and_flown_by_name(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_installed_experiment_is_listed_with_its_package_and_flown_by_name(cli: Cli) -> None:
     install("wide = " + PLAIN % "")
-    assert floaty(monkeypatch, "list") == 0
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wide-eight")]
+    assert cli("list") == 0
+    (line,) = [line for line in cli.out.splitlines() if line.startswith("wide-eight")]
     assert line.split(maxsplit=1)[1] == "a summary (eights 1.2)"
     result = fly("wide-eight").result
     assert result.source is not None
@@ -290,16 +268,14 @@ def test_an_installed_experiment_is_listed_with_its_package_and_flown_by_name(
     ],
 )
 def test_a_broken_package_is_one_line_and_leaves_the_list_as_it_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], text: str, entry: str, told: str
+    cli: Cli, text: str, entry: str, told: str
 ) -> None:
     install(text, entry)
-    assert floaty(monkeypatch, "fly", "wide-eight") == 2
-    error = capsys.readouterr().err
+    error = cli.refusal("fly", "wide-eight")
     assert error.startswith("floaty: experiment wide-eight of eights 1.2: ")
     assert told in error
-    assert error.count("\n") == 1
-    assert floaty(monkeypatch, "list") == 0
-    shown = capsys.readouterr().out
+    assert cli("list") == 0
+    shown = cli.out
     assert told in shown
     assert "hover  " in shown
 

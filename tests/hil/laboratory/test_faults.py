@@ -31,7 +31,7 @@ from hil.pictures.report import write_report
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig
 from hil.world.plant import Plant
 from hil.world.tunnel import TunnelConfig
-from support.command import floaty
+from support.command import Cli
 
 HOVER = EXPERIMENTS["hover"]
 Settings = tuple[str, ...]
@@ -111,17 +111,10 @@ def test_every_default_is_a_size_that_its_kind_allows() -> None:
     ],
 )
 def test_a_wrong_fault_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    text: str,
-    message: str,
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert floaty(monkeypatch, "fly", "hover", "--fault", text) == 2
-    shown = capsys.readouterr().err
-    assert message in shown
-    assert shown.count("\n") == 1
+    assert message in cli.refusal("fly", "hover", "--fault", text)
     assert os.listdir() == []
 
 
@@ -576,10 +569,8 @@ def test_a_flight_without_faults_has_no_table_of_them(tmp_path: Path) -> None:
     assert json.loads((folder / "result.json").read_text())["faults"] == []
 
 
-def test_the_list_tells_every_kind(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert floaty(monkeypatch, "list", "--faults") == 0
-    shown = capsys.readouterr().out
+def test_the_list_tells_every_kind(cli: Cli) -> None:
+    assert cli("list", "--faults") == 0
+    shown = cli.out
     first = [line.split()[0] for line in shown.splitlines() if line and not line.startswith(" ")]
     assert first == ["kind", *KINDS]

@@ -12,7 +12,7 @@ from hil.laboratory.recorder import load_log
 from hil.laboratory.result import read_result
 from hil.laboratory.run import Request, fly, prepare
 from support.app_packets import AppPackets
-from support.command import floaty
+from support.command import Cli
 from support.crazyflie_app import App, build_app
 
 URI = "udp://127.0.0.1:9"
@@ -104,12 +104,12 @@ def test_a_board_that_fails_in_flight_ends_it_in_one_line_with_what_was_flown(
 
 
 def test_the_check_compares_a_board_and_prints_what_it_measured(
-    plugged: Plug, library: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cli: Cli, plugged: Plug, library: Path
 ) -> None:
     plugged(library).app.cycles.value = 1234
     arguments = ("deploy", "check", "hover", "--duration", "0.3", "--targets", URI)
-    assert floaty(monkeypatch, *arguments) == 0
-    printed = " ".join(capsys.readouterr().out.split())
+    assert cli(*arguments) == 0
+    printed = " ".join(cli.out.split())
     assert f"130 ticks, numba beside {URI}: no bit differs" in printed
     assert f"{URI}: cycles per call, mean and worst, as measured on the board" in printed
     assert "estimate 130 calls 1234 1234" in printed
@@ -117,18 +117,18 @@ def test_the_check_compares_a_board_and_prints_what_it_measured(
 
 @pytest.mark.long
 def test_a_bit_error_planted_in_the_app_is_found_with_call_field_and_values(
-    plugged: Plug, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cli: Cli, plugged: Plug, tmp_path: Path
 ) -> None:
     plant = ("floaty_core.c", "control->count[flap] =", "control->count[flap] = 1 ^")
     plugged(build_app(tmp_path / "app", plant=plant))
-    assert floaty(monkeypatch, "deploy", "check", "hover", "--duration", "0.1", "--targets", URI) == 1
-    printed = " ".join(capsys.readouterr().out.split())
+    assert cli("deploy", "check", "hover", "--duration", "0.1", "--targets", URI) == 1
+    printed = " ".join(cli.out.split())
     assert "DIFFERS first in tick 0, after control: Control.count[0]: 3" in printed
     assert f"{URI} DIFFERS" in printed
 
 
 def test_a_check_whose_board_falls_silent_fails_in_one_line(
-    plugged: Plug, library: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cli: Cli, plugged: Plug, library: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link = plugged(library)
     send, left = link.send, [400]
@@ -139,8 +139,8 @@ def test_a_check_whose_board_falls_silent_fails_in_one_line(
         send(data)
 
     monkeypatch.setattr(link, "send", send_some)
-    assert floaty(monkeypatch, "deploy", "check", "hover", "--duration", "1", "--targets", URI) == 1
-    assert f"hover, seed 1: error: board {URI}: silent for 3 s" in capsys.readouterr().out
+    assert cli("deploy", "check", "hover", "--duration", "1", "--targets", URI) == 1
+    assert f"hover, seed 1: error: board {URI}: silent for 3 s" in cli.out
 
 
 @pytest.mark.parametrize(
@@ -155,12 +155,11 @@ def test_a_check_whose_board_falls_silent_fails_in_one_line(
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_in_one_line(
-    plugged: Plug, library: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    arguments: tuple[str, ...], said: str,
-) -> None:  # fmt: skip
+    cli: Cli, plugged: Plug, library: Path, arguments: tuple[str, ...], said: str
+) -> None:
     plugged(library).silent = True
-    assert floaty(monkeypatch, *arguments) == 2
-    error = capsys.readouterr().err
+    assert cli(*arguments) == 2
+    error = cli.err
     assert said in error
     assert "Traceback" not in error
 

@@ -45,7 +45,7 @@ from hil.pictures.figures import PICTURES
 from hil.pictures.panels import marks_of_flight
 from hil.pictures.report import write_report
 from hil.pictures.trials import YAW_STEP
-from support.command import floaty
+from support.command import Cli
 from support.full_disk import small_files
 from support.html_page import Page
 
@@ -152,14 +152,10 @@ def test_a_real_flight_lies_over_the_simulated_one(both: tuple[Path, Path], simu
 
 @pytest.mark.long
 def test_the_command_shows_both_and_says_what_only_one_has(
-    both: tuple[Path, Path],
-    simulated: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
+    cli: Cli, both: tuple[Path, Path], simulated: Path, tmp_path: Path
 ) -> None:
-    assert floaty(monkeypatch, "compare", both[0], simulated, "--out", tmp_path / "out") == 1
-    shown = capsys.readouterr().out
+    assert cli("compare", both[0], simulated, "--out", tmp_path / "out") == 1
+    shown = cli.out
     assert "not in " in shown
     assert "cameras.x" in shown
     assert "first difference" not in shown

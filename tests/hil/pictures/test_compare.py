@@ -21,7 +21,7 @@ from hil.laboratory.metrics import free_flight, measure, position_error
 from hil.laboratory.recorder import load_log
 from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.compare import FlownRun, compare, load_flown, pair, write_comparison
-from support.command import floaty
+from support.command import Cli
 from support.html_page import Page
 
 
@@ -177,12 +177,12 @@ def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_p
 
 @pytest.mark.long
 def test_the_command_tells_the_difference_by_its_exit_code(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], runs: dict[str, Path], tmp_path: Path
+    cli: Cli, runs: dict[str, Path], tmp_path: Path
 ) -> None:
-    assert floaty(monkeypatch, "compare", runs["one"], runs["again"], "--out", tmp_path) == 0
-    assert "identical" in capsys.readouterr().out
-    assert floaty(monkeypatch, "compare", runs["one"], runs["two"], "--out", tmp_path / "new") == 1
-    shown = capsys.readouterr().out
+    assert cli("compare", runs["one"], runs["again"], "--out", tmp_path) == 0
+    assert "identical" in cli.out
+    assert cli("compare", runs["one"], runs["two"], "--out", tmp_path / "new") == 1
+    shown = cli.out
     assert "first difference: row " in shown
     assert "seed: 1 | 2" in shown
     assert (tmp_path / "new" / "compare.png").read_bytes().startswith(b"\x89PNG")
@@ -193,9 +193,8 @@ def test_the_command_tells_the_difference_by_its_exit_code(
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "no parquet", "no flight", "no json"])
 def test_a_bad_folder_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], runs: dict[str, Path], tmp_path: Path,
-    damage: str,
-) -> None:  # fmt: skip
+    cli: Cli, runs: dict[str, Path], tmp_path: Path, damage: str
+) -> None:
     bad = tmp_path / "bad"
     if damage == "empty":
         bad.mkdir()
@@ -207,8 +206,4 @@ def test_a_bad_folder_is_one_line_and_exit_code_two(
         pq.write_table(load_log(bad).select(["t", "truth.x"]), bad / "log.parquet")
     elif damage == "no json":
         (bad / "result.json").write_text("{")
-    assert floaty(monkeypatch, "compare", runs["one"], bad, "--out", tmp_path / "out") == 2
-    error = capsys.readouterr().err
-    assert error.startswith("floaty: ")
-    assert "bad" in error
-    assert error.count("\n") == 1
+    assert "bad" in cli.refusal("compare", runs["one"], bad, "--out", tmp_path / "out")

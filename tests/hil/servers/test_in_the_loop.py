@@ -33,7 +33,7 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.report import write_report
 from hil.servers.in_the_loop import flight_in_the_loop
 from support.app_air import AppAir
-from support.command import floaty
+from support.command import Cli
 from support.crazyflie_app import App, build_app
 
 URI = "udp://127.0.0.1:9"
@@ -497,12 +497,11 @@ def test_processor_time_of_a_real_board_cannot_be_taken(app: App) -> None:
     ],
 )  # fmt: skip
 def test_what_cannot_be_in_the_loop_is_refused_in_one_line(
-    app: App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    arguments: tuple[str, ...], said: str,
-) -> None:  # fmt: skip
+    cli: Cli, app: App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], said: str
+) -> None:
     monkeypatch.chdir(tmp_path)
     air = AppAir(app)
     air.silent = True
     monkeypatch.setattr(packets, "CflibPackets", lambda uri: air)
-    assert floaty(monkeypatch, "fly", "hover", *arguments) == 2
-    assert said in capsys.readouterr().err
+    assert cli("fly", "hover", *arguments) == 2
+    assert said in cli.err

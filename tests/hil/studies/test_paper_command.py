@@ -27,7 +27,7 @@ from hil.studies.paper_report import write_paper
 from hil.studies.paper_rows import OUTSIDE, ROWS, MetricClaim, PaperRow
 from hil.studies.study import Change, Expected, Study, Variant
 from hil.studies.study_run import Cell, Curve, StudyResult
-from support.command import floaty
+from support.command import Cli, floaty
 from support.html_page import Page
 
 
@@ -35,8 +35,7 @@ from support.html_page import Page
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two seeds of the hover on both profiles."""
     folder = tmp_path_factory.mktemp("paper") / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        assert floaty(patch, "paper", "--only", "hov*", "--seeds", "2", "--out", str(folder)) == 0
+    assert floaty("paper", "--only", "hov*", "--seeds", "2", "--out", folder) == 0
     return folder
 
 
@@ -95,12 +94,8 @@ def test_the_table_is_the_mean_and_deviation_of_the_flights(flown: Path) -> None
 
 
 @pytest.mark.long
-def test_a_flight_of_the_paper_is_the_flight_that_fly_flies(
-    flown: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    floaty(
-        monkeypatch, "fly", "hover", "--profile", "as-flown", "--seed", "2", "--out", str(tmp_path / "run")
-    )
+def test_a_flight_of_the_paper_is_the_flight_that_fly_flies(cli: Cli, flown: Path, tmp_path: Path) -> None:
+    cli("fly", "hover", "--profile", "as-flown", "--seed", "2", "--out", str(tmp_path / "run"))
     alone = json.loads((tmp_path / "run" / "result.json").read_text())
     assert content(flown)["rows"][0]["profiles"]["as-flown"]["flights"][1]["hash"] == alone["hash"]
 
@@ -224,14 +219,8 @@ def test_a_figure_that_no_flight_has_is_a_dash(result: Result) -> None:
         (["paper", "--only", "hover", "--out", "/proc/floaty"], "--out /proc/floaty: cannot be written"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    assert floaty(monkeypatch, *arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("floaty: ")
-    assert message in error
-    assert error.count("\n") == 1
+def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
+    assert message in cli.refusal(*arguments)
 
 
 @pytest.mark.long

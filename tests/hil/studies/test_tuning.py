@@ -14,7 +14,7 @@ from hil.design.tune import Flow, GainTask, judged, refuse_late
 from hil.errors import LabError
 from hil.laboratory.robot import Streams
 from hil.world.plant import Plant
-from support.command import floaty
+from support.command import Cli
 
 
 def test_the_profile_cad_has_the_plate_model_on_board() -> None:
@@ -36,14 +36,8 @@ def test_the_profile_cad_has_the_plate_model_on_board() -> None:
         (["--runs", "/proc/floaty"], "--runs /proc/floaty: cannot be written"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    assert floaty(monkeypatch, "tune", *arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("floaty: ")
-    assert message in error
-    assert error.count("\n") == 1
+def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
+    assert message in cli.refusal("tune", *arguments)
 
 
 def test_a_loop_that_bears_less_delay_than_the_link_has_is_refused_with_both_numbers() -> None:
@@ -67,21 +61,17 @@ def test_a_loop_that_bears_less_delay_than_the_link_has_is_refused_with_both_num
     [([], "its own gains lose the robot"), (["--repeat", "2"], "round 1 ends: identify-u1 lost the robot: ")],
 )
 def test_a_robot_that_is_lost_ends_it_with_a_clear_line(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    arguments: list[str],
-    message: str,
+    cli: Cli, tmp_path: Path, arguments: list[str], message: str
 ) -> None:
     profile = tmp_path / "bad.toml"
     profile.write_text('base = "cad"\n[controller]\ngain_y = 3.5\n')
-    assert floaty(monkeypatch, "tune", "--profile", profile, "--runs", tmp_path / "runs", *arguments) == 2
-    assert message in capsys.readouterr().err
+    assert cli("tune", "--profile", profile, "--runs", tmp_path / "runs", *arguments) == 2
+    assert message in cli.err
 
 
 @pytest.mark.long
 def test_a_round_from_the_authors_gains_and_the_plate_model_hovers_as_the_default_profile_does(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    cli: Cli, tmp_path: Path
 ) -> None:
     out = tmp_path / "mine.toml"
     arguments = (
@@ -96,12 +86,12 @@ def test_a_round_from_the_authors_gains_and_the_plate_model_hovers_as_the_defaul
         "--robots",
         "30",
     )
-    assert floaty(monkeypatch, "tune", *arguments) == 0
-    shown = capsys.readouterr().out
+    assert cli("tune", *arguments) == 0
+    shown = cli.out
     assert "least of 31" in shown
     assert "round 1" in shown
     for name, folder in (("floaty", "usual"), (str(out), "tuned")):
-        floaty(monkeypatch, "fly", "hover", "--profile", name, "--seed", "7", "--out", tmp_path / folder)
+        cli("fly", "hover", "--profile", name, "--seed", "7", "--out", tmp_path / folder)
     usual, tuned = (
         json.loads((tmp_path / name / "result.json").read_text())["metrics"] for name in ("usual", "tuned")
     )

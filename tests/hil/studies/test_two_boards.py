@@ -18,7 +18,7 @@ from hil.laboratory.run import Request, fly, prepare
 from hil.laboratory.schedule import SCHEMA
 from hil.pictures.compare import FlownRun, load_flown
 from hil.studies.two_boards import CLOCK, RATES, comparable, seeds_of, two_boards
-from support.command import floaty
+from support.command import Cli
 
 Columns = dict[str, NDArray[np.generic]]
 RELEASE, FLOWN = 100, 30  # rows
@@ -138,9 +138,7 @@ def test_only_flights_of_two_boards_that_were_asked_for_alike_are_comparable(
 
 
 @pytest.mark.long
-def test_two_folders_of_runs_are_a_row_per_seed(
-    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_folders_of_runs_are_a_row_per_seed(cli: Cli, flown: Path, tmp_path: Path) -> None:
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
     for seed in (10, 2):
@@ -154,13 +152,13 @@ def test_two_folders_of_runs_are_a_row_per_seed(
     assert [one.seed for one in found] == [2, 10]
     assert all(one.first is not None and one.first.row == RELEASE + 1 for one in found)
     assert all(one.apart_m == 0 and one.fused[0] == one.fused[1] for one in found)
-    assert floaty(monkeypatch, "compare", tmp_path / "first", tmp_path / "second") == 1
-    assert "2 seeds: rms errors within 0.0 % of the first's, bodies within 0.00 mm" in capsys.readouterr().out
+    assert cli("compare", tmp_path / "first", tmp_path / "second") == 1
+    assert "2 seeds: rms errors within 0.0 % of the first's, bodies within 0.00 mm" in cli.out
     with pytest.raises(LabError, match="neither two runs nor folders with runs of the same names"):
         seeds_of(tmp_path / "first", flown.parent)
     shutil.copytree(flown, tmp_path / "alone")
     write_result(replace(read_result(tmp_path / "alone"), seed=2))
-    assert floaty(monkeypatch, "compare", tmp_path / "alone", tmp_path / "second" / "hover-2") == 1
-    assert "first servo count: row 101" in capsys.readouterr().out
+    assert cli("compare", tmp_path / "alone", tmp_path / "second" / "hover-2") == 1
+    assert "first servo count: row 101" in cli.out
     page = (tmp_path / "second" / "hover-2" / "compare.html").read_text(encoding="utf-8")
     assert "<li>first servo count: row 101" in page

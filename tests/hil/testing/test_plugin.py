@@ -17,7 +17,7 @@ from hil.errors import LabError
 from hil.testing import choices
 from hil.testing.choices import Choice, Marked, Wanted, choices_of, why_not
 from hil.testing.flights import folder_of
-from support.command import floaty
+from support.command import Cli
 from support.examples import FILE, blocks
 from support.own_logic import LAW, make_project
 
@@ -97,7 +97,7 @@ def test_a_broken_controller_is_one_message_and_no_traceback_of_the_library(
 
 @pytest.mark.long
 def test_a_failure_shows_limit_value_folder_picture_and_the_command_that_flies_it_again(
-    strict: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+    cli: Cli, strict: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result = strict.runpytest_inprocess()
     result.assert_outcomes(failed=1)
@@ -113,7 +113,7 @@ def test_a_failure_shows_limit_value_folder_picture_and_the_command_that_flies_i
     run = load_run(folder)
     assert float(value[1]) == pytest.approx(100 * run.metrics["rms_x"], rel=1e-3)
     monkeypatch.chdir(strict.mkdir("elsewhere"))
-    assert floaty(monkeypatch, *again.split(), "--out", "again") == 1
+    assert cli(*again.split(), "--out", "again") == 1
     assert load_run("again").hash == run.hash
 
 
