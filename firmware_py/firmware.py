@@ -166,7 +166,6 @@ class Firmware:
         """Create the services for MAVLink clients."""
         from firmware_py.links.mavlink_absent import answer_for_what_is_not_there
         from firmware_py.links.mavlink_commands import CommandService
-        from firmware_py.links.mavlink_on_request import RequestedMessages
         from firmware_py.links.mavlink_parameters import MavlinkParameters
         from firmware_py.links.mavlink_poses import PoseService
         from firmware_py.links.mavlink_setpoints import SetpointService
@@ -177,10 +176,9 @@ class Firmware:
         core, supervisor = self._core, self._supervisor
         setpoints = SetpointService(stack, running.pilot, config.home)
         poses = PoseService(stack, self.measurements, running.localisation, setpoints)
-        world, control = World(core.estimator.fields, setpoints), core.control.fields
-        messages = FlightMessages(stack, supervisor, world, poses, control, self.variables)
-        requested = RequestedMessages(stack, supervisor, world, control, self._measured, config.home)
-        streams = StreamService(stack, (*messages.streams(config.rates), *requested.streams(config.rates)))
+        world = World(core.estimator.fields, core.control.fields, setpoints)
+        messages = FlightMessages(stack, supervisor, world, poses, self.variables, self._measured)
+        streams = StreamService(stack, messages.streams(config.rates))
         MavlinkParameters(stack, own)
         CommandService(stack, self._board, supervisor, streams, setpoints, own, running.storage)
         answer_for_what_is_not_there(stack)

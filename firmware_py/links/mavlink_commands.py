@@ -13,8 +13,9 @@ from firmware_py.links.mavlink_streams import StreamService
 from firmware_py.links.parameters import Parameter
 from firmware_py.links.storage import ParameterStorage
 from firmware_py.supervisor import Supervisor
-from firmware_py.wire import mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.mavlink_layouts import NUMBERS
 from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Mode, Result
 
 FORCE = 21196  # MAVLink's magic number for disarming in flight
@@ -55,33 +56,31 @@ class CommandService:
             Command.PREFLIGHT_STORAGE: self._store,
             Command.PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
             Command.COMPONENT_ARM_DISARM: self._arm,
-            Command.GET_HOME_POSITION: lambda command: self._once(mavlink.MSG_HOME_POSITION),
+            Command.GET_HOME_POSITION: lambda command: self._once(NUMBERS["HOME_POSITION"]),
             Command.INJECT_FAILURE: self._fail,
             Command.GET_MESSAGE_INTERVAL: self._report_interval,
             Command.SET_MESSAGE_INTERVAL: self._set_interval,
             Command.REQUEST_MESSAGE: self._request,
-            Command.REQUEST_PROTOCOL_VERSION: lambda command: self._once(mavlink.MSG_PROTOCOL_VERSION),
-            Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda command: self._once(mavlink.MSG_AUTOPILOT_VERSION),
+            Command.REQUEST_PROTOCOL_VERSION: lambda command: self._once(NUMBERS["PROTOCOL_VERSION"]),
+            Command.REQUEST_AUTOPILOT_CAPABILITIES: lambda command: self._once(NUMBERS["AUTOPILOT_VERSION"]),
         }
-        stack.handle(mavlink.MSG_COMMAND_LONG, self._obey)
-        stack.handle(mavlink.MSG_COMMAND_INT, self._obey)
-        stack.handle(mavlink.MSG_PING, self._answer_ping)
-        stack.handle(
-            mavlink.MSG_FILE_TRANSFER_PROTOCOL, lambda request: stack.reply(mavlink.ftp_nak(request))
-        )
+        stack.handle("COMMAND_LONG", self._obey)
+        stack.handle("COMMAND_INT", self._obey)
+        stack.handle("PING", self._answer_ping)
+        stack.handle("FILE_TRANSFER_PROTOCOL", lambda request: stack.reply(services.ftp_nak(request)))
 
     def _obey(self, command: Message) -> None:
         obey = self._commands.get(command.command)
         result, answers = (Result.UNSUPPORTED, ()) if obey is None else obey(command)
         self._stack.refused += result is not Result.ACCEPTED
         source = command.get_srcSystem(), command.get_srcComponent()
-        self._stack.reply(mavlink.command_ack(command.command, result, *source))
+        self._stack.reply(services.command_ack(command.command, result, *source))
         for answer in answers:
             self._stack.reply(answer)
 
     def _answer_ping(self, ping: Message) -> None:
         if ping.target_system == 0:  # otherwise it is an answer
-            self._stack.reply(mavlink.ping_answer(ping))
+            self._stack.reply(services.ping_answer(ping))
 
     def _arm(self, command: Message) -> Outcome:
         if command.param1 not in (0, 1):
@@ -95,11 +94,11 @@ class CommandService:
         elif self._supervisor.battery_empty:
             obstacle = "battery low"
         else:
-            obstacle = f"stopped; set {mavlink.mavlink_name(STOP)} 0"
+            obstacle = f"stopped; set {services.mavlink_name(STOP)} 0"
         return self._not_now(f"not armed: {obstacle}")
 
     def _not_now(self, why: str) -> Outcome:
-        return Result.TEMPORARILY_REJECTED, mavlink.status_text(WARNING, why)
+        return Result.TEMPORARILY_REJECTED, services.status_text(WARNING, why)
 
     def _reboot(self, command: Message) -> Outcome:
         if command.param1 != REBOOT:
@@ -143,13 +142,13 @@ class CommandService:
         number = _whole(command.param1)
         if not 0 <= number <= 0xFFFF:
             return DENIED
-        return Result.ACCEPTED, (mavlink.message_interval(number, self._streams.interval_us(number)),)
+        return Result.ACCEPTED, (services.message_interval(number, self._streams.interval_us(number)),)
 
     def _request(self, command: Message) -> Outcome:
         number, index = _whole(command.param1), _whole(command.param2)
-        if number != mavlink.MSG_AVAILABLE_MODES:
+        if number != NUMBERS["AVAILABLE_MODES"]:
             return self._once(number)
-        modes = tuple(mavlink.available_mode(mode) for mode in Mode)
+        modes = tuple(services.available_mode(mode) for mode in Mode)
         if index == 0:
             return Result.ACCEPTED, modes
         return (Result.ACCEPTED, modes[index - 1 : index]) if 1 <= index <= len(modes) else DENIED
@@ -162,7 +161,7 @@ class CommandService:
 
 def _sixth(command: Message) -> float:
     """A command's sixth parameter, which COMMAND_INT calls y."""
-    value: float = command.param6 if command.get_msgId() == mavlink.MSG_COMMAND_LONG else command.y
+    value: float = command.param6 if command.get_type() == "COMMAND_LONG" else command.y
     return value
 
 

@@ -12,7 +12,8 @@ from zlib import crc32
 
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.links.parameters import Parameter
-from firmware_py.wire import WireError, mavlink
+from firmware_py.wire import WireError
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.parameters import OK
 
@@ -30,13 +31,13 @@ class MavlinkParameters:
     def __init__(self, stack: MavlinkStack, parameters: Sequence[Parameter]) -> None:
         self._stack = stack
         self._parameters = [parameter for parameter in parameters if parameter.write is not None]
-        self._names = [mavlink.mavlink_name(parameter.name) for parameter in self._parameters]
+        self._names = [services.mavlink_name(parameter.name) for parameter in self._parameters]
         self._numbers = {name: number for number, name in enumerate(self._names)}
         self._next = len(self._parameters)  # of the list that is being sent
         self._listing = stack.kernel.create_binary_semaphore("mavList")
-        stack.handle(mavlink.MSG_PARAM_REQUEST_LIST, self._start_list)
-        stack.handle(mavlink.MSG_PARAM_REQUEST_READ, self._read)
-        stack.handle(mavlink.MSG_PARAM_SET, self._set)
+        stack.handle("PARAM_REQUEST_LIST", self._start_list)
+        stack.handle("PARAM_REQUEST_READ", self._read)
+        stack.handle("PARAM_SET", self._set)
         stack.kernel.create_task("MAV-PARAM", 1, self._list_task)
 
     def _start_list(self, message: Message) -> None:
@@ -60,7 +61,7 @@ class MavlinkParameters:
                 return
             number = self._find(message)
         elif number >= len(self._parameters):
-            self._stack.reply(mavlink.parameter_error(message, message.param_id, number, DOES_NOT_EXIST))
+            self._stack.reply(services.parameter_error(message, message.param_id, number, DOES_NOT_EXIST))
             raise WireError(f"parameter {number}: there are {len(self._parameters)}")
         self._stack.reply(self._value(number))
 
@@ -72,7 +73,7 @@ class MavlinkParameters:
         done = message.param_type == REAL32 and whole and parameter.set(value) == OK
         self._stack.reply(self._value(number))
         if not done:
-            self._stack.reply(mavlink.parameter_error(message, name, NO_NUMBER, OUT_OF_RANGE))
+            self._stack.reply(services.parameter_error(message, name, NO_NUMBER, OUT_OF_RANGE))
             limits = f"{parameter.minimum:g}..{parameter.maximum:g}"
             raise WireError(f"{name} = {value:g}: refused, {limits}")
 
@@ -80,13 +81,13 @@ class MavlinkParameters:
         name = request.param_id
         number = self._numbers.get(name)
         if number is None:
-            self._stack.reply(mavlink.parameter_error(request, name, NO_NUMBER, DOES_NOT_EXIST))
+            self._stack.reply(services.parameter_error(request, name, NO_NUMBER, DOES_NOT_EXIST))
             raise WireError(f"no parameter {name}")
         return number
 
     def _value(self, number: int) -> Message:
         value = float(self._parameters[number].read())
-        return mavlink.parameter(self._names[number], value, number, len(self._parameters))
+        return services.parameter(self._names[number], value, number, len(self._parameters))
 
     def _hash(self) -> Message:
         """A number that changes with the names and with any value, by which clients recognise their cached copy."""
@@ -95,4 +96,4 @@ class MavlinkParameters:
             for name, parameter in zip(self._names, self._parameters, strict=True)
         )
         value = crc32(content) >> (32 - HASH_BITS)
-        return mavlink.parameter(HASH_NAME, float(value), NO_INDEX, len(self._parameters))
+        return services.parameter(HASH_NAME, float(value), NO_INDEX, len(self._parameters))

@@ -13,6 +13,7 @@ from firmware_py.links.timesync import RemoteClock
 from firmware_py.measurements import POSE, Measurement
 from firmware_py.rtos import Queue
 from firmware_py.wire import mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.crtp import Correction
 from firmware_py.wire.mavlink_frames import Message
 
@@ -43,10 +44,10 @@ class PoseService:
         self._localisation = localisation
         self._partner: tuple[int, int] | None = None
         self._clock = RemoteClock()
-        for number in mavlink.POSES:
-            stack.handle(number, self._take_pose)
-        stack.handle(mavlink.MSG_HEARTBEAT, self._see_heartbeat)
-        stack.handle(mavlink.MSG_TIMESYNC, self._take_timesync)
+        for name in mavlink.POSES:
+            stack.handle(name, self._take_pose)
+        stack.handle("HEARTBEAT", self._see_heartbeat)
+        stack.handle("TIMESYNC", self._take_timesync)
         stack.kernel.create_task("MAV-SYNC", 1, self._sync_task)
 
     def _take_pose(self, message: Message) -> None:
@@ -80,7 +81,7 @@ class PoseService:
         """Answer a request; use an answer of the partner."""
         now_us = self._stack.kernel.now_us
         if message.tc1 == 0:
-            self._stack.reply(mavlink.timesync(now_us * 1000, message.ts1))
+            self._stack.reply(services.timesync(now_us * 1000, message.ts1))
         elif (message.get_srcSystem(), message.get_srcComponent()) == self._partner:
             self._clock.answer(now_us, message.ts1 // 1000, message.tc1 // 1000)
 
@@ -94,4 +95,4 @@ class PoseService:
             yield from kernel.delay_until(wake_tick)
             if self._partner is not None:
                 self._clock.request(kernel.now_us)
-                yield from self._stack.offer(mavlink.timesync(0, kernel.now_us * 1000))
+                yield from self._stack.offer(services.timesync(0, kernel.now_us * 1000))

@@ -16,6 +16,7 @@ from firmware_py.pilot import Pilot
 from firmware_py.planner import stay
 from firmware_py.rtos import FOREVER, TICK_US
 from firmware_py.wire import WireError, mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.mavlink_numbers import Command, Mode, Result
 
@@ -26,7 +27,7 @@ Goal = tuple[Vector, float]  # position in W [m] and yaw [rad]
 
 
 class SetpointService:
-    """`mode` is the one in force."""
+    """`mode` is the one in force; `home` is where goals begin."""
 
     def __init__(self, stack: MavlinkStack, pilot: Pilot, home: Vector) -> None:
         self.mode = Mode.HOLD
@@ -35,12 +36,12 @@ class SetpointService:
         self._seen_us = -1  # when that came
         self._stack = stack
         self._pilot = pilot
-        self._home = home
+        self.home = home
         self._leader: Source | None = None  # in offboard
         self._led_us = 0  # when its last set-point came
         self._started = stack.kernel.create_binary_semaphore("mavOffboard")
-        stack.handle(mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED, self._take_target)
-        stack.handle(mavlink.MSG_SET_MODE, self._take_mode)
+        stack.handle("SET_POSITION_TARGET_LOCAL_NED", self._take_target)
+        stack.handle("SET_MODE", self._take_mode)
         stack.kernel.create_task("MAV-MODE", 1, self._watch)
 
     def choose(self, command: Message) -> tuple[Result, Sequence[Message]]:
@@ -71,7 +72,7 @@ class SetpointService:
             return self._seen_from
         motion = self._pilot.frame(self._stack.kernel.now_us)
         if motion is None:
-            return self._home, 0.0
+            return self.home, 0.0
         x, y, z = motion.position
         ox, oy, oz = self._origin
         return (x + ox, y + oy, z + oz), motion.yaw
@@ -100,7 +101,7 @@ class SetpointService:
 
     def _excess(self, p_WG: Vector) -> float:
         """How far a goal is outside the box [m]: from there the robot may return."""
-        return self._pilot.box.excess(p_WG, self._home)
+        return self._pilot.box.excess(p_WG, self.home)
 
     def _lead(self, now_us: int) -> None:
         """Let the pilot fly to the goal."""
@@ -111,14 +112,14 @@ class SetpointService:
     @property
     def _origin(self) -> Vector:
         """Where the origin of the pilot's frame is in W."""
-        return (0.0, 0.0, 0.0) if self._pilot.absolute else self._home
+        return (0.0, 0.0, 0.0) if self._pilot.absolute else self.home
 
     def _take_mode(self, message: Message) -> None:
         """SET_MODE, which MAV_CMD_DO_SET_MODE has replaced."""
         number, source = message.custom_mode, _source(message)
         known = number in tuple(Mode)
         result = Result.ACCEPTED if known else Result.DENIED
-        self._stack.reply(mavlink.command_ack(Command.DO_SET_MODE, result, *source))
+        self._stack.reply(services.command_ack(Command.DO_SET_MODE, result, *source))
         for answer in self._enter(Mode(number), source) if known else ():
             self._stack.reply(answer)
 
@@ -132,9 +133,9 @@ class SetpointService:
 
     def _change(self, mode: Mode, severity: int, text: str) -> Sequence[Message]:
         """Change the mode; returns the news for all clients."""
-        texts = () if mode is self.mode else mavlink.status_text(severity, text)
+        texts = () if mode is self.mode else services.status_text(severity, text)
         self.mode = mode
-        return (*texts, mavlink.current_mode(mode))
+        return (*texts, services.current_mode(mode))
 
     def _watch(self) -> Task:
         """Leave offboard when its set-points stop."""

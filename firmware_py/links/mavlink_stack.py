@@ -16,7 +16,9 @@ from firmware_py.links.notices import Notices
 from firmware_py.rtos import Kernel, Queue
 from firmware_py.rtos.scheduler import GO_ON
 from firmware_py.wire import WireError, mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
+from firmware_py.wire.mavlink_layouts import NUMBERS
 
 Task = Generator[int, None, None]
 Handler = Callable[[Message], object]
@@ -73,8 +75,7 @@ class MavlinkStack:
     @property
     def bad(self) -> int:
         """Frames that were damaged or not correctly signed."""
-        counters = self.counters
-        return counters.bad_crc + counters.bad_signature + counters.unsigned + counters.replayed
+        return self.counters.bad
 
     @property
     def dropped(self) -> int:
@@ -95,9 +96,9 @@ class MavlinkStack:
         """Interrupt: the UART has bytes."""
         self._received.give_from_isr()
 
-    def handle(self, number: int, handler: Handler) -> None:
-        """Let the receiving task call `handler` for each message of this number; `WireError` refuses it."""
-        self._handlers[number] = handler
+    def handle(self, name: str, handler: Handler) -> None:
+        """Let the receiving task call `handler` for each message of this name; `WireError` refuses it."""
+        self._handlers[NUMBERS[name]] = handler
 
     def reply(self, message: Message) -> None:
         """Queue a message that was requested. A plain call, for handlers; dropped when the queue is full."""
@@ -144,7 +145,7 @@ class MavlinkStack:
     def report(self, severity: int, line: str) -> None:
         """Send a line to the operators as STATUSTEXT."""
         self._texts = self._texts % 0xFFFF + 1
-        for message in mavlink.status_text(severity, line, self._texts):
+        for message in services.status_text(severity, line, self._texts):
             self.reply(message)
 
     def _receive_task(self) -> Task:
@@ -160,11 +161,10 @@ class MavlinkStack:
         if (message.get_srcSystem(), message.get_srcComponent()) == (self.system, self.component):
             return  # an echo of our own
         self._heard_us = self.kernel.now_us
-        number = message.get_msgId()
-        handler = self._handlers.get(number)
+        handler = self._handlers.get(message.get_msgId())
         if handler is None or not self._is_ours(message):
             self.unserved += 1
-            if handler is None and number not in mavlink.ENDS and self._is_request(message):
+            if handler is None and message.get_type() not in mavlink.ENDS and self._is_request(message):
                 self.notice(message, f"{message.get_type()} is not served")
             return
         try:

@@ -10,18 +10,18 @@ from dataclasses import dataclass
 
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
 from firmware_py.rtos import FOREVER, TICK_US
-from firmware_py.wire import mavlink
 from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.mavlink_layouts import NUMBERS
 
 DEFAULT, OFF = 0, -1  # intervals in SET_MESSAGE_INTERVAL
 NONE_SUCH = 0  # interval in MESSAGE_INTERVAL
 LONGEST_TICKS = 1_000_000
 
-_STATUS = (mavlink.MSG_SYS_STATUS, mavlink.MSG_BATTERY_STATUS, mavlink.MSG_ESTIMATOR_STATUS)
-_ATTITUDE = (mavlink.MSG_ATTITUDE, mavlink.MSG_ATTITUDE_QUATERNION)
-_POSITION = (mavlink.MSG_LOCAL_POSITION_NED,)
-_SERVOS = (mavlink.MSG_SERVO_OUTPUT_RAW,)
-_REST = (mavlink.MSG_NAMED_VALUE_FLOAT,)
+_STATUS = ("SYS_STATUS", "BATTERY_STATUS", "ESTIMATOR_STATUS")
+_ATTITUDE = ("ATTITUDE", "ATTITUDE_QUATERNION")
+_POSITION = ("LOCAL_POSITION_NED",)
+_SERVOS = ("SERVO_OUTPUT_RAW",)
+_REST = ("NAMED_VALUE_FLOAT",)
 GROUPS = {  # MAV_DATA_STREAM of the older REQUEST_DATA_STREAM
     0: (*_STATUS, *_ATTITUDE, *_POSITION, *_SERVOS, *_REST),
     2: _STATUS,
@@ -36,7 +36,7 @@ GROUPS = {  # MAV_DATA_STREAM of the older REQUEST_DATA_STREAM
 class Stream:
     """A kind of message; `make` returns those of one tick. An interval of None means off."""
 
-    number: int
+    name: str
     default_ticks: int | None
     make: Callable[[int], Sequence[Message]]
     interval_ticks: int | None = None
@@ -61,11 +61,11 @@ class StreamService:
 
     def __init__(self, stack: MavlinkStack, streams: Sequence[Stream]) -> None:
         self._stack = stack
-        self._streams = {stream.number: stream for stream in streams}
+        self._streams = {NUMBERS[stream.name]: stream for stream in streams}
         for stream in streams:
             stream.start(stream.default_ticks, 0)
         self._changed = stack.kernel.create_binary_semaphore("mavStreams")
-        stack.handle(mavlink.MSG_REQUEST_DATA_STREAM, self._take_request)
+        stack.handle("REQUEST_DATA_STREAM", self._take_request)
         stack.kernel.create_task("MAV-STREAM", 1, self._task)
 
     def set_interval(self, number: int, interval_us: int) -> bool:
@@ -98,8 +98,8 @@ class StreamService:
     def _take_request(self, request: Message) -> None:
         on = request.start_stop == 1 and request.req_message_rate > 0
         interval_us = 1_000_000 // request.req_message_rate if on else OFF
-        for number in GROUPS.get(request.req_stream_id, ()):
-            self.set_interval(number, interval_us)
+        for name in GROUPS.get(request.req_stream_id, ()):
+            self.set_interval(NUMBERS[name], interval_us)
 
     def _task(self) -> Task:
         kernel, stack = self._stack.kernel, self._stack

@@ -1,14 +1,16 @@
 """What the streams carry: the running board's values as messages, with the tick as time stamp.
 
 Our own ground station takes the flight array: the telemetry blocks as the board knows them, relative to the goal that the
-last pose was seen from. For other stations the standard's messages are absolute in W.
+last pose was seen from. For other stations the standard's messages are absolute in W; those of rate 0 are sent only on
+SET_MESSAGE_INTERVAL or REQUEST_MESSAGE.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import sqrt
 
 from firmware_py.config import StreamRates
-from firmware_py.core.structs import POSITION, Control
+from firmware_py.core.structs import POSITION
+from firmware_py.geometry import Vector, conjugate, rotate
 from firmware_py.links.log import LogVariable
 from firmware_py.links.mavlink_poses import PoseService
 from firmware_py.links.mavlink_stack import MavlinkStack
@@ -17,10 +19,16 @@ from firmware_py.links.mavlink_world import World
 from firmware_py.rtos.statistics import Load
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink, telemetry
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import Message
 
 UNKNOWN_AGE = -1.0
+VERSION = (26, 11, 0)
+REVISION = bytes.fromhex("0f10a717")  # the parameters firmware.revision0
+SERIAL_NUMBER = 0x00F10A71  # the parameter cpu.id0
+
 Messages = Sequence[Message]
+ReadImu = Callable[[], tuple[Vector, Vector]]  # rates [rad/s, B] and acceleration [g, B]
 
 
 class FlightMessages:
@@ -32,39 +40,53 @@ class FlightMessages:
         supervisor: Supervisor,
         world: World,
         poses: PoseService,
-        control: Control,
         variables: Sequence[LogVariable],
+        read_imu: ReadImu,
     ) -> None:
         self._stack = stack
         self._supervisor = supervisor
         self._world = world
         self._poses = poses
-        self._control = control
+        self._read_imu = read_imu
+        self._unix_ahead_us: int | None = None  # of the board's own clock
         read = {variable.name: variable.read for variable in variables}
         self._blocks = [(block, [read[item.name] for item in block.variables]) for block in telemetry.BLOCKS]
         self._load = Load(stack.kernel)
+        stack.handle("SYSTEM_TIME", self._see_time)
 
     def streams(self, rates: StreamRates) -> tuple[Stream, ...]:
         """Return all streams with their intervals after boot."""
         return tuple(
-            Stream(number, interval_of(rate_hz), make)
-            for number, rate_hz, make in (
-                (mavlink.MSG_HEARTBEAT, rates.heartbeat, self._heartbeat),
-                (mavlink.MSG_ATTITUDE, rates.attitude, self._attitude),
-                (mavlink.MSG_ATTITUDE_QUATERNION, rates.attitude_quaternion, self._attitude_quaternion),
-                (mavlink.MSG_LOCAL_POSITION_NED, rates.local_position, self._local_position),
-                (mavlink.MSG_DEBUG_FLOAT_ARRAY, rates.flight_array, self._flight_array),
-                (mavlink.MSG_SERVO_OUTPUT_RAW, rates.servo_output, self._servo_outputs),
-                (mavlink.MSG_ESTIMATOR_STATUS, rates.estimator_status, self._estimator_status),
-                (mavlink.MSG_SYS_STATUS, rates.sys_status, self._sys_status),
-                (mavlink.MSG_BATTERY_STATUS, rates.battery_status, self._battery),
-                (mavlink.MSG_NAMED_VALUE_FLOAT, rates.named_values, self._named_values),
+            Stream(name, interval_of(rate_hz), make)
+            for name, rate_hz, make in (
+                ("HEARTBEAT", rates.heartbeat, self._heartbeat),
+                ("ATTITUDE", rates.attitude, self._attitude),
+                ("ATTITUDE_QUATERNION", rates.attitude_quaternion, self._attitude_quaternion),
+                ("LOCAL_POSITION_NED", rates.local_position, self._local_position),
+                ("DEBUG_FLOAT_ARRAY", rates.flight_array, self._flight_array),
+                ("SERVO_OUTPUT_RAW", rates.servo_output, self._servo_outputs),
+                ("ESTIMATOR_STATUS", rates.estimator_status, self._estimator_status),
+                ("SYS_STATUS", rates.sys_status, self._sys_status),
+                ("BATTERY_STATUS", rates.battery_status, self._battery),
+                ("NAMED_VALUE_FLOAT", rates.named_values, self._named_values),
+                ("SYSTEM_TIME", rates.system_time, self._system_time),
+                ("CURRENT_MODE", rates.current_mode, self._mode),
+                ("POSITION_TARGET_LOCAL_NED", rates.position_target, self._target),
+                ("VFR_HUD", rates.vfr_hud, self._hud),
+                ("ACTUATOR_OUTPUT_STATUS", rates.actuator_output, self._actuators),
+                ("HOME_POSITION", rates.home_position, self._home_position),
+                ("ODOMETRY", rates.odometry, self._odometry),
+                ("GLOBAL_POSITION_INT", 0, self._global_position),
+                ("HIGHRES_IMU", 0, self._imu),
+                ("AUTOPILOT_VERSION", 0, self._version),
+                ("EXTENDED_SYS_STATE", 0, self._extended_state),
+                ("PROTOCOL_VERSION", 0, lambda tick: (services.protocol_version(),)),
             )
         )
 
     def _heartbeat(self, tick: int) -> Messages:
         supervisor, mode = self._supervisor, self._world.setpoints.mode
-        return (mavlink.heartbeat(supervisor.controlling, supervisor.state, mode),)
+        return (services.heartbeat(supervisor.controlling, supervisor.state, mode),)
 
     def _attitude(self, tick: int) -> Messages:
         return (mavlink.attitude(tick, *self._world.angles(), *self._world.rates()),)
@@ -80,7 +102,7 @@ class FlightMessages:
         return (mavlink.flight_array(tick * 1000, values),)
 
     def _servo_outputs(self, tick: int) -> Messages:
-        return (mavlink.servo_outputs(tick * 1000, tuple(self._control.count.tolist())),)
+        return (mavlink.servo_outputs(tick * 1000, tuple(self._world.control.count.tolist())),)
 
     def _estimator_status(self, tick: int) -> Messages:
         healthy = self._supervisor.has_recent_pose
@@ -100,7 +122,7 @@ class FlightMessages:
     def _named_values(self, tick: int) -> Messages:
         age_us = self._poses.age_us
         return tuple(
-            mavlink.named_value(tick, name, value)
+            services.named_value(tick, name, value)
             for name, value in (
                 ("age_ms", UNKNOWN_AGE if age_us is None else age_us * 1e-3),
                 ("refused", int(self._world.estimator.refused)),
@@ -109,3 +131,46 @@ class FlightMessages:
                 ("overruns", self._stack.overruns),
             )
         )
+
+    def _see_time(self, message: Message) -> None:
+        """Take the time of day from a station that knows it."""
+        if message.time_unix_usec:
+            self._unix_ahead_us = message.time_unix_usec - self._stack.kernel.now_us
+
+    def _system_time(self, tick: int) -> Messages:
+        ahead_us = self._unix_ahead_us
+        return (services.system_time(0 if ahead_us is None else tick * 1000 + ahead_us, tick),)
+
+    def _mode(self, tick: int) -> Messages:
+        return (services.current_mode(self._world.setpoints.mode),)
+
+    def _target(self, tick: int) -> Messages:
+        return (mavlink.position_target(tick, *self._world.setpoints.goal),)
+
+    def _hud(self, tick: int) -> Messages:
+        return (mavlink.hud(*self._world.motion(), self._world.angles()[2]),)
+
+    def _actuators(self, tick: int) -> Messages:
+        return (mavlink.actuator_outputs(tick * 1000, tuple(self._world.control.count.tolist())),)
+
+    def _global_position(self, tick: int) -> Messages:
+        yaw = self._world.angles()[2]
+        return (mavlink.global_position(tick, *self._world.motion(), yaw, self._world.setpoints.home[2]),)
+
+    def _imu(self, tick: int) -> Messages:
+        return (mavlink.imu(tick * 1000, *self._read_imu()),)
+
+    def _version(self, tick: int) -> Messages:
+        return (services.autopilot_version(VERSION, REVISION, SERIAL_NUMBER),)
+
+    def _home_position(self, tick: int) -> Messages:
+        return (mavlink.home_position(tick * 1000, self._world.setpoints.home),)
+
+    def _extended_state(self, tick: int) -> Messages:
+        return (services.extended_state(self._supervisor.state),)
+
+    def _odometry(self, tick: int) -> Messages:
+        world = self._world
+        (p_WB, v_W), q_WB = world.motion(), world.q_WB()
+        v_B = rotate(conjugate(q_WB), v_W)
+        return (mavlink.odometry(tick * 1000, p_WB, q_WB, v_B, world.rates()),)

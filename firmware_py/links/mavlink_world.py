@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY, Estimator
+from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY, Control, Estimator
 from firmware_py.geometry import Quaternion, Vector, from_euler_zyx, rotate, wrap_angle, yaw_quaternion
 from firmware_py.links.mavlink_setpoints import SetpointService
 
@@ -12,6 +12,7 @@ class World:
     """Reads the running board; every call returns the present values."""
 
     estimator: Estimator
+    control: Control
     setpoints: SetpointService
 
     def angles(self) -> Vector:

@@ -21,81 +21,20 @@ from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.mavlink_services import u16, u32
 from firmware_py.wire.telemetry import BATTERY, BLOCKS, LOAD, TIMESTAMP_MASK, Sample
 
-# isort: off
-from firmware_py.wire.mavlink_services import (  # offered here, too
-    autopilot_version as autopilot_version, available_mode as available_mode, command as command,
-    command_ack as command_ack, current_mode as current_mode,
-    extended_state as extended_state, ftp_nak as ftp_nak, heartbeat as heartbeat, mavlink_name as mavlink_name,
-    message_interval as message_interval, named_value as named_value, no_control as no_control,
-    no_log_data as no_log_data, no_logs as no_logs,
-    no_mission as no_mission, parameter as parameter, parameter_list as parameter_list,
-    parameter_read as parameter_read, parameter_set as parameter_set,
-    parameter_error as parameter_error, ping_answer as ping_answer, protocol_version as protocol_version,
-    read_heartbeat as read_heartbeat, refusal as refusal, refused_mission as refused_mission,
-    station_heartbeat as station_heartbeat, status_text as status_text, system_time as system_time,
-    timesync as timesync,
-)  # fmt: skip
-# isort: on
-
-MSG_HEARTBEAT = 0
-MSG_SYS_STATUS = 1
-MSG_SYSTEM_TIME = 2
-MSG_PING = 4
-MSG_CHANGE_OPERATOR_CONTROL = 5
-MSG_SET_MODE = 11
-MSG_PARAM_REQUEST_READ = 20
-MSG_PARAM_REQUEST_LIST = 21
-MSG_PARAM_VALUE = 22
-MSG_PARAM_SET = 23
-MSG_ATTITUDE = 30
-MSG_ATTITUDE_QUATERNION = 31
-MSG_LOCAL_POSITION_NED = 32
-MSG_GLOBAL_POSITION_INT = 33
-MSG_SERVO_OUTPUT_RAW = 36
-MSG_MISSION_REQUEST_LIST = 43
-MSG_MISSION_ACK = 47
-MSG_REQUEST_DATA_STREAM = 66
-MSG_VFR_HUD = 74
-MSG_COMMAND_INT = 75
-MSG_COMMAND_LONG = 76
-MSG_COMMAND_ACK = 77
-MSG_SET_POSITION_TARGET_LOCAL_NED = 84
-MSG_POSITION_TARGET_LOCAL_NED = 85
-MSG_GLOBAL_VISION_POSITION_ESTIMATE = 101
-MSG_VISION_POSITION_ESTIMATE = 102
-MSG_VICON_POSITION_ESTIMATE = 104
-MSG_HIGHRES_IMU = 105
-MSG_FILE_TRANSFER_PROTOCOL = 110
-MSG_TIMESYNC = 111
-MSG_LOG_REQUEST_LIST = 117
-MSG_LOG_REQUEST_DATA = 119
-MSG_LOG_REQUEST_END = 122
-MSG_ATT_POS_MOCAP = 138
-MSG_BATTERY_STATUS = 147
-MSG_AUTOPILOT_VERSION = 148
-MSG_ESTIMATOR_STATUS = 230
-MSG_HOME_POSITION = 242
-MSG_EXTENDED_SYS_STATE = 245
-MSG_NAMED_VALUE_FLOAT = 251
-MSG_STATUSTEXT = 253
-MSG_PROTOCOL_VERSION = 300
-MSG_ODOMETRY = 331
-MSG_DEBUG_FLOAT_ARRAY = 350
-MSG_ACTUATOR_OUTPUT_STATUS = 375
-MSG_AVAILABLE_MODES = 435
-MSG_CURRENT_MODE = 436
-
 POSES = (
-    MSG_ATT_POS_MOCAP,
-    MSG_VISION_POSITION_ESTIMATE,
-    MSG_GLOBAL_VISION_POSITION_ESTIMATE,
-    MSG_VICON_POSITION_ESTIMATE,
-    MSG_ODOMETRY,
+    "ATT_POS_MOCAP",
+    "VISION_POSITION_ESTIMATE",
+    "GLOBAL_VISION_POSITION_ESTIMATE",
+    "VICON_POSITION_ESTIMATE",
+    "ODOMETRY",
 )
 # They end a transaction, or answer: nothing is left to say.
-ENDS = (MSG_MISSION_ACK, MSG_COMMAND_ACK, MSG_LOG_REQUEST_END)
+ENDS = ("MISSION_ACK", "COMMAND_ACK", "LOG_REQUEST_END")
 # All messages about missions except the request for the list and its end.
-MISSION_MESSAGES = (37, 38, 39, 40, 41, 44, 45, 51, 73)
+MISSION_MESSAGES = (
+    *("MISSION_REQUEST_PARTIAL_LIST", "MISSION_WRITE_PARTIAL_LIST", "MISSION_ITEM", "MISSION_REQUEST"),
+    *("MISSION_SET_CURRENT", "MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_REQUEST_INT", "MISSION_ITEM_INT"),
+)
 
 FLIGHT_ARRAY = "floaty"
 FLIGHT_ARRAY_SIZE = sum(len(block.variables) for block in BLOCKS) - 4  # without excitation
@@ -181,11 +120,11 @@ def pose(t_us: int, p_WB: Vector, q_WB: Quaternion) -> Message:
 
 def read_pose(message: Message) -> Pose:
     """The pose in one of `POSES`; `WireError` also for one in other frames, or that its sender declares unreliable."""
-    number = message.get_msgId()
-    if number == MSG_ODOMETRY:
+    kind = message.get_type()
+    if kind == "ODOMETRY":
         _check_odometry(message)
         t_us, q, covariance = message.time_usec, tuple(message.q), message.pose_covariance
-    elif number == MSG_ATT_POS_MOCAP:
+    elif kind == "ATT_POS_MOCAP":
         t_us, q, covariance = message.time_usec, tuple(message.q), message.covariance
     else:
         q = _from_euler(message.roll, message.pitch, message.yaw)

@@ -50,6 +50,11 @@ class FrameCounters:
     lost: int = 0  # gaps in the sequence numbers
     late: int = 0  # behind the newest of their sender: reordered (and counted as lost before) or repeated
 
+    @property
+    def bad(self) -> int:
+        """Frames that were damaged or not correctly signed."""
+        return self.bad_crc + self.bad_signature + self.unsigned + self.replayed
+
 
 class FrameSender:
     """Makes the frames of one sender on one link, and counts them."""

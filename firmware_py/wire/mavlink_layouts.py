@@ -20,7 +20,7 @@ Message: TypeAlias = MAVLink_message
 class Layout:
     """How a kind of message lies in its payload."""
 
-    create: Callable[..., Any]
+    create: Any  # pymavlink's class of the message
     payload: struct.Struct
     crc_seed: bytes
     read: Callable[[Any], Any]  # the fields of a message in wire order
@@ -134,6 +134,7 @@ class CurrentMode(_Later):
 
 LAYOUTS = {number: _layout(kind) for number, kind in dialect.mavlink_map.items()}
 LAYOUTS |= {kind.id: _layout(kind) for kind in (ProtocolVersion, AvailableModes, CurrentMode)}
+NUMBERS: dict[str, int] = {layout.create.msgname: number for number, layout in LAYOUTS.items()}
 
 
 def crc16(data: bytes) -> int:

@@ -1,6 +1,6 @@
 """The messages of the standard's services: heartbeats, commands, parameters, clocks, texts, files.
 
-Nothing here has an axis; what flies is in `mavlink`, which offers these functions, too.
+Nothing here has an axis; what flies is in `mavlink`.
 """
 
 import pymavlink.dialects.v20.common as dialect

@@ -14,7 +14,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from firmware_py.wire import WireError, mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
+from firmware_py.wire.mavlink_layouts import NUMBERS
 from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.latency import LinkLatency
 from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget
@@ -43,18 +45,6 @@ class MavlinkLinkConfig:
     latency_us: int = 0  # to the board, until it is measured
 
 
-@dataclass(frozen=True, slots=True)
-class LinkStatistics:
-    """Counters of the link."""
-
-    poses: int  # sent
-    goals: int  # sent
-    frames: int  # received
-    lost: int  # on the downlink, by their sequence numbers
-    bad: int  # wrong CRC or signature
-    round_trip_us: int | None  # of the last time request, None before
-
-
 class MavlinkLink:
     """One board at the other end of `transmit(now_us, bytes)`; implements `ground_station.station.Link`.
 
@@ -80,9 +70,8 @@ class MavlinkLink:
         self._carry = transmit
         self._sender = FrameSender(SYSTEM, COMPONENT, signing)
         self._receiver = FrameReceiver(signing)
-        self.counters = self._receiver.counters
-        self._poses = self._goals = 0
-        self._round_trip_us: int | None = None
+        self.counters = self._receiver.counters  # of the downlink
+        self.round_trip_us: int | None = None  # of the last time request
         self._goal: Goal | None = None  # as last sent
         self._goal_us = 0
         self._asked = False
@@ -92,22 +81,15 @@ class MavlinkLink:
         self.controls = MavlinkControls(self._send, lambda: self._addressee)
         self._time_request_ns = 0  # own clock in the last one
         self._read_us = 0  # when the bytes that are being decoded were read
-        self._handlers: dict[int, Callable[[int, Message], Sequence[Sample]]] = {
-            mavlink.MSG_HEARTBEAT: self._on_heartbeat,
-            mavlink.MSG_TIMESYNC: self._on_timesync,
-            mavlink.MSG_DEBUG_FLOAT_ARRAY: self._on_flight_array,
-            mavlink.MSG_SYS_STATUS: self._on_status,
-            mavlink.MSG_COMMAND_ACK: self._on_command_ack,
-            mavlink.MSG_PARAM_VALUE: self._on_parameter,
-            mavlink.MSG_STATUSTEXT: self._on_text,
+        self._handlers: dict[str, Callable[[int, Message], Sequence[Sample]]] = {
+            "HEARTBEAT": self._on_heartbeat,
+            "TIMESYNC": self._on_timesync,
+            "DEBUG_FLOAT_ARRAY": self._on_flight_array,
+            "SYS_STATUS": self._on_status,
+            "COMMAND_ACK": self._on_command_ack,
+            "PARAM_VALUE": self._on_parameter,
+            "STATUSTEXT": self._on_text,
         }
-
-    @property
-    def statistics(self) -> LinkStatistics:
-        """The counters of the link so far."""
-        c = self.counters
-        bad = c.bad_crc + c.bad_signature + c.unsigned + c.replayed
-        return LinkStatistics(self._poses, self._goals, c.frames, c.lost, bad, self._round_trip_us)
 
     # Uplink
 
@@ -124,7 +106,6 @@ class MavlinkLink:
         if self._goal is None or (goal != self._goal and since_us >= self.budget.goal_period_us):
             self._send_goal(now_us, frame, goal)
         self._send(now_us, pose)
-        self._poses += 1
         if goal == self._goal and now_us - self._goal_us >= REPEAT_GOAL_US:
             self._send_goal(now_us, frame, goal)
         if now_us >= self._look_us:
@@ -133,7 +114,6 @@ class MavlinkLink:
     def _send_goal(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         self._send(now_us, mavlink.target(frame.t_us // 1000, goal.p_WG, goal.yaw, self._addressee))
         self._goal, self._goal_us = goal, now_us
-        self._goals += 1
 
     @property
     def _addressee(self) -> int:
@@ -153,12 +133,12 @@ class MavlinkLink:
         """Send a time request and a heartbeat, and request telemetry that is too slow."""
         self._look_us = now_us + LOOK_PERIOD_US
         self._time_request_ns = now_us * 1000
-        self._send(now_us, mavlink.timesync(0, self._time_request_ns))
-        self._send(now_us, mavlink.station_heartbeat())
+        self._send(now_us, services.timesync(0, self._time_request_ns))
+        self._send(now_us, services.station_heartbeat())
         rate_hz = self.budget.telemetry_hz
         if self._asked and self._samples < rate_hz / 2:
-            wanted = (SET_MESSAGE_INTERVAL, mavlink.MSG_DEBUG_FLOAT_ARRAY, 1_000_000 // rate_hz)
-            self._send(now_us, mavlink.command(self._addressee, BOARD_COMPONENT, *wanted))
+            wanted = (SET_MESSAGE_INTERVAL, NUMBERS["DEBUG_FLOAT_ARRAY"], 1_000_000 // rate_hz)
+            self._send(now_us, services.command(self._addressee, BOARD_COMPONENT, *wanted))
         self._samples = 0
 
     # Downlink
@@ -173,7 +153,7 @@ class MavlinkLink:
         for message in self._receiver.feed(now_us, data):
             if self._note_frame is not None:
                 self._note_frame(now_us, bytes(message.get_msgbuf()))
-            handler = self._handlers.get(message.get_msgId())
+            handler = self._handlers.get(message.get_type())
             if handler is None or not self._is_of_board(message):
                 continue
             self.heard_us = now_us
@@ -189,7 +169,7 @@ class MavlinkLink:
     def _on_heartbeat(self, now_us: int, message: Message) -> Sequence[Sample]:
         if message.autopilot != NO_AUTOPILOT:
             self.board = message.get_srcSystem()
-            self.supervisor_state = mavlink.read_heartbeat(message)
+            self.supervisor_state = services.read_heartbeat(message)
         return ()
 
     def _on_timesync(self, now_us: int, message: Message) -> Sequence[Sample]:
@@ -197,16 +177,16 @@ class MavlinkLink:
             # The board takes our answer's time for the middle between its request and its receipt. So the middle
             # between arrival and answer is stated, as in NTP: a late answer is less precise, but not wrong.
             middle_us = (now_us + self._read_us) // 2
-            self._send(self._read_us, mavlink.timesync(middle_us * 1000, message.ts1))
+            self._send(self._read_us, services.timesync(middle_us * 1000, message.ts1))
         elif message.ts1 == self._time_request_ns:
-            self._round_trip_us = now_us - message.ts1 // 1000
-            self.latency = LinkLatency("serial", self._round_trip_us // 2, measured=True)
+            self.round_trip_us = now_us - message.ts1 // 1000
+            self.latency = LinkLatency("serial", self.round_trip_us // 2, measured=True)
         return ()
 
     def _on_command_ack(self, now_us: int, message: Message) -> Sequence[Sample]:
         self.answered = True
         if not self.controls.hear(self._read_us, message) and message.result != ACCEPTED:
-            self.texts.append(mavlink.refusal(message))
+            self.texts.append(services.refusal(message))
         return ()
 
     def _on_parameter(self, now_us: int, message: Message) -> Sequence[Sample]:

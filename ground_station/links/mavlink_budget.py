@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from firmware_py.wire import mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import SIGNATURE_SIZE, FrameSender, Message
 from firmware_py.wire.mavlink_numbers import Mode
 from ground_station.errors import LinkError
@@ -74,12 +75,12 @@ def _bytes(messages: Iterable[Message], signed: bool) -> int:
 
 _POSE = (mavlink.pose(10**12, _U, _Q),)
 _GOAL = (mavlink.target(10**9, _U, 0.1),)
-_HOUSEKEEPING = (mavlink.station_heartbeat(),)
-_TIME = (mavlink.timesync(10**15, 10**15),)
+_HOUSEKEEPING = (services.station_heartbeat(),)
+_TIME = (services.timesync(10**15, 10**15),)
 _SAMPLE = (mavlink.flight_array(10**12, (0.5,) * mavlink.FLIGHT_ARRAY_SIZE),)
 # What the board sends unasked: rate [Hz] and message.
 _BOARD = (
-    (1.0, mavlink.heartbeat(True, 2)),
+    (1.0, services.heartbeat(True, 2)),
     (1.0, mavlink.sys_status(3900, 0.1, 1, 0.1)),
     (1.0, mavlink.battery(3900)),
     (4.0, mavlink.attitude(10**9, *_U, *_U)),
@@ -87,9 +88,9 @@ _BOARD = (
     (4.0, mavlink.local_position(10**9, _U, _U)),
     (2.0, mavlink.servo_outputs(10**9, (31_500,) * 4)),
     (1.0, mavlink.estimator_status(10**12, True, 0.1, 0.1)),
-    (3.0, mavlink.named_value(10**9, "ten_letter", 0.1)),
-    (0.2, mavlink.system_time(10**15, 10**9)),
-    (0.2, mavlink.current_mode(Mode.OFFBOARD)),
+    (3.0, services.named_value(10**9, "ten_letter", 0.1)),
+    (0.2, services.system_time(10**15, 10**9)),
+    (0.2, services.current_mode(Mode.OFFBOARD)),
     (0.2, mavlink.position_target(10**9, _U, 0.1)),
     (0.2, mavlink.hud(_U, _U, 0.1)),
     (0.2, mavlink.actuator_outputs(10**12, (31_500,) * 4)),

@@ -6,7 +6,7 @@ What the board calls `extCtrl.y_P` is `EXT_Y_P` here; a request may have either 
 from collections.abc import Callable, Generator
 from typing import Any
 
-from firmware_py.wire import mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import Message
 from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Result
 from firmware_py.wire.scalars import Scalar
@@ -17,7 +17,7 @@ BOARD_COMPONENT = 1  # autopilot
 ARM, TERMINATE = 1, 1
 WARNING = 4  # MAV_SEVERITY
 REASON_US = 200_000  # after a refusal, in which the board may state the reason
-STOPPED = mavlink.mavlink_name("floaty.stop")  # a latch, which arming alone does not reset
+STOPPED = services.mavlink_name("floaty.stop")  # a latch, which arming alone does not reset
 
 
 class MavlinkControls(Dialogue[Message]):
@@ -46,7 +46,7 @@ class MavlinkControls(Dialogue[Message]):
         found: dict[int, Message] = {}
 
         def take(message: Message) -> Message | None:
-            if message.get_msgId() != mavlink.MSG_PARAM_VALUE or message.param_index >= message.param_count:
+            if message.get_type() != "PARAM_VALUE" or message.param_index >= message.param_count:
                 return None
             found[message.param_index] = message
             return message
@@ -55,12 +55,12 @@ class MavlinkControls(Dialogue[Message]):
             return next(number for number in range(len(found) + 1) if number not in found)
 
         last = yield Exchange(
-            lambda now_us: self._send(now_us, mavlink.parameter_list(self._board(), BOARD_COMPONENT)), take
+            lambda now_us: self._send(now_us, services.parameter_list(self._board(), BOARD_COMPONENT)), take
         )
         while len(found) < last.param_count:
             last = yield Exchange(
                 lambda now_us: self._send(
-                    now_us, mavlink.parameter_read(self._board(), BOARD_COMPONENT, missing())
+                    now_us, services.parameter_read(self._board(), BOARD_COMPONENT, missing())
                 ),
                 take,
                 waits=True,
@@ -71,13 +71,13 @@ class MavlinkControls(Dialogue[Message]):
 
     def _read(self, name: str) -> Script[Message]:
         name = yield from self._find(name)
-        message = mavlink.parameter_read(self._board(), BOARD_COMPONENT, name)
+        message = services.parameter_read(self._board(), BOARD_COMPONENT, name)
         reply = yield self._until(message, lambda got: _is_value_of(got, name))
         return ((name, reply.param_value),)
 
     def _write(self, name: str, value: float) -> Script[Message]:
         name = yield from self._find(name)
-        message = mavlink.parameter_set(self._board(), BOARD_COMPONENT, name, value)
+        message = services.parameter_set(self._board(), BOARD_COMPONENT, name, value)
         reply = yield self._until(message, lambda got: _is_value_of(got, name))
         if reply.param_value != Scalar.F32.cast(value):
             raise ControlsError(f"{name} = {value:g}: refused, it stays {reply.param_value:g}")
@@ -90,12 +90,12 @@ class MavlinkControls(Dialogue[Message]):
         return (yield from self._command(Command.COMPONENT_ARM_DISARM, ARM))
 
     def _command(self, number: int, *params: float) -> Script[Message]:
-        message = mavlink.command(self._board(), BOARD_COMPONENT, number, *params)
+        message = services.command(self._board(), BOARD_COMPONENT, number, *params)
         reply = yield self._until(
-            message, lambda got: got.get_msgId() == mavlink.MSG_COMMAND_ACK and got.command == number
+            message, lambda got: got.get_type() == "COMMAND_ACK" and got.command == number
         )
         if reply.result != Result.ACCEPTED:
-            refusal = mavlink.refusal(reply)
+            refusal = services.refusal(reply)
             reason = yield Exchange(
                 lambda now_us: None, _warning, waits=True, patience_us=REASON_US, missing=refusal
             )
@@ -109,7 +109,7 @@ class MavlinkControls(Dialogue[Message]):
 
     def _find(self, name: str) -> Generator[Exchange[Message], Any, str]:
         yield from self._list_once()
-        for spelt in (name, mavlink.mavlink_name(name)):
+        for spelt in (name, services.mavlink_name(name)):
             if spelt in self._names:
                 return spelt
         raise ControlsError(unknown(name, self._names))
@@ -120,9 +120,9 @@ class MavlinkControls(Dialogue[Message]):
 
 def _warning(message: Message) -> str | None:
     """Return the text of a warning."""
-    is_warning = message.get_msgId() == mavlink.MSG_STATUSTEXT and message.severity <= WARNING
+    is_warning = message.get_type() == "STATUSTEXT" and message.severity <= WARNING
     return message.text if is_warning else None
 
 
 def _is_value_of(message: Message, name: str) -> bool:
-    return bool(message.get_msgId() == mavlink.MSG_PARAM_VALUE and message.param_id == name)
+    return bool(message.get_type() == "PARAM_VALUE" and message.param_id == name)

@@ -147,7 +147,7 @@ class MavlinkSerialLink(LiveLink):
             return f"system {self._link.board} answers no command {within}{hint}"
         if not count:
             return f"no heartbeat {within}: no bytes arrive"
-        if refused := seen.unsigned + seen.bad_signature + seen.replayed:
+        if refused := seen.bad - seen.bad_crc:
             return f"no heartbeat {within}: {refused} frames not signed with mavlink.signing_key"
         if not seen.frames:
             return f"no heartbeat {within}: {count} bytes, not one frame: wrong baud rate?"
@@ -211,10 +211,10 @@ class MavlinkSerialLink(LiveLink):
 
     def summary(self) -> str:
         """Return one line on the state of the link."""
-        link = self._link.statistics
-        round_trip = "?" if link.round_trip_us is None else f"{link.round_trip_us / 1000:.1f}"
+        frames, round_trip_us = self._link.counters, self._link.round_trip_us
+        round_trip = "?" if round_trip_us is None else f"{round_trip_us / 1000:.1f}"
         return (
-            f"{self.sent} sent, {self.late} late  frames {link.frames}, {link.lost} lost, {link.bad} bad  "
+            f"{self.sent} sent, {self.late} late  frames {frames.frames}, {frames.lost} lost, {frames.bad} bad  "
             f"round trip {round_trip} ms"
         )
 

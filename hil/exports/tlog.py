@@ -24,6 +24,7 @@ from hil.laboratory.recorder import load_events, load_log
 
 try:
     from firmware_py.wire import mavlink
+    from firmware_py.wire import mavlink_services as services
     from firmware_py.wire.mavlink_frames import FrameSender
 except ImportError as error:
     raise LabError(f"no telemetry log without its package ({error}): {install_command('mavlink')}") from None
@@ -42,7 +43,7 @@ def write_tlog(folder: Path) -> Path:
     texts = [
         (event["t_us"], BOARD, message)
         for number, event in enumerate(load_events(folder), 1)
-        for message in mavlink.status_text(INFO, event["text"], number)
+        for message in services.status_text(INFO, event["text"], number)
     ]
     senders = {who: FrameSender(*who) for who in (BOARD, STATION)}
     path = folder / FILE
@@ -71,7 +72,7 @@ def _flown(log: pa.Table) -> Iterator[Said]:
             yield us, STATION, mavlink.target(us // 1000, tuple(sent_goal[:3]), sent_goal[3])
         if row % SLOW == 0:
             state = columns["supervisor.state"][row]
-            yield us, BOARD, mavlink.heartbeat(state == State.FLYING, state)
+            yield us, BOARD, services.heartbeat(state == State.FLYING, state)
             if "battery.voltage" in columns and isfinite(voltage := columns["battery.voltage"][row]):
                 yield us, BOARD, mavlink.battery(round(1000 * voltage))
         if row % ROWS == 0:

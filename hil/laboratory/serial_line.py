@@ -35,7 +35,7 @@ def serial_channel(uart: VirtualSerial, firmware: BoardFirmware, link: MavlinkLi
     assert board is not None
 
     def counts() -> tuple[int, ...]:
-        at_station = link.statistics if link else None
+        at_station = link.counters if link else None
         return (
             up.deliveries, down.deliveries, up.latency_sum_us, down.latency_sum_us,
             up.busy_us, down.busy_us, up.sent_bytes, down.sent_bytes, up.overrun_bytes,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import from_euler_zyx
-from firmware_py.wire import mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.telemetry import BLOCKS
 from ground_station.config import StationConfig
 from ground_station.controls import REPEAT_US, Action, Request
@@ -251,10 +251,10 @@ def test_texts_and_refusals_are_collected():
 def test_a_text_in_pieces_is_one_line_unless_its_beginning_was_lost():
     bench = LinkWithCodec()
     line = "0123456789" * 11
-    first, second, last = mavlink.status_text(6, line, 9)
+    first, second, last = services.status_text(6, line, 9)
     bench.hear(0, first, second)
     assert list(bench.link.texts) == []
-    bench.hear(10, last, *mavlink.status_text(6, "short"))
+    bench.hear(10, last, *services.status_text(6, "short"))
     assert list(bench.link.texts) == [f"board: {line}", "board: short"]
 
 
@@ -285,9 +285,9 @@ def test_the_round_trip_is_that_of_the_own_request_only():
     ((_, request),) = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)
     assert (request.tc1, request.ts1) == (0, 1_000_000_000)
     bench.hear(1_001_000, dialect.MAVLink_timesync_message(5, 999_000_000))
-    assert bench.link.statistics.round_trip_us is None
+    assert bench.link.round_trip_us is None
     bench.hear(1_004_200, dialect.MAVLink_timesync_message(5, request.ts1))
-    assert bench.link.statistics.round_trip_us == 4200
+    assert bench.link.round_trip_us == 4200
 
 
 def test_the_latency_is_half_of_the_round_trip_and_assumed_before():
@@ -340,7 +340,7 @@ def test_lost_and_broken_frames_are_counted():
         frames.append(heartbeat().pack(bench.codec))
     broken = frames[5][:-1] + bytes((frames[5][-1] ^ 1,))
     bench.link.receive(0, b"".join((*frames[:2], *frames[4:5], broken, *frames[6:])))
-    statistics = bench.link.statistics
+    statistics = bench.link.counters
     assert (statistics.frames, statistics.lost, statistics.bad) == (7, 3, 1)
 
 
@@ -351,7 +351,7 @@ def test_with_a_key_everything_is_signed_and_nothing_unsigned_is_believed():
     assert bench.of(POSE)[0][1].get_signed()  # pymavlink has checked it
     assert stranger.link.receive(0, heartbeat().pack(stranger.codec)) == []
     assert bench.link.receive(0, heartbeat().pack(stranger.codec)) == []
-    assert (bench.link.board, bench.link.statistics.bad) == (None, 1)
+    assert (bench.link.board, bench.link.counters.bad) == (None, 1)
     bench.hear(0, heartbeat())
     assert bench.link.board == 1
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.firmware import Firmware
 from firmware_py.wire import telemetry
 from firmware_py.wire.mavlink import POSES
+from firmware_py.wire.mavlink_layouts import NUMBERS
 from firmware_py.wire.supervisor import Cause, State
 from hil.config import load_config
 from hil.devices.board import VirtualBoard
@@ -189,7 +190,7 @@ def test_a_pose_from_the_future_is_as_old_as_the_clocks_are_known_and_one_of_hal
     client.clock_ahead_us = 0
     client.send("heartbeat", 6, 8, 0, 0, 4, 3)
     client.run(2_000_000)
-    service: Any = client.stack._handlers[POSES[0]].__self__  # type: ignore[attr-defined]
+    service: Any = client.stack._handlers[NUMBERS[POSES[0]]].__self__  # type: ignore[attr-defined]
 
     def age_of(lag_us: int) -> int | None:
         client.pose(t_us=client.now_us - lag_us)
@@ -942,7 +943,7 @@ def test_a_message_that_fits_no_frame_is_dropped_and_the_next_one_sent(client: M
         client.stack.reply(dialect.MAVLink_heartbeat_message(999, 0, 0, 0, 0, 3))  # a byte of 999
         client.stack.reply(dialect.MAVLink_ping_message(1, 77, 255, 190))
 
-    client.stack.handle(dialect.MAVLINK_MSG_ID_PING, answer)
+    client.stack.handle("PING", answer)
     client.send("ping", 1, 76, 0, 0)
     client.run(client.now_us + 3000)
     assert client.stack.dropped == dropped + 1

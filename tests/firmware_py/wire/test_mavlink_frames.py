@@ -11,7 +11,9 @@ import pymavlink.dialects.v20.common as dialect
 import pytest
 
 from firmware_py.wire import WireError, mavlink
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import HALF_FRAME_US, FrameReceiver, FrameSender, Signing
+from firmware_py.wire.mavlink_layouts import NUMBERS
 
 KEY = sha256(b"floaty").digest()
 STAMP = 370_000_000_000_00  # 10 us since 2015: 2026
@@ -73,9 +75,9 @@ def conversation(rng: np.random.Generator, count: int) -> list[Any]:
     """Messages of a flight: poses mostly."""
     others = (
         lambda: mavlink.target(int(rng.integers(1 << 31)), tuple(rng.normal(size=3)), rng.normal()),
-        mavlink.station_heartbeat,
-        lambda: mavlink.timesync(0, int(rng.integers(1 << 62))),
-        lambda: mavlink.parameter("EXT_X_P", rng.normal(), int(rng.integers(60)), 60),
+        services.station_heartbeat,
+        lambda: services.timesync(0, int(rng.integers(1 << 62))),
+        lambda: services.parameter("EXT_X_P", rng.normal(), int(rng.integers(60)), 60),
     )
     return [
         others[i // 4 % 4]()
@@ -151,7 +153,7 @@ def test_a_payload_of_zeros_keeps_its_first_byte() -> None:
 def test_version_1_is_read() -> None:
     frames = [
         message.pack(peer(), force_mavlink1=True)
-        for message in (mavlink.station_heartbeat(), mavlink.timesync(1, 2))
+        for message in (services.station_heartbeat(), services.timesync(1, 2))
     ]
     assert feed_all(FrameReceiver(), b"".join(frames), 7) == frames
 
@@ -162,7 +164,7 @@ def test_a_field_that_does_not_fit_is_refused_and_takes_no_sequence_number() -> 
         sender.encode(0, dialect.MAVLink_param_value_message(b"X", 1e300, 9, 1, 0))
     with pytest.raises(WireError, match="12345678"):
         sender.encode(0, dialect.MAVLink_message(12345678, "NONE"))
-    assert sender.encode(0, mavlink.timesync(0, 1)) == golden(peer(), [mavlink.timesync(0, 1)])[0]
+    assert sender.encode(0, services.timesync(0, 1)) == golden(peer(), [services.timesync(0, 1)])[0]
 
 
 # Damage
@@ -232,8 +234,8 @@ def test_bit_errors_of_1e_4_cost_only_the_frames_they_hit() -> None:
 
 def test_half_a_frame_is_given_up_after_silence_and_not_before() -> None:
     receiver = FrameReceiver()
-    half = b"\xfd\xff" + golden(peer(), [mavlink.timesync(0, 1)])[0][2:10]  # promises 255 bytes
-    frame = golden(peer(), [mavlink.station_heartbeat()])[0]
+    half = b"\xfd\xff" + golden(peer(), [services.timesync(0, 1)])[0][2:10]  # promises 255 bytes
+    frame = golden(peer(), [services.station_heartbeat()])[0]
     assert receiver.feed(1000, half + frame) == []
     assert receiver.feed(1000 + HALF_FRAME_US, b"") == []
     assert received(receiver.feed(1001 + HALF_FRAME_US, b"")) == [frame]
@@ -241,7 +243,7 @@ def test_half_a_frame_is_given_up_after_silence_and_not_before() -> None:
 
 def test_the_rest_of_a_frame_is_taken_even_after_silence() -> None:
     receiver = FrameReceiver()
-    frame = golden(peer(), [mavlink.station_heartbeat()])[0]
+    frame = golden(peer(), [services.station_heartbeat()])[0]
     receiver.feed(0, frame[:12])
     assert received(receiver.feed(10 * HALF_FRAME_US, frame[12:])) == [frame]
 
@@ -256,7 +258,7 @@ def signed_receiver() -> FrameReceiver:
 def test_pymavlink_accepts_our_signature() -> None:
     theirs = peer(KEY)
     theirs.signing.allow_unsigned_callback = None
-    frame = FrameSender(7, 9, Signing(KEY, start=STAMP)).encode(0, mavlink.timesync(0, 5))
+    frame = FrameSender(7, 9, Signing(KEY, start=STAMP)).encode(0, services.timesync(0, 5))
     assert theirs.decode(bytearray(frame)).ts1 == 5
     assert theirs.signing.goodsig_count == 1
 
@@ -265,7 +267,7 @@ def test_with_a_key_nothing_unsigned_is_accepted() -> None:
     receiver = signed_receiver()
     messages = conversation(np.random.default_rng(8), 20)
     assert feed_all(receiver, b"".join(golden(peer(), messages)), 30) == []
-    assert feed_all(receiver, mavlink.timesync(0, 1).pack(peer(), force_mavlink1=True), 30) == []
+    assert feed_all(receiver, services.timesync(0, 1).pack(peer(), force_mavlink1=True), 30) == []
     assert (receiver.counters.unsigned, receiver.counters.frames) == (21, 0)
 
 
@@ -291,12 +293,12 @@ def test_replayed_frames_are_refused() -> None:
 
 def test_a_forged_time_stamp_changes_nothing() -> None:
     receiver = signed_receiver()
-    first, true = golden(peer(KEY), [mavlink.timesync(0, 1), mavlink.timesync(0, 2)])
+    first, true = golden(peer(KEY), [services.timesync(0, 1), services.timesync(0, 2)])
     receiver.feed(0, first)
     forged = bytearray(first)
     forged[-12:-6] = b"\xff" * 6
     assert receiver.feed(0, bytes(forged)) == []
-    other = bytearray(golden(peer(KEY, system=8), [mavlink.timesync(0, 1)])[0])
+    other = bytearray(golden(peer(KEY, system=8), [services.timesync(0, 1)])[0])
     other[-12:-6] = b"\xff" * 6
     assert receiver.feed(0, bytes(other)) == []
     assert received(receiver.feed(0, true)) == [true]
@@ -308,7 +310,7 @@ def test_a_new_stream_may_be_a_minute_behind(behind: int, count: int) -> None:
     receiver = signed_receiver()
     codec = peer(KEY)
     codec.signing.timestamp = STAMP + 500_000 - behind
-    frame = golden(codec, [mavlink.timesync(0, 1)])[0]
+    frame = golden(codec, [services.timesync(0, 1)])[0]
     assert len(receiver.feed(5_000_000, frame)) == count
     assert receiver.counters.replayed == 1 - count
 
@@ -318,9 +320,9 @@ def test_a_board_without_a_calendar_learns_the_time_from_a_genuine_frame() -> No
     receiver, sender = FrameReceiver(signing), FrameSender(1, 1, signing)
     theirs = peer(KEY)
     with pytest.raises(dialect.MAVError, match="signature"):
-        theirs.decode(bytearray(sender.encode(0, mavlink.timesync(0, 1))))
-    receiver.feed(0, golden(peer(KEY), [mavlink.timesync(0, 1)])[0])
-    assert theirs.decode(bytearray(sender.encode(0, mavlink.timesync(0, 2)))).ts1 == 2
+        theirs.decode(bytearray(sender.encode(0, services.timesync(0, 1))))
+    receiver.feed(0, golden(peer(KEY), [services.timesync(0, 1)])[0])
+    assert theirs.decode(bytearray(sender.encode(0, services.timesync(0, 2)))).ts1 == 2
 
 
 def test_a_cut_signature_costs_only_its_frame() -> None:
@@ -344,7 +346,7 @@ def count(order: Iterable[int]) -> tuple[int, int, int]:
     receiver, codec = FrameReceiver(), peer()
     for number in order:
         codec.seq = number % 256
-        receiver.feed(0, mavlink.timesync(0, 1).pack(codec))
+        receiver.feed(0, services.timesync(0, 1).pack(codec))
     return receiver.counters.frames, receiver.counters.lost, receiver.counters.late
 
 
@@ -372,7 +374,7 @@ def test_senders_are_counted_apart() -> None:
     codecs[1].seq = 77
     for _ in range(300):
         for codec in codecs:
-            receiver.feed(0, golden(codec, [mavlink.timesync(0, 1)])[0])
+            receiver.feed(0, golden(codec, [services.timesync(0, 1)])[0])
     assert (receiver.counters.frames, receiver.counters.lost, receiver.counters.late) == (600, 0, 0)
 
 
@@ -384,7 +386,7 @@ def test_unknown_messages_are_counted_and_not_lost() -> None:
             frame = stranger._pack(codec, 99, np.random.default_rng(i).bytes(40))
             codec.seq += 1
         else:
-            frame = golden(codec, [mavlink.timesync(0, 1)])[0]
+            frame = golden(codec, [services.timesync(0, 1)])[0]
         receiver.feed(0, frame)
     assert (receiver.counters.frames, receiver.counters.unknown, receiver.counters.lost) == (40, 10, 0)
 
@@ -428,15 +430,15 @@ def test_fuzzed_frames_never_raise_and_the_next_good_frame_is_received() -> None
     numbers = [number for number, _ in DIALECT]
     readers = {
         **dict.fromkeys(mavlink.POSES, mavlink.read_pose),
-        **dict.fromkeys(mavlink.MISSION_MESSAGES, mavlink.refused_mission),
-        mavlink.MSG_MISSION_REQUEST_LIST: mavlink.no_mission,
-        mavlink.MSG_LOG_REQUEST_DATA: mavlink.no_log_data,
-        mavlink.MSG_SET_POSITION_TARGET_LOCAL_NED: mavlink.read_target,
-        mavlink.MSG_DEBUG_FLOAT_ARRAY: mavlink.read_flight_array,
-        mavlink.MSG_PING: mavlink.ping_answer,
-        mavlink.MSG_FILE_TRANSFER_PROTOCOL: mavlink.ftp_nak,
+        **dict.fromkeys(mavlink.MISSION_MESSAGES, services.refused_mission),
+        "MISSION_REQUEST_LIST": services.no_mission,
+        "LOG_REQUEST_DATA": services.no_log_data,
+        "SET_POSITION_TARGET_LOCAL_NED": mavlink.read_target,
+        "DEBUG_FLOAT_ARRAY": mavlink.read_flight_array,
+        "PING": services.ping_answer,
+        "FILE_TRANSFER_PROTOCOL": services.ftp_nak,
     }
-    read = list(readers)
+    read = [NUMBERS[name] for name in readers]
     receivers = (FrameReceiver(), signed_receiver())
     sender, read_well = FrameSender(1, 1), 0
     done = 0
@@ -454,7 +456,7 @@ def test_fuzzed_frames_never_raise_and_the_next_good_frame_is_received() -> None
         for receiver in receivers:
             for message in receiver.feed(done, stream):
                 try:
-                    reader = readers.get(message.get_msgId())
+                    reader = readers.get(message.get_type())
                     if reader is not None:
                         answer = reader(message)
                         read_well += 1
@@ -463,8 +465,8 @@ def test_fuzzed_frames_never_raise_and_the_next_good_frame_is_received() -> None
                 except WireError:
                     pass
     assert read_well > done / 50
-    last = golden(peer(KEY), [mavlink.timesync(0, 1)])[0]
-    last_for_signed = FrameSender(7, 9, Signing(KEY, start=2 * STAMP)).encode(0, mavlink.timesync(0, 1))
+    last = golden(peer(KEY), [services.timesync(0, 1)])[0]
+    last_for_signed = FrameSender(7, 9, Signing(KEY, start=2 * STAMP)).encode(0, services.timesync(0, 1))
     for receiver, frame in zip(receivers, (last, last_for_signed), strict=True):
         messages = receiver.feed(done, frame) + receiver.feed(done + HALF_FRAME_US + 1, b"")
         assert frame in received(messages)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from firmware_py.wire import WireError, mavlink, telemetry
+from firmware_py.wire import mavlink_services as services
 from firmware_py.wire.mavlink_frames import FrameSender
 from firmware_py.wire.mavlink_numbers import Mode
 from firmware_py.wire.supervisor import State
@@ -45,7 +46,7 @@ def near(expected: Any) -> Any:
 
 def test_pose_is_the_standards_and_comes_back() -> None:
     message = over_the_wire(mavlink.pose(1_234_567, V, Q_WB))
-    assert message.get_msgId() == mavlink.MSG_ATT_POS_MOCAP
+    assert message.get_type() == "ATT_POS_MOCAP"
     assert message.time_usec == 1_234_567
     assert vector(message, "x y z") == near(D @ V)
     assert message.q == near(R_NED_FRD.as_quat(scalar_first=True))
@@ -226,13 +227,13 @@ def test_a_masked_part_may_hold_anything() -> None:
 
 
 def test_command_pads_its_parameters() -> None:
-    message = over_the_wire(mavlink.command(3, 4, 511, 30, 20_000))
+    message = over_the_wire(services.command(3, 4, 511, 30, 20_000))
     assert (message.target_system, message.target_component, message.command) == (3, 4, 511)
     assert vector(message, "param1 param2 param3 param4 param5 param6 param7") == [30, 20_000, 0, 0, 0, 0, 0]
 
 
 def test_station_is_a_station() -> None:
-    message = over_the_wire(mavlink.station_heartbeat())
+    message = over_the_wire(services.station_heartbeat())
     assert (message.type, message.autopilot) == (dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID)
     assert not message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED
 
@@ -277,11 +278,11 @@ def test_servo_counts_become_microseconds() -> None:
 )
 def test_heartbeat_tells_state_and_arming(state: int, status: str) -> None:
     for armed in (False, True):
-        message = over_the_wire(mavlink.heartbeat(armed, state))
+        message = over_the_wire(services.heartbeat(armed, state))
         # With INVALID no client takes us for a vehicle.
         assert message.autopilot == dialect.MAV_AUTOPILOT_GENERIC
         assert message.custom_mode == Mode.HOLD
-        assert mavlink.read_heartbeat(message) == state
+        assert services.read_heartbeat(message) == state
         assert message.system_status == getattr(dialect, f"MAV_STATE_{status}")
         assert bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED) == armed
         assert message.base_mode & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -331,29 +332,29 @@ def test_flight_array_carries_the_telemetry_blocks() -> None:
 
 
 def test_texts_are_cut_to_their_fields() -> None:
-    (text,) = mavlink.status_text(4, "ö" + "x" * 49)
+    (text,) = services.status_text(4, "ö" + "x" * 49)
     assert (over_the_wire(text).text, text.id) == ("?" + "x" * 49, 0)
-    assert over_the_wire(mavlink.named_value(1, "abcdefghijklm", 2.5)).name == "abcdefghij"
-    assert over_the_wire(mavlink.parameter("A" * 16, 2.5, 3, 60)).param_id == "A" * 16
+    assert over_the_wire(services.named_value(1, "abcdefghijklm", 2.5)).name == "abcdefghij"
+    assert over_the_wire(services.parameter("A" * 16, 2.5, 3, 60)).param_id == "A" * 16
 
 
 @pytest.mark.parametrize(("size", "pieces"), [(51, [50, 1]), (100, [50, 50, 0]), (101, [50, 50, 1])])
 def test_a_long_text_travels_in_pieces_of_which_the_last_is_shorter(size: int, pieces: list[int]) -> None:
     line = ("0123456789" * 11)[:size]
-    messages = [over_the_wire(message) for message in mavlink.status_text(4, line, 7)]
+    messages = [over_the_wire(message) for message in services.status_text(4, line, 7)]
     assert "".join(message.text for message in messages) == line
     assert [len(message.text) for message in messages] == pieces
     assert [(message.id, message.chunk_seq) for message in messages] == [(7, n) for n in range(len(pieces))]
 
 
 def test_parameters_are_real32() -> None:
-    message = over_the_wire(mavlink.parameter("EXT_X_P", -2.5, 3, 60))
+    message = over_the_wire(services.parameter("EXT_X_P", -2.5, 3, 60))
     assert message.param_type == dialect.MAV_PARAM_TYPE_REAL32
     assert (message.param_value, message.param_index, message.param_count) == (-2.5, 3, 60)
 
 
 def test_version_is_packed_in_bytes() -> None:
-    message = over_the_wire(mavlink.autopilot_version((1, 2, 3), b"abcdefghij", 0x1234))
+    message = over_the_wire(services.autopilot_version((1, 2, 3), b"abcdefghij", 0x1234))
     assert message.flight_sw_version.to_bytes(4, "big")[:3] == bytes((1, 2, 3))
     assert bytes(message.flight_custom_version) == b"abcdefgh"
     assert message.uid == 0x1234
@@ -367,20 +368,20 @@ def test_answers_go_to_who_asked() -> None:
     def from_station(message: Any) -> Any:
         return dialect.MAVLink(None).decode(bytearray(message.pack(station)))
 
-    ping = over_the_wire(mavlink.ping_answer(from_station(dialect.MAVLink_ping_message(123, 45, 0, 0))))
+    ping = over_the_wire(services.ping_answer(from_station(dialect.MAVLink_ping_message(123, 45, 0, 0))))
     assert vector(ping, "time_usec seq target_system target_component") == [123, 45, 255, 230]
     # sequence 0xFFFF, session 7, opcode 4 (open for reading), size, request opcode, burst, padding, offset
     asked = [0xFF, 0xFF, 7, 4, 12, 0, 0, 0, 1, 2, 3, 4, *b"@PARAM/param.pck"]
     asked += [0] * (251 - len(asked))
     nak = over_the_wire(
-        mavlink.ftp_nak(from_station(dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, asked)))
+        services.ftp_nak(from_station(dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, asked)))
     )
     assert (nak.target_system, nak.target_component) == (255, 230)
     assert nak.payload == [0, 0, 7, 129, 1, 4, 0, 0, 1, 2, 3, 4, 6] + [0] * 238
-    ack = over_the_wire(mavlink.command_ack(400, 3, 255, 230))
+    ack = over_the_wire(services.command_ack(400, 3, 255, 230))
     assert vector(ack, "command result target_system target_component") == [400, 3, 255, 230]
-    assert vector(over_the_wire(mavlink.timesync(5, 6)), "tc1 ts1") == [5, 6]
-    assert vector(over_the_wire(mavlink.message_interval(30, -1)), "message_id interval_us") == [30, -1]
+    assert vector(over_the_wire(services.timesync(5, 6)), "tc1 ts1") == [5, 6]
+    assert vector(over_the_wire(services.message_interval(30, -1)), "message_id interval_us") == [30, -1]
 
 
 big = st.integers(-(1 << 70), 1 << 70)
@@ -401,10 +402,10 @@ def test_nothing_that_goes_down_raises(n: int, m: int, a: float, b: float, text:
         mavlink.estimator_status(t, a > b, a, b),
         mavlink.home_position(t, v),
         mavlink.flight_array(t, (a, b) * 14),
-        mavlink.named_value(n, text, a),
-        *mavlink.status_text(6, text),
-        mavlink.parameter(text, a, n, m),
-        mavlink.message_interval(n, m),
+        services.named_value(n, text, a),
+        *services.status_text(6, text),
+        services.parameter(text, a, n, m),
+        services.message_interval(n, m),
     ):
         FrameSender(1, 1).encode(0, message)
 
@@ -416,13 +417,13 @@ def test_parameter_names_are_unique_and_fit() -> None:
     names = list(CrtpClient().toc(PARAM))
     # The stock names behind it are for Crazyflie clients only.
     ours = names[: names.index("activeMarker.back")]
-    names = [mavlink.mavlink_name(name) for name in ours]
+    names = [services.mavlink_name(name) for name in ours]
     assert len(set(names)) == len(ours) > 60
     for name in names:
         assert len(name) <= 16
         assert set(name) <= set("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
-    assert mavlink.mavlink_name("extCtrl.pitch_rate_P") == "EXT_PITCH_RATE_P"
-    assert mavlink.mavlink_name("sound.effect") == "SOUND_EFFECT"
+    assert services.mavlink_name("extCtrl.pitch_rate_P") == "EXT_PITCH_RATE_P"
+    assert services.mavlink_name("sound.effect") == "SOUND_EFFECT"
 
 
 @pytest.mark.parametrize(
@@ -430,14 +431,14 @@ def test_parameter_names_are_unique_and_fit() -> None:
     [
         (mavlink.pose(10**12, V, Q_WB), 48),
         (mavlink.target(10**6, V, 0.5), 65),
-        (mavlink.station_heartbeat(), 21),
+        (services.station_heartbeat(), 21),
         (mavlink.attitude(10**6, *ANGLES, *U), 40),
         (mavlink.attitude_quaternion(10**6, Q_WB, *U), 44),
         (mavlink.local_position(10**6, V, U), 40),
         (mavlink.servo_outputs(10**9, (31_500,) * 4), 24),
-        (mavlink.parameter("ABC", 1.0, 0, 60), 37),
-        (mavlink.command_ack(400, 0, 255, 190), 22),
-        (mavlink.status_text(6, "hello")[0], 18),
+        (services.parameter("ABC", 1.0, 0, 60), 37),
+        (services.command_ack(400, 0, 255, 190), 22),
+        (services.status_text(6, "hello")[0], 18),
     ],
 )
 def test_frame_sizes_are_those_of_the_line_budget(message: Any, size: int) -> None:
