@@ -104,7 +104,7 @@ def commands_named(text: str) -> list[str]:
 def test_every_command_that_a_source_names_exists_with_its_options_and_values() -> None:
     sources = [path for path in tracked() if path.suffix != ".md" and path != Path(__file__)]
     named = {command for path in sources for command in commands_named(path.read_text(encoding="utf-8"))}
-    assert {"floaty board doctor", "floaty deploy flash"} <= named
+    assert {"floaty board doctor", "floaty deploy check"} <= named
     assert [wrong for command in sorted(named) if (wrong := parse(command))] == []
 
 

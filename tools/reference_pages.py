@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -21,7 +21,7 @@ sys.path.insert(
 
 from firmware_py.firmware import Firmware
 from firmware_py.table import OF_PROFILE
-from hil.commands.app import app
+from hil.commands import app
 from hil.config import LabConfig, load_config
 from hil.devices.board import VirtualBoard
 from hil.laboratory.fault_kinds import KINDS
@@ -76,7 +76,7 @@ SECTIONS = {
 def pages() -> dict[str, str]:
     """Return the text of each page by its place in the documentation."""
     return {
-        **split(COMMANDS, list(app.commands), command_line),
+        **split(COMMANDS, list(app.COMMANDS), command_line),
         **split(SECTIONS, list(LabConfig.model_fields), profile_keys),
         **board_variables(),
         "reference/log.md": log_columns(),
@@ -104,9 +104,9 @@ def split(
 
 def command_line(name: str) -> str:
     """Return the block that shows a command, which mkdocs-click finds by its module."""
-    function: Any = app.commands[name].callback
+    file, function = app.COMMANDS[name].split(".")
     return (
-        f"::: mkdocs-click\n    :module: {function.__module__}\n    :command: {function.__name__}\n"
+        f"::: mkdocs-click\n    :module: hil.commands.{file}\n    :command: {function}\n"
         f"    :prog_name: floaty {name}\n    :depth: 1\n    :style: plain\n    :list_subcommands: true\n"
     )
 

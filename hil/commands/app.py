@@ -6,26 +6,54 @@ Bad input ends in one line on standard error and exit code 2; a failed limit in 
 import atexit
 import gc
 import sys
+from importlib import import_module
 
 import click
 
 from firmware_py.fast import STALE
-from hil.commands.campaign import campaign
-from hil.commands.compare import compare
-from hil.commands.deploy import board, deploy
-from hil.commands.design import design
-from hil.commands.fly import fly
-from hil.commands.identify import identify, tune
-from hil.commands.listing import list_experiments, runs
-from hil.commands.new import new
 from hil.commands.options import INTERRUPTED
-from hil.commands.paper import drag_model, paper, study
-from hil.commands.param import param
-from hil.commands.pictures import export, report, view
-from hil.commands.serve import serve
-from hil.commands.station import station
 from hil.errors import LabError
 from hil.installation import describe
+
+# The file of this room and the function for each command, in the order of the help.
+COMMANDS = {
+    "fly": "fly.fly",
+    "new": "new.new",
+    "list": "listing.list_experiments",
+    "runs": "listing.runs",
+    "view": "pictures.view",
+    "report": "pictures.report",
+    "export": "pictures.export",
+    "serve": "serve.serve",
+    "station": "station.station",
+    "param": "param.param",
+    "compare": "compare.compare",
+    "paper": "paper.paper",
+    "study": "paper.study",
+    "identify": "identify.identify",
+    "tune": "identify.tune",
+    "drag-model": "paper.drag_model",
+    "design": "design.design",
+    "campaign": "campaign.campaign",
+    "deploy": "deploy.deploy",
+    "board": "deploy.board",
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports the file of a command when the command is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names in the order of the help."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return a command; None for an unknown name."""
+        if cmd_name not in COMMANDS:
+            return None
+        file, function = COMMANDS[cmd_name].split(".")
+        command: click.Command = getattr(import_module(f"hil.commands.{file}"), function)
+        return command
 
 
 def _print_version(context: click.Context, option: click.Parameter, wanted: bool) -> None:
@@ -34,7 +62,7 @@ def _print_version(context: click.Context, option: click.Parameter, wanted: bool
         context.exit()
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
     "--version",
     is_flag=True,
@@ -45,14 +73,6 @@ def _print_version(context: click.Context, option: click.Parameter, wanted: bool
 )
 def app() -> None:
     """Floaty virtual laboratory: firmware, ground station and wind tunnel, joined by real bytes."""
-
-
-for command in (
-    fly, new, list_experiments, runs, view, report, export, serve, station, param, compare, paper, study, identify, tune,
-    drag_model, design,
-    campaign, deploy, board,
-):  # fmt: skip
-    app.add_command(command)
 
 
 def main() -> None:

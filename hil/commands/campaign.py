@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.progress import MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from hil.commands.options import INTERRUPTED, announce_compilation, console, notices
+from hil.commands.options import INTERRUPTED, announce_compilation, console, notices, progress_bar
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
     from hil.campaigns.config import Spec
     from hil.campaigns.flying import Campaign, CampaignRow
     from hil.campaigns.run import Standing
@@ -159,13 +158,8 @@ def _stops_noted(stops: list[int]) -> Iterator[None]:
 
 @contextmanager
 def _progress() -> Iterator[Callable[[Standing], None]]:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+    columns = (MofNCompleteColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn())
+    with progress_bar(*columns) as progress:
         bar = progress.add_task("flying", rate="")
         yield partial(_show, progress, bar)
 

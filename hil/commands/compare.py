@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.table import Table
 
 from hil.commands.options import console, wide_console
 
@@ -51,7 +52,6 @@ def compare(first: Path, second: Path, out: Path | None) -> int:
 
 
 def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> None:
-    from rich.table import Table
 
     table = Table(title=f"{first} | {second}")
     table.add_column("metric")
@@ -88,8 +88,6 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
 
 def _print_seeds(first: Path, second: Path, seeds: list["Seed"]) -> int:
     """Print a row per seed; returns the exit code."""
-    from rich.table import Table
-
     table = Table(title=f"{first} | {second}")
     for heading in (
         "seed",

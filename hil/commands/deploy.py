@@ -13,8 +13,20 @@ from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
+from rich.progress import TimeRemainingColumn
 
-from hil.commands.options import INTERRUPTED, announce_compilation, notices, profile_option, say, set_option
+from firmware_py.export.errors import ExportError
+from firmware_py.export.usage import CLOCK_MHZ
+from firmware_py.extras import install_command
+from ground_station.errors import LinkError
+from hil.commands.options import (
+    INTERRUPTED,
+    announce_compilation,
+    profile_option,
+    progress_bar,
+    say,
+    set_option,
+)
 from hil.errors import LabError
 
 if TYPE_CHECKING:
@@ -114,7 +126,6 @@ def check(
 
 def _check_around(elf: Path, profile: str, overrides: tuple[str, ...]) -> bool:
     """Check what is around the core in an image; print what is found, and what stays unproven."""
-    from rich.progress import BarColumn, Progress, TextColumn
 
     from hil.deploy.image_check import UNPROVEN, check_image, check_memory, has_app
 
@@ -124,8 +135,7 @@ def _check_around(elf: Path, profile: str, overrides: tuple[str, ...]) -> bool:
     if not app:
         console.print(f"unproven: everything but the core: {elf} has no exported app", soft_wrap=True)
         return True
-    columns = (TextColumn("{task.description}"), BarColumn())
-    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+    with progress_bar() as progress:
         bar = progress.add_task("", total=None)
 
         def show(what: str, done: int, total: int) -> None:
@@ -147,10 +157,7 @@ def say_finding(finding: Finding) -> None:
 @contextmanager
 def _progress(name: str) -> Iterator[Callable[[int, Flight], None]]:
     """Show the progress of a flight."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+    with progress_bar(TimeRemainingColumn()) as progress:
         bar = progress.add_task(name, total=None)
         yield lambda now_us, flight: progress.update(bar, completed=now_us, total=flight.end_us)
 
@@ -178,7 +185,6 @@ def _print_sum(checked: list[Checked]) -> None:
 
 
 def _print_machine_code(code: MachineCode) -> None:
-    from firmware_py.export.usage import CLOCK_MHZ
 
     ticks = code.ticks
     flash = "" if code.flash_bytes is None else f"flash {code.flash_bytes} B, "
@@ -224,7 +230,6 @@ def _read(source: Path) -> str:
 def export(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
     """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the folder DIR."""
     from firmware_py.export.crazyflie import write_app
-    from firmware_py.export.errors import ExportError
     from hil.config import load_config
 
     config = load_config(profile, overrides)
@@ -241,22 +246,16 @@ def export(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
 @click.option("--uri", required=True, metavar="radio://…", help="The board, as in `floaty station`.")
 def flash(image: Path, uri: str) -> None:
     """Flash IMAGE, the .bin of a Crazyflie build, over the radio, read it back and start it."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
     try:
         from ground_station.flashing import flash as flash_board
     except ImportError as error:
-        from firmware_py.extras import install_command
-
         raise LabError(f"deploy flash: {error}: {install_command('radio')}") from None
-    from ground_station.errors import LinkError
 
     try:
         content = image.read_bytes()
     except OSError as error:
         raise LabError(f"{image}: {error.strerror or error}") from None
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+    with progress_bar(TimeRemainingColumn()) as progress:
         bar = progress.add_task("", total=None)
 
         def show(what: str, done: int, size: int) -> None:
@@ -283,7 +282,6 @@ def doctor(link: str, profile: str, overrides: tuple[str, ...]) -> int:
 
     The board must not fly, and nothing moves. Exit code 0: all is well; 1: something is not; 2: no board answers.
     """
-    from ground_station.errors import LinkError
     from hil.config import load_config
     from hil.deploy.doctor import examine
     from hil.devices.real_core import open_real_core

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.table import Table
 
 from hil.commands.options import (
     announce_compilation,
@@ -197,8 +198,6 @@ def folder_for(out: Path) -> Path:
 
 def show(found: "Analysis") -> None:
     """Print the tables."""
-    from rich.table import Table
-
     for name, value in found.robot:
         console.print(f"{name:38} {value}", soft_wrap=True)
     table = Table("input", "alone, inside the flaps' range", "linear, in both directions about the hover")
@@ -211,8 +210,6 @@ def show(found: "Analysis") -> None:
 
 def show_claims(found: "Analysis") -> None:
     """Print the paper's claims."""
-    from rich.table import Table
-
     table = Table("claim", "paper", "computed", "", title="the paper's design")
     for claim in found.claims:
         colour = "green" if claim.verdict == "agrees" else "red"

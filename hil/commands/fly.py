@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.progress import TextColumn, TimeRemainingColumn
 
+from hil.clock import FreeRunning, Paced
 from hil.commands.options import (
     INTERRUPTED,
     announce_compilation,
@@ -19,6 +21,7 @@ from hil.commands.options import (
     open_debugger,
     open_live,
     profile_option,
+    progress_bar,
     seed_option,
     set_option,
     view_option,
@@ -144,9 +147,7 @@ def _fly_one(
     gdb: int | None,
 ) -> int:
     """Fly one seed with all its pictures; returns the exit code."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from hil.clock import FreeRunning, Paced
     from hil.laboratory.run import fly, lockstep
     from hil.servers.in_the_loop import in_the_loop
     from hil.servers.linked import linked_flight
@@ -154,13 +155,7 @@ def _fly_one(
     view = open_live(target)
     debugger = open_debugger(gdb, request.elf or Path(request.board))
     clock = Paced() if realtime else FreeRunning()
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[now]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=notices, transient=True, disable=not notices.is_terminal) as progress:
+    with progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
 
         def show(now_us: int, flight: Flight) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.table import Table
 
 from hil.commands.options import (
     announce_compilation,
@@ -73,7 +74,6 @@ def identify(
 
 
 def _print_constants(found: "Identification") -> None:
-    from rich.table import Table
 
     from hil.identify.identify import interval_text
 
@@ -162,7 +162,6 @@ def tune(
 
 def _print_round(one: "Round") -> None:
     """Print a round: gains, margins, predicted and flown motion."""
-    from rich.table import Table
 
     from hil.studies.tuning import rms
 

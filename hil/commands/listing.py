@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.markup import escape
+from rich.table import Table
 
 from hil.commands.options import console, wide_console
 from hil.errors import LabError
@@ -59,7 +61,6 @@ def list_experiments(file: Path | None, faults: bool) -> None:
 
 
 def _list_faults() -> None:
-    from rich.table import Table
 
     from hil.laboratory.fault_kinds import KINDS
 
@@ -80,8 +81,6 @@ def _list_faults() -> None:
 @click.argument("folder", default="runs", type=click.Path(path_type=Path))
 def runs(folder: Path) -> None:
     """List the run folders below FOLDER [runs], the latest last: date, request, verdict and hash."""
-    from rich.markup import escape
-    from rich.table import Table
 
     from hil.laboratory.recorder import EVENTS
     from hil.laboratory.result import RESULT, read_result

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 
 from hil.errors import LabError
 
@@ -93,6 +94,12 @@ def say(text: str) -> None:
     """Print a line and flush it, because a program may read it."""
     print(text)
     sys.stdout.flush()
+
+
+def progress_bar(*columns: ProgressColumn) -> Progress:
+    """Return a progress bar on standard error with further columns, invisible where that is not a terminal."""
+    shown = (TextColumn("{task.description}"), BarColumn(), *columns)
+    return Progress(*shown, console=notices, transient=True, disable=not notices.is_terminal)
 
 
 def stop_signals() -> list[int]:

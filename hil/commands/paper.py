@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.progress import track
+from rich.table import Table
 
 from hil.commands.design import show_claims
 from hil.commands.options import (
@@ -111,7 +113,6 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
 
 
 def _print_rows(flown: "Paper") -> None:
-    from rich.table import Table
 
     from hil.studies.catalogue import PROFILES
     from hil.studies.paper import Spread
@@ -139,7 +140,6 @@ def _print_rows(flown: "Paper") -> None:
 
 
 def _print_constants(constants: "Sequence[PaperConstant]") -> None:
-    from rich.table import Table
 
     from hil.studies.paper_identification import COLUMNS, WHY
 
@@ -178,7 +178,6 @@ def _print_studies(flown: "Paper") -> None:
 )
 def drag_model(seed: int, profile: str, overrides: tuple[str, ...], out: Path) -> None:
     """Measure forces and torques on the mounted robot over flap angles, against the paper's simplified model."""
-    from rich.progress import track
 
     from hil.config import load_config
     from hil.studies import drag_model, drag_model_report

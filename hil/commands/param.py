@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import click
 
+from ground_station.controls import Action, Request, Settings
+from ground_station.errors import LinkError
+from ground_station.links.schemes import find_link
 from hil.commands.options import profile_option, say, set_option
+from hil.commands.station import settings_of, why
 from hil.errors import LabError
-
-if TYPE_CHECKING:
-    from ground_station.controls import Request, Settings
 
 link_option = click.option(
     "--link", "uri", required=True, metavar="URI",
@@ -30,8 +29,6 @@ def param() -> None:
 @set_option
 def list_all(group: str, uri: str, profile: str, overrides: tuple[str, ...]) -> None:
     """Show all parameters, or those whose names begin with GROUP."""
-    from ground_station.controls import Action, Request
-
     (values,) = _ask(uri, profile, overrides, [Request(Action.LIST, group)])
     chosen = [(name, value) for name, value in values if name.lower().startswith(group.lower())]
     if not chosen:
@@ -48,7 +45,6 @@ def list_all(group: str, uri: str, profile: str, overrides: tuple[str, ...]) -> 
 def get(names: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ...]) -> None:
     """Show the values of parameters."""
     from firmware_py.table import on_board
-    from ground_station.controls import Action, Request
 
     requests = [Request(Action.READ, on_board(name)[0]) for name in names]
     for typed, ((_, value),) in zip(names, _ask(uri, profile, overrides, requests), strict=True):
@@ -63,7 +59,6 @@ def get(names: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ..
 def set_values(settings: tuple[str, ...], uri: str, profile: str, overrides: tuple[str, ...]) -> None:
     """Change parameters, until the board's next boot; `floaty param save` keeps them."""
     from firmware_py.table import on_board
-    from ground_station.controls import Action, Request
 
     wanted = [_setting(text) for text in settings]
     requests = [Request(Action.WRITE, on_board(name)[0], on_board(name)[1] * value) for name, value in wanted]
@@ -77,8 +72,6 @@ def set_values(settings: tuple[str, ...], uri: str, profile: str, overrides: tup
 @set_option
 def save(uri: str, profile: str, overrides: tuple[str, ...]) -> None:
     """Keep the parameters for the board's next boot."""
-    from ground_station.controls import Action, Request
-
     _ask(uri, profile, overrides, [Request(Action.SAVE)])
     say("saved")
 
@@ -95,10 +88,7 @@ def _setting(text: str) -> tuple[str, float]:
 
 def _ask(uri: str, profile: str, overrides: tuple[str, ...], requests: list[Request]) -> list[Settings]:
     """Send requests over a link; return the values of each answer. Raises `LabError` for the first one refused."""
-    from ground_station.errors import LinkError
-    from ground_station.links.schemes import find_link
     from ground_station.program import ask
-    from hil.commands.station import settings_of, why
     from hil.config import load_config
 
     settings = settings_of(load_config(profile, overrides))

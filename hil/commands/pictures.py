@@ -6,6 +6,7 @@ import click
 
 from hil.commands.options import console, run_folder, say
 from hil.errors import LabError
+from hil.live.window import show
 
 
 @click.command()
@@ -17,7 +18,6 @@ from hil.errors import LabError
 def view(run: Path, at_s: float | None, web: bool) -> None:
     """Open RUN, a run folder, in the rerun viewer."""
     from hil.live.recording import browse, show_at
-    from hil.live.window import show
     from hil.pictures.viewer.recording import recording_of
 
     if web:

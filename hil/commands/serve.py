@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,8 +27,6 @@ from hil.commands.options import (
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from hil.servers.motive import Streaming, Up
     from hil.servers.serial_server import Address
     from hil.servers.server import Ends

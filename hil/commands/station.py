@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from firmware_py.extras import install_command
+from ground_station.controls import ControlsError
+from ground_station.errors import LinkError, MocapError
+from ground_station.links.schemes import LinkSettings
+from ground_station.trajectory import Goal, Trajectory
 from hil.commands.options import (
     INTERRUPTED,
     close_live,
@@ -23,10 +28,7 @@ from hil.commands.tables import print_result
 from hil.errors import LabError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from ground_station.program import GroundSettings
-    from ground_station.trajectory import Goal, Trajectory
     from hil.config import LabConfig
 
 
@@ -92,7 +94,6 @@ def station(
 
     Exit code with --out: as `floaty fly`, by the limits of the trajectory's experiment on what the cameras saw.
     """
-    from ground_station.errors import LinkError, MocapError
     from ground_station.operator import COMMANDS, Operator
     from ground_station.program import Cockpit, Session, fly, run_until
     from ground_station.terminal import Terminal
@@ -165,7 +166,6 @@ def _check_files(
 
 
 def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
-    from ground_station.controls import ControlsError
     from hil.experiments import find_experiment
 
     try:
@@ -176,8 +176,6 @@ def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
 
 def why(error: Exception, uri: str) -> str:
     """Return the line with the reason why the station gave up."""
-    from ground_station.errors import LinkError
-
     if isinstance(error, LinkError):
         return f"--link {error}"
     if isinstance(error, OSError):
@@ -191,7 +189,6 @@ def why(error: Exception, uri: str) -> str:
 
 def settings_of(config: LabConfig) -> GroundSettings:
     """Return the ground station's settings of a profile."""
-    from ground_station.links.schemes import LinkSettings
     from ground_station.program import GroundSettings
 
     corrections_hz = min(config.station.corrections_hz, 1e6 / config.mocap.period_us)

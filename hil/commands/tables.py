@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from rich.table import Table
+
+from ground_station.latency import budget_line
+from hil.clock import process_age_s
 from hil.commands.options import console, wide_console
 
 if TYPE_CHECKING:
@@ -21,8 +25,6 @@ SEED_COLUMNS = (
 
 def print_seeds(rows: list[Result]) -> None:
     """Print one row per seed and the summary."""
-    from rich.table import Table
-
     if not rows:
         return
     table = Table(title=f"{rows[0].experiment}, profile {rows[0].profile}")
@@ -59,10 +61,7 @@ def print_seeds(rows: list[Result]) -> None:
 
 def print_result(result: Result) -> None:
     """Print the verdicts of one flight and the files."""
-    from rich.table import Table
 
-    from ground_station.latency import budget_line
-    from hil.clock import process_age_s
     from hil.laboratory.metrics import METRICS, short_of
 
     table = Table(title=f"{result.title}, profile {result.profile}")

@@ -90,7 +90,7 @@ def parse(command: str) -> str:
     words = [word for word in words if word]
     group: click.Command = app
     while isinstance(group, click.Group) and words and not words[0].startswith("-"):
-        found = group.commands.get(words[0])
+        found = group.get_command(click.Context(group), words[0])
         if found is None:
             if group.invoke_without_command or PLACEHOLDER.fullmatch(words[0]):
                 break

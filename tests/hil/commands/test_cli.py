@@ -186,6 +186,39 @@ def test_a_missing_package_is_one_line_before_anything_is_flown_or_deleted(
     assert Path("runs/hover-1/log.parquet").is_file()
 
 
+HEAVY = {
+    "numpy", "scipy", "pandas", "pyarrow", "numba", "pydantic", "rerun", "matplotlib", "jinja2", "cflib", "pymavlink",
+    "control", "dask", "distributed", "unicorn", "prompt_toolkit",
+}  # fmt: skip
+
+
+def test_no_help_loads_what_is_slow_to_load() -> None:
+    """Of every command and command of a group; each imports only its own file."""
+    code = f"""
+import sys
+import click
+from hil.commands.app import app
+
+def show(command, *names):
+    context = click.Context(command, info_name=names[-1])
+    assert command.get_help(context)
+    for name in command.list_commands(context) if isinstance(command, click.Group) else ():
+        show(command.get_command(context, name), *names, name)
+
+show(app, "floaty")
+print(*sorted({HEAVY!r} & {{*sys.modules}}))
+"""
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert found.stdout.strip() == ""
+
+
+def test_a_command_imports_no_other() -> None:
+    code = "from hil.commands.app import main; import sys; sys.argv = ['floaty', 'new', '-h']; main()"
+    code = f"import atexit, sys; atexit.register(lambda: print('DESIGN', 'hil.commands.design' in sys.modules)); {code}"
+    shown = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert shown.endswith("DESIGN False\n")
+
+
 def test_listing_the_studies_loads_neither_an_extra_nor_what_draws() -> None:
     code = "import hil.studies.catalogue, sys; print(*{'scipy.optimize', 'control', 'matplotlib'} & {*sys.modules})"
     found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
