@@ -68,6 +68,10 @@ def test_hover_over_udp_holds_its_limits(tmp_path: Path) -> None:
     assert [stage["name"] for stage in result["ages"]][-1] == "udp"
 
 
+def address(link: str) -> str:
+    return f"udp://127.0.0.1:{free_port()}" if link == "udp" else link
+
+
 @pytest.mark.parametrize("link", [DONGLE, pytest.param("mavlink:pty", marks=pytest.mark.long)])
 def test_the_goal_moves_when_the_board_flies_and_the_flight_is_judged_by_what_the_station_sent(
     tmp_path: Path, link: str
@@ -83,6 +87,12 @@ def test_the_goal_moves_when_the_board_flies_and_the_flight_is_judged_by_what_th
     assert goal[-1] == pytest.approx(np.radians(110.0))
 
 
+@pytest.mark.parametrize(("name", "link"), [("occlusion", "mavlink:pty"), ("airspeed-9.75", "udp")])
+def test_experiments_hold_their_limits_over_real_links(tmp_path: Path, name: str, link: str) -> None:
+    result = fly(tmp_path / "run", name, "--link", address(link))
+    assert result["passed"], result["verdicts"]
+
+
 @pytest.mark.parametrize(
     ("link", "faults"),
     [
@@ -92,9 +102,10 @@ def test_the_goal_moves_when_the_board_flies_and_the_flight_is_judged_by_what_th
     ],
 )
 def test_faults_of_every_layer_act_on_every_link(tmp_path: Path, link: str, faults: tuple[str, ...]) -> None:
-    link = f"udp://127.0.0.1:{free_port()}" if link == "udp" else link
     arguments = [f"--fault={fault}" for fault in faults]
-    result = fly(tmp_path / "run", "hover", "--seed", "2", "--link", link, "--duration", "6", *arguments)
+    result = fly(
+        tmp_path / "run", "hover", "--seed", "2", "--link", address(link), "--duration", "6", *arguments
+    )
     assert result["outcome"] == "completed"
     texts = [event["text"] for event in load_events(tmp_path / "run")]
     for fault in faults:

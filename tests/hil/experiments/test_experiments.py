@@ -38,10 +38,11 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def flown(
-    folder: Path, name: str, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float | None = None
+    folder: Path, name: str, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float | None = None,
+    link: str = "radio",
 ) -> Result:  # fmt: skip
     prepare(folder)
-    return fly(Request.of(EXPERIMENTS[name], profile, overrides, seed, duration_s), folder)
+    return fly(Request.of(EXPERIMENTS[name], profile, overrides, seed, duration_s, link=link), folder)
 
 
 def is_drawn(shown: Plot | Still) -> bool:
@@ -173,9 +174,10 @@ def test_no_flap_angle_carries_the_plant_at_eight_metres_per_second() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(("link", "seed"), [("radio", 7), ("mavlink", 1)])
 @pytest.mark.parametrize("name", PAPER)
-def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str) -> None:
-    result = flown(tmp_path / "run", name, seed=7)
+def test_the_default_profile_holds_the_limits(tmp_path: Path, name: str, link: str, seed: int) -> None:
+    result = flown(tmp_path / "run", name, seed=seed, link=link)
     assert result.passed, explain(result)
     assert result.verdicts
     assert is_drawn(pictures_of(EXPERIMENTS[name])[0].draw(load_log(result.folder)))
