@@ -6,6 +6,7 @@ cameras are checked and skipped. `hil.servers.motive` writes what is read here. 
 NatNet SDK, PacketClient.
 """
 
+import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -13,16 +14,19 @@ from ground_station.errors import MocapError
 from ground_station.sources.natnet_reader import Quaternion, Reader, Vector, Version
 
 COMMAND_PORT = 1510
-DATA_PORT = 1511
 MULTICAST_GROUP = "239.255.42.99"
 VERSIONS: tuple[Version, ...] = ((3, 0), (3, 1), (4, 0), (4, 1))
 TRACKED = 1  # bit of a body's parameters
 HEADER_SIZE = 4
 END_TAG_SIZE = 4  # zeros behind a frame
 
-_NAME_SIZE = 256  # of the server, padded with zeros
-_BODY_SIZE = 38  # id, position, rotation, error, parameters
-_LABELLED_SIZE = 26  # id, position, size, parameters, residual
+# Layouts, which the virtual Motive shares.
+SERVER_INFO = struct.Struct("<256s4B4BQHB4B")  # name, app, NatNet, clock, data port, multicast, group
+BODY = struct.Struct("<I3f4ffH")  # id, position, rotation x y z w, error, parameters
+LABELLED = struct.Struct("<I3ffHf")  # id, position, size, parameters, residual
+SUFFIX = struct.Struct("<8xd3Q")  # no timecode, timestamp; exposure, arrival and departure
+_HEADER = struct.Struct("<HH")
+_ECHO = struct.Struct("<QQ")
 
 
 class MessageId(IntEnum):
@@ -156,7 +160,7 @@ def decode(data: bytes, version: Version) -> Message:
     if version not in VERSIONS:
         raise MocapError(f"NatNet {version[0]}.{version[1]}: only 3.0, 3.1, 4.0 and 4.1 can be read")
     reader = Reader(data, version)
-    message, size = reader.u16(), reader.u16()
+    message, size = reader.unpack(_HEADER)
     if size != len(data) - HEADER_SIZE:
         raise MocapError(f"NatNet packet of {len(data)} bytes says that it has {size + HEADER_SIZE}")
     if message == MessageId.FRAME:
@@ -166,7 +170,7 @@ def decode(data: bytes, version: Version) -> Message:
     if message == MessageId.MODELDEF:
         return _model_definition(reader)
     if message == MessageId.ECHO_RESPONSE:
-        return Echo(reader.u64(), reader.u64())
+        return Echo(*reader.unpack(_ECHO))
     if message == MessageId.RESPONSE:
         return _response(reader)
     return Other(message)
@@ -179,14 +183,12 @@ def _response(reader: Reader) -> Response:
 
 
 def _server_info(reader: Reader) -> ServerInfo:
-    name = reader.take(_NAME_SIZE).partition(b"\0")[0].decode("utf-8", "replace")
-    a, b, c, d = reader.take(4)
-    e, f, g, h = reader.take(4)
-    clock_hz, port, multicast = reader.u64(), reader.u16(), reader.take(1) != b"\0"
+    raw, a, b, c, d, e, f, g, h, clock_hz, port, multicast, *address = reader.unpack(SERVER_INFO)
+    name = raw.partition(b"\0")[0].decode("utf-8", "replace")
     if clock_hz == 0 or port == 0:
         raise MocapError(f"NatNet server {name!r}: clock {clock_hz} Hz, data port {port}: neither may be 0")
-    group = ".".join(str(part) for part in reader.take(4))
-    return ServerInfo(name, (a, b, c, d), (e, f, g, h), clock_hz, port, multicast, group)
+    group = ".".join(map(str, address))
+    return ServerInfo(name, (a, b, c, d), (e, f, g, h), clock_hz, port, bool(multicast), group)
 
 
 def _frame(reader: Reader) -> Frame:
@@ -195,42 +197,38 @@ def _frame(reader: Reader) -> Frame:
         reader.text()
         reader.take(12 * reader.count(12))
     unlabelled = tuple(reader.vector() for _ in range(reader.section(12)))
-    bodies = tuple(_body(reader) for _ in range(reader.section(_BODY_SIZE)))
+    bodies = tuple(_body(reader) for _ in range(reader.section(BODY.size)))
     for _ in range(reader.section(8)):  # skeletons
         reader.u32()
-        reader.take(_BODY_SIZE * reader.count(_BODY_SIZE))
+        reader.take(BODY.size * reader.count(BODY.size))
     if reader.version >= (4, 1):
         for _ in range(reader.section(12)):  # assets
             reader.u32()
-            reader.take(_BODY_SIZE * reader.count(_BODY_SIZE))
-            reader.take(_LABELLED_SIZE * reader.count(_LABELLED_SIZE))
-    labelled = tuple(_labelled(reader) for _ in range(reader.section(_LABELLED_SIZE)))
+            reader.take(BODY.size * reader.count(BODY.size))
+            reader.take(LABELLED.size * reader.count(LABELLED.size))
+    labelled = tuple(_labelled(reader) for _ in range(reader.section(LABELLED.size)))
     for _ in range(2):  # force plates, devices
         for _ in range(reader.section(8)):
             reader.u32()
             for _ in range(reader.count(4)):  # channels
                 reader.take(4 * reader.count(4))
-    reader.take(8)  # time code
-    timestamp_s = reader.f64()
-    mid_exposure, received, transmitted = reader.u64(), reader.u64(), reader.u64()
+    timestamp_s, exposed, received, sent = reader.unpack(SUFFIX)
     if reader.version >= (4, 0):
         reader.take(8)  # time of a precision time protocol
-    parameters = reader.u16()
+    parameters = int.from_bytes(reader.take(2), "little")
     if reader.left not in (0, END_TAG_SIZE):
         raise MocapError(f"NatNet frame {number}: {reader.left} bytes too many")
-    return Frame(
-        number, bodies, unlabelled, labelled, timestamp_s, mid_exposure, received, transmitted, parameters
-    )
+    return Frame(number, bodies, unlabelled, labelled, timestamp_s, exposed, received, sent, parameters)
 
 
 def _body(reader: Reader) -> BodyPose:
-    return BodyPose(
-        reader.u32(), reader.vector(), reader.quaternion(), reader.f32(), bool(reader.u16() & TRACKED)
-    )
+    number, x, y, z, qx, qy, qz, qw, error, parameters = reader.unpack(BODY)
+    return BodyPose(number, (x, y, z), (qw, qx, qy, qz), error, bool(parameters & TRACKED))
 
 
 def _labelled(reader: Reader) -> LabelledMarker:
-    return LabelledMarker(reader.u32(), reader.vector(), reader.f32(), reader.u16(), reader.f32())
+    number, x, y, z, *rest = reader.unpack(LABELLED)
+    return LabelledMarker(number, (x, y, z), *rest)
 
 
 def _model_definition(reader: Reader) -> ModelDefinition:

@@ -1,6 +1,7 @@
 """The pieces that NatNet packets are made of, every length checked, so that no bytes can do harm."""
 
 import struct
+from typing import Any
 
 from ground_station.errors import MocapError
 
@@ -8,13 +9,8 @@ Version = tuple[int, int]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-_U16 = struct.Struct("<H")
 _U32 = struct.Struct("<I")
-_U64 = struct.Struct("<Q")
-_F32 = struct.Struct("<f")
-_F64 = struct.Struct("<d")
 _VECTOR = struct.Struct("<3f")
-_QUATERNION = struct.Struct("<4f")
 
 
 class Reader:
@@ -35,40 +31,19 @@ class Reader:
         at = self._advance(size)
         return self._data[at : at + size]
 
-    def u16(self) -> int:
-        """The next number of 2 bytes."""
-        value: int = _U16.unpack_from(self._data, self._advance(2))[0]
-        return value
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Return the next values of a layout."""
+        return layout.unpack_from(self._data, self._advance(layout.size))
 
     def u32(self) -> int:
-        """The next number of 4 bytes."""
-        value: int = _U32.unpack_from(self._data, self._advance(4))[0]
-        return value
-
-    def u64(self) -> int:
-        """The next number of 8 bytes."""
-        value: int = _U64.unpack_from(self._data, self._advance(8))[0]
-        return value
-
-    def f32(self) -> float:
-        """The next float of 4 bytes."""
-        value: float = _F32.unpack_from(self._data, self._advance(4))[0]
-        return value
-
-    def f64(self) -> float:
-        """The next float of 8 bytes."""
-        value: float = _F64.unpack_from(self._data, self._advance(8))[0]
+        """Return the next number of 4 bytes."""
+        value: int = self.unpack(_U32)[0]
         return value
 
     def vector(self) -> Vector:
-        """The next three floats."""
-        x, y, z = _VECTOR.unpack_from(self._data, self._advance(12))
+        """Return the next three floats."""
+        x, y, z = self.unpack(_VECTOR)
         return x, y, z
-
-    def quaternion(self) -> Quaternion:
-        """The next rotation: x y z w in the packet, w x y z returned."""
-        x, y, z, w = _QUATERNION.unpack_from(self._data, self._advance(16))
-        return w, x, y, z
 
     def text(self) -> str:
         """The next text, which ends with a zero."""

@@ -7,6 +7,10 @@ import struct
 from collections.abc import Sequence
 
 from ground_station.sources.natnet import (
+    BODY,
+    LABELLED,
+    SERVER_INFO,
+    SUFFIX,
     TRACKED,
     BodyDescription,
     BodyPose,
@@ -19,13 +23,9 @@ from ground_station.sources.natnet import (
 )
 from ground_station.sources.natnet_reader import Version
 
-_SERVER_INFO = struct.Struct("<256s4B4BQHB4B")
 _COUNT = struct.Struct("<I")
 _DESCRIBED = struct.Struct("<II3fI")  # id, parent, offset, markers
 _VECTOR = struct.Struct("<3f")
-_BODY = struct.Struct("<I3f4ffH")  # id, position, rotation x y z w, error, parameters
-_LABELLED = struct.Struct("<I3ffHf")
-_SUFFIX = struct.Struct("<8xd3Q")  # no timecode, timestamp; exposure, arrival and departure
 _NO_PRECISION_TIME = bytes(8)
 _END = struct.Struct("<HI")  # parameters, end tag
 _RIGID_BODY = 1  # kind of a description
@@ -35,7 +35,7 @@ def encode_server_info(info: ServerInfo) -> bytes:
     """The answer to CONNECT, alike in all versions."""
     group = (int(part) for part in info.group.split("."))
     rest = (*info.app_version, *info.natnet_version, info.clock_hz, info.data_port, info.multicast, *group)
-    return packet(MessageId.SERVER_INFO, _SERVER_INFO.pack(info.name.encode(), *rest))
+    return packet(MessageId.SERVER_INFO, SERVER_INFO.pack(info.name.encode(), *rest))
 
 
 def encode_models(models: ModelDefinition, version: Version) -> bytes:
@@ -64,7 +64,7 @@ def encode_frame(frame: Frame, version: Version) -> bytes:
         _section([_labelled(marker) for marker in frame.labelled], version),
         nothing,  # force plates
         nothing,  # devices
-        _SUFFIX.pack(frame.timestamp_s, frame.mid_exposure, frame.received, frame.transmitted),
+        SUFFIX.pack(frame.timestamp_s, frame.mid_exposure, frame.received, frame.transmitted),
         _NO_PRECISION_TIME if version >= (4, 0) else b"",
         _END.pack(frame.parameters, 0),
     )
@@ -92,8 +92,8 @@ def _text(text: str) -> bytes:
 
 def _body(body: BodyPose) -> bytes:
     w, x, y, z = body.q
-    return _BODY.pack(body.id, *body.p, x, y, z, w, body.error, TRACKED if body.valid else 0)
+    return BODY.pack(body.id, *body.p, x, y, z, w, body.error, TRACKED if body.valid else 0)
 
 
 def _labelled(marker: LabelledMarker) -> bytes:
-    return _LABELLED.pack(marker.id, *marker.p, marker.size, marker.parameters, marker.residual)
+    return LABELLED.pack(marker.id, *marker.p, marker.size, marker.parameters, marker.residual)
