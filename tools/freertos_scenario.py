@@ -15,37 +15,69 @@ from typing import Any
 
 from firmware_py.rtos import TICK_US, Kernel, KernelError, Mutex, Queue, Semaphore, Task, Timer
 
-# The operands of each operation: n number, p positive number, q id of a queue, l of a semaphore or mutex, t name of a
-# task, T index of a timer.
-OPERATIONS = {
-    "work": "n",
-    "delay": "n",
-    "delay_until": "p",
-    "send": "qnn",
-    "recv": "qn",
-    "take": "ln",
-    "give": "l",
-    "notify": "t",
-    "ntake": "nn",
-    "yield": "",
-    "suspend": "t",
-    "resume": "t",
-    "prio": "tn",
-    "suspend_all": "",
-    "resume_all": "",
-    "tmr_start": "Tn",
-    "tmr_stop": "Tn",
-    "tmr_reset": "Tn",
-    "tmr_period": "Tpn",
-}
-INTERRUPTS = {"isr_send": "qn", "isr_give": "l", "isr_notify": "t"}
 NOT_HELD = -2  # result of giving a mutex that the task does not hold
 
 Operation = tuple[str, list[Any]]
-Record = Callable[[int, str, str, int, int], None]
-
-
 Interrupt = tuple[int, Operation]  # instant [us] and what is called then
+Record = Callable[[int, str, str, int, int], None]
+Call = tuple[str, Callable[..., Any]]
+
+
+def _receive(_: Kernel, queue: Queue[int], timeout: int) -> Generator[int, None, int]:
+    item = yield from queue.receive(timeout)
+    return -1 if item is None else item
+
+
+def _give(kernel: Kernel, given: Semaphore | Mutex) -> Generator[int, None, int]:
+    if isinstance(given, Mutex) and given.holder is not kernel.current:
+        kernel.count_call()
+        return NOT_HELD
+    return (yield from given.give())
+
+
+# The operands of each operation and what it calls: n number, p positive number, q id of a queue, l of a semaphore or mutex,
+# t name of a task, T index of a timer, w the task's latest planned wake-up, which the scenario does not state.
+OPERATIONS: dict[str, Call] = {
+    "work": ("n", lambda kernel, us: kernel.work(us)),
+    "delay": ("n", lambda kernel, ticks: kernel.delay(ticks)),
+    "delay_until": ("pw", lambda kernel, ticks, wake: wake.delay(kernel, ticks)),
+    "send": ("qnn", lambda _, queue, item, timeout: queue.send(item, timeout)),
+    "recv": ("qn", _receive),
+    "take": ("ln", lambda _, taken, timeout: taken.take(timeout)),
+    "give": ("l", _give),
+    "notify": ("t", lambda _, task: task.notify()),
+    "ntake": ("nn", lambda kernel, clear, timeout: kernel.notify_take(bool(clear), timeout)),
+    "yield": ("", lambda kernel: kernel.task_yield()),
+    "suspend": ("t", lambda _, task: task.suspend()),
+    "resume": ("t", lambda _, task: task.resume()),
+    "prio": ("tn", lambda _, task, priority: task.priority_set(priority)),
+    "suspend_all": ("", lambda kernel: kernel.suspend_all() or ()),
+    "resume_all": ("", lambda kernel: kernel.resume_all()),
+    "tmr_start": ("Tn", lambda _, timer, timeout: timer.start(timeout)),
+    "tmr_stop": ("Tn", lambda _, timer, timeout: timer.stop(timeout)),
+    "tmr_reset": ("Tn", lambda _, timer, timeout: timer.reset(timeout)),
+    "tmr_period": ("Tpn", lambda _, timer, period, timeout: timer.change_period(period, timeout)),
+}
+INTERRUPTS: dict[str, Call] = {
+    "isr_send": ("qn", lambda queue, item: queue.send_from_isr(item)),
+    "isr_give": ("l", lambda given: given.give_from_isr()),
+    "isr_notify": ("t", lambda task: task.notify_from_isr() and 0),
+}
+
+
+@dataclass(slots=True)
+class PlannedWake:
+    """The tick until which a task last wanted to wait."""
+
+    tick: int = 0
+
+    def delay(self, kernel: Kernel, ticks: int) -> Generator[int, None, bool]:
+        """Wait until so many ticks after the last planned wake-up; return whether there was something to wait for."""
+        early = kernel.tick_count < self.tick  # FreeRTOS takes this for an overflow and does not wait
+        self.tick += ticks
+        waits = not early and self.tick > kernel.tick_count
+        yield from kernel.delay_until(0 if early else self.tick)
+        return waits
 
 
 class ScenarioError(Exception):
@@ -79,7 +111,7 @@ class Scenario:
 def parse(text: str) -> Scenario:
     """Read a scenario; raise ScenarioError."""
     scenario = Scenario()
-    unchecked: list[tuple[int, Operation, dict[str, str]]] = []
+    unchecked: list[tuple[int, Operation, dict[str, Call]]] = []
     for line_number, line in enumerate(text.splitlines(), 1):
         words = line.split("#")[0].split()
         if not words:
@@ -99,7 +131,7 @@ def parse(text: str) -> Scenario:
     return scenario
 
 
-def _parse_line(scenario: Scenario, words: list[str]) -> list[tuple[Operation, dict[str, str]]]:
+def _parse_line(scenario: Scenario, words: list[str]) -> list[tuple[Operation, dict[str, Call]]]:
     """Enters one line into the scenario; returns the operations that it holds, with the names allowed there."""
     match words:
         case ["run", ticks]:
@@ -127,11 +159,11 @@ def _parse_line(scenario: Scenario, words: list[str]) -> list[tuple[Operation, d
     return []
 
 
-def _check(line: int, name: str, operands: list[Any], known: dict[str, str], kinds: dict[str, Any]) -> None:
+def _check(line: int, name: str, operands: list[Any], known: dict[str, Call], kinds: dict[str, Any]) -> None:
     """Check an operation and turn its numbers into ints, in place."""
     if name not in known:
         raise ScenarioError(f"line {line}: {name!r} is none of {', '.join(known)}")
-    signature = known[name]
+    signature = known[name][0].removesuffix("w")
     if len(operands) != len(signature):
         raise ScenarioError(f"line {line}: {name} takes {len(signature)} operands, not {len(operands)}")
     for place, kind in enumerate(signature):
@@ -192,23 +224,26 @@ class Run:
         self.record(end_us, "END", "-", 0, 0)
 
     def _interrupt(self, name: str, operands: list[Any]) -> None:
-        result = 0
-        if name == "isr_send":
-            result = int(self.objects[operands[0]].send_from_isr(operands[1]))
-        elif name == "isr_give":
-            result = int(self.objects[operands[0]].give_from_isr())
-        else:
-            self.tasks[operands[0]].notify_from_isr()
-        self.record(self.kernel.now_us, "ISR", name, result, int(self.kernel.task_woken))
+        signature, call = INTERRUPTS[name]
+        result = call(*self._meant(signature, operands))
+        self.record(self.kernel.now_us, "ISR", name, int(result or 0), int(self.kernel.task_woken))
+
+    def _meant(self, signature: str, operands: list[Any]) -> list[Any]:
+        """Return the objects that operands name."""
+        places: dict[str, Any] = {"q": self.objects, "l": self.objects, "t": self.tasks, "T": self.timers}
+        return [
+            places[kind][operand] if kind in places else operand
+            for kind, operand in zip(signature, operands, strict=False)
+        ]
 
     def _scripted_task(
         self, name: str, operations: list[Operation], once: bool
     ) -> Generator[int, None, None]:
-        wake_tick = [self.kernel.tick_count]
+        wake = PlannedWake(self.kernel.tick_count)
         while True:
             for place, operation in enumerate(operations):
                 self.record(self.kernel.now_us, "CALL", name, place, 0)
-                result = yield from self._perform(operation, wake_tick)
+                result = yield from self._perform(operation, wake)
                 self.record(self.kernel.now_us, "RET", name, place, result)
             while once:
                 yield from self.tasks[name].suspend()
@@ -216,67 +251,17 @@ class Run:
     def _timer_callback(self, operation: Operation) -> Callable[[Timer], Generator[int, None, None]]:
         def callback(timer: Timer) -> Generator[int, None, None]:
             self.record(self.kernel.now_us, "TMR_CB", timer.name, 0, 0)
-            result = yield from self._perform(operation, [0])
+            result = yield from self._perform(operation, PlannedWake())
             self.record(self.kernel.now_us, "TMR_RET", timer.name, 0, result)
 
         return callback
 
-    def _perform(self, operation: Operation, wake_tick: list[int]) -> Generator[int, None, int]:
-        """Do one operation in the running task; `wake_tick` holds the task's latest planned wake-up."""
-        kernel = self.kernel
+    def _perform(self, operation: Operation, wake: PlannedWake) -> Generator[int, None, int]:
+        """Do one operation in the running task."""
         name, operands = operation
-        match name:
-            case "work":
-                yield from kernel.work(operands[0])
-            case "delay":
-                yield from kernel.delay(operands[0])
-            case "delay_until":
-                # FreeRTOS takes this for an overflow and does not wait.
-                early = kernel.tick_count < wake_tick[0]
-                wake_tick[0] += operands[0]
-                waits = not early and wake_tick[0] > kernel.tick_count
-                yield from kernel.delay_until(0 if early else wake_tick[0])
-                return int(waits)
-            case "send":
-                queue: Queue[int] = self.objects[operands[0]]
-                return int((yield from queue.send(operands[1], operands[2])))
-            case "recv":
-                item = yield from self.objects[operands[0]].receive(operands[1])
-                return -1 if item is None else item
-            case "take":
-                return int((yield from self.objects[operands[0]].take(operands[1])))
-            case "give":
-                given: Semaphore | Mutex = self.objects[operands[0]]
-                if isinstance(given, Mutex) and given.holder is not kernel.current:
-                    kernel.count_call()
-                    return NOT_HELD
-                return int((yield from given.give()))
-            case "notify":
-                return int((yield from self.tasks[operands[0]].notify()))
-            case "ntake":
-                return (yield from kernel.notify_take(bool(operands[0]), operands[1]))
-            case "yield":
-                yield from kernel.task_yield()
-            case "suspend":
-                yield from self.tasks[operands[0]].suspend()
-            case "resume":
-                yield from self.tasks[operands[0]].resume()
-            case "prio":
-                yield from self.tasks[operands[0]].priority_set(operands[1])
-            case "suspend_all":
-                kernel.suspend_all()
-            case "resume_all":
-                yield from kernel.resume_all()
-            case "tmr_start":
-                return int((yield from self.timers[operands[0]].start(operands[1])))
-            case "tmr_stop":
-                return int((yield from self.timers[operands[0]].stop(operands[1])))
-            case "tmr_reset":
-                return int((yield from self.timers[operands[0]].reset(operands[1])))
-            case "tmr_period":
-                timer: Timer = self.timers[operands[0]]
-                return int((yield from timer.change_period(operands[1], operands[2])))
-        return 0
+        signature, call = OPERATIONS[name]
+        result = yield from call(self.kernel, *self._meant(signature, [*operands, wake][: len(signature)]))
+        return int(result or 0)
 
 
 def trace(text: str, preemption: bool, write: Callable[[str], Any]) -> None:
