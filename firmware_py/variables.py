@@ -15,7 +15,7 @@ from firmware_py.drivers.imu import acceleration, rates
 from firmware_py.geometry import Vector, from_euler_zyx, rotate, wrap_angle, yaw_quaternion
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
-from firmware_py.rtos.statistics import Load
+from firmware_py.rtos.statistics import ProcessorLoad
 from firmware_py.running import Running
 from firmware_py.table import CORE_VARIABLES, CoreVariable
 from firmware_py.wire.scalars import Scalar
@@ -146,7 +146,7 @@ def _counters(running: Running) -> Iterator[LogVariable]:
     yield from _fields("crtp", "malformed unserved dropped", U32, "", running.stack)
     if running.mavlink is not None:
         yield from _fields("mavlink", "frames lost bad refused dropped overruns", U32, "", running.mavlink)
-    load = Load(running.stack.kernel, LOAD_US)
+    load = ProcessorLoad(running.stack.kernel, LOAD_US)
     yield LogVariable("system.load", F32, "%", lambda: 100 * load())
     yield LogVariable("sensors.dropped", U32, "", partial(getattr, running.measurements, "dropped"))
     yield LogVariable("app.overflows", U32, "", partial(getattr, running.platform, "app_overflows"))

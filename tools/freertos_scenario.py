@@ -182,7 +182,7 @@ def _instant_us(interrupt: Interrupt) -> int:
     return interrupt[0]
 
 
-class Run:
+class ScenarioRun:
     """One scenario on one kernel; `record` gets the runner's events and, when `traced`, the kernel's."""
 
     def __init__(self, scenario: Scenario, preemption: bool, record: Record, traced: bool = True) -> None:
@@ -266,7 +266,9 @@ class Run:
 
 def trace(text: str, preemption: bool, write: Callable[[str], Any]) -> None:
     """Run the scenario `text` and call `write` with every line of its trace."""
-    Run(parse(text), preemption, lambda us, event, who, a, b: write(f"{us},{event},{who},{a},{b}\n")).run()
+    ScenarioRun(
+        parse(text), preemption, lambda us, event, who, a, b: write(f"{us},{event},{who},{a},{b}\n")
+    ).run()
 
 
 def main() -> int:

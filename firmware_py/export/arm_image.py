@@ -22,7 +22,7 @@ TARGET_FLAGS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Image:
+class CoreImage:
     """What lies in flash."""
 
     path: Path
@@ -31,7 +31,7 @@ class Image:
     constants: frozenset[int]  # half words of `code` that are not instructions
 
 
-def build_image(source: str, header: str, folder: Path, optimisation: str = "-Os") -> Image:
+def build_image(source: str, header: str, folder: Path, optimisation: str = "-Os") -> CoreImage:
     """Compile and link the core, as small as the Crazyflie's firmware is; `folder` keeps it. Raises `ExportError`."""
     texts = {"floaty_core.c": source, "floaty_core.h": header}
     texts.update({name: (SOURCES / name).read_text(encoding="utf-8") for name in ("rt.c", "flash.ld")})
@@ -47,7 +47,7 @@ def build_meter(folder: Path) -> Path:
     return compile_texts({"meter.c": text}, ("meter.c",), HOST_FLAGS, "meter.so", folder, zig())
 
 
-def read_image(path: Path, alone: bool = True) -> Image:
+def read_image(path: Path, alone: bool = True) -> CoreImage:
     """Read a linked image, the core `alone` or in a firmware around it.
 
     Raises `ExportError` when an entry point is missing, or when the core alone has variables.
@@ -62,4 +62,4 @@ def read_image(path: Path, alone: bool = True) -> Image:
         entries = {name: addresses[f"floaty_core_{name}"] | 1 for name in CALLS}
     except KeyError as error:
         raise ExportError(f"{path}: there is no function {error.args[0]}") from None
-    return Image(path, code, entries, elf.constants(FLASH, len(code)))
+    return CoreImage(path, code, entries, elf.constants(FLASH, len(code)))

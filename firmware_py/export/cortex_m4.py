@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.core_runner import CoreBlocks
-from firmware_py.export.arm_image import Image
+from firmware_py.export.arm_image import CoreImage
 from firmware_py.export.cycles import count
 from firmware_py.export.elf import FLASH, FLASH_SIZE
 from firmware_py.export.errors import ExportError
-from firmware_py.export.usage import CLOCK_MHZ, Load, Usage
+from firmware_py.export.usage import CLOCK_MHZ, EntryLoad, Usage
 from firmware_py.extras import install_command
 from firmware_py.logic.plugs import ANSWERING
 
@@ -50,12 +50,12 @@ class CortexM4Runner:
     Raises `ExportError` when unicorn is missing, or the blocks are too large for the RAM.
     """
 
-    def __init__(self, blocks: CoreBlocks, image: Image, meter: Path) -> None:
+    def __init__(self, blocks: CoreBlocks, image: CoreImage, meter: Path) -> None:
         unicorn = find_emulator()
         from unicorn import arm_const, unicorn_const
 
         self.image = image
-        self.load = {name: Load() for name in image.entries}
+        self.load = {name: EntryLoad() for name in image.entries}
         self._fault = unicorn.UcError
         self._result, self._pc = arm_const.UC_ARM_REG_R0, arm_const.UC_ARM_REG_PC
         self._cpu = unicorn.Uc(
@@ -165,7 +165,7 @@ class CortexM4Runner:
 class Meter:
     """Counts the instructions and cycles of a call; see arm/meter.c."""
 
-    def __init__(self, image: Image, library: Path, cpu: Any) -> None:
+    def __init__(self, image: CoreImage, library: Path, cpu: Any) -> None:
         self._library = ctypes.CDLL(str(library))
         self._library.meter_size.restype = ctypes.c_uint64
         half_words = FLASH_SIZE // 2

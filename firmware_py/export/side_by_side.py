@@ -31,7 +31,7 @@ class Divergence:
         return f"tick {self.tick}, after {self.call}: {self.where}.{self.differences[0]}{more}"
 
 
-class Target:
+class ComparedTarget:
     """One implementation beside the reference."""
 
     __slots__ = ("blocks", "calls", "divergence", "name", "ticks")
@@ -48,7 +48,7 @@ class SideBySide:
     """A `CoreRunner` that runs Python on the flight's memory and every target beside it."""
 
     def __init__(self, blocks: CoreBlocks, targets: Mapping[str, RunnerFactory]) -> None:
-        self.targets = [Target(name, blocks, factory) for name, factory in targets.items()]
+        self.targets = [ComparedTarget(name, blocks, factory) for name, factory in targets.items()]
         self._reference = PythonRunner(blocks)
         self._blocks = blocks
         self._inputs = blocks.inputs

@@ -6,7 +6,7 @@ CLOCK_MHZ = 168
 
 
 @dataclass(slots=True)
-class Load:
+class EntryLoad:
     """Instructions and cycles of an entry point so far, over all calls."""
 
     calls: int = 0
@@ -23,7 +23,7 @@ class Load:
         self.worst_instructions = max(self.worst_instructions, instructions)
         self.worst_cycles = max(self.worst_cycles, cycles)
 
-    def merge(self, other: "Load") -> None:
+    def merge(self, other: "EntryLoad") -> None:
         """Add what another load has counted."""
         self.calls += other.calls
         self.instructions += other.instructions
@@ -54,4 +54,4 @@ class Usage:
     flash_bytes: int | None  # None: not known of a real board
     ram_bytes: int  # the structs
     stack_bytes: int | None  # at most so far
-    entries: dict[str, Load]
+    entries: dict[str, EntryLoad]

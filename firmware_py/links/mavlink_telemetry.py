@@ -16,7 +16,7 @@ from firmware_py.links.mavlink_poses import PoseService
 from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
 from firmware_py.links.mavlink_world import World
-from firmware_py.rtos.statistics import Load
+from firmware_py.rtos.statistics import ProcessorLoad
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink, telemetry
 from firmware_py.wire import mavlink_services as services
@@ -51,7 +51,7 @@ class FlightMessages:
         self._unix_ahead_us: int | None = None  # of the board's own clock
         read = {variable.name: variable.read for variable in variables}
         self._blocks = [(block, [read[item.name] for item in block.variables]) for block in telemetry.BLOCKS]
-        self._load = Load(stack.kernel)
+        self._load = ProcessorLoad(stack.kernel)
         stack.handle("SYSTEM_TIME", self._see_time)
 
     def streams(self, rates: StreamRates) -> tuple[Stream, ...]:

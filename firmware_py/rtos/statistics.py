@@ -18,7 +18,7 @@ from firmware_py.rtos.task import Task
 LATENCY_BOUNDS_US = (1, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)  # of the histogram's classes
 
 
-class Load:
+class ProcessorLoad:
     """The share of the processor's time that tasks use: 0 to 1, between the last two calls that are `least_us` apart."""
 
     def __init__(self, kernel: Kernel, least_us: int = 1) -> None:

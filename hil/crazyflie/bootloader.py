@@ -25,7 +25,7 @@ DONE, OUT_OF_RANGE = bytes((1, 0)), bytes((0, 1))  # done, error
 
 
 @dataclass(slots=True)
-class Target:
+class FlashTarget:
     """One processor's flash and the buffer in front of it."""
 
     number: int
@@ -44,8 +44,8 @@ class Bootloader:
     """Answers the packets of a flashing tool. `stm32` and `nrf51` keep their contents."""
 
     def __init__(self) -> None:
-        self.stm32 = Target(STM32, buffer_pages=10, flash_pages=1024, first_page=16)
-        self.nrf51 = Target(NRF51, buffer_pages=1, flash_pages=232, first_page=88)
+        self.stm32 = FlashTarget(STM32, buffer_pages=10, flash_pages=1024, first_page=16)
+        self.nrf51 = FlashTarget(NRF51, buffer_pages=1, flash_pages=232, first_page=88)
         self.malformed = 0
 
     def answer(self, packet: bytes) -> bytes | None:
@@ -62,7 +62,7 @@ class Bootloader:
         return None if reply is None else packet[:3] + reply
 
 
-def _execute(target: Target, command: int, parameters: bytes) -> bytes | None:
+def _execute(target: FlashTarget, command: int, parameters: bytes) -> bytes | None:
     if command == GET_INFO:
         sizes = PAGE_SIZE, target.buffer_pages, target.flash_pages, target.first_page
         return _INFO.pack(*sizes, bytes(12), PROTOCOL_VERSION)
@@ -86,7 +86,7 @@ def _offset(parameters: bytes) -> int:
     return int(page * PAGE_SIZE + offset)
 
 
-def _write(target: Target, buffer_page: int, page: int, pages: int) -> bytes:
+def _write(target: FlashTarget, buffer_page: int, page: int, pages: int) -> bytes:
     """Copy whole pages from the buffer to the flash."""
     if (
         page < target.first_page

@@ -19,7 +19,7 @@ from hil.stm32f405.crash import Crash, CrashReports
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.stm32f405.image import Image
-from hil.stm32f405.processor import Processor
+from hil.stm32f405.processor import ChipProcessor
 
 BATTERY_PERIOD_US = 100_000
 LOOK_PERIOD_US = 100_000  # for tasks that do not wait
@@ -69,7 +69,7 @@ class Crazyflie:
         self.parts = Parts(chip, np.frombuffer(outside.eeprom, np.uint8))
         self.tasks = FreeRtos.of(image, chip.read)
         run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
-        self.processor = Processor(chip, self.tasks, self._act, run)
+        self.processor = ChipProcessor(chip, self.tasks, self._act, run)
         self.resets = {WATCHDOG: 0, SOFTWARE: 0}  # by cause, since power-on
         self._outside = outside
         self._crashes = CrashReports(image, chip, self.tasks, ASSERTION)

@@ -21,7 +21,7 @@ NAME_LENGTH = 32
 
 
 @dataclass(frozen=True, slots=True)
-class LogVariable:
+class ImageVariable:
     """A variable of the image's table of contents."""
 
     name: str
@@ -40,10 +40,10 @@ class ImageParameter:
     read: Callable[[], float]
 
 
-def log_table(image: Image, chip: Chip) -> list[LogVariable]:
+def log_table(image: Image, chip: Chip) -> list[ImageVariable]:
     """Return the log variables of an image; none when it has no table."""
     return [
-        LogVariable(name, scalar, partial(_read, chip, address, scalar))
+        ImageVariable(name, scalar, partial(_read, chip, address, scalar))
         for _, name, kind, address in _entries(image, chip, "log", "<BxxxII")
         if not kind & LOG_BY_FUNCTION and (scalar := LOG_SCALARS.get(kind & TYPE)) is not None
     ]

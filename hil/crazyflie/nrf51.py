@@ -35,7 +35,7 @@ SET_CHANNEL, SET_RATE = 1, 2  # commands of the type RADIO; that for the power c
 
 
 @dataclass(frozen=True, slots=True)
-class RadioSettings:
+class AirSettings:
     """The settings that two radios must share to hear each other."""
 
     channel: int  # 0..CHANNEL_MAX, 2400 MHz + channel
@@ -52,7 +52,7 @@ class Power(Enum):
     BOOTLOADER = auto()  # both processors
 
 
-class Processor(Protocol):
+class PoweredProcessor(Protocol):
     """The STM32 behind the radio chip."""
 
     @property
@@ -93,11 +93,11 @@ class Nrf51:
 
     def __init__(
         self,
-        settings: RadioSettings,
+        settings: AirSettings,
         chip: bytes,
         queue: int,
         events: EventQueue,
-        processor: Processor,
+        processor: PoweredProcessor,
         air: Air,
         wire_us: Callable[[bytes], int] = syslink_us,
     ) -> None:
@@ -107,7 +107,7 @@ class Nrf51:
         self.settings = settings  # while the firmware runs, which may change them
         self.bootloader = Bootloader()
         self.heard_us = 0  # the last packet
-        self._bootloader_settings = RadioSettings(0, 2_000_000, bytes((0xB1, *chip[3::-1])))
+        self._bootloader_settings = AirSettings(0, 2_000_000, bytes((0xB1, *chip[3::-1])))
         self._chip = chip
         self._capacity = queue
         self._events = events
@@ -121,22 +121,22 @@ class Nrf51:
         self._answer = b""  # sent last, to be repeated
         self._reset_armed = False
 
-    def tune(self, settings: RadioSettings) -> None:
+    def tune(self, settings: AirSettings) -> None:
         """Set its radio, as a firmware that boots does."""
         self.settings = settings
 
-    def hears(self, settings: RadioSettings) -> bool:
+    def hears(self, settings: AirSettings) -> bool:
         """Whether a packet sent with these settings reaches this board."""
         if self.power is Power.OFF:
             return False
         booting = self.power is Power.BOOTLOADER
         return settings == (self._bootloader_settings if booting else self.settings)
 
-    def hears_all(self, settings: RadioSettings) -> bool:
+    def hears_all(self, settings: AirSettings) -> bool:
         """Whether a packet to all boards sent with these settings reaches this board."""
         own = self.settings
         firmware = self.power in (Power.RADIO_ONLY, Power.RUNNING)
-        return firmware and settings == RadioSettings(own.channel, own.bits_per_second, BROADCAST)
+        return firmware and settings == AirSettings(own.channel, own.bits_per_second, BROADCAST)
 
     def send(self, now_us: int, data: bytes) -> bool:
         """Take a packet of the STM32 for the ground; False when the queue is full."""
@@ -188,9 +188,9 @@ class Nrf51:
         """Set the radio until the next start of the processor, which sets it to the values in its EEPROM."""
         wanted = own = self.settings
         if command == SET_CHANNEL and value <= CHANNEL_MAX:
-            wanted = RadioSettings(value, own.bits_per_second, own.address)
+            wanted = AirSettings(value, own.bits_per_second, own.address)
         elif command == SET_RATE and value < len(RATES):
-            wanted = RadioSettings(own.channel, RATES[value], own.address)
+            wanted = AirSettings(own.channel, RATES[value], own.address)
         if wanted != own:
             self.settings = wanted
             self._processor.retuned(now_us)

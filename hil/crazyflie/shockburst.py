@@ -90,7 +90,7 @@ class AirCounters:
 
 
 @dataclass(slots=True)
-class Exchange:
+class RadioExchange:
     """A packet of `size` bytes and its answer.
 
     `hear(now_us)` is called whenever a try reaches the board and returns the size of its answer; None: it has none.
@@ -114,7 +114,7 @@ class Transmitter:
         self._events = events
         self._uniform = uniform
 
-    def send(self, start_us: int, exchange: Exchange) -> None:
+    def send(self, start_us: int, exchange: RadioExchange) -> None:
         """Take a packet from the host at `start_us`; 1 + `retries` tries at most follow, each in both directions."""
         self.counters.exchanges += 1
         size, rate, usb_us = exchange.size, exchange.bits_per_second, self._config.usb_us
@@ -128,7 +128,7 @@ class Transmitter:
                 return
         self._give_up(exchange, given_up_us)
 
-    def _heard(self, exchange: Exchange, first: int, given_up_us: int, now_us: int) -> None:
+    def _heard(self, exchange: RadioExchange, first: int, given_up_us: int, now_us: int) -> None:
         """Let the board hear the packet and answer; draw the outcome of that and of all further tries at once."""
         ack_size = exchange.hear(now_us)
         if ack_size is None:
@@ -149,7 +149,7 @@ class Transmitter:
                 return
         self._give_up(exchange, given_up_us)
 
-    def _give_up(self, exchange: Exchange, at_us: int) -> None:
+    def _give_up(self, exchange: RadioExchange, at_us: int) -> None:
         self.counters.retried += exchange.retries
         self.counters.unanswered += 1
         self._events.at(at_us, partial(exchange.ended, None))

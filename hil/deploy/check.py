@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
 from firmware_py.export.errors import ExportError
-from firmware_py.export.side_by_side import SideBySide, Target
+from firmware_py.export.side_by_side import ComparedTarget, SideBySide
 from firmware_py.rtos import TaskError, WatchdogError
 from ground_station.errors import LinkError
 from hil.devices.board_firmware import PythonBoard
@@ -39,7 +39,7 @@ class Checked:
 
     request: Request
     outcome: str  # completed, lost (and why), interrupted, error (and which)
-    targets: tuple[Target, ...]
+    targets: tuple[ComparedTarget, ...]
 
     @property
     def failed(self) -> bool:

@@ -10,19 +10,19 @@ from pathlib import Path
 
 from firmware_py.config import LogicConfig
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
-from firmware_py.export.arm_image import Image, build_image, build_meter, read_image
+from firmware_py.export.arm_image import CoreImage, build_image, build_meter, read_image
 from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
 from firmware_py.export.errors import ExportError
 from firmware_py.export.native import NativeRunner, build
 from firmware_py.export.plain import PlainRunner
-from firmware_py.export.usage import Load
+from firmware_py.export.usage import EntryLoad
 from firmware_py.logic.loading import translation_of
 from hil.devices.real_core import RealCore, is_link, open_real_core
 from hil.errors import LabError
 from hil.laboratory.run import BUILD
 
 PLAIN, C_O0, C_O2, CORTEX_M4 = TARGETS = ("plain", "c-O0", "c-O2", "cortex-m4")
-Loads = dict[str, Load]  # by entry point
+Loads = dict[str, EntryLoad]  # by entry point
 OPTIMISATION = {C_O0: "-O0", C_O2: "-O2"}
 TICK_HZ = 100
 
@@ -46,7 +46,7 @@ def target_names(text: str | None) -> tuple[str, ...]:
 class Metered(CortexM4Runner):
     """Machine code whose ticks are counted: the poses, the estimator and the controller of each."""
 
-    def __init__(self, blocks: CoreBlocks, image: Image, meter: Path, ticks: Load) -> None:
+    def __init__(self, blocks: CoreBlocks, image: CoreImage, meter: Path, ticks: EntryLoad) -> None:
         super().__init__(blocks, image, meter)
         self._ticks = ticks
         self._so_far: tuple[int, int] | None = None  # instructions, cycles at the last tick's end; None: boot
@@ -69,7 +69,7 @@ class MachineCode:
     """What the machine code takes of the board, over all flights of a check: memory, and processor time per tick."""
 
     flash_bytes: int | None  # None: with a firmware around it
-    ticks: Load
+    ticks: EntryLoad
     entries: Loads = field(default_factory=dict)
     ram_bytes: int = 0
     stack_bytes: int = 0
@@ -110,7 +110,7 @@ class Toolbox:
                     self._image = read_image(elf, False) if elf else build_image(c.source, c.header, BUILD)
                     self._meter = build_meter(BUILD)
                     flash = None if elf else len(self._image.code)
-                    self.machine_code = MachineCode(flash, Load())
+                    self.machine_code = MachineCode(flash, EntryLoad())
         except ExportError as error:
             raise LabError(str(error)) from None
 
@@ -152,4 +152,4 @@ class Toolbox:
 def add_loads(total: Loads, flight: Loads) -> None:
     """Add what a flight took to what all before it have taken."""
     for name, load in flight.items():
-        total.setdefault(name, Load()).merge(load)
+        total.setdefault(name, EntryLoad()).merge(load)

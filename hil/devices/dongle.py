@@ -11,8 +11,8 @@ from functools import partial
 import numpy as np
 
 from hil.crazyflie.config import RadioConfig
-from hil.crazyflie.nrf51 import RATES, Nrf51, RadioSettings
-from hil.crazyflie.shockburst import MAX_PACKET, RETRIES, Air, Exchange, Transmitter
+from hil.crazyflie.nrf51 import RATES, AirSettings, Nrf51
+from hil.crazyflie.shockburst import MAX_PACKET, RETRIES, Air, RadioExchange, Transmitter
 from hil.events import EventQueue
 
 Answer = Callable[[int, bytes], None]  # (now_us, what the host reads from the dongle)
@@ -32,7 +32,7 @@ class VirtualDongle:
         self._rng = rng
         self._transmitter = Transmitter(config, events, rng.random)
         self._boards = boards
-        self._settings = RadioSettings(2, 2_000_000, b"\xe7" * 5)
+        self._settings = AirSettings(2, 2_000_000, b"\xe7" * 5)
         self._retries = RETRIES
         self._acks = True
 
@@ -40,11 +40,11 @@ class VirtualDongle:
         """Execute a vendor request; those that change nothing here (power, retry delay, carrier) are accepted."""
         old = self._settings
         if request == SET_CHANNEL:
-            self._settings = RadioSettings(value, old.bits_per_second, old.address)
+            self._settings = AirSettings(value, old.bits_per_second, old.address)
         elif request == SET_ADDRESS and len(data) == 5:
-            self._settings = RadioSettings(old.channel, old.bits_per_second, data)
+            self._settings = AirSettings(old.channel, old.bits_per_second, data)
         elif request == SET_RATE and value < len(RATES):
-            self._settings = RadioSettings(old.channel, RATES[value], old.address)
+            self._settings = AirSettings(old.channel, RATES[value], old.address)
         elif request == SET_RETRIES:
             self._retries = value & 0x0F
         elif request == SET_ACKS:
@@ -62,7 +62,7 @@ class VirtualDongle:
         for any_board in self._boards:
             if packet and any_board.hears_all(settings):
                 hear_too = partial(any_board.overhear, data=packet)
-                to_all = Exchange(
+                to_all = RadioExchange(
                     len(packet), settings.bits_per_second, any_board.air, retries, hear_too, _nobody_waits
                 )
                 self._transmitter.send(now_us, to_all)
@@ -85,7 +85,7 @@ class VirtualDongle:
                 answer(now_us, NOT_ACKNOWLEDGED)
 
         jitter_us = int(self._rng.random() * air.uplink_jitter_us) if air.uplink_jitter_us else 0
-        exchange = Exchange(len(packet), settings.bits_per_second, air, retries, hear, ended)
+        exchange = RadioExchange(len(packet), settings.bits_per_second, air, retries, hear, ended)
         self._transmitter.send(now_us + jitter_us, exchange)
 
 

@@ -24,14 +24,14 @@ from firmware_py.signals import CONTROL, ESTIMATOR, Signals
 from firmware_py.wire.supervisor import Cause, State
 from hil.crazyflie import syslink
 from hil.crazyflie.crazyflie import Crazyflie
-from hil.crazyflie.log_table import LogVariable, log_numbers, log_table, parameter_table
+from hil.crazyflie.log_table import ImageVariable, log_numbers, log_table, parameter_table
 from hil.devices.board_firmware import ImageReport, PowerOn
 from hil.errors import LabError
 from hil.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
 from hil.stm32f405.freertos import HEAP, HEAP_LEAST
 from hil.stm32f405.gdb import GdbServer
 from hil.stm32f405.image import Image
-from hil.stm32f405.processor import Processor
+from hil.stm32f405.processor import ChipProcessor
 
 # The stock firmware's self-test and gyro calibration take 3.06 s. The rest lets the app's estimator step at the phase of the
 # cameras' frames at which ours does, 2 to 3 ms after a pose: in reality it is any.
@@ -43,7 +43,7 @@ OWN_LOGIC = "floaty_guard"  # there is one in images with logic of the user's ow
 class ChipSupervisor:
     """State and cause of the app's supervisor, calibrating for ever without the app."""
 
-    def __init__(self, variables: dict[str, LogVariable]) -> None:
+    def __init__(self, variables: dict[str, ImageVariable]) -> None:
         self._state, self._cause = (variables.get(f"supervisor.{name}") for name in ("state", "cause"))
 
     @property
@@ -64,7 +64,7 @@ class ChipSupervisor:
 class ImageStatistics:
     """How long the image's tasks have run."""
 
-    def __init__(self, kernel: Processor) -> None:
+    def __init__(self, kernel: ChipProcessor) -> None:
         self._kernel = kernel
 
     def reports(self) -> list[TaskReport]:
@@ -202,7 +202,7 @@ class ImageFirmware:
 
     # What is read of the app
 
-    def _signals(self, table: dict[str, LogVariable]) -> Signals:
+    def _signals(self, table: dict[str, ImageVariable]) -> Signals:
         estimator, control = (
             self._struct("floaty_estimator", ESTIMATOR),
             self._struct("floaty_control", CONTROL),

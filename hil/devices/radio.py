@@ -27,7 +27,7 @@ from hil.crazyflie.shockburst import (
     TURN_ROUND_US,
     Air,
     BoardEnd,
-    Exchange,
+    RadioExchange,
     Transmitter,
     Waiting,
     again_us,
@@ -186,7 +186,7 @@ class VirtualRadio:
     def _exchange(self, start_us: int) -> None:
         """Hand packet or poll to the dongle."""
         self._answer_size = None
-        exchange = Exchange(
+        exchange = RadioExchange(
             POLL_BYTES if self._uploading is None else len(self._uploading.data),
             self._config.bits_per_second, self.medium, RETRIES, self._hear, self._ended,
         )  # fmt: skip

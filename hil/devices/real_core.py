@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.core_runner import CoreBlocks, PythonRunner, RunnerFactory
-from firmware_py.export.usage import Load, Usage
+from firmware_py.export.usage import EntryLoad, Usage
 from firmware_py.extras import install_command
 from firmware_py.wire.core_port import WRITE_MAX, About, Call, Called, call, write
 from ground_station.errors import LinkError
@@ -58,7 +58,7 @@ class RealCore:
     """
 
     def __init__(self, blocks: CoreBlocks, client: CoreClient) -> None:
-        self.load = {entry.name.lower(): Load() for entry in Call if entry.name.lower() not in HERE}
+        self.load = {entry.name.lower(): EntryLoad() for entry in Call if entry.name.lower() not in HERE}
         self.unexpected = 0  # calls that came to something else than here
         self._client = client
         self._host = PythonRunner(blocks)

@@ -41,7 +41,7 @@ from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
-from hil.crazyflie.log_table import LogVariable
+from hil.crazyflie.log_table import ImageVariable
 from hil.crazyflie.shockburst import syslink_us
 from hil.devices.board_firmware import PowerOn
 from hil.devices.sample_window import SampleWindow
@@ -259,5 +259,5 @@ class RealFirmware:
         self._wall.shift(max(-SLEW_MAX_US, min(SLEW_MAX_US, surplus_us)))
 
 
-def _variable(name: str, unit: str, read: Callable[[], int]) -> LogVariable:
-    return LogVariable(f"loop.{name}", Scalar.I32, read, unit)
+def _variable(name: str, unit: str, read: Callable[[], int]) -> ImageVariable:
+    return ImageVariable(f"loop.{name}", Scalar.I32, read, unit)

@@ -16,7 +16,7 @@ from ground_station.trajectory import Goal, Hold
 from hil.clock import Readers
 from hil.config import LabConfig
 from hil.crazyflie.crazyflie import POLL_PERIOD_US
-from hil.crazyflie.nrf51 import RATES, Nrf51, RadioSettings
+from hil.crazyflie.nrf51 import RATES, AirSettings, Nrf51
 from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, Memory, unsupported
 from hil.devices.radio import VirtualRadio
@@ -55,7 +55,7 @@ class _PosesOnly(LoopbackLink):
 
 
 class ServedRobot:
-    """One robot and its ends; it implements `hil.crazyflie.nrf51.Processor` towards its radio chip, and boots the robot."""
+    """One robot and its ends; it is the `PoweredProcessor` of its radio chip, and boots the robot."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class ServedRobot:
         self._line_end: Endpoint | None = None
         patient = config.radio.model_copy(update={"uplink_queue": UDP_QUEUE})
         self.udp_radio = VirtualRadio(patient, events, rng, air, wire_us)
-        settings = RadioSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
+        settings = AirSettings(CHANNEL, config.radio.bits_per_second, address_of(number))
         chip = bytes((number, 0x10, 0xA7, 0xF1, 0x0A, 0xC0))
         self.nrf51 = Nrf51(settings, chip, config.radio.downlink_queue, events, self, air, wire_us)
         memory.eeprom[:CONFIG_SIZE] = _factory_config(number, config)
@@ -214,11 +214,11 @@ class ServedRobot:
             self._udp_awaited = False
             self._say(f"board {self.number}: udp port {self.udp.port} is open again")
 
-    def _settings_at_boot(self) -> RadioSettings:
+    def _settings_at_boot(self) -> AirSettings:
         """Return where the firmware sets the radio at boot: to its configuration block; nowhere else when that is none."""
         try:
             block = decode_config(bytes(self._memory.eeprom[:CONFIG_SIZE]))
-            return RadioSettings(block.channel, RATES[block.data_rate], block.address.to_bytes(5))
+            return AirSettings(block.channel, RATES[block.data_rate], block.address.to_bytes(5))
         except (WireError, IndexError):
             return self.nrf51.settings
 

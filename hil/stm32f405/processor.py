@@ -34,7 +34,7 @@ T = TypeVar("T")
 Trace = Callable[[int, str, str, int, int], None]
 
 
-class Processor:
+class ChipProcessor:
     """The chip's time as `firmware_py.rtos.Kernel` shows it: microseconds since the firmware's boot."""
 
     queues: tuple[Any, ...] = ()

@@ -11,7 +11,7 @@ pytest.importorskip("cffi")
 from hil.stm32f405.chip import CYCLES_PER_US, Chip, Why, build_machine
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.image import Image
-from hil.stm32f405.processor import Processor
+from hil.stm32f405.processor import ChipProcessor
 from support.stm32_firmware import BUILD, build
 
 
@@ -26,9 +26,11 @@ class FirmwareOnChip:
         for name, value in variables.items():
             self.poke(name, value)
 
-    def processor(self) -> Processor:
+    def processor(self) -> ChipProcessor:
         """Return the chip as the laboratory's time line sees it."""
-        return Processor(self.chip, FreeRtos.of(self.image, self.chip.read), lambda why: None, self.chip.run)
+        return ChipProcessor(
+            self.chip, FreeRtos.of(self.image, self.chip.read), lambda why: None, self.chip.run
+        )
 
     def run(self, us: int) -> Why:
         """Run until that long after power-on, or until something stops the chip."""

@@ -15,7 +15,7 @@ from hil.laboratory.schedule import runs
 from hil.pictures import curves, monitor
 from hil.pictures.curves import Curves
 from hil.pictures.monitor import MARK_COLOURS, RATES, REFUSALS, Rates
-from hil.pictures.viewer.track import Track, mark_path, rgba, rgba_array
+from hil.pictures.viewer.track import RecordingTrack, mark_path, rgba, rgba_array
 
 PLOTS: Mapping[str, Curves] = {
     "position/error": curves.POSITION,
@@ -72,7 +72,7 @@ class ShownCurves:
 class Plots:
     """Draws curves, marks and states from the rows of a log."""
 
-    def __init__(self, track: Track, schema: pa.Schema) -> None:
+    def __init__(self, track: RecordingTrack, schema: pa.Schema) -> None:
         self._track, self._known = track, ShownCurves.of(schema)
         self._states = curves.lanes_of(schema.names)
         self._refusals = {

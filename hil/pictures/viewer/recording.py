@@ -22,7 +22,7 @@ from hil.pictures.links import HOST
 from hil.pictures.viewer.layout import LEGEND, blueprint
 from hil.pictures.viewer.plots import SLOW, Plots
 from hil.pictures.viewer.scene import Scene
-from hil.pictures.viewer.track import Track, timeline_of
+from hil.pictures.viewer.track import RecordingTrack, timeline_of
 
 RECORDING = "flight.rrd"
 APPLICATION = "floaty"
@@ -36,7 +36,7 @@ class RerunFlight:
     def __init__(self, recording: rr.RecordingStream, schema: pa.Schema) -> None:
         """Log everything static; `schema` is the log's, its metadata holds the configuration."""
         metadata = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
-        self._track = Track(recording, schema)
+        self._track = RecordingTrack(recording, schema)
         name = "real flight" if "cameras.x" in schema.names else f"seed {metadata.get('seed', '?')}"
         recording.send_recording_name(f"{metadata.get('experiment', 'flight')}, {name}")
         self._scene = Scene(self._track, schema)

@@ -12,7 +12,7 @@ from hil.devices.markers import DIAMETER, marker_places
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import BOX, body, column, is_real
 from hil.pictures import curves, scene
-from hil.pictures.viewer.track import Times, Track, rgba
+from hil.pictures.viewer.track import RecordingTrack, Times, rgba
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
 from hil.world.geometry import weigh
 
@@ -33,7 +33,7 @@ PARTS = ("base", "flap1", "flap2", "flap3", "flap4")
 class Scene:
     """Draws what has a place, from the rows of a log whose schema holds the configuration."""
 
-    def __init__(self, track: Track, schema: pa.Schema) -> None:
+    def __init__(self, track: RecordingTrack, schema: pa.Schema) -> None:
         config = json.loads((schema.metadata or {}).get(b"config", b"{}"))
         plant = {
             key: value for key, value in config.get("plant", {}).items() if key in PlantConfig.model_fields

@@ -22,7 +22,7 @@ def timeline_of(metadata: Mapping[bytes, bytes] | None) -> tuple[str, int]:
     return FROM_START, 0
 
 
-class Track:
+class RecordingTrack:
     """Writes to a recording, with times of the flight's log."""
 
     def __init__(self, recording: rr.RecordingStream, schema: pa.Schema) -> None:

@@ -15,7 +15,7 @@ from unicorn import UC_HOOK_BLOCK, UC_HOOK_CODE
 
 from firmware_py.config import parameters_of
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
-from firmware_py.export.arm_image import Image, build_image, build_meter
+from firmware_py.export.arm_image import CoreImage, build_image, build_meter
 from firmware_py.export.c99 import Translation, translate
 from firmware_py.export.cortex_m4 import CortexM4Runner
 from firmware_py.export.cycles import count
@@ -52,12 +52,12 @@ def core() -> Translation:
 
 
 @pytest.fixture(scope="module")
-def image(core: Translation) -> Image:
+def image(core: Translation) -> CoreImage:
     return build_image(core.source, core.header, BUILD)
 
 
 @pytest.fixture(scope="module")
-def optimised(core: Translation) -> Image:
+def optimised(core: Translation) -> CoreImage:
     return build_image(core.source, core.header, BUILD, "-O2")
 
 
@@ -71,7 +71,7 @@ class Listed:
     conditional: bool  # in an IT block: takes its time when it is skipped as well
 
 
-def listed(image: Image) -> list[Listed]:
+def listed(image: CoreImage) -> list[Listed]:
     reader = capstone.Cs(capstone.CS_ARCH_ARM, capstone.CS_MODE_THUMB | capstone.CS_MODE_MCLASS)
     found: list[Listed] = []
     index, written, left = 0, "", 0  # left: in the IT block
@@ -101,11 +101,11 @@ def cycles_of(name: str, operands: str) -> int:
     return next(CYCLES[stem] for suffix in CONDITIONS if (stem := name.removesuffix(suffix)) in CYCLES)
 
 
-def runner_of(image: Image) -> Callable[[CoreBlocks], CoreRunner]:
+def runner_of(image: CoreImage) -> Callable[[CoreBlocks], CoreRunner]:
     return lambda blocks: CortexM4Runner(blocks, image, build_meter(BUILD))
 
 
-def started(image: Image) -> tuple[CoreBlocks, CortexM4Runner]:
+def started(image: CoreImage) -> tuple[CoreBlocks, CortexM4Runner]:
     blocks = CoreBlocks(parameters_of(CONFIG), runner_of(image))
     assert isinstance(blocks.run, CortexM4Runner)
     blocks.run.call("reset")
@@ -204,7 +204,7 @@ def test_a_call_takes_the_instructions_and_cycles_of_its_way(
     assert all(instructions[at].conditional for at in Counter(passed) - Counter(starts))
 
 
-def test_looking_ahead_tells_the_cost_and_leaves_the_memory_alone(image: Image) -> None:
+def test_looking_ahead_tells_the_cost_and_leaves_the_memory_alone(image: CoreImage) -> None:
     (blocks, runner), (direct, other) = started(image), started(image)
     for tick in range(30):
         for each in (blocks, direct):
@@ -225,7 +225,7 @@ def test_looking_ahead_tells_the_cost_and_leaves_the_memory_alone(image: Image) 
     assert runner.usage == other.usage
 
 
-def test_what_was_seen_ahead_is_forgotten_when_the_inputs_change(image: Image) -> None:
+def test_what_was_seen_ahead_is_forgotten_when_the_inputs_change(image: CoreImage) -> None:
     (blocks, runner), (direct, other) = started(image), started(image)
     for each in (blocks, direct):
         feed(each, 1)
@@ -242,7 +242,7 @@ def test_what_was_seen_ahead_is_forgotten_when_the_inputs_change(image: Image) -
     assert memory(blocks) == memory(direct)
 
 
-def test_code_that_goes_astray_is_stopped(image: Image) -> None:
+def test_code_that_goes_astray_is_stopped(image: CoreImage) -> None:
     _, runner = started(
         replace(image, entries={**image.entries, "control": (FLASH + len(image.code) + 2) | 1})
     )
@@ -250,7 +250,7 @@ def test_code_that_goes_astray_is_stopped(image: Image) -> None:
         runner.call("control")
 
 
-def test_the_core_leaves_room_on_the_board(image: Image) -> None:
+def test_the_core_leaves_room_on_the_board(image: CoreImage) -> None:
     blocks, runner = started(image)
     for tick in range(50):
         feed(blocks, tick)
@@ -287,7 +287,7 @@ def test_code_that_cannot_be_a_core_is_refused_in_one_line(
 
 
 def test_what_is_built_is_not_compiled_again(
-    core: Translation, image: Image, monkeypatch: pytest.MonkeyPatch
+    core: Translation, image: CoreImage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("firmware_py.export.compilers.subprocess", None)
     assert build_image(core.source, core.header, BUILD) == image

@@ -39,7 +39,7 @@ def test_without_a_trace_the_calls_return_the_same_at_the_same_instants(name, mo
     """Then the kernel jumps over ticks at which nothing can happen; only what the runner itself records is left."""
     scenario = freertos_scenario.parse((VECTORS / f"{name}.txt").read_text())
     lines = []
-    run = freertos_scenario.Run(
+    run = freertos_scenario.ScenarioRun(
         scenario, mode == "preempt", lambda *record: lines.append(",".join(map(str, record))), traced=False
     )
     run.run()

@@ -9,7 +9,7 @@ from cflib.crtp.radiodriver import _RadioDriverThread
 from cflib.drivers.crazyradio import _radio_ack
 
 from hil.crazyflie.config import RadioConfig
-from hil.crazyflie.nrf51 import RESET_DELAY_US, Nrf51, Power, RadioSettings
+from hil.crazyflie.nrf51 import RESET_DELAY_US, AirSettings, Nrf51, Power
 from hil.crazyflie.shockburst import Air, air_us, exchange_us, syslink_us
 from hil.devices.dongle import VirtualDongle
 from hil.events import EventQueue
@@ -65,7 +65,7 @@ class DongleWithBoards:
         self.stms = [Stm() for _ in range(boards)]
         self.boards = [
             Nrf51(
-                RadioSettings(80, 2_000_000, ADDRESS[:4] + bytes((0xE7 - n,))),
+                AirSettings(80, 2_000_000, ADDRESS[:4] + bytes((0xE7 - n,))),
                 CHIP,
                 8,
                 self.events,
@@ -124,7 +124,7 @@ def test_empty_packets_do_not_reach_the_processor() -> None:
 @pytest.mark.parametrize("size", [1, 4, 28, 31])
 def test_an_exchange_takes_its_time_on_the_air_and_on_usb(rate: int, bits_per_second: int, size: int) -> None:
     bench = DongleWithBoards()
-    bench.boards[0].settings = RadioSettings(80, bits_per_second, ADDRESS)
+    bench.boards[0].settings = AirSettings(80, bits_per_second, ADDRESS)
     bench.tune(80, rate, ADDRESS)
     bench.exchange(bytes([0x10] * size))
     assert bench.events.now_us == pytest.approx(
@@ -163,7 +163,7 @@ def test_giving_up_takes_as_long_as_the_tries(
     rate: int, bits_per_second: int, retry_us: int, retries: int, channel: int, lost: dict[str, float]
 ) -> None:
     bench = DongleWithBoards(**lost)
-    bench.boards[0].settings = RadioSettings(80, bits_per_second, ADDRESS)
+    bench.boards[0].settings = AirSettings(80, bits_per_second, ADDRESS)
     bench.tune(channel, rate, ADDRESS)
     bench.dongle.control(0x06, retries, b"")
     assert bench.exchange(b"\x10hello") == b"\x00"
@@ -182,7 +182,7 @@ def test_ten_boards_hear_only_what_is_for_them() -> None:
 
 def test_a_broadcast_reaches_every_board_on_its_channel_once_and_nobody_answers() -> None:
     bench = DongleWithBoards(boards=3)
-    bench.boards[2].settings = RadioSettings(81, 2_000_000, ADDRESS)
+    bench.boards[2].settings = AirSettings(81, 2_000_000, ADDRESS)
     bench.tune(80, 2, bytes.fromhex("FFE7E7E7E7"))
     bench.dongle.control(0x10, 0, b"")
     answers: list[bytes] = []

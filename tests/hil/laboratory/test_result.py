@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from firmware_py.export.usage import Load, Usage
+from firmware_py.export.usage import EntryLoad, Usage
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
 from hil.errors import LabError
@@ -35,7 +35,7 @@ def result(tmp_path: Path) -> Result:
         own_metrics={"lap": Metric("s", "max", "time of a lap")},
         verdicts=(Verdict("rms_x", 0.01, 0.02, True, "m", "max"), Verdict("settle", math.nan, 0.5, False, "s", "max")),
         tasks=(TaskReport("KALMAN", 2, 50, 100, 900, 30, (1,) * 12, None, 0),), queues=(QueueReport("log", 5, 2, 0),),
-        usage=Usage(7530, 4820, 256, {"estimate": Load(3, 100, 120, 50, 60)}), ages=(Stage("pose", 40.5, 41.0),),
+        usage=Usage(7530, 4820, 256, {"estimate": EntryLoad(3, 100, 120, 50, 60)}), ages=(Stage("pose", 40.5, 41.0),),
         hash="ab" * 32, real_time_factor=12.34, stood_still_ms=0.0, folder=tmp_path,
     )  # fmt: skip
 

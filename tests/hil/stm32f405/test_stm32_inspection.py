@@ -13,7 +13,7 @@ from hil.stm32f405.chip import Why
 from hil.stm32f405.crash import CrashReports
 from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.image import Image
-from hil.stm32f405.processor import Processor
+from hil.stm32f405.processor import ChipProcessor
 from support.stm32_firmware import SOURCES
 from support.stm32_machine import FirmwareOnChip
 
@@ -144,7 +144,7 @@ def test_a_call_through_a_null_pointer_is_a_change_to_arm_code(compiler: str) ->
     )
 
 
-def stopped(machine: FirmwareOnChip, why: Why) -> tuple[Processor, CrashReports]:
+def stopped(machine: FirmwareOnChip, why: Why) -> tuple[ChipProcessor, CrashReports]:
     """Run until something is noticed."""
     processor = machine.processor()
     assert run_to_end(machine, 100) == why
