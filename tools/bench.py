@@ -22,7 +22,7 @@ from heapq import heapreplace
 from pathlib import Path
 
 import numpy as np
-from bench_kernel import kernel_us_per_activation, simpy_us_per_activation
+from bench_kernel import kernel_run, simpy_run, us_per_activation
 from rich.console import Console
 from rich.table import Table
 
@@ -241,7 +241,7 @@ def main() -> None:
     part("core: estimator tick (100 Hz)", estimate_us, 0.1)
     part("core: controller tick (100 Hz)", control_us, 0.1)
     part("plant: one millisecond", plant_us(), 1.0)
-    kernel_us, simpy_us = kernel_us_per_activation(), simpy_us_per_activation()
+    kernel_us, simpy_us = us_per_activation(kernel_run), us_per_activation(simpy_run)
     part("scheduler: one activation (4 per ms)", kernel_us, 4.0)
     figures.add("simpy on the same scenario", simpy_us, "us", f"{simpy_us / kernel_us:.1f} x ours")
     part("recorder and telemetry log, per ms", (recorded - bare) / simulated_s * 1e3, 1.0)

@@ -17,11 +17,9 @@ from firmware_py.rtos import TICK_US, Kernel, Queue, Semaphore
 
 ACTIVATIONS_PER_TICK = 4
 IMU_PHASE_US = 300
-# Of sensors, stabilizer before and after the tick, estimator; where work is switched on.
-WORK_US = (30, 50, 50, 200)
 
 
-def kernel_run(ticks: int, work: bool = False) -> int:
+def kernel_run(ticks: int) -> int:
     """Run the pattern for `ticks` milliseconds of simulated time; return the number of samples that arrived."""
     kernel = Kernel()
     imu_ready = kernel.create_binary_semaphore("imu_ready")
@@ -33,27 +31,19 @@ def kernel_run(ticks: int, work: bool = False) -> int:
     def sensors() -> Generator[int, None, None]:
         while True:
             yield from imu_ready.take()
-            if work:
-                yield from kernel.work(WORK_US[0])
             yield from samples.send(1, 0)
             yield from sample_ready.give()
 
     def stabilizer() -> Generator[int, None, None]:
         while True:
             yield from sample_ready.take()
-            if work:
-                yield from kernel.work(WORK_US[1])
             yield from kernel.delay_until(kernel.tick_count + 1)
-            if work:
-                yield from kernel.work(WORK_US[2])
             yield from run_estimator.give()
 
     def estimator() -> Generator[int, None, None]:
         nonlocal arrived
         while True:
             yield from run_estimator.take()
-            if work:
-                yield from kernel.work(WORK_US[3])
             while (sample := samples.receive_nowait()) is not None:
                 arrived += sample
 
@@ -119,26 +109,11 @@ def simpy_run(ticks: int) -> int:
     return arrived
 
 
-def kernel_us_per_activation(ticks: int = 20_000, work: bool = False) -> float:
-    """Return the best of three runs of our kernel [us]."""
-    return _best_us(lambda: kernel_run(ticks, work), ticks)
-
-
-def simpy_us_per_activation(ticks: int = 20_000) -> float:
-    """Return the best of three runs of simpy [us]."""
-    return _best_us(lambda: simpy_run(ticks), ticks)
-
-
-def _best_us(run: Callable[[], int], ticks: int) -> float:
+def us_per_activation(run: Callable[[int], int], ticks: int = 20_000) -> float:
+    """Return the best of three runs [us]."""
     seconds = []
     for _ in range(3):
         start = perf_counter()
-        run()
+        run(ticks)
         seconds.append(perf_counter() - start)
     return min(seconds) * 1e6 / (ticks * ACTIVATIONS_PER_TICK)
-
-
-if __name__ == "__main__":
-    print(f"kernel                   {kernel_us_per_activation():6.3f} us per activation")
-    print(f"kernel, tasks that work  {kernel_us_per_activation(work=True):6.3f} us per activation")
-    print(f"simpy                    {simpy_us_per_activation():6.3f} us per activation")

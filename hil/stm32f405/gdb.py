@@ -11,7 +11,7 @@ from collections.abc import Callable
 from hil.errors import LabError
 from hil.stm32f405.chip import Chip, Why
 from hil.stm32f405.freertos import FreeRtos
-from hil.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol, Threads, Wish
+from hil.stm32f405.gdb_protocol import SIGINT, SIGTRAP, Debuggee, RemoteProtocol, Wish
 
 HOST = "127.0.0.1"
 READ_SIZE = 4096
@@ -30,11 +30,11 @@ class GdbServer:
             raise LabError(f"--gdb {port}: {error.strerror or error}") from None
         self._listener.setblocking(True)
 
-    def attach(self, debuggee: Debuggee, threads: Threads | None = None) -> None:
-        """Let it be this machine from now on; who debugged another one has to come again."""
+    def attach(self, debuggee: Debuggee, kernel: FreeRtos | None = None) -> None:
+        """Switch to this machine and its tasks; a client of the previous one must reconnect."""
         self._part()
-        self._debuggee, self._threads = debuggee, threads
-        self._protocol = RemoteProtocol(debuggee, threads)
+        self._debuggee, self._kernel = debuggee, kernel
+        self._protocol = RemoteProtocol(debuggee, kernel)
 
     @property
     def port(self) -> int:
@@ -77,7 +77,7 @@ class GdbServer:
         self._waiting(self.port)
         self._client, _ = self._listener.accept()
         self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._protocol = RemoteProtocol(self._debuggee, self._threads)
+        self._protocol = RemoteProtocol(self._debuggee, self._kernel)
 
     def _receive(self) -> None:
         """Answer what comes next; who hangs up has let the machine go."""
@@ -105,32 +105,11 @@ class GdbServer:
             self._client = None
 
 
-class TaskThreads:
-    """The tasks of FreeRTOS as a debugger's threads, by the addresses of their control blocks."""
-
-    def __init__(self, kernel: FreeRtos) -> None:
-        self._kernel = kernel
-
-    @property
-    def running(self) -> int:
-        """The task that has the processor, 1 before the scheduler has begun."""
-        return self._kernel.current_block if self._kernel.running else 1
-
-    def all(self) -> dict[int, str]:
-        """Return name, state and priority of each."""
-        tasks = self._kernel.tasks() if self._kernel.running else []
-        return {task.block: f"{task.name}, {task.state}, priority {task.priority}" for task in tasks}
-
-    def registers(self, thread: int) -> dict[str, int]:
-        """Return what lies on a task's stack."""
-        return self._kernel.saved_registers(thread)
-
-
 class DebuggedChip:
     """Runs a chip as its debugger wants it; at first it waits for one."""
 
     def __init__(self, chip: Chip, server: GdbServer, kernel: FreeRtos | None = None) -> None:
-        server.attach(chip, None if kernel is None else TaskThreads(kernel))
+        server.attach(chip, kernel)
         self._chip, self._server = chip, server
         self._wish = Wish.STAND
 

@@ -9,6 +9,7 @@ from enum import Enum, auto
 from typing import Protocol
 
 from hil.errors import LabError
+from hil.stm32f405.freertos import FreeRtos
 
 PACKET_SIZE = 0x4000
 SIGINT, SIGTRAP = 2, 5
@@ -47,37 +48,6 @@ class Debuggee(Protocol):
     def set_register(self, name: str, value: int) -> None:
         """Change a register."""
         ...
-
-
-class Threads(Protocol):
-    """The tasks of a scheduler, by numbers above 0."""
-
-    @property
-    def running(self) -> int:
-        """The one whose registers are the machine's."""
-        ...
-
-    def all(self) -> dict[int, str]:
-        """Return what GDB shows of each; empty while there is no scheduler."""
-        ...
-
-    def registers(self, thread: int) -> dict[str, int]:
-        """Return what is kept of the registers of one that does not run; raises `LabError` where nothing is."""
-        ...
-
-
-class NoThreads:
-    """A machine without a scheduler."""
-
-    running = 1
-
-    def all(self) -> dict[int, str]:
-        """Return nothing."""
-        return {}
-
-    def registers(self, thread: int) -> dict[str, int]:
-        """Raise `LabError`."""
-        raise LabError(f"no thread {thread}")
 
 
 class Wish(Enum):
@@ -148,9 +118,9 @@ class Framing:
 class RemoteProtocol:
     """One debugger at one machine: what it asks is answered, what it wants of the machine stands in `wish`."""
 
-    def __init__(self, debuggee: Debuggee, threads: Threads | None = None) -> None:
-        self._debuggee = debuggee
-        self._threads: Threads = threads or NoThreads()
+    def __init__(self, debuggee: Debuggee, kernel: FreeRtos | None = None) -> None:
+        """`kernel` has the tasks that are GDB's threads, each by the address of its control block."""
+        self._debuggee, self._kernel = debuggee, kernel
         self._thread = 0  # whose registers are asked for; 0: those of the machine
         self._framing = Framing(bytearray())
         self._items: list[bytes] = []
@@ -241,11 +211,13 @@ class RemoteProtocol:
 
     def _stop_reply(self, watched: int | None = None) -> bytes:
         why = b"" if watched is None else b"watch:%x;" % watched
-        return b"T%02x%sthread:%x;" % (self._signal, why, self._threads.running)
+        return b"T%02x%sthread:%x;" % (self._signal, why, self._running)
 
     def _registers(self, numbers: Iterable[int]) -> bytes:
         """Return registers of the selected thread; `x` for what is not kept of it."""
-        kept = None if self._is_machine() else self._threads.registers(self._thread)
+        kept = None
+        if self._kernel is not None and not self._is_machine():
+            kept = self._kernel.saved_registers(self._thread)
         found = b""
         for name, size in map(_known, numbers):
             if kept is None or (name, size) in SYSTEM:  # what the processor has only once
@@ -256,12 +228,18 @@ class RemoteProtocol:
         return found
 
     def _is_machine(self) -> bool:
-        return self._thread in (0, self._threads.running)
+        return self._thread in (0, self._running)
+
+    @property
+    def _running(self) -> int:
+        """The thread whose registers are the machine's: 1 without a scheduler."""
+        return self._kernel.current_block if self._kernel is not None and self._kernel.running else 1
 
     def _all_threads(self) -> dict[int, str]:
         """Return all, the running one first, which alone is there without a scheduler."""
-        running, every = self._threads.running, self._threads.all()
-        return {running: every.get(running, "")} | every
+        tasks = self._kernel.tasks() if self._kernel is not None and self._kernel.running else []
+        every = {task.block: f"{task.name}, {task.state}, priority {task.priority}" for task in tasks}
+        return {self._running: every.get(self._running, "")} | every
 
     def _select(self, rest: bytes) -> bytes:
         """Take the thread whose registers are meant; which one runs on is not chosen."""
@@ -328,7 +306,7 @@ class RemoteProtocol:
             return self._all_threads().get(_hex(rest.partition(b",")[2]), "").encode().hex().encode()
         if rest == b"fThreadInfo":
             return b"m" + b",".join(b"%x" % thread for thread in self._all_threads())
-        fixed = {b"Attached": b"1", b"C": b"QC%x" % self._threads.running, b"sThreadInfo": b"l"}
+        fixed = {b"Attached": b"1", b"C": b"QC%x" % self._running, b"sThreadInfo": b"l"}
         return fixed.get(rest, b"")
 
     def _set(self, rest: bytes) -> bytes:
