@@ -10,7 +10,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -44,11 +45,11 @@ class MissingError(Exception):
     """A program that makes a picture is not there."""
 
 
-def floaty(*arguments: str) -> None:
-    """Fly; a limit that fails is no error here."""
-    ran = subprocess.run([BIN / "floaty", *arguments], stdout=subprocess.DEVNULL)
+def floaty(command: str) -> None:
+    """Run a command of floaty; a limit that fails is no error here."""
+    ran = subprocess.run([BIN / "floaty", *command.split()], stdout=subprocess.DEVNULL)
     if ran.returncode > 1:
-        raise RuntimeError(f"floaty {' '.join(arguments)}: exit code {ran.returncode}")
+        raise RuntimeError(f"floaty {command}: exit code {ran.returncode}")
 
 
 def program(*names: str) -> str:
@@ -65,68 +66,50 @@ def scene(run: Path, at_s: float, out: Path) -> None:
 
     recording = ServedRecording(run)
     # The mouse pointer stands in the middle of the screen: below the window, where it lights nothing up.
-    command = [
-        program("xvfb-run"),
-        "-a",
-        "-s",
-        "-screen 0 3200x4400x24",
-        str(BIN / "rerun"),
-        recording.at(at_s),
-    ]
-    subprocess.run(
-        [*command, "--port", "0", "--screenshot-to", str(out), "--window-size", "1600x1000"],
-        check=True, stderr=subprocess.DEVNULL, timeout=180,
-    )  # fmt: skip
+    screen = [program("xvfb-run"), "-a", "-s", "-screen 0 3200x4400x24"]
+    viewer = [str(BIN / "rerun"), recording.at(at_s), "--port", "0", "--screenshot-to", str(out)]
+    command = [*screen, *viewer, "--window-size", "1600x1000"]
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL, timeout=180)
     with Image.open(out) as picture:
         picture.convert("RGB").resize((1600, 1000), Image.Resampling.LANCZOS).save(out, optimize=True)
 
 
 def hover(out: Path) -> None:
-    floaty(
-        "fly",
-        "hover",
-        "--duration",
-        "10",
-        "--fault",
-        "push.y@4=1.5",
-        "--fault",
-        "mocap.dropout@7.5=1",
-        "--out",
-        "run",
-    )
+    floaty("fly hover --duration 10 --fault push.y@4=1.5 --fault mocap.dropout@7.5=1 --out run")
     scene(Path("run"), 4.35, out)
 
 
 def markers(out: Path) -> None:
-    hidden = ("--set", "markers.enabled=true", "--fault", "marker.hidden@1=2")
-    floaty("fly", "hover", "--duration", "3", *hidden, "--out", "run")
+    floaty("fly hover --duration 3 --set markers.enabled=true --fault marker.hidden@1=2 --out run")
     scene(Path("run"), 2.0, out)
     with Image.open(out) as picture:
         picture.crop((0, 64, 890, 736)).save(out, optimize=True)
 
 
 def report(out: Path) -> None:
-    faults = ("--fault", "push.y@2=2", "--fault", "mocap.dropout@4:0.6")
-    floaty("fly", "hover", "--duration", "6", *faults, "--out", "run")
+    floaty("fly hover --duration 6 --fault push.y@2=2 --fault mocap.dropout@4:0.6 --out run")
     page = (Path("run") / "report.html").resolve().as_uri()
-    subprocess.run(
-        [
-            program("chromium", "chromium-browser", "google-chrome"), "--headless", "--no-sandbox", "--hide-scrollbars",
-            "--window-size=1000,2480", "--virtual-time-budget=8000", f"--screenshot={out}", page,
-        ],
-        check=True, stderr=subprocess.DEVNULL, timeout=120,
-    )  # fmt: skip
+    browser = program("chromium", "chromium-browser", "google-chrome")
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--hide-scrollbars",
+        "--window-size=1000,2480",
+        "--virtual-time-budget=8000",
+    ]
+    command = [browser, *options, f"--screenshot={out}", page]
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL, timeout=120)
 
 
 def latency(out: Path) -> None:
-    floaty("study", "latency", "--out", "study")
+    floaty("study latency --out study")
     shutil.copy(next(Path("study").rglob("study-latency.png")), out)
 
 
 def real_flight(out: Path) -> None:
     """Fly a served robot with the ground station of real flights, and show what that has recorded."""
     with served():
-        floaty("station", "--link", SERVED, "--duration", "10", "--out", "run")
+        floaty(f"station --link {SERVED} --duration 10 --out run")
     scene(Path("run"), 4.0, out)
 
 
@@ -140,19 +123,16 @@ def cfclient(out: Path) -> None:
         )
 
 
-class served:  # noqa: N801 - read as a word: with served()
-    """A robot that `floaty serve` flies while the block runs."""
-
-    def __init__(self, *options: str) -> None:
-        self._command = [BIN / "floaty", "serve", *options]
-
-    def __enter__(self) -> None:
-        self._server = subprocess.Popen(self._command, stdout=subprocess.DEVNULL)
+@contextmanager
+def served(*options: str) -> Iterator[None]:
+    """Let `floaty serve` fly a robot while the block runs."""
+    server = subprocess.Popen([BIN / "floaty", "serve", *options], stdout=subprocess.DEVNULL)
+    try:
         time.sleep(5.0)  # until it listens
-
-    def __exit__(self, *failure: object) -> None:
-        self._server.terminate()
-        self._server.wait()
+        yield
+    finally:
+        server.terminate()
+        server.wait()
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import PurePath
 from struct import unpack, unpack_from
-from typing import Protocol
 
 from hil.errors import LabError
 from hil.stm32f405.call_frames import LR, PC, SP
+from hil.stm32f405.chip import Chip
 from hil.stm32f405.freertos import FreeRtos, stacked_registers
 from hil.stm32f405.image import Image
 
@@ -42,23 +42,6 @@ MMFAR_VALID, BFAR_VALID = 1 << 7, 1 << 15
 VECTOR_UNREADABLE = 1 << 1  # in HFSR
 
 
-class Machine(Protocol):
-    """A machine that stands still; memory includes the registers of the system control block."""
-
-    @property
-    def task_return(self) -> int:
-        """EXC_RETURN of the last exception that has interrupted a task."""
-        ...
-
-    def read(self, address: int, size: int) -> bytes:
-        """Return memory; raises `LabError` where there is none."""
-        ...
-
-    def register(self, name: str) -> int:
-        """Return r0 to r12, sp, lr, pc, xpsr, msp or psp."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Crash:
     """Why the firmware did not go on."""
@@ -74,11 +57,11 @@ class Crash:
 
 
 class CrashReports:
-    """The crashes of one image on one machine."""
+    """The crashes of one image on one chip."""
 
-    def __init__(self, image: Image, machine: Machine, kernel: FreeRtos | None, assertion: str) -> None:
+    def __init__(self, image: Image, chip: Chip, kernel: FreeRtos | None, assertion: str) -> None:
         """Watch the fault handlers and `assertion`, a function of three arguments: expression, file and line."""
-        self._image, self._machine, self._kernel = image, machine, kernel
+        self._image, self._chip, self._kernel = image, chip, kernel
         self._handlers = {self._vector(number) & ~1 for number in FAULTS}
         self._assertion = image.symbol(assertion).address if image.has(assertion) else 0
 
@@ -89,7 +72,7 @@ class CrashReports:
 
     def here(self) -> Crash:
         """Return what happened, at one of `addresses`."""
-        if self._machine.register("pc") == self._assertion:
+        if self._chip.register("pc") == self._assertion:
             return self._assertion_failed()
         return self._fault()
 
@@ -128,12 +111,12 @@ class CrashReports:
         )
 
     def _here(self, what: str) -> Crash:
-        number = self._machine.register("xpsr") & 0x1FF
+        number = self._chip.register("xpsr") & 0x1FF
         return Crash(what, self._who(number), self._trace(self._registers()))
 
     def _assertion_failed(self) -> Crash:
-        expression, file = (self._text(self._machine.register(name)) for name in ("r0", "r1"))
-        line = self._machine.register("r2")
+        expression, file = (self._text(self._chip.register(name)) for name in ("r0", "r1"))
+        line = self._chip.register("r2")
         crash = self._here(f"assertion {expression} failed at {file}:{line}")
         return Crash(
             crash.what, crash.who, self._with_place(f"{PurePath(file).name}:{line}", crash.trace[1:])
@@ -148,16 +131,16 @@ class CrashReports:
         return (place, *trace[1 if same else 0 :])
 
     def _fault(self) -> Crash:
-        exc_return = self._machine.register("lr")
-        frame = self._machine.register("psp" if exc_return & USES_PSP else "msp")
-        number = self._machine.register("xpsr") & 0x1FF
+        exc_return = self._chip.register("lr")
+        frame = self._chip.register("psp" if exc_return & USES_PSP else "msp")
+        number = self._chip.register("xpsr") & 0x1FF
         what = (
             f"{FAULTS[number]}: {self._reasons()}"
             if number in FAULTS
             else f"{self._who(number)} is not handled"
         )
         try:
-            stacked = stacked_registers(self._machine.read, frame, exc_return)
+            stacked = stacked_registers(self._chip.read, frame, exc_return)
         except LabError:
             return Crash(f"{what}; there is no memory at its stack pointer, 0x{frame:08x}", self._who(0), ())
         if self._word(CFSR) & NOT_STACKED:
@@ -198,10 +181,10 @@ class CrashReports:
         assert self._kernel is not None
         if task != self._kernel.current_block:
             return self._numbered(self._kernel.saved_registers(task))
-        if not self._machine.register("xpsr") & 0x1FF:
+        if not self._chip.register("xpsr") & 0x1FF:
             return self._registers()
-        psp, exc_return = self._machine.register("psp"), self._machine.task_return
-        return self._numbered(stacked_registers(self._machine.read, psp, exc_return))
+        psp, exc_return = self._chip.register("psp"), self._chip.task_return
+        return self._numbered(stacked_registers(self._chip.read, psp, exc_return))
 
     def _trace(self, registers: dict[int, int]) -> tuple[str, ...]:
         """Return the places of a backtrace, as far as the stack can be read and functions were called."""
@@ -228,11 +211,11 @@ class CrashReports:
 
     def _registers(self) -> dict[int, int]:
         """Return r0 to pc as they are, by number."""
-        return {number: self._machine.register(name) for number, name in enumerate(NAMES)}
+        return {number: self._chip.register(name) for number, name in enumerate(NAMES)}
 
     def _numbered(self, registers: dict[str, int]) -> dict[int, int]:
         """Return r0 to pc by number; what was not kept is as it is now."""
-        return {n: registers.get(name, self._machine.register(name)) for n, name in enumerate(NAMES)}
+        return {n: registers.get(name, self._chip.register(name)) for n, name in enumerate(NAMES)}
 
     def _vector(self, exception: int) -> int:
         offset = 4 * exception
@@ -243,10 +226,10 @@ class CrashReports:
     def _text(self, address: int) -> str:
         """Return a string of the image's constants; its address when there is none."""
         try:
-            text = self._machine.read(address, LONGEST_TEXT).partition(b"\0")[0].decode("ascii")
+            text = self._chip.read(address, LONGEST_TEXT).partition(b"\0")[0].decode("ascii")
         except (LabError, UnicodeDecodeError):
             return f"0x{address:08x}"
         return text
 
     def _word(self, address: int) -> int:
-        return int(unpack("<I", self._machine.read(address, 4))[0])
+        return int(unpack("<I", self._chip.read(address, 4))[0])
