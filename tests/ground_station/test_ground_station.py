@@ -1,7 +1,7 @@
 """Frames in, corrections out, telemetry into the log."""
 
 import csv
-from math import inf, isnan, nan, pi
+from math import isnan, pi
 
 import numpy as np
 import pytest
@@ -136,34 +136,6 @@ def test_untracked_frames_are_never_sent_and_the_slots_keep_their_phase():
     bench.frames(20, valid=lambda number: number not in (4, 5, *range(8, 15)))
     assert bench.numbers() == [0, 6, 15, 16]
     assert bench.station.counters.invalid == 9
-
-
-def test_a_frame_without_a_pose_is_not_sent():
-    bench = StationWithPackets(corrections_hz=200.0)
-    bench.frames(3, p=lambda number: (nan, 0.0, 0.0) if number == 1 else (0.001 * number, 0.0, 1.15))
-    assert bench.numbers() == [0, 2]
-    assert bench.station.counters.invalid == 1
-
-
-@pytest.mark.parametrize("tracked", [False, True])
-@pytest.mark.parametrize(
-    ("p", "q"),
-    [
-        ((0.0, nan, 0.0), UPRIGHT),
-        ((0.0, 0.0, inf), UPRIGHT),
-        ((2000.0, 0.0, 0.0), UPRIGHT),
-        (HOME.p_WG, (0.0, 0.0, 0.0, 0.0)),
-        (HOME.p_WG, (nan, 0.0, 0.0, 1.0)),
-        (HOME.p_WG, (0.0, 1.05, 0.0, 0.0)),
-    ],
-)
-def test_what_is_no_pose_gets_no_further_than_the_station_s_border(tracked, p, q):
-    bench = StationWithPackets(
-        corrections_hz=200.0, tracker=Tracker(TrackerConfig(), 5000) if tracked else None
-    )
-    for number in range(10):
-        bench.station.on_frame(MocapFrame(5000 * number, p, q, True), 5000 * number + 38_000)
-    assert (bench.sent, bench.station.counters.invalid) == ([], 10)
 
 
 def test_refused_frames_are_not_sent_and_the_next_good_one_takes_their_place():

@@ -8,7 +8,7 @@ from math import pi
 import numpy as np
 import pymavlink.dialects.v20.common as dialect
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -317,20 +317,6 @@ def test_what_is_read_late_counts_from_its_arrival():
 
 
 # What goes wrong
-
-
-@settings(max_examples=300)
-@given(
-    st.lists(
-        st.binary(max_size=60)
-        | st.sampled_from([message.pack(LinkWithCodec().codec) for message in telemetry(20)])
-    )
-)
-def test_whatever_comes_nothing_is_raised(pieces):
-    bench = LinkWithCodec()
-    bench.pose(0)
-    for k, piece in enumerate(pieces):
-        bench.link.receive(1000 * k, piece)
 
 
 def test_lost_and_broken_frames_are_counted():

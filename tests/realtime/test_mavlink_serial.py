@@ -173,13 +173,6 @@ def test_why_there_is_no_connection_is_said(
         link_to(peers(talk, board_key), station_key).open(lambda: False)
 
 
-def test_connecting_ends_when_it_is_told_to(peers: Callable[..., Peer]) -> None:
-    begin_s = time.monotonic()
-    with pytest.raises(LinkError, match="stopped while connecting"):
-        link_to(peers(silent)).open(lambda: True)
-    assert time.monotonic() - begin_s < 4.0
-
-
 def test_a_port_has_one_user(peers: Callable[..., Peer]) -> None:
     peer = peers(board)
     link = link_to(peer)
@@ -203,21 +196,6 @@ def wait_until(reached: Callable[[], bool]) -> None:
     while not reached():
         assert time.monotonic() < deadline
         time.sleep(0.005)
-
-
-def test_poses_go_out_as_they_come_and_stale_ones_do_not(peers: Callable[..., Peer]) -> None:
-    peer = peers(board)
-    link = link_to(peer)
-    link.open(lambda: False)
-    for k in range(20):
-        sent = link.summary()
-        link.send(clock_us(), fresh(k), HOME)
-        wait_until(lambda sent=sent: link.summary() != sent)
-    link.send(clock_us(), MocapFrame(clock_us() - 130_000, HOME.p_WG, (1.0, 0.0, 0.0, 0.0), True), HOME)
-    wait_until(lambda: "20 sent, 1 late" in link.summary())
-    link.close()
-    poses = [message for message in peer.heard if message.get_type() == "ATT_POS_MOCAP"]
-    assert [round(1000 * message.x) for message in poses] == list(range(20))
 
 
 def test_a_stuck_line_makes_nobody_wait_and_is_a_lost_one(peers: Callable[..., Peer]) -> None:

@@ -224,15 +224,6 @@ def test_a_broadcast_is_lost_for_each_board_on_its_own() -> None:
     assert len(heard[0] & heard[1]) / 2000 == pytest.approx(0.36, abs=0.04)
 
 
-def test_without_acknowledgements_a_packet_is_sent_once() -> None:
-    bench = DongleWithBoards(uplink_loss=0.5)
-    bench.dongle.control(0x10, 0, b"")
-    for _ in range(1000):
-        bench.dongle.transmit(bench.events.now_us, b"\x10hello", lambda _, answer: None)
-        bench.wait(5000)
-    assert len(bench.stms[0].packets) / 1000 == pytest.approx(0.5, abs=0.05)
-
-
 @pytest.mark.parametrize(
     ("command", "value", "channel", "rate"),
     [(1, 90, 90, 2), (1, 126, 80, 2), (2, 0, 80, 0), (2, 1, 80, 1), (2, 3, 80, 2), (3, 2, 80, 2)],

@@ -1,5 +1,6 @@
 """Edges of the pytest plugin's choices and folders, without a flight."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +10,7 @@ import pytest
 from hil.config import load_config
 from hil.devices.imu_counts import COS, SIN
 from hil.testing.board import BareBoard
-from hil.testing.choices import Choice, Marked, name_of
+from hil.testing.choices import Choice, name_of
 from hil.testing.flights import NAME_MAX, SHOWN, Item, folder_of, shown_of
 from hil.testing.strategies import _round_step
 
@@ -22,11 +23,6 @@ def test_a_name_tells_only_what_differs_between_the_choices() -> None:
     assert name_of(Choice(), [Choice()]) == ""
 
 
-def test_as_many_seeds_as_the_mark_says_from_one_on() -> None:
-    assert Marked.of({"seeds": 1}).seeds == (1,)
-    assert Marked.of({"seeds": 3}).seeds == (1, 2, 3)
-
-
 @pytest.mark.parametrize("count", [1, SHOWN, SHOWN + 1])
 def test_of_a_few_flights_all_are_shown_and_of_more_the_last(count: int) -> None:
     flown: Any = [SimpleNamespace(number=number) for number in range(count)]
@@ -35,10 +31,20 @@ def test_of_a_few_flights_all_are_shown_and_of_more_the_last(count: int) -> None
 
 
 def test_names_that_differ_in_what_a_folder_cannot_have_get_folders_of_their_own() -> None:
-    names = ["test_a[1]", "test_a-1", "test_a(1)", "test_a" + "x" * NAME_MAX, "test_b" + "x" * NAME_MAX]
+    names = [
+        "a[1]",
+        "a-1",
+        "a(1)",
+        "a.py::test[x/y]",
+        "a.py::test[x y]",
+        "a" * NAME_MAX,
+        "a" * (NAME_MAX + 1),
+    ]
+    names += ["x" * (NAME_MAX + 20), "x" * (NAME_MAX + 20) + "y"]
     folders = [folder_of(name) for name in names]
     assert len(set(folders)) == len(names)
-    assert folders[1] == "test_a-1"
+    assert folders[1] == "a-1"
+    assert all(re.fullmatch(r"[\w.-]{1,100}", folder) for folder in folders)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from hil.api import load_run
 from hil.errors import LabError
 from hil.testing import choices
 from hil.testing.choices import Choice, Marked, Wanted, choices_of, why_not
-from hil.testing.flights import folder_of
 from support.command import Cli
 from support.examples import FILE, blocks
 from support.own_logic import LAW, make_project
@@ -205,13 +204,6 @@ def test_what_a_fixture_of_the_module_has_flown_can_be_looked_at_by_every_test(
         """)
     pytester.runpytest_inprocess().assert_outcomes(passed=2)
     assert kept(pytester) == []
-
-
-def test_no_two_tests_share_a_folder() -> None:
-    names = ["a.py::test[x/y]", "a.py::test[x-y]", "a.py::test[x y]", "a.py-test-x-y", "a" * 300, "a" * 301]
-    folders = [folder_of(name) for name in names]
-    assert len(set(folders)) == len(names)
-    assert all(re.fullmatch(r"[\w.-]{1,100}", folder) for folder in folders)
 
 
 # What is flown
