@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from hil.stm32f405.image import Image
 from support import stm32_firmware
 from support.bare_cortex import BareCortex
 from support.paths import ROOT
+from support.serving import FLOATY
 from support.stm32_machine import FirmwareOnChip
 
 GDB = "gdb-multiarch"
@@ -150,18 +150,7 @@ def test_gdb_shows_tasks_and_stops_at_a_write() -> None:
 
 def test_a_flight_that_stood_at_breakpoints_has_the_hash_of_one_that_did_not(tmp_path: Path) -> None:
     elf = str(stm32_firmware.build())
-    command = [
-        sys.executable,
-        "-m",
-        "hil.commands",
-        "fly",
-        "hover",
-        "--duration",
-        "0.2",
-        "--board",
-        elf,
-        "--out",
-    ]
+    command = [*FLOATY, "fly", "hover", "--duration", "0.2", "--board", elf, "--out"]
     alone = subprocess.run(
         [*command, str(tmp_path / "alone")], cwd=ROOT, capture_output=True, text=True, timeout=300
     )

@@ -7,7 +7,6 @@ import re
 import select
 import socket
 import subprocess
-import sys
 import threading
 import time
 import tty
@@ -28,10 +27,9 @@ from ground_station.links.mavlink import MavlinkLinkConfig
 from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
-from support.serving import CAMERAS, Served, serve, station
+from support.serving import CAMERAS, FLOATY, Served, serve, station
 from support.telemetry_rows import is_whole
 
-FLOATY = (sys.executable, "-m", "hil.commands")
 PATIENCE_S = 40.0
 KEY = hashlib.sha256(b"floaty").hexdigest()
 HOME = Goal((0.0, 0.0, 1.15), 0.0)

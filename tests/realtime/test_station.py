@@ -1,7 +1,6 @@
 """The ground station of a laboratory, in real time: cameras while a board connects, records and what they are good for."""
 
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,9 +19,7 @@ from ground_station.sources.replay import read_frames
 from ground_station.station import GroundStation
 from ground_station.trajectory import Goal, Hold
 from support.motive_bench import moving
-from support.serving import serve
-
-FLOATY = (sys.executable, "-m", "hil.commands")
+from support.serving import FLOATY, serve
 
 
 class SlowLink:

@@ -15,10 +15,9 @@ from hil.errors import LabError
 from hil.laboratory.recorder import load_log
 from hil.live.window import DISPLAYS
 from support.command import Cli
+from support.serving import FLOATY
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
-
-FLOATY = (sys.executable, "-m", "hil.commands")
 
 
 def test_fly_writes_everything_and_says_where(cli: Cli, tmp_path: Path) -> None:

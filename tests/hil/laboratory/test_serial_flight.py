@@ -1,7 +1,6 @@
 """Whole flights over the serial line: limits at every baud rate, determinism, wrong bits, signatures, what does not fit."""
 
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,8 +17,8 @@ from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.result import Result
 from hil.laboratory.run import Request, fly, prepare
 from hil.pictures.figures import PICTURES
+from support.serving import FLOATY
 
-FLOATY = (sys.executable, "-m", "hil.commands")
 KEY = "5a" * 32
 
 

@@ -15,8 +15,33 @@ from hil.laboratory.recorder import Channel, Quantity, Recorder, load_log
 from hil.laboratory.run import Request, fly, prepare
 from hil.live import feed
 from hil.live.feed import Feed, LiveView
-from support import pictures
-from support.pictures import picture
+
+# Pictures that do not behave, in place of `hil.live.picture`; what they do is their whole program.
+STALLS = "print('ready', flush=True); import signal; signal.pause()"
+IS_CLOSED = """
+import pyarrow as pa, sys
+print('ready', flush=True)
+reader = pa.ipc.open_stream(sys.stdin.buffer)
+print('taken', reader.read_next_batch().num_rows, flush=True)
+"""  # in mid-flight
+NEVER_COMES_UP = "import signal; signal.pause()"
+FAILS = "print('failed no such screen', flush=True)"
+DIES = "raise SystemExit"
+TAKES_ALL = """
+import pyarrow as pa, sys
+print('ready here', flush=True)
+reader, taken = pa.ipc.open_stream(sys.stdin.buffer), 0
+for batch in reader:
+    taken += batch.num_rows
+    print('taken', taken, flush=True)
+print('typed set a.b 2.0', flush=True)
+"""
+
+
+def picture(program: str) -> list[str]:
+    """The command of a picture."""
+    return [sys.executable, "-c", program]
+
 
 SCHEMA = pa.schema([("t", pa.int64())])
 
@@ -39,25 +64,25 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize(
     ("program", "taken"),
     [
-        (pictures.STALLS, range(1)),
-        (pictures.IS_CLOSED, range(20, 150)),
-        (pictures.NEVER_COMES_UP, range(1)),
-        (pictures.TAKES_ALL, range(150, 151)),
+        (STALLS, range(1)),
+        (IS_CLOSED, range(20, 150)),
+        (NEVER_COMES_UP, range(1)),
+        (TAKES_ALL, range(150, 151)),
     ],
 )
 def test_a_flight_is_the_same_whatever_its_picture_does(
     program: str, taken: range, unseen: str, tmp_path: Path
 ) -> None:
-    is_silent = program == pictures.NEVER_COMES_UP
+    is_silent = program == NEVER_COMES_UP
     view = LiveView(picture(program), [].append, start_timeout_s=0.01 if is_silent else 30)
     assert flight_hash(tmp_path / "run", view) == unseen
-    missed = view.close(0.0 if program == pictures.STALLS else 30)
+    missed = view.close(0.0 if program == STALLS else 30)
     assert load_log(tmp_path / "run").num_rows == view.offered == 150
     assert view.offered - missed in taken
 
 
 def test_what_does_not_fit_into_the_queue_is_dropped_and_counted() -> None:
-    view = LiveView(picture(pictures.STALLS), [].append)
+    view = LiveView(picture(STALLS), [].append)
     for piece in range(2000):
         view.rows(rows(1000 * piece, 1000))  # 8 kB: more than a pipe holds
     assert len(view._feed._waiting) == feed.QUEUE_PIECES
@@ -67,15 +92,13 @@ def test_what_does_not_fit_into_the_queue_is_dropped_and_counted() -> None:
 
 def test_a_picture_that_says_nothing_is_not_waited_for() -> None:
     said: list[str] = []
-    view = LiveView(picture(pictures.NEVER_COMES_UP), said.append, start_timeout_s=0.01)
+    view = LiveView(picture(NEVER_COMES_UP), said.append, start_timeout_s=0.01)
     assert said == ["the viewer has not opened within 0.01 s; the flight goes on without waiting"]
     view.rows(rows(0, 20))
     assert view.close() == 20
 
 
-@pytest.mark.parametrize(
-    ("program", "why"), [(pictures.FAILS, "no such screen"), (pictures.DIES, "ended without a message")]
-)
+@pytest.mark.parametrize(("program", "why"), [(FAILS, "no such screen"), (DIES, "ended without a message")])
 def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight(program: str, why: str) -> None:
     with pytest.raises(LabError, match=why):
         LiveView(picture(program), [].append)
@@ -83,7 +106,7 @@ def test_a_picture_that_cannot_come_up_is_an_error_before_the_flight(program: st
 
 def test_a_picture_says_where_it_is_and_what_was_typed_there() -> None:
     said: list[str] = []
-    view = LiveView(picture(pictures.TAKES_ALL), said.append)
+    view = LiveView(picture(TAKES_ALL), said.append)
     view.note(5, "lab", "the first text")
     view.rows(rows(0, 20))
     view.note(25, "lab", "the last text")
@@ -173,7 +196,7 @@ def test_who_looks_on_sees_every_row_once_five_times_a_second(kept: bool, tmp_pa
 
 
 def test_a_picture_stays_until_it_ends_by_itself() -> None:
-    view = LiveView(picture(pictures.IS_CLOSED), [].append)
+    view = LiveView(picture(IS_CLOSED), [].append)
     view.rows(rows(0, 20))
     view.stay()
     assert view.close() == 0
@@ -187,7 +210,7 @@ import sys, tempfile
 from pathlib import Path
 from hil.laboratory.recorder import Channel, Quantity, Recorder
 from hil.live.feed import LiveView
-view = LiveView([sys.executable, '-c', {pictures.TAKES_ALL!r}], print)
+view = LiveView([sys.executable, '-c', {TAKES_ALL!r}], print)
 with tempfile.TemporaryDirectory() as folder:
     recorder = Recorder(Path(folder), (Channel('float64', lambda: 0.0, (Quantity(('x',), 'm'),)),), {{}}, view)
     before = set(sys.modules)
