@@ -13,11 +13,8 @@ from hil.laboratory.recorder import load_events, load_log
 from support.serving import FLOATY, free_port, serve
 
 DONGLE = "radio://0/80/2M/E7E7E7E7E7"
-HOVER = (
-    "hover",
-    "--seed",
-    "2",
-)  # stays well within the limits whenever it is released; that depends on the machine
+# It stays well within the limits whenever it is released; that depends on the machine.
+HOVER = ("hover", "--seed", "2")
 
 
 def fly(folder: Path, *arguments: str) -> dict[str, Any]:

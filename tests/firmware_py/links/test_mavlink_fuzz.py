@@ -5,8 +5,6 @@ FLOATY_FUZZ is the number of messages of the long run (default 20,000).
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from firmware_py.wire.supervisor import State
 from support.mavlink_client import STATION, MavlinkClient, codec
@@ -68,24 +66,6 @@ def test_the_board_survives_messages_of_every_kind_with_any_contents(messages: i
     client.poses(client.now_us + 5000, client.now_us + 2_000_000)
     client.run(client.now_us + 2_000_000)
     assert client.firmware.signals.supervisor.state is State.FLYING, client.console
-
-
-@pytest.fixture(scope="module")
-def board() -> MavlinkClient:
-    client = MavlinkClient()
-    client.imu_alive = False
-    return client
-
-
-@given(st.lists(st.binary(max_size=300), max_size=4), st.booleans())
-@settings(max_examples=300, deadline=None)
-@pytest.mark.long
-def test_any_bytes_leave_the_board_alive(board: MavlinkClient, bursts: list[bytes], magic: bool) -> None:
-    for data in bursts:
-        board.receive(b"\xfd" + data if magic else data)
-        board.run(board.now_us + 1000)
-    board.run(board.now_us + 200_000)  # half a frame is given up
-    assert board.one("ping", 1, 2, 0, 0).seq == 2
 
 
 def test_a_board_with_a_key_learns_nothing_from_a_hundred_thousand_unsigned_bytes() -> None:
