@@ -45,15 +45,13 @@ def test_the_complete_laboratory_flies_hover_within_its_limits(tmp_path: Path) -
     assert "<h2>Age of the poses</h2>" in (tmp_path / "run" / "report.html").read_text()
 
 
-def test_hover_stays_within_its_limits_when_a_third_of_the_packets_is_lost(tmp_path: Path) -> None:
+def test_hover_holds_its_limits_when_a_third_of_the_packets_is_lost(tmp_path: Path) -> None:
     """On a profile that describes other cameras than the virtual ones."""
     losses = ("--set=radio.uplink_loss=0.3", "--set=radio.downlink_loss=0.3")
     cameras = "system=optitrack multicast=true body=robot axes=z-up origin=[1,2,0] yaw=1 body_yaw=1"
     others = [f"--set=capture.{setting}" for setting in cameras.split()]
     result = fly(tmp_path / "run", *HOVER, "--link", DONGLE, "--duration", "6", *losses, *others)
-    missed = [verdict["metric"] for verdict in result["verdicts"] if not verdict["holds"]]
-    # It may begin where several packets in a row are lost.
-    assert set(missed) <= {"settle"}, result["verdicts"]
+    assert result["passed"], result["verdicts"]
 
 
 def address(link: str) -> str:
