@@ -6,23 +6,21 @@ clock, `t`, which counts microseconds; frames are W (world, z up) and B (body, x
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, Unpack
 
 import pyarrow as pa
 
 from firmware_py.export.boards import PYTHON
 from ground_station import trajectory
-from ground_station.trajectory import Trajectory
 from hil.arguments import Known, checked
-from hil.config import DEFAULT_PROFILE, Overrides
+from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError
 from hil.experiments import find_again, find_experiment
 from hil.laboratory.experiment import Experiment
@@ -30,13 +28,14 @@ from hil.laboratory.fault_kinds import Kind, Knob, declare, knob
 from hil.laboratory.faults import Fault
 from hil.laboratory.faults import parse as fault
 from hil.laboratory.flight import Flight
-from hil.laboratory.lockstep import RADIO
+from hil.laboratory.folder import folder_of, reserved
+from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.metrics import METRICS, Metric, Verdict, column, free_flight, position_error
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import RADIO, Options, Request
 from hil.laboratory.result import Outcome, Result, read_result
-from hil.laboratory.run import MakeFlight, Request
+from hil.laboratory.run import MakeFlight
 from hil.laboratory.run import fly as fly_into
-from hil.run_folder import folder_of, reserved
 
 __all__ = [
     "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Options", "Request", "Run",
@@ -60,35 +59,10 @@ class Along(trajectory.Along):
     __slots__ = ()
 
 
-class Flown(TypedDict, total=False):
-    """What `Request.of` takes beside an experiment, everything optional."""
-
-    profile: str  # one that ships, or a path that ends in .toml; default: floaty
-    overrides: Overrides  # {"section.key": value}, or "section.key=value" as for `--set`
-    seed: int  # of everything random; default: 1
-    duration_s: float | None  # of free flight; default: the experiment's
-    link: str  # radio and mavlink: in lockstep; a URI: in real time; default: radio
-    faults: Sequence[Fault | str]  # on top of the experiment's own
-    board: str  # what executes the flight core: python, c or cortex-m4; default: python
-
-
-class Options(Flown, total=False):
-    """How to fly, everything optional."""
-
-    trajectory: Callable[[trajectory.Goal, int], Trajectory]  # instead of the experiment's, like Along(path)
-
-
 @checked
-def request_of(
-    experiment: Experiment | str,
-    *,
-    trajectory: Callable[[trajectory.Goal, int], Trajectory] | None = None,
-    **options: Unpack[Flown],
-) -> Request:
+def request_of(experiment: Experiment | str, **options: Unpack[Options]) -> Request:
     """Return the request for an experiment, an object, a name or FILE.py:NAME. Raises `LabError` for bad input."""
     chosen = find_experiment(experiment) if isinstance(experiment, str) else experiment
-    if trajectory is not None:
-        chosen = dataclasses.replace(chosen, trajectory=trajectory)
     return Request.of(chosen, **options)
 
 
@@ -125,18 +99,23 @@ def fly(
             show(min(now_us / flight.end_us, 1.0))  # almost 0 while the release is not planned
 
     with reserved(request, place, replace):
-        result = fly_into(request, place, progress=on_progress, flight_of=_maker_of(request))
+        result = fly_into(request, place, progress=on_progress, flight_of=maker_of(request))
         if show is not None:
             show(1.0)
-        run = Run(result, request.experiment)
+        run = Run(result)
         if report:
             run.write_report()
     return run
 
 
-def _maker_of(request: Request) -> MakeFlight | None:
-    if request.in_lockstep:
-        return None
+def maker_of(request: Request) -> MakeFlight:
+    """Return what assembles the flight of a request, by its link and board."""
+    if request.bench.in_loop:
+        from hil.servers.in_the_loop import in_the_loop
+
+        return in_the_loop
+    if request.bench.in_lockstep:
+        return in_lockstep
     from hil.servers.linked import linked_flight
 
     return linked_flight
@@ -145,16 +124,24 @@ def _maker_of(request: Request) -> MakeFlight | None:
 @checked
 def load_run(folder: Path | str) -> Run:
     """Return a run that was flown before. Raises `LabError` when the folder holds none."""
-    result = read_result(Path(folder))
-    return Run(result, find_again(result.experiment, result.source))
+    return Run(read_result(Path(folder), find_again))
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A flight and its folder. `experiment` is None when it is no longer known here."""
+    """A flight and its folder."""
 
     result: Result
-    experiment: Experiment | None
+
+    @property
+    def request(self) -> Request:
+        """The request, equal to the one that was flown if its experiment is still known here."""
+        return self.result.request
+
+    @property
+    def experiment(self) -> Experiment | None:
+        """The experiment; None when it is no longer known here."""
+        return self.request.experiment if self.request.experiment.is_known else None
 
     @property
     def folder(self) -> Path:
@@ -241,7 +228,7 @@ class Run:
     def __repr__(self) -> str:
         failed = "; ".join(map(str, self.result.failed))
         how = self.cause or failed or ("all limits hold" if self.verdicts else "no limits")
-        return f"<{self.result.experiment}, seed {self.result.seed}: {self.outcome}, {how}; {self.folder}>"
+        return f"<{self.request.title}: {self.outcome}, {how}; {self.folder}>"
 
     def _repr_html_(self) -> str:
         """Return the HTML that a notebook shows."""
@@ -259,20 +246,18 @@ class Run:
 def command_of(request: Request) -> str | None:
     """Return the command that flies a request again, bit for bit; None for an experiment that no command can name."""
     experiment = request.experiment
-    settings, others = (
-        request.overrides[: len(experiment.settings)],
-        request.overrides[len(experiment.settings) :],
-    )
-    if find_again(experiment.name, experiment.source) != experiment or settings != experiment.settings:
+    if find_again(experiment.name, experiment.source) != experiment:
         return None
     words = ["floaty", "fly", experiment.reference, "--seed", str(request.seed)]
     words += ["--duration", repr(request.duration_s)] if request.duration_s != experiment.duration_s else []
     words += ["--profile", request.profile] if request.profile != DEFAULT_PROFILE else []
-    words += _options("--set", others)
-    words += _options("--fault", map(str, request.faults))
-    words += ["--link", request.link] if request.link != RADIO else []
-    words += ["--board", request.board] if request.board != PYTHON else []
-    words += ["--elf", str(request.elf)] if request.elf is not None else []
+    words += _options("--set", request.overrides[len(experiment.settings) :])
+    words += _options("--fault", request.faults[len(experiment.faults) :])
+    bench = request.bench
+    words += ["--link", bench.link] if bench.link != RADIO else []
+    words += ["--board", bench.board] if bench.board != PYTHON else []
+    words += ["--elf", str(bench.elf)] if bench.elf is not None else []
+    words += [f"--hil={bench.in_loop}"] if bench.in_loop else []
     return shlex.join(words)
 
 

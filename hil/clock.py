@@ -150,3 +150,18 @@ def process_age_s() -> float:
     except OSError:
         return float("nan")
     return time.clock_gettime(time.CLOCK_BOOTTIME) - int(figures[START_TIME]) / os.sysconf("SC_CLK_TCK")
+
+
+class Pace:
+    """Simulated over real time."""
+
+    def __init__(self) -> None:
+        self.begin(0)
+
+    def begin(self, now_us: int) -> None:
+        """Count from here."""
+        self._us, self._ns = now_us, time.monotonic_ns()
+
+    def factor(self, now_us: int) -> float:
+        """Return the factor up to now."""
+        return (now_us - self._us) * 1e3 / (time.monotonic_ns() - self._ns)

@@ -45,7 +45,7 @@ FLOORS = (
     ("devices",),
     ("config",),
     ("laboratory",),
-    ("experiments", "run_folder"),
+    ("experiments",),
     ("pictures", "exports"),
     ("servers", "live"),
     ("api", "design"),
@@ -65,7 +65,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
     "youplot": ("hil/pictures/pages.py",),
     "time": (
-        "hil/clock.py", "hil/commands/listing.py", "hil/laboratory/run.py",
+        "hil/clock.py", "hil/commands/listing.py",
         "hil/campaigns/flying.py", "ground_station/clock.py",
     ),
     "datetime": (),

@@ -35,7 +35,8 @@ from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.recorder import Recorder
-from hil.laboratory.run import Request, fly
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.world.plant import Plant
 
 ROOT = Path(__file__).parent.parent
@@ -124,7 +125,7 @@ def start_up_s(cache: Path | None) -> float:
     """Wall time of a process that flies until its first tick; with a cache folder: compiling everything."""
     code = (
         "from hil.experiments import EXPERIMENTS; from hil.laboratory.lockstep import lockstep_flight;"
-        "from hil.laboratory.run import Request;"
+        "from hil.laboratory.request import Request;"
         "flight = lockstep_flight(Request.of(EXPERIMENTS['hover'], duration_s=1.0));"
         "flight.lab.end_at(30_000); flight.run()"
     )
@@ -216,7 +217,7 @@ def main() -> None:
     arguments.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     options = arguments.parse_args()
     with tempfile.TemporaryDirectory() as folder:  # warm up
-        fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 1.0), Path(folder))
+        fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0), Path(folder))
 
     figures = Figures()
     bare, recorded = flight_s(recorded=False), flight_s(recorded=True)

@@ -14,7 +14,7 @@ from rich.console import Console
 from hil.experiments import find_experiment
 from hil.identify.identify import IdentifiedConstant, identify
 from hil.identify.record import KEPT, load_record
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 from hil.studies.sweep import Job, fly_all
 from hil.studies.tuning import EXCITATIONS
 from hil.world.paper_table import PAPER_TABLE

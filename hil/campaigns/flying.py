@@ -16,13 +16,14 @@ from pathlib import Path
 
 from hil.campaigns.config import Spec
 from hil.campaigns.sampling import Draw, draw, request_of
-from hil.clock import Clock
 from hil.errors import LabError, blame
 from hil.experiments import find_experiment
 from hil.laboratory.experiment import Source
 from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import in_lockstep
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import LOADED_US, Request, fly, lockstep, prepare
+from hil.laboratory.run import LOADED_US, fly
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -92,16 +93,12 @@ def fly_within(request: Request, spec: Spec) -> Result:
             raise TooLongError(f"limits.wall_s = {spec.limits.wall_s:g}: the flight had not ended")
 
     with tempfile.TemporaryDirectory(prefix="floaty-") as parent:
-        folder = Path(parent) / "run"
-        prepare(folder)
-        return fly(request, folder, progress=watch, flight_of=_unlogged)
+        return fly(request, Path(parent) / "run", progress=watch, flight_of=_unlogged)
 
 
-def _unlogged(
-    request: Request, _telemetry: Path, clock: Clock | None, trace_all: bool, stack: ExitStack
-) -> Flight:
+def _unlogged(request: Request, _telemetry: Path | None, stack: ExitStack) -> Flight:
     """Return the flight without the station's log, which nobody would read: an eighth of its time."""
-    return lockstep(request, None, clock, trace_all, stack)
+    return in_lockstep(request, None, stack)
 
 
 def row_of(drawn: Draw, result: Result) -> CampaignRow:

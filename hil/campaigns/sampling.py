@@ -27,7 +27,7 @@ from hil.campaigns.config import DESIGNS, Distribution, SampledFault, Spec, Valu
 from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.faults import Fault
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 
 DIGITS = 9
 LEVELS = 4  # of Morris' grid, as in his paper
@@ -228,9 +228,14 @@ def _toml(value: Value) -> str:
 def request_of(spec: Spec, drawn: Draw, faults: tuple[Fault, ...] | None = None) -> Request:
     """Return the request of a flight; `faults` replace those drawn. Raises `LabError` for what cannot be flown."""
     return Request.of(
-        find_experiment(drawn.experiment), drawn.profile, drawn.settings, drawn.seed, spec.duration_s, spec.link,
-        drawn.faults if faults is None else faults,
-    )  # fmt: skip
+        find_experiment(drawn.experiment),
+        profile=drawn.profile,
+        overrides=drawn.settings,
+        seed=drawn.seed,
+        duration_s=spec.duration_s,
+        link=spec.link,
+        faults=drawn.faults if faults is None else faults,
+    )
 
 
 def check_spec(spec: Spec) -> None:

@@ -17,8 +17,8 @@ from hil.campaigns.sampling import Draw, request_of
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS, add, either, times
 from hil.laboratory.faults import Fault, parse
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request
 
 HALVINGS = 6  # a size is found to 1/64 of what was drawn
 SHORTEST_S = 0.01

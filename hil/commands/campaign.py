@@ -114,7 +114,7 @@ def _compile(spec: Spec) -> None:
     from firmware_py.compiling import is_kept
     from hil.campaigns.flying import fly_within
     from hil.experiments import EXPERIMENTS
-    from hil.laboratory.run import Request
+    from hil.laboratory.request import Request
     from hil.world.motion import advance
 
     if not is_kept(advance):

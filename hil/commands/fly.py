@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 from rich.progress import TextColumn, TimeRemainingColumn
 
-from hil.clock import FreeRunning, Paced
 from hil.commands.options import (
     INTERRUPTED,
     announce_compilation,
@@ -18,7 +17,6 @@ from hil.commands.options import (
     fault_option,
     gdb_option,
     notices,
-    open_debugger,
     open_live,
     profile_option,
     progress_bar,
@@ -32,7 +30,7 @@ from hil.errors import LabError, writing
 
 if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
-    from hil.laboratory.run import Request
+    from hil.laboratory.request import InLoop, Request
 
 SEEDS_MAX = 10_000
 
@@ -70,7 +68,7 @@ SEEDS_MAX = 10_000
 )
 @gdb_option
 @click.option(
-    "--hil", "in_loop", is_flag=False, flag_value="still", metavar="[moving]",
+    "--hil", "in_loop", type=click.Choice(["still", "moving"]), is_flag=False, flag_value="still",
     help="Let the board of --board fly by its own tasks and clock, with the gyro samples of the virtual IMU; its servos "
     "stay at hover, or move as well.",
 )  # fmt: skip
@@ -94,7 +92,7 @@ def fly(
     link: str,
     board: str,
     elf: Path | None,
-    in_loop: str | None,
+    in_loop: InLoop,
     gdb: int | None,
     out: Path | None,
 ) -> int:
@@ -102,72 +100,54 @@ def fly(
 
     Exit code 0: all limits hold; 1: a limit fails; 2: bad input; 130: interrupted.
     """
-    from hil.experiments import find_experiment
-
-    chosen = find_experiment(experiment)
     if seeds > 1 and (realtime or target or perfetto):
         raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
-    if in_loop not in (None, "still", "moving"):
-        raise LabError(f"--hil {in_loop}: expected --hil or --hil moving")
     if seeds > 1 and in_loop:
         raise LabError(f"--hil: --seeds {seeds}: a real board is in one flight at a time")
+    if seeds > 1 and gdb is not None:
+        raise LabError(f"--gdb {gdb}: needs one flight with an image as --board")
     if perfetto:
         import hil.exports.perfetto  # noqa: F401 - reports a missing package now, not after the flight
-    from hil.laboratory.run import Request
+    from hil.api import request_of
 
-    requests = [
-        Request.of(chosen, profile, overrides, seed + index, duration, link, fault_texts, board, elf)
-        for index in range(seeds)
-    ]
-    if gdb is not None and (seeds > 1 or not requests[0].is_image):
-        raise LabError(f"--gdb {gdb}: needs one flight with an image as --board")
+    request = request_of(
+        experiment, profile=profile, overrides=overrides, seed=seed, duration_s=duration, faults=fault_texts, link=link,
+        board=board, elf=elf, in_loop=in_loop, gdb=gdb, realtime=realtime, trace=perfetto,
+    )  # fmt: skip
     announce_compilation()
-    if seeds > 1 and not requests[0].in_lockstep:
+    if seeds > 1 and not request.bench.in_lockstep:
         raise LabError(f"--link {link}: --seeds is for flights in lockstep")
     if seeds > 1 and "://" in board:
         raise LabError(f"--board {board}: --seeds {seeds}: a real board is in one flight at a time")
     if seeds > 1:
-        return _fly_many(requests, out or Path("runs"))
-    from hil.run_folder import folder_of, moved, reserved
+        return _fly_many([replace(request, seed=seed + index) for index in range(seeds)], out or Path("runs"))
+    from hil.laboratory.folder import folder_of, moved, reserved
 
-    folder = out or folder_of(requests[0])
-    if out is None and (why := moved(requests[0], folder)):
+    folder = out or folder_of(request)
+    if out is None and (why := moved(request, folder)):
         notices.print(why, soft_wrap=True)
-    with reserved(requests[0], folder):
-        return _fly_one(requests[0], folder, realtime, target, perfetto, in_loop, gdb)
+    with reserved(request, folder):
+        return _fly_one(request, folder, target)
 
 
-def _fly_one(
-    request: Request,
-    folder: Path,
-    realtime: bool,
-    target: str | None,
-    perfetto: bool,
-    in_loop: str | None,
-    gdb: int | None,
-) -> int:
+def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     """Fly one seed with all its pictures; returns the exit code."""
 
-    from hil.laboratory.run import fly, lockstep
-    from hil.servers.in_the_loop import in_the_loop
-    from hil.servers.linked import linked_flight
+    from hil.api import maker_of
+    from hil.laboratory.run import fly
 
     view = open_live(target)
-    debugger = open_debugger(gdb, request.elf or Path(request.board))
-    clock = Paced() if realtime else FreeRunning()
     with progress_bar(TextColumn("{task.fields[now]}"), TimeRemainingColumn()) as progress:
         bar = progress.add_task(f"{request.experiment.name} seed {request.seed}", total=None, now="")
 
         def show(now_us: int, flight: Flight) -> None:
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
-        own = in_the_loop(in_loop == "moving") if in_loop else partial(lockstep, debugger=debugger)
-        make = own if in_loop or request.in_lockstep else linked_flight
         with writing("--out", folder):
-            result = fly(request, folder, clock, show, view, perfetto, make)
+            result = fly(request, folder, show, view, maker_of(request))
         progress.update(bar, description="writing recording and report", total=None, now="")
         write_pictures(folder, request.experiment)
-        if perfetto:
+        if request.bench.trace:
             from hil.exports.perfetto import write_perfetto
 
             write_perfetto(folder)
@@ -185,7 +165,7 @@ def _fly_one(
 
 def _fly_many(requests: list[Request], parent: Path) -> int:
     """Fly seeds in parallel processes; one row per seed, a summary at the end; returns the exit code."""
-    from hil.run_folder import folder_of, moved
+    from hil.laboratory.folder import folder_of, moved
     from hil.studies.sweep import Job, fly_all
 
     jobs = [Job(request, folder_of(request, parent)) for request in requests]

@@ -109,9 +109,9 @@ def runs(folder: Path) -> None:
 
 def _request_of(result: Result) -> str:
     """Return what was flown, without what is usual."""
-    from hil.laboratory.result import USUAL
+    from hil.laboratory.request import USUAL
 
-    asked = {**result.requested(), "": result.experiment}
+    asked = {**result.request.parts(), "": result.request.experiment.name}
     return ", ".join(
         f"{name} {value}".strip() for name, value in asked.items() if value != USUAL.get(name, "")
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import signal
 import sys
 from contextlib import closing
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from hil.laboratory.experiment import Experiment
     from hil.laboratory.result import Result
     from hil.live.feed import LiveView
-    from hil.stm32f405.gdb import GdbServer
 
 INTERRUPTED = 130
 
@@ -67,18 +65,6 @@ gdb_option = click.option(
     "--gdb", type=click.IntRange(0, 65535), metavar="PORT",
     help="With an image as --board: wait for GDB on this port of 127.0.0.1 (0: any); time stands still at its breakpoints.",
 )  # fmt: skip
-
-
-def open_debugger(port: int | None, image: Path) -> GdbServer | None:
-    """Open the port that `--gdb` asks for; it prints the command to type when it waits, and closes with this command."""
-    if port is None:
-        return None
-    from hil.stm32f405.gdb import GdbServer
-
-    def waiting(port: int) -> None:
-        say(f"waiting for gdb-multiarch {shlex.quote(str(image))} -ex 'target remote 127.0.0.1:{port}'")
-
-    return click.get_current_context().with_resource(closing(GdbServer(port, waiting)))
 
 
 def announce_compilation() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,6 @@ from hil.commands.options import (
     close_live,
     fault_option,
     gdb_option,
-    open_debugger,
     open_live,
     profile_option,
     say,
@@ -132,8 +132,8 @@ def serve(
     from hil.config import load_config
     from hil.laboratory.fault_kinds import MARKERS_ON
     from hil.laboratory.faults import check, parse
+    from hil.laboratory.lockstep import debugger, image_at
     from hil.laboratory.robot import PYTHON_BOARD
-    from hil.laboratory.run import image_at
     from hil.servers.live_faults import LiveFaults
     from hil.servers.motive import Streaming
     from hil.servers.serial_server import parse_addresses
@@ -149,8 +149,9 @@ def serve(
     faults = [parse(text) for text in fault_texts]
     check(faults, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
     announce_compilation()
-    debugger = open_debugger(gdb, Path(board or ""))
-    executor = PYTHON_BOARD if board is None else image_at(board, None, debugger)
+    stack = click.get_current_context().with_resource(ExitStack())
+    port = debugger(gdb, Path(board or ""), stack)
+    executor = PYTHON_BOARD if board is None else image_at(board, None, port)
     view = open_live(target)
     server = Server(config, boards, seed, say, bool(ends), faults, state, view, executor)
     try:

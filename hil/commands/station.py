@@ -101,6 +101,7 @@ def station(
     from hil.experiments import EXPERIMENTS, find_experiment
     from hil.laboratory.real_flight import RealFlight
     from hil.laboratory.recorder import OPERATOR
+    from hil.laboratory.request import REAL, Bench, Request
 
     config = load_config(profile, overrides)
     experiment = find_experiment(trajectory)
@@ -108,7 +109,9 @@ def station(
     view = open_live(target)
     flight = None
     if out is not None or view is not None:
-        flight = RealFlight(out, experiment, config, profile, overrides, uri, say, onlooker=view)
+        bench = Bench(link=uri, board=REAL)
+        request = Request(experiment, profile, overrides, 0, experiment.duration_s, (), bench)
+        flight = RealFlight(out, request, say, onlooker=view)
 
     def report(text: str) -> None:
         say(text)

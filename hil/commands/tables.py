@@ -27,14 +27,14 @@ def print_seeds(rows: list[Result]) -> None:
     """Print one row per seed and the summary."""
     if not rows:
         return
-    table = Table(title=f"{rows[0].experiment}, profile {rows[0].profile}")
+    table = Table(title=f"{rows[0].request.experiment.name}, profile {rows[0].request.profile}")
     for heading in ("seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict"):
         table.add_column(heading, justify="right")
     for result in rows:
         failed = ", ".join(verdict.metric for verdict in result.failed)
         verdict = "ok" if result.passed else result.cause or f"fails: {failed}"
         table.add_row(
-            str(result.seed),
+            str(result.request.seed),
             *(
                 " ".join(f"{result.metrics[name] * scale:.{digits}f}" for name in names)
                 for _, names, scale, digits in SEED_COLUMNS
@@ -64,7 +64,7 @@ def print_result(result: Result) -> None:
 
     from hil.laboratory.metrics import METRICS, short_of
 
-    table = Table(title=f"{result.title}, profile {result.profile}")
+    table = Table(title=f"{result.request.title}, profile {result.request.profile}")
     table.add_column("metric")
     for heading in ("value", "limit", "verdict"):
         table.add_column(heading, justify="right")
@@ -77,7 +77,7 @@ def print_result(result: Result) -> None:
         if name in verdicts:
             limit = f"{'<=' if metric.bound == 'max' else '>='} {metric.show(verdicts[name].bound)}"
             mark = verdicts[name].mark
-        over = short_of(metric, value, result.metrics["flown"], result.duration_s)
+        over = short_of(metric, value, result.metrics["flown"], result.request.duration_s)
         table.add_row(name, metric.show(value) + over, limit, mark)
     console.print(table)
     cause = f": {result.cause}" if result.cause else ""
@@ -89,7 +89,7 @@ def print_result(result: Result) -> None:
         console.print(budget_line(result.ages), soft_wrap=True)
     if result.usage is not None:
         for name, load in result.usage.entries.items():
-            console.print(f"  {result.board} {name:9} {load}", soft_wrap=True)
+            console.print(f"  {result.request.bench.board} {name:9} {load}", soft_wrap=True)
     for name in ("report.html", "flight.rrd", "flight.perfetto-trace", "log.parquet"):
         if (result.folder / name).is_file():
             hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""

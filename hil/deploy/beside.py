@@ -20,8 +20,9 @@ from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import column, free_flight
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.pictures.compare import FlownRun, load_flown
 
 SECONDS, SEED = 4.0, 1
@@ -110,14 +111,13 @@ def fly_beside_python(
         for name, board in (("python", PYTHON), ("image", str(image))):
             request = Request.of(
                 find_experiment("hover"),
-                profile,
-                overrides,
-                SEED,
-                SECONDS,
+                profile=profile,
+                overrides=overrides,
+                seed=SEED,
+                duration_s=SECONDS,
                 faults=list(map(parse, FAULTS)),
                 board=board,
             )
-            prepare(Path(folder) / name)
 
             def show(now_us: int, flight: Flight, name: str = name) -> None:
                 progress(name, now_us, flight)

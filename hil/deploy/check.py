@@ -21,7 +21,7 @@ from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 
 DEFAULT = ("hover", "yaw-step")  # and the one with faults: 10 000 ticks in all
 LONGEST_S = 60.0  # of an experiment with --all: `endurance` takes half an hour
@@ -98,7 +98,14 @@ def plan(
         raise LabError(f"--fault {faults[0]}: for which EXPERIMENT?")
 
     def request(name: str, length_s: float | None, faults: Sequence[Fault] = ()) -> Request:
-        return Request.of(find_experiment(name), profile, overrides, seed, length_s, faults=faults)
+        return Request.of(
+            find_experiment(name),
+            profile=profile,
+            overrides=overrides,
+            seed=seed,
+            duration_s=length_s,
+            faults=faults,
+        )
 
     if experiment is not None:
         return [request(experiment, duration_s, faults)]

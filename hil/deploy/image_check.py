@@ -11,7 +11,7 @@ from hil.deploy.beside import fly_beside_python
 from hil.deploy.doctor import Finding
 from hil.deploy.image_bench import SERVO_OUTPUTS, ImageBench, check_parameters
 from hil.laboratory.flight import Flight
-from hil.laboratory.run import image_at
+from hil.laboratory.lockstep import image_at
 from hil.stm32f405.image import Image, MemoryUse
 
 FREE_LEAST = 1024  # [bytes]

@@ -19,7 +19,7 @@ from firmware_py.export.usage import EntryLoad
 from firmware_py.logic.loading import translation_of
 from hil.devices.real_core import RealCore, is_link, open_real_core
 from hil.errors import LabError
-from hil.laboratory.run import BUILD
+from hil.laboratory.lockstep import BUILD
 
 PLAIN, C_O0, C_O2, CORTEX_M4 = TARGETS = ("plain", "c-O0", "c-O2", "cortex-m4")
 Loads = dict[str, EntryLoad]  # by entry point

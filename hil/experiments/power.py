@@ -6,7 +6,6 @@ for a minute and computes the rest from the mean power and the same model of the
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from firmware_py.wire.supervisor import Cause, State
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.metrics import column
+from hil.laboratory.recorder import stored_in
 from hil.world.battery import endurance
 from hil.world.config import BatteryConfig, GeometryConfig
 from hil.world.geometry import weigh
@@ -66,7 +66,7 @@ def until_empty(flight: pa.Table) -> Mapping[str, float]:
 
 
 def _configuration(flight: pa.Table) -> dict[str, Any]:
-    config: dict[str, Any] = json.loads(flight.schema.metadata[b"config"])
+    config = stored_in(flight.schema.metadata, "config")
     return config
 
 

@@ -126,7 +126,7 @@ def _flown_with(folder: Path) -> tuple[LabConfig, bool, float]:
     0: not known.
     """
     metadata = load_log(folder).schema.metadata or {}
-    simulated = read_result(folder).seed is not None
+    simulated = not read_result(folder).request.is_real
     try:
         config = LabConfig.model_validate_json(metadata[b"config"])
         return config, simulated, 1e-6 * release_of(metadata) if simulated else 0.0

@@ -6,7 +6,7 @@ flight has what its ground station knows, NaN before the first value: `station_c
 
 from collections.abc import Callable, Sequence
 from math import nan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from firmware_py.firmware import DEADLINES_US
 from firmware_py.logic.plugs import GROUP
@@ -20,10 +20,14 @@ from ground_station.trajectory import Goal, Trajectory
 from hil.devices.board_firmware import BoardFirmware
 from hil.devices.cameras import VirtualMocap
 from hil.devices.radio import VirtualRadio
+from hil.devices.uart import VirtualSerial
 from hil.laboratory.faults import Fault
 from hil.laboratory.recorder import Channel, Quantity
 from hil.laboratory.robot import Robot
 from hil.world.battery import Battery
+
+if TYPE_CHECKING:
+    from ground_station.links.mavlink import MavlinkLink  # needs pymavlink
 
 UNKNOWN_STATE = 4  # of the supervisor, beside those of `firmware_py.wire.supervisor`
 WRAP = 1 << 16  # the board's counters of poses are uint16
@@ -89,6 +93,36 @@ def radio_channel(radio: VirtualRadio) -> Channel:
         ),
         (quantity("link", names), quantity("link", "up_latency_sum down_latency_sum", "us")),
     )  # fmt: skip
+
+
+def serial_channel(uart: VirtualSerial, firmware: BoardFirmware, link: "MavlinkLink | None") -> Channel:
+    """Return the counters of a serial line with MAVLink; without a `link` the station's frames are unknown and stay 0.
+
+    `link.*` counts pieces of the stream, `serial.*` bytes, bits and frames.
+    """
+    up, down, board = uart.up, uart.down, firmware.mavlink
+    assert board is not None
+
+    def counts() -> tuple[int, ...]:
+        at_station = link.counters if link else None
+        return (
+            up.deliveries, down.deliveries, up.latency_sum_us, down.latency_sum_us,
+            up.busy_us, down.busy_us, up.sent_bytes, down.sent_bytes, up.overrun_bytes,
+            up.dropped_bytes + down.dropped_bytes, up.cut_bytes + down.cut_bytes, up.wrong_bits + down.wrong_bits,
+            board.bad, board.lost, at_station.bad if at_station else 0, at_station.lost if at_station else 0,
+        )  # fmt: skip
+
+    return Channel(
+        "int64",
+        counts,
+        (
+            quantity("link", "up_delivered down_delivered"),
+            quantity("link", "up_latency_sum down_latency_sum", "us"),
+            quantity("serial", "up_busy down_busy", "us"),
+            quantity("serial", "up_bytes down_bytes overrun no_room cut", "bytes"),
+            quantity("serial", "wrong_bits up_bad up_lost down_bad down_lost"),
+        ),
+    )
 
 
 def battery_channel(battery: Battery) -> Channel:

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from hil.laboratory.faults import Fault
-    from hil.laboratory.flight import Flight
     from hil.laboratory.robot import Robot
 
 
@@ -37,7 +36,7 @@ def need_nothing(robot: Robot) -> None:
     """Need nothing special on board."""
 
 
-def leave_alone(flight: Flight) -> None:
+def leave_alone(flight: object) -> None:
     """Plan no events."""
 
 
@@ -72,7 +71,7 @@ class Experiment:
     limits: Mapping[str, float]  # of the default profile; another one has its own in [limits.NAME]
     trajectory: Callable[[Goal, int], Trajectory] = stay  # (home, release instant [us])
     prepare: Callable[[Robot], None] = need_nothing  # creates from the start what the script will need
-    script: Callable[[Flight], None] = leave_alone
+    script: Callable[[Any], None] = leave_alone  # takes the `Flight`, which is described above this file
     settings: tuple[str, ...] = ()  # "section.key=value", on top of the profile
     faults: tuple[Fault, ...] = ()  # those of the command line come on top
     # Computes the experiment's own metrics from the rows after the release.
@@ -104,6 +103,11 @@ class Experiment:
     def reference(self) -> str:
         """Its name for `floaty fly` and `floaty station --trajectory`."""
         return self.source.reference if self.source else self.name
+
+    @property
+    def is_known(self) -> bool:
+        """Whether this is more than a stand-in."""
+        return not isinstance(self.trajectory, Unknown)
 
     def measured(self, flight: pa.Table) -> Mapping[str, float]:
         """Return its own metrics, from the rows after the release. Raises `LabError` for invalid ones."""
@@ -140,3 +144,19 @@ class Experiment:
             raise LabError(
                 f"experiment {self.name}: trajectory at {t_us * 1e-6:g} s: {blame(error)}"
             ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """The trajectory of an experiment that is unknown here: it raises."""
+
+    name: str
+
+    def __call__(self, home: Goal, release_us: int) -> Trajectory:
+        """Raise `LabError`."""
+        raise LabError(f"experiment {self.name}: unknown here, or its file has changed since the flight")
+
+
+def unknown(name: str, source: Source | None) -> Experiment:
+    """Return the stand-in for an experiment that is unknown here: it has a name, but cannot be flown."""
+    return Experiment(name, "", 1.0, {}, trajectory=Unknown(name), source=source)

@@ -6,7 +6,6 @@ end), size in the kind's unit: `mocap.dropout@10:0.5`, `push.y@3=2`, `servo.stuc
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING
 from hil.arguments import checked
 from hil.errors import LabError, hint
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
-from hil.laboratory.recorder import release_of
+from hil.laboratory.recorder import release_of, stored_in
 
 if TYPE_CHECKING:
     from hil.laboratory.robot import Robot
@@ -119,10 +118,9 @@ def spans(faults: Iterable[Fault], release_us: int) -> list[Span]:
 
 def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
     """Return when the faults of a flight act, from the metadata of its log; those of kinds unknown here are left out."""
-    known = metadata or {}
-    texts = json.loads(known.get(b"faults", b"[]"))
+    texts = stored_in(metadata, "request").get("faults", ())
     faults = [parse(text) for text in texts if text.partition("@")[0] in KINDS]
-    return spans(faults, release_of(known))
+    return spans(faults, release_of(metadata))
 
 
 class Switchboard:

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Protocol
 
 from firmware_py.wire.supervisor import Cause
-from ground_station.trajectory import Goal, Trajectory
+from ground_station.trajectory import Trajectory
 from hil.clock import Clock
-from hil.config import LabConfig
 from hil.devices.board_firmware import Executor
 from hil.events import EventQueue
 from hil.laboratory.channels import (
@@ -25,9 +24,10 @@ from hil.laboratory.channels import (
     flight_channels,
     marker_channel,
 )
-from hil.laboratory.faults import Fault, Switchboard
+from hil.laboratory.faults import Switchboard
 from hil.laboratory.laboratory import Laboratory, Progress
 from hil.laboratory.recorder import Channel, Recorder
+from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams
 from hil.laboratory.schedule import WINDOW_US, ScheduleTrace
 
@@ -86,86 +86,18 @@ class Line(Protocol):
         ...
 
 
-class Programme(Protocol):
-    """The part of an experiment that a flight needs."""
-
-    @property
-    def reference(self) -> str:
-        """Its name for `floaty station --trajectory`."""
-        ...
-
-    @property
-    def faults(self) -> tuple[Fault, ...]:
-        """Its own faults."""
-        ...
-
-    @property
-    def trajectory(self) -> Callable[[Goal, int], Trajectory]:
-        """(home, release instant [us]) to the goals."""
-        ...
-
-    @property
-    def prepare(self) -> Callable[[Robot], None]:
-        """Creates from the start what the script will need."""
-        ...
-
-    @property
-    def script(self) -> Callable[[Flight], None]:
-        """Plans the events."""
-        ...
-
-
-class Order(Protocol):
-    """The part of a request that a flight needs."""
-
-    @property
-    def config(self) -> LabConfig:
-        """The profile."""
-        ...
-
-    @property
-    def experiment(self) -> Programme:
-        """The experiment."""
-        ...
-
-    @property
-    def duration_s(self) -> float:
-        """How long it is free."""
-        ...
-
-    @property
-    def seed(self) -> int:
-        """The seed of everything random."""
-        ...
-
-    @property
-    def link(self) -> str:
-        """Over which line."""
-        ...
-
-    @property
-    def faults(self) -> tuple[Fault, ...]:
-        """Faults on top of the experiment's own."""
-        ...
-
-
-LineOf = Callable[[Order, Site, Laboratory], Line]  # makes the line of a flight
+LineOf = Callable[[Request, Site, Laboratory], Line]  # makes the line of a flight
 
 
 class Flight:
-    """A robot in its tunnel with all that its flight needs; `run` it. With `trace_all` its schedule is traced throughout."""
+    """A robot in its tunnel with all that its flight needs; `run` it."""
 
     def __init__(
-        self,
-        order: Order,
-        clock: Clock,
-        line_of: LineOf,
-        executor: Executor = PYTHON_BOARD,
-        trace_all: bool = False,
+        self, request: Request, clock: Clock, line_of: LineOf, executor: Executor = PYTHON_BOARD
     ) -> None:
-        self.config = order.config
-        self.experiment = order.experiment
-        self.faults = (*order.experiment.faults, *order.faults)
+        self.config = request.config
+        self.experiment = request.experiment
+        self.faults = request.planned_faults
         self.lab = Laboratory(clock)
         self.lost: str | None = None
         self.logic_failed: str | None = None  # how own logic failed, and when
@@ -173,17 +105,17 @@ class Flight:
         self._recorder: Recorder | None = None
         self._early: list[tuple[str, str]] = []  # messages from before there was a recorder
         self._release_us: int | None = None
-        self._duration_us = round(order.duration_s * 1e6)
-        self._trace_all = trace_all
+        self._duration_us = round(request.duration_s * 1e6)
+        self._trace_all = request.bench.trace
         self._drops_noted: dict[str, int] = {}
         self._next_drop_note_us = 0
-        site = Site(order.config, self.events, Streams.of_seed(order.seed), self.note, executor)
-        self.line = line_of(order, site, self.lab)
+        site = Site(request.config, self.events, Streams.of_seed(request.seed), self.note, executor)
+        self.line = line_of(request, site, self.lab)
         self.robot = self.line.robot
         self.lab.robots.append(self.robot)
         self.robot.plant.hold()
         self.switchboard = Switchboard(self.robot)
-        order.experiment.prepare(self.robot)
+        request.experiment.prepare(self.robot)
         self.switchboard.prepare(self.faults)
         self.schedule = ScheduleTrace(self.robot.firmware.scheduler)
         self._recorded = self.robot.firmware

@@ -2,43 +2,51 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
+from firmware_py.errors import FirmwareError
+from firmware_py.export.boards import runner_of
+from ground_station.errors import LinkError
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal
-from hil.clock import Clock, FreeRunning
+from hil.clock import Clock, FreeRunning, Paced
 from hil.config import LabConfig
 from hil.crazyflie.shockburst import Air
-from hil.devices.board_firmware import Executor, Flashed
+from hil.devices.board_firmware import Executor, Flashed, PythonBoard
+from hil.devices.image_firmware import ChipImage
 from hil.devices.image_settings import ImageSettings
 from hil.devices.radio import Receiver, VirtualRadio
+from hil.devices.real_core import is_link, real_core
 from hil.devices.uart import VirtualSerial
-from hil.laboratory.channels import radio_channel, tracker_channel
-from hil.laboratory.flight import Flight, Order
+from hil.errors import LabError
+from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
+from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.recorder import Channel
+from hil.laboratory.request import MAVLINK, Request, check_image
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
+from hil.stm32f405.gdb import GdbServer
 
-RADIO, MAVLINK = "radio", "mavlink"
-LOCKSTEP = (RADIO, MAVLINK)  # links that are fully simulated
+BUILD = Path("runs/build")
 
 
 class ModelledLine:
     """`hil.laboratory.flight.Line` for the modelled links; `station`, `tracker` and `radio` may be read."""
 
-    def __init__(self, telemetry: Path | None, order: Order, site: Site, lab: Laboratory) -> None:
+    def __init__(self, telemetry: Path | None, request: Request, site: Site, lab: Laboratory) -> None:
         config, events, streams = site.config, site.events, site.streams
-        serial = order.link == MAVLINK
+        serial = request.bench.link == MAVLINK
         self.record: Path | None = None  # the log has the goals already
         self._release_us = config.flight.release_us
-        self.trajectory = order.experiment.trajectory(Goal(config.flight.home, 0.0), self._release_us)
+        self.trajectory = request.experiment.trajectory(Goal(config.flight.home, 0.0), self._release_us)
         self.tracker = tracker_of(config.tracker, config.mocap.period_us)
         air = Air.of(config.radio)
         uart = VirtualSerial(config.serial, events, streams.serial) if serial else None
@@ -93,10 +101,20 @@ class ModelledLine:
         return link, radio_channel(self.radio)
 
     def _serial(self, site: Site, uart: VirtualSerial, telemetry: Path | None) -> tuple[Link, Channel]:
-        """Return the station's end of the serial line, whose package is an extra."""
-        from hil.laboratory.serial_line import link_of, serial_channel
+        """Return the station's end of the serial line. Raises `LabError` when no flight fits on it."""
+        from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig  # whose package is an extra
 
-        link = link_of(site.config, uart, None if telemetry is None else self._note_frame)
+        config = site.config
+        settings = MavlinkLinkConfig(
+            config.serial.baud,
+            min(config.station.corrections_hz, 1e6 / config.mocap.period_us),
+            bytes.fromhex(config.mavlink.signing_key),
+            latency_us=config.station.link_latency_us,
+        )
+        try:
+            link = MavlinkLink(uart.uplink, settings, None if telemetry is None else self._note_frame)
+        except LinkError as error:
+            raise LabError(f"--link mavlink: {error}") from None
         if telemetry is not None:
             self._frames = FrameLog(telemetry.with_name(FRAME_LOG))
         site.events.at(0, lambda now_us: site.say("lab", link.budget.text))
@@ -126,11 +144,52 @@ class ModelledLine:
 
 
 def lockstep_flight(
-    order: Order,
+    request: Request,
     telemetry: Path | None = None,
-    clock: Clock | None = None,
-    trace_all: bool = False,
     executor: Executor = PYTHON_BOARD,
+    clock: Clock | None = None,
 ) -> Flight:
-    """Return a flight over a modelled link."""
-    return Flight(order, clock or FreeRunning(), partial(ModelledLine, telemetry), executor, trace_all)
+    """Return a flight over a modelled link; by default paced if the request says so."""
+    clock = clock or (Paced() if request.bench.realtime else FreeRunning())
+    return Flight(request, clock, partial(ModelledLine, telemetry), executor)
+
+
+def in_lockstep(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
+    """Return a flight over a modelled link. Raises `LabError` when its board is not available here."""
+    try:
+        return lockstep_flight(request, telemetry, _executor(request, stack))
+    except LinkError as error:
+        raise LabError(f"--board {error}") from None
+
+
+def _executor(request: Request, stack: ExitStack) -> Executor:
+    bench = request.bench
+    if is_link(bench.board):
+        return PythonBoard(real_core(bench.board, stack))
+    if bench.is_image:
+        return image_at(bench.board, bench.elf, debugger(bench.gdb, bench.elf or Path(bench.board), stack))
+    try:
+        return PythonBoard(runner_of(bench.board, BUILD, request.config.logic))
+    except FirmwareError as error:
+        raise LabError(f"--board {bench.board}: {error}") from None
+
+
+def image_at(board: str, elf: Path | None, debugger: GdbServer | None = None) -> ChipImage:
+    """Return the image that `--board` and `--elf` name. Raises `LabError` when it cannot run here."""
+    check_image(board)
+    try:
+        return ChipImage.load(Path(board), elf, BUILD, debugger)
+    except FirmwareError as error:
+        raise LabError(f"--board {board}: {error}") from None
+
+
+def debugger(port: int | None, image: Path, stack: ExitStack) -> GdbServer | None:
+    """Open the port that `--gdb` asks for until the stack is closed; it prints the command to type when it waits."""
+    if port is None:
+        return None
+
+    def waiting(port: int) -> None:
+        connect = f"-ex 'target remote 127.0.0.1:{port}'"
+        print(f"waiting for gdb-multiarch {shlex.quote(str(image))} {connect}", flush=True)
+
+    return stack.enter_context(closing(GdbServer(port, waiting)))

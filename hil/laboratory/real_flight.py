@@ -13,22 +13,19 @@ from math import nan, sqrt
 from pathlib import Path
 
 from firmware_py.elementary import cos
-from firmware_py.logic.loading import digest_of
 from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us
 from ground_station.mocap import MocapFrame
 from ground_station.program import Cockpit
 from ground_station.telemetry_log import TELEMETRY
-from hil.config import LabConfig
 from hil.errors import LabError, writing
-from hil.installation import commit, versions
 from hil.laboratory.ages import STATION_START, ages_of, reported_ages
 from hil.laboratory.channels import station_channels
-from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import RECORD_PERIOD_US
-from hil.laboratory.metrics import check_limits, free_flight, judge, limits_of, measure
+from hil.laboratory.metrics import check_limits, free_flight, judge, measure
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
-from hil.laboratory.result import REAL, Origin, Outcome, Result, with_resets, write_result
+from hil.laboratory.request import Request
+from hil.laboratory.result import Outcome, Program, Result, metadata_of, with_resets, write_result
 from hil.world.config import LimitsConfig
 
 
@@ -42,25 +39,18 @@ class RealFlight:
     def __init__(
         self,
         folder: Path | None,
-        experiment: Experiment,
-        config: LabConfig,
-        profile: str,
-        overrides: tuple[str, ...],
-        uri: str,
+        request: Request,
         say: Callable[[str], None],
         clock: Callable[[], int] = clock_us,
         onlooker: Onlooker | None = None,
     ) -> None:
         self._folder = folder
         self._onlooker = onlooker
-        self._experiment = experiment
-        self._config = config
-        self._limits = limits_of(experiment.limits, config.limits.get(experiment.name))
-        check_limits(self._limits, experiment.metrics)
-        self._origin = Origin(
-            experiment.name, profile, overrides, None, experiment.duration_s, uri, REAL, (), versions(),
-            commit(), experiment.source, digest_of(config.logic),
-        )  # fmt: skip
+        self._request = request
+        self._experiment = request.experiment
+        self._config = request.config
+        check_limits(request.limits, request.experiment.metrics)
+        self._program = Program.of(request.config)
         self._say = say
         self._clock = clock
         self._start_us = clock()
@@ -103,8 +93,7 @@ class RealFlight:
 
     def _begin(self, cockpit: Cockpit) -> None:
         metadata = {
-            **self._origin.metadata(),
-            "config": self._config.model_dump_json(),
+            **metadata_of(self._request, self._program),
             STATION_START.decode(): str(self._start_us),
         }
         channels = station_channels(
@@ -181,16 +170,17 @@ class RealFlight:
         outcome: Outcome = "lost" if self._lost else "completed" if self._whole else cut_short
         outcome, cause = with_resets(outcome, self._lost or failure or None, metrics["resets"])
         return Result(
-            **self._origin.fields(),
+            request=self._request,
+            program=self._program,
             outcome=outcome,
             cause=cause,
             metrics=metrics,
             own_metrics=own,
-            verdicts=tuple(judge(metrics, self._limits, own)),
+            verdicts=tuple(judge(metrics, self._request.limits, own)),
             tasks=(),
             queues=(),
             usage=None,
-            ages=ages_of(reported_ages(folder), log, self._origin.link),
+            ages=ages_of(reported_ages(folder), log, self._request.bench.link),
             hash=digest,
             real_time_factor=nan,
             stood_still_ms=nan,

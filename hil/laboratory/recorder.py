@@ -227,12 +227,18 @@ def log_pieces(folder: Path) -> Iterator[pa.Table]:
         raise LabError(f"{folder}: no {PARQUET} or {STREAM} in it; expected a run folder")
 
 
+def stored_in(metadata: Mapping[bytes, bytes] | None, name: str) -> dict[str, Any]:
+    """Return what a log's metadata hold as JSON: `request`, `program` or `config`; empty for a log without."""
+    stored: dict[str, Any] = json.loads((metadata or {}).get(name.encode(), b"{}"))
+    return stored
+
+
 def release_of(metadata: Mapping[bytes, bytes] | None) -> int:
     """Return when the robot of a log was released [us], or when that was planned; 0 for a log with neither."""
     known = metadata or {}
     if RELEASE_US in known:
         return int(known[RELEASE_US])
-    return int(json.loads(known.get(b"config", b"{}")).get("flight", {}).get("release_us", 0))
+    return int(stored_in(known, "config").get("flight", {}).get("release_us", 0))
 
 
 def load_events(folder: Path) -> list[dict[str, Any]]:

@@ -7,30 +7,31 @@ A number that a flight does not have is NaN here and null in the file. Of a run 
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, computed_field
+from pydantic import Field, TypeAdapter, ValidationError, computed_field
+from pydantic_core import from_json
 
 from firmware_py.export.usage import Usage
+from firmware_py.logic.loading import digest_of
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
+from hil.config import LabConfig
 from hil.devices.board_firmware import ImageReport
 from hil.errors import LabError
-from hil.laboratory.experiment import Source
+from hil.installation import commit, versions
+from hil.laboratory.experiment import unknown
 from hil.laboratory.metrics import Figure, Metric, Verdict, measure
-from hil.laboratory.recorder import load_log
+from hil.laboratory.recorder import load_log, stored_in
+from hil.laboratory.request import Find, Request, StoredRequest
 
 RESULT = "result.json"
-USUAL = {"profile": "floaty", "link": "radio", "board": "python"}  # of `Origin.requested`
-REAL = "real"  # the board of a flight that only its ground station saw
+PARTS = ("request", "program", "experiment", "bench")  # whose own parts stand beside the others in the file
 
 # reset: flown to its end, but the board was reset on the way.
 Outcome = Literal["completed", "lost", "reset", "interrupted", "error"]
-# In a log's schema values are JSON text.
-AsText = BeforeValidator(lambda value: json.loads(value) if isinstance(value, str) else value)
-OrNone = BeforeValidator(lambda value: None if value == "null" else value)  # likewise
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,53 +45,34 @@ class QueueReport:
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
-    """What was flown, by which program; also stored in the log's schema."""
+class Program:
+    """What computed a flight."""
 
-    experiment: str
-    profile: str
-    overrides: Annotated[tuple[str, ...], AsText]
-    seed: Annotated[int | None, OrNone]  # None: a real flight has none
-    duration_s: float
-    link: str
-    board: str
-    faults: Annotated[tuple[str, ...], AsText]  # the experiment's own and those on top
-    versions: Annotated[Mapping[str, str], AsText]  # of the packages that computed the flight
+    versions: Mapping[str, str]  # of the packages
     commit: str
-    source: Annotated[Source | None, AsText]  # of an experiment that does not ship
     logic: str  # hash of the user's modules in the core, empty without
 
-    def fields(self) -> dict[str, Any]:
-        """Return them by name, also of a `Result`."""
-        return {field.name: getattr(self, field.name) for field in fields(Origin)}
+    @classmethod
+    def of(cls, config: LabConfig) -> "Program":
+        """Return this program, with the modules of a configuration."""
+        return cls(versions(), commit(), digest_of(config.logic))
 
-    def requested(self) -> dict[str, str]:
-        """Return the request as text, by what `floaty fly` calls it: equal for flights that were asked for alike."""
-        return {
-            "": self.source.reference if self.source else self.experiment,
-            "seed": str(self.seed), "duration": f"{self.duration_s!r} s", "profile": self.profile,
-            "set": " ".join(self.overrides), "fault": " ".join(self.faults), "link": self.link, "board": self.board,
-        }  # fmt: skip
 
-    @property
-    def title(self) -> str:
-        """The heading of a page or a table."""
-        return (
-            f"{self.experiment}, real flight" if self.seed is None else f"{self.experiment}, seed {self.seed}"
-        )
-
-    def metadata(self) -> dict[str, str]:
-        """Return it as text for a log's schema."""
-        values = _ORIGIN.dump_python(self, mode="json")
-        return {
-            name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()
-        }
+def metadata_of(request: Request, program: Program) -> dict[str, str]:
+    """Return the origin of a flight as text for its log's schema."""
+    return {
+        "request": json.dumps(request.stored()),
+        "program": json.dumps(asdict(program)),
+        "config": request.config.model_dump_json(),
+    }
 
 
 @dataclass(frozen=True, slots=True)
-class Result(Origin):
-    """The outcome of a run."""
+class Result:
+    """The outcome of a run. In its file the parts of request and program stand beside the others."""
 
+    request: StoredRequest
+    program: Program
     outcome: Outcome
     cause: str | None
     metrics: Mapping[str, Figure]
@@ -129,45 +111,60 @@ def with_resets(outcome: Outcome, cause: str | None, resets: float) -> tuple[Out
     return "reset" if outcome == "completed" else outcome, "; ".join(filter(None, (cause, how)))
 
 
-_ORIGIN, _RESULT = TypeAdapter(Origin), TypeAdapter(Result)
+_RESULT = TypeAdapter(Result)
 
 
 def write_result(result: Result) -> None:
     """Write `result.json`."""
-    (result.folder / RESULT).write_bytes(_RESULT.dump_json(result, indent=2) + b"\n")
+    values = _RESULT.dump_python(result, mode="json")
+    flat = {**values.pop("request"), **values.pop("program"), **values}
+    (result.folder / RESULT).write_text(json.dumps(flat, indent=2) + "\n", encoding="utf-8")
 
 
-def read_result(folder: Path) -> Result:
-    """Return the result of a run folder. Raises `LabError` when the folder holds no run of this version."""
+def read_result(folder: Path, find: Find = unknown) -> Result:
+    """Return the result of a run folder; `find` finds its experiment, by default there is a stand-in.
+
+    Raises `LabError` when the folder holds no run of this version.
+    """
     path = folder / RESULT
     try:
         if not path.is_file():
-            return _of_killed(folder)
-        return replace(_RESULT.validate_json(path.read_bytes()), folder=folder)
+            return _of_killed(folder, find)
+        return _read(from_json(path.read_bytes()), folder, find)
     except OSError as error:
         raise LabError(f"{folder}: {error.strerror or error}") from None
     except ValidationError as error:
         raise LabError(f"{path}: {_first_of(error)}") from None
+    except ValueError as error:
+        raise LabError(f"{path}: invalid JSON: {error}") from None
 
 
-def _of_killed(folder: Path) -> Result:
+def _read(values: Any, folder: Path, find: Find) -> Result:
+    parts = {**values, "request": values, "program": values} if isinstance(values, dict) else values
+    return replace(_RESULT.validate_python(parts, context=find), folder=folder)
+
+
+def _of_killed(folder: Path, find: Find) -> Result:
     log = load_log(folder)
-    metadata = {key.decode(): value.decode() for key, value in (log.schema.metadata or {}).items()}
+    metadata = log.schema.metadata
+    outcome = {
+        "outcome": "error", "cause": "the process ended before the flight did", "metrics": measure(log, lost=False),
+        "own_metrics": {}, "verdicts": (), "tasks": (), "queues": (), "usage": None, "ages": (), "hash": "",
+        "real_time_factor": math.nan, "stood_still_ms": math.nan,
+    }  # fmt: skip
     try:
-        origin = _ORIGIN.validate_python(metadata)
+        return _read(
+            {**stored_in(metadata, "request"), **stored_in(metadata, "program"), **outcome}, folder, find
+        )
     except ValidationError as error:
         raise LabError(f"{folder}: the log's schema: {_first_of(error)}") from None
-    return Result(
-        **origin.fields(), outcome="error", cause="the process ended before the flight did",
-        metrics=measure(log, lost=False), own_metrics={}, verdicts=(), tasks=(), queues=(), usage=None, ages=(), hash="",
-        real_time_factor=math.nan, stood_still_ms=math.nan, folder=folder,
-    )  # fmt: skip
 
 
 def _first_of(error: ValidationError) -> str:
     """Return the first error: the value, and what is expected."""
     detail = error.errors()[0]
-    name, message = ".".join(map(str, detail["loc"])), detail["msg"]
+    place = detail["loc"][sum(part in PARTS for part in detail["loc"][:-1]) :]
+    name, message = ".".join(map(str, place)), detail["msg"]
     if detail["type"] == "missing":
         return f"{name} is missing: it was written by another version; fly again"
     value = f"{name} = {detail['input']!r}: " if name else ""

@@ -5,7 +5,6 @@ at the same instant of their logs, real ones and those over a real link, share n
 over the time since the release shows what the model does not contain.
 """
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ import pyarrow as pa
 from hil.errors import LabError, writing
 from hil.experiments import find_again
 from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure
-from hil.laboratory.recorder import load_log, release_of
+from hil.laboratory.recorder import load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
 from hil.pictures import curves
 from hil.pictures.curves import since_release
@@ -32,7 +31,7 @@ AROUND_US = 1_000_000  # shown before and after the judged part of a real flight
 PICTURE, PAGE = "compare.png", "compare.html"
 PAIR = (DARK, curves.ORANGE)
 # The keys of a result that describe its settings.
-SETTINGS = ("experiment", "profile", "seed", "duration_s", "link", "board", "outcome", "commit")
+SETTINGS = ("experiment", "profile", "seed", "duration_s", "link", "board")
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +102,7 @@ class Comparison:
 
 def load_flown(folder: Path) -> FlownRun:
     """Return the log and result of a run folder. Raises `LabError` when it cannot be read."""
-    run = FlownRun(load_log(folder), read_result(folder))
+    run = FlownRun(load_log(folder), read_result(folder, find_again))
     if "flight.free" not in run.log.column_names:
         raise LabError(f"{folder}: its log is not that of a flight")
     return run
@@ -235,9 +234,9 @@ def _up_to(run: FlownRun, end_s: float) -> Result:
         return run.result
     log = run.log.filter(since_release(run.log) < end_s + ROW_S / 2)
     metrics = measure(log, lost=False)
-    known = find_again(run.result.experiment, run.result.source)
-    if known is not None and (free := free_flight(log)).num_rows > 1:
-        metrics.update(known.measured(free))
+    experiment = run.result.request.experiment
+    if experiment.is_known and (free := free_flight(log)).num_rows > 1:
+        metrics.update(experiment.measured(free))
     return replace(run.result, metrics=metrics)
 
 
@@ -253,9 +252,10 @@ def _metric_pairs(a: Result, b: Result) -> list[MetricPair]:
 
 def _differing_settings(a: FlownRun, b: FlownRun) -> list[tuple[str, str, str]]:
     trees = [
-        {name: getattr(run.result, name) for name in SETTINGS}
-        | {f"versions.{name}": number for name, number in run.result.versions.items()}
-        | _flat(json.loads((run.log.schema.metadata or {}).get(b"config", b"{}")))
+        {name: value for name, value in run.result.request.stored().items() if name in SETTINGS}
+        | {"outcome": run.result.outcome, "commit": run.result.program.commit}
+        | {f"versions.{name}": number for name, number in run.result.program.versions.items()}
+        | _flat(stored_in(run.log.schema.metadata, "config"))
         for run in (a, b)
     ]
     names = [*trees[0], *(name for name in trees[1] if name not in trees[0])]

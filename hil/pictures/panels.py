@@ -3,7 +3,6 @@
 Times are seconds from the release.
 """
 
-import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from firmware_py.wire.supervisor import State
 from hil.laboratory.faults import spans_of
 from hil.laboratory.metrics import column, free_flight
-from hil.laboratory.recorder import release_of
+from hil.laboratory.recorder import release_of, stored_in
 from hil.pictures.curves import GREY, Curves, marks_of, since_release
 
 Signal = NDArray[np.float64]  # (N,)
@@ -156,7 +155,7 @@ def _spells(kind: str, times: Signal, acts: NDArray[np.bool_], text: str = "") -
 
 def saturated(flight: pa.Table) -> Iterator[tuple[int, NDArray[np.bool_]]]:
     """Yield the flaps whose commands reach an end of their range, and the rows in which they do."""
-    limits = json.loads((flight.schema.metadata or {}).get(b"config", b"{}")).get("allocation")
+    limits = stored_in(flight.schema.metadata, "config").get("allocation")
     # a real board does not report its commands
     if limits is None or "control.flap_1" not in flight.column_names:
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from hil.experiments.measures import seconds
 from hil.experiments.power import power
 from hil.experiments.specific_power import CONVENTIONAL_W_PER_KG, VEHICLES
 from hil.laboratory.metrics import column, free_flight
+from hil.laboratory.recorder import stored_in
 from hil.pictures import curves
 from hil.pictures.figures import SECOND
 from hil.pictures.panels import Panel, Plot, Series
@@ -88,7 +88,7 @@ def discharge(*flights: pa.Table) -> Plot:
         charges.append(Series(name, colour, times, 100 * column(flight, "battery.charge")))
     whole = np.array([0.0, times.max(initial=0.0)])
     mean = Series(f"mean {power.mean():.2f} W", curves.GREY, whole, np.full(2, power.mean()))
-    config = json.loads((flights[0].schema.metadata or {}).get(b"config", b"{}"))
+    config = stored_in(flights[0].schema.metadata, "config")
     low = (1e-3 * config["supervisor"]["low_battery_mv"],) if config else ()
     return Plot(
         (

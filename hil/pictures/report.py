@@ -16,7 +16,7 @@ from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, spans_of
 from hil.laboratory.metrics import METRICS, SHOWN, short_of
-from hil.laboratory.recorder import load_events, load_log, release_of
+from hil.laboratory.recorder import load_events, load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.close_ups import close_ups
@@ -60,10 +60,10 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
 
     `experiment` is the one flown; by default it is found from the run's reference.
     """
-    result, events = read_result(folder), load_events(folder)
+    result, events = read_result(folder, find_again), load_events(folder)
     log = with_marks(load_log(folder), events)
-    experiment = experiment or find_again(result.experiment, result.source)
-    own = pictures_of(experiment) if experiment else ()
+    experiment = experiment or result.request.experiment
+    own = pictures_of(experiment)
     ages, schedule = ages_in_time_of(iter([log]), folder), load_schedule(folder)
     of_log = [*own, *PICTURES, *([OWN_LOGIC] if own_logic(log) else [])]
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
@@ -73,12 +73,12 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     if schedule.num_rows:
         figures.append(draw(SCHEDULE, marks, schedule.replace_schema_metadata(log.schema.metadata)))
     close = close_ups(log, marks)
-    config = json.loads((log.schema.metadata or {}).get(b"config", b"{}"))
+    config = stored_in(log.schema.metadata, "config")
     return write_page(
         folder / REPORT,
         TEMPLATE,
         result=result,
-        found=experiment is not None,
+        found=experiment.is_known,
         rows=metric_rows(result),
         faults=fault_rows(span.fault for span in spans_of(log.schema.metadata)),
         events=events,
@@ -108,7 +108,7 @@ def metric_rows(result: Result) -> list[MetricRow]:
         sign = "≤" if metric.bound == "max" else "≥"
         limit = "" if verdict is None else f"{sign} {verdict.bound * scale:.4g}"
         text = "–" if math.isnan(value) else "never" if math.isinf(value) else f"{value * scale:.4g}"
-        unit += short_of(metric, value, result.metrics.get("flown", math.nan), result.duration_s)
+        unit += short_of(metric, value, result.metrics.get("flown", math.nan), result.request.duration_s)
         rows.append(
             MetricRow(name, metric.meaning, text, unit, limit, None if verdict is None else verdict.mark)
         )

@@ -12,43 +12,33 @@ from pathlib import Path
 
 from ground_station.errors import LinkError
 from hil.clock import Clock, Paced
-from hil.devices.real_core import is_link, open_real_core
+from hil.devices.real_core import open_real_core
 from hil.devices.real_firmware import RealBoard
 from hil.errors import LabError
 from hil.laboratory.flight import Flight
-from hil.laboratory.lockstep import RADIO, lockstep_flight
-from hil.laboratory.run import MakeFlight, Request
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.request import Request
 
 HOLD_US = 2_000_000  # in the holder at least: the gyro's zero has to be found through the link
 
 
-def in_the_loop(moving: bool) -> MakeFlight:
-    """Return what puts such flights together; `moving`: the board's servos move as well."""
-
-    def flight_of(
-        request: Request, telemetry: Path, clock: Clock | None, trace_all: bool, stack: ExitStack
-    ) -> Flight:
-        if not is_link(request.board) or request.link != RADIO:
-            raise LabError(
-                f"--hil: --board {request.board} --link {request.link}: expected the link to a real board as --board"
-            )
-        paced = Paced()
-        board = RealBoard(open_real_core(request.board, "--board", stack), moving, paced)
-        stack.callback(board.leave)
-        return flight_in_the_loop(request, board, paced, telemetry)
-
-    return flight_of
+def in_the_loop(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
+    """Return such a flight, on a clock that follows the wall. Raises `LabError` when there is no board."""
+    paced = Paced()
+    core = open_real_core(request.bench.board, "--board", stack)
+    board = RealBoard(core, request.bench.in_loop == "moving", paced)
+    stack.callback(board.leave)
+    return flight_in_the_loop(request, board, paced, telemetry)
 
 
 def flight_in_the_loop(
     request: Request, board: RealBoard, clock: Clock, telemetry: Path | None = None
 ) -> Flight:
-    """Return a flight on a clock that follows the wall. Raises `LabError` when there is no board."""
-    held = max(request.config.flight.release_us, HOLD_US)
-    start = request.config.flight.model_copy(update={"release_us": held})
-    order = replace(request, config=request.config.model_copy(update={"flight": start}))
+    """Return a flight with an opened board, which is held until its gyro's zero is known."""
+    held_us = max(request.config.flight.release_us, HOLD_US)
+    held = replace(request, overrides=(*request.overrides, f"flight.release_us={held_us}"))
     try:
-        flight = lockstep_flight(order, telemetry, clock, executor=board)
+        flight = lockstep_flight(held, telemetry, board, clock)
     except LinkError as error:
         raise LabError(f"--board {error}") from None
     flight.events.at(0, lambda now_us: flight.note("board", str(flight.robot.firmware)))

@@ -18,17 +18,18 @@ from pathlib import Path
 
 from ground_station.links.frame_log import FRAME_LOG
 from ground_station.trajectory import Goal, Trajectory
-from hil.clock import Clock, Paced
+from hil.clock import Paced
 from hil.devices.image_settings import to_set
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS, find_experiment
+from hil.experiments import find_again
 from hil.laboratory.ages import STATION_CLOCK
-from hil.laboratory.channels import radio_channel
-from hil.laboratory.flight import Flight, Order
+from hil.laboratory.channels import radio_channel, serial_channel
+from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
+from hil.laboratory.lockstep import image_at
 from hil.laboratory.recorder import Channel, Quantity
+from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Site
-from hil.laboratory.run import Request, image_at
 from hil.servers.dongle_plugin import VARIABLE
 from hil.servers.holder import HOLD_US, Holder
 from hil.servers.motive import Streaming
@@ -56,16 +57,16 @@ class StationProcess:
     """
 
     def __init__(
-        self, telemetry: Path, arguments: Sequence[str], order: Order, site: Site, lab: Laboratory
+        self, telemetry: Path, arguments: Sequence[str], request: Request, site: Site, lab: Laboratory
     ) -> None:
         assert isinstance(lab.clock, Paced)
-        config, uri = site.config, order.link
+        config, uri = site.config, request.bench.link
         self._say = site.say
         self._served = ServedRobot(1, site, partial(site.say, "lab"), uri.startswith(SERIAL))
         self.robot = self._served.robot
-        self._ends = Ends(lab, lab.clock.readers, config, order.seed)
+        self._ends = Ends(lab, lab.clock.readers, config, request.seed)
         self._ends.robots.append(self._served)
-        self._experiment = order.experiment
+        self._experiment = request.experiment
         self.record: Path | None = telemetry
         self._home = Goal(config.flight.home, 0.0)
         self._release_us: int | None = None  # the robot is held
@@ -77,7 +78,7 @@ class StationProcess:
         self._command = [
             sys.executable, "-m", "hil.commands", "station", "--link", station_uri,
             "--mocap", f"optitrack:127.0.0.1:{motive.port},body={name_of(1)},y-up",
-            "--trajectory", order.experiment.reference, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
+            "--trajectory", request.experiment.reference, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
             *(("--tlog", str(telemetry.with_name(FRAME_LOG))) if uri.startswith(SERIAL) else ()), *arguments, *ALIGNED,
         ]  # fmt: skip
         self._output = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - closed with the line
@@ -130,8 +131,6 @@ class StationProcess:
         """What line and board count; the station keeps its own record."""
         robot = self.robot
         if robot.uart is not None:
-            from hil.laboratory.serial_line import serial_channel  # needs pymavlink
-
             line: tuple[Channel, ...] = (serial_channel(robot.uart, robot.firmware, None),)
         else:
             line = (radio_channel(self._served.udp_radio),) if self._served.udp else ()
@@ -210,27 +209,23 @@ class StationProcess:
         self._ends.close()
 
 
-def linked_flight(
-    request: Request, telemetry: Path, clock: Clock | None, trace_all: bool, stack: ExitStack
-) -> Flight:
+def linked_flight(request: Request, telemetry: Path | None, stack: ExitStack) -> Flight:
     """Return a flight over a real link, always paced; it is released when its board flies.
 
     Raises `LabError` for an experiment whose trajectory the station's process cannot find.
     """
     experiment = request.experiment
-    found = (
-        EXPERIMENTS.get(experiment.name)
-        if experiment.source is None
-        else find_experiment(experiment.reference)
-    )
+    found = find_again(experiment.name, experiment.source)
     if found is None or found.trajectory != experiment.trajectory:
         raise LabError(
-            f"--link {request.link}: experiment {experiment.name}: its trajectory must stand in a file or a package, where "
-            "the ground station's process finds it"
+            f"--link {request.bench.link}: experiment {experiment.name}: its trajectory must stand in a file or a "
+            "package, where the ground station's process finds it"
         )
     arguments = ["--profile", request.profile, *(f"--set={override}" for override in request.overrides)]
-    executor = image_at(request.board, request.elf) if request.is_image else PYTHON_BOARD
-    return Flight(request, Paced(), partial(StationProcess, telemetry, arguments), executor, trace_all)
+    bench = request.bench
+    executor = image_at(bench.board, bench.elf) if bench.is_image else PYTHON_BOARD
+    assert telemetry is not None
+    return Flight(request, Paced(), partial(StationProcess, telemetry, arguments), executor)
 
 
 def _pty(uri: str) -> Address:

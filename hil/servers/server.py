@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,14 +23,15 @@ from hil.laboratory.channels import (
     flight_channels,
     marker_channel,
     radio_channel,
+    serial_channel,
 )
-from hil.laboratory.failures import Failures
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
 from hil.laboratory.recorder import Channel, Onlooker, Recorder
 from hil.laboratory.robot import PYTHON_BOARD, Site, Streams, with_system
 from hil.servers.dongle_server import DongleServer
+from hil.servers.failures import Failures
 from hil.servers.holder import Holder
 from hil.servers.motive import Streaming, VirtualMotive
 from hil.servers.serial_server import Address
@@ -123,7 +125,7 @@ class Shown:
             served.robot.thief.share = 0.0
         self._firmware = served.robot.firmware
         config = served.robot.config
-        metadata = {"experiment": "served", "link": "served:", "config": config.model_dump_json()}
+        metadata = {"request": json.dumps({"experiment": "served"}), "config": config.model_dump_json()}
         self._recorder = Recorder(None, self._channels(), metadata, onlooker)
 
     def row(self, now_us: int) -> None:
@@ -136,8 +138,6 @@ class Shown:
     def _channels(self) -> tuple[Channel, ...]:
         robot = self._served.robot
         if robot.uart is not None:
-            from hil.laboratory.serial_line import serial_channel  # needs pymavlink
-
             line = serial_channel(robot.uart, robot.firmware, None)
         else:
             line = radio_channel(self._served.udp_radio)

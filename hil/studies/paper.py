@@ -17,8 +17,8 @@ from rich.console import Console
 from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.metrics import METRICS, SHOWN
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper_rows import ROWS, PaperRow
 from hil.studies.study import Study
@@ -166,7 +166,9 @@ def fly_paper(
     trials: dict[tuple[str, str], list[Hashable]] = {}
     for name in rows:
         for profile in PROFILES:
-            requests = [Request.of(find_experiment(name), profile, seed=seed) for seed in range(1, seeds + 1)]
+            requests = [
+                Request.of(find_experiment(name), profile=profile, seed=seed) for seed in range(1, seeds + 1)
+            ]
             trials[name, profile] = [_key(request) for request in requests]
             for request in requests:
                 jobs[_key(request)] = Job(request, out / f"{name}-{profile}-{request.seed}", KEPT)

@@ -17,7 +17,7 @@ from hil.experiments import find_experiment
 from hil.identify.identify import Identification, identify, interval_text
 from hil.identify.record import KEPT, load_record
 from hil.identify.two_controllers import SIGMAS, closed_loop, input_constant
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 from hil.studies.sweep import Job, fly_all
 
 FLIGHTS = ("two-controllers-1", "two-controllers-2", "identify-u1")

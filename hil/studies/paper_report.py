@@ -15,7 +15,6 @@ from typing import Any
 from hil.config import load_config
 from hil.design.analysis import Analysis
 from hil.design.analysis import write as write_design
-from hil.experiments import EXPERIMENTS
 from hil.installation import commit, versions
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
@@ -106,7 +105,7 @@ def _figures(both: Sequence[Trials]) -> list[tuple[str, list[PageFigure]]]:
         if not ordered:
             continue
         logs = [load_log(result.folder) for result in ordered]
-        own = pictures_of(EXPERIMENTS[ordered[0].experiment])
+        own = pictures_of(ordered[0].request.experiment)
         marks = marks_of_flight(logs[0], ordered[0].cause if ordered[0].outcome == "lost" else None)
         drawn = [draw(one, marks, *(logs if own else logs[:1])) for one in own or OF_EVERY_FLIGHT]
         shown = [replace(one, name=f"{trials.profile}-{one.name}", alone=True) for one in drawn]
@@ -145,7 +144,7 @@ def _trials(row: PaperRow, trials: Trials) -> dict[str, Any]:
         },
         "flights": [
             {
-                "seed": result.seed,
+                "seed": result.request.seed,
                 "outcome": result.outcome,
                 "cause": result.cause,
                 "passed": result.passed,

@@ -17,7 +17,7 @@ from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.identify.identify import identify
 from hil.identify.record import KEPT, load_record
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 from hil.studies.sweep import Job, fly_all
 
 PROFILES = ("design-half", "design-paper", "design-double")
@@ -34,7 +34,10 @@ def fly_scaling(out: Path, notices: Console) -> list[Claim]:
     jobs = [
         Job(
             Request.of(
-                find_experiment(name), profile, (f"excitation.{name[-2:]}={AMPLITUDES[name]}",), 1, DURATION_S
+                find_experiment(name),
+                profile=profile,
+                overrides=(f"excitation.{name[-2:]}={AMPLITUDES[name]}",),
+                duration_s=DURATION_S,
             ),
             out / f"{profile}-{name}",
             KEPT,

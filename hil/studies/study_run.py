@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.experiments import find_experiment
-from hil.laboratory.faults import parse
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request
 from hil.studies.study import Expected, Study, Variant
 
 OUTCOMES = ("holds", "degrades", "failsafe", "lost", "error")  # from good to bad
@@ -89,12 +88,19 @@ def flights_of(study: Study, seeds: int) -> Iterator[tuple[Variant, float, Reque
     for variant in study.variants:
         for size in study.sizes:
             change = variant.change(size)
-            settings, faults = (*variant.settings, *change.settings), tuple(map(parse, change.faults))
+            settings, faults = (*variant.settings, *change.settings), change.faults
             for seed in range(1, seeds + 1):
                 yield (
                     variant,
                     size,
-                    Request.of(experiment, variant.profile, settings, seed, study.duration_s, faults=faults),
+                    Request.of(
+                        experiment,
+                        profile=variant.profile,
+                        overrides=settings,
+                        seed=seed,
+                        duration_s=study.duration_s,
+                        faults=faults,
+                    ),
                 )
 
 

@@ -20,9 +20,10 @@ from hil.arguments import checked
 from hil.errors import LabError
 from hil.experiments import find_again
 from hil.laboratory.experiment import Experiment, Source
+from hil.laboratory.folder import reserved
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly
-from hil.run_folder import reserved
+from hil.laboratory.run import fly
 
 
 @checked

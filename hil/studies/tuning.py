@@ -26,9 +26,9 @@ from hil.identify.identify import identify
 from hil.identify.profile_out import write_profile
 from hil.identify.record import KEPT, load_record
 from hil.identify.robots import FLAP_RATE, Robots, robots_of
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
 from hil.laboratory.robot import Streams
-from hil.laboratory.run import Request
 from hil.studies.study_run import distance
 from hil.studies.sweep import Job, fly_all
 from hil.world.config import ConstantName
@@ -55,7 +55,14 @@ class TuningFlights:
         experiment = find_experiment("hover")
         return self._fly(
             Job(
-                Request.of(experiment, profile, settings, self.seed, HOVER_S, board=self.board),
+                Request.of(
+                    experiment,
+                    profile=profile,
+                    overrides=settings,
+                    seed=self.seed,
+                    duration_s=HOVER_S,
+                    board=self.board,
+                ),
                 self.folder / (f"{name}-{number}" if number else name),
                 KEPT,
             )
@@ -66,7 +73,7 @@ class TuningFlights:
         """Fly an excitation of each input."""
         return self._fly(
             Job(
-                Request.of(find_experiment(name), profile, (), self.seed + number, board=self.board),
+                Request.of(find_experiment(name), profile=profile, seed=self.seed + number, board=self.board),
                 self.folder / name,
                 KEPT,
             )
@@ -219,7 +226,9 @@ def rounds(profile: str, flights: TuningFlights, count: int, most: int) -> Itera
         own = replace(flights, folder=folder, seed=flights.seed + 10 * (number - 1))
         for result in own.excitations(profile):
             if result.outcome != "completed":
-                raise LabError(f"round {number} ends: {result.experiment} lost the robot: {result.cause}")
+                raise LabError(
+                    f"round {number} ends: {result.request.experiment.name} lost the robot: {result.cause}"
+                )
         model = folder / "model.toml"
         records = [load_record(folder / name, profile) for name in EXCITATIONS]
         write_profile(model, profile, identify(records))

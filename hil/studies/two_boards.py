@@ -63,11 +63,9 @@ class TwoBoards:
 
 def comparable(a: FlownRun, b: FlownRun) -> bool:
     """Return whether two runs differ in their boards, and in nothing else that was asked for."""
-    asked = [
-        (one.experiment, one.profile, one.overrides, one.seed, one.link, one.faults)
-        for one in (a.result, b.result)
-    ]
-    return asked[0] == asked[1] and a.result.seed is not None and a.result.board != b.result.board
+    asked = [{**one.result.request.parts(), "board": "", "duration": ""} for one in (a, b)]
+    boards = {one.result.request.bench.board for one in (a, b)}
+    return asked[0] == asked[1] and not a.result.request.is_real and len(boards) == 2
 
 
 def two_boards(a: FlownRun, b: FlownRun) -> TwoBoards:
@@ -221,9 +219,8 @@ def _seed(a: FlownRun, b: FlownRun) -> Seed:
     rms = [np.sqrt((position_error(flight) ** 2).mean(axis=0)) for flight in flights]
     fused = [int(column(flight, "estimator.fused")[-1]) for flight in flights]
     apart = np.sqrt(((places[0] - places[1]) ** 2).sum(axis=0))
-    assert a.result.seed is not None
     return Seed(
-        a.result.seed,
+        a.result.request.seed,
         two_boards(a, b).first,
         (rms[0], rms[1]),
         float(apart.max(initial=0.0)),

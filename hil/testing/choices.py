@@ -14,8 +14,8 @@ from firmware_py.export.boards import BOARDS, PYTHON, runner_of
 from firmware_py.export.errors import ExportError
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, hint
-from hil.laboratory.lockstep import LOCKSTEP, RADIO
-from hil.laboratory.run import BUILD
+from hil.laboratory.lockstep import BUILD
+from hil.laboratory.request import LOCKSTEP, RADIO
 
 PACKAGES = {"mavlink": "pymavlink", "radio": "cflib"}  # capabilities that a package provides
 LOCKSTEP_ONLY = "lockstep"

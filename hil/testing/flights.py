@@ -13,13 +13,13 @@ from typing import Unpack
 import pytest
 
 from firmware_py.export.boards import BOARDS, runner_of
-from hil.api import Options, Run, command_of, fly, request_of
+from hil.api import Run, command_of, fly, request_of
 from hil.arguments import checked
 from hil.config import Overrides, load_config, settings_of
 from hil.errors import LabError
 from hil.laboratory.experiment import Experiment
-from hil.laboratory.lockstep import MAVLINK, RADIO
-from hil.laboratory.run import BUILD, Request
+from hil.laboratory.lockstep import BUILD
+from hil.laboratory.request import MAVLINK, RADIO, Options, Request
 from hil.testing.board import BareBoard
 from hil.testing.choices import Choice, why_no_board
 
@@ -149,11 +149,11 @@ def text_of(item: Item, kept: bool, options: str) -> str:
         request, result = one.request, one.run.result
         how = f"{result.outcome}: {result.cause}" if result.cause else result.outcome
         lines = [
-            f"{request.experiment.name}, seed {request.seed}, board {request.board}, profile {request.profile}, "
-            f"{request.link}: {how}"
+            f"{request.experiment.name}, seed {request.seed}, board {request.bench.board}, profile {request.profile}, "
+            f"{request.bench.link}: {how}"
         ]
         lines += [f"  limit    {verdict}" for verdict in result.failed]
-        lines += [f"  fault    {fault}" for fault in result.faults]
+        lines += [f"  fault    {fault}" for fault in request.faults]
         lines += [f"  folder   {one.run.folder}"] if kept else []
         lines += [f"  picture  {one.run.folder / PICTURE}"] if (one.run.folder / PICTURE).is_file() else []
         if result.stood_still_ms:

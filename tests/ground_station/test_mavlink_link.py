@@ -26,7 +26,8 @@ from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.trajectory import Goal, Hold
 from hil.api import request_of
-from hil.laboratory.lockstep import MAVLINK, lockstep_flight
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.request import MAVLINK
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 HOME = Goal((0.0, 0.0, 1.15), 0.0)

@@ -10,8 +10,8 @@ import pytest
 
 from hil import LabError, fly, load_run
 from hil.api import request_of
+from hil.laboratory.folder import folder_of, reserved
 from hil.laboratory.recorder import PARQUET
-from hil.run_folder import folder_of, reserved
 from support.command import Cli
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -21,7 +21,7 @@ HOLDER = """
 import sys
 from pathlib import Path
 from hil.api import request_of
-from hil.run_folder import reserved
+from hil.laboratory.folder import reserved
 with reserved(request_of("hover", duration_s=0.05), Path(sys.argv[1])):
     print("reserved", flush=True)
     sys.stdin.read()
@@ -67,7 +67,7 @@ def test_a_folder_that_was_asked_for_keeps_another_flight_unless_it_may_be_repla
         "--out mine: holds another flight (duration 0.05 s; profile floaty): choose another folder, or delete this one"
     )
     assert stored("mine") == kept
-    assert fly("hover", "mine", replace=True, duration_s=0.1, profile="lqr").result.profile == "lqr"
+    assert fly("hover", "mine", replace=True, duration_s=0.1, profile="lqr").request.profile == "lqr"
 
 
 def test_what_cannot_be_read_is_not_replaced() -> None:
@@ -103,7 +103,7 @@ def test_the_command_names_the_folder_that_stays(cli: Cli, monkeypatch: pytest.M
     ]
     assert "runs/hover-1-2/log.parquet" in cli.out
     assert stored("runs/hover-1") == kept
-    assert load_run("runs/hover-1-2").result.duration_s == 0.1
+    assert load_run("runs/hover-1-2").request.duration_s == 0.1
     assert cli("fly", "hover", "--duration", "0.1", "--out", "runs/hover-1") == 2
     assert cli.err == (
         "floaty: --out runs/hover-1: holds another flight (duration 0.05 s): choose another folder, or delete this one\n"

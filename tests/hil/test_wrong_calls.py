@@ -206,7 +206,7 @@ def refused_in_one_line(call: Callable[[], object]) -> None:
 @settings(max_examples=50, deadline=None)
 def test_a_figure_that_a_run_lacks_is_refused(name: str, value: object) -> None:
     result: Any = SimpleNamespace(metrics={"rms_x": 1.0}, own_metrics={}, folder=Path())
-    run = Run(result, None)
+    run = Run(result)
     for read in (
         lambda: run.metrics[name],
         lambda: run.unit_of(name),

@@ -143,7 +143,7 @@ def test_the_tests_of_a_project_fly_over_a_real_link(pytester: pytest.Pytester) 
 
         def test_it(floaty):
             flight = floaty.fly(duration_s=2.0)
-            assert flight.result.link.startswith("radio://")
+            assert flight.request.bench.link.startswith("radio://")
             assert flight.outcome == "completed"
 
         @pytest.mark.floaty(boards=["c"])

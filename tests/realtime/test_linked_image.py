@@ -11,7 +11,8 @@ pytest.importorskip("cflib")
 
 from hil.experiments import find_experiment
 from hil.laboratory.recorder import load_events
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.servers.linked import linked_flight
 
 ELF = os.environ.get("FLOATY_CF2_ELF", "")
@@ -22,7 +23,6 @@ ELF = os.environ.get("FLOATY_CF2_ELF", "")
 )
 def test_a_station_sets_what_the_experiment_wants_and_flies_the_image(tmp_path: Path) -> None:
     """How well it flies hangs on whether the machine keeps up with the wall clock, which is told."""
-    prepare(tmp_path)
     request = Request.of(find_experiment("yaw-step"), duration_s=2.0, board=ELF, link="udp://127.0.0.1:19853")
     result = fly(request, tmp_path, flight_of=linked_flight)
     assert result.outcome in ("completed", "lost"), result.cause

@@ -14,7 +14,8 @@ import pytest
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.live.window import COMMAND, LOOPBACK, free_port, is_open
 from hil.pictures.report import write_report
 from support.foxglove_client import FoxgloveClient
@@ -35,7 +36,6 @@ def page_of(lab: Served) -> str:
 
 def test_the_links_of_a_report_lead_into_the_recording(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    prepare(folder)
     fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0, faults=[parse("push.y@0.3=1")]), folder)
     (link,) = Page(write_report(folder).read_text(encoding="utf-8")).links
     with started("view", folder, "--web") as viewer:

@@ -12,8 +12,9 @@ from firmware_py.wire.core_port import HIL_HOLD
 from ground_station.clock import wait
 from hil.experiments import find_experiment
 from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import read_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from support.app_board import board
 from support.command import Cli
 from support.plugged_dongle import plug
@@ -35,7 +36,6 @@ SERVO_S = 0.005  # what servos and control period take at least
 def python(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The hash of the flight on the board that all others are held to."""
     folder = tmp_path_factory.mktemp("python")
-    prepare(folder)
     return fly(Request.of(find_experiment("hover"), duration_s=1.0), folder).hash
 
 
@@ -54,7 +54,7 @@ def test_a_flight_on_a_board_behind_a_link_is_the_flight_of_python(
     out = tmp_path / "run"
     assert cli("fly", "hover", "--duration", "1", "--board", uri, "--out", out) == 0
     result = read_result(out)
-    assert (result.board, result.hash) == (uri, python)
+    assert (result.request.bench.board, result.hash) == (uri, python)
     assert result.usage.entries["control"].calls == 200
 
 
@@ -69,7 +69,6 @@ def test_a_board_that_is_killed_in_flight_ends_it_in_one_line_with_what_was_flow
             if now_us > 500_000:
                 served.process.kill()
 
-        prepare(out)
         result = fly(Request.of(find_experiment("hover"), duration_s=5.0, board=uri), out, progress=kill)
     assert result.outcome == "error"
     assert re.fullmatch(rf"board {re.escape(uri)}: (silent for 3 s|lost: .*)", result.cause)

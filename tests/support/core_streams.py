@@ -20,9 +20,8 @@ from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.export.native import NativeRunner
 from hil.config import load_config
 from hil.experiments.hover import HOVER
-from hil.laboratory.faults import parse
 from hil.laboratory.lockstep import lockstep_flight
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 from support.paths import ROOT
 
 CONFIG = load_config()
@@ -137,9 +136,7 @@ class RecordingRunner:
 def record_flight(duration_s: float) -> Recording:
     """Return the core's calls in a hover with pushes and with gaps, outliers and late poses."""
     faults = ["push.y@2=2", "push.roll@3=0.2", "mocap.dropout@4:0.4", "push.z@5=2"]
-    flight = lockstep_flight(
-        Request(HOVER, CONFIG, "floaty", (), 1, duration_s, faults=tuple(parse(text) for text in faults))
-    )
+    flight = lockstep_flight(Request.of(HOVER, duration_s=duration_s, faults=faults))
     core = flight.robot.firmware._core
     runner = RecordingRunner(core)
     core.run = runner  # type: ignore[assignment]

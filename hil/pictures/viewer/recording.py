@@ -15,7 +15,7 @@ from rerun_bindings import CatalogClientInternal
 
 from hil.errors import LabError
 from hil.laboratory.ages import ages_in_time_of
-from hil.laboratory.recorder import OPERATOR, load_events, log_pieces
+from hil.laboratory.recorder import OPERATOR, load_events, log_pieces, stored_in
 from hil.laboratory.schedule import load_schedule
 from hil.pictures import monitor
 from hil.pictures.links import HOST
@@ -35,10 +35,10 @@ class RerunFlight:
 
     def __init__(self, recording: rr.RecordingStream, schema: pa.Schema) -> None:
         """Log everything static; `schema` is the log's, its metadata holds the configuration."""
-        metadata = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
+        request = stored_in(schema.metadata, "request")
         self._track = RecordingTrack(recording, schema)
-        name = "real flight" if "cameras.x" in schema.names else f"seed {metadata.get('seed', '?')}"
-        recording.send_recording_name(f"{metadata.get('experiment', 'flight')}, {name}")
+        name = "real flight" if "cameras.x" in schema.names else f"seed {request.get('seed', '?')}"
+        recording.send_recording_name(f"{request.get('experiment', 'flight')}, {name}")
         self._scene = Scene(self._track, schema)
         self.plots = Plots(self._track, schema)
         self._track.static("legend", rr.TextDocument(LEGEND, media_type=rr.MediaType.MARKDOWN))

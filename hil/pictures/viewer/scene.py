@@ -1,7 +1,5 @@
 """The 3-D scene below `/world`, in metres and W: tunnel, robot, goal, estimate, drag, flow, tether, markers and pushes."""
 
-import json
-
 import numpy as np
 import pyarrow as pa
 import rerun as rr
@@ -11,6 +9,7 @@ from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil.devices.markers import DIAMETER, marker_places
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import BOX, body, column, is_real
+from hil.laboratory.recorder import stored_in
 from hil.pictures import curves, scene
 from hil.pictures.viewer.track import RecordingTrack, Times, rgba
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
@@ -34,7 +33,7 @@ class Scene:
     """Draws what has a place, from the rows of a log whose schema holds the configuration."""
 
     def __init__(self, track: RecordingTrack, schema: pa.Schema) -> None:
-        config = json.loads((schema.metadata or {}).get(b"config", b"{}"))
+        config = stored_in(schema.metadata, "config")
         plant = {
             key: value for key, value in config.get("plant", {}).items() if key in PlantConfig.model_fields
         }

@@ -8,7 +8,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from hil.laboratory.recorder import RELEASE_US, release_of
+from hil.laboratory.recorder import RELEASE_US, release_of, stored_in
 
 FROM_RELEASE, FROM_START = "from_release", "from_start"
 Times = NDArray[np.float64]  # (N,) [us] of the log
@@ -17,7 +17,9 @@ Times = NDArray[np.float64]  # (N,) [us] of the log
 def timeline_of(metadata: Mapping[bytes, bytes] | None) -> tuple[str, int]:
     """Return the timeline of a log and its zero in the log's time [us]."""
     known = metadata or {}
-    if RELEASE_US in known or ":" not in known.get(b"link", b"").decode():  # in lockstep it is planned
+    if RELEASE_US in known or ":" not in stored_in(known, "request").get(
+        "link", ""
+    ):  # in lockstep it is planned
         return FROM_RELEASE, release_of(known)
     return FROM_START, 0
 

@@ -26,8 +26,8 @@ from firmware_py.core.structs import (
 from ground_station.trajectory import Goal, Offsets, Sine, Square, Trajectory
 from hil.experiments import Experiment
 from hil.laboratory.lockstep import lockstep_flight
-from hil.laboratory.run import Request
-from support.core_bench import CONFIG, LEVEL, Core, Vector, counts, quaternion, turned
+from hil.laboratory.request import Request
+from support.core_bench import LEVEL, Core, Vector, counts, quaternion, turned
 from support.paper_model import model
 
 TICK_US = 10_000
@@ -158,9 +158,7 @@ def flight() -> list[Record]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(entry, "file_pose", listen_pose)
         patch.setattr(entry, "estimate", listen_tick)
-        flight = lockstep_flight(
-            Request(Experiment("tour", "", 10.0, {}, tour), CONFIG, "floaty", (), 3, 10.0)
-        )
+        flight = lockstep_flight(Request.of(Experiment("tour", "", 10.0, {}, tour), seed=3))
         for at_us, force, torque in (
             (3_000_000, (0.3, 0.0, 0.0), (0.0, 0.0, 0.003)),
             (5_000_000, (0.0, -0.5, 0.3), (0.002, 0.0, 0.0)),

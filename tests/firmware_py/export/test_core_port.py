@@ -43,11 +43,11 @@ from hil.devices.real_core import RealCore
 from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 from support.app_packets import AppPackets
 from support.core_streams import MEMORY
 from support.crazyflie_app import App, build_app
-from support.own_logic import LAW, own_config
+from support.own_logic import make_project
 
 TICK = Parameters.dtype.itemsize + Input.dtype.itemsize + Estimator.dtype.fields["tick"][1]  # where it lies
 
@@ -299,12 +299,10 @@ def test_a_flight_with_fourteen_faults_has_the_bits_of_python_on_the_app(app: Ap
 
 @pytest.mark.long
 def test_own_logic_is_executed_on_the_app_too(tmp_path: Path) -> None:
-    config = own_config(tmp_path, LAW)
-    app = App(build_app(tmp_path / "app", config), tmp_path / "copy.so")
+    request = Request.of(find_experiment("hover"), profile=str(make_project(tmp_path)), duration_s=0.5)
+    app = App(build_app(tmp_path / "app", request.config), tmp_path / "copy.so")
     app.boot()
     client, _ = client_of(app)
-    hover = find_experiment("hover")
-    request = Request(hover, config, "own", (), 1, 0.5)
     checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
     assert checked.equal
     assert checked.targets[0].calls > 300
@@ -421,8 +419,7 @@ def test_a_session_number_that_was_in_use_is_not_taken(app: App) -> None:
 
 def test_a_core_of_another_layout_is_refused_in_one_line(app: App, tmp_path: Path) -> None:
     client, _ = client_of(app)
-    config = own_config(tmp_path, LAW)
-    request = Request(find_experiment("hover"), config, "own", (), 1, 0.5)
+    request = Request.of(find_experiment("hover"), profile=str(make_project(tmp_path)), duration_s=0.5)
     with pytest.raises(
         LabError, match=rf"^app: its core has {MEMORY} B of memory, this one \d+: export and flash it again$"
     ):

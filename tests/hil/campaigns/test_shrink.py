@@ -173,5 +173,5 @@ def test_what_is_shrunk_is_the_flight_that_was_drawn() -> None:
     assert (request.seed, request.overrides, request.faults) == (
         drawn.seed,
         drawn.settings,
-        reflight.whole.faults,
+        drawn.faults,
     )

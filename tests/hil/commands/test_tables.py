@@ -12,8 +12,9 @@ from hil.commands.compare import _print_seeds
 from hil.commands.tables import SEED_COLUMNS, print_result, print_seeds
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS, Verdict
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result, read_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.studies.two_boards import FirstCount, Seed
 from support.command import Cli
 
@@ -21,7 +22,6 @@ from support.command import Cli
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Result:
     folder = tmp_path_factory.mktemp("tables") / "run"
-    prepare(folder)
     fly(Request.of(EXPERIMENTS["hover"], duration_s=0.1), folder)
     return read_result(folder)
 

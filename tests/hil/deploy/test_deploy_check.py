@@ -22,7 +22,7 @@ from hil.deploy.targets import TARGETS
 from hil.devices.board_firmware import PythonBoard
 from hil.laboratory.faults import parse
 from hil.laboratory.lockstep import lockstep_flight
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 from support.command import Cli
 from support.core_streams import MEMORY
 

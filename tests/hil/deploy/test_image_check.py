@@ -19,7 +19,8 @@ from hil.deploy.image_bench import TARGET, check_parameters
 from hil.deploy.image_check import check_image, check_memory
 from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.pictures.compare import FlownRun, load_flown
 from hil.stm32f405.image import MemoryUse
 from support.crazyflie_app import App
@@ -122,7 +123,6 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., FlownRun]:
 
     def fly_hover(*faults: str) -> FlownRun:
         folder = tmp_path_factory.mktemp("run") / "run"
-        prepare(folder)
         chosen = [parse(text) for text in faults]
         fly(Request.of(find_experiment("hover"), duration_s=0.5, faults=chosen), folder)
         return load_flown(folder)

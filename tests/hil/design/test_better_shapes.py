@@ -21,7 +21,8 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_log
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.world.body import SIGNS
 from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import weigh
@@ -171,10 +172,13 @@ def test_the_steady_side_step_is_that_of_the_simulated_linear_model() -> None:
 
 def measured_agility(profile: Path, folder: Path) -> float:
     """Yaw acceleration per u3 [1/s2], by least squares over a yaw step as it was flown."""
-    prepare(folder)
     fly(
         Request.of(
-            EXPERIMENTS["yaw-step"], str(profile), ("tunnel.turbulence=none",), seed=1, duration_s=4.0
+            EXPERIMENTS["yaw-step"],
+            profile=str(profile),
+            overrides=("tunnel.turbulence=none",),
+            seed=1,
+            duration_s=4.0,
         ),
         folder,
     )
@@ -207,8 +211,8 @@ def test_command_writes_the_pareto_picture_and_a_profile_that_flies(cli: Cli, tm
     assert cli("design", *arguments, "--write", str(profile)) == 0
     assert (tmp_path / "pareto-least-authority.png").read_bytes().startswith(b"\x89PNG")
     assert "1.375 are needed" in cli.out
-    prepare(tmp_path / "flight")
-    result = fly(Request.of(EXPERIMENTS["hover"], str(profile), seed=1, duration_s=4.0), tmp_path / "flight")
+    request = Request.of(EXPERIMENTS["hover"], profile=str(profile), duration_s=4.0)
+    result = fly(request, tmp_path / "flight")
     assert result.metrics["lost"] == 0.0
     assert cli("design", *arguments, "--updrafts", "11", "8") == 2
     assert "expected the least first" in cli.err
@@ -217,7 +221,6 @@ def test_command_writes_the_pareto_picture_and_a_profile_that_flies(cli: Cli, tm
 @pytest.mark.parametrize("name", DESIGNS)
 @pytest.mark.long
 def test_the_three_designs_hover(name: str, tmp_path: Path) -> None:
-    prepare(tmp_path / "flight")
-    result = fly(Request.of(EXPERIMENTS["hover"], name, seed=2, duration_s=8.0), tmp_path / "flight")
+    result = fly(Request.of(EXPERIMENTS["hover"], profile=name, seed=2, duration_s=8.0), tmp_path / "flight")
     assert result.outcome == "completed"
     assert result.metrics["in_box"] > 0.97

@@ -20,7 +20,7 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 from hil.world.body import MIRRORS
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import axis_of

@@ -22,8 +22,9 @@ from hil.experiments.pushes import FAULTS, PUSHES
 from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import ALWAYS, METRICS
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.pictures.gallery import pictures_of
 from hil.pictures.panels import Plot, Still
 from hil.pictures.picture import Picture
@@ -41,8 +42,10 @@ def flown(
     folder: Path, name: str, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float | None = None,
     link: str = "radio",
 ) -> Result:  # fmt: skip
-    prepare(folder)
-    return fly(Request.of(EXPERIMENTS[name], profile, overrides, seed, duration_s, link=link), folder)
+    request = Request.of(
+        EXPERIMENTS[name], profile=profile, overrides=overrides, seed=seed, duration_s=duration_s, link=link
+    )
+    return fly(request, folder)
 
 
 def is_drawn(shown: Plot | Still) -> bool:
@@ -217,7 +220,6 @@ def test_pushes_come_one_after_the_other_and_are_counted_until_the_robot_is_lost
     assert len(begun) == len(PUSHES) == calm.metrics["recovered"]
     hard = [replace(fault, size=2.5 * fault.size) for fault in FAULTS if fault.kind == "push.y"]
     stronger = replace(EXPERIMENTS["pushes"], faults=(*FAULTS[:5], *hard))
-    prepare(tmp_path / "lost")
     lost = fly(Request.of(stronger), tmp_path / "lost")
     assert lost.outcome == "lost"
     assert lost.metrics["recovered"] == 5 + 2  # the calm time of x, then the push in y

@@ -16,18 +16,18 @@ from hil.exports.perfetto import write_perfetto
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import Flight
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures.report import write_report
 
 
 def go(
-    folder: Path, experiment: Experiment, duration_s: float, *overrides: str, trace_all: bool = False
+    folder: Path, experiment: Experiment, duration_s: float, *overrides: str, trace: bool = False
 ) -> Result:
-    prepare(folder)
-    request = Request(experiment, load_config("floaty", overrides), "floaty", overrides, 1, duration_s)
-    return fly(request, folder, trace_all=trace_all)
+    request = Request.of(experiment, overrides=overrides, duration_s=duration_s, trace=trace)
+    return fly(request, folder)
 
 
 def hover(script: object = None) -> Experiment:
@@ -165,7 +165,7 @@ def test_a_full_queue_is_noted_again_only_when_it_dropped_more(tmp_path: Path) -
 
 def test_perfetto_has_a_track_per_task_and_the_slices_of_the_schedule(tmp_path: Path) -> None:
     plain = go(tmp_path / "plain", hover(), 0.3)
-    traced = go(tmp_path / "traced", hover(), 0.3, trace_all=True)
+    traced = go(tmp_path / "traced", hover(), 0.3, trace=True)
     assert traced.hash == plain.hash
     trace = Trace()
     trace.ParseFromString(write_perfetto(tmp_path / "traced").read_bytes())

@@ -20,8 +20,8 @@ from hil.laboratory.experiment import Experiment, Source
 from hil.laboratory.fault_kinds import KINDS, Kind, declare
 from hil.laboratory.faults import parse
 from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import read_result
-from hil.laboratory.run import Request
 from hil.pictures.report import write_report
 from hil.servers.linked import linked_flight
 from support.command import Cli
@@ -91,16 +91,17 @@ def test_an_experiment_of_a_file_is_flown_and_its_run_names_the_file_and_its_has
         + "\n"
     )
     result = fly("mine.py:wide").result
-    assert result.source == in_file("mine.py:wide").source
-    assert result.source is not None
-    assert result.source.reference == str(Path("mine.py:wide").absolute())
+    source = result.request.experiment.source
+    assert source == in_file("mine.py:wide").source
+    assert source is not None
+    assert source.reference == str(Path("mine.py:wide").absolute())
     assert result.metrics["rows"] == 30.0
     log = load_log(Path("runs/mine-1"))
-    assert json.loads(log.schema.metadata[b"source"])["sha256"] == result.source.sha256
+    assert json.loads(log.schema.metadata[b"request"])["source"]["sha256"] == source.sha256
     assert log.column("goal.y")[-1].as_py() == pytest.approx(0.3, abs=0.02)
-    assert find_again(result.experiment, result.source) is not None
+    assert find_again("mine", source) is not None
     write("wide = " + PLAIN.replace("0.3", "0.4") % "")
-    assert find_again(result.experiment, result.source) is None
+    assert find_again("mine", source) is None
 
 
 @pytest.mark.long
@@ -249,10 +250,11 @@ def test_an_installed_experiment_is_listed_with_its_package_and_flown_by_name(cl
     (line,) = [line for line in cli.out.splitlines() if line.startswith("wide-eight")]
     assert line.split(maxsplit=1)[1] == "a summary (eights 1.2)"
     result = fly("wide-eight").result
-    assert result.source is not None
-    assert (result.source.reference, result.source.package) == ("wide-eight", "eights 1.2")
-    assert len(result.source.sha256) == 64
-    assert find_again(result.experiment, result.source) == find_experiment("wide-eight")
+    flown = result.request.experiment
+    assert flown.source is not None
+    assert (flown.source.reference, flown.source.package) == ("wide-eight", "eights 1.2")
+    assert len(flown.source.sha256) == 64
+    assert find_again(flown.name, flown.source) == find_experiment("wide-eight")
     with pytest.raises(LabError, match="did you mean wide-eight"):
         find_experiment("wide-eigth")
 
@@ -303,4 +305,4 @@ def test_a_station_in_its_own_process_is_not_asked_for_a_trajectory_that_it_cann
     write("wide = " + PLAIN % "")
     request = Request.of(experiment, link="udp://127.0.0.1:19850")
     with pytest.raises(LabError, match="its trajectory must stand in a file or a package"):
-        linked_flight(request, tmp_path / "telemetry.csv", None, False, ExitStack())
+        linked_flight(request, tmp_path / "telemetry.csv", ExitStack())

@@ -11,8 +11,9 @@ from hil.experiments import EXPERIMENTS
 from hil.experiments.take_off import CONTROLLER_ON, FANS_OFF, LANDING_FROM, STANDING_Z
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
 
@@ -34,8 +35,7 @@ def standing(**changes: float) -> Plant:
 
 
 def flown(folder: Path, *, profile: str = "floaty", seed: int = 1) -> Result:
-    prepare(folder)
-    return fly(Request.of(EXPERIMENTS["take-off-landing"], profile, seed=seed), folder)
+    return fly(Request.of(EXPERIMENTS["take-off-landing"], profile=profile, seed=seed), folder)
 
 
 def test_a_robot_at_rest_sinks_in_by_its_weight() -> None:

@@ -21,7 +21,8 @@ from hil.exports.tlog import write_tlog
 from hil.exports.wide_csv import write_csv
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log, release_of
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from support.command import Cli
 
 
@@ -29,7 +30,6 @@ from support.command import Cli
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with the step in yaw, 1 s after the release, until the robot has turned."""
     folder = tmp_path_factory.mktemp("export") / "run"
-    prepare(folder)
     fly(Request.of(EXPERIMENTS["yaw-step"], duration_s=1.6), folder)
     return folder
 

@@ -12,15 +12,15 @@ from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 
 HOVER = EXPERIMENTS["hover"]
 DURATION_S = 1.5
 
 
 def go(folder: Path, board: str, *overrides: str) -> Result:
-    prepare(folder)
     return fly(Request.of(HOVER, overrides=overrides, duration_s=DURATION_S, board=board), folder)
 
 

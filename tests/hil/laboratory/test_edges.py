@@ -7,13 +7,12 @@ import pyarrow as pa
 import pytest
 
 from firmware_py.geometry import yaw_quaternion
-from hil.config import load_config
 from hil.experiments import EXPERIMENTS, measures
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON
 from hil.laboratory.faults import Fault
-from hil.laboratory.lockstep import MAVLINK, RADIO, lockstep_flight
+from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import attitude_error, measure
-from hil.laboratory.run import Request
+from hil.laboratory.request import MAVLINK, RADIO, Request
 
 ROWS = 400
 TIMES = 10_000 * np.arange(ROWS)
@@ -82,8 +81,9 @@ def test_a_step_settles_at_the_first_row_from_which_it_stays_within_5_percent() 
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])
 def test_faults_that_together_leave_a_knobs_range_stop_at_its_end_and_give_it_back(link: str) -> None:
     """Every kind three times at once, at its largest and at its smallest: the flight goes on, and ends as it began."""
-    config = load_config("floaty", [MARKERS_ON])
-    flight = lockstep_flight(Request(EXPERIMENTS["hover"], config, "floaty", (), 1, 1.0, link))
+    flight = lockstep_flight(
+        Request.of(EXPERIMENTS["hover"], overrides=[MARKERS_ON], duration_s=1.0, link=link)
+    )
     kinds = {name: kind for name, kind in KINDS.items() if kind.link in ("", link)}
     knobs = [knob for kind in kinds.values() for knob in kind.knobs]
     before = [knob.read(flight.robot) for knob in knobs]

@@ -22,11 +22,12 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, Experiment
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind
 from hil.laboratory.faults import Fault, check, parse, spans_of
-from hil.laboratory.lockstep import MAVLINK, RADIO, lockstep_flight
+from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import MAVLINK, RADIO, Request
 from hil.laboratory.result import Result, read_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig
 from hil.world.plant import Plant
@@ -53,8 +54,9 @@ def go(
     link: str = RADIO,
     settings: Settings = (),
 ) -> Result:
-    prepare(folder)
-    request = Request.of(HOVER, "floaty", settings, seed, duration_s, link, [parse(text) for text in faults])
+    request = Request.of(
+        HOVER, overrides=settings, seed=seed, duration_s=duration_s, link=link, faults=faults
+    )
     return fly(request, folder)
 
 
@@ -361,8 +363,8 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
         "servo.slow.1@0.2:0.6",
         "servo.stuck.1@0.4:0.1",
     ]
-    config = load_config("floaty", ["tunnel.side_wind=[0.1, 0.2, 0.3]", "actuators.speed=[0.8, 1, 1, 1]"])
-    flight = lockstep_flight(Request(HOVER, config, "floaty", (), 1, 2.0, faults=tuple(map(parse, texts))))
+    settings = ["tunnel.side_wind=[0.1, 0.2, 0.3]", "actuators.speed=[0.8, 1, 1, 1]"]
+    flight = lockstep_flight(Request.of(HOVER, overrides=settings, duration_s=2.0, faults=texts))
     wind: list[float] = []
     pace: list[float] = []
 
@@ -436,7 +438,7 @@ def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> No
         expected += (column(log, "t") >= span.begin_us) & (column(log, "t") < span.end_us)
     assert column(log, "fault.active").tolist() == expected.tolist()
     assert [str(span.fault) for span in spans_of(log.schema.metadata)] == list(
-        read_result(result.folder).faults
+        read_result(result.folder).request.faults
     )
     texts = [event["text"] for event in load_events(result.folder) if "fault" in event["text"]]
     assert texts[:3] == [
@@ -461,7 +463,6 @@ def test_same_seed_same_hash_with_faults(tmp_path: Path) -> None:
 def test_an_experiments_faults_that_do_not_concern_the_flight_are_left_out(tmp_path: Path) -> None:
     own = (*map(parse, ("push.x@0.2=0.1", "push.x@5=0.1", "serial.cut@0.1", "marker.swap@0.1")),)
     experiment = Experiment("hover", "", 10.0, {}, faults=own)
-    prepare(tmp_path / "run")
     fly(Request.of(experiment, duration_s=1.0, faults=[parse("push.y@0.5")]), tmp_path / "run")
     begun = [event["text"] for event in load_events(tmp_path / "run") if event["text"].startswith("fault")]
     assert begun[::2] == ["fault push.x@0.2=0.1 begins", "fault push.y@0.5=2 begins"]

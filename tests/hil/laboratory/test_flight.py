@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 
 from ground_station.tracker import Quality
-from hil.clock import FreeRunning, Paced
 from hil.commands.tables import print_result, print_seeds
-from hil.config import load_config
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS, find_experiment
+from hil.experiments import EXPERIMENTS, find_again, find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.flight import Flight
-from hil.laboratory.lockstep import LOCKSTEP
 from hil.laboratory.metrics import ALWAYS, METRICS, column, judge
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import LOCKSTEP, Bench, Request
 from hil.laboratory.result import Result, read_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from support.full_disk import small_files
 
@@ -29,8 +27,7 @@ HOVER = EXPERIMENTS["hover"]
 def hover(
     folder: Path, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float = 30.0
 ) -> Result:
-    request = Request(HOVER, load_config(profile, overrides), profile, overrides, seed, duration_s)
-    prepare(folder)
+    request = Request.of(HOVER, profile=profile, overrides=overrides, seed=seed, duration_s=duration_s)
     return fly(request, folder)
 
 
@@ -67,7 +64,6 @@ def test_without_the_predictor_the_authors_gains_lose_the_robot(tmp_path: Path, 
 @pytest.mark.long
 def test_log_events_and_report_know_what_the_tracker_refused(tmp_path: Path) -> None:
     outlier = parse("mocap.outlier@1:0.05=0.5")
-    prepare(tmp_path / "run")
     result = fly(Request.of(HOVER, duration_s=2.0, faults=[outlier]), tmp_path / "run")
     log = load_log(result.folder)
     assert column(log, "tracker.refused")[-1] == result.metrics["frames_refused"] == 10
@@ -99,7 +95,6 @@ HEALTHY = (
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "faults"), HEALTHY)
 def test_the_tracker_refuses_no_healthy_pose(tmp_path: Path, name: str, faults: tuple[str, ...]) -> None:
-    prepare(tmp_path / "run")
     duration_s = 4.0 if faults else None
     request = Request.of(EXPERIMENTS[name], duration_s=duration_s, faults=[parse(text) for text in faults])
     fly(request, tmp_path / "run")
@@ -118,11 +113,9 @@ def test_same_seed_same_hash_other_seed_other_hash(tmp_path: Path) -> None:
 
 
 def test_pacing_changes_nothing_that_is_flown(tmp_path: Path) -> None:
-    request = Request(HOVER, load_config("floaty", ["flight.release_us=100000"]), "floaty", (), 3, 0.2)
-    for name in ("free", "paced"):
-        prepare(tmp_path / name)
-    free = fly(request, tmp_path / "free", FreeRunning())
-    paced = fly(request, tmp_path / "paced", Paced())
+    request = Request.of(HOVER, overrides=["flight.release_us=100000"], seed=3, duration_s=0.2)
+    free = fly(request, tmp_path / "free")
+    paced = fly(replace(request, bench=Bench(realtime=True)), tmp_path / "paced")
     assert free.hash == paced.hash
 
 
@@ -147,8 +140,7 @@ def test_ctrl_c_keeps_what_was_flown(tmp_path: Path) -> None:
         if now_us > 2_000_000:
             raise KeyboardInterrupt
 
-    request = Request(HOVER, load_config(), "floaty", (), 1, 30.0)
-    prepare(tmp_path / "run")
+    request = Request.of(HOVER, duration_s=30.0)
     result = fly(request, tmp_path / "run", progress=interrupt)
     assert result.outcome == "interrupted"
     assert not result.passed
@@ -161,8 +153,7 @@ def test_an_error_of_the_firmware_ends_the_flight_with_its_log(tmp_path: Path) -
         if now_us > 1_500_000:
             flight.robot.board.read_imu = lambda: None  # type: ignore[method-assign,assignment,return-value]
 
-    request = Request(HOVER, load_config(), "floaty", (), 1, 30.0)
-    prepare(tmp_path / "run")
+    request = Request.of(HOVER, duration_s=30.0)
     result = fly(request, tmp_path / "run", progress=sabotage)
     assert result.outcome == "error"
     assert "task SENSORS at 1" in str(result.cause)
@@ -174,9 +165,9 @@ def test_log_carries_units_frames_and_origin(tmp_path: Path) -> None:
     assert table.schema.field("truth.x").metadata == {b"unit": b"m", b"frame": b"W"}
     assert table.schema.field("motor.m1").metadata[b"unit"] == b"counts"
     metadata = table.schema.metadata
-    assert metadata[b"seed"] == b"1"
+    assert json.loads(metadata[b"request"])["seed"] == 1
     assert json.loads(metadata[b"config"])["controller"]["gain_y"] == -1.8
-    assert b"numba" in metadata[b"versions"]
+    assert b"numba" in metadata[b"program"]
 
 
 def test_estimate_follows_the_truth(tmp_path: Path) -> None:
@@ -199,11 +190,10 @@ def test_pose_is_about_forty_milliseconds_old(tmp_path: Path) -> None:
 def test_a_killed_run_is_readable_up_to_its_last_second(tmp_path: Path) -> None:
     result = hover(tmp_path / "run", duration_s=0.5)
     (result.folder / "result.json").unlink()
-    killed = read_result(result.folder)
+    killed = read_result(result.folder, find_again)
     assert killed.outcome == "error"
     assert not killed.passed
-    assert (killed.experiment, killed.seed, killed.duration_s, killed.faults) == ("hover", 1, 0.5, ())
-    assert killed.versions == result.versions
+    assert (killed.request, killed.program) == (result.request, result.program)
     assert killed.metrics["rms_x"] == result.metrics["rms_x"]
 
 
@@ -253,7 +243,6 @@ def test_a_lost_flight_holds_no_limit_unless_its_limit_on_the_loss_admits_it() -
 
 def test_a_lost_flight_says_so_in_every_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     request = Request.of(HOVER, duration_s=3.0, faults=[parse("wind.fan@0.5=0.3")])
-    prepare(tmp_path / "run")
     result = fly(request, tmp_path / "run")
     assert {verdict.metric for verdict in result.verdicts if verdict.holds} == set()
     assert [verdict.metric for verdict in result.failed] == ["lost"]
@@ -280,7 +269,6 @@ class Reboots:
 
 def test_a_board_that_is_reset_has_not_completed_its_flight(tmp_path: Path) -> None:
     experiment = replace(HOVER, name="reboots", script=Reboots(3), duration_s=1.5)
-    prepare(tmp_path / "run")
     result = fly(Request.of(experiment), tmp_path / "run")
     assert (result.outcome, result.cause) == ("reset", "the board was reset 3 times")
     assert result.metrics["resets"] == 3.0
@@ -288,5 +276,4 @@ def test_a_board_that_is_reset_has_not_completed_its_flight(tmp_path: Path) -> N
     assert {"resets", "uncontrolled"} <= {verdict.metric for verdict in result.failed}
     assert not result.passed
     patient = replace(experiment, limits={"resets": 3.0, "uncontrolled": 0.6})
-    prepare(tmp_path / "patient")
     assert fly(Request.of(patient), tmp_path / "patient").passed

@@ -12,9 +12,11 @@ pytest.importorskip("cffi")
 from hil.devices import image_firmware
 from hil.experiments import find_experiment
 from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import in_lockstep
 from hil.laboratory.recorder import load_events
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result, read_result
-from hil.laboratory.run import Request, fly, lockstep, prepare
+from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from support.stm32_firmware import build
 
@@ -33,12 +35,11 @@ def flown(folder: Path, planted: int, duration_s: float, monkeypatch: pytest.Mon
     )
 
     def made(*arguments: object) -> Flight:
-        flight = lockstep(*arguments)  # type: ignore[arg-type]
+        flight = in_lockstep(*arguments)  # type: ignore[arg-type]
         image = flight.robot.firmware
         image.chip.write(image.image.symbol("planted").address, pack("<I", planted))
         return flight
 
-    prepare(folder / "run")
     return fly(request, folder / "run", flight_of=made)
 
 
@@ -92,4 +93,6 @@ def test_the_report_has_what_was_never_used_of_the_stacks_and_how_often_the_imag
     for name, free in image.stack_free_bytes.items():
         assert f'<tr><td>{name}</td><td class="number">{free}</td></tr>' in stacks
     assert f"<td>0 by the watchdog, {image.software_resets} by the firmware itself</td>" in page
-    assert f"--board {result.board}" in page[page.index('<dl id="story">') : page.index("</dl>")]
+    assert (
+        f"--board {result.request.bench.board}" in page[page.index('<dl id="story">') : page.index("</dl>")]
+    )

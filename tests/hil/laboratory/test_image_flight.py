@@ -13,8 +13,9 @@ from hil.errors import LabError
 from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures.compare import load_flown
 from hil.studies.two_boards import two_boards
@@ -27,7 +28,6 @@ HOVER = find_experiment("hover")
 
 
 def flown(folder: Path, duration_s: float, *faults: str, seed: int = 1, board: str = ELF) -> Result:
-    prepare(folder)
     chosen = [parse(text) for text in faults]
     return fly(Request.of(HOVER, seed=seed, duration_s=duration_s, faults=chosen, board=board), folder)
 
@@ -88,7 +88,6 @@ def test_what_sets_the_image_apart_from_the_python_board_is_measured(tmp_path: P
 @pytest.mark.long
 @flies
 def test_an_experiments_settings_reach_the_image_before_its_release(tmp_path: Path) -> None:
-    prepare(tmp_path)
     request = Request.of(find_experiment("yaw-step"), board=ELF)
     result = fly(request, tmp_path)
     assert result.passed, [verdict for verdict in result.verdicts if not verdict.passed]
@@ -103,14 +102,13 @@ def test_an_image_without_the_app_is_flown_and_recorded_with_its_tasks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from hil.devices import image_firmware
-    from hil.laboratory import run
+    from hil.laboratory import lockstep
     from support.stm32_firmware import BUILD, build
 
     monkeypatch.setattr(image_firmware, "WARM_UP_US", 20_000)
-    monkeypatch.setattr(run, "BUILD", BUILD)
+    monkeypatch.setattr(lockstep, "BUILD", BUILD)
     elf = build("clang")
     request = Request.of(HOVER, duration_s=0.1, board=str(elf), overrides=("flight.release_us=50000",))
-    prepare(tmp_path / "run")
     result = fly(request, tmp_path / "run")
     assert (result.outcome, result.cause) == ("completed", None)
     assert len(result.tasks) > 1
@@ -145,7 +143,7 @@ def test_an_image_has_no_serial_line_for_mavlink(link: str) -> None:
 
 @pytest.mark.parametrize("link", ["radio://0/80/2M/E7E7E7E7E7", "udp://127.0.0.1:19850"])
 def test_an_image_is_reached_over_radio_and_udp(link: str) -> None:
-    assert not Request.of(HOVER, link=link, board=str(Path(__file__))).in_lockstep
+    assert not Request.of(HOVER, link=link, board=str(Path(__file__))).bench.in_lockstep
 
 
 def test_an_elf_beside_another_board_is_refused() -> None:

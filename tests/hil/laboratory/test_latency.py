@@ -26,12 +26,12 @@ from ground_station.latency import (
 )
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
-from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.ages import STATION_CLOCK, ages_of, reported_ages, with_goals_sent
-from hil.laboratory.lockstep import MAVLINK, RADIO, lockstep_flight
+from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.recorder import load_log
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import MAVLINK, RADIO, Request
+from hil.laboratory.run import fly
 from hil.servers.dongle_server import Readers
 from hil.servers.motive import Streaming, VirtualMotive
 
@@ -91,8 +91,8 @@ def test_the_budget_forgets_what_is_long_ago() -> None:
 @pytest.mark.parametrize("link", [RADIO, MAVLINK])
 def test_the_age_on_board_is_the_true_one_while_the_latency_changes(link: str) -> None:
     """A pose that the estimator thinks to be so old was sent: poses are 20 ms apart."""
-    config = load_config("floaty", ["radio.uplink_loss=0", "radio.downlink_loss=0"])
-    flight = lockstep_flight(Request(HOVER, config, "floaty", (), 1, 3.0, link))
+    settings = ["radio.uplink_loss=0", "radio.downlink_loss=0"]
+    flight = lockstep_flight(Request.of(HOVER, overrides=settings, duration_s=3.0, link=link))
     rng = np.random.default_rng(1)
     exposed_us: list[int] = []
     fused_us: list[int] = []  # exposures, as the board has them
@@ -127,7 +127,6 @@ def test_the_age_on_board_is_the_true_one_while_the_latency_changes(link: str) -
 def test_a_flight_has_its_budget(tmp_path: Path, link: str, name: str, off_us: float) -> None:
     """The first packets up are short: they ask for telemetry. On the serial line the way down is not quite that up."""
     settings = ("mocap.latency_us=30000", "mocap.processing_us=12000")
-    prepare(tmp_path / "run")
     result = fly(Request.of(HOVER, overrides=settings, duration_s=1.0, link=link), tmp_path / "run")
     means = {stage.name: stage.mean_us for stage in result.ages}
     assert list(means) == ["pose", "camera", "processing", "network", "station", name]
@@ -140,7 +139,6 @@ def test_a_flight_has_its_budget(tmp_path: Path, link: str, name: str, off_us: f
 
 
 def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:
-    prepare(tmp_path / "run")
     result = fly(Request.of(HOVER, duration_s=0.5), tmp_path / "run")
     telemetry, log = tmp_path / "run" / "telemetry.csv", load_log(tmp_path / "run")
     text = telemetry.read_text()

@@ -13,7 +13,7 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import judge, measure
 from hil.laboratory.recorder import Recorder, load_log
-from hil.laboratory.run import Request
+from hil.laboratory.request import Request
 from support import natnet_packets as packets
 
 V = (4, 1)

@@ -14,7 +14,9 @@ from firmware_py.wire.supervisor import State
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, Result, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.result import Result
+from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, make_project
 from support.paths import ROOT
@@ -25,8 +27,10 @@ HOVER = EXPERIMENTS["hover"]
 def go(
     folder: Path, profile: str | Path, duration_s: float, *overrides: str, board: str = "python"
 ) -> Result:
-    prepare(folder)
-    return fly(Request.of(HOVER, str(profile), overrides, duration_s=duration_s, board=board), folder)
+    return fly(
+        Request.of(HOVER, profile=str(profile), overrides=overrides, duration_s=duration_s, board=board),
+        folder,
+    )
 
 
 @pytest.mark.long
@@ -102,7 +106,7 @@ def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
 def test_the_same_flight_on_another_board_is_alike_to_the_last_bit(
     failed: Result, tmp_path: Path, board: str
 ) -> None:
-    again = go(tmp_path, failed.profile, 0.5, *failed.overrides, board=board)
+    again = go(tmp_path, failed.request.profile, 0.5, *failed.request.overrides, board=board)
     assert again.hash == failed.hash
     assert again.cause == failed.cause
 

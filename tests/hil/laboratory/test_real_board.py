@@ -9,8 +9,9 @@ from ground_station.errors import LinkError
 from ground_station.links import packets
 from hil.experiments import find_experiment
 from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import read_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from support.app_packets import AppPackets
 from support.command import Cli
 from support.crazyflie_app import App, build_app
@@ -37,7 +38,6 @@ Plug = Callable[[Path], AppPackets]
 
 
 def flown(folder: Path, duration_s: float, **arguments: object) -> str:
-    prepare(folder)
     return fly(Request.of(find_experiment("hover"), duration_s=duration_s, **arguments), folder).hash
 
 
@@ -58,7 +58,6 @@ def test_whole_experiments_have_the_hash_of_python_at_ten_per_cent_loss(
     plugged(library).mess = 0.1
     hashes = []
     for board in ("python", URI):
-        prepare(tmp_path / "run")
         hashes.append(fly(Request.of(find_experiment(experiment), board=board), tmp_path / "run").hash)
     assert hashes[0] == hashes[1]
 
@@ -68,7 +67,6 @@ def test_measured_cycles_are_the_processor_time_of_the_tasks(
 ) -> None:
     link = plugged(library)
     link.app.cycles.value = 168 * 700
-    prepare(tmp_path / "run")
     result = fly(
         Request.of(find_experiment("hover"), duration_s=0.2, overrides=("cpu.measured=true",), board=URI),
         tmp_path / "run",
@@ -94,7 +92,6 @@ def test_a_board_that_fails_in_flight_ends_it_in_one_line_with_what_was_flown(
         if now_us >= 1_200_000:
             link.silent, link.app = happens == "silent", rebooted if happens == "reboots" else link.app
 
-    prepare(tmp_path / "run")
     request = Request.of(find_experiment("hover"), duration_s=3.0, board=URI)
     result = fly(request, tmp_path / "run", progress=fail)
     assert (result.outcome, result.cause) == ("error", f"board {URI}: {cause}")

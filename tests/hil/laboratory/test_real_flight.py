@@ -35,8 +35,9 @@ from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.metrics import ALWAYS, body, free_flight, known, measure
 from hil.laboratory.real_flight import RealFlight
 from hil.laboratory.recorder import Recorder, load_events, load_log
+from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.result import Result, read_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.pictures import figures
 from hil.pictures.compare import _judged, compare, load_flown
 from hil.pictures.curves import with_marks
@@ -56,9 +57,10 @@ AGE_US = 40_000
 
 
 def recorder_of(folder: Path, experiment: str, clock: Any, said: list[str]) -> RealFlight:
-    return RealFlight(
-        folder, EXPERIMENTS[experiment], CONFIG, "floaty", (), "udp://127.0.0.1:19850", said.append, clock
-    )
+    chosen = EXPERIMENTS[experiment]
+    bench = Bench("udp://127.0.0.1:19850", REAL)
+    request = Request(chosen, "floaty", (), 0, chosen.duration_s, (), bench)
+    return RealFlight(folder, request, said.append, clock)
 
 
 class Link:
@@ -84,7 +86,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     real, simulated = folder / "real", folder / "simulated"
     simulated.mkdir()
     experiment = EXPERIMENTS["yaw-step-0"]
-    flight = lockstep_flight(Request(experiment, CONFIG, "floaty", (), 1, 4.0), simulated / "telemetry.csv")
+    flight = lockstep_flight(Request.of(experiment, duration_s=4.0), simulated / "telemetry.csv")
     metadata = {"experiment": experiment.name, "config": CONFIG.model_dump_json()}
     recorder = Recorder(simulated, flight.channels(), metadata)
     record = recorder_of(real, experiment.name, lambda: flight.now_us, [])
@@ -134,7 +136,6 @@ def test_the_estimate_of_a_real_board_stands_in_the_log_as_the_board_has_it(both
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of the same flight, simulated."""
     folder = tmp_path_factory.mktemp("simulated") / "run"
-    prepare(folder)
     fly(Request.of(EXPERIMENTS["yaw-step-0"], seed=1, duration_s=4.0), folder)
     return folder
 
@@ -216,7 +217,7 @@ def test_a_real_flight_is_exported_as_what_the_cameras_saw(both: tuple[Path, Pat
     assert "cameras.x [m]" in write_csv(folder).read_text().splitlines()[0]
 
 
-class Bench:
+class StationBench:
     """A station that sees what the test says; nothing flies."""
 
     def __init__(self, folder: Path, experiment: str = "hover") -> None:
@@ -246,7 +247,7 @@ class Bench:
 
 
 def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run", "yaw-step")
+    bench = StationBench(tmp_path / "run", "yaw-step")
     bench.fly(1.0, (0.2, 0.0, 1.15))
     bench.plan.start(bench.now_us)
     bench.fly(EXPERIMENTS["yaw-step"].duration_s + 0.05)  # the cameras see the past
@@ -270,7 +271,7 @@ def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(
 @pytest.mark.parametrize("comes_back", [True, False])
 def test_time_without_poses_is_not_flown_and_fails_its_limit(tmp_path: Path, comes_back: bool) -> None:
     """A server that was killed in flight: turns go on, frames do not."""
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
     bench.fly(2.0)
     end_us = bench.now_us + 3_500_000
@@ -287,7 +288,7 @@ def test_time_without_poses_is_not_flown_and_fails_its_limit(tmp_path: Path, com
 
 
 def test_a_real_board_that_calibrates_again_was_reset(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
     for state in (State.FLYING, State.CALIBRATING, State.FLYING, State.CALIBRATING, State.FLYING):
         bench.cockpit.link.supervisor_state = state  # type: ignore[misc]
@@ -298,7 +299,7 @@ def test_a_real_board_that_calibrates_again_was_reset(tmp_path: Path) -> None:
 
 
 def test_a_comparison_shows_what_was_judged_and_a_second_around_it(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run", "yaw-step")
+    bench = StationBench(tmp_path / "run", "yaw-step")
     bench.fly(5.0)
     bench.plan.start(bench.now_us)
     bench.fly(20.0)
@@ -308,7 +309,7 @@ def test_a_comparison_shows_what_was_judged_and_a_second_around_it(tmp_path: Pat
 
 
 def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
     bench.fly(1.0)
     bench.fly(0.2, (0.0, 0.46, 1.15))
@@ -331,13 +332,13 @@ def test_a_robot_that_leaves_the_flow_is_lost_and_what_follows_is_not_judged(tmp
 def test_whatever_ends_a_flight_its_result_is_written(
     tmp_path: Path, how: dict[str, Any], outcome: str, cause: str | None
 ) -> None:
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     bench.record.note("station", "connected")
     bench.plan.start(bench.now_us)
     bench.fly(2.0)
     bench.result(**how)
     read = read_result(tmp_path / "run")
-    assert (read.outcome, read.cause, read.seed, read.board) == (outcome, cause, None, "real")
+    assert (read.outcome, read.cause, read.request.is_real) == (outcome, cause, True)
     assert read.metrics["flown"] == pytest.approx(2.0, abs=0.06)
     assert {verdict.metric for verdict in read.verdicts} == {*EXPERIMENTS["hover"].limits, *ALWAYS}
     texts = [(event["source"], event["text"]) for event in load_events(tmp_path / "run")]
@@ -348,7 +349,7 @@ def test_a_killed_station_leaves_all_but_the_last_second_and_can_be_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hil.pictures.report, "PICTURES", PICTURES[:1])
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
     bench.fly(4.5)
     left = Path(shutil.copytree(tmp_path / "run", tmp_path / "left"))
@@ -361,7 +362,7 @@ def test_a_killed_station_leaves_all_but_the_last_second_and_can_be_reported(
 
 
 def test_slow_cameras_do_not_make_more_than_a_second_be_lost(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     for _ in range(32):
         bench.now_us += 95_000
         bench.record.turn(bench.cockpit, bench.now_us)
@@ -371,7 +372,7 @@ def test_slow_cameras_do_not_make_more_than_a_second_be_lost(tmp_path: Path) -> 
 
 
 def test_a_flight_that_never_began_leaves_no_folder(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     bench.record.note("station", "no board")
     assert bench.record.close("no answer") is None
     assert not (tmp_path / "run").exists()
@@ -379,17 +380,17 @@ def test_a_flight_that_never_began_leaves_no_folder(tmp_path: Path) -> None:
 
 def test_a_real_flight_overwrites_nothing(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
-    Bench(tmp_path / "run").record.close()
+    StationBench(tmp_path / "run").record.close()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "events.jsonl").write_text("{}")
     with pytest.raises(LabError, match="there is something already"):
-        Bench(tmp_path / "other")
+        StationBench(tmp_path / "other")
     with pytest.raises(LabError, match="cannot be written"):
-        Bench(Path("/proc/floaty/run"))
+        StationBench(Path("/proc/floaty/run"))
 
 
 def test_a_full_disk_ends_the_record_and_not_the_flight(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     with small_files(150_000):
         bench.fly(5.0)
         assert len(bench.said) == 1
@@ -403,7 +404,7 @@ def test_what_the_station_recorded_stands_in_the_time_of_the_log(
     both: tuple[Path, Path], tmp_path: Path
 ) -> None:
     """A computer's clock has run for days when a flight begins, here for 7 s."""
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     shutil.copy(both[0] / "telemetry.csv", tmp_path / "run")
     bench.fly(1.0)
     bench.result()
@@ -418,7 +419,7 @@ def test_what_the_station_recorded_stands_in_the_time_of_the_log(
 
 
 def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run")
+    bench = StationBench(tmp_path / "run")
     bench.plan.start(bench.now_us)
     bench.fly(1.0)
     bench.ground.telemetry[BATTERY.id] = Sample(BATTERY, 0, (3.9,))
@@ -443,7 +444,7 @@ def test_a_counter_of_sixteen_bits_goes_on_where_it_wraps() -> None:
 
 
 def test_an_experiment_that_needs_what_only_a_laboratory_has_is_told_so(tmp_path: Path) -> None:
-    bench = Bench(tmp_path / "run", "power")
+    bench = StationBench(tmp_path / "run", "power")
     bench.plan.start(bench.now_us)
     bench.fly(1.0)
     result = bench.result()

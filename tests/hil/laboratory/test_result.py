@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +13,28 @@ from firmware_py.export.usage import EntryLoad, Usage
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
 from hil.errors import LabError
-from hil.laboratory.experiment import Source
+from hil.experiments import EXPERIMENTS, find_again
+from hil.laboratory.experiment import Source, unknown
 from hil.laboratory.metrics import Metric, Verdict
 from hil.laboratory.recorder import Channel, Quantity, Recorder
-from hil.laboratory.result import RESULT, Origin, QueueReport, Result, read_result, write_result
+from hil.laboratory.request import REAL, Bench, Request
+from hil.laboratory.result import RESULT, Program, QueueReport, Result, metadata_of, read_result, write_result
 from support.command import Cli
 
 KEYS = """
     experiment profile overrides seed duration_s link board faults source logic outcome cause metrics
     own_metrics verdicts passed tasks queues usage ages hash versions commit real_time_factor
-    stood_still_ms image not_shown
+    stood_still_ms image not_shown elf in_loop gdb realtime trace
 """.split()  # noqa: SIM905  of result.json, which programs of users read
 
 
 @pytest.fixture
 def result(tmp_path: Path) -> Result:
+    wide = unknown("hover", Source("/home/anna/eights.py:wide", "5e" * 32, "eights 1.0"))
+    bench = Bench("radio", "cortex-m4", elf=Path("image.elf"))
     return Result(
-        "hover", "floaty", ("predictor.enabled=false",), 7, 2.5, "radio", "cortex-m4", ("push.y@1:0.3=2",),
-        {"python": "3.11.2"}, "0123456789ab+", Source("/home/anna/eights.py:wide", "5e" * 32, "eights 1.0"), "1c" * 32,
+        Request(wide, "floaty", ("predictor.enabled=false",), 7, 2.5, ("push.y@1:0.3=2", "own.kind@1"), bench),
+        Program({"python": "3.11.2"}, "0123456789ab+", "1c" * 32),
         outcome="lost", cause="fell", metrics={"rms_x": 0.01, "settle": math.nan, "rise": math.inf, "lap": 9.5},
         own_metrics={"lap": Metric("s", "max", "time of a lap")},
         verdicts=(Verdict("rms_x", 0.01, 0.02, True, "m", "max"), Verdict("settle", math.nan, 0.5, False, "s", "max")),
@@ -57,6 +61,19 @@ def test_a_result_is_read_back_as_it_was_written(result: Result) -> None:
     metrics = {"rms_x": 0.01, "settle": math.nan, "rise": math.inf, "lap": 9.5}
     # A NaN does not equal a NaN, but is written alike.
     assert repr(read) == repr(replace(result, metrics=metrics))
+
+
+def test_a_stored_request_is_read_back_equal() -> None:
+    options = {"link": "mavlink", "board": "c", "realtime": True, "trace": True}
+    for request in (
+        Request.of(EXPERIMENTS["hover"]),
+        Request.of(
+            EXPERIMENTS["pushes"], profile="lqr", overrides={"servo.trim": (1, 2, 3, 4)}, seed=7, duration_s=1.5,
+            faults=["imu.noise@0.1:0.123456789=2"], **options,
+        ),
+        Request(EXPERIMENTS["hover"], "floaty", (), 0, 8.0, (), Bench("radio://0/80", REAL)),
+    ):  # fmt: skip
+        assert Request.read(json.loads(json.dumps(request.stored())), find_again) == request
 
 
 def test_the_file_holds_the_keys_that_programs_read_and_null_where_there_is_no_number(result: Result) -> None:
@@ -90,7 +107,7 @@ def test_a_run_passes_that_ends_by_itself_and_holds_every_limit(
     [
         (lambda folder: (folder / RESULT).write_bytes(b"{"), "invalid JSON"),
         (lambda folder: (folder / RESULT).write_bytes(b'{"hash": "\xff"}'), "invalid JSON"),
-        (lambda folder: (folder / RESULT).write_text("[]"), "should be an object"),
+        (lambda folder: (folder / RESULT).write_text("[]"), "should be a dictionary"),
         (lambda folder: drop(folder, "ages"), "ages is missing: it was written by another version"),
         (lambda folder: change(folder, seed="x"), "seed = 'x': input should be a valid integer"),
         (lambda folder: change(folder, outcome="won"), "outcome = 'won': input should be 'completed', 'lost'"),
@@ -102,7 +119,7 @@ def test_what_is_no_result_is_one_line_that_names_file_and_value(
     cli: Cli, result: Result, damage: Callable[[Path], None], told: str
 ) -> None:
     write_result(result)
-    killed(result.folder, result.metadata())
+    killed(result.folder, metadata_of(result.request, result.program))
     damage(result.folder)
     error = cli.refusal("report", result.folder)
     assert error.startswith(f"floaty: {result.folder / RESULT}: ")
@@ -115,21 +132,19 @@ def killed(folder: Path, metadata: dict[str, str]) -> None:
 
 
 def test_the_origin_of_a_killed_run_is_read_from_its_log(result: Result) -> None:
-    killed(result.folder, result.metadata())
+    killed(result.folder, metadata_of(result.request, result.program))
     read = read_result(result.folder)
-    assert Origin(*(getattr(read, name) for name in Origin.__slots__)) == Origin(
-        *(getattr(result, name) for name in Origin.__slots__)
-    )
+    assert (read.request, read.program) == (result.request, result.program)
     assert (read.outcome, read.passed, read.hash, read.folder) == ("error", False, "", result.folder)
     assert math.isnan(read.real_time_factor)
 
 
 def test_a_log_whose_schema_does_not_tell_where_it_comes_from_is_refused(result: Result) -> None:
-    origin = result.metadata()
-    for metadata, told in (
-        ({name: text for name, text in origin.items() if name != "seed"}, "seed is missing"),
-        (origin | {"overrides": "["}, "overrides = '['"),
+    stored = {**result.request.stored(), **asdict(result.program)}
+    for values, told in (
+        ({name: value for name, value in stored.items() if name != "seed"}, "seed is missing"),
+        (stored | {"overrides": "["}, "overrides = '['"),
     ):
-        killed(result.folder, metadata)
+        killed(result.folder, {"request": json.dumps(values), "program": json.dumps(values)})
         with pytest.raises(LabError, match=f"{result.folder}.*{told}".replace("[", r"\[")):
             read_result(result.folder)

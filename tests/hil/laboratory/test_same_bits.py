@@ -14,7 +14,8 @@ from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
-from hil.laboratory.run import Request, fly
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 
 FAULTS = (
     "servo.slow.2@0.1:0.5=0.5",

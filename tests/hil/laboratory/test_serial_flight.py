@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.laboratory.lockstep import MAVLINK
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import MAVLINK, Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.pictures.figures import PICTURES
 from support.serving import FLOATY
 
@@ -25,10 +24,9 @@ KEY = "5a" * 32
 def fly_over_mavlink(
     folder: Path, *overrides: str, seed: int = 1, duration_s: float = 10.0, experiment: str = "hover"
 ) -> Result:
-    request = Request(
-        EXPERIMENTS[experiment], load_config("floaty", overrides), "floaty", overrides, seed, duration_s, MAVLINK
-    )  # fmt: skip
-    prepare(folder)
+    request = Request.of(
+        EXPERIMENTS[experiment], overrides=overrides, seed=seed, duration_s=duration_s, link=MAVLINK
+    )
     return fly(request, folder)
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.recorder import Channel, Quantity, Recorder, load_log
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.live import feed
 from hil.live.feed import Feed, LiveView
 
@@ -51,8 +51,7 @@ def rows(first: int, count: int) -> pa.RecordBatch:
 
 
 def flight_hash(folder: Path, view: LiveView | None) -> str:
-    prepare(folder)
-    return fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 0.5), folder, onlooker=view).hash
+    return fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), folder, onlooker=view).hash
 
 
 @pytest.fixture(scope="module")

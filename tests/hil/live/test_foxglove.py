@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.recorder import load_log
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.live.foxglove_server import FoxgloveScreen
 from support.foxglove_client import FoxgloveClient
 
@@ -58,8 +58,7 @@ def test_a_parameter_is_changed_by_the_operator_and_shown_when_the_board_has_it(
 def test_the_rows_of_a_flight_are_what_the_mcap_file_has(
     screen: FoxgloveScreen, client: FoxgloveClient, tmp_path: Path
 ) -> None:
-    prepare(tmp_path / "run")
-    fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 0.1), tmp_path / "run")
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.1), tmp_path / "run")
     log = load_log(tmp_path / "run")
     screen.show(log.slice(0, 20), [{"t_us": 5, "source": "lab", "text": "released"}])
     while not {"/truth/pose", "/estimate/pose", "/tf", "/flaps", "/text"} <= set(client.channels):

@@ -9,8 +9,9 @@ import pytest
 
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.laboratory.request import Request
 from hil.laboratory.result import read_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.live.recording import Links
 from hil.live.window import free_port
 from hil.pictures.links import HOST, link_to
@@ -20,7 +21,6 @@ from hil.pictures.viewer.recording import ServedRecording
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recording") / "run"
-    prepare(folder)
     fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), folder)
     return folder
 

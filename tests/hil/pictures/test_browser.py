@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from support.html_page import Page
 
@@ -72,9 +72,8 @@ def seen(page: Path, width: int, profile: Path) -> dict[str, Any]:
 @pytest.mark.parametrize("width", [420, 1180])
 def test_every_panel_is_drawn_with_aligned_edges_and_one_zoom_and_cursor(tmp_path: Path, width: int) -> None:
     folder = tmp_path / "run"
-    prepare(folder)
     faults = (parse("push.y@1=1"),)
-    fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 3.0, faults=faults), folder)
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=3.0, faults=faults), folder)
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     told = seen(folder / "report.html", width, tmp_path / "profile")
     panels = [name for name, plot in page.plots.items() for _ in plot["panels"]]

@@ -19,15 +19,15 @@ from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import free_flight, measure, position_error
 from hil.laboratory.recorder import load_log
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.pictures.compare import FlownRun, compare, load_flown, pair, write_comparison
 from support.command import Cli
 from support.html_page import Page
 
 
 def flown(folder: Path, seed: int, *overrides: str) -> Path:
-    prepare(folder)
-    fly(Request.of(EXPERIMENTS["hover"], "floaty", overrides, seed, 0.5), folder)
+    fly(Request.of(EXPERIMENTS["hover"], overrides=overrides, seed=seed, duration_s=0.5), folder)
     return folder
 
 

@@ -24,8 +24,9 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory import ages
 from hil.laboratory.metrics import ALWAYS, METRICS, judge
 from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import read_result, write_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.laboratory.schedule import load_schedule
 from hil.pictures import curves
 from hil.pictures.figures import PICTURES, latency_budget
@@ -54,8 +55,7 @@ def report(folder: Path) -> Page:
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report") / "run"
-    prepare(folder)
-    fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 2.0), folder)
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=2.0), folder)
     return folder
 
 
@@ -148,7 +148,7 @@ def test_the_report_tells_where_the_flight_comes_from(folder: Path) -> None:
     assert run["hash"] == result.hash
     assert run["commit"] == "0123456789ab"
     assert run["profile"] == "floaty --set tunnel.turbulence=T1"
-    for name, number in result.versions.items():
+    for name, number in result.program.versions.items():
         assert f"{name} {number}" in run["versions"]
     assert "released" in [row[2] for row in page.tables["events"]]
 
@@ -204,14 +204,15 @@ def test_the_report_begins_with_what_was_asked_for_what_failed_and_what_happened
     columns["truth.x"][150:] = 0.2
     columns["supervisor.state"][160:170] = State.FAILSAFE
     columns["control.flap_2"][155] = -load_config().allocation.opening_max
-    faults = '["push.y@0.3=2", "servo.slow.2@1=0.5"]'
-    metadata = {**log.schema.metadata, b"faults": faults.encode()}
+    faults = ("push.y@0.3=2", "servo.slow.2@1=0.5")
+    metadata = {**log.schema.metadata, b"request": json.dumps({"faults": faults}).encode()}
     changed = pa.table(columns, schema=log.schema.with_metadata(metadata))
     pq.write_table(changed, folder / "log.parquet")
     verdicts = judge({"in_box": 0.2, "lost": 1.0}, {"in_box": 0.99, "lost": 0.0}, {})
+    request = dataclasses.replace(result.request, overrides=("a.b=c",), faults=("push.y@0.3=2",))
     lost = dataclasses.replace(
-        result, outcome="lost", cause="fell", verdicts=tuple(verdicts), overrides=("a.b=c",), faults=("push.y@0.3=2",)
-    )  # fmt: skip
+        result, outcome="lost", cause="fell", verdicts=tuple(verdicts), request=request
+    )
     write_result(lost)
     page = write_report(folder).read_text(encoding="utf-8")
     story = page[page.index('<dl id="story">') : page.index("</dl>")]
@@ -245,10 +246,11 @@ def test_faults_failsafe_flap_limits_and_loss_are_marked_for_every_figure_and_sh
     columns["supervisor.state"][160:170] = State.FAILSAFE
     columns["control.flap_2"][155:158] = -load_config().allocation.opening_max
     columns["control.flap_2"][159] = -load_config().allocation.opening_max
-    faults = '["push.y@0.3=2", "push.x@0.3=1", "servo.slow.2@1=0.5"]'
-    metadata = {**log.schema.metadata, b"faults": faults.encode()}
+    faults = ("push.y@0.3=2", "push.x@0.3=1", "servo.slow.2@1=0.5")
+    metadata = {**log.schema.metadata, b"request": json.dumps({"faults": faults}).encode()}
     pq.write_table(pa.table(columns, schema=log.schema.with_metadata(metadata)), folder / "log.parquet")
-    write_result(dataclasses.replace(result, outcome="lost", cause="fell", faults=("push.y@0.3=2",)))
+    asked = dataclasses.replace(result.request, faults=("push.y@0.3=2",))
+    write_result(dataclasses.replace(result, outcome="lost", cause="fell", request=asked))
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     (marks,) = page.marks
     assert {plot["marks"] for plot in page.plots.values()} == {0}

@@ -1,6 +1,7 @@
 """The viewer: what stands in a recording, the shape of the picture, and that a window never holds a flight."""
 
 import importlib
+import json
 import os
 import signal
 import subprocess
@@ -29,7 +30,8 @@ from hil.laboratory.fault_kinds import MARKERS_ON
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
 from hil.laboratory.schedule import SCHEMA
 from hil.live import window
 from hil.live.feed import open_view
@@ -52,8 +54,7 @@ angles = st.floats(-1.5, 1.5)
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder: 1 s held, 0.5 s free, 150 rows."""
     folder = tmp_path_factory.mktemp("viewer") / "run"
-    prepare(folder)
-    fly(Request(EXPERIMENTS["hover"], load_config(), "floaty", (), 1, 0.5), folder)
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), folder)
     return folder
 
 
@@ -104,7 +105,6 @@ def test_texts_and_changes_of_state_are_recorded_once(folder: Path) -> None:
 
 
 def test_markers_change_colour_where_they_come_into_sight_or_go(tmp_path: Path) -> None:
-    prepare(tmp_path / "run")
     request = Request.of(
         EXPERIMENTS["hover"],
         overrides=[MARKERS_ON],
@@ -329,7 +329,8 @@ def real_log(rows: int = 30) -> pa.Table:
         "station.malformed": np.zeros(rows),
     }
     columns |= {"estimator.rejected": np.where(silent, np.nan, np.arange(rows) // 20)}
-    return pa.table(columns).replace_schema_metadata({"link": "udp://127.0.0.1:19850", "experiment": "hover"})
+    request = json.dumps({"link": "udp://127.0.0.1:19850", "experiment": "hover"})
+    return pa.table(columns).replace_schema_metadata({"request": request})
 
 
 def test_a_real_flight_has_the_same_scene_and_what_nobody_knows_is_not_drawn(tmp_path: Path) -> None:

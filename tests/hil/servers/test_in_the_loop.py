@@ -28,8 +28,9 @@ from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from hil.servers.in_the_loop import flight_in_the_loop
 from support.app_air import AppAir
@@ -358,7 +359,6 @@ def flown(
         air.join(flight.events)
         return flight
 
-    prepare(folder)
     request = Request.of(
         find_experiment("hover"), duration_s=duration_s, board=URI, faults=tuple(map(parse, faults))
     )
@@ -452,7 +452,6 @@ def test_a_board_that_dies_in_the_loop_ends_the_flight_in_one_line(app: App, tmp
         flight.events.at(2_500_000, lambda now_us: setattr(air, "dead", True))
         return flight
 
-    prepare(tmp_path / "run")
     request = Request.of(find_experiment("hover"), duration_s=10.0, board=URI)
     result = fly(request, tmp_path / "run", flight_of=flight_of)
     assert (result.outcome, result.cause) == ("error", "board app: silent for 1 s")
@@ -491,7 +490,7 @@ def test_processor_time_of_a_real_board_cannot_be_taken(app: App) -> None:
     [
         (("--hil",), "--hil: --board python --link radio: expected the link to a real board as --board"),
         (("--hil", "--board", URI, "--link", "mavlink"), "expected the link to a real board as --board"),
-        (("--hil", "shaking", "--board", URI), "--hil shaking: expected --hil or --hil moving"),
+        (("--hil", "shaking", "--board", URI), "'shaking' is not one of 'still', 'moving'"),
         (("--hil", "--board", URI, "--seeds", "2"), "--seeds 2: a real board is in one flight at a time"),
         (("--hil", "--board", URI), f"--board {URI}: silent for 3 s"),
     ],

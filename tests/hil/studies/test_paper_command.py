@@ -19,8 +19,9 @@ from hil.design.analysis import analyse
 from hil.design.sweeps import point_of
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import METRICS, Verdict
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_report import write_paper
@@ -42,7 +43,6 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     folder = tmp_path_factory.mktemp("flight") / "run"
-    prepare(folder)
     return fly(Request.of(EXPERIMENTS["hover"], duration_s=0.3), folder)
 
 

@@ -11,8 +11,9 @@ from hil.commands.app import main
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.studies.catalogue import STUDIES
 from hil.studies.study import Change, Expected, Study, Variant
 from hil.studies.study_figures import picture
@@ -22,9 +23,18 @@ from hil.studies.study_run import OUTCOMES, Cell, Curve, StudyResult, flights_of
 def flight(
     folder: Path, profile: str, settings: tuple[str, ...], fault: str, seconds: float, seed: int = 1
 ) -> Result:
-    prepare(folder)
     faults = (parse(fault),) if fault else ()
-    return fly(Request.of(EXPERIMENTS["hover"], profile, settings, seed, seconds, faults=faults), folder)
+    return fly(
+        Request.of(
+            EXPERIMENTS["hover"],
+            profile=profile,
+            overrides=settings,
+            seed=seed,
+            duration_s=seconds,
+            faults=faults,
+        ),
+        folder,
+    )
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
@@ -149,7 +159,6 @@ def test_the_predictors_cliff(tmp_path: Path) -> None:
 def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold(tmp_path: Path) -> None:
     study = STUDIES["loss"]
     variant, size, request = next(flights_of(study, 1))
-    prepare(tmp_path / "run")
     result = summarise(study, [(variant, size, fly(request, tmp_path / "run"))])
     assert [len(curve.cells) for curve in result.curves] == [1]
     assert not result.holds

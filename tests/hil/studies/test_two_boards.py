@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.result import read_result, write_result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.laboratory.schedule import SCHEMA
 from hil.pictures.compare import FlownRun, load_flown
 from hil.studies.two_boards import CLOCK, RATES, comparable, seeds_of, two_boards
@@ -27,7 +29,6 @@ RELEASE, FLOWN = 100, 30  # rows
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("boards") / "hover-1"
-    prepare(folder)
     fly(Request.of(EXPERIMENTS["hover"], duration_s=FLOWN / 100), folder)
     return folder
 
@@ -39,7 +40,8 @@ def other(flown: Path, folder: Path, change: Callable[[Columns], None], board: s
     columns = {name: log.column(name).to_numpy().copy() for name in log.column_names}
     change(columns)
     pq.write_table(pa.table(columns).replace_schema_metadata(log.schema.metadata), folder / "log.parquet")
-    write_result(replace(read_result(folder), board=board))
+    result = read_result(folder)
+    write_result(replace(result, request=replace(result.request, bench=Bench(board=board))))
     return load_flown(folder)
 
 
@@ -133,8 +135,12 @@ def test_only_flights_of_two_boards_that_were_asked_for_alike_are_comparable(
     b = other(flown, tmp_path / "b", lambda columns: None)
     assert comparable(a, b)
     assert not comparable(a, a)
-    for change in ({"seed": 2}, {"seed": None}, {"overrides": ("a.b=1",)}, {"faults": ("push.y@1=1",)}):
-        assert not comparable(a, FlownRun(b.log, replace(b.result, **change)))  # type: ignore[arg-type]
+    changes: list[dict[str, Any]] = [{"seed": 2}, {"overrides": ("a.b=1",)}, {"faults": ("push.y@1=1",)}]
+    for change in changes:
+        assert not comparable(
+            a, FlownRun(b.log, replace(b.result, request=replace(b.result.request, **change)))
+        )
+    assert not comparable(other(flown, tmp_path / "real", lambda columns: None, REAL), b)
 
 
 @pytest.mark.long

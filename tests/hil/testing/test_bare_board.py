@@ -10,7 +10,7 @@ from firmware_py.wire import crtp
 from firmware_py.wire.crtp import Packet
 from hil.config import load_config
 from hil.errors import LabError
-from hil.laboratory.run import BUILD
+from hil.laboratory.lockstep import BUILD
 from hil.testing.board import BareBoard, UnmetExpectation
 
 POSE = crtp.encode_ext_pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 40_000)

@@ -13,8 +13,9 @@ from hil.experiments.specific_power import VEHICLES
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import Request, fly, prepare
+from hil.laboratory.run import fly
 from hil.world.battery import Battery, endurance, open_circuit_voltage
 from hil.world.config import BatteryConfig
 
@@ -22,7 +23,6 @@ CONFIG = BatteryConfig()
 
 
 def flown(folder: Path, name: str, *overrides: str, duration_s: float) -> Result:
-    prepare(folder)
     return fly(Request.of(EXPERIMENTS[name], overrides=overrides, duration_s=duration_s), folder)
 
 
@@ -90,7 +90,6 @@ def test_draw_is_the_power_model_of_the_paper_and_the_servos() -> None:
 
 
 def test_a_sag_reaches_board_and_log_and_is_gone_afterwards(tmp_path: Path) -> None:
-    prepare(tmp_path / "run")
     fly(
         Request.of(EXPERIMENTS["hover"], duration_s=3.0, faults=(parse("battery.sag@1:1=0.5"),)),
         tmp_path / "run",

@@ -1,17 +1,55 @@
-"""The folder of a flight: no other flight is replaced there, and one flight at a time writes there."""
+"""The folder of a flight: its name, an older run in it, and that one flight at a time writes there.
+
+No flight replaces that of another request. An older run of the same request is set aside until the flight begins, and
+brought back when there is no board or link to fly with.
+"""
 
 import fcntl
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
 from hil.errors import LabError, writing
-from hil.laboratory.result import read_result
-from hil.laboratory.run import OLDER, Request, prepare
+from hil.laboratory.recorder import EVENTS
+from hil.laboratory.request import Request
+from hil.laboratory.result import RESULT, read_result
 
 RUNS = Path("runs")
+OLDER = "older-run"  # in a run folder, until the next flight begins
+
+
+def prepare(folder: Path) -> None:
+    """Make a folder ready for a run: set an older one aside. Raises `LabError` when it holds something else."""
+    with writing("--out", folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        bring_back(folder)  # before a flight that was never begun
+        if older := list(folder.iterdir()):
+            if not any((folder / name).exists() for name in (RESULT, EVENTS)):
+                raise LabError(
+                    f"--out {folder}: the folder is not empty and holds no run; choose another one"
+                )
+            (folder / OLDER).mkdir()
+            for path in older:
+                path.rename(folder / OLDER / path.name)
+
+
+def bring_back(folder: Path) -> None:
+    """Undo what `prepare` did to an older run, and what an attempt to fly has left."""
+    if (folder / OLDER).exists():
+        for path in folder.iterdir():
+            if path.name != OLDER:
+                path.unlink()
+        for path in (folder / OLDER).iterdir():
+            path.rename(folder / path.name)
+        (folder / OLDER).rmdir()
+
+
+def drop_older(folder: Path) -> None:
+    """Delete the older run: the flight begins."""
+    shutil.rmtree(folder / OLDER, ignore_errors=True)
 
 
 def folder_of(request: Request, parent: Path = RUNS) -> Path:
@@ -33,19 +71,17 @@ def other_in(folder: Path, request: Request) -> str:
         return ""
     older = folder / OLDER
     try:
-        flown, asked = (
-            read_result(older if older.exists() else folder).requested(),
-            request.origin().requested(),
-        )
+        flown = read_result(older if older.exists() else folder).request.parts()
     except LabError:
         return "something else"
+    asked = request.parts()
     differing = [f"{name} {flown[name] or 'none'}".strip() for name in flown if flown[name] != asked[name]]
     return f"another flight ({'; '.join(differing)})" if differing else ""
 
 
 @contextmanager
 def reserved(request: Request, folder: Path, replace: bool = False) -> Iterator[None]:
-    """Prepare a folder for a flight, and keep other flights out until its last file is written.
+    """Make a folder for a flight, and keep other flights out until its last file is written.
 
     Raises `LabError` when another flight is writing there or, unless it may `replace` that, when another request was flown.
     The lock is the kernel's, on the folder: it ends with the process, however that ends.
@@ -58,7 +94,6 @@ def reserved(request: Request, folder: Path, replace: bool = False) -> Iterator[
         _lock(lock, folder)
         if not replace and (other := other_in(folder, request)):
             raise LabError(f"--out {folder}: holds {other}: choose another folder, or delete this one")
-        prepare(folder)
         yield
     finally:
         os.close(lock)

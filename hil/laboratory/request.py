@@ -1,0 +1,278 @@
+"""A request: which flight to fly, on which bench. Whatever flies or reads a flight has this description of it.
+
+A run folder stores the request, and `Request.read` returns an equal one, given a function that finds its experiment.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypedDict, Unpack
+
+from pydantic import (
+    BeforeValidator,
+    GetCoreSchemaHandler,
+    GetPydanticSchema,
+    PlainSerializer,
+    TypeAdapter,
+    ValidationInfo,
+)
+from pydantic_core.core_schema import CoreSchema, with_info_after_validator_function
+
+from firmware_py.export.boards import BOARDS, CORTEX_M4, PYTHON
+from ground_station.links.schemes import SCHEMES
+from ground_station.trajectory import Goal, Trajectory
+from hil.arguments import checked
+from hil.config import DEFAULT_PROFILE, LabConfig, Overrides, load_config, settings_of
+from hil.devices.real_core import is_link
+from hil.errors import LabError, require
+from hil.laboratory.experiment import Experiment, Source, unknown
+from hil.laboratory.faults import Fault, check, parse
+from hil.laboratory.metrics import check_limits, limits_of
+
+RADIO, MAVLINK = "radio", "mavlink"
+LOCKSTEP = (RADIO, MAVLINK)  # links that are fully simulated
+REAL = "real"  # the board of a flight that only its ground station saw
+DURATION_MAX_S = 86_400.0
+SEED_MAX = 2**62
+USUAL = {"profile": DEFAULT_PROFILE, "link": RADIO, "board": PYTHON}  # of `Request.parts`
+
+InLoop = Literal["still", "moving"] | None
+Find = Callable[
+    [str, Source | None], Experiment | None
+]  # the experiment of a name or source, None: unknown here
+
+
+@checked
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """The link and the board of a flight, and how they run."""
+
+    link: str = RADIO  # radio and mavlink: in lockstep; a URI: a station in a process of its own, paced
+    board: str = PYTHON  # what executes the flight core, the path of an image that is flashed whole, a link
+    elf: Path | None = None  # with the symbols of an image that has none
+    in_loop: InLoop = None  # a real board flies by its own tasks and clock; its servos stay, or move as well
+    gdb: int | None = None  # port on which an image waits for a debugger; 0: any
+    realtime: bool = False  # pace the flight to the wall clock
+    trace: bool = False  # the schedule of the whole flight, not only of 50 ms
+
+    @property
+    def is_image(self) -> bool:
+        """Whether the board executes an image that is flashed whole."""
+        return self.board not in (*BOARDS, REAL) and not is_link(self.board)
+
+    @property
+    def in_lockstep(self) -> bool:
+        """Whether station and board share one time line."""
+        return self.link in LOCKSTEP
+
+    def check(self) -> None:
+        """Raise `LabError` when link, board and options do not fit together, or a package for them is missing."""
+        if self.is_image:
+            check_image(self.board)
+        if self.is_image and self.link.startswith(MAVLINK):
+            raise LabError(f"--link {self.link}: {self.board} speaks CRTP over its radio, not MAVLink")
+        if self.elf is not None and not self.is_image:
+            raise LabError(f"--elf {self.elf}: goes with an image as --board, not with {self.board}")
+        if self.gdb is not None and not self.is_image:
+            raise LabError(f"--gdb {self.gdb}: needs one flight with an image as --board")
+        if self.in_loop and not (is_link(self.board) and self.link == RADIO):
+            raise LabError(
+                f"--hil: --board {self.board} --link {self.link}: expected the link to a real board as --board"
+            )
+        if self.board != PYTHON and not self.is_image and not self.in_lockstep:
+            raise LabError(
+                f"--board {self.board}: --link {self.link}: only python flies over a link, and an image"
+            )
+        if not self.in_lockstep and self.link.partition(":")[0] not in SCHEMES:
+            raise LabError(
+                f"--link {self.link}: expected radio, mavlink, radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:PORT, "
+                "mavlink:pty or mavlink:PATH"
+            )
+        self._require_packages()
+
+    def _require_packages(self) -> None:
+        link, board = f"--link {self.link}", f"--board {self.board}"
+        if self.link.startswith(MAVLINK):
+            require(link, "mavlink", "pymavlink", *(() if self.in_lockstep else ("serial",)))
+        elif not self.in_lockstep:
+            require(link, "radio", "cflib")
+        if is_link(self.board):
+            require(board, "radio", "cflib")
+        elif self.board == CORTEX_M4:
+            require(board, "deploy", "unicorn", "elftools", "ziglang")
+        elif self.is_image:
+            require(board, "deploy", "unicorn", "cffi", "elftools")
+
+
+class Options(TypedDict, total=False):
+    """How to fly an experiment, everything optional: the parts of the request and of its bench."""
+
+    profile: str  # one that ships, or a path that ends in .toml; default: floaty
+    overrides: Overrides  # {"section.key": value}, or "section.key=value" as for `--set`
+    seed: int  # of everything random; default: 1
+    duration_s: float | None  # of free flight; default: the experiment's
+    faults: Sequence[Fault | str]  # on top of the experiment's own
+    trajectory: Callable[[Goal, int], Trajectory]  # instead of the experiment's, like Along(path)
+    link: str  # radio and mavlink: in lockstep; a URI: in real time; default: radio
+    board: str  # what executes the flight core: python, c or cortex-m4; default: python
+    elf: Path | None
+    in_loop: InLoop
+    gdb: int | None
+    realtime: bool
+    trace: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """The parts of a stored request that name its experiment."""
+
+    experiment: str
+    source: Source | None
+
+
+def _found(named: Named, info: ValidationInfo) -> Experiment:
+    """Return the experiment of a stored request: found again, or its stand-in."""
+    find: Find = info.context or unknown
+    return find(named.experiment, named.source) or unknown(named.experiment, named.source)
+
+
+def _by_name(_: object, handler: GetCoreSchemaHandler) -> CoreSchema:
+    return with_info_after_validator_function(_found, handler.generate_schema(Named))
+
+
+@dataclass(frozen=True)
+class Request:
+    """One flight. `overrides` and `faults` begin with those of the experiment itself.
+
+    `Request.of` makes one from a user's options and checks it.
+    """
+
+    experiment: Annotated[Experiment, GetPydanticSchema(_by_name)]
+    profile: str
+    overrides: tuple[str, ...]
+    seed: Annotated[int, BeforeValidator(lambda seed: 0 if seed is None else seed)]
+    duration_s: float
+    faults: tuple[str, ...]  # as text: of kinds that are unknown where it is read, too
+    bench: Bench
+
+    @classmethod
+    @checked
+    def of(cls, experiment: Experiment, **options: Unpack[Options]) -> Request:
+        """Return the request for an experiment: its settings and faults first. Raises `LabError` for one that cannot fly."""
+        trajectory, duration_s = options.get("trajectory"), options.get("duration_s")
+        if trajectory is not None:
+            experiment = dataclasses.replace(experiment, trajectory=trajectory)
+        bench: Mapping[str, Any] = {name: value for name, value in options.items() if name in _OF_BENCH}
+        request = cls(
+            experiment,
+            options.get("profile", DEFAULT_PROFILE),
+            (*experiment.settings, *settings_of(options.get("overrides", ()))),
+            options.get("seed", 1),
+            experiment.duration_s if duration_s is None else duration_s,
+            tuple(map(str, (*experiment.faults, *_parsed(options.get("faults", ()))))),
+            Bench(**bench),
+        )
+        request.check()
+        return request
+
+    def check(self) -> None:
+        """Raise `LabError` when the flight cannot be flown: before anything is written."""
+        self.bench.check()
+        if not 0 <= self.seed <= SEED_MAX:
+            raise LabError(f"--seed {self.seed}: expected a whole number, 0 to {SEED_MAX}")
+        if not 0.0 < self.duration_s <= DURATION_MAX_S:
+            raise LabError(
+                f"--duration {self.duration_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}"
+            )
+        on_top = self.planned_faults[len(self.experiment.faults) :]
+        check(on_top, self.duration_s, self.bench.link, self.config.markers.enabled)
+        check_limits(self.limits, self.experiment.metrics)
+        home = self.config.flight.home
+        self.experiment.check_goals(home, self.duration_s, partial(why_left, self.config))
+
+    @cached_property
+    def config(self) -> LabConfig:
+        """The configuration of the flight. Raises `LabError` for an unknown profile or a wrong override."""
+        return load_config(self.profile, self.overrides)
+
+    @cached_property
+    def planned_faults(self) -> tuple[Fault, ...]:
+        """The faults of the flight. Raises `LabError` for an unknown kind."""
+        return _parsed(self.faults)
+
+    @property
+    def is_real(self) -> bool:
+        """Whether it was a real flight, which has no seed, and of which only the ground station's view is known."""
+        return self.bench.board == REAL
+
+    @property
+    def limits(self) -> Mapping[str, float]:
+        """The limits of the flight."""
+        return limits_of(self.experiment.limits, self.config.limits.get(self.experiment.name))
+
+    @property
+    def title(self) -> str:
+        """The heading of a page or a table."""
+        return f"{self.experiment.name}, {'real flight' if self.is_real else f'seed {self.seed}'}"
+
+    def parts(self) -> dict[str, str]:
+        """Return what was asked for as text, by what `floaty fly` calls it: equal for equal flights."""
+        return {
+            "": self.experiment.reference, "seed": str(self.seed), "duration": f"{self.duration_s!r} s",
+            "profile": self.profile, "set": " ".join(self.overrides), "fault": " ".join(self.faults),
+            "link": self.bench.link, "board": self.bench.board, "hil": self.bench.in_loop or "",
+        }  # fmt: skip
+
+    def stored(self) -> dict[str, Any]:
+        """Return the request as a run folder stores it, ready for JSON."""
+        source, elf = self.experiment.source, self.bench.elf
+        return {
+            "experiment": self.experiment.name, "source": None if source is None else asdict(source),
+            "profile": self.profile, "overrides": self.overrides, "seed": None if self.is_real else self.seed,
+            "duration_s": self.duration_s, "faults": self.faults,
+            **asdict(self.bench), "elf": None if elf is None else str(elf),
+        }  # fmt: skip
+
+    @staticmethod
+    def read(values: Mapping[str, Any], find: Find = unknown) -> Request:
+        """Return a stored request; `find` returns its experiment. Raises pydantic's `ValidationError`."""
+        return _STORED.validate_python(values, context=find)
+
+
+def _nested(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a stored request as its parts, which take what is theirs."""
+    return {**values, "experiment": values, "bench": values}
+
+
+StoredRequest = Annotated[Request, BeforeValidator(_nested), PlainSerializer(Request.stored)]
+_STORED: TypeAdapter[Request] = TypeAdapter(StoredRequest)
+_OF_BENCH = tuple(field.name for field in fields(Bench))
+
+
+def _parsed(faults: Sequence[Fault | str]) -> tuple[Fault, ...]:
+    return tuple(parse(one) if isinstance(one, str) else one for one in faults)
+
+
+def why_left(config: LabConfig, p_W: Sequence[float]) -> str:
+    """Return why a robot at a place [m] has left the flow, by the limits of the plant; empty when it has not."""
+    limits, height = config.plant.limits, p_W[2] - config.tunnel.hover_height
+    if (radius := math.sqrt(p_W[0] * p_W[0] + p_W[1] * p_W[1])) > limits.radius:
+        return f"{radius:.2f} m from the axis; up to {limits.radius:g} m"
+    if not -limits.below <= height <= limits.above:
+        where = "below" if height < 0.0 else "above"
+        return f"{abs(height):.2f} m {where} the hover point; up to {getattr(limits, where):g} m"
+    return ""
+
+
+def check_image(board: str) -> None:
+    """Raise `LabError` when no file is where `--board` says."""
+    if not Path(board).is_file():
+        raise LabError(
+            f"--board {board}: expected {', '.join(BOARDS)}, an image of a Crazyflie's firmware: an ELF file, or the link "
+            "to a real board"
+        )
