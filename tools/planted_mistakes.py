@@ -5,9 +5,9 @@
 The table lists by file, then by the tests that should fail, rows of a text that occurs once in the file and the text of a
 tired developer in its place; a row may name other tests. `hangs = true` says that the mistake makes a loop endless:
 only then does a run without an end count as caught. A mistake has to get past the compiler: a file in Python is compiled,
-a file in C names the function that builds it in a folder (`build = "module:function"`). A test that is named with `::` may
-be a long one. Exit code 0: at least 95 % are caught in every room, 1: fewer, 2: the table or the tests are not in order, and
-nothing was tested.
+a file in C is built in a folder by the function that `build` names for its own (`module:function`). A test that is named
+with `::` may be a long one. Exit code 0: at least 95 % are caught in every room, 1: fewer, 2: the table or the tests are not
+in order, and nothing was tested.
 """
 
 import argparse
@@ -60,9 +60,10 @@ class Mistake:
 
 def read(table: Path) -> list[Mistake]:
     """Return the rows of a table."""
-    rows = []
-    for path, groups in tomllib.loads(table.read_text(encoding="utf-8")).items():
-        build = groups.pop("build", "")
+    rows, files = [], tomllib.loads(table.read_text(encoding="utf-8"))
+    builds = files.pop("build", {})
+    for path, groups in files.items():
+        build = builds.get(Path(path).parent.as_posix(), "")
         for tests, mistakes in groups.items():
             for old, wrong in mistakes.items():
                 row = wrong if isinstance(wrong, dict) else {"new": wrong}
@@ -86,7 +87,7 @@ def planted(mistake: Mistake, root: Path) -> str:
         except SyntaxError as error:
             raise TableError(f"{mistake.path}: {mistake.new!r} is no Python: {error.msg}") from error
     elif not mistake.build:
-        raise TableError(f'{mistake.path}: `build = "module:function"` is missing')
+        raise TableError(f"{mistake.path}: `build` names no function for its folder")
     for test in mistake.tests:
         if not (root / test.partition("::")[0]).is_file():
             raise TableError(f"{mistake.path}: no such tests: {test}")

@@ -136,8 +136,9 @@ def reach(point: Point, found: Attainable) -> Figure:
     pairs = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
     for axes, (a, b) in zip(figure.subplots(2, 3).flat, pairs, strict=True):
         for points, colour, label in (
-            (found.all, BLUE, "any lift"), (found.level, ORANGE, "lift = weight ± 2 %"),
-        ):  # fmt: skip
+            (found.all, BLUE, "any lift"),
+            (found.level, ORANGE, "lift = weight ± 2 %"),
+        ):
             if b == 3 and colour == ORANGE:
                 continue
             _outline(axes, points[:, [a, b]], colour, label)

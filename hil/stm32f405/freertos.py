@@ -58,9 +58,7 @@ class FreeRtos:
         """Return where the current task's pointer, in a task its stack and its list, and the ready lists begin and end."""
         ready = self._image.symbol("pxReadyTasksLists")
         stack, container = self._task["pxStack"], self._task[f"xStateListItem.{self._container}"]
-        return (
-            self._current, stack.offset, container.offset, ready.address, ready.address + ready.size,
-        )  # fmt: skip
+        return (self._current, stack.offset, container.offset, ready.address, ready.address + ready.size)
 
     @property
     def running(self) -> bool:

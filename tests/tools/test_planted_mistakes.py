@@ -89,14 +89,14 @@ def test_an_endless_loop_is_caught_where_the_row_says_so(project, capsys, monkey
     assert "1 of 2 caught" in said
 
 
-def plant_c(project: Path, *rows: str, build: str = "build = 'native.building:build'") -> int:
+def plant_c(project: Path, *rows: str, build: str = "'native' = 'native.building:build'") -> int:
     (project / "native").mkdir(exist_ok=True)
     (project / "native" / "__init__.py").touch()
     (project / "native" / "steps.c").write_text(C_SOURCE)
     (project / "native" / "building.py").write_text(C_BUILD)
     (project / "test_c.py").write_text(C_TESTS)
     table = project / "table.toml"
-    table.write_text("\n".join(['["native/steps.c"]', build, '["native/steps.c"."test_c.py"]', *rows]))
+    table.write_text("\n".join(["[build]", build, '["native/steps.c"."test_c.py"]', *rows]))
     return planted_mistakes.main((), project, table)
 
 
@@ -115,7 +115,7 @@ def test_c_that_does_not_compile_is_a_mistake_of_the_table(project, capsys) -> N
     assert said.err.count("\n") == 1
     assert "caught" not in said.out
     assert plant_c(project, "'-n' = 'n'", build="") == 2
-    assert 'native/steps.c: `build = "module:function"` is missing' in capsys.readouterr().err
+    assert "native/steps.c: `build` names no function for its folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
