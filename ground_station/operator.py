@@ -10,6 +10,7 @@ import shlex
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from difflib import get_close_matches
+from functools import partial
 from math import degrees, hypot, isfinite, radians
 
 from firmware_py.table import OF_PROFILE, on_board
@@ -98,32 +99,34 @@ class Operator:
             words = line.split(None, 1) if line.startswith("mark ") else shlex.split(line)
             if not words:
                 return
-            self._talk = self._talk_of(words[0], words[1:], cockpit, now_us)
-            self._go_on(cockpit, now_us, None)
+            self._execute(words[0], words[1:], cockpit, now_us)
         except (ControlsError, ValueError) as error:
             self._refuse(str(error))
 
-    def _talk_of(self, command: str, words: list[str], cockpit: Cockpit, now_us: int) -> Talk:
-        if command == "goal":
-            return self._goal(words, cockpit, now_us)
-        if command == "fly":
-            return self._fly(words, cockpit, now_us)
-        if command == "set":
-            return self._write(words, now_us)
-        if command == "get":
-            return self._read(words)
-        if command == "params":
-            return self._list(words)
-        if command in ("save", "arm", "stop"):
-            return self._ask(command, words)
-        if command == "reset":
-            return self._reset(words)
-        if command == "mark":
-            return self._mark(words)
-        if command == "help":
-            return self._help()
-        near = get_close_matches(command, COMMANDS, 1)
-        raise ControlsError(f"unknown{f'; did you mean {near[0]}?' if near else '; help lists the commands'}")
+    def _execute(self, command: str, words: list[str], cockpit: Cockpit, now_us: int) -> None:
+        """Do what a line says at once, or begin its dialogue with the board."""
+        at_once: dict[str, Callable[[], str]] = {
+            "goal": lambda: self._goal(words, cockpit, now_us),
+            "fly": lambda: self._fly(words, cockpit, now_us),
+            "mark": lambda: f"mark {_words(words, 'mark TEXT', 1)[0].strip()}",
+            "help": self._help,
+        }
+        talks: dict[str, Callable[[list[str]], Talk]] = {
+            "set": self._write,
+            "get": self._read,
+            "params": self._list,
+            "reset": self._reset,
+            **dict.fromkeys(("save", "arm", "stop"), partial(self._ask, command)),
+        }
+        if command in at_once:
+            self._finish(at_once[command]())
+        elif command in talks:
+            self._talk = talks[command](words)
+            self._go_on(cockpit, now_us, None)
+        else:
+            near = get_close_matches(command, COMMANDS, 1)
+            hint = f"did you mean {near[0]}?" if near else "help lists the commands"
+            raise ControlsError(f"unknown; {hint}")
 
     def _hear(self, cockpit: Cockpit, now_us: int, answer: Answer) -> None:
         try:
@@ -145,15 +148,19 @@ class Operator:
             request = next(self._talk) if values is None else self._talk.send(values)
         except StopIteration as done:
             self._talk = None
-            if done.value:
-                self._note(done.value)
-                self._say(done.value)
+            self._finish(done.value)
         else:
             cockpit.link.ask(now_us, request)
 
-    # The commands; those that do not need the board yield nothing
+    def _finish(self, done: str) -> None:
+        """Record and show what was done, if there is something to note."""
+        if done:
+            self._note(done)
+            self._say(done)
 
-    def _goal(self, words: list[str], cockpit: Cockpit, now_us: int) -> Talk:
+    # The commands
+
+    def _goal(self, words: list[str], cockpit: Cockpit, now_us: int) -> str:
         numbers = [_number(word) for word in words]
         if len(numbers) not in (3, 4):
             raise ControlsError("expected goal X Y Z [YAW], metres in W and degrees")
@@ -164,15 +171,13 @@ class Operator:
         yaw = radians(numbers[3]) if len(numbers) == 4 else cockpit.plan.at(now_us).yaw
         cockpit.plan.steer(Hold(Goal(place, yaw)))
         return f"goal {' '.join(f'{x:g}' for x in place)} m, yaw {degrees(yaw):.4g} deg"
-        yield
 
-    def _fly(self, words: list[str], cockpit: Cockpit, now_us: int) -> Talk:
+    def _fly(self, words: list[str], cockpit: Cockpit, now_us: int) -> str:
         (name,) = _words(words, "fly NAME", 1)
         cockpit.plan.steer(self._find(name)(cockpit.plan.home, now_us))
         return f"fly {name}"
-        yield
 
-    def _write(self, words: list[str], now_us: int) -> Talk:
+    def _write(self, words: list[str]) -> Talk:
         typed, text = _words(words, "set NAME VALUE", 2)
         (name, factor), value = on_board(typed), _number(text)
         ((known, before),) = yield Request(Action.READ, name)
@@ -224,16 +229,10 @@ class Operator:
             self._well_since_us = None  # the others have not flown beside it
         return "reset " + ", ".join(f"{name} {value:.6g}" for name, value in changed.items())
 
-    def _mark(self, words: list[str]) -> Talk:
-        (text,) = _words(words, "mark TEXT", 1)
-        return f"mark {text.strip()}"
-        yield
-
-    def _help(self) -> Talk:
+    def _help(self) -> str:
         for line in HELP.splitlines():
             self._say(line)
         return ""
-        yield
 
     def _watch(self, cockpit: Cockpit, now_us: int) -> None:
         """Remember values after they have flown well for a while."""

@@ -3,7 +3,6 @@
 import math
 import os
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pymavlink.dialects.v20.common as dialect
@@ -22,12 +21,6 @@ def masters(served: Served) -> list[str]:
     return served.line("mavlink ")
 
 
-@pytest.fixture(scope="module")
-def served() -> Iterator[Served]:
-    with serve("--mavlink", "tcp:0") as served:
-        yield served
-
-
 @pytest.mark.parametrize("end", ["pty", "udp", "tcp"])
 def test_every_end_carries_the_whole_parameter_table(end: str) -> None:
     with serve("--mavlink", f"udp:{free_port()}" if end == "udp" else end + ":0" * (end == "tcp")) as served:
@@ -42,13 +35,14 @@ def test_every_end_carries_the_whole_parameter_table(end: str) -> None:
     assert all(math.isfinite(message.param_value) for message in found.values())
 
 
-def test_two_tcp_clients_hear_the_board_and_each_gets_its_answers(served: Served) -> None:
-    first, second = (MavlinkSocket(masters(served)[0]) for _ in range(2))
-    for client in (first, second):
-        assert client.command(dialect.MAV_CMD_NAV_LAND) == dialect.MAV_RESULT_UNSUPPORTED
-    for client in (first, second):
-        client.wait("HEARTBEAT")
-        client.close()
+def test_two_tcp_clients_hear_the_board_and_each_gets_its_answers() -> None:
+    with serve("--mavlink", "tcp:0") as served:
+        first, second = (MavlinkSocket(masters(served)[0]) for _ in range(2))
+        for client in (first, second):
+            assert client.command(dialect.MAV_CMD_NAV_LAND) == dialect.MAV_RESULT_UNSUPPORTED
+        for client in (first, second):
+            client.wait("HEARTBEAT")
+            client.close()
 
 
 def test_the_baud_rate_limits_what_comes_through() -> None:
