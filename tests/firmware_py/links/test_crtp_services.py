@@ -39,19 +39,6 @@ C_TYPES = {
 }  # fmt: skip
 
 
-IDLE_TASKS = (
-    "SYSLINK",
-    "CRTP-RX",
-    "CRTP-TX",
-    "LOG",
-    "PARAM",
-    "MEM",
-    "CONSOLE",
-    "CRTP-SRV",
-    "APP",
-)
-
-
 @pytest.fixture
 def client() -> CrtpClient:
     return CrtpClient()

@@ -109,11 +109,6 @@ def test_the_imu_measures_in_si_in_the_bodys_axes() -> None:
     assert 0 <= client.now_us - found.time_usec <= 3000
 
 
-def test_home_is_told_as_often_as_wanted(moving: MavlinkClient) -> None:
-    home = once(moving, 242)
-    assert (home.x, home.y, home.z) == pytest.approx((0.0, 0.0, -1.15))
-
-
 def test_the_board_says_whether_it_is_in_the_air_as_far_as_it_knows() -> None:
     client = MavlinkClient()
 
