@@ -222,4 +222,5 @@ def parameters_of(config: FirmwareConfig) -> Block[Parameters]:
     block.fields.gyro_scale = f32(GYRO_SCALE)
     block.fields.age_measured = i32(config.predictor.age == "measured")
     block.fields.direction[:] = config.servo.direction
+    block.fields.home[:] = config.mavlink.home
     return block

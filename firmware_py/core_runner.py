@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from firmware_py.config import CpuConfig
 from firmware_py.core import entry
-from firmware_py.core.structs import Control, Estimator, Input, Parameters, Sampling, Supervisor
+from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block, Struct
 from firmware_py.export.usage import Usage
 from firmware_py.logic.plugs import CALLS
@@ -58,6 +58,7 @@ class CoreBlocks:
         "logic",
         "named",
         "parameters",
+        "report",
         "run",
         "sampling",
         "supervisor",
@@ -73,13 +74,14 @@ class CoreBlocks:
         self.control = Control.allocate()  # written by the stabilizer task
         self.sampling = Sampling.allocate()  # by both
         self.supervisor = Supervisor.allocate()  # by the stabilizer task, and by requests
+        self.report = Report.allocate()  # by the estimator task
         self.watchdog_fed_us = 0  # by the stabilizer task
         self.logic = logic
         self.calls = CALLS if logic is None else logic.loaded.calls
         own = {} if logic is None else logic.allocate()
         core: dict[str, Block[Struct]] = {
             "parameters": parameters, "data": self.data, "estimator": self.estimator, "control": self.control,
-            "sampling": self.sampling, "supervisor": self.supervisor,
+            "sampling": self.sampling, "supervisor": self.supervisor, "report": self.report,
         }  # fmt: skip
         self.named = core | own
         self.run: CoreRunner = runner(self)

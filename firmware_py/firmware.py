@@ -7,8 +7,8 @@ Hardware calls `imu_ready`, `radio_received` and `uart_ready` (interrupts), then
 from typing import TYPE_CHECKING, ClassVar
 
 from firmware_py.board import Board
-from firmware_py.box import GoalBox
 from firmware_py.config import FirmwareConfig, MavlinkConfig, parameters_of
+from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts, PythonRunner, RunnerFactory, costs_of
 from firmware_py.drivers.imu import acceleration, rates
 from firmware_py.export.usage import Usage
@@ -25,7 +25,6 @@ from firmware_py.links.platform import PlatformService
 from firmware_py.links.storage import ParameterStorage
 from firmware_py.links.trajectories import MEMORY_SIZE
 from firmware_py.logic.loading import load_logic
-from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.parameters import parameters
 from firmware_py.pilot import Pilot
@@ -38,6 +37,7 @@ from firmware_py.supervisor import Supervisor
 from firmware_py.tasks import estimator_task, power_task, sensors_task, stabilizer_task
 from firmware_py.variables import log_variables
 from firmware_py.wire import WireError
+from firmware_py.wire.crtp import Correction
 from firmware_py.wire.memories import (
     CONFIG_SIZE,
     RadioSettings,
@@ -61,7 +61,7 @@ DECK = (0xBC, 0xF1, "bcFloaty", "A")  # vendor, product, name, revision of the d
 
 
 class Firmware:
-    """A booted board. `kernel`, `variables` and `parameters` may be read; `signals` are views on the core.
+    """A booted board. `kernel`, `pilot`, `variables` and `parameters` may be read; `signals` are views on the core.
 
     With `mavlink` the UART speaks MAVLink, which needs pymavlink. `runner` executes the flight core. Its clock is that of
     who runs it, and it has its profile's constants: there is nothing to tell of either.
@@ -80,13 +80,16 @@ class Firmware:
         self.kernel = self.scheduler = Kernel(preemption=True)
         self._board = board
         core = CoreBlocks(parameters_of(config), runner, load_logic(config.logic))
+        core.data.fields.absolute = i32(config.predictor.absolute)
         core.run.call("reset")
         core.run.call("control")
         board.write_compare(core.control.fields.count.tolist())  # hover from the first PWM period on
         self._core = core
         self.link = CrtpStack(self.kernel, config.cpu, board)
         self._console = Console(self.link, board)
-        self._supervisor = Supervisor(core, self._console.write)
+        self._notices = Notices(self.kernel, self._console.write)
+        self.pilot = Pilot(core)
+        self._supervisor = Supervisor(core, self._console.write, self.pilot, self._client_is_there)
         self._imu_ready = self.kernel.create_binary_semaphore("imuReady")
         data_ready = self.kernel.create_binary_semaphore("dataReady")
         estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
@@ -102,7 +105,8 @@ class Firmware:
         )  # fmt: skip
         kernel.create_task(
             "KALMAN", 2, estimator_task,
-            kernel, cost, estimator_run, self.measurements, core, costs, self._zero_found,
+            kernel, cost, estimator_run, self.measurements, core, costs, self.pilot, self._zero_found,
+            self._pose_refused,
         )  # fmt: skip
         kernel.create_task("PWRMGNT", 0, power_task, kernel, board, core)
         self.mavlink = self._mavlink_stack(config) if mavlink else None
@@ -113,25 +117,22 @@ class Firmware:
 
     def _start_services(self, config: FirmwareConfig) -> None:
         """Create the services of the links."""
-        self._supervisor.connected = self._client_is_there
         board, core, link, supervisor = self._board, self._core, self.link, self._supervisor
         settings = _radio_settings(board)
         if board.deck_memory == b"\xff" * len(board.deck_memory):
             board.deck_memory[:] = encode_one_wire(*DECK)
         tester, storage = Tester(), ParameterStorage(board.eeprom)
-        pilot = supervisor.goals = Pilot(config.predictor, GoalBox(config.box), config.mavlink.home)
         trajectories = bytearray(MEMORY_SIZE)
-        notices = Notices(self.kernel, self._console.write)
+        pilot, notices = self.pilot, self._notices
         high_level = HighLevelService(link, pilot, supervisor, trajectories, notices)
         running = Running(
             board=board,
             core=core,
             supervisor=supervisor,
-            manual=ManualFlaps(core.parameters.fields, core.data.fields),
             measurements=self.measurements,
             stack=link,
             localisation=LocalisationService(
-                link, self.measurements, supervisor, pilot, settings.address & 0xFF, notices
+                link, self.measurements, supervisor, pilot, settings.address & 0xFF
             ),
             platform=PlatformService(link, supervisor, pilot),
             tester=tester,
@@ -243,6 +244,12 @@ class Firmware:
 
     def _client_is_there(self) -> bool:
         return self.link.connected or (self.mavlink is not None and self.mavlink.connected)
+
+    def _pose_refused(self, pose: Correction) -> None:
+        place = "{:.2f} {:.2f} {:.2f}".format(*pose.p_GB)
+        self._notices.refuse(
+            "pose", f"pose refused: {place} m is no correction; for absolute poses set extPose.absolute 1"
+        )
 
     def _zero_found(self) -> None:
         bias = self._core.data.fields.gyro_bias.tolist()

@@ -3,19 +3,15 @@
 Names are the Crazyflie's and the original Floaty's.
 """
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from math import sqrt
 
 from firmware_py.links.parameters import Parameter
 from firmware_py.running import Running
-from firmware_py.supervisor import Manual
-from firmware_py.table import CORE_PARAMETERS, OUTSIDE, CoreParameter, Place
+from firmware_py.table import CORE_PARAMETERS, CoreParameter
 from firmware_py.variables import F32, I8, U8, U16, U32
 
 STD_LIMITS = (1e-4, 1.0)  # [m], [rad]
-
-Access = tuple[Callable[[], float], Callable[[float], object]]  # to a number: read it, write it
 
 
 def parameters(running: Running) -> tuple[Parameter, ...]:
@@ -24,7 +20,6 @@ def parameters(running: Running) -> tuple[Parameter, ...]:
     own = () if logic is None else logic.loaded.parameters
     return (
         *(_declared(running, parameter) for parameter in (*CORE_PARAMETERS, *own)),
-        *_words(running),
         *_kalman(running),
         *_supervision(running),
         Parameter(
@@ -37,58 +32,15 @@ def parameters(running: Running) -> tuple[Parameter, ...]:
 def _declared(running: Running, declared: CoreParameter) -> Parameter:
     """Return a parameter of the table of variables."""
     place, scale = declared.place, declared.scale
-    read, write = {OUTSIDE: _around, "data": _manual}.get(place.block, _in_core)(running, place)
+    array, index = running.core.named[place.block].memory[place.field], (0, *place.index)
 
     def put(value: float) -> None:
-        write(scale * value)
-        if place.field in ("trim", "manual", "manual_mode"):
-            running.manual.apply()
+        array[index] = scale * value
 
     return Parameter(
-        declared.name, declared.scalar, declared.unit, lambda: read() / scale, put,
+        declared.name, declared.scalar, declared.unit, lambda: array.item(*index) / scale, put,
         declared.low, declared.high, declared.persistent,
     )  # fmt: skip
-
-
-def _in_core(running: Running, place: Place) -> Access:
-    array, index = running.core.named[place.block].memory[place.field], (0, *place.index)
-    return partial(array.item, *index), partial(array.__setitem__, index)
-
-
-def _manual(running: Running, place: Place) -> Access:
-    """Return the access to who moves the flaps, and to which angles, while no words do."""
-    manual = running.manual
-    if place.field == "manual_mode":
-        return lambda: manual.mode, lambda value: setattr(manual, "mode", Manual(int(value)))
-    return partial(manual.angles.item, *place.index), partial(manual.angles.__setitem__, place.index)
-
-
-def _around(running: Running, place: Place) -> Access:
-    """Return the access to what the firmware around the core has."""
-    field, pilot = place.field, running.pilot
-    if field == "absolute":
-        return lambda: pilot.absolute, lambda value: setattr(pilot, "absolute", value == 1)
-    return partial(getattr, pilot.box, field), partial(setattr, pilot.box, field)
-
-
-def _words(running: Running) -> Iterator[Parameter]:
-    """Servo words from outside."""
-    manual = running.manual
-
-    def use(value: float) -> None:
-        manual.use_words = value == 1
-        manual.apply()
-
-    def put(index: int, value: float) -> None:
-        manual.words[index] = value
-        manual.apply()
-
-    yield Parameter("motorPowerSet.enable", U8, "", lambda: manual.use_words, use, 0, 1)
-    for index in range(4):
-        yield Parameter(
-            f"motorPowerSet.m{index + 1}", U16, "words", partial(manual.words.item, index), partial(put, index),
-            0, 0xFFFF,
-        )  # fmt: skip
 
 
 def _kalman(running: Running) -> Iterator[Parameter]:

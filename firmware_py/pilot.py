@@ -1,14 +1,23 @@
-"""Where to fly, as the high-level commander has it, and external poses as errors against that.
+"""Where to fly, as the high-level commander has it: the goal from which a pose is seen, and set-points for the core.
 
 Poses come in a frame X: corrections are in the goal frame of the ground station, absolute ones in that of the cameras.
-The error that the estimator takes is the pose as it looks from the goal, which the planner moves in X, at the instant at
-which the pose was true. While the planner is idle, corrections are errors already (the goal is X's origin); with absolute
-poses there is nothing to fly to: the goal stays under the robot, and the supervisor keeps the flaps at hover.
+A pose is seen from the goal, which the planner moves in X, at the instant at which the pose was true. While the planner is
+idle, corrections are errors already (the goal is X's origin); with absolute poses there is nothing to fly to: the goal stays
+under the robot, and the supervisor keeps the flaps at hover.
 """
 
-from firmware_py.box import GoalBox
-from firmware_py.config import PredictorConfig
-from firmware_py.geometry import Vector, in_goal_frame, to_euler_zyx
+from firmware_py.core.structs import (
+    GOAL_ABSOLUTE,
+    GOAL_NONE,
+    GOAL_OF_CORRECTIONS,
+    SETPOINT_OTHER,
+    SETPOINT_POSITION,
+    Input,
+)
+from firmware_py.core.subset import i32
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.geometry import Vector, to_euler_zyx
+from firmware_py.measurements import Arrived
 from firmware_py.planner import Motion, Path, Phase, Planner, stay
 from firmware_py.wire.crtp import Correction
 
@@ -17,23 +26,25 @@ SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHU
 
 
 class Pilot:
-    """`absolute` says what poses are. `goal` is what the last error was formed against, None for an unchanged correction."""
+    """`goal` is what the last pose was seen from, None for an unchanged correction."""
 
-    def __init__(self, config: PredictorConfig, box: GoalBox, home: Vector) -> None:
-        self.box = box
+    def __init__(self, core: CoreBlocks) -> None:
         self.planner = Planner()
-        self.absolute: bool = config.absolute
         self.goal: Motion | None = None
         self.here: Motion | None = None  # the last absolute pose
         self.seen_us = -1  # when the last pose came
         self._setpoint_us: int | None = None  # when the last set-point came, while they lead
-        self._default_age_us: int = config.default_age_us
-        self._home = home  # of absolute poses
+        self._core = core
+
+    @property
+    def absolute(self) -> bool:
+        """Whether poses over CRTP are absolute."""
+        return bool(self._core.data.fields.absolute)
 
     def flies(self, now_us: int) -> bool:
         """Whether there is something to fly to; poses from links other than CRTP do not pass the pilot."""
         idle = self.planner.phase(now_us) is Phase.IDLE
-        return not (self.absolute and idle and self.here is not None)
+        return not (idle and self.here is not None and self.absolute)
 
     @property
     def led(self) -> bool:
@@ -44,19 +55,31 @@ class Pilot:
         """Whether set-points lead and have stopped arriving."""
         return self._setpoint_us is not None and now_us - self._setpoint_us >= SETPOINT_SILENCE_US
 
+    def judged(self, setpoint: tuple[Vector, float] | None, now_us: int) -> int:
+        """Return what becomes of a set-point, `SETPOINT_...`; None: it gives no position."""
+        data = self._core.data.fields
+        data.poses_absolute = i32(self.absolute)
+        data.setpoint_kind = i32(SETPOINT_OTHER)
+        if setpoint is not None:
+            data.setpoint_kind = i32(SETPOINT_POSITION)
+            data.setpoint[:3], data.setpoint[3] = setpoint
+        put_goal(data, self.begin(now_us))
+        return self._core.run.call("follow")
+
     def admits(self, path: Path) -> bool:
-        """Return whether a path stays in the box, or returns to it."""
-        return self.box.holds(path.places(), self._centre)
+        """Return whether a path ends in the box and is never further outside than at its beginning."""
+        begin, *places = path.places()
+        return all(self.admits_place(place, begin, self.absolute) for place in places) and self.admits_place(
+            places[-1], None, self.absolute
+        )
 
-    def admits_place(self, position: Vector, now_us: int) -> bool:
-        """Return whether a set-point is in the box, or no further outside than what is flown to now."""
-        begin = self.begin(now_us)
-        allowed = self.box.excess(begin.position, self._centre) if begin is not None else 0.0
-        return self.box.excess(position, self._centre) <= allowed
-
-    @property
-    def _centre(self) -> Vector:
-        return self._home if self.absolute else ORIGIN.position
+    def admits_place(self, place: Vector, goal: Vector | None, absolute: bool) -> bool:
+        """Return whether a place is in the box, or no further outside than a goal."""
+        data = self._core.data.fields
+        data.poses_absolute = i32(absolute)
+        data.setpoint[:3] = place
+        put_goal(data, None if goal is None else Motion(goal, 0.0))
+        return bool(self._core.run.call("admits"))
 
     def follow(self, path: Path, now_us: int, lands: bool = False) -> None:
         """Start a path of the high-level commander, which needs no further messages."""
@@ -87,18 +110,25 @@ class Pilot:
         """Where the origin of the estimate is in X now; None while they are the same."""
         return self.planner.at(now_us) if self.planner.phase(now_us) is not Phase.IDLE else self.goal
 
-    def error(self, pose: Correction, now_us: int) -> Correction:
-        """Return the error that the estimator takes for a pose that has just arrived."""
+    def measured(self, pose: Correction, now_us: int) -> Arrived:
+        """Return a pose over CRTP that has just arrived with the goal from which it is seen."""
         self.seen_us = now_us
-        age_us = self._default_age_us if pose.age_us is None else pose.age_us
+        age_us = int(self._core.parameters.fields.default_age_us) if pose.age_us is None else pose.age_us
         if self.absolute:
             self.here = Motion(pose.p_GB, to_euler_zyx(pose.q_GB)[2])
         if self.planner.phase(now_us) is not Phase.IDLE:
             self.goal = self.planner.at(now_us - age_us)
         else:
             self.goal = self.here if self.absolute else None
-        if self.goal is None:
-            return pose
-        return Correction(
-            *in_goal_frame(pose.p_GB, pose.q_GB, self.goal.position, self.goal.yaw), pose.age_us
-        )
+        return now_us, pose, self.absolute, self.goal
+
+
+def put_goal(data: Input, goal: Motion | None) -> None:
+    """Hand the core the goal in the frame of the poses."""
+    if goal is None:
+        data.goal_kind = i32(GOAL_NONE)
+        return
+    data.goal_kind = i32(GOAL_ABSOLUTE if data.poses_absolute else GOAL_OF_CORRECTIONS)
+    data.goal[:3] = goal.position
+    data.goal[3] = goal.yaw
+    data.goal_velocity[:] = goal.velocity

@@ -12,7 +12,6 @@ from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.memories import Tester
 from firmware_py.links.platform import PlatformService
 from firmware_py.links.storage import ParameterStorage
-from firmware_py.manual import ManualFlaps
 from firmware_py.measurements import Measurement
 from firmware_py.pilot import Pilot
 from firmware_py.rtos import Queue
@@ -37,7 +36,6 @@ class Running:
     board: Board
     core: CoreBlocks
     supervisor: Supervisor
-    manual: ManualFlaps
     measurements: Queue[Measurement]
     stack: CrtpStack
     localisation: LocalisationService

@@ -16,7 +16,7 @@ from firmware_py.links.log import LogVariable
 from firmware_py.links.parameters import Parameter
 from firmware_py.running import Running
 from firmware_py.table import whole_names
-from firmware_py.variables import F32, I8, U8, U16, U32, angle
+from firmware_py.variables import F32, I8, U8, U16, U32
 from firmware_py.wire.scalars import Scalar
 
 SIGNAL_DBM = 40  # radio.rssi: below 0 dBm, what the virtual radio chip measures
@@ -106,7 +106,7 @@ def stock_variables(running: Running) -> Iterator[LogVariable]:
 
     def across(axis: int) -> float:
         """The target in axes that turn with the body's yaw."""
-        return rotate(yaw_quaternion(-angle(running, 2)), _target(running)[0])[axis]
+        return rotate(yaw_quaternion(-running.core.report.fields.attitude.item(2)), _target(running)[0])[axis]
 
     for axis, name in enumerate("xyz"):
         yield LogVariable(f"ctrltarget.{name}", F32, "m", partial(along, axis))

@@ -6,21 +6,12 @@ reboot, as on the Crazyflie. The board arms itself at boot.
 """
 
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Protocol
 
 from firmware_py.core import structs
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.wire.supervisor import Cause, State
-
-
-class Manual(IntEnum):
-    """Who moves the flaps: the original's parameter `extCtrl.manual`."""
-
-    OFF = structs.MANUAL_OFF
-    ANGLES = structs.MANUAL_ANGLES
-    HOVER = structs.MANUAL_HOVER
 
 
 class GoalSource(Protocol):
@@ -42,15 +33,21 @@ class GoalSource(Protocol):
 class Supervisor:
     """Requests to the core's supervisor, and a view on it."""
 
-    def __init__(self, core: CoreBlocks, announce: Callable[[str], None]) -> None:
-        self.goals: GoalSource | None = None  # None: there is always something to fly to
-        self.connected: Callable[[], bool] = lambda: True  # whether a client is there
+    def __init__(
+        self,
+        core: CoreBlocks,
+        announce: Callable[[str], None],
+        goals: GoalSource,
+        connected: Callable[[], bool],
+    ) -> None:
         self.state = State.CALIBRATING
         self.cause = Cause.NONE
         self._core = core
         self._data, self._fields = core.data.fields, core.supervisor.fields
         self._sampling, self._parameters = core.sampling.fields, core.parameters.fields
         self._announce = announce
+        self._goals = goals
+        self._connected = connected  # whether a client is there
         self.arm(True)
 
     @property
@@ -110,18 +107,17 @@ class Supervisor:
 
     def look(self, now_us: int) -> None:
         """Have the controller's mode decided at this instant and announce a change of state; called every 10 ms."""
-        data, goals = self._data, self.goals
-        data.now_us, data.connected = wrapped(now_us), i32(self.connected())
-        if goals is not None:
-            if goals.forsaken(now_us):
-                self.emergency_stop()
-            data.idle = i32(not goals.flies(now_us))
+        data, goals = self._data, self._goals
+        data.now_us, data.connected = wrapped(now_us), i32(self._connected())
+        if goals.forsaken(now_us):
+            self.emergency_stop()
+        data.idle = i32(not goals.flies(now_us))
         if self._core.run.call("supervise"):
             self.state, self.cause = State(int(self._fields.state)), Cause(int(self._fields.cause))
             cause = self.cause
             reason = "" if cause is Cause.NONE else f", {cause.name.lower().replace('_', ' ')}"
             self._announce(f"supervisor: {self.state.name.lower()}{reason}")
-        if goals is not None and not self._fields.ready:
+        if not self._fields.ready:
             goals.abort()
 
     def emergency_stop(self) -> None:

@@ -6,34 +6,20 @@ parameters, the exported app, the keys of a profile, and what a profile's key is
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, get_args
+from typing import get_args
 
 import numpy as np
 
-from firmware_py.core.structs import Control, Estimator, Input, Parameters, Sampling, Supervisor
-from firmware_py.core.subset import F32s, Logged, Settable, f32, i32
-from firmware_py.wire.parameters import ABSOLUTE
+from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
+from firmware_py.core.subset import F32s, Logged, Settable, f32
 from firmware_py.wire.scalars import Scalar
 
 SCALARS = {"f32": Scalar.F32, "i32": Scalar.I32}  # by the core's types
 
 
-class Outside:
-    """What may be tuned of the firmware around the core."""
-
-    absolute: Annotated[
-        i32,
-        Settable("predictor", ABSOLUTE, "", 0, 1, "true: poses over CRTP are absolute; false: corrections", type="U8"),
-    ]  # fmt: skip
-    radius: Annotated[f32, Settable("box", "", "m", 1e-6, 5, "from the axis through home")]
-    below: Annotated[f32, Settable("box", "", "m", 0, 5, "below home")]
-    above: Annotated[f32, Settable("box", "", "m", 0, 5, "above home")]
-
-
-OUTSIDE = "outside"
 BLOCKS: Mapping[str, type] = {
     "parameters": Parameters, "data": Input, "estimator": Estimator, "control": Control, "sampling": Sampling,
-    "supervisor": Supervisor, OUTSIDE: Outside,
+    "supervisor": Supervisor, "report": Report,
 }  # fmt: skip
 
 
@@ -103,7 +89,11 @@ class _Field:
         """Yield the numbers that a mark names, each with its place among the names."""
         scalar = Scalar[mark.type] if mark.type else SCALARS[self.base]
         unit = getattr(mark, "shown", "") or mark.unit
-        names = mark.names if isinstance(mark, Logged) else mark.names or f"{mark.section}.{self.name}"
+        names = (
+            mark.names
+            if isinstance(mark, Logged)
+            else mark.names or (mark.section and f"{mark.section}.{self.name}")
+        )
         for listed, stock in ((names, False), (mark.stock, True)):
             for number, name in enumerate(whole_names(listed)):
                 element = np.unravel_index(mark.first + mark.step * number, self.shape) if self.shape else ()

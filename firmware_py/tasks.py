@@ -9,9 +9,12 @@ from collections.abc import Callable, Generator
 
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig
+from firmware_py.core.structs import POSE_NO_CORRECTION
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts
 from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement
+from firmware_py.pilot import Pilot, put_goal
+from firmware_py.planner import Motion
 from firmware_py.rtos import Kernel, Queue, Semaphore
 from firmware_py.supervisor import Supervisor, wrapped
 from firmware_py.wire.crtp import Correction
@@ -78,7 +81,9 @@ def estimator_task(
     measurements: Queue[Measurement],
     core: CoreBlocks,
     costs: CoreCosts,
+    pilot: Pilot,
     zero_found: Callable[[], None],
+    pose_refused: Callable[[Correction], None],
 ) -> Task:
     """Take measurements at 1 kHz, estimate at 100 Hz."""
     sampling, sample = core.sampling.fields, core.data.fields.gyro_sample
@@ -92,9 +97,13 @@ def estimator_task(
                     zero_found()
                     yield from kernel.yield_if_pending()
             elif measurement[0] == POSE:
-                hand_pose_to_core(kernel, *measurement[1], core)
+                answer = hand_pose_to_core(kernel, core, *measurement[1])
+                if answer == POSE_NO_CORRECTION:
+                    pose_refused(measurement[1][1])
+                    yield from kernel.yield_if_pending()
         if sampling.estimate_due:
             yield from kernel.work(costs.estimate_us())
+            put_goal(core.data.fields, pilot.frame(kernel.now_us))
             core.run.call("estimate")
 
 
@@ -107,12 +116,16 @@ def power_task(kernel: Kernel, board: Board, core: CoreBlocks) -> Task:
         yield from kernel.delay_until(wake_tick)
 
 
-def hand_pose_to_core(kernel: Kernel, arrived_us: int, pose: Correction, core: CoreBlocks) -> None:
-    """Hand a pose to the core."""
+def hand_pose_to_core(
+    kernel: Kernel, core: CoreBlocks, arrived_us: int, pose: Correction, absolute: bool, goal: Motion | None
+) -> int:
+    """Hand a pose to the core; returns what became of it, `POSE_...`."""
     data = core.data.fields
+    data.poses_absolute = i32(absolute)
+    put_goal(data, goal)
     data.now_us = wrapped(kernel.now_us)
     data.pose_waited_us = i32(kernel.now_us - arrived_us)
     data.pose_position[:] = pose.p_GB
     data.pose_quaternion[:] = pose.q_GB
     data.pose_age_us = i32(-1 if pose.age_us is None else pose.age_us)
-    core.run.call("file_pose")
+    return core.run.call("file_pose")

@@ -9,10 +9,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from math import degrees
 
-from firmware_py.core.structs import ATTITUDE, FLAP, POSITION, VELOCITY, Control, Estimator
 from firmware_py.core_runner import CoreBlocks
 from firmware_py.drivers.imu import acceleration, rates
-from firmware_py.geometry import Vector, from_euler_zyx, rotate, wrap_angle, yaw_quaternion
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogVariable
 from firmware_py.rtos.statistics import ProcessorLoad
@@ -22,7 +20,6 @@ from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import LEGACY_DEGREES
 
-AGE_UNIT_US = 100  # locSrv.age counts tenths of a millisecond
 BATTERY_FULL_MV = 4200
 # The least time over which the processor's load is averaged.
 LOAD_US = 100_000
@@ -34,11 +31,11 @@ F32, U8, I8, U16, I16, U32 = Scalar.F32, Scalar.U8, Scalar.I8, Scalar.U16, Scala
 def log_variables(running: Running) -> tuple[LogVariable, ...]:
     """Return the table, in the order of the log TOC."""
     core, supervisor = running.core, running.supervisor
-    estimator, control = core.estimator.fields, core.control.fields
+    control = core.control.fields
     own = () if core.logic is None else core.logic.loaded.variables
     return (
         *(_declared(core, variable) for variable in (*CORE_VARIABLES, *own)),
-        *_state_estimate(running, estimator, control),
+        *_parts("stateEstimate", "roll pitch yaw", "deg", partial(_legacy_angle, running)),
         *_crazyflie(running),
         LogVariable("motors_ctrp.min_angle", F32, "rad", lambda: control.flap.min()),
         LogVariable("motors_ctrp.max_angle", F32, "rad", lambda: control.flap.max()),
@@ -46,8 +43,7 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
         LogVariable("sys.canfly", U8, "", partial(getattr, supervisor, "can_fly")),
         LogVariable("sys.isFlying", U8, "", lambda: supervisor.state is State.FLYING),
         LogVariable("sys.isTumbled", U8, "", lambda: 0),
-        *_localisation(running.localisation, estimator),
-        *_parts("kalman", "stateX stateY stateZ", "m", partial(_vector, running, POSITION, "position")),
+        *_localisation(running.localisation),
         *_counters(running),
     )
 
@@ -71,39 +67,8 @@ def _parts(group: str, names: str, unit: str, read: Callable[[int], float]) -> I
         yield LogVariable(f"{group}.{name}", F32, unit, partial(read, index))
 
 
-def _state_estimate(running: Running, estimator: Estimator, control: Control) -> Iterator[LogVariable]:
-    now, flap, command = estimator.now, control.flap, control.command
-    angles = "flap_1 flap_2 flap_3 flap_4"
-    yield from _parts("stateEstimate", "x y z", "m", partial(_vector, running, POSITION, "position"))
-    yield from _parts("stateEstimate", "vx vy vz", "m/s", partial(_vector, running, VELOCITY, "velocity"))
-    yield from _parts("stateEstimate", "roll pitch yaw", "deg", partial(_legacy_angle, running))
-    yield from _parts("stateEstimate", angles, "rad", lambda i: now[FLAP + i] + (flap[i] - command[i]))
-    yield from _parts("stateEstimate", "qw qx qy qz", "", partial(_quaternion, running))
-
-
-def _vector(running: Running, first: int, of: str, axis: int) -> float:
-    """Return an axis of the position or velocity that begins at `first` of the state, in the frame of the poses."""
-    now, frame = running.core.estimator.fields.now, running.pilot.frame(running.stack.kernel.now_us)
-    if frame is None:
-        return now.item(first + axis)
-    x, y, z = now[first : first + 3].tolist()
-    origin: Vector = getattr(frame, of)
-    return origin[axis] + rotate(yaw_quaternion(frame.yaw), (x, y, z))[axis]
-
-
-def angle(running: Running, axis: int) -> float:
-    """Return roll, pitch or yaw [rad] in the frame of the poses."""
-    own = running.core.estimator.fields.now.item(ATTITUDE + axis)
-    frame = running.pilot.frame(running.stack.kernel.now_us) if axis == 2 else None
-    return own if frame is None else wrap_angle(own + frame.yaw)
-
-
-def _quaternion(running: Running, part: int) -> float:
-    return from_euler_zyx(*(angle(running, axis) for axis in range(3)))[part]
-
-
 def _legacy_angle(running: Running, axis: int) -> float:
-    return LEGACY_DEGREES[axis] * angle(running, axis)
+    return LEGACY_DEGREES[axis] * running.core.report.fields.attitude.item(axis)
 
 
 def _crazyflie(running: Running) -> Iterator[LogVariable]:
@@ -132,12 +97,9 @@ def _crazyflie(running: Running) -> Iterator[LogVariable]:
     yield LogVariable("pm.batteryLevel", U8, "%", battery_level)
 
 
-def _localisation(service: LocalisationService, estimator: Estimator) -> Iterator[LogVariable]:
+def _localisation(service: LocalisationService) -> Iterator[LogVariable]:
     yield from _parts("locSrv", "x y z", "m", lambda axis: service.last.p_GB[axis])
     yield from _parts("locSrv", "qw qx qy qz", "", lambda part: service.last.q_GB[part])
-    yield LogVariable("locSrv.age", U16, "0.1 ms", lambda: int(estimator.pose_age_us) // AGE_UNIT_US)
-    yield LogVariable("locSrv.poses", U16, "", lambda: _received(estimator) & 0xFFFF)
-    yield LogVariable("locSrv.rejected", U16, "", lambda: _rejected(estimator) & 0xFFFF)
     yield LogVariable("locSrv.positions", U32, "", partial(getattr, service, "positions"))
 
 
@@ -151,11 +113,3 @@ def _counters(running: Running) -> Iterator[LogVariable]:
     yield LogVariable("sensors.dropped", U32, "", partial(getattr, running.measurements, "dropped"))
     yield LogVariable("app.overflows", U32, "", partial(getattr, running.platform, "app_overflows"))
     yield LogVariable("memTst.errCntW", U32, "", partial(getattr, running.tester, "errors"))
-
-
-def _rejected(estimator: Estimator) -> int:
-    return int(estimator.refused + estimator.too_old + estimator.invalid)
-
-
-def _received(estimator: Estimator) -> int:
-    return int(estimator.fused + estimator.jumps) + _rejected(estimator)

@@ -28,7 +28,7 @@ from rich.table import Table
 
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
-from firmware_py.core.structs import Control, Estimator, Input, Sampling, Supervisor
+from firmware_py.core.structs import Control, Estimator, Input, Report, Sampling, Supervisor
 from firmware_py.extras import install_command
 from firmware_py.fast import STALE, STATE
 from hil.config import load_config
@@ -85,7 +85,7 @@ def core_us() -> tuple[float, float]:
     """Microseconds of one estimator tick (with a pose every other tick) and one controller tick."""
     parameters = parameters_of(load_config())
     data, estimator, control = (struct.allocate() for struct in (Input, Estimator, Control))
-    sampling, supervisor = Sampling.allocate(), Supervisor.allocate()
+    sampling, supervisor, report = Sampling.allocate(), Supervisor.allocate(), Report.allocate()
     entry.reset(parameters.arg, estimator.arg)
     data.fields.pose_quaternion[:] = 1.0, 0.0, 0.0, 0.0
     data.fields.mode = 1
@@ -98,7 +98,7 @@ def core_us() -> tuple[float, float]:
         if ticks % 2:
             data.fields.pose_age_us = 33_000
             entry.file_pose(parameters.arg, data.arg, estimator.arg, sampling.arg, supervisor.arg)
-        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg)
+        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg, report.arg)
 
     def steer() -> None:
         entry.control(parameters.arg, data.arg, estimator.arg, control.arg)

@@ -6,6 +6,7 @@ pitch with the sign of the profile's pitch constant, u3 > 0 turns left, u4 > 0 l
 
 from firmware_py.core.excitation import excite
 from firmware_py.core.maths import HALF, ZERO, clamp, cos, sin, wrap
+from firmware_py.core.servo import WORD_CENTRE, WORDS_PER_RADIAN
 from firmware_py.core.structs import (
     ATTITUDE,
     MODE_FLY,
@@ -122,6 +123,15 @@ def release(control: Control) -> None:
 
 
 @kernel
+def manual_angle(parameters: Parameters, data: Input, flap: Integer) -> f32:
+    """Return the flap angle from outside [rad]; of a servo word that which the mapping, which truncates, turns into it."""
+    if data.by_words == 0:
+        return f32(data.manual[flap])
+    untrimmed = f32(data.words[flap]) + HALF - WORD_CENTRE - parameters.trim[flap]
+    return f32(parameters.direction[flap] * untrimmed / WORDS_PER_RADIAN)
+
+
+@kernel
 def control_flaps(parameters: Parameters, data: Input, estimator: Estimator, control: Control) -> None:
     """Write the commanded flap angles for the mode: closed loop, hover angles, or angles from outside."""
     if data.mode == MODE_FLY:
@@ -133,6 +143,6 @@ def control_flaps(parameters: Parameters, data: Input, estimator: Estimator, con
         for flap in range(4):
             control.flap[flap] = sign(flap) * parameters.hover_angle
             if data.mode == MODE_MANUAL:
-                control.flap[flap] = clamp(data.manual[flap], -FLAP_LIMIT, FLAP_LIMIT)
+                control.flap[flap] = clamp(manual_angle(parameters, data, flap), -FLAP_LIMIT, FLAP_LIMIT)
     for flap in range(4):
         control.command[flap] = control.flap[flap] - sign(flap) * parameters.hover_angle

@@ -1,7 +1,16 @@
 """The calls by which the firmware enters the core; every argument is the memory of one struct."""
 
-from firmware_py.core import controller, poses, predictor, sampling, servo, supervisor
-from firmware_py.core.structs import POSE_ON_TIME, Control, Estimator, Input, Parameters, Sampling, Supervisor
+from firmware_py.core import controller, goal, poses, predictor, sampling, servo, supervisor
+from firmware_py.core.structs import (
+    POSE_ON_TIME,
+    Control,
+    Estimator,
+    Input,
+    Parameters,
+    Report,
+    Sampling,
+    Supervisor,
+)
 from firmware_py.core.subset import Memory, i32, kernel
 
 _reset = predictor.reset
@@ -10,6 +19,10 @@ _estimate = predictor.estimate
 _control_flaps = controller.control_flaps
 _drive_servos = servo.drive_servos
 _age_at_tick = poses.age_at_tick
+_admits = goal.admits
+_follow = goal.follow
+_see_from_goal = goal.see_from_goal
+_report_state = goal.report_state
 _begin_step = sampling.begin_step
 _take_sample = sampling.take_sample
 _clear_samples = sampling.clear_samples
@@ -47,7 +60,10 @@ def file_pose(
     sampling: Memory[Sampling],
     supervisor: Memory[Supervisor],
 ) -> i32:
-    """File the pose in the input under the instant at which it was true."""
+    """File the pose in the input, as it looks from the goal, under the instant at which it was true."""
+    seen = _see_from_goal(data[0], estimator[0])
+    if seen != POSE_ON_TIME:
+        return seen
     _age_at_tick(data[0], sampling[0])
     answer = _file_pose(parameters[0], data[0], estimator[0])
     if answer == POSE_ON_TIME:
@@ -62,10 +78,12 @@ def estimate(
     estimator: Memory[Estimator],
     control: Memory[Control],
     sampling: Memory[Sampling],
+    report: Memory[Report],
 ) -> None:
     """Run one tick of the estimator."""
     _estimate(parameters[0], data[0], estimator[0], control[0])
     _clear_samples(data[0], sampling[0])
+    _report_state(data[0], estimator[0], control[0], report[0])
 
 
 @kernel
@@ -101,6 +119,18 @@ def request(
 ) -> i32:
     """Serve a request; returns whether it was obeyed."""
     return _serve(parameters[0], data[0], sampling[0], supervisor[0])
+
+
+@kernel
+def admits(parameters: Memory[Parameters], data: Memory[Input]) -> i32:
+    """Return whether the set-point is in the box, or no further outside than the goal is."""
+    return _admits(parameters[0], data[0])
+
+
+@kernel
+def follow(parameters: Memory[Parameters], data: Memory[Input]) -> i32:
+    """Take the commander's set-point as the goal; returns what became of it."""
+    return _follow(parameters[0], data[0])
 
 
 @kernel

@@ -14,7 +14,6 @@ from firmware_py.core.structs import (
     ATTITUDE,
     HISTORY,
     HORIZON_LIMIT,
-    POSE_INVALID,
     POSE_ON_TIME,
     POSE_TOO_OLD,
     RATE,
@@ -32,8 +31,6 @@ CATCH_UP = 2  # filter ticks per tick at most, so that the time of a tick stays 
 SECONDS_PER_US = f32(1e-6)
 # The sensor sits at -45 deg in the body, as in drivers/imu.py: p = cos45 (gx + gy), q = cos45 (gy - gx).
 COS_45 = f32(0.707106781186548)
-UNIT_TOLERANCE = f32(0.2)  # on the squared length of a quaternion
-POSE_LIMIT = f32(100.0)  # [m]
 
 
 @kernel
@@ -68,28 +65,11 @@ def reset(parameters: Parameters, estimator: Estimator) -> None:
 
 
 @kernel
-def valid_pose(data: Input) -> bool:
-    """Return whether the pose is made of sane numbers."""
-    length = ZERO
-    for i in range(4):
-        length = length + data.pose_quaternion[i] * data.pose_quaternion[i]
-    if not abs(length - f32(1.0)) <= UNIT_TOLERANCE:
-        return False
-    for axis in range(3):
-        if not abs(data.pose_position[axis]) <= POSE_LIMIT:
-            return False
-    return True
-
-
-@kernel
 def pose_into_history(parameters: Parameters, data: Input, estimator: Estimator) -> i32:
-    """File a pose under the coming tick minus its age; returns POSE_ON_TIME, POSE_TOO_OLD or POSE_INVALID.
+    """File a valid pose under the coming tick minus its age; returns POSE_ON_TIME or POSE_TOO_OLD.
 
     Call it before `estimate` of the tick that `pose_age_us` refers to.
     """
-    if not valid_pose(data):
-        estimator.invalid = i32(estimator.invalid + 1)
-        return i32(POSE_INVALID)
     age_us = data.pose_age_us
     if parameters.predict != 0 and parameters.age_measured == 0:
         age_us = i32(clamp_horizon(parameters.horizon) * TICK_US)

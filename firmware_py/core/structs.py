@@ -57,6 +57,17 @@ REQUEST_FEED = 6  # the watchdog of the emergency stop
 POSE_ON_TIME = 0
 POSE_TOO_OLD = 1
 POSE_INVALID = 2
+POSE_NO_CORRECTION = 3  # the robot cannot be there from its goal
+
+GOAL_NONE = 0
+GOAL_OF_CORRECTIONS = 1  # in the frame that corrections are in
+GOAL_ABSOLUTE = 2  # in W
+
+SETPOINT_NONE = 0  # nothing is commanded, the goal stays
+SETPOINT_POSITION = 1  # a position, perhaps with a yaw
+SETPOINT_OTHER = 2  # attitude, rates, velocity, thrust: not flown
+SETPOINT_OUTSIDE = 3  # a position outside the box
+SETPOINT_OF_CORRECTIONS = 4  # poses are corrections: who sends them has the goal
 
 
 # fmt: off
@@ -171,6 +182,11 @@ class Parameters(Struct):
         type="U16", scale=1000, shown="ms")]
     low_battery_mv: Annotated[i32, Settable(
         "supervisor", "supervisor.lowBattery", "mV", 0, 20_000, "supply below which flight ends after 5 s", type="U16")]
+    # where goals may be: an upright cylinder
+    box_radius: Annotated[f32, Settable("box", "box.radius", "m", 1e-6, 5, "from the axis through home", key="radius")]
+    box_below: Annotated[f32, Settable("box", "box.below", "m", 0, 5, "below home", key="below")]
+    box_above: Annotated[f32, Settable("box", "box.above", "m", 0, 5, "above home", key="above")]
+    home: Annotated[F32s, 3]  # [m] W
 # fmt: on
 
 
@@ -185,13 +201,33 @@ class Input(Struct):
     gyro_sum: Annotated[I32s, 3]  # [counts] sum over the samples since the last tick, sensor frame
     gyro_samples: i32
     gyro_bias: Annotated[F32s, 3]  # [counts] the gyro's zero
+    # what poses over CRTP are
+    absolute: Annotated[
+        i32,
+        Settable(
+            "predictor",
+            "extPose.absolute",
+            "",
+            0,
+            1,
+            "true: poses over CRTP are absolute; false: corrections",
+            type="U8",
+        ),
+    ]
+    poses_absolute: i32  # 1: the pose and the set-point are in W; 0: the pose is a correction
     pose_waited_us: i32  # since the pose's arrival
-    pose_position: Annotated[F32s, 3]  # [m] p_GB
-    pose_quaternion: Annotated[F32s, 4]  # q_GB, w x y z
+    pose_position: Annotated[F32s, 3]  # [m] of B; as seen from the goal once it is filed
+    pose_quaternion: Annotated[F32s, 4]  # likewise, w x y z
     pose_age_us: i32  # at its arrival, then at the next tick; negative: unknown
     battery_mv: i32
     connected: i32  # a client is there
     idle: i32  # there is nothing to fly to
+    goal_kind: i32  # GOAL_...
+    goal: Annotated[F32s, 4]  # x, y, z [m] and yaw [rad]
+    goal_velocity: Annotated[F32s, 3]  # [m/s]
+    setpoint_kind: i32  # SETPOINT_..., of the commander
+    setpoint: Annotated[F32s, 4]  # as the goal; a yaw of NaN leaves the goal's
+    setpoint_velocity: Annotated[F32s, 3]
     request: i32  # REQUEST_...
     # MANUAL_...
     manual_mode: Annotated[
@@ -203,6 +239,15 @@ class Input(Struct):
         F32s,
         4,
         Settable("", "extCtrl.m1 m2 m3 m4", "rad", -1.5707963267948966, 1.5707963267948966, persistent=False),
+    ]
+    # or servo words, which win
+    by_words: Annotated[
+        i32, Settable("", "", "", 0, 1, stock="motorPowerSet.enable", type="U8", persistent=False)
+    ]
+    words: Annotated[
+        I32s,
+        4,
+        Settable("", "", "words", 0, 65535, stock="motorPowerSet.m1 m2 m3 m4", type="U16", persistent=False),
     ]
 
 
@@ -251,6 +296,7 @@ class Estimator(Struct):
     # ticks by which the filter runs behind
     horizon: Annotated[i32, Logged("10 ms", "delayComp.horizon", type="U8")]
     pose_age_us: i32  # of the last pose that was accepted for fusion, at its tick
+    no_corrections: i32  # of the invalid poses, those that the robot cannot have from its goal
     # work space, no meaning between ticks
     work_1: Annotated[F32s, 16]
     work_2: Annotated[F32s, 16]
@@ -321,3 +367,21 @@ class Supervisor(Struct):
     outside_us: i32  # until the state counts as inside its bounds again
     controller_faults: i32  # of own logic
     estimator_faults: i32
+
+
+class Report(Struct):
+    """What the board reports of itself: the state in the frame of the poses, and how many of them it has taken."""
+
+    position: Annotated[
+        F32s,
+        3,
+        Logged("m", stock="stateEstimate.x y z"),
+        Logged("m", stock="kalman.stateX stateY stateZ"),
+    ]
+    velocity: Annotated[F32s, 3, Logged("m/s", stock="stateEstimate.vx vy vz")]
+    attitude: Annotated[F32s, 3]  # [rad] roll, pitch, yaw
+    quaternion: Annotated[F32s, 4, Logged("", stock="stateEstimate.qw qx qy qz")]
+    flap: Annotated[F32s, 4, Logged("rad", "stateEstimate.flap_1 flap_2 flap_3 flap_4")]  # estimated angles
+    age: Annotated[i32, Logged("0.1 ms", "locSrv.age", type="U16")]  # of the last pose, 65535 at most
+    poses: Annotated[i32, Logged("", "locSrv.poses", type="U16")]  # received, modulo 65536
+    rejected: Annotated[i32, Logged("", "locSrv.rejected", type="U16")]  # of these, refused

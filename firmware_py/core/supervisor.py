@@ -185,9 +185,12 @@ def state_of(data: Input, sampling: Sampling, supervisor: Supervisor, cause: Int
 @kernel
 def mode_of(data: Input, supervisor: Supervisor) -> i32:
     """Return the mode that follows from state, cause and who moves the flaps."""
-    if supervisor.cause > CAUSE_OUT_OF_BOUNDS or data.manual_mode == MANUAL_HOVER:
+    manual = data.manual_mode
+    if data.by_words != 0:
+        manual = i32(MANUAL_ANGLES)
+    if supervisor.cause > CAUSE_OUT_OF_BOUNDS or manual == MANUAL_HOVER:
         return i32(MODE_HOVER)
-    if data.manual_mode == MANUAL_ANGLES:
+    if manual == MANUAL_ANGLES:
         if data.connected != 0:
             return i32(MODE_MANUAL)
         return i32(MODE_HOVER)  # nobody is there who could take the angles back

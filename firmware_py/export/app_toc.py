@@ -11,7 +11,7 @@ from firmware_py.config import FirmwareConfig
 from firmware_py.core.subset import f32
 from firmware_py.export.reading import float_literal
 from firmware_py.logic.loading import load_logic
-from firmware_py.table import CORE_PARAMETERS, CORE_VARIABLES, OUTSIDE, CoreParameter, Place, value_in
+from firmware_py.table import CORE_PARAMETERS, CORE_VARIABLES, CoreParameter, Place, value_in
 from firmware_py.wire.parameters import ABSOLUTE
 from firmware_py.wire.scalars import Scalar
 
@@ -23,25 +23,18 @@ TYPES = {  # in C, and what the macros of both tables call them
     Scalar.U16: ("uint16_t", "UINT16"),
     Scalar.U8: ("uint8_t", "UINT8"),
 }
-AROUND = {  # what the table has outside the core
-    "absolute": ("floaty_absolute", Scalar.U8),
-    **{size: (f"floaty_box.{size}", Scalar.F32) for size in ("radius", "below", "above")},
-}
-OBSERVED = (  # and what an observer sees
-    *((f"stateEstimate.flap_{flap + 1}", Scalar.F32, f"floaty_observed.flap[{flap}]") for flap in range(4)),
+OBSERVED = (  # what the app counts itself
     ("floaty.malformed", Scalar.U32, "floaty_observed.malformed"),
     ("floaty.overflows", Scalar.U32, "floaty_observed.overflows"),
     ("floaty.staleHovers", Scalar.U32, "floaty_observed.stale_hovers"),
-    *((f"locSrv.{name}", Scalar.U16, f"floaty_observed.{name}") for name in ("age", "poses", "rejected")),
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AppParameter(CoreParameter):
-    """A parameter in the app: `target`, of type `memory`, is its scale times the value that a client sees."""
+    """A parameter in the app: `target` is its scale times the value that a client sees."""
 
     target: str  # in C
-    memory: Scalar
     initial: float  # as the client sees it
 
 
@@ -204,7 +197,6 @@ def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
     parameters = (*CORE_PARAMETERS, *(() if logic is None else logic.loaded.parameters))
     found = []
     for one in parameters:
-        target, memory = _in_c(one.place)
         if one.name == ABSOLUTE:
             initial = 1.0  # as Bitcraze's programs send poses
         elif one.name in own:
@@ -213,7 +205,7 @@ def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
             initial = value_in(config, one.key) / one.scale if one.key else 0.0
         if not one.stock:
             declared = {field.name: getattr(one, field.name) for field in fields(one)}
-            found.append(AppParameter(**declared, target=target, memory=memory, initial=initial))
+            found.append(AppParameter(**declared, target=_in_c(one.place), initial=initial))
     return tuple(found)
 
 
@@ -222,7 +214,7 @@ def toc_source(config: FirmwareConfig) -> str:
     logic = load_logic(config.logic)
     table = app_parameters(config)
     variables = (*CORE_VARIABLES, *(() if logic is None else logic.loaded.variables))
-    logged = [(one.name, one.scalar, _in_c(one.place)[0]) for one in variables if not one.stock]
+    logged = [(one.name, one.scalar, _in_c(one.place)) for one in variables if not one.stock]
     params = [(one.name, _added(one)) for one in table]
     logs = [
         (name, f"LOG_ADD(LOG_{TYPES[scalar][1]}, NAME, &{c})") for name, scalar, c in (*logged, *OBSERVED)
@@ -239,13 +231,10 @@ def toc_source(config: FirmwareConfig) -> str:
     return text
 
 
-def _in_c(place: Place) -> tuple[str, Scalar]:
-    """Return the C expression of a variable in the app, and its type."""
+def _in_c(place: Place) -> str:
+    """Return the C expression of a variable in the app."""
     block = {"data": "input"}.get(place.block, place.block)
-    whole, scalar = f"floaty_{block}.{place.field}", place.scalar
-    if place.block == OUTSIDE:
-        whole, scalar = AROUND[place.field]
-    return whole + "".join(f"[{number}]" for number in place.index), scalar
+    return f"floaty_{block}.{place.field}" + "".join(f"[{number}]" for number in place.index)
 
 
 def _row(parameter: AppParameter) -> str:
@@ -253,7 +242,7 @@ def _row(parameter: AppParameter) -> str:
     cells = (
         f'"{parameter.name}"', f"&{_seen(parameter)}", f"&{parameter.target}",
         *map(number, (parameter.scale, parameter.low, parameter.high, parameter.initial)),
-        f"KIND_{parameter.scalar.name}", f"KIND_{parameter.memory.name}",
+        f"KIND_{parameter.scalar.name}", f"KIND_{parameter.place.scalar.name}",
     )  # fmt: skip
     return f"  {{{', '.join(cells)}}},"
 

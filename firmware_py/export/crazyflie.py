@@ -8,7 +8,7 @@ from pathlib import Path
 
 from firmware_py.config import FirmwareConfig
 from firmware_py.export.app_logic import calls_header
-from firmware_py.export.app_toc import number, toc_source
+from firmware_py.export.app_toc import toc_source
 from firmware_py.export.app_wire import wire_header
 from firmware_py.export.errors import ExportError
 from firmware_py.export.profile_c import profile_source
@@ -29,7 +29,7 @@ def app_files(config: FirmwareConfig, profile: str) -> dict[str, str]:
     files["src/floaty_core.h"] = core.header
     files["src/floaty_core.c"] = core.source
     files["src/floaty_profile.c"] = profile_source(config)
-    files["src/floaty_settings.h"] = _settings(config, profile)
+    files["src/floaty_settings.h"] = _settings(profile)
     files["src/floaty_calls.h"] = calls_header(config.logic)
     files["src/floaty_wire.h"] = wire_header()
     files["src/floaty_toc.c"] = toc_source(config)
@@ -51,16 +51,11 @@ def write_app(config: FirmwareConfig, profile: str, folder: Path) -> tuple[Path,
     return tuple(folder / name for name in files)
 
 
-def _settings(config: FirmwareConfig, profile: str) -> str:
-    """Return the header with what the profile says beyond the core's parameters."""
+def _settings(profile: str) -> str:
+    """Return the header with the profile's name."""
     name = profile.replace("\\", "/").replace('"', "'")
     return (
-        "/* What the profile says beyond the parameters of the core. */\n"
+        "/* The profile that the app was made of. Written by `floaty deploy`. */\n"
         "#pragma once\n\n"
         f'#define FLOATY_PROFILE_NAME "{name}"\n'
-        f"#define FLOATY_HOME {{{', '.join(map(number, config.mavlink.home))}}}\n"
-        + "".join(
-            f"#define FLOATY_BOX_{size.upper()} {number(value)}\n"
-            for size, value in config.box.model_dump().items()
-        )
     )

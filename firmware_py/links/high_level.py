@@ -8,6 +8,7 @@ fourth byte, as the stock firmware answers.
 
 from dataclasses import dataclass, replace
 
+from firmware_py.core.structs import SETPOINT_OF_CORRECTIONS, SETPOINT_OUTSIDE, SETPOINT_POSITION
 from firmware_py.links.crtp_stack import CrtpStack, Task
 from firmware_py.links.notices import Notices
 from firmware_py.links.trajectories import decode_trajectory
@@ -167,7 +168,7 @@ class HighLevelService:
         """Port 3: roll, pitch, yaw rate and thrust. Clients send it without thrust when they disconnect."""
         check_size("an attitude set-point", packet.data, setpoints.ATTITUDE_SIZE)
         if any(packet.data[12:14]):
-            self._refuse_setpoint("attitude")
+            self._refuse_setpoint("attitude", self._pilot.judged(None, self._stack.kernel.now_us))
         yield from self._stack.kernel.yield_if_pending()
 
     def _see_setpoint(self, packet: Packet) -> Task:
@@ -185,15 +186,15 @@ class HighLevelService:
 
     def _hold(self, kind: int, data: bytes) -> None:
         """Fly to a set-point if it gives a position and poses are absolute."""
-        if kind in (setpoints.POSITION, setpoints.FULL_STATE) and self._pilot.absolute:
-            place = setpoints.decode_place(data)
-            now_us = self._stack.kernel.now_us
-            if not self._pilot.admits_place(place[0], now_us):
-                self._refuse_place("set-point")
-            elif self._supervisor.can_fly:
-                self._pilot.hold(*place, now_us)
-        else:
-            self._refuse_setpoint(setpoints.NAMES.get(kind, "unknown"))
+        now_us = self._stack.kernel.now_us
+        place = setpoints.decode_place(data) if kind in (setpoints.POSITION, setpoints.FULL_STATE) else None
+        answer = self._pilot.judged(place, now_us)
+        if answer == SETPOINT_OUTSIDE:
+            self._refuse_place("set-point")
+        elif place is None or answer != SETPOINT_POSITION:
+            self._refuse_setpoint(setpoints.NAMES.get(kind, "unknown"), answer)
+        elif self._supervisor.can_fly:
+            self._pilot.hold(*place, now_us)
 
     def _refuse_place(self, what: str) -> None:
         self._refuse(
@@ -201,8 +202,9 @@ class HighLevelService:
             f"{what} refused: it leaves the box, see box.radius, box.below and box.above",
         )
 
-    def _refuse_setpoint(self, kind: str) -> None:
-        instead = "positions are" if self._pilot.absolute else "poses are corrections, see extPose.absolute"
+    def _refuse_setpoint(self, kind: str, answer: int) -> None:
+        of_corrections = answer == SETPOINT_OF_CORRECTIONS
+        instead = "poses are corrections, see extPose.absolute" if of_corrections else "positions are"
         self._refuse(f"{kind} set-point", f"{kind} set-points are not flown, {instead}")
 
     def _refuse(self, kind: str, why: str) -> None:

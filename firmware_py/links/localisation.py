@@ -1,12 +1,10 @@
 """Poses from outside into the measurement queue, and the emergency stop; runs in the receiving task.
 
 A position without attitude is counted and logged but not fused, as in the original. Packed items are taken when they
-carry the last byte of the board's radio address. The pilot turns poses into errors.
+carry the last byte of the board's radio address. The pilot adds the goal from which a pose is seen.
 """
 
-from firmware_py.box import is_correction
 from firmware_py.links.crtp_stack import CrtpStack, Task
-from firmware_py.links.notices import Notices
 from firmware_py.measurements import POSE, Measurement
 from firmware_py.pilot import Pilot
 from firmware_py.rtos import Queue
@@ -27,7 +25,6 @@ class LocalisationService:
         supervisor: Supervisor,
         pilot: Pilot,
         address: int,
-        notices: Notices,
     ) -> None:
         self.last = Correction((0.0, 0.0, 0.0), UPRIGHT, None)
         self.positions = 0
@@ -36,7 +33,6 @@ class LocalisationService:
         self._supervisor = supervisor
         self._pilot = pilot
         self._address = address
-        self._notices = notices
         stack.handle(crtp.PORT_LOCALISATION, self._handle)
 
     def _handle(self, packet: Packet) -> Task:
@@ -68,12 +64,5 @@ class LocalisationService:
         self.last = Correction(p_GB, self.last.q_GB, None)
 
     def _measure(self, now_us: int, pose: Correction) -> Task:
-        if not self._pilot.absolute and not is_correction(pose.p_GB):
-            place = "{:.2f} {:.2f} {:.2f}".format(*pose.p_GB)
-            self._notices.refuse(
-                "pose", f"pose refused: {place} m is no correction; for absolute poses set extPose.absolute 1"
-            )
-            raise WireError(f"a correction of {place} m")
         self.last = pose
-        error = self._pilot.error(pose, now_us)
-        yield from self._measurements.send((POSE, (now_us, error)), 0)
+        yield from self._measurements.send((POSE, self._pilot.measured(pose, now_us)), 0)

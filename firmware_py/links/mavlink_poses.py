@@ -1,11 +1,10 @@
 """Absolute poses from the serial line into the measurement queue; runs in the receiving task.
 
-The board forms the correction itself: the pose as it looks from the goal that is in force when it arrives. How old a
+A pose is seen from the goal that is in force when it arrives. How old a
 pose is follows from its time stamp and from the sender's clock, which is asked twice a second, faster at first. Whoever
 sends poses is the partner; before the first pose, whoever sends heartbeats.
 """
 
-from firmware_py.geometry import in_goal_frame
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
@@ -54,10 +53,10 @@ class PoseService:
         pose = mavlink.read_pose(message)
         self._meet(message)
         now_us = self._stack.kernel.now_us
-        p_GB, q_GB = in_goal_frame(pose.p_WB, pose.q_WB, *self._setpoints.see_pose())
+        goal = self._setpoints.see_pose()
         self.age_us = self._age_us(now_us, pose.t_us)
-        self._localisation.last = Correction(p_GB, q_GB, self.age_us)
-        self._measurements.send_nowait((POSE, (now_us, self._localisation.last)))
+        self._localisation.last = Correction(pose.p_WB, pose.q_WB, self.age_us)
+        self._measurements.send_nowait((POSE, (now_us, self._localisation.last, True, goal)))
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """How long ago the sender's clock showed `t_us`; None when that is not known."""

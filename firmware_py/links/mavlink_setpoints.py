@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from firmware_py.geometry import Vector
 from firmware_py.links.mavlink_stack import INFO, WARNING, MavlinkStack, Task
 from firmware_py.pilot import Pilot
-from firmware_py.planner import stay
+from firmware_py.planner import Motion, stay
 from firmware_py.rtos import FOREVER, TICK_US
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
@@ -55,10 +55,10 @@ class SetpointService:
                 return Result.ACCEPTED, self._enter(mode, _source(command))
         return Result.DENIED, ()
 
-    def see_pose(self) -> Goal:
+    def see_pose(self) -> Motion:
         """Return the goal that a pose from MAVLink, which has just arrived, is to be seen from."""
         self._seen_from, self._seen_us = self._goal, self._stack.kernel.now_us
-        return self._goal
+        return Motion(*self._goal)
 
     @property
     def goal(self) -> Goal:
@@ -87,7 +87,7 @@ class SetpointService:
         if self._leader not in (None, source):
             raise WireError("target refused: another client is in offboard")
         p_WG, yaw = self._goal
-        if target.p_WG is not None and self._excess(target.p_WG) > self._excess(p_WG):
+        if target.p_WG is not None and not self._pilot.admits_place(target.p_WG, p_WG, absolute=True):
             raise WireError("target refused: outside the box, see BOX_RADIUS, BOX_BELOW and BOX_ABOVE")
         self._goal = (
             p_WG if target.p_WG is None else target.p_WG,
@@ -98,10 +98,6 @@ class SetpointService:
             self._lead(now_us)
         if target.moves:
             self._stack.notice(message, "only position and yaw of targets are flown")
-
-    def _excess(self, p_WG: Vector) -> float:
-        """How far a goal is outside the box [m]: from there the robot may return."""
-        return self._pilot.box.excess(p_WG, self.home)
 
     def _lead(self, now_us: int) -> None:
         """Let the pilot fly to the goal."""

@@ -26,7 +26,11 @@ PARAMETER_ROOM = 12  # characters: MAVLink has 16, of which OWN_ takes four
 VARIABLE_ROOM = MAX_NAME - len(GROUP)
 CORE_STRUCTS = {"parameters": "Parameters", "data": "Input", "estimator": "Estimator", "control": "Control"}
 OWN, MEMORY = "own", "memory"
-BLOCKS = CORE_STRUCTS | {"sampling": "Sampling", "supervisor": "Supervisor"}  # of the core, in their order
+BLOCKS = CORE_STRUCTS | {
+    "sampling": "Sampling",
+    "supervisor": "Supervisor",
+    "report": "Report",
+}  # of the core, in their order
 _SIGNATURES = {
     name: signature(function)
     for name, function in vars(entry).items()

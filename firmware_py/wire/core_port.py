@@ -89,6 +89,8 @@ class Call(IntEnum):
     REQUEST = 7
     LOSE_CONTROL = 8
     BEGIN_AFRESH = 9
+    ADMITS = 10
+    FOLLOW = 11
 
 
 class Hil(IntEnum):

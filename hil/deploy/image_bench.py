@@ -107,7 +107,7 @@ def _check_parameter(parameter: AppParameter, board: ParameterBoard) -> Iterator
 def _behind(parameter: AppParameter, value: float) -> float:
     """Return the number in memory for a client's value, rounded as the board does."""
     product = float(np.float32(parameter.scale) * np.float32(value))
-    return parameter.memory.cast(product)
+    return parameter.place.scalar.cast(product)
 
 
 def _values(parameter: AppParameter, scalar: Scalar) -> list[float]:
@@ -176,7 +176,7 @@ class ImageBench:
 
     def field(self, parameter: AppParameter) -> float:
         """Return the number in memory that a parameter acts on."""
-        return self.memory(parameter.target, parameter.memory)
+        return self.memory(parameter.target, parameter.place.scalar)
 
     def memory(self, target: str, scalar: Scalar) -> float:
         """Return a number by its expression in C, like `floaty_parameters.trim[2]`."""

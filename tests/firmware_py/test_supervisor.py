@@ -16,14 +16,15 @@ from firmware_py.core.supervisor import (
     EPISODE_LIMIT_US,
 )
 from firmware_py.links.platform import supervisor_bits
-from firmware_py.supervisor import Manual
 from firmware_py.wire import crtp
+from firmware_py.wire.crtp import Correction
 from firmware_py.wire.supervisor import Cause, State
 from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, CrtpClient
 from support.firmware_bench import HOVER_COUNTS, LEVEL
 from support.mavlink_client import MavlinkClient
 from support.supervisor_bench import SupervisorBench
 
+MANUALS = (structs.MANUAL_OFF, structs.MANUAL_ANGLES, structs.MANUAL_HOVER)
 OFF_CENTRE = (0.0, 0.04, 0.02)
 
 
@@ -127,12 +128,12 @@ def test_floatys_own_parameter_arms_and_disarms(flying: CrtpClient) -> None:
     [
         (
             CrtpClient, 1_000_000,
-            lambda client: write(client, "extCtrl.manual", Manual.ANGLES),
+            lambda client: write(client, "extCtrl.manual", structs.MANUAL_ANGLES),
             lambda client: client.firmware.radio_polled(),  # an empty packet of the radio
         ),
         (
             MavlinkClient, 3_000_000,
-            lambda client: client.send("param_set", 1, 1, b"EXT_MANUAL", Manual.ANGLES, 9),
+            lambda client: client.send("param_set", 1, 1, b"EXT_MANUAL", structs.MANUAL_ANGLES, 9),
             lambda client: client.send("heartbeat", 6, 8, 0, 0, 0),
         ),
     ],
@@ -219,16 +220,16 @@ def in_flight(happen: Callable[[SupervisorBench], object], now_us: int = 0) -> S
 
 
 @EVENTS
-@pytest.mark.parametrize("manual", Manual)
+@pytest.mark.parametrize("manual", MANUALS)
 def test_angles_from_outside_move_the_flaps_unless_somebody_the_battery_or_own_logic_stopped_the_robot(
-    happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int], manual: Manual
+    happen: Callable[[SupervisorBench], object], cause: Cause, flown_by: tuple[int, int, int], manual: int
 ) -> None:
     bench = in_flight(happen)
     bench.data.manual_mode = manual
     assert bench.look() == flown_by[manual]
     assert bench.view.cause is cause
-    bench.view.connected = lambda: False
-    assert bench.look() == (MODE_HOVER if manual is Manual.ANGLES else flown_by[manual])
+    bench.connected = False
+    assert bench.look() == (MODE_HOVER if manual == structs.MANUAL_ANGLES else flown_by[manual])
 
 
 @pytest.mark.parametrize(("gap_us", "outside"), [(EPISODE_GAP_US, True), (EPISODE_GAP_US + 10_000, False)])
@@ -365,7 +366,7 @@ def test_nothing_is_in_the_air_before_a_flight_and_five_seconds_after_it_was_sto
 
 def test_flaps_that_are_moved_by_hand_are_not_at_rest() -> None:
     bench = SupervisorBench()
-    bench.data.manual_mode = Manual.ANGLES
+    bench.data.manual_mode = structs.MANUAL_ANGLES
     bench.look()
     assert bench.core.supervisor.fields.aloft
 
@@ -410,13 +411,14 @@ def test_a_flight_that_begins_afresh_waits_for_gyro_and_pose_and_is_not_armed_by
 
 def test_a_robot_without_anything_to_fly_to_waits() -> None:
     bench = in_flight(lambda bench: bench.fly(100_000))
-    bench.data.idle = 1
+    bench.data.absolute = 1
+    bench.pilot.measured(Correction((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), None), bench.now_us)
     assert bench.look() == MODE_HOVER
     assert bench.found == (State.WAITING, Cause.NONE)
 
 
 def test_the_wire_has_the_numbers_of_the_core() -> None:
-    for kind in (State, Cause, Manual):
+    for kind in (State, Cause):
         numbers = {one.name: getattr(structs, f"{kind.__name__.upper()}_{one.name}") for one in kind}
         assert numbers == {one.name: one.value for one in kind}
 

@@ -20,7 +20,7 @@ def test_no_name_stands_twice_and_each_fits_a_table_of_contents(table: tuple[obj
 
 def test_what_a_client_cannot_set_of_the_cores_parameters_belongs_to_the_hardware() -> None:
     settable = {parameter.place.field for parameter in CORE_PARAMETERS}
-    assert set(Parameters.dtype.names or ()) - settable == {"age_measured", "direction", "gyro_scale"}
+    assert set(Parameters.dtype.names or ()) - settable == {"age_measured", "direction", "gyro_scale", "home"}
 
 
 def test_a_name_stands_for_its_own_element() -> None:

@@ -8,7 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
-from firmware_py.core.structs import MODE_FLY, Control, Estimator, Input, Sampling, Supervisor
+from firmware_py.core.structs import (
+    GOAL_ABSOLUTE,
+    MODE_FLY,
+    Control,
+    Estimator,
+    Input,
+    Report,
+    Sampling,
+    Supervisor,
+)
 from hil.config import load_config
 
 Vector = NDArray[np.float64]
@@ -22,10 +31,13 @@ class Core:
     def __init__(self, **parameters: float) -> None:
         self.parameters = parameters_of(CONFIG)
         self.data, self.estimator, self.control = (kind.allocate() for kind in (Input, Estimator, Control))
-        self.sampling, self.supervisor = Sampling.allocate(), Supervisor.allocate()
+        self.sampling, self.supervisor, self.report = (
+            kind.allocate() for kind in (Sampling, Supervisor, Report)
+        )
         self.sampling.fields.phase = 9  # the estimator's tick comes in this step
         for name, value in parameters.items():
             self.parameters.memory[name] = value
+        self.data.fields.poses_absolute, self.data.fields.goal_kind = 1, GOAL_ABSOLUTE  # seen from W's origin
         self.fields = self.estimator.fields
         entry.reset(self.parameters.arg, self.estimator.arg)
 
@@ -41,7 +53,7 @@ class Core:
         data = self.data.fields
         data.gyro_sum[:], data.gyro_samples = gyro_sum, samples
         self.control.fields.command[:] = command
-        blocks = (self.parameters, self.data, self.estimator, self.control, self.sampling)
+        blocks = (self.parameters, self.data, self.estimator, self.control, self.sampling, self.report)
         entry.estimate(*(block.arg for block in blocks))
 
     def fly(self) -> None:

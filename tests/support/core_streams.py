@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.config import parameters_of
-from firmware_py.core.structs import Control, Estimator, Input, Parameters, Sampling, Supervisor
+from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
 from firmware_py.core.subset import Block
 from firmware_py.core_runner import CoreBlocks, PythonRunner
 from firmware_py.export.native import NativeRunner
@@ -28,8 +28,8 @@ CONFIG = load_config()
 BUILD = ROOT / "runs" / "build" / "core"
 # Calls with arbitrary bits in what the tasks write, and their shares; sums of samples would overflow.
 WILD = {
-    "reset": 0.02, "file_pose": 0.26, "estimate": 0.3, "control": 0.22, "begin_step": 0.08, "supervise": 0.08,
-    "request": 0.04,
+    "reset": 0.02, "file_pose": 0.24, "estimate": 0.3, "control": 0.22, "begin_step": 0.06, "supervise": 0.06,
+    "request": 0.04, "admits": 0.02, "follow": 0.04,
 }  # fmt: skip
 ONE_NAN = 0x7FC00000
 SPECIAL_FLOATS = np.array(
@@ -45,7 +45,7 @@ def float_words(dtype: np.dtype[Any]) -> NDArray[np.bool_]:
     return np.concatenate(ones)
 
 
-STRUCTS = (Parameters, Input, Estimator, Control, Sampling, Supervisor)
+STRUCTS = (Parameters, Input, Estimator, Control, Sampling, Supervisor, Report)
 MEMORY = sum(struct.dtype.itemsize for struct in STRUCTS)  # [B] of the default core
 FLOATS = {struct.dtype: float_words(struct.dtype) for struct in STRUCTS}
 
@@ -220,9 +220,14 @@ def record_plausible(seed: int, ticks: int) -> Recording:
         fields.tick, fields.now_us = tick, 1000 * tick
         fields.gyro[:] = fields.gyro_sample[:] = rng.normal(0, 300, 3)
         fields.battery_mv, fields.manual_mode = rng.integers(3000, 4000), rng.choice(3, p=[0.8, 0.1, 0.1])
-        fields.idle, fields.connected = rng.random(2) < 0.1
+        fields.idle, fields.connected, fields.by_words = rng.random(3) < 0.1
+        fields.words[:] = rng.integers(65536, size=4)
+        fields.poses_absolute, fields.setpoint_kind = rng.random() < 0.5, rng.integers(5)
+        fields.goal_kind = rng.integers(3)
+        fields.goal[:], fields.setpoint[:] = rng.normal(0, 0.3, (2, 4))
         fields.request = rng.integers(7)
         calls = ["begin_step", "take_sample", "estimate", "supervise", "control"]
+        calls += ["admits", "follow"]
         calls += ["request"] if rng.random() < 0.02 else []
         recording.steps += [Step(call, parameters.bytes(), data.bytes()) for call in calls]
     recording.after = list(replay(recording, None))

@@ -23,17 +23,6 @@ GENERIC = 1
 OUT_OF_TREE = 3  # StateEstimatorTypeOutOfTree
 
 
-class Pose(ctypes.Structure):
-    """FloatyPose."""
-
-    _fields_ = (
-        ("arrival_us", ctypes.c_int32),
-        ("position", ctypes.c_float * 3),
-        ("quaternion", ctypes.c_float * 4),
-        ("age_us", ctypes.c_int32),
-    )
-
-
 class Setpoint(ctypes.Structure):
     """setpoint_t; modes 0 disable, 1 absolute, 2 velocity."""
 
@@ -115,8 +104,6 @@ class App:
         c.stub_log_name.restype = c.stub_param_name.restype = ctypes.c_char_p
         c.stub_log_value.restype = c.stub_param_get.restype = ctypes.c_double
         c.stub_param_set.argtypes = c.stub_param_load.argtypes = (ctypes.c_int, ctypes.c_double)
-        c.floaty_pose_decode.argtypes = (ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int32, ctypes.c_void_p)
-        c.floaty_pose_decode.restype = ctypes.c_bool
         for test in (c.estimatorOutOfTreeTest, c.watchdogNormalStartTest, c.cfAssertNormalStartTest):
             test.restype = ctypes.c_bool
         self.now = ctypes.c_uint64.in_dll(c, "stub_now_us")

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pymavlink.dialects.v20.common as dialect
 
-from firmware_py.box import is_correction
 from firmware_py.wire import WireError, crtp, high_level, setpoints
 
 HEADERS = [port << 4 | channel for port in range(15) for channel in range(4)]
@@ -27,6 +26,7 @@ RIGHTS = {  # stops and disarming: port, channel, data
     *((9, 1, b"\1\0"), (13, 0, b"\1\0")),
 }
 PARAMETERS = 1000  # more than any board has
+POSSIBLE_CORRECTION = 2.1  # [m]
 POSSIBLE = 1e5  # metres, seconds and radians that a command may mean
 RADIO_CHIP, CHIP_SWITCHES = 0xF3, (0x03, 0x05, 0xFE)  # header of its packets, and their types
 
@@ -84,7 +84,7 @@ def _are_possible(decode: Callable[[], Sequence[float]]) -> bool:
 
 def _is_possible_pose(data: bytes) -> bool:
     try:
-        return is_correction(crtp.decode_ext_pose(data).p_GB)
+        return all(abs(value) < POSSIBLE_CORRECTION for value in crtp.decode_ext_pose(data).p_GB)
     except WireError:
         return False
 

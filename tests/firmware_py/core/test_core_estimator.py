@@ -147,13 +147,13 @@ def flight() -> list[Record]:
                       int(data["pose_age_us"][0])))  # fmt: skip
         return answer
 
-    def listen_tick(parameters, data, estimator, control, sampling):
+    def listen_tick(parameters, data, estimator, control, sampling, report):
         records.append(
             Record(poses.copy(), data["gyro_sum"][0].tolist(), int(data["gyro_samples"][0]),
                    data["gyro_bias"][0].astype(float), control["command"][0].astype(float))
         )  # fmt: skip
         poses.clear()
-        estimate(parameters, data, estimator, control, sampling)
+        estimate(parameters, data, estimator, control, sampling, report)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(entry, "file_pose", listen_pose)

@@ -21,6 +21,7 @@ from firmware_py.core.structs import (
     Control,
     Estimator,
     Input,
+    Report,
     Sampling,
     Supervisor,
 )
@@ -34,7 +35,7 @@ def fly() -> None:
     rng = np.random.default_rng(5)
     parameters = parameters_of(load_config())
     data, estimator, control = Input.allocate(), Estimator.allocate(), Control.allocate()
-    sampling, supervisor = Sampling.allocate(), Supervisor.allocate()
+    sampling, supervisor, report = Sampling.allocate(), Supervisor.allocate(), Report.allocate()
     fields = data.fields
     entry.reset(parameters.arg, estimator.arg)
     for tick in range(TICKS):
@@ -63,12 +64,12 @@ def fly() -> None:
             parameters.fields.horizon = 6
         if tick in (700, 1300):
             estimator.fields.x[tick % 16] = math.nan
-        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg)
+        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg, report.arg)
         fields.mode = MODE_FLY if tick % 100 < 90 else (MODE_MANUAL if tick % 2 else MODE_HOVER)
         fields.manual[:] = (0.1, math.nan, -9.0, math.inf)
         entry.control(parameters.arg, data.arg, estimator.arg, control.arg)
         structs = b"".join(
-            block.bytes() for block in (parameters, data, estimator, control, sampling, supervisor)
+            block.bytes() for block in (parameters, data, estimator, control, sampling, supervisor, report)
         )
         print(hashlib.sha256(structs).hexdigest()[:16])
     counters = {name: int(getattr(estimator.fields, name)) for name in

@@ -1,6 +1,5 @@
 """The Crazyflie app: the same flight as the laboratory's board, on a board of memory and through Debian's ARM compiler."""
 
-import ctypes
 import math
 import os
 import re
@@ -14,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from firmware_py import supervisor as reference
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
-from firmware_py.core.structs import Estimator
+from firmware_py.core.structs import MANUAL_ANGLES, Estimator
 from firmware_py.export.crazyflie import write_app
 from firmware_py.export.errors import ExportError
 from firmware_py.export.profile_c import profile_hash
@@ -31,10 +30,10 @@ from firmware_py.geometry import (
     in_goal_frame,
     yaw_quaternion,
 )
-from firmware_py.wire import WireError, crtp, telemetry
+from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.mavlink_numbers import Result
 from hil.config import LabConfig, load_config
-from support.crazyflie_app import LOCALISATION, STUBS, App, Pose, Setpoint, build_app
+from support.crazyflie_app import LOCALISATION, STUBS, App, Setpoint, build_app
 from support.own_logic import ESTIMATOR, LAW, own_config
 
 ARM = "arm-none-eabi-gcc"
@@ -54,7 +53,7 @@ def app(library: Path, tmp_path: Path) -> App:
 
 @pytest.fixture(scope="module")
 def functions(library: Path) -> App:
-    """An app that no step runs on: for its pure functions."""
+    """An app that no step runs on: for its parameters."""
     functions = App(library, library.with_name("functions.so"))
     functions.boot()
     return functions
@@ -136,7 +135,7 @@ def scenario(rng: np.random.Generator, steps: int) -> dict[int, list[Event]]:
         age_us = int(rng.choice([25_000, 40_000, 41_500, 60_000, 126_000]))
         data = crtp.encode_ext_pose(tuple(p), q, None if rng.random() < 0.1 else age_us)
         if rng.random() < 0.03:
-            data = data[:2] + bytes(29)
+            data = data[:1] + bytes(30)
         just_before_control = step in (600, 3800)  # the first one, and the one that ends the silence
         events[step + (0 if just_before_control else int(rng.integers(0, 20)))].append(pose(data))
     for step, stop in ((5207, 1), (5603, 0), (7301, 0)):  # the last one leaves the empty battery
@@ -338,9 +337,8 @@ def test_a_frozen_gyro_opens_the_loop_until_it_has_worked_for_a_while(app: App) 
 
 
 def test_a_loop_that_stands_still_puts_the_servos_to_hover(app: App) -> None:
-    app.boot()
-    hover = app.counts()
     flying(app)
+    hover = hover_of(app)
     assert app.counts() != hover
     app.now.value += 30_000
     app.c.stub_run_app(1)
@@ -591,7 +589,7 @@ def test_while_another_controller_runs_the_state_is_no_flight(app: App) -> None:
 def test_manual_angles_last_as_long_as_a_client_is_there(app: App) -> None:
     app.boot()
     hover = hover_of(app)
-    app.set("extCtrl.manual", reference.Manual.ANGLES)
+    app.set("extCtrl.manual", MANUAL_ANGLES)
     for connected in (1, 0, 1):
         app.connected.value = connected
         for step in range(1, 21):
@@ -818,14 +816,14 @@ def test_a_pose_that_cannot_be_a_correction_is_counted_and_reported(
     app: App, place: tuple[float, float, float]
 ) -> None:
     flying(app)
-    before, malformed = estimate(app), app.log("floaty.malformed")
+    before, invalid = estimate(app), app.log("kalman.invalid")
     for step in range(1200, 1260):
         if step % 20 == 1:
             app.radio(crtp.encode_ext_pose(place, yaw_quaternion(0.0), 40_000)[1:])
         app.step(step)
         app.c.stub_run_app(1)
     assert estimate(app) == pytest.approx(before, abs=0.02)
-    assert app.log("floaty.malformed") - malformed == 3
+    assert app.log("kalman.invalid") - invalid == 3
     assert app.console().count("for absolute poses set extPose.absolute 1") == 1
 
 
@@ -927,6 +925,7 @@ def test_log_variables_have_names_of_the_laboratory(app: App) -> None:
 FLOATS = st.floats(width=32) | st.floats(-1.25, 1.25, width=32)
 
 
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.binary(max_size=31)
     | st.builds(
@@ -935,40 +934,31 @@ FLOATS = st.floats(width=32) | st.floats(-1.25, 1.25, width=32)
         st.binary(max_size=2),
     )
 )
-def test_poses_are_read_as_the_laboratory_reads_them(functions: App, data: bytes) -> None:
-    here = Pose()
-    if len(data) >= 29:
-        norm2 = sum(value * value for value in struct.unpack_from("<4f", data, 13))
-        assume(not any(abs(norm2 - limit) < 1e-5 for limit in (0.81, 1.21)))
-    understood = functions.c.floaty_pose_decode(data, len(data), 123, ctypes.byref(here))
-    try:
-        there = crtp.decode_ext_pose(data)
-    except WireError:
-        assert not understood
-        return
-    assert understood
-    assert (tuple(here.position), tuple(here.quaternion)) == (there.p_GB, there.q_GB)
-    assert here.age_us == (-1 if there.age_us is None else there.age_us)
-    assert here.arrival_us == 123
+def test_poses_are_read_as_the_laboratory_reads_them(app: App, data: bytes) -> None:
+    assume(len(data) > 1)
+    app.boot()
+    app.data.absolute = 0  # it has booted before
+    malformed = app.log("floaty.malformed")
+    app.radio(data)
+    app.step(11)
+    app.step(12)
+    is_pose = data[:1] == b"\x08" and len(data) in (29, 30)
+    assert app.log("floaty.malformed") == malformed + (not is_pose)
+    if is_pose:
+        x, y, z, qx, qy, qz, qw = np.frombuffer(data[1:29], np.float32)
+        fields = (*app.data.pose_position, *app.data.pose_quaternion)
+        assert fields == pytest.approx((x, y, z, qw, qx, qy, qz), abs=0, rel=0, nan_ok=True)
 
 
-@pytest.mark.parametrize(("age", "age_us"), [(b"", -1), (b"\x50", 40_000), (b"\xff", -1)])
-def test_a_pose_is_whole_with_29_bytes_and_none_of_its_numbers_may_be_nan(
-    functions: App, age: bytes, age_us: int
-) -> None:
-    def understood(floats: Sequence[float], cut: int = 0) -> bool:
-        data = struct.pack("<B7f", 8, *floats)[: 29 - cut] + (b"" if cut else age)
-        return bool(functions.c.floaty_pose_decode(data, len(data), 123, ctypes.byref(here)))
-
-    here = Pose()
-    whole = [1000.0, -1000.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-    assert understood(whole)
-    assert here.age_us == age_us
-    assert not understood(whole, cut=1)
-    for place in range(7):
-        assert not understood([math.nan if i == place else value for i, value in enumerate(whole)])
-    for place in range(3):
-        assert not understood([1000.1 if i == place else value for i, value in enumerate(whole)])
+@pytest.mark.parametrize(("age", "known"), [(b"", False), (b"\x50", True), (b"\xff", False)])
+def test_a_pose_without_an_age_has_the_profiles(app: App, age: bytes, known: bool) -> None:
+    app.boot()
+    app.set("delayComp.defaultAge", 60_000)
+    for step in range(1, 320):
+        if step % 20 == 5:
+            app.radio(struct.pack("<B7f", 8, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0) + age)
+        app.step(step)
+    assert 400 <= app.log("locSrv.age") <= 510 if known else app.log("locSrv.age") == 600
 
 
 # The folder and its build for the board
@@ -1064,7 +1054,7 @@ def test_the_app_compiles_with_the_crazyflies_flags_and_fits(arm_build: Path) ->
         for name in ("estimatorOutOfTree", "controllerOutOfTree", "app_task", "appInit", "receive")
     }
     print(f"flash {text + data} B, RAM {data + bss} B, stack {stack} B")
-    assert text + data < 27_000
+    assert text + data < 28_000
     assert data + bss < 16_000  # a core that flies, one for the port
     assert "ccm" not in sections.lower()
     assert max(stack.values()) < STABILIZER_STACK // 2

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_py.core.structs import Control, Sampling, Supervisor
+from firmware_py.core.structs import Control, Report, Sampling, Supervisor
 from firmware_py.export.c99 import Translation, translate
 from firmware_py.export.compilers import Compiler, compilers, find_compiler
 from firmware_py.export.errors import ExportError
@@ -119,7 +119,7 @@ def test_a_changed_operator_is_caught(
 def test_arbitrary_bits_give_equal_bits_and_counts_inside_the_servo_limits(seed: int) -> None:
     recording = record_wild(seed, 120)
     assert first_difference(recording, build(C, BUILD, "-O2")) is None
-    behind = sum(struct.dtype.itemsize for struct in (Control, Sampling, Supervisor))
+    behind = sum(struct.dtype.itemsize for struct in (Control, Sampling, Supervisor, Report))
     at = Control.dtype.fields["count"][1] - behind  # from the end
     for step, after in zip(recording.steps, recording.after, strict=True):
         if step.call == "control":

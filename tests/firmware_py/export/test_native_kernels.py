@@ -12,7 +12,16 @@ import pytest
 
 from firmware_py.config import parameters_of
 from firmware_py.core.poses import LONG_US
-from firmware_py.core.structs import Control, Estimator, Input, Parameters, Sampling, Struct, Supervisor
+from firmware_py.core.structs import (
+    Control,
+    Estimator,
+    Input,
+    Parameters,
+    Report,
+    Sampling,
+    Struct,
+    Supervisor,
+)
 from firmware_py.core.subset import F32s, Integer
 from firmware_py.export.c99 import Translation, translate
 from firmware_py.export.compilers import compilers
@@ -20,7 +29,7 @@ from firmware_py.export.native import build
 from support import core_streams
 from support.core_streams import BUILD, one_nan, wild_words
 
-STRUCTS = (Parameters, Input, Estimator, Control, Sampling, Supervisor)
+STRUCTS = (Parameters, Input, Estimator, Control, Sampling, Supervisor, Report)
 
 SHAPES = {"x": 16, "dx": 16, "first": 16, "other": 16, "command": (32, 4), "P": (16, 16), "M": (16, 16), "q": 4,
           "attitude": 16, "pose": 16}  # fmt: skip

@@ -12,7 +12,7 @@ from cflib.crazyflie.supervisor import BIT_HL_CONTROL_ACTIVE, BIT_HL_CONTROL_DIS
 from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
-from firmware_py.pilot import Pilot
+from firmware_py.signals import COUNTERS
 from firmware_py.wire import crtp
 from support.crtp_client import LOG, MEM, PARAM, PLATFORM, SUPERVISOR, CrtpClient
 
@@ -144,8 +144,7 @@ def test_corrections_are_flown_as_they_come_until_the_commander_moves_the_goal_a
 def test_a_moving_goal_is_that_of_the_instant_at_which_the_pose_was_true(absolute: Flyer) -> None:
     absolute.order(absolute.commander.go_to, 1.0, 0.0, 0.0, 0.0, 1.0, relative=True, linear=True)
     absolute.wait(0.5)
-    pilot = absolute.firmware.signals.supervisor.goals
-    assert isinstance(pilot, Pilot)
+    pilot = absolute.firmware.pilot
     last = pilot.seen_us
     assert pilot.goal is not None
     assert pilot.goal.position[0] == pytest.approx(pilot.planner.at(last - 20_000).position[0], abs=2e-3)
@@ -378,7 +377,7 @@ def test_pose_that_cannot_be_a_correction_changes_nothing_and_is_reported_once(
             *place
         )
     ]
-    assert relative.firmware.link.malformed >= 14
+    assert relative.firmware.signals.counters[COUNTERS.index("invalid")] >= 14
 
 
 def test_among_corrections_a_position_is_no_place_to_fly_to(relative: Flyer) -> None:

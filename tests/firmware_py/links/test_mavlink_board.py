@@ -49,11 +49,10 @@ def target(
 
 
 def last_pose(client: MavlinkClient) -> tuple[Any, Any, int | None]:
-    """Position, quaternion and age of the last pose as the log variables show them."""
+    """Position and quaternion of the last pose as the core files it, and its age as the log variable shows it."""
     values = {variable.name: variable.read for variable in client.firmware.variables}
-    p = [values[f"locSrv.{axis}"]() for axis in "xyz"]
-    q = [values[f"locSrv.{axis}"]() for axis in ("qx", "qy", "qz", "qw")]
-    return np.array(p), Rotation.from_quat(q), values["locSrv.age"]()
+    data = client.firmware._core.data.fields
+    return data.pose_position, Rotation.from_quat(np.roll(data.pose_quaternion, -1)), values["locSrv.age"]()
 
 
 # Poses and goals
@@ -397,6 +396,7 @@ def test_the_flight_array_holds_the_telemetry_blocks() -> None:
 
 def test_counters_in_the_flight_array_wrap_as_those_of_the_log_do(client: MavlinkClient) -> None:
     client.firmware.signals.counters[0] = (1 << 16) + 7  # poses that were fused
+    client.run(client.now_us + 20_000)
     (array,) = client.command(512, 350)[1:]
     names = [variable.name for block in telemetry.BLOCKS for variable in block.variables]
     assert array.data[names.index("locSrv.poses")] == 7

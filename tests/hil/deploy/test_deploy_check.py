@@ -241,15 +241,17 @@ static FloatyEstimator estimator;
 static FloatyControl control;
 static FloatySampling sampling;
 static FloatySupervisor supervisor;
+static FloatyReport report;
 int calls = 7;
 int main(void) {
     floaty_core_reset(&parameters, &estimator);
     for (;;) {
         calls += floaty_core_file_pose(&parameters, &data, &estimator, &sampling, &supervisor);
-        floaty_core_estimate(&parameters, &data, &estimator, &control, &sampling);
+        floaty_core_estimate(&parameters, &data, &estimator, &control, &sampling, &report);
         calls += floaty_core_begin_step(&data, &sampling) + floaty_core_take_sample(&data, &sampling);
         calls += floaty_core_supervise(&parameters, &data, &estimator, &sampling, &supervisor);
         calls += floaty_core_request(&parameters, &data, &sampling, &supervisor);
+        calls += floaty_core_admits(&parameters, &data) + floaty_core_follow(&parameters, &data);
         floaty_core_lose_control(&supervisor);
         floaty_core_begin_afresh(&data, &sampling, &supervisor);
         floaty_core_control(&parameters, &data, &estimator, &control);

@@ -53,11 +53,9 @@ class AppBoard:
         name, member, index = TARGET.match(parameter.target).groups()
         offsets = {"floaty_parameters": Parameters.dtype.fields, "floaty_input": Input.dtype.fields}
         offset = 0
-        if name == "floaty_box":
-            offset = 4 * ("radius", "below", "above").index(member)
-        elif member:
+        if member:
             offset = offsets[name][member][1]
-        scalar = parameter.memory
+        scalar = parameter.place.scalar
         place = (
             ctypes.addressof(ctypes.c_char.in_dll(self.app.c, name)) + offset + scalar.size * int(index or 0)
         )

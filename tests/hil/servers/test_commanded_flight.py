@@ -20,7 +20,6 @@ from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import to_euler_zyx
-from firmware_py.pilot import Pilot
 from firmware_py.planner import Phase
 from firmware_py.wire.crtp import PORT_MEMORIES, Packet, encode, encode_ext_pose
 from ground_station.mocap import MocapFrame
@@ -73,8 +72,7 @@ class Script:
 
     def _look(self, now_us: int) -> None:
         """Note how far the robot is from its goal while there is one."""
-        pilot, board_us = self.robot.firmware.signals.supervisor.goals, self.robot.firmware.kernel.now_us
-        assert isinstance(pilot, Pilot)
+        pilot, board_us = self.robot.firmware.pilot, self.robot.firmware.kernel.now_us
         if pilot.planner.phase(board_us) is not Phase.IDLE:
             self._errors.append(self.robot.plant.p_WB - pilot.planner.at(board_us).position)
 

@@ -45,7 +45,7 @@
 #define BATTERY_STEPS 100
 #define POSE_QUEUE 8
 #define DEGREES 57.2957795f /* per radian */
-#define TURN 6.28318531f
+#define RADIANS 0.0174532925f /* per degree */
 
 FloatyParameters floaty_parameters;
 FloatyInput floaty_input;
@@ -53,15 +53,13 @@ FloatyEstimator floaty_estimator;
 FloatyControl floaty_control;
 FloatySampling floaty_sampling;
 FloatySupervisor floaty_supervisor;
+FloatyReport floaty_report;
 FloatyObserved floaty_observed;
 FloatyRequests floaty_requests;
-uint8_t floaty_absolute = 1;
-FloatyBox floaty_box = {FLOATY_BOX_RADIUS, FLOATY_BOX_BELOW, FLOATY_BOX_ABOVE, FLOATY_HOME};
 
 static logVarId_t gyro_raw[3];
 static bool gyro_found;
-static FloatyGoal goal;  /* of absolute poses */
-static FloatyGoal frame; /* that the estimate is in: the last pose's goal; W itself for corrections */
+static volatile int32_t followed; /* FLOATY_SETPOINT_... */
 static volatile TickType_t controlled_tick;
 static bool holding;    /* in this step the flight stands still */
 static bool controlled; /* in this step the controller runs */
@@ -79,6 +77,7 @@ static void request(int32_t wanted) {
 void floaty_begin(void) {
   pose_queue = xQueueCreateStatic(POSE_QUEUE, sizeof(FloatyPose), pose_queue_storage, &pose_queue_buffer);
   floaty_core_init(&floaty_parameters);
+  floaty_input.absolute = 1; /* as Bitcraze's programs send poses */
   call_reset();
   request(FLOATY_REQUEST_ARM);
   call_control(); /* mode 0: hover */
@@ -110,8 +109,8 @@ void floaty_queue_pose(const FloatyPose *pose) {
   }
 }
 
-bool floaty_poses_absolute(void) {
-  return floaty_absolute && floaty_hil_mode() == FLOATY_HIL_OFF; /* a host in the loop sends corrections */
+int32_t floaty_followed(void) {
+  return followed;
 }
 
 int32_t floaty_pose_clock_us(void) {
@@ -130,14 +129,7 @@ static bool asked(volatile bool *request) {
   return was;
 }
 
-static void hand_pose_to_core(FloatyPose *pose) {
-  if (floaty_poses_absolute()) {
-    floaty_goal_see(&goal, pose);
-    frame = goal;
-  } else {
-    memset(&goal, 0, sizeof goal); /* not known */
-    memset(&frame, 0, sizeof frame);
-  }
+static void hand_pose_to_core(const FloatyPose *pose) {
   memcpy(floaty_input.pose_position, pose->position, sizeof floaty_input.pose_position);
   memcpy(floaty_input.pose_quaternion, pose->quaternion, sizeof floaty_input.pose_quaternion);
   floaty_input.pose_age_us = pose->age_us;
@@ -168,44 +160,18 @@ static void take_measurements(stabilizerStep_t step) {
   }
 }
 
-/* For the firmware's commander and its log variables: in W when poses are, in degrees, pitch positive with the nose up. */
+/* For the firmware's commander and its log variables: in degrees, pitch positive with the nose up. */
 static void tell_state(state_t *state, stabilizerStep_t step) {
-  const float *now = floaty_estimator.now;
-  const float yaw = remainderf(now[8] + frame.yaw, TURN);
-  const float cr = cosf(0.5f * now[6]), sr = sinf(0.5f * now[6]);
-  const float cp = cosf(0.5f * now[7]), sp = sinf(0.5f * now[7]);
-  const float cy = cosf(0.5f * yaw), sy = sinf(0.5f * yaw);
-  float p[3], v[3];
-  floaty_goal_turn(&frame, now, p);
-  floaty_goal_turn(&frame, now + FLOATY_VELOCITY, v);
-  state->position.timestamp = step;
-  state->position.x = frame.position[0] + p[0];
-  state->position.y = frame.position[1] + p[1];
-  state->position.z = frame.position[2] + p[2];
-  state->velocity.timestamp = step;
-  state->velocity.x = v[0];
-  state->velocity.y = v[1];
-  state->velocity.z = v[2];
-  state->attitude.timestamp = step;
-  state->attitude.roll = DEGREES * now[6];
-  state->attitude.pitch = -DEGREES * now[7];
-  state->attitude.yaw = DEGREES * yaw;
-  state->attitudeQuaternion.w = cr * cp * cy + sr * sp * sy;
-  state->attitudeQuaternion.x = sr * cp * cy - cr * sp * sy;
-  state->attitudeQuaternion.y = cr * sp * cy + sr * cp * sy;
-  state->attitudeQuaternion.z = cr * cp * sy - sr * sp * cy;
-}
-
-static void observe(void) {
-  const FloatyEstimator *e = &floaty_estimator;
-  const int32_t rejected = e->refused + e->too_old + e->invalid;
-  for (int i = 0; i < 4; i++) {
-    floaty_observed.flap[i] = e->now[12 + i] + (floaty_control.flap[i] - floaty_control.command[i]);
-  }
-  const int32_t age = e->pose_age_us / 100;
-  floaty_observed.age = (uint16_t)(age < UINT16_MAX ? age : UINT16_MAX);
-  floaty_observed.rejected = (uint16_t)rejected;
-  floaty_observed.poses = (uint16_t)(e->fused + e->jumps + rejected);
+  const FloatyReport *r = &floaty_report;
+  state->position = (point_t){step, r->position[0], r->position[1], r->position[2]};
+  state->velocity = (point_t){step, r->velocity[0], r->velocity[1], r->velocity[2]};
+  state->attitude.roll = DEGREES * r->attitude[0];
+  state->attitude.pitch = -DEGREES * r->attitude[1];
+  state->attitude.yaw = DEGREES * r->attitude[2];
+  state->attitudeQuaternion.w = r->quaternion[0];
+  state->attitudeQuaternion.x = r->quaternion[1];
+  state->attitudeQuaternion.y = r->quaternion[2];
+  state->attitudeQuaternion.z = r->quaternion[3];
 }
 
 static bool find_gyro(void) {
@@ -266,7 +232,8 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (asked(&floaty_requests.reset)) {
     call_reset();
   }
-  if (floaty_poses_absolute() && floaty_supervisor.state == FLOATY_STATE_FLYING) {
+  floaty_input.poses_absolute = floaty_input.absolute && floaty_hil_mode() == FLOATY_HIL_OFF; /* a host sends corrections */
+  if (floaty_input.poses_absolute && floaty_supervisor.state == FLOATY_STATE_FLYING) {
     /* The firmware's supervisor, which looks at this next, takes more than the idle thrust for a flight; else it would
      * disarm and stop its commander 30 s after arming. One more is less than a step of the motors' PWM: no pulse. */
     const uint32_t idle = powerDistributionGetIdleThrust();
@@ -276,7 +243,6 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (floaty_sampling.estimate_due) {
     call_estimate();
     tell_state(state, stabilizerStep);
-    observe();
   }
 }
 
@@ -301,6 +267,23 @@ static void serve_requests(void) {
   }
 }
 
+/* The stock commander's set-point in the core's terms. */
+static void read_setpoint(const setpoint_t *setpoint) {
+  const setpoint_mode_t *mode = &setpoint->mode;
+  const quaternion_t *q = &setpoint->attitudeQuaternion;
+  const bool place = mode->x == modeAbs && mode->y == modeAbs && mode->z == modeAbs;
+  const bool any = mode->x || mode->y || mode->z || mode->roll || mode->pitch || mode->yaw || mode->quat;
+  float yaw = mode->yaw == modeAbs ? RADIANS * setpoint->attitude.yaw : NAN;
+  if (mode->quat == modeAbs) {
+    yaw = atan2f(2.0f * (q->w * q->z + q->x * q->y), q->w * q->w + q->x * q->x - q->y * q->y - q->z * q->z);
+  }
+  floaty_input.setpoint_kind = place ? FLOATY_SETPOINT_POSITION : any ? FLOATY_SETPOINT_OTHER : FLOATY_SETPOINT_NONE;
+  memcpy(floaty_input.setpoint, (float[4]){setpoint->position.x, setpoint->position.y, setpoint->position.z, yaw},
+         sizeof floaty_input.setpoint);
+  memcpy(floaty_input.setpoint_velocity, (float[3]){setpoint->velocity.x, setpoint->velocity.y, setpoint->velocity.z},
+         sizeof floaty_input.setpoint_velocity);
+}
+
 void controllerOutOfTreeInit(void) {}
 
 bool controllerOutOfTreeTest(void) {
@@ -314,10 +297,8 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
   memset(control, 0, sizeof *control); /* no motors */
   floaty_input.now_us = loop_us();
   serve_requests();
-  floaty_observed.setpoint = floaty_setpoint_kind(setpoint);
-  if (floaty_observed.setpoint == FLOATY_SETPOINT_POSITION && !floaty_goal_move(&goal, setpoint, &floaty_box)) {
-    floaty_observed.setpoint = FLOATY_SETPOINT_OUTSIDE;
-  }
+  read_setpoint(setpoint);
+  followed = call_follow();
   if (holding) {
     controlled_tick = xTaskGetTickCount(); /* nothing is wrong with the loop */
   } else if (controlled) {

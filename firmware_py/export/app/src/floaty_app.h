@@ -5,19 +5,20 @@
 #include <stdint.h>
 
 #include "floaty_core.h"
-#include "floaty_goal.h"
-#include "floaty_poses.h"
 
-/* What an observer sees and the core does not hold in this form. */
+/* A pose on its way to the stabilizer task. */
 typedef struct {
-  float flap[4];     /* [rad] estimated flap angles */
-  uint16_t age;      /* [0.1 ms] of the last pose, 65535 at most */
-  uint16_t poses;    /* received, modulo 65536 */
-  uint16_t rejected; /* of these, refused */
+  int32_t arrival_us; /* wraps */
+  float position[3];   /* [m] */
+  float quaternion[4]; /* w x y z */
+  int32_t age_us;      /* at arrival; negative: the sender does not know */
+} FloatyPose;
+
+/* What the app counts itself. */
+typedef struct {
   uint32_t malformed;     /* packets on the pose channels that no one could read */
   uint32_t overflows;     /* poses that a newer one drove out of the full queue */
   uint32_t stale_hovers;  /* times no controller step came and the servos were put to hover */
-  uint8_t setpoint;       /* FloatySetpoint: what the stock commander commands */
 } FloatyObserved;
 
 extern FloatyParameters floaty_parameters;
@@ -26,9 +27,8 @@ extern FloatyEstimator floaty_estimator;
 extern FloatyControl floaty_control;
 extern FloatySampling floaty_sampling;
 extern FloatySupervisor floaty_supervisor;
+extern FloatyReport floaty_report;
 extern FloatyObserved floaty_observed;
-extern FloatyBox floaty_box;
-extern uint8_t floaty_absolute; /* 1: poses are in W, the commander says where to fly; 0: they are corrections, in G */
 
 /* What other tasks ask of the stabilizer task, which alone touches the supervisor's instants and the estimator. */
 typedef struct {
@@ -47,8 +47,8 @@ void floaty_begin(void);
 /* floaty_app.c: the raw counts of the board's own gyro, zero where there is none that is known. */
 void floaty_gyro(int32_t counts[3]);
 
-/* floaty_app.c: what poses are that come now: in W, or corrections. */
-bool floaty_poses_absolute(void);
+/* floaty_app.c: what became of the stock commander's last set-point, FLOATY_SETPOINT_... */
+int32_t floaty_followed(void);
 
 /* floaty_app.c: the clock by which poses arrive [us]; it wraps. */
 int32_t floaty_pose_clock_us(void);

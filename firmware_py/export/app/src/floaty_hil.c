@@ -199,7 +199,7 @@ void floaty_hil_tell(bool fresh) {
       .m4 = (uint16_t)floaty_control.count[3],
       .fused = (uint16_t)floaty_estimator.fused,
       .refused = (uint16_t)floaty_estimator.refused,
-      .age = floaty_observed.age,
+      .age = (uint16_t)floaty_report.age,
   };
   memset(&packet, 0, sizeof packet);
   packet.port = FLOATY_PORT_CORE;

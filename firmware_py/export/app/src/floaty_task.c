@@ -10,6 +10,8 @@
 
 #include "floaty_app.h"
 
+#include <string.h>
+
 #include "FreeRTOS.h"
 #include "task.h"
 
@@ -31,6 +33,11 @@
 #define CHANNEL_GENERIC 1
 #define EMERGENCY_STOP 3
 #define EMERGENCY_STOP_WATCHDOG 4
+#define EXT_POSE 8
+#define POSE_SIZE (1 + 7 * sizeof(float))
+#define AGE_UNIT_US 500
+#define AGE_UNKNOWN_CODE 255
+#define AGE_UNKNOWN (-1)
 #define STALE_MS 50 /* without a controller step: servos to hover */
 #define LOOK_MS 20  /* how often the task looks at that */
 #define POSE_LINE_MS 10000 /* between lines about poses that are refused */
@@ -41,18 +48,20 @@ static bool restarted; /* by the watchdog or a failed assert */
 static StackType_t stack[CONFIG_APP_STACKSIZE]; /* in ordinary memory: CCM is full */
 static StaticTask_t task;
 
-static volatile bool impossible; /* a pose came that cannot be a correction */
-
+/* EXT_POSE, x y z [m], qx qy qz qw as little-endian float32, and perhaps the age in units of 0.5 ms: firmware_py/wire/crtp.py. */
 static void receive_pose(const uint8_t *data, uint32_t length) {
-  FloatyPose pose;
-  if (!floaty_pose_decode(data, length, floaty_pose_clock_us(), &pose)) {
+  FloatyPose pose = {.arrival_us = floaty_pose_clock_us(), .age_us = AGE_UNKNOWN};
+  if ((length != POSE_SIZE && length != POSE_SIZE + 1) || data[0] != EXT_POSE) {
     floaty_observed.malformed += 1;
-  } else if (!floaty_poses_absolute() && !floaty_pose_is_correction(&pose)) {
-    floaty_observed.malformed += 1;
-    impossible = true;
-  } else {
-    floaty_queue_pose(&pose);
+    return;
   }
+  memcpy(pose.position, data + 1, sizeof pose.position);
+  memcpy(pose.quaternion + 1, data + 1 + sizeof pose.position, 3 * sizeof(float));
+  memcpy(pose.quaternion, data + POSE_SIZE - sizeof(float), sizeof(float)); /* x y z w on the wire */
+  if (length > POSE_SIZE && data[POSE_SIZE] != AGE_UNKNOWN_CODE) {
+    pose.age_us = data[POSE_SIZE] * AGE_UNIT_US;
+  }
+  floaty_queue_pose(&pose);
 }
 
 static void receive_localisation(CRTPPacket *packet) {
@@ -83,16 +92,13 @@ static void announce_state(void) {
 }
 
 static void announce_setpoint(void) {
+  static const char *const REASONS[] = {
+      [FLOATY_SETPOINT_OTHER] = "only positions are",
+      [FLOATY_SETPOINT_OUTSIDE] = "it leaves the box, see box.radius, box.below and box.above",
+      [FLOATY_SETPOINT_OF_CORRECTIONS] = "poses are corrections, see extPose.absolute",
+  };
   static const char *refused;
-  const uint8_t setpoint = floaty_observed.setpoint;
-  const char *why = NULL;
-  if (setpoint != FLOATY_SETPOINT_NONE && !floaty_poses_absolute()) {
-    why = "poses are corrections, see extPose.absolute";
-  } else if (setpoint == FLOATY_SETPOINT_OTHER) {
-    why = "only positions are";
-  } else if (setpoint == FLOATY_SETPOINT_OUTSIDE) {
-    why = "it leaves the box, see box.radius, box.below and box.above";
-  }
+  const char *why = REASONS[floaty_followed()];
   if (why != NULL && why != refused) {
     DEBUG_PRINT("set-point not followed: %s\n", why);
   }
@@ -101,12 +107,14 @@ static void announce_setpoint(void) {
 
 static void announce_poses(void) {
   static TickType_t announced;
+  static int32_t refused;
   const TickType_t now = xTaskGetTickCount();
-  if (impossible && (announced == 0 || now - announced >= M2T(POSE_LINE_MS))) {
+  const int32_t count = floaty_estimator.no_corrections;
+  if (count != refused && (announced == 0 || now - announced >= M2T(POSE_LINE_MS))) {
     DEBUG_PRINT("pose refused: no correction is that large; for absolute poses set extPose.absolute 1\n");
     announced = now;
   }
-  impossible = false;
+  refused = count;
 }
 
 /* A loop that stands still, or a controller that is not Floaty's. */
