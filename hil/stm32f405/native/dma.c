@@ -96,7 +96,7 @@ void dma_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
     }
     unsigned s = (offset - FIRST_STREAM) / STREAM_SIZE & 7;
     struct stream *stream = &dma->stream[s];
-    uint32_t was = stream->cr;
+    uint32_t was = stream->cr, *const plain[] = {&stream->par, &stream->m0ar, &stream->m1ar, &stream->fcr};
     switch ((offset - FIRST_STREAM) % STREAM_SIZE) {
     case 0x00:
         stream->cr = value;
@@ -112,10 +112,6 @@ void dma_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
         update_line(m, n, s);
         break;
     case 0x04: stream->ndtr = value & 0xFFFF; break;
-    case 0x08: stream->par = value; break;
-    case 0x0C: stream->m0ar = value; break;
-    case 0x10: stream->m1ar = value; break;
-    case 0x14: stream->fcr = value; break;
-    default: break;
+    default: *plain[(offset - FIRST_STREAM) % STREAM_SIZE / 4 - 2] = value;
     }
 }

@@ -108,31 +108,23 @@ uint32_t usart_feed(struct machine *m, unsigned n, const uint8_t *bytes, uint32_
 uint32_t usart_read(struct machine *m, unsigned n, uint32_t offset)
 {
     struct usart *u = &m->usart[n];
-    switch (offset) {
-    case 0x00: return u->sr;
-    case 0x04:
+    const uint32_t registers[] = {u->sr, u->dr, u->brr, u->cr1, u->cr2, u->cr3};
+    if (offset == 0x04) {
         u->sr &= ~(uint32_t)(RXNE | ORE);
         update_line(m, n);
-        return u->dr;
-    case 0x08: return u->brr;
-    case 0x0C: return u->cr1;
-    case 0x10: return u->cr2;
-    case 0x14: return u->cr3;
-    default: return 0;
     }
+    return offset < sizeof registers ? registers[offset / 4] : 0;
 }
 
 void usart_write(struct machine *m, unsigned n, uint32_t offset, uint32_t value)
 {
     struct usart *u = &m->usart[n];
-    switch (offset) {
-    case 0x00: u->sr &= value | ~(uint32_t)(TC | RXNE); break;
-    case 0x04: write_data(m, n, value & 0xFF); break;
-    case 0x08: u->brr = value & 0xFFFF; break;
-    case 0x0C: u->cr1 = value; break;
-    case 0x10: u->cr2 = value; break;
-    case 0x14: u->cr3 = value; break;
-    default: break;
-    }
+    uint32_t *const plain[] = {&u->brr, &u->cr1, &u->cr2, &u->cr3};
+    if (offset == 0x00)
+        u->sr &= value | ~(uint32_t)(TC | RXNE);
+    else if (offset == 0x04)
+        write_data(m, n, value & 0xFF);
+    else if (offset < 0x18)
+        *plain[offset / 4 - 2] = value & 0xFFFF;
     usart_kick(m);
 }
