@@ -14,7 +14,7 @@ from ground_station.mocap import MocapSource
 from ground_station.sources.address import find_source
 from support.mavlink_socket import GAIN, MavlinkSocket
 from support.plugged_dongle import plug
-from support.serving import Served, free_port, serve
+from support.serving import PATIENCE_S, Served, free_port, serve
 
 
 def masters(served: Served) -> list[str]:
@@ -66,7 +66,7 @@ def test_the_baud_rate_limits_what_comes_through() -> None:
 def test_wrong_bits_spoil_frames_and_nothing_else() -> None:
     with serve("--mavlink", "tcp:0", "--set", "serial.downlink_bit_error_rate=1e-3") as served:
         client = MavlinkSocket(masters(served)[0])
-        client.wait("HEARTBEAT", timeout_s=20)
+        client.wait("HEARTBEAT")
         client.codec.command_long_send(
             1,
             1,
@@ -127,17 +127,17 @@ def test_poses_fly_the_board_and_a_pulled_pty_ends_in_failsafe_until_it_is_plugg
         poses.open()
         client = MavlinkSocket(masters(served)[0])
         with Pilot(client, poses):
-            served.wait_for("board 1: released", 15)
+            served.wait_for("board 1: released", PATIENCE_S)
             with pytest.raises(AssertionError, match="no line"):  # it flies free
                 served.wait_for("lost|failsafe", 2.0)
         client.close()  # the cable is pulled
-        served.wait_for("supervisor: failsafe, silence", 5)
-        served.wait_for("it is put back", 15)
+        served.wait_for("supervisor: failsafe, silence", PATIENCE_S)
+        served.wait_for("it is put back", PATIENCE_S)
         served.forget()
         client = MavlinkSocket(masters(served)[0])
         with Pilot(client, poses):
-            served.wait_for("supervisor: flying", 5)
-            served.wait_for("board 1: released", 5)
+            served.wait_for("supervisor: flying", PATIENCE_S)
+            served.wait_for("board 1: released", PATIENCE_S)
         client.close()
         poses.close()
 

@@ -29,9 +29,7 @@ from hil.servers.dongle_plugin import Backend
 from support.cflib_client import CflibClient
 from support.paths import SUPPORT
 from support.plugged_dongle import plug
-from support.serving import Served, serve
-
-PATIENCE_S = 30.0
+from support.serving import PATIENCE_S, Served, serve
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,8 @@ import pytest
 from cflib.utils.power_switch import PowerSwitch
 
 from support.plugged_dongle import plug
-from support.serving import CAMERAS, serve, started, station
+from support.serving import CAMERAS, PATIENCE_S, serve, started, station
 from support.telemetry_rows import is_whole
-
-PATIENCE_S = 40.0
 
 
 @pytest.mark.parametrize(

@@ -27,10 +27,9 @@ from support.mavlink_client import STATION, codec
 from support.mavlink_socket import GAIN, MavlinkSocket
 from support.plugged_dongle import plug
 from support.random_requests import harmless_message, random_packet, spoilt
-from support.serving import Served, serve
+from support.serving import PATIENCE_S, Served, serve
 
 DURATION_S = 20.0
-PATIENCE_S = 30.0
 SETTLED_S = 2.0
 PERIOD_S = 0.002
 BATCH = 4  # packets of every sender per period: 2000 per second, 34 kB/s

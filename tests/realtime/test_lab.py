@@ -19,9 +19,8 @@ from ground_station.sources.address import find_source
 from support.mavproxy_program import MavProxy, mavproxy_here
 from support.motive_bench import FROM_MOTIVE, needs
 from support.paths import SUPPORT
-from support.serving import Served, free_port, serve, station
+from support.serving import PATIENCE_S, Served, free_port, serve, station
 
-START_S = 20.0
 HOVER = 0.1  # off home at most [m]; the paper hovers within centimetres
 AGE_MS = 5.0  # off the cameras' latency at most: the loopback interface and a busy machine
 
@@ -32,7 +31,7 @@ def test_whichever_axis_points_up_the_printed_address_shows_the_robot_in_its_hol
         assert lab.motive.endswith(",z-up") == (up == "z")
         receiver = find_source(lab.motive, CaptureConfig())
         receiver.open()
-        frame, deadline = None, time.monotonic() + START_S
+        frame, deadline = None, time.monotonic() + PATIENCE_S
         while (frame is None or not frame.valid) and time.monotonic() < deadline:
             frame = receiver.receive(0.1)
         receiver.close()
@@ -55,7 +54,7 @@ def test_the_cameras_pose_is_what_a_client_gets() -> None:
         command = [sys.executable, script, "natnet", port, "unicast", "50"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE)
         frames = []
-        deadline = time.monotonic() + START_S
+        deadline = time.monotonic() + PATIENCE_S
         while process.poll() is None and time.monotonic() < deadline:
             if (frame := receiver.receive(0.1)) is not None:
                 frames.append(frame)
@@ -64,7 +63,7 @@ def test_the_cameras_pose_is_what_a_client_gets() -> None:
         markers = subprocess.run(
             [sys.executable, script, "natnet-markers", port, "unicast", "5"],
             capture_output=True,
-            timeout=START_S,
+            timeout=PATIENCE_S,
         )
     receiver.close()
     assert_markers(markers.stdout)
@@ -103,7 +102,7 @@ def test_markers_can_be_taken_off() -> None:
         port = lab.motive.split(":")[2]
         script = str(SUPPORT / "natnet_clients.py")
         command = [sys.executable, script, "natnet-markers", port, "unicast", "1"]
-        out = subprocess.run(command, capture_output=True, timeout=START_S).stdout
+        out = subprocess.run(command, capture_output=True, timeout=PATIENCE_S).stdout
     described, (_, error, *markers) = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]
     assert (described, error, markers) == ([[]], [0.0], [[], []])
 
@@ -129,7 +128,7 @@ def test_mavproxy_flies_the_robot_from_what_motive_says(tmp_path: Path) -> None:
         for line in ("module load optitrack", "optitrack set multicast False", "optitrack set msg_intvl_ms 18",
                      "optitrack start"):  # fmt: skip
             proxy.type(line)
-        lab.wait_for("board 1: released", START_S)
+        lab.wait_for("board 1: released", PATIENCE_S)
         assert_still_flying(lab, 2.0)
         pose = [message for message in proxy.heard() if message.get_type() == "LOCAL_POSITION_NED"][-1]
         proxy.kill()
@@ -180,18 +179,18 @@ def test_a_station_in_another_process_flies_and_flies_again_when_motive_is_back(
         network = Network(int(lab.motive.split(":")[2]))
         try:
             with station(lab, uri, mocap=f"optitrack:127.0.0.1:{network.port}") as typed:
-                lab.wait_for("board 1: released", START_S)
-                shown = typed.wait_for("^pose ", START_S)
+                lab.wait_for("board 1: released", PATIENCE_S)
+                shown = typed.wait_for("^pose ", PATIENCE_S)
                 assert not any("lost" in line for line in lab.lines)
                 lab.forget()
                 network.cut = True
-                typed.wait_for("^motion capture: no frames; calling the server again$", START_S)
-                lab.wait_for("failsafe, silence", START_S)
+                typed.wait_for("^motion capture: no frames; calling the server again$", PATIENCE_S)
+                lab.wait_for("failsafe, silence", PATIENCE_S)
                 network.cut = False
-                typed.wait_for("^motion capture: frames again after", START_S)
-                lab.wait_for("supervisor: flying", START_S)
+                typed.wait_for("^motion capture: frames again after", PATIENCE_S)
+                lab.wait_for("supervisor: flying", PATIENCE_S)
                 assert typed.interrupt() == 0
-                lab.wait_for("failsafe, silence", START_S)
+                lab.wait_for("failsafe, silence", PATIENCE_S)
         finally:
             network.close()
     age = re.fullmatch(

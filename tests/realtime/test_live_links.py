@@ -18,9 +18,8 @@ from ground_station.links.schemes import LinkSettings, find_link
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
 from support.plugged_dongle import plug
-from support.serving import Served, serve
+from support.serving import PATIENCE_S, Served, serve
 
-PATIENCE_S = 20.0
 SETTINGS = LinkSettings(50.0, 2_000, 921_600, b"")
 HOME = Goal((0.0, 0.0, 0.0), 0.0)
 ENDS: dict[str, tuple[str, ...]] = {
@@ -136,7 +135,7 @@ def test_a_board_that_has_gone_is_a_lost_link_in_one_line(end: str) -> None:
             time.sleep(0.02)
         except LinkError as error:
             message = str(error)
-        assert time.monotonic() - begin_s < SILENCE_TIMEOUT_US * 1e-6 + 2.0
+        assert time.monotonic() - begin_s < SILENCE_TIMEOUT_US * 1e-6 + 10.0
     link.close()
     assert message.startswith(f"{link.uri}: lost: ")
     assert "\n" not in message

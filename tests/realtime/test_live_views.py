@@ -20,10 +20,8 @@ from hil.live.window import COMMAND, LOOPBACK, free_port, is_open
 from hil.pictures.report import write_report
 from support.foxglove_client import FoxgloveClient
 from support.html_page import Page
-from support.serving import Served, serve, started, station
+from support.serving import PATIENCE_S, Served, serve, started, station
 from support.serving import free_port as free_udp_port
-
-PATIENCE_S = 60.0
 
 
 def page_of(lab: Served) -> str:

@@ -27,10 +27,9 @@ from ground_station.links.mavlink import MavlinkLinkConfig
 from ground_station.links.mavlink_serial import MavlinkSerialLink, parse_uri
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
-from support.serving import CAMERAS, FLOATY, Served, serve, station
+from support.serving import CAMERAS, FLOATY, PATIENCE_S, Served, serve, station
 from support.telemetry_rows import is_whole
 
-PATIENCE_S = 40.0
 KEY = hashlib.sha256(b"floaty").hexdigest()
 HOME = Goal((0.0, 0.0, 1.15), 0.0)
 Talk = Callable[["Peer"], None]

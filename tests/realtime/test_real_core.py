@@ -18,7 +18,7 @@ from hil.laboratory.run import fly
 from support.app_board import board
 from support.command import Cli
 from support.plugged_dongle import plug
-from support.serving import START_TIMEOUT_S, Served, started
+from support.serving import PATIENCE_S, Served, started
 
 pytestmark = pytest.mark.realtime
 LOSSY = (
@@ -119,7 +119,7 @@ def in_the_loop(library: Path, out: Path, duration_s: int) -> Iterator[tuple[Ser
         (uri,) = served.line("udp ")
         duration = ("--duration", str(duration_s))
         with started("fly", "hover", *duration, "--board", uri, "--hil", "--out", out) as host:
-            served.wait_for("^state FLYING", START_TIMEOUT_S)
+            served.wait_for("^state FLYING", PATIENCE_S)
             yield served, host, uri
 
 
@@ -129,7 +129,7 @@ def test_a_host_that_stops_for_half_a_second_flies_on_with_the_board(library: Pa
         host.process.send_signal(signal.SIGSTOP)
         wait(0.5)
         host.process.send_signal(signal.SIGCONT)
-        assert host.process.wait(START_TIMEOUT_S) == 0
+        assert host.process.wait(PATIENCE_S) == 0
         served.listen()
     result = read_result(out)
     assert result.metrics["samples_held"] in range(HIL_HOLD, HIL_HOLD + 500)
@@ -145,10 +145,10 @@ def test_a_host_that_stops_for_longer_finds_the_board_in_the_failsafe_and_flies_
     with in_the_loop(library, out, 4) as (served, host, _):
         served.forget()
         host.process.send_signal(signal.SIGSTOP)
-        served.wait_for("^state FAILSAFE SILENCE", START_TIMEOUT_S)
+        served.wait_for("^state FAILSAFE SILENCE", PATIENCE_S)
         host.process.send_signal(signal.SIGCONT)
-        served.wait_for("^state FLYING", START_TIMEOUT_S)
-        host.process.wait(START_TIMEOUT_S)
+        served.wait_for("^state FLYING", PATIENCE_S)
+        host.process.wait(PATIENCE_S)
     assert read_result(out).outcome == "completed"
 
 
@@ -158,7 +158,7 @@ def test_a_board_whose_host_is_killed_puts_its_flaps_to_hover_and_seeks_its_own_
     with in_the_loop(library, tmp_path / "run", 20) as (served, host, _):
         served.forget()
         host.process.kill()
-        served.wait_for("^state CALIBRATING", START_TIMEOUT_S)
+        served.wait_for("^state CALIBRATING", PATIENCE_S)
         states = [line for line in served.lines if line.startswith("state")]
     assert states == ["state FAILSAFE SILENCE", "state CALIBRATING NONE"]
 
@@ -169,7 +169,7 @@ def test_a_board_that_is_killed_in_the_loop_ends_the_flight_in_one_line(
     out = tmp_path / "run"
     with in_the_loop(library, out, 20) as (served, host, uri):
         served.process.kill()
-        assert host.process.wait(START_TIMEOUT_S) == 1
+        assert host.process.wait(PATIENCE_S) == 1
     result = read_result(out)
     assert result.outcome == "error"
     assert re.fullmatch(rf"board {re.escape(uri)}: (silent for 1 s|lost: .*)", result.cause)

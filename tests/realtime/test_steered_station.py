@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from hil.laboratory.recorder import load_events, load_log
-from support.serving import FLOATY, Served, serve, station
+from support.serving import FLOATY, PATIENCE_S, Served, serve, station
 
-PATIENCE_S = 30.0
 ENDS: dict[str, tuple[str, ...]] = {
     "radio": ("--radio", "--radio-port", "0"),
     "udp": ("--udp", "0"),

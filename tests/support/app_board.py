@@ -28,7 +28,7 @@ from hil.servers.served_robot import ServedRobot
 from hil.servers.server import Ends
 from support.crazyflie_app import App
 from support.paths import TESTS
-from support.serving import START_TIMEOUT_S, Served
+from support.serving import PATIENCE_S, Served
 
 STEP_US = 1000
 TRANSMIT_PERIOD_US = 1000  # in which the firmware tries again when its radio chip takes nothing
@@ -124,7 +124,7 @@ def board(library: Path, *overrides: str) -> Iterator[Served]:
     )  # fmt: skip
     served = Served(process)
     try:
-        served.wait_for("^serving", START_TIMEOUT_S)
+        served.wait_for("^serving", PATIENCE_S)
         yield served
     finally:
         process.kill()

@@ -8,11 +8,11 @@ from typing import Self
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig
 
+from support.serving import PATIENCE_S
+
 
 class CflibClient:
-    """A program with cflib: connected, in the end disconnected. No wait is longer than `patience_s`."""
-
-    patience_s = 30.0
+    """A program with cflib: connected, in the end disconnected. No wait is longer than `PATIENCE_S`."""
 
     def __init__(self, uri: str, cache: Path) -> None:
         self.cf = Crazyflie(rw_cache=str(cache))
@@ -27,8 +27,8 @@ class CflibClient:
         self.cf.open_link(uri)
 
     def ready(self) -> Self:
-        assert self.connected.wait(self.patience_s), "not connected"
-        assert self.fully.wait(self.patience_s), "not fully connected"
+        assert self.connected.wait(PATIENCE_S), "not connected"
+        assert self.fully.wait(PATIENCE_S), "not fully connected"
         assert self.problem == ""
         return self
 
@@ -51,7 +51,7 @@ class CflibClient:
     def heard(self, text: str) -> bool:
         """Whether the console says it, or has said it."""
         with self._spoken:
-            return self._spoken.wait_for(lambda: text in self.console, self.patience_s)
+            return self._spoken.wait_for(lambda: text in self.console, PATIENCE_S)
 
     def answer(self, ask: Callable[..., object], *arguments: object) -> tuple[object, ...]:
         """What a callback of cflib is called with."""
@@ -62,7 +62,7 @@ class CflibClient:
             done.set()
 
         ask(*arguments, called)
-        assert done.wait(self.patience_s)
+        assert done.wait(PATIENCE_S)
         return answers[0]
 
     def set(self, name: str, value: float) -> float:
@@ -75,7 +75,7 @@ class CflibClient:
 
         self.cf.param.add_update_callback(*name.split("."), updated)
         self.cf.param.set_value(name, value)
-        assert done.wait(self.patience_s)
+        assert done.wait(PATIENCE_S)
         self.cf.param.remove_update_callback(*name.split("."), updated)
         return answers[0]
 
@@ -93,11 +93,11 @@ class CflibClient:
         self.cf.log.add_config(block)
         block.data_received_cb.add_callback(received)
         block.start()
-        assert done.wait(self.patience_s), f"{len(rows)} of {count} rows"
+        assert done.wait(PATIENCE_S), f"{len(rows)} of {count} rows"
         block.stop()
         block.delete()
         return rows[:count]
 
     def close(self) -> None:
         self.cf.close_link()
-        assert self.gone.wait(self.patience_s)
+        assert self.gone.wait(PATIENCE_S)

@@ -10,7 +10,8 @@ from typing import Any
 import pymavlink.dialects.v20.common as dialect
 import serial
 
-PATIENCE_S = 10.0
+from support.serving import PATIENCE_S
+
 GAIN = "EXT_Z_P"  # extCtrl.z_P, the parameter that tests tune
 
 

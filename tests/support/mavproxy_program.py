@@ -13,7 +13,8 @@ from typing import Any
 import pymavlink.dialects.v20.common as dialect
 import pytest
 
-PATIENCE_S = 15.0
+from support.serving import PATIENCE_S
+
 mavproxy_here = pytest.mark.skipif(
     importlib.util.find_spec("MAVProxy") is None,
     reason="MAVProxy IS NOT TESTED: `make clients` (pip install --no-deps MAVProxy) installs it",

@@ -15,6 +15,7 @@ from hil.devices.markers import NO_POINTS, Sighting, marker_places
 from hil.servers.dongle_server import Readers
 from hil.servers.motive import Streaming, Up, VirtualMotive
 from hil.world.config import GeometryConfig, GroundConfig
+from support.serving import PATIENCE_S
 
 FROM_MOTIVE = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # columns: Motive's axes in the world
 PERIOD_S = 0.005
@@ -71,9 +72,9 @@ class MotiveBench:
 
     def run(self, stopping: Callable[[], bool]) -> None:
         """Expose at 200 Hz and answer."""
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + PATIENCE_S
         while not stopping():
-            assert time.monotonic() < deadline, "10 s have gone by"
+            assert time.monotonic() < deadline, f"{PATIENCE_S} s have gone by"
             self.expose()
             select.select(self.readers, (), (), PERIOD_S)
             self.answer()

@@ -18,7 +18,7 @@ from support.paths import VECTORS
 FLOATY = (sys.executable, "-m", "hil.commands")
 CAMERAS = f"replay:{VECTORS / 'hover_frame.csv'}"  # one frame, for those who need no more
 
-START_TIMEOUT_S = 60.0
+PATIENCE_S = 60.0  # for what comes sooner or later, however busy the machine is
 STANDSTILL = re.compile(r"time stood still for (\d+) ms")
 SERVED: list["Served"] = []  # those of this test session
 
@@ -100,11 +100,11 @@ class Served:
     def interrupt(self) -> int:
         """Press Ctrl-C, read what it says in the end, and return the exit code."""
         self.process.send_signal(signal.SIGINT)
-        deadline = time.monotonic() + START_TIMEOUT_S
+        deadline = time.monotonic() + PATIENCE_S
         while select.select([self.process.stdout], [], [], max(0.0, deadline - time.monotonic()))[0]:
             if not self._read():
                 break
-        return self.process.wait(timeout=20)
+        return self.process.wait(PATIENCE_S)
 
 
 def free_port() -> int:
@@ -141,7 +141,7 @@ def serve(*arguments: str, motive: bool = False) -> Iterator[Served]:
     cameras = ("--natnet-port", "0") if motive else ("--no-motive",)
     with started("serve", *cameras, *arguments) as served:
         SERVED.append(served)
-        served.wait_for("^serving", START_TIMEOUT_S)
+        served.wait_for("^serving", PATIENCE_S)
         yield served
 
 
