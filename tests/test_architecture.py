@@ -13,7 +13,7 @@ PACKAGES = ("firmware_py", "ground_station", "hil")
 LAYERS: dict[str, tuple[str, ...]] = {
     "firmware_py.core.subset": ("firmware_py.compiling",),
     "firmware_py.core": ("firmware_py.core",),
-    "firmware_py.wire": ("firmware_py.wire", "firmware_py.elementary"),
+    "firmware_py.wire": ("firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary"),
     "firmware_py.geometry": ("firmware_py.elementary",),
     "firmware_py.elementary": (),
     "firmware_py.compiling": (),

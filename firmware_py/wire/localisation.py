@@ -7,6 +7,7 @@ quaternion is "smallest three": the largest component is left out, the others ta
 import struct
 from math import sqrt
 
+from firmware_py.geometry import Vector
 from firmware_py.wire import WireError, check_size
 from firmware_py.wire.crtp import Correction, check_place, check_pose
 
@@ -15,8 +16,6 @@ CHANNEL_PACKED = 2
 EMERGENCY_STOP = 3  # type bytes of the generic channel
 EMERGENCY_STOP_WATCHDOG = 4
 EXT_POSE_PACKED = 9
-
-Vector = tuple[float, float, float]
 
 _POSITION = struct.Struct("<3f")
 _PACKED_POSITION = struct.Struct("<B3h")

@@ -14,7 +14,7 @@ from math import degrees, hypot, isfinite, isnan, nan
 
 import pymavlink.dialects.v20.common as dialect
 
-from firmware_py.elementary import cos, sin
+from firmware_py.geometry import Quaternion, Vector, from_euler_zyx
 from firmware_py.wire import WireError
 from firmware_py.wire.crtp import check_place, check_pose
 from firmware_py.wire.mavlink_frames import Message
@@ -78,9 +78,6 @@ _ESTIMATES = (
     | dialect.ESTIMATOR_POS_VERT_ABS
 )
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-
 
 @dataclass(frozen=True, slots=True)
 class Pose:
@@ -127,7 +124,8 @@ def read_pose(message: Message) -> Pose:
     elif kind == "ATT_POS_MOCAP":
         t_us, q, covariance = message.time_usec, tuple(message.q), message.covariance
     else:
-        q = _from_euler(message.roll, message.pitch, message.yaw)
+        angles = message.roll, message.pitch, message.yaw
+        q = from_euler_zyx(*angles) if isfinite(sum(angles)) else (nan, nan, nan, nan)
         t_us, covariance = message.usec, message.covariance
     _check_covariance(covariance)
     p_WB, q_WB = turn((message.x, message.y, message.z)), turn_quaternion(q)
@@ -334,20 +332,6 @@ def read_sys_status(message: Message, timestamp_ms: int) -> tuple[Sample, ...]:
     """The samples in a SYS_STATUS, which has no time of its own; NaN for a voltage that the board does not know."""
     voltage = nan if message.voltage_battery == _U16_MAX else 1e-3 * message.voltage_battery
     return Sample(BATTERY, timestamp_ms, (voltage,)), Sample(LOAD, timestamp_ms, (0.1 * message.load,))
-
-
-def _from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """The quaternion of zyx angles; NaN for angles that are not finite."""
-    if not isfinite(roll + pitch + yaw):
-        return (nan, nan, nan, nan)
-    cr, sr, cp, sp = cos(roll / 2), sin(roll / 2), cos(pitch / 2), sin(pitch / 2)
-    cy, sy = cos(yaw / 2), sin(yaw / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
 
 
 def _i16(value: float) -> int:

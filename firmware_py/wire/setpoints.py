@@ -7,9 +7,10 @@ import struct
 from math import isfinite, radians, remainder, tau
 
 from firmware_py.elementary import atan2
+from firmware_py.geometry import Vector
 from firmware_py.wire import WireError, check_size
 from firmware_py.wire.crtp import check_place
-from firmware_py.wire.localisation import Vector, unpack_quaternion
+from firmware_py.wire.localisation import unpack_quaternion
 
 CHANNEL_SETPOINT, CHANNEL_NOTICE = 0, 1
 STOP_SIZE, NOTICE_SIZE, ATTITUDE_SIZE = 1, 5, 14  # [bytes], the last on port 3

@@ -10,8 +10,9 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
+from firmware_py.geometry import Quaternion, Vector
 from ground_station.errors import MocapError
-from ground_station.sources.natnet_reader import Quaternion, Reader, Vector, Version
+from ground_station.sources.natnet_reader import Reader, Version
 
 COMMAND_PORT = 1510
 MULTICAST_GROUP = "239.255.42.99"

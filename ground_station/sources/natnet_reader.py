@@ -3,11 +3,10 @@
 import struct
 from typing import Any
 
+from firmware_py.geometry import Vector
 from ground_station.errors import MocapError
 
 Version = tuple[int, int]
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 
 _U32 = struct.Struct("<I")
 _VECTOR = struct.Struct("<3f")

@@ -5,6 +5,7 @@ A server with a newer NatNet than can be read here is asked for the newest reada
 
 from dataclasses import dataclass
 
+from firmware_py.geometry import Quaternion, Vector
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
 from ground_station.sources.alignment import Alignment
@@ -21,7 +22,7 @@ from ground_station.sources.natnet import (
     decode,
     packet,
 )  # fmt: skip
-from ground_station.sources.natnet_reader import Quaternion, Vector, Version
+from ground_station.sources.natnet_reader import Version
 from ground_station.sources.server_clock import ServerClock
 from ground_station.sources.silence import Silence
 
