@@ -31,24 +31,9 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "Along",
-    "Experiment",
-    "Fault",
-    "Goal",
-    "Kind",
-    "Knob",
-    "LabError",
-    "Metric",
-    "Request",
-    "Run",
-    "column",
-    "declare",
-    "fault",
-    "fly",
-    "knob",
-    "load_run",
-    "position_error",
-]
+    "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Request", "Run", "column", "declare",
+    "fault", "fly", "knob", "load_run", "position_error",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

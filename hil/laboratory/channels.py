@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from firmware_py.firmware import DEADLINES_US
 from firmware_py.logic.plugs import GROUP
 from firmware_py.signals import COUNTERS
-from firmware_py.wire.telemetry import ATTITUDE, CONTROL, MOTION, SLOW_BLOCKS
-from firmware_py.wire.telemetry import FLAPS as FLAP_BLOCK
+from firmware_py.table import whole_names
+from firmware_py.wire.telemetry import BLOCKS, SLOW_BLOCKS
 from ground_station.latency import STAGES
 from ground_station.program import Cockpit
 from ground_station.tracker import Tracker
@@ -29,6 +29,7 @@ from hil.world.battery import Battery
 if TYPE_CHECKING:
     from ground_station.links.mavlink import MavlinkLink  # needs pymavlink
 
+UNKNOWN = (nan, nan, nan)  # a vector that nothing has measured
 UNKNOWN_STATE = 4  # of the supervisor, beside those of `firmware_py.wire.supervisor`
 WRAP = 1 << 16  # the board's counters of poses are uint16
 AGE_UNIT_US = 100  # of locSrv.age
@@ -74,6 +75,15 @@ TELEMETRY = (
     quantity("estimator", "pose_age_us", "us"),
     quantity("estimator", "poses rejected"),
 )
+# The log variables of these columns, in their order.
+TOLD = [
+    name
+    for listed in (
+        "stateEstimate.x y z vx vy vz roll pitch yaw roll_rate pitch_rate yaw_rate flap_1 flap_2 flap_3 flap_4",
+        "motor.m1 m2 m3 m4", "controller.u1 u2 u3 u4", "locSrv.age poses rejected",
+    )
+    for name in whole_names(listed)
+]  # fmt: skip
 STATION = (
     quantity("link", "sent late"),
     quantity("station", "frames unusable samples malformed"),
@@ -269,27 +279,26 @@ class StationView:
         state = self._link.supervisor_state
         return UNKNOWN_STATE if state is None else state
 
-    def cameras(self) -> tuple[float, ...]:
-        """CAMERAS, with the velocities of the tracker."""
+    def cameras(self) -> tuple[float, ...] | float:
+        """Return CAMERAS, with the velocities of the tracker."""
         frame, track = self._ground.frame, self._ground.track
         if frame is None:
-            return (nan,) * 14
-        motion = (nan,) * 6 if track is None else (*track.v_WB, *track.w_B)
-        return (frame.t_us - self._start_us, *frame.p_WB, *frame.q_WB, *motion)
+            return nan
+        v_WB, w_B = (UNKNOWN, UNKNOWN) if track is None else (track.v_WB, track.w_B)
+        return (frame.t_us - self._start_us, *frame.p_WB, *frame.q_WB, *v_WB, *w_B)
 
-    def telemetry(self) -> tuple[float, ...]:
-        """TELEMETRY, when there is a sample of every block."""
+    def telemetry(self) -> tuple[float, ...] | float:
+        """Return TELEMETRY, when there is a sample of every block."""
         newest = self._ground.telemetry
-        try:
-            motion, attitude, flaps, control = (
-                newest[block.id].values for block in (MOTION, ATTITUDE, FLAP_BLOCK, CONTROL)
-            )
-        except KeyError:
-            return (nan,) * 27
-        *angles, age, poses, rejected = attitude
-        _, *rates_and_inputs = control[:8]
-        counted = (AGE_UNIT_US * age, self._poses(poses), self._rejected(rejected))
-        return (*motion, *angles, *rates_and_inputs[:3], *flaps, *rates_and_inputs[3:], *counted)
+        if any(block.id not in newest for block in BLOCKS):
+            return nan
+        told = {
+            variable.name: value
+            for block in BLOCKS
+            for variable, value in zip(block.variables, newest[block.id].values, strict=True)
+        }
+        *measured, age, poses, rejected = (told[name] for name in TOLD)
+        return (*measured, AGE_UNIT_US * age, self._poses(poses), self._rejected(rejected))
 
     def slow(self) -> tuple[float, ...]:
         """Battery and load."""

@@ -21,7 +21,7 @@ SCHEMA = pa.schema(
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class Turn:
     """An interval in which a task had the processor."""
 
     task: str
@@ -64,7 +64,7 @@ def load_schedule(folder: Path) -> pa.Table:
     return pa.parquet.read_table(path) if path.is_file() else SCHEMA.empty_table()
 
 
-def runs(schedule: pa.Table) -> Iterator[Run]:
+def runs(schedule: pa.Table) -> Iterator[Turn]:
     """Yield the intervals in which tasks had the processor, the idle task included, without those of no length."""
     events, times, names = (schedule.column(name).to_pylist() for name in ("event", "us", "who"))
     task, start_us = "", 0
@@ -72,6 +72,6 @@ def runs(schedule: pa.Table) -> Iterator[Run]:
         if event not in ("IN", "END"):
             continue
         if task and us > start_us and who != task:
-            yield Run(task, start_us, us)
+            yield Turn(task, start_us, us)
         if who != task:
             task, start_us = who, us

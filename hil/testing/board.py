@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from firmware_py.board import ImuCounts
 from firmware_py.core_runner import PythonRunner, RunnerFactory
 from firmware_py.firmware import Firmware
+from firmware_py.geometry import Vector
 from firmware_py.rtos import TaskReport
 from hil.config import LabConfig
 from hil.devices.board import VirtualBoard
@@ -17,7 +18,6 @@ from hil.events import EventQueue
 from hil.world.motion import GRAVITY
 
 IMU_PERIOD_US = 1_000
-Vector = tuple[float, float, float]
 
 
 class UnmetExpectation(AssertionError):  # noqa: N818 - pytest shows the name

@@ -15,22 +15,12 @@ from firmware_py.export.errors import ExportError
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, hint
 from hil.laboratory.lockstep import BUILD
-from hil.laboratory.request import LOCKSTEP, RADIO
+from hil.laboratory.request import LOCKSTEP, RADIO, Options
 
 PACKAGES = {"mavlink": "pymavlink", "radio": "cflib"}  # capabilities that a package provides
 LOCKSTEP_ONLY = "lockstep"
 CAPABILITIES = (*BOARDS, *PACKAGES, LOCKSTEP_ONLY)
 WORDS = ("seeds", "boards", "profiles", "needs")
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """The seed, board and profile of one test."""
-
-    seed: int = 1
-    board: str = PYTHON
-    profile: str = DEFAULT_PROFILE
-    link: str = RADIO
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,40 +64,45 @@ class Marked:
         return marked
 
 
-def choices_of(marked: Marked, wanted: Wanted) -> list[Choice]:
-    """Return the choices of a test: the command line overrides the mark, and a board that it needs is its board."""
+def choices_of(marked: Marked, wanted: Wanted) -> list[Options]:
+    """Return the seeds, boards, profiles and link of a test as the options that its flights start from.
+
+    The command line overrides the mark, and a board that the test needs is its board.
+    """
     needed = tuple(board for board in marked.needs if board in BOARDS)
     seeds = tuple(range(1, wanted.seeds + 1)) or marked.seeds or (1,)
     boards = wanted.boards or marked.boards or needed or (PYTHON,)
     profiles = wanted.profiles or marked.profiles or (wanted.usual_profile,)
     return [
-        Choice(seed, board, profile, wanted.link) for profile, board, seed in product(profiles, boards, seeds)
+        {"seed": seed, "board": board, "profile": profile, "link": wanted.link}
+        for profile, board, seed in product(profiles, boards, seeds)
     ]
 
 
-def name_of(choice: Choice, choices: Sequence[Choice]) -> str:
+def name_of(choice: Options, choices: Sequence[Options]) -> str:
     """Return the text that distinguishes a choice in a test's name."""
     parts = {
-        choice.profile: len({one.profile for one in choices}),
-        choice.board: len({one.board for one in choices}),
-        f"seed{choice.seed}": len({one.seed for one in choices}),
+        choice["profile"]: len({one["profile"] for one in choices}),
+        choice["board"]: len({one["board"] for one in choices}),
+        f"seed{choice['seed']}": len({one["seed"] for one in choices}),
     }
     return "-".join(part for part, many in parts.items() if many > 1)
 
 
-def why_not(choice: Choice, needs: Iterable[str]) -> str:
+def why_not(choice: Options, needs: Iterable[str]) -> str:
     """Return why a test cannot fly on its choice here, empty when it can."""
-    in_lockstep = choice.link in LOCKSTEP
-    if not in_lockstep and choice.board != PYTHON:
-        return f"board {choice.board}: --floaty-link {choice.link}: only python flies over a link"
+    board, link = choice["board"], choice["link"]
+    in_lockstep = link in LOCKSTEP
+    if not in_lockstep and board != PYTHON:
+        return f"board {board}: --floaty-link {link}: only python flies over a link"
     for need in needs:
-        if need in BOARDS and need != choice.board:
-            return f"needs {need}: this flies on {choice.board}"
+        if need in BOARDS and need != board:
+            return f"needs {need}: this flies on {board}"
         if need == LOCKSTEP_ONLY and not in_lockstep:
-            return f"needs lockstep: this flies over {choice.link}"
+            return f"needs lockstep: this flies over {link}"
         if need in PACKAGES and importlib.util.find_spec(PACKAGES[need]) is None:
             return f"needs {need}: {PACKAGES[need]} is not installed"
-    return why_no_board(choice.board)
+    return why_no_board(board)
 
 
 @cache

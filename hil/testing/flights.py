@@ -21,7 +21,7 @@ from hil.laboratory.experiment import Experiment
 from hil.laboratory.lockstep import BUILD
 from hil.laboratory.request import MAVLINK, RADIO, Options, Request
 from hil.testing.board import BareBoard
-from hil.testing.choices import Choice, why_no_board
+from hil.testing.choices import why_no_board
 
 SHOWN = 3  # flights of a test; of more, the last
 PICTURE = "flight.png"
@@ -43,7 +43,7 @@ class Item:
 
     name: str  # pytest's
     folder: Path
-    choice: Choice
+    choice: Options  # that its flights start from
     flown: list[Flown] = field(default_factory=list)
     failed: bool = False
 
@@ -56,14 +56,14 @@ class Flights:
         self._folder = folder  # of all tests' runs
         self._item: Item | None = None
 
-    def begin(self, name: str, choice: Choice) -> Item:
+    def begin(self, name: str, choice: Options) -> Item:
         """Fly for a test from now on."""
         self._item = Item(name, self._folder / folder_of(name), choice)
         shutil.rmtree(self._item.folder, ignore_errors=True)
         return self._item
 
     @property
-    def choice(self) -> Choice:
+    def choice(self) -> Options:
         """The choice of the present test."""
         assert self._item is not None
         return self._item.choice
@@ -71,17 +71,17 @@ class Flights:
     @property
     def seed(self) -> int:
         """Of everything random."""
-        return self.choice.seed
+        return self.choice["seed"]
 
     @property
     def profile(self) -> str:
         """The profile."""
-        return self.choice.profile
+        return self.choice["profile"]
 
     @property
     def target(self) -> str:
         """What executes the flight core: python, c or cortex-m4."""
-        return self.choice.board
+        return self.choice["board"]
 
     @checked
     def fly(self, experiment: Experiment | str = "hover", **options: Unpack[Options]) -> Run:
@@ -90,16 +90,14 @@ class Flights:
         Options are those of `hil.fly`. A failed limit is no error: the test reads `passed`, `metrics`, `verdicts`. Skips the
         test when a board is not available here. Raises `LabError` for bad input.
         """
-        item, choice = self._item, self.choice
+        item = self._item
         assert item is not None
-        options.setdefault("seed", choice.seed)
-        options.setdefault("board", choice.board)
-        options.setdefault("link", choice.link)
-        options["profile"] = self._placed(options.get("profile", choice.profile))
-        self._need(options["board"])
+        chosen: Options = {**item.choice, **options}
+        chosen["profile"] = self._placed(chosen["profile"])
+        self._need(chosen["board"])
         if isinstance(experiment, str):
             experiment = self._placed(experiment)
-        request = request_of(experiment, **options)
+        request = request_of(experiment, **chosen)
         number = len(item.flown) + 1
         run = fly(request, item.folder / str(number))
         item.flown.append(Flown(number, request, run))
@@ -113,9 +111,9 @@ class Flights:
         """
         if link not in (RADIO, MAVLINK):
             raise LabError(f"board: link {link!r}: expected {RADIO} or {MAVLINK}")
-        self._need(self.choice.board)
-        config = load_config(self._placed(profile or self.choice.profile), settings_of(overrides))
-        return BareBoard(config, runner_of(self.choice.board, BUILD, config.logic), link == MAVLINK)
+        self._need(self.target)
+        config = load_config(self._placed(profile or self.profile), settings_of(overrides))
+        return BareBoard(config, runner_of(self.target, BUILD, config.logic), link == MAVLINK)
 
     def _need(self, board: str) -> None:
         if board in BOARDS and (reason := why_no_board(board)):

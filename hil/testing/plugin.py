@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
-    from hil.testing.choices import Choice, Marked, Wanted
+    from hil.laboratory.request import Options
+    from hil.testing.choices import Marked, Wanted
     from hil.testing.flights import Flights, Item
 
 CHOICE = "floaty_choice"  # the parameter of a test that flies on several
@@ -98,7 +99,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     marked = _marked(item)
     callspec = getattr(item, "callspec", None)
     parameters = callspec.params if callspec else {}
-    choice: Choice = parameters.get(CHOICE) or choices_of(marked, _wanted(item.config))[0]
+    choice: Options = parameters.get(CHOICE) or choices_of(marked, _wanted(item.config))[0]
     if reason := why_not(choice, marked.needs):
         pytest.skip(f"floaty: {reason}")
     item.stash[ITEM] = _flights(item.config).begin(item.nodeid, choice)

@@ -17,14 +17,16 @@ FLY = """
 import sys
 from pathlib import Path
 from hil.experiments import find_experiment
-from hil.laboratory.faults import parse
 from hil.laboratory.result import read_result
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.servers import served_robot  # inherits from modules of the loop
 for number, link in enumerate(("radio", "mavlink")):
-    faults = [parse("push.y@1=1"), parse("mocap.dropout@1.5:0.3")]
-    request = Request.of(find_experiment("hover"), "floaty", ["markers.enabled=true"], 4, 3.0, link, faults)
+    request = Request.of(
+        find_experiment("hover"), overrides=["markers.enabled=true"], seed=4, duration_s=3.0, link=link,
+        faults=["push.y@1=1", "mocap.dropout@1.5:0.3"],
+    )
+    folder = Path(sys.argv[1]) / str(number)
     print(fly(request, folder).hash == read_result(folder).hash, read_result(folder).hash)
 """
 

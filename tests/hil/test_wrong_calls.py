@@ -42,7 +42,7 @@ from hil.laboratory.fault_kinds import KINDS, add
 from hil.laboratory.robot import attributes_of, specimen
 from hil.studies.sweep import Job, fly_all
 from hil.testing import Flights, Waypoints, faults, trajectories
-from hil.testing.choices import Choice
+from support.choices import choice
 
 HOVER = EXPERIMENTS["hover"]
 PUSH = KINDS["push.y"]
@@ -53,7 +53,7 @@ TABLE = pa.table({"t": [0, 1], **{name: [0.0, 0.0] for name in ("goal.x", "truth
 def flights() -> Flights:
     """Return the pytest fixture for a test here."""
     found = Flights(Path(), Path("runs"))
-    found.begin("test", Choice())
+    found.begin("test", choice())
     return found
 
 

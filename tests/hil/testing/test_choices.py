@@ -10,23 +10,24 @@ import pytest
 from hil.config import load_config
 from hil.devices.imu_counts import COS, SIN
 from hil.testing.board import BareBoard
-from hil.testing.choices import Choice, name_of
+from hil.testing.choices import name_of
 from hil.testing.flights import NAME_MAX, SHOWN, Item, folder_of, shown_of
 from hil.testing.strategies import _round_step
+from support.choices import choice
 
 
 def test_a_name_tells_only_what_differs_between_the_choices() -> None:
-    two = [Choice(1), Choice(2)]
+    two = [choice(1), choice(2)]
     assert [name_of(one, two) for one in two] == ["seed1", "seed2"]
-    boards = [Choice(1, "python"), Choice(1, "c")]
+    boards = [choice(1, "python"), choice(1, "c")]
     assert [name_of(one, boards) for one in boards] == ["python", "c"]
-    assert name_of(Choice(), [Choice()]) == ""
+    assert name_of(choice(), [choice()]) == ""
 
 
 @pytest.mark.parametrize("count", [1, SHOWN, SHOWN + 1])
 def test_of_a_few_flights_all_are_shown_and_of_more_the_last(count: int) -> None:
     flown: Any = [SimpleNamespace(number=number) for number in range(count)]
-    shown = [one.number for one in shown_of(Item("x", Path(), Choice(), flown))]
+    shown = [one.number for one in shown_of(Item("x", Path(), choice(), flown))]
     assert shown == (list(range(count)) if count <= SHOWN else [count - 1])
 
 

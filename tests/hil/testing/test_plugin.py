@@ -14,8 +14,10 @@ import hil
 from firmware_py.export.errors import ExportError
 from hil.api import load_run
 from hil.errors import LabError
+from hil.laboratory.request import Options
 from hil.testing import choices
-from hil.testing.choices import Choice, Marked, Wanted, choices_of, why_not
+from hil.testing.choices import Marked, Wanted, choices_of, why_not
+from support.choices import choice
 from support.command import Cli
 from support.examples import FILE, blocks
 from support.own_logic import LAW, make_project
@@ -248,19 +250,19 @@ def test_flights_take_what_the_mark_says_and_options_go_before_it(pytester: pyte
 @pytest.mark.parametrize(
     ("marked", "wanted", "found"),
     [
-        ({}, Wanted(), [Choice()]),
-        ({"seeds": 2}, Wanted(), [Choice(1), Choice(2)]),
-        ({"seeds": [5, 3]}, Wanted(), [Choice(5), Choice(3)]),
-        ({"seeds": 20, "boards": ["c"]}, Wanted(1, ("python", "c")), [Choice(1), Choice(1, "c")]),
-        ({"needs": "cortex-m4"}, Wanted(), [Choice(1, "cortex-m4")]),
-        ({"needs": ["lockstep"]}, Wanted(link="udp://x:1"), [Choice(link="udp://x:1")]),
-        ({}, Wanted(usual_profile="as-flown"), [Choice(profile="as-flown")]),
-        ({"profiles": ["floaty"]}, Wanted(usual_profile="as-flown"), [Choice()]),
-        ({"profiles": ["floaty"]}, Wanted(profiles=("as-flown",)), [Choice(profile="as-flown")]),
+        ({}, Wanted(), [choice()]),
+        ({"seeds": 2}, Wanted(), [choice(1), choice(2)]),
+        ({"seeds": [5, 3]}, Wanted(), [choice(5), choice(3)]),
+        ({"seeds": 20, "boards": ["c"]}, Wanted(1, ("python", "c")), [choice(1), choice(1, "c")]),
+        ({"needs": "cortex-m4"}, Wanted(), [choice(1, "cortex-m4")]),
+        ({"needs": ["lockstep"]}, Wanted(link="udp://x:1"), [choice(link="udp://x:1")]),
+        ({}, Wanted(usual_profile="as-flown"), [choice(profile="as-flown")]),
+        ({"profiles": ["floaty"]}, Wanted(usual_profile="as-flown"), [choice()]),
+        ({"profiles": ["floaty"]}, Wanted(profiles=("as-flown",)), [choice(profile="as-flown")]),
     ],
 )
 def test_the_command_line_goes_before_the_mark_and_the_mark_before_the_usual(
-    marked: dict[str, object], wanted: Wanted, found: list[Choice]
+    marked: dict[str, object], wanted: Wanted, found: list[Options]
 ) -> None:
     assert choices_of(Marked.of(marked), wanted) == found
 
@@ -316,26 +318,26 @@ def test_a_board_that_cannot_be_had_is_skipped_and_the_summary_says_so(
 
 
 @pytest.mark.parametrize(
-    ("choice", "needs", "told"),
+    ("chosen", "needs", "told"),
     [
-        (Choice(), (), ""),
-        (Choice(), ("lockstep", "mavlink", "radio"), ""),
-        (Choice(), ("cortex-m4",), "needs cortex-m4: this flies on python"),
-        (Choice(link="udp://127.0.0.1:1"), ("lockstep",), "needs lockstep: this flies over udp://127.0.0.1:1"),
-        (Choice(board="c", link="udp://127.0.0.1:1"), (), "board c: --floaty-link udp://127.0.0.1:1: only python flies"),
+        (choice(), (), ""),
+        (choice(), ("lockstep", "mavlink", "radio"), ""),
+        (choice(), ("cortex-m4",), "needs cortex-m4: this flies on python"),
+        (choice(link="udp://127.0.0.1:1"), ("lockstep",), "needs lockstep: this flies over udp://127.0.0.1:1"),
+        (choice(board="c", link="udp://127.0.0.1:1"), (), "board c: --floaty-link udp://127.0.0.1:1: only python flies"),
     ],
 )  # fmt: skip
 def test_what_a_test_needs_decides_whether_it_is_flown(
-    choice: Choice, needs: tuple[str, ...], told: str
+    chosen: Options, needs: tuple[str, ...], told: str
 ) -> None:
-    reason = why_not(choice, needs)
+    reason = why_not(chosen, needs)
     assert reason.startswith(told)
     assert bool(reason) == bool(told)
 
 
 def test_a_package_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(choices.PACKAGES, "mavlink", "pymavlink_is_not_here")
-    assert why_not(Choice(), ("mavlink",)) == "needs mavlink: pymavlink_is_not_here is not installed"
+    assert why_not(choice(), ("mavlink",)) == "needs mavlink: pymavlink_is_not_here is not installed"
 
 
 @pytest.mark.parametrize(
