@@ -62,9 +62,17 @@ class CaptureConfig(Section):
     system: System = Field("optitrack", description="optitrack: Motive, also that of `floaty serve`")
     host: str = Field("127.0.0.1", min_length=1, description="where the system's computer is")
     port: int | None = number(
-        None, "[1, 65535]", "default: the system's own; optitrack 1510, vicon 801, qualisys 22222, vrpn 3883"
+        None,
+        "[0, 65534]",
+        "default: the system's own; optitrack 1510, vicon 801, qualisys 22222, vrpn 3883; 0: `floaty serve` finds one",
     )
-    multicast: bool = Field(False, description="optitrack: insist on frames by multicast")
+    multicast: bool = Field(
+        False,
+        description="optitrack: insist on frames by multicast; `floaty serve` sends no others",
+    )
+    natnet: Literal["3.1", "4.1"] = Field(
+        "4.1", description="the version that the Motive of `floaty serve` streams"
+    )
     body: str = Field("", description="the rigid body's name in the system; empty: the only one there is")
     axes: Axes | None = Field(
         None,

@@ -40,6 +40,18 @@ COMMANDS = {
 }
 
 
+# What became of options that no longer exist.
+MOVED = {
+    "--baud": "--set serial.baud=N",
+    "--natnet": "--set capture.natnet=3.1",
+    "--natnet-port": "--set capture.port=PORT",
+    "--multicast": "--set capture.multicast=true",
+    "--up": "--set capture.axes=z-up",
+    "--trajectory": "floaty station EXPERIMENT",
+    "--web": "--view web",
+}
+
+
 class LazyGroup(click.Group):
     """A group that imports the file of a command when the command is asked for."""
 
@@ -88,6 +100,9 @@ def main() -> None:
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
         sys.exit(2)
+    except click.NoSuchOption as error:
+        moved = MOVED.get(error.option_name)
+        sys.exit(_refuse(f"{error.option_name}: now {moved}" if moved else error.format_message()))
     except click.ClickException as error:
         sys.exit(_refuse(error.format_message()))
     except (click.Abort, KeyboardInterrupt):

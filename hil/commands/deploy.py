@@ -1,4 +1,4 @@
-"""`floaty deploy export | check | flash`: the flight core as C for a Crazyflie, and the proof that it equals the one that
+"""`floaty deploy write | check | flash`: the flight core as C for a Crazyflie, and the proof that it equals the one that
 flew.
 
 And `floaty board doctor`: the state of what is connected, within a minute.
@@ -227,7 +227,7 @@ def _read(source: Path) -> str:
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @profile_option
 @set_option
-def export(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
+def write(folder: Path, profile: str, overrides: tuple[str, ...]) -> None:
     """Write the Crazyflie app with the flight core as C, and PROFILE's parameters in it, into the folder DIR."""
     from firmware_py.export.crazyflie import write_app
     from hil.config import load_config

@@ -14,13 +14,16 @@ from hil.live.window import show
 @click.option(
     "--at", "at_s", type=float, metavar="S", help="With the time at an instant, seconds from the release."
 )
-@click.option("--web", is_flag=True, help="In a browser; meanwhile the links of the run's report lead there.")
-def view(run: Path, at_s: float | None, web: bool) -> None:
+@click.option(
+    "--view", "target", type=click.Choice(["window", "web"]), default="window", show_default=True,
+    help="web: in a browser; meanwhile the links of the run's report lead there.",
+)  # fmt: skip
+def view(run: Path, at_s: float | None, target: str) -> None:
     """Open RUN, a run folder, in the rerun viewer."""
     from hil.live.recording import browse, show_at
     from hil.pictures.viewer.recording import recording_of
 
-    if web:
+    if target == "web":
         browse(run, at_s or 0.0, say)
     elif at_s is not None:
         show_at(run, at_s)

@@ -27,14 +27,12 @@ from hil.commands.options import (
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
-    from hil.servers.motive import Streaming, Up
+    from hil.servers.motive import Streaming
     from hil.servers.serial_server import Address
     from hil.servers.server import Ends
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
-MOTIVE_PORT = 1510  # Motive's command port
-NATNET = {"3.1": (3, 1), "4.1": (4, 1)}
 BOARDS_MAX = 10
 
 
@@ -54,10 +52,6 @@ BOARDS_MAX = 10
     "there), tcp[:[HOST:]PORT] (listens).",
 )
 @click.option(
-    "--baud", type=click.IntRange(9600, 3_000_000), metavar="N",
-    help="Bits per second of the serial line.  [default: the profile's]",
-)  # fmt: skip
-@click.option(
     "--board",
     metavar="FILE",
     help="The image of a Crazyflie's firmware, an ELF file, which every board executes whole.",
@@ -72,18 +66,6 @@ BOARDS_MAX = 10
     "--motive/--no-motive", default=True, show_default=True, help="Stream the cameras' poses over NatNet."
 )
 @click.option(
-    "--natnet", type=click.Choice(list(NATNET)), default="4.1", show_default=True, help="Motive's version."
-)
-@click.option(
-    "--natnet-port", type=click.IntRange(0, 65534), default=MOTIVE_PORT, show_default=True, metavar="PORT",
-    help="Motive's command port; frames go to the next one. 0: any.",
-)  # fmt: skip
-@click.option(
-    "--up", type=click.Choice(["y", "z"]), default="y", show_default=True,
-    help="Which axis of Motive's stream points up.",
-)  # fmt: skip
-@click.option("--multicast", is_flag=True, help="Motive sends frames to its group instead of to each client.")
-@click.option(
     "--state", type=click.Path(path_type=Path), metavar="DIR",
     help="Keep each board's EEPROM and deck memory in this folder, over restarts of the server.",
 )  # fmt: skip
@@ -97,16 +79,11 @@ def serve(
     radio: bool,
     radio_port: int,
     mavlink: str | None,
-    baud: int | None,
     board: str | None,
     gdb: int | None,
     boards: int,
     station: str | None,
     motive: bool,
-    natnet: str,
-    natnet_port: int,
-    up: Up,
-    multicast: bool,
     state: Path | None,
     target: str | None,
     fault_texts: tuple[str, ...],
@@ -118,7 +95,8 @@ def serve(
 
     Without --udp, --radio or --mavlink the first board is on UDP. A robot is held until it flies: corrections come from
     clients or, with --station, from within. Motive calls the bodies floaty, floaty2, .... It tracks them
-    by eight markers each; with --set markers.enabled=false poses have noise of their own instead.
+    by eight markers each; with --set markers.enabled=false poses have noise of their own instead. Its stream is that of
+    [capture] in the profile: capture.port (frames go to the next one), axes, multicast and natnet.
 
     --view shows the first robot, with home as its goal.
 
@@ -126,7 +104,7 @@ def serve(
     """
     if udp is None and not radio and mavlink is None:
         udp = UDP_PORT
-    _check_options(udp, mavlink, baud, board, gdb, boards)
+    _check_options(udp, mavlink, board, gdb, boards)
     if mavlink is not None:
         require(f"--mavlink {mavlink}", "mavlink", "pymavlink")
     from hil.config import load_config
@@ -135,16 +113,15 @@ def serve(
     from hil.laboratory.lockstep import debugger, image_at
     from hil.laboratory.robot import PYTHON_BOARD
     from hil.servers.live_faults import LiveFaults
-    from hil.servers.motive import Streaming
+    from hil.servers.motive import streaming_of
     from hil.servers.serial_server import parse_addresses
     from hil.servers.server import Server
 
     markers = (MARKERS_ON,) if motive else ()
-    line = (f"serial.baud={baud}",) if baud is not None else ()
     poses = (
         () if station == "corrections" else ("predictor.absolute=true",)
     )  # as Bitcraze's programs send them
-    config = load_config(profile, (*markers, *poses, *overrides, *line))
+    config = load_config(profile, (*markers, *poses, *overrides))
     ends = parse_addresses(mavlink, boards) if mavlink is not None else []
     faults = [parse(text) for text in fault_texts]
     check(faults, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
@@ -155,7 +132,7 @@ def serve(
     view = open_live(target)
     server = Server(config, boards, seed, say, bool(ends), faults, state, view, executor)
     try:
-        streaming = Streaming(natnet_port, NATNET[natnet], multicast, up) if motive else None
+        streaming = streaming_of(config.capture) if motive else None
         _open_ends(server.ends, udp, radio_port if radio else None, ends, streaming)
         if station is not None:
             for robot in server.ends.robots:
@@ -174,13 +151,11 @@ def serve(
 
 
 def _check_options(
-    udp: int | None, mavlink: str | None, baud: int | None, board: str | None, gdb: int | None, boards: int
+    udp: int | None, mavlink: str | None, board: str | None, gdb: int | None, boards: int
 ) -> None:
     """Raise `LabError` for options that contradict each other."""
     if udp is not None and udp + boards - 1 > 65535:
         raise LabError(f"--udp {udp}: there are no {boards} ports from there on")
-    if baud is not None and mavlink is None:
-        raise LabError(f"--baud {baud}: there is no serial line without --mavlink")
     if board is not None and mavlink is not None:
         raise LabError(f"--mavlink {mavlink}: {board} speaks CRTP over its radio, not MAVLink")
     if gdb is not None and (board is None or boards > 1):

@@ -44,9 +44,7 @@ if TYPE_CHECKING:
     "serve`, vicon:HOST[:PORT], qualisys:HOST, vrpn:HOST[:PORT], each with [,body=NAME] [,z-up|,y-up], optitrack with "
     "[,multicast]; or replay:PATH, a file of --record, a telemetry.csv or a run folder, whose end ends the flight.",
 )  # fmt: skip
-@click.option(
-    "--trajectory", default="hover", show_default=True, metavar="NAME", help="An experiment of `floaty list`."
-)
+@click.argument("named", metavar="[EXPERIMENT]", default="hover")
 @click.option(
     "--start", "start_s", type=click.FloatRange(0, 3600), default=1.0, show_default=True, metavar="S",
     help="When the trajectory begins, after the board first flies.",
@@ -75,7 +73,7 @@ if TYPE_CHECKING:
 def station(
     uri: str,
     mocap: str | None,
-    trajectory: str,
+    named: str,
     start_s: float,
     duration: float | None,
     log: Path | None,
@@ -86,13 +84,15 @@ def station(
     profile: str,
     overrides: tuple[str, ...],
 ) -> int:
-    """Fly a board, real or virtual: poses in, poses or corrections out at 50 Hz, telemetry shown and logged.
+    """Fly EXPERIMENT, by default hover, with a board, real or virtual: poses in, poses or corrections out at 50 Hz.
+
+    `floaty list` names the experiments. Telemetry is shown and logged.
 
     Ctrl-C ends the flight: no more poses are sent, the board puts its flaps to hover, the link is closed.
 
     While it flies, lines like goal 0.1 0 1.15, set controller.gain_y -2.0 or stop act at once; help lists the commands.
 
-    Exit code with --out: as `floaty fly`, by the limits of the trajectory's experiment on what the cameras saw.
+    Exit code with --out: as `floaty fly`, by the limits of EXPERIMENT on what the cameras saw.
     """
     from ground_station.operator import COMMANDS, Operator
     from ground_station.program import Cockpit, Session, fly, run_until
@@ -104,7 +104,7 @@ def station(
     from hil.laboratory.request import REAL, Bench, Request
 
     config = load_config(profile, overrides)
-    experiment = find_experiment(trajectory)
+    experiment = find_experiment(named)
     _check_files(log, record, tlog, out, uri)
     view = open_live(target)
     flight = None

@@ -75,7 +75,7 @@ def examine(client: CoreClient, config: LabConfig) -> Iterator[Finding]:
         yield firmware
         yield Finding(
             "app",
-            "missing: the firmware answers, Floaty's app does not; see floaty deploy export",
+            "missing: the firmware answers, Floaty's app does not; see floaty deploy write",
             good=False,
         )
         return

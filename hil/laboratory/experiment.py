@@ -101,7 +101,7 @@ class Experiment:
 
     @property
     def reference(self) -> str:
-        """Its name for `floaty fly` and `floaty station --trajectory`."""
+        """Its name for `floaty fly` and `floaty station`."""
         return self.source.reference if self.source else self.name
 
     @property

@@ -55,7 +55,7 @@ class Links(HTTPServer):
         except OSError as error:
             raise LabError(
                 f"{run}: the links of reports lead to port {port}, which is taken ({error.strerror}): "
-                "another floaty view --web?"
+                "another floaty view --view web?"
             ) from None
 
 
@@ -72,7 +72,7 @@ class _Visit(BaseHTTPRequestHandler):
         elif self.path == f"/{REPORT}" and report.is_file():
             self._respond(HTTPStatus.OK, "text/html", report.read_bytes())
         else:
-            text = f"Here is {self.server.run}; for another flight: floaty view RUN --web with its folder.\n"
+            text = f"Here is {self.server.run}; for another flight: floaty view RUN --view web with its folder.\n"
             self._respond(HTTPStatus.NOT_FOUND, "text/plain", text.encode())
 
     def _respond(self, status: HTTPStatus, kind: str, content: bytes) -> None:

@@ -136,7 +136,7 @@ def end(viewer: "subprocess.Popen[bytes]") -> None:
 def _require_display() -> None:
     if sys.platform == "linux" and not any(os.environ.get(name) for name in DISPLAYS):
         raise LabError(
-            "the viewer needs a display, and this computer has none; in a browser: floaty view RUN --web, or "
+            "the viewer needs a display, and this computer has none; in a browser: floaty view RUN --view web, or "
             "floaty fly … --view web"
         )
 

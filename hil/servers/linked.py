@@ -76,9 +76,9 @@ class StationProcess:
         station_uri, self._environment = self._serve(uri, config.serial.baud)
         motive = self._ends.serve_motive(Streaming(0, (4, 1), multicast=False))
         self._command = [
-            sys.executable, "-m", "hil.commands", "station", "--link", station_uri,
+            sys.executable, "-m", "hil.commands", "station", request.experiment.reference, "--link", station_uri,
             "--mocap", f"optitrack:127.0.0.1:{motive.port},body={name_of(1)},y-up",
-            "--trajectory", request.experiment.reference, "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
+            "--start", str(HOLD_US * 1e-6), "--log", str(telemetry),
             *(("--tlog", str(telemetry.with_name(FRAME_LOG))) if uri.startswith(SERIAL) else ()), *arguments, *ALIGNED,
         ]  # fmt: skip
         self._output = tempfile.TemporaryFile("wb+")  # noqa: SIM115 - closed with the line

@@ -17,8 +17,10 @@ from typing import Literal
 
 from firmware_py.geometry import Quaternion, Vector
 from ground_station.clock import clock_us
+from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapFrame
 from ground_station.sources.natnet import (
+    COMMAND_PORT,
     HEADER_SIZE,
     MULTICAST_GROUP,
     BodyDescription,
@@ -73,6 +75,13 @@ class Streaming:
     version: Version
     multicast: bool  # to the group, else to each client
     up: Up = "y"  # the axis; z: those of the world
+
+
+def streaming_of(config: CaptureConfig) -> Streaming:
+    """Return the stream that a station with these settings expects."""
+    port = COMMAND_PORT if config.port is None else config.port
+    major, minor = map(int, config.natnet.split("."))
+    return Streaming(port, (major, minor), config.multicast, "z" if config.axes == "z-up" else "y")
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +160,8 @@ class VirtualMotive:
         except OSError as error:
             self._socket.close()
             raise LabError(
-                f"natnet port {settings.port}: {error.strerror or error}; --natnet-port 0 takes a free one, --no-motive none"
+                f"natnet port {settings.port}: {error.strerror or error}; --set capture.port=0 takes a free one, "
+                "--no-motive none"
             ) from None
         self.port: int = self._socket.getsockname()[1]
         self.data_port = self.port + 1

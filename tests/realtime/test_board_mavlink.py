@@ -46,7 +46,7 @@ def test_two_tcp_clients_hear_the_board_and_each_gets_its_answers() -> None:
 
 
 def test_the_baud_rate_limits_what_comes_through() -> None:
-    with serve("--mavlink", "tcp:0", "--baud", "9600") as served:
+    with serve("--mavlink", "tcp:0", "--set", "serial.baud=9600") as served:
         client = MavlinkSocket(masters(served)[0])
         client.wait("HEARTBEAT")
         for message in (dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED):

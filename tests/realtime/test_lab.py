@@ -27,7 +27,7 @@ AGE_MS = 5.0  # off the cameras' latency at most: the loopback interface and a b
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_whichever_axis_points_up_the_printed_address_shows_the_robot_in_its_holder(up: str) -> None:
-    with serve("--udp", "0", "--up", up, motive=True) as lab:
+    with serve("--udp", "0", "--set", f"capture.axes={up}-up", motive=True) as lab:
         assert lab.motive.endswith(",z-up") == (up == "z")
         receiver = find_source(lab.motive, CaptureConfig())
         receiver.open()
@@ -122,7 +122,7 @@ def test_mavproxy_flies_the_robot_from_what_motive_says(tmp_path: Path) -> None:
     """Its optitrack module knows no ports but 1510 and 1511."""
     if any(map(is_taken, (1510, 1511))):
         pytest.skip("MAVProxy's optitrack IS NOT TESTED: another program has UDP port 1510 or 1511")
-    with serve("--mavlink", "pty", "--natnet-port", "1510", motive=True) as lab:
+    with serve("--mavlink", "pty", "--set", "capture.port=1510", motive=True) as lab:
         proxy = MavProxy(lab.line("mavlink ")[0], tmp_path)
         proxy.sees("Detected vehicle 1:1")
         for line in ("module load optitrack", "optitrack set multicast False", "optitrack set msg_intvl_ms 18",

@@ -36,7 +36,7 @@ def test_the_links_of_a_report_lead_into_the_recording(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0, faults=[parse("push.y@0.3=1")]), folder)
     (link,) = Page(write_report(folder).read_text(encoding="utf-8")).links
-    with started("view", folder, "--web") as viewer:
+    with started("view", folder, "--view", "web") as viewer:
         page_of(viewer)
         with urllib.request.urlopen(link, timeout=20) as page:
             assert b"rerun" in page.read().lower()

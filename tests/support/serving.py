@@ -138,7 +138,7 @@ def started(*arguments: str | Path, environment: dict[str, str] | None = None) -
 @contextmanager
 def serve(*arguments: str, motive: bool = False) -> Iterator[Served]:
     """A server, with or without Motive, on a free port."""
-    cameras = ("--natnet-port", "0") if motive else ("--no-motive",)
+    cameras = ("--set", "capture.port=0") if motive else ("--no-motive",)
     with started("serve", *cameras, *arguments) as served:
         SERVED.append(served)
         served.wait_for("^serving", PATIENCE_S)

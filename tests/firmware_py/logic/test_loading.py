@@ -338,7 +338,7 @@ def test_a_mistake_in_a_module_is_one_line_and_exit_code_two_wherever_it_would_f
 ) -> None:
     monkeypatch.chdir(tmp_path)
     make_project(tmp_path, changed(LAW, "f32(0.01)", "0.01"))
-    for command in (("fly", "hover"), ("deploy", "check"), ("deploy", "export", "app")):
+    for command in (("fly", "hover"), ("deploy", "check"), ("deploy", "write", "app")):
         assert cli(*command, "--profile", "profile.toml") == 2
         said = cli.err
         at = f"controller.py:{line_of(LAW, 'DT =')}"

@@ -59,7 +59,7 @@ def test_a_station_refuses_a_port_on_which_no_board_listens(cli: Cli) -> None:
     ("arguments", "message"),
     [
         (["station", "--link", RADIO, "--mocap", "vicon"], "--mocap vicon: expected optitrack:HOST"),
-        (["station", "--link", RADIO, "--trajectory", "loop"], "experiment 'loop': unknown"),
+        (["station", "loop", "--link", RADIO], "experiment 'loop': unknown"),
         (["station", "--link", RADIO, "--log", "/nowhere/a.csv"], "--log /nowhere/a.csv: there is no folder /nowhere"),
         (["fly", "hover", "--link", "radio://0/81/2M/E7E7E7E7E7"], f"expected radio, mavlink, {RADIO}"),
         (["fly", "hover", "--link", RADIO, "--seeds", "2"], "--seeds is for flights in lockstep"),
@@ -69,7 +69,6 @@ def test_a_station_refuses_a_port_on_which_no_board_listens(cli: Cli) -> None:
         (["serve", "--mavlink", "usb"], "--mavlink usb: expected pty"),
         (["serve", "--mavlink", "udp:70000"], "--mavlink udp:70000: port 70000"),
         (["serve", "--mavlink", "pty:/no/folder", "--no-motive"], "mavlink pty /no/folder: No such file"),
-        (["serve", "--baud", "57600"], "--baud 57600: there is no serial line without --mavlink"),
         (["serve", "--mavlink", "pty", "--set", "mavlink.system=255", "--boards", "2"], "mavlink.system = 256"),
         (["deploy", "flash", "--uri", NOBODY, "cf2.bin"], "Cannot find a Crazyradio Dongle"),
         (["deploy", "flash", "--uri", "udp://127.0.0.1:19850", "cf2.bin"], "udp://127.0.0.1:19850: expected radio://"),
@@ -95,7 +94,7 @@ def taken() -> Iterator[str]:
 def test_a_server_names_the_port_that_another_program_has(cli: Cli, taken: str) -> None:
     said = cli.refusal("serve", "--no-motive", "--udp", taken)
     assert said == f"floaty: udp port {taken}: Address already in use\n"
-    said = cli.refusal("serve", "--udp", "0", "--natnet-port", taken)
+    said = cli.refusal("serve", "--udp", "0", "--set", f"capture.port={taken}")
     assert said.startswith(
-        f"floaty: natnet port {taken}: Address already in use; --natnet-port 0 takes a free one"
+        f"floaty: natnet port {taken}: Address already in use; --set capture.port=0 takes a free one"
     )

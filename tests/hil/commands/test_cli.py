@@ -72,6 +72,7 @@ def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
         (["fly", "hover", "--gdb", "3333"], "--gdb 3333: needs one flight with an image as --board"),
         (["serve", "--gdb", "3333"], "--gdb 3333: needs one board and an image as --board"),
         (["fly", "hover", "--bogus"], "No such option"),
+        (["serve", "--baud", "9600"], "--baud: now --set serial.baud=N"),
         (["fly"], "Missing argument"),
         (["report", "nowhere"], "nowhere"),
         (["view", "nowhere"], "nowhere"),

@@ -123,5 +123,5 @@ def test_a_project_outside_the_clone_flies_tests_checks_and_exports_with_the_whe
         "c-O2",
     ).stdout
     assert "no bit differs" in checked
-    run(project, command, "deploy", "export", "app", "--profile", "profile.toml")
+    run(project, command, "deploy", "write", "app", "--profile", "profile.toml")
     assert any("integral" in path.read_text() for path in (project / "app").rglob("*.c"))

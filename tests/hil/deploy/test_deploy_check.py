@@ -330,7 +330,7 @@ def test_bad_input_of_check_is_one_line_and_exit_code_two(
 
 
 def test_the_exported_app_holds_the_c_that_is_checked(cli: Cli) -> None:
-    assert cli("deploy", "export", "app", "--profile", "as-flown") == 0
+    assert cli("deploy", "write", "app", "--profile", "as-flown") == 0
     shown = [Path(line) for line in cli.out.splitlines()]
     assert {path for path in Path("app").rglob("*") if path.is_file()} == set(shown)
     assert Path("app/src/floaty_core.c").read_text(encoding="utf-8") == translate().source
@@ -351,6 +351,6 @@ def test_bad_input_of_export_is_one_line_and_exit_code_two(
 ) -> None:
     Path("other").mkdir()
     Path("other/thesis.tex").write_text("mine", encoding="utf-8")
-    assert message in cli.refusal("deploy", "export", *arguments)
+    assert message in cli.refusal("deploy", "write", *arguments)
     assert [path.name for path in Path("other").iterdir()] == ["thesis.tex"]
     assert not Path("app").exists()

@@ -84,7 +84,7 @@ def test_a_parameter_that_is_set_in_flight_reaches_every_target(project: Path) -
 def test_export_from_a_folder_of_the_users_writes_an_app_with_the_c_that_is_checked(
     cli: Cli, project: Path
 ) -> None:
-    assert cli("deploy", "export", "app", "--profile", "profile.toml", "--set", "logic.gain_iy=0.5") == 0
+    assert cli("deploy", "write", "app", "--profile", "profile.toml", "--set", "logic.gain_iy=0.5") == 0
     core = (project / "app" / "src" / "floaty_core.c").read_text(encoding="utf-8")
     assert core == translation_of(LogicConfig(controller=str(project / "controller.py"))).source
     assert str(project) not in core  # the same law is the same C wherever it lies

@@ -55,7 +55,7 @@ def test_a_link_leads_to_its_instant(links: Links, run: Path, at_s: float) -> No
 def test_what_is_no_link_of_this_flight_leads_nowhere(links: Links, run: Path, path: str) -> None:
     status, where, text = answer(links, path)
     assert (status, where) == (404, None)
-    assert text.startswith(f"Here is {run}; for another flight: floaty view RUN --web")
+    assert text.startswith(f"Here is {run}; for another flight: floaty view RUN --view web")
 
 
 def test_the_report_is_there_too(links: Links, run: Path) -> None:

@@ -35,7 +35,7 @@ def test_without_a_display_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp
     for opens in (open_window, lambda: show(str(tmp_path / "flight.rrd"))):
         with pytest.raises(
             LabError,
-            match=r"^the viewer needs a display, and this computer has none; in a browser: floaty view RUN --web",
+            match=r"^the viewer needs a display, and this computer has none; in a browser: floaty view RUN --view web",
         ):
             opens()
 

@@ -333,7 +333,7 @@ def test_no_bytes_stop_the_server(lab: MotiveBench, client: NatNetSocket) -> Non
 def test_a_taken_port_is_said_in_one_line(lab: MotiveBench) -> None:
     with pytest.raises(
         LabError,
-        match=rf"^natnet port {lab.motive.port}: Address already in use; --natnet-port 0 takes",
+        match=rf"^natnet port {lab.motive.port}: Address already in use; --set capture.port=0 takes",
     ):
         VirtualMotive(Streaming(lab.motive.port, (4, 1), False), {1: "floaty"}, {})
 
