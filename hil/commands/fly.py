@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import click
 from rich.progress import TextColumn, TimeRemainingColumn
@@ -30,7 +30,7 @@ from hil.errors import LabError, writing
 
 if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
-    from hil.laboratory.request import InLoop, Request
+    from hil.laboratory.request import Options, Request
 
 SEEDS_MAX = 10_000
 
@@ -42,13 +42,17 @@ SEEDS_MAX = 10_000
     "--seeds", type=click.IntRange(1, SEEDS_MAX), default=1, metavar="N",
     help="Fly N seeds from --seed on, in parallel; logs without pictures.",
 )  # fmt: skip
-@click.option("--duration", type=float, metavar="S", help="Free flight [s]; default: the experiment's.")
+@click.option(
+    "--duration", "duration_s", type=float, metavar="S", help="Free flight [s]; default: the experiment's."
+)
 @profile_option
 @set_option
 @fault_option
 @click.option("--realtime", is_flag=True, help="Pace the flight to the wall clock.")
 @view_option
-@click.option("--perfetto", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace.")
+@click.option(
+    "--perfetto", "trace", is_flag=True, help="Trace the scheduler and write flight.perfetto-trace."
+)
 @click.option(
     "--link", metavar="LINK", default="radio", show_default=True,
     help="radio or mavlink: in lockstep; radio://0/80/2M/E7E7E7E7E7, udp://127.0.0.1:PORT or mavlink:/dev/NAME: over "
@@ -78,49 +82,24 @@ SEEDS_MAX = 10_000
     metavar="DIR",
     help="Run folder [runs/EXPERIMENT-SEED, or -2, -3, … where another request was flown].",
 )
-def fly(
-    experiment: str,
-    seed: int,
-    seeds: int,
-    duration: float | None,
-    profile: str,
-    overrides: tuple[str, ...],
-    fault_texts: tuple[str, ...],
-    realtime: bool,
-    target: str | None,
-    perfetto: bool,
-    link: str,
-    board: str,
-    elf: Path | None,
-    in_loop: InLoop,
-    gdb: int | None,
-    out: Path | None,
-) -> int:
+def fly(experiment: str, seeds: int, target: str | None, out: Path | None, **options: Unpack[Options]) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
 
     Exit code 0: all limits hold; 1: a limit fails; 2: bad input; 130: interrupted.
     """
-    if seeds > 1 and (realtime or target or perfetto):
-        raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
-    if seeds > 1 and in_loop:
-        raise LabError(f"--hil: --seeds {seeds}: a real board is in one flight at a time")
-    if seeds > 1 and gdb is not None:
-        raise LabError(f"--gdb {gdb}: needs one flight with an image as --board")
-    if perfetto:
+    if options["trace"]:
         import hil.exports.perfetto  # noqa: F401 - reports a missing package now, not after the flight
     from hil.api import request_of
 
-    request = request_of(
-        experiment, profile=profile, overrides=overrides, seed=seed, duration_s=duration, faults=fault_texts, link=link,
-        board=board, elf=elf, in_loop=in_loop, gdb=gdb, realtime=realtime, trace=perfetto,
-    )  # fmt: skip
-    announce_compilation()
-    if seeds > 1 and not request.bench.in_lockstep:
-        raise LabError(f"--link {link}: --seeds is for flights in lockstep")
-    if seeds > 1 and "://" in board:
-        raise LabError(f"--board {board}: --seeds {seeds}: a real board is in one flight at a time")
+    request = request_of(experiment, **options)
     if seeds > 1:
-        return _fly_many([replace(request, seed=seed + index) for index in range(seeds)], out or Path("runs"))
+        _check_seeds(seeds, request, target)
+    announce_compilation()
+    if seeds > 1:
+        first = request.seed
+        return _fly_many(
+            [replace(request, seed=first + index) for index in range(seeds)], out or Path("runs")
+        )
     from hil.laboratory.folder import folder_of, moved, reserved
 
     folder = out or folder_of(request)
@@ -128,6 +107,19 @@ def fly(
         notices.print(why, soft_wrap=True)
     with reserved(request, folder):
         return _fly_one(request, folder, target)
+
+
+def _check_seeds(seeds: int, request: Request, target: str | None) -> None:
+    """Raise `LabError` for a request of which only one seed can fly at a time."""
+    bench = request.bench
+    if bench.realtime or target or bench.trace:
+        raise LabError(f"--seeds {seeds}: --realtime, --view and --perfetto are for one seed")
+    if bench.gdb is not None:
+        raise LabError(f"--gdb {bench.gdb}: needs one flight with an image as --board")
+    if not bench.in_lockstep:
+        raise LabError(f"--link {bench.link}: --seeds is for flights in lockstep")
+    if bench.in_loop or "://" in bench.board:
+        raise LabError(f"--board {bench.board}: --seeds {seeds}: a real board is in one flight at a time")
 
 
 def _fly_one(request: Request, folder: Path, target: str | None) -> int:

@@ -36,7 +36,7 @@ seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**62), default=1, show_default=True, help="Of everything random."
 )
 fault_option = click.option(
-    "--fault", "fault_texts", multiple=True, metavar="KIND@START[:DURATION][=SIZE]",
+    "--fault", "faults", multiple=True, metavar="KIND@START[:DURATION][=SIZE]",
     help="Inject a fault START seconds after the release; repeatable. `floaty list --faults` lists the kinds.",
 )  # fmt: skip
 profile_option = click.option(

@@ -86,7 +86,7 @@ def serve(
     motive: bool,
     state: Path | None,
     target: str | None,
-    fault_texts: tuple[str, ...],
+    faults: tuple[str, ...],
     seed: int,
     profile: str,
     overrides: tuple[str, ...],
@@ -123,14 +123,14 @@ def serve(
     )  # as Bitcraze's programs send them
     config = load_config(profile, (*markers, *poses, *overrides))
     ends = parse_addresses(mavlink, boards) if mavlink is not None else []
-    faults = [parse(text) for text in fault_texts]
-    check(faults, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
+    planned = [parse(text) for text in faults]
+    check(planned, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
     announce_compilation()
     stack = click.get_current_context().with_resource(ExitStack())
     port = debugger(gdb, Path(board or ""), stack)
     executor = PYTHON_BOARD if board is None else image_at(board, None, port)
     view = open_live(target)
-    server = Server(config, boards, seed, say, bool(ends), faults, state, view, executor)
+    server = Server(config, boards, seed, say, bool(ends), planned, state, view, executor)
     try:
         streaming = streaming_of(config.capture) if motive else None
         _open_ends(server.ends, udp, radio_port if radio else None, ends, streaming)
