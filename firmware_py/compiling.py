@@ -9,6 +9,7 @@ import hashlib
 import inspect
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -44,6 +45,14 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
         return cast(Function, dispatcher)
 
     return compiled
+
+
+def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """Return the call of a function on these arguments; a compiled one then looks at their types only now."""
+    compiled = getattr(function, "compile", None)
+    if compiled is None:
+        return partial(function, *arguments)
+    return partial(compiled(tuple(map(numba.typeof, arguments))), *arguments)
 
 
 def is_kept(function: Callable[..., Any]) -> bool:

@@ -5,9 +5,9 @@ under `firmware_py.export` the same core as C on this machine and as machine cod
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
+from firmware_py.compiling import bound
 from firmware_py.config import CpuConfig
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Parameters, Report, Sampling, Supervisor
@@ -97,18 +97,21 @@ class CoreBlocks:
 class PythonRunner:
     """Runs the Python sources: compiled by numba, or plain with NUMBA_DISABLE_JIT=1."""
 
-    __slots__ = ("_calls",)
+    __slots__ = ("_blocks", "_calls")
 
     def __init__(self, blocks: CoreBlocks) -> None:
-        module = entry if blocks.logic is None else blocks.logic.loaded.entry
-        self._calls: dict[str, Callable[[], Any]] = {
-            name: partial(getattr(module, name), *(blocks.named[block].arg for block in taken))
-            for name, taken in blocks.calls.items()
-        }
+        self._blocks = blocks
+        self._calls: dict[str, Callable[[], Any]] = {}
 
     def call(self, name: str) -> int:
-        """Execute an entry point."""
-        return int(self._calls[name]() or 0)
+        """Execute an entry point; its first call compiles it."""
+        return int((self._calls.get(name) or self._bind(name))() or 0)
+
+    def _bind(self, name: str) -> Callable[[], Any]:
+        blocks = self._blocks
+        module = entry if blocks.logic is None else blocks.logic.loaded.entry
+        arguments = (blocks.named[block].arg for block in blocks.calls[name])
+        return self._calls.setdefault(name, bound(getattr(module, name), *arguments))
 
 
 class ConfiguredCosts:
