@@ -1,9 +1,7 @@
 """The command line as a user meets it: exit codes, one-line errors, files where it says they are."""
 
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -100,14 +98,6 @@ def test_perfetto_writes_its_trace(cli: Cli) -> None:
 
 
 @pytest.mark.long
-def test_report_can_be_written_again(cli: Cli) -> None:
-    cli("fly", "hover", "--duration", "0.5", "--out", "run")
-    Path("run/report.html").unlink()
-    assert cli("report", "run") == 0
-    assert Path("run/report.html").stat().st_size > 10_000
-
-
-@pytest.mark.long
 def test_seeds_fly_in_other_processes_with_the_same_hash(cli: Cli) -> None:
     assert cli("fly", "hover", "--duration", "1", "--seed", "4", "--seeds", "2") == 0
     assert "2 seeds: 2 hold all limits, 0 lost" in cli.out
@@ -132,17 +122,6 @@ def start(*arguments: str) -> "subprocess.Popen[str]":
     while rows_on_disk() < 100:
         assert process.poll() is None, process.stdout.read()
     return process
-
-
-@pytest.mark.long
-def test_ctrl_c_leaves_log_report_and_recording(tmp_path: Path) -> None:
-    process = start("fly", "hover", "--realtime", "--duration", "600", "--out", "run")
-    process.send_signal(signal.SIGINT)
-    shown, _ = process.communicate(timeout=60)
-    assert process.returncode == 130, shown
-    assert "interrupted" in shown
-    assert load_log(tmp_path / "run").num_rows >= 100
-    assert {"report.html", "flight.rrd", "result.json"} <= set(os.listdir("run"))
 
 
 @pytest.mark.long
