@@ -177,13 +177,8 @@ class RealFlight:
             metrics=metrics,
             own_metrics=own,
             verdicts=tuple(judge(metrics, self._request.limits, own)),
-            tasks=(),
-            queues=(),
-            usage=None,
             ages=ages_of(reported_ages(folder), log, self._request.bench.link),
             hash=digest,
-            real_time_factor=nan,
-            stood_still_ms=nan,
             folder=folder,
         )
 

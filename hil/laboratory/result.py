@@ -78,13 +78,13 @@ class Result:
     metrics: Mapping[str, Figure]
     own_metrics: Mapping[str, Metric]  # the definitions of the experiment's own metrics
     verdicts: tuple[Verdict, ...]
-    tasks: tuple[TaskReport, ...]
-    queues: tuple[QueueReport, ...]
-    usage: Usage | None  # of the board, where it was measured
     ages: tuple[Stage, ...]  # the latency budget of the poses
     hash: str  # empty: the process was killed
-    real_time_factor: Figure
-    stood_still_ms: Figure  # simulated time, while the machine was too slow for a paced flight
+    tasks: tuple[TaskReport, ...] = ()
+    queues: tuple[QueueReport, ...] = ()
+    usage: Usage | None = None  # of the board, where it was measured
+    real_time_factor: Figure = math.nan
+    stood_still_ms: Figure = math.nan  # simulated time, while the machine was too slow for a paced flight
     folder: Annotated[Path, Field(exclude=True)] = Path()  # its run folder
     image: ImageReport | None = None  # of a board that executes an image
     not_shown: int | None = None  # rows of the log that the live viewer did not take; null without one
@@ -149,8 +149,7 @@ def _of_killed(folder: Path, find: Find) -> Result:
     metadata = log.schema.metadata
     outcome = {
         "outcome": "error", "cause": "the process ended before the flight did", "metrics": measure(log, lost=False),
-        "own_metrics": {}, "verdicts": (), "tasks": (), "queues": (), "usage": None, "ages": (), "hash": "",
-        "real_time_factor": math.nan, "stood_still_ms": math.nan,
+        "own_metrics": {}, "verdicts": (), "ages": (), "hash": "",
     }  # fmt: skip
     try:
         return _read(
