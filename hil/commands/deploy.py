@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import click
 from rich.console import Console
@@ -22,6 +22,7 @@ from ground_station.errors import LinkError
 from hil.commands.options import (
     INTERRUPTED,
     announce_compilation,
+    fault_option,
     profile_option,
     progress_bar,
     say,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from hil.deploy.doctor import Finding
     from hil.deploy.targets import Loads, MachineCode
     from hil.laboratory.flight import Flight
+    from hil.laboratory.request import Options
 
 console = Console(highlight=False, markup=False)
 
@@ -51,15 +53,14 @@ def deploy() -> None:
 )
 @click.option(
     "--duration",
+    "duration_s",
     type=click.FloatRange(0, 86_400, min_open=True),
     metavar="S",
     help="Free flight [s]; default: the experiment's.",
 )
 @profile_option
 @set_option
-@click.option(
-    "--fault", "fault_texts", multiple=True, metavar="KIND@START[:DURATION][=SIZE]", help="As for fly; repeatable.",
-)  # fmt: skip
+@fault_option
 @click.option(
     "--targets", "target_text", metavar="NAME,...",
     help="What to compare with numba: plain, c-O0, c-O2, cortex-m4, and real boards: radio://…, usb://0, udp://…  "
@@ -70,38 +71,32 @@ def deploy() -> None:
     help="Check this floaty_core.c, which was exported before, instead of a fresh export.",
 )  # fmt: skip
 @click.option(
-    "--elf", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    "--elf", "firmware", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
     help="Check this linked firmware, the build/cf2.elf that is flashed: its core as cortex-m4 (only that, unless --targets "
     "says otherwise), its parameters and a flight of it on the emulated board.",
 )  # fmt: skip
 def check(
     experiment: str | None,
     every: bool,
-    seed: int,
-    duration: float | None,
-    profile: str,
-    overrides: tuple[str, ...],
-    fault_texts: tuple[str, ...],
     target_text: str | None,
     source: Path | None,
-    elf: Path | None,
+    firmware: Path | None,
+    **options: Unpack[Options],
 ) -> int:
     """Fly with numba, plain Python, C and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
 
     Without EXPERIMENT: hover, yaw step and a hover with faults, 10 000 ticks of 10 ms. Exit code 0: no bit differs; 1: one
     does; 2: bad input; 130: interrupted. With --elf 1 also when anything else in the firmware is not as in PROFILE.
     """
+    from hil.config import settings_of
     from hil.deploy.check import check_flight, plan
     from hil.deploy.targets import CORTEX_M4, Toolbox, target_names
-    from hil.laboratory.faults import parse
 
-    if source and elf:
+    if source and firmware:
         raise LabError("--source and --elf: one or the other")
-    names = target_names(CORTEX_M4 if elf and target_text is None else target_text)
-    flights = plan(
-        experiment, every, profile, overrides, seed, duration, [parse(text) for text in fault_texts]
-    )
-    toolbox = Toolbox(names, flights[0].config.logic, _read(source) if source else None, elf)
+    names = target_names(CORTEX_M4 if firmware and target_text is None else target_text)
+    flights = plan(experiment, every, **options)
+    toolbox = Toolbox(names, flights[0].config.logic, _read(source) if source else None, firmware)
     announce_compilation()
     checked: list[Checked] = []
     for request in flights:
@@ -119,8 +114,8 @@ def check(
     if checked[-1].outcome == "interrupted":
         return INTERRUPTED
     well = all(one.equal and not one.failed for one in checked)
-    if elf is not None:
-        well = _check_around(elf, profile, overrides) and well
+    if firmware is not None:
+        well = _check_around(firmware, options["profile"], settings_of(options["overrides"])) and well
     return 0 if well else 1
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Unpack
 
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
 from firmware_py.export.errors import ExportError
@@ -21,7 +22,7 @@ from hil.experiments import EXPERIMENTS, find_experiment
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
-from hil.laboratory.request import Request
+from hil.laboratory.request import Options, Request
 
 DEFAULT = ("hover", "yaw-step")  # and the one with faults: 10 000 ticks in all
 LONGEST_S = 60.0  # of an experiment with --all: `endurance` takes half an hour
@@ -87,25 +88,17 @@ def check_flight(
     return Checked(request, outcome, tuple(made[0].targets))
 
 
-def plan(
-    experiment: str | None, every: bool, profile: str, overrides: Sequence[str], seed: int, duration_s: float | None,
-    faults: Sequence[Fault],
-) -> list[Request]:  # fmt: skip
+def plan(experiment: str | None, every: bool, **options: Unpack[Options]) -> list[Request]:
     """Return the flights to check: one experiment, every one, or by default hover, yaw step and a hover with faults."""
+    duration_s, faults = options.get("duration_s"), options.get("faults", ())
     if every and experiment is not None:
         raise LabError(f"{experiment} and --all: one or the other")
     if faults and experiment is None:
         raise LabError(f"--fault {faults[0]}: for which EXPERIMENT?")
 
-    def request(name: str, length_s: float | None, faults: Sequence[Fault] = ()) -> Request:
-        return Request.of(
-            find_experiment(name),
-            profile=profile,
-            overrides=overrides,
-            seed=seed,
-            duration_s=length_s,
-            faults=faults,
-        )
+    def request(name: str, length_s: float | None, faults: Sequence[Fault | str] = ()) -> Request:
+        chosen: Options = {**options, "duration_s": length_s, "faults": faults}
+        return Request.of(find_experiment(name), **chosen)
 
     if experiment is not None:
         return [request(experiment, duration_s, faults)]

@@ -20,7 +20,6 @@ from firmware_py.extras import install_command
 from hil.deploy.check import Checked, check_flight, plan
 from hil.deploy.targets import TARGETS
 from hil.devices.board_firmware import PythonBoard
-from hil.laboratory.faults import parse
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from support.command import Cli
@@ -56,7 +55,7 @@ class Spoilt(PythonRunner):
 
 
 def fly_beside(factory: RunnerFactory) -> Checked:
-    [request] = plan("hover", False, "floaty", (), 3, 0.5, ())
+    [request] = plan("hover", False, seed=3, duration_s=0.5)
     return check_flight(request, lambda stack: {"spoilt": factory}, lambda now_us, flight: None)
 
 
@@ -108,7 +107,7 @@ def test_a_target_that_has_differed_does_not_hide_the_others() -> None:
 
         return {"spoilt": spoilt, "python": PythonRunner}
 
-    [request] = plan("hover", False, "floaty", (), 3, 0.5, ())
+    [request] = plan("hover", False, seed=3, duration_s=0.5)
     checked = check_flight(request, factories, lambda now_us, flight: None)
     assert [target.ticks for target in checked.targets] == [20, 150]
     assert not checked.equal
@@ -116,7 +115,7 @@ def test_a_target_that_has_differed_does_not_hide_the_others() -> None:
 
 
 def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> None:
-    flights: list[Request] = plan(None, False, "floaty", (), 1, None, ())
+    flights: list[Request] = plan(None, False)
     assert [(one.experiment.name, bool(one.faults)) for one in flights] == [
         ("hover", False), ("yaw-step", False), ("hover", True),
     ]  # fmt: skip
@@ -181,7 +180,7 @@ def test_one_changed_operator_in_the_c_is_exit_one_and_found_in_its_tick(
     options = ("--targets", target, "--source", "changed.c")
     assert cli("deploy", "check", "hover", *SOMETHING_OF_EACH, *options) == 1
     shown = cli.out
-    [request] = plan("hover", False, "floaty", (), 1, 0.8, [parse(text) for text in SOMETHING_OF_EACH[3::2]])
+    [request] = plan("hover", False, duration_s=0.8, faults=SOMETHING_OF_EACH[3::2])
     Watch.first.clear()
     flight = lockstep_flight(request, executor=PythonBoard(Watch))
     flight.run()
