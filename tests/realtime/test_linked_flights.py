@@ -26,6 +26,22 @@ def fly(folder: Path, *arguments: str) -> dict[str, Any]:
     return result
 
 
+def test_a_link_that_leads_nowhere_is_one_line_and_exit_code_two(tmp_path: Path) -> None:
+    command = [
+        *FLOATY,
+        "fly",
+        "hover",
+        "--link",
+        "radio://0/81/2M/E7E7E7E7E7",
+        "--out",
+        str(tmp_path / "run"),
+    ]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert shown.returncode == 2
+    assert f"expected radio, mavlink, {DONGLE}" in shown.stderr
+    assert len(shown.stderr.strip().splitlines()) == 1
+
+
 def test_the_complete_laboratory_flies_hover_within_its_limits(tmp_path: Path) -> None:
     """Motive, station process and virtual dongle for 8 s; the limits leave a busy machine room, the ages less."""
     result = fly(tmp_path / "run", *HOVER, "--link", DONGLE, "--duration", "8")

@@ -61,7 +61,6 @@ def test_a_station_refuses_a_port_on_which_no_board_listens(cli: Cli) -> None:
         (["station", "--link", RADIO, "--mocap", "vicon"], "--mocap vicon: expected optitrack:HOST"),
         (["station", "loop", "--link", RADIO], "experiment 'loop': unknown"),
         (["station", "--link", RADIO, "--log", "/nowhere/a.csv"], "--log /nowhere/a.csv: there is no folder /nowhere"),
-        (["fly", "hover", "--link", "radio://0/81/2M/E7E7E7E7E7"], f"expected radio, mavlink, {RADIO}"),
         (["fly", "hover", "--link", RADIO, "--seeds", "2"], "--seeds is for flights in lockstep"),
         (["serve", "--set", "radio.uplink_loss=2"], "radio.uplink_loss = 2"),
         (["serve", "--boards", "11"], "11"),
