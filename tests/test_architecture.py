@@ -49,8 +49,8 @@ FLOORS = (
     ("pictures", "exports"),
     ("servers", "live"),
     ("api", "design"),
-    ("identify",),
-    ("studies", "campaigns", "deploy", "testing"),
+    ("identify", "campaigns"),
+    ("studies", "deploy", "testing"),
     ("commands",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -66,18 +66,18 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "youplot": ("hil/pictures/pages.py",),
     "time": (
         "hil/clock.py", "hil/commands/listing.py",
-        "hil/campaigns/flying.py", "ground_station/clock.py",
+        "hil/campaigns/jobs.py", "ground_station/clock.py",
     ),
     "datetime": (),
     "asyncio": (),
     "threading": (
-        "hil/live/feed.py", "hil/campaigns/cluster.py",
+        "hil/live/feed.py", "hil/campaigns/workers.py",
         "ground_station/links/live_link.py", "ground_station/links/crazyradio.py", "ground_station/links/mavlink_serial.py",
         "ground_station/terminal.py",
     ),
     "prompt_toolkit": ("ground_station/terminal.py",),
-    "multiprocessing": ("hil/studies/sweep.py",),
-    "concurrent": ("hil/studies/sweep.py", "hil/campaigns/cluster.py"),
+    "multiprocessing": ("hil/campaigns/workers.py",),
+    "concurrent": ("hil/campaigns/workers.py",),
     "unicorn": ("firmware_py/export/cortex_m4.py", "hil/stm32f405/chip.py"),
     "elftools": ("firmware_py/export/elf.py",),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
@@ -108,8 +108,8 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "control.dlqr": ("hil/design/",),
     "control.stability_margins": ("hil/design/",),  # `control` alone is also a name of ours
     "SALib": ("hil/campaigns/",),
-    "dask": ("hil/campaigns/cluster.py",),
-    "distributed": ("hil/campaigns/cluster.py",),
+    "dask": (),
+    "distributed": ("hil/campaigns/workers.py",),
     "pytest": ("hil/testing/",),
     "hypothesis": ("hil/testing/strategies.py",),
     "perfetto": ("hil/exports/perfetto.py",),
@@ -132,8 +132,7 @@ BY_PROCESSOR = """
 """.split()  # noqa: SIM905
 CONFINED |= dict.fromkeys(BY_PROCESSOR, AFTER_THE_FLIGHT)
 CONFINED["click"] = CONFINED["rich"] = (
-    "hil/commands/", "hil/studies/sweep.py", "hil/studies/paper.py", "hil/studies/tuning.py",
-    "hil/studies/paper_identification.py", "hil/studies/paper_scaling.py",
+    "hil/commands/", "hil/campaigns/run.py",
 )  # fmt: skip
 # Of a whole flight.
 CONFINED |= dict.fromkeys(("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",))
@@ -252,7 +251,7 @@ def test_file_keeps_to_its_room(path: Path) -> None:
         ("hil/pictures/report.py", "import hil.servers.server"),
         ("hil/deploy/check.py", "from hil.studies.paper import fly_paper"),
         ("hil/campaigns/run.py", "from distributed import Client"),
-        ("hil/campaigns/run.py", "from hil.studies.sweep import fly_all"),
+        ("hil/campaigns/run.py", "from hil.studies.paper import fly_paper"),
         ("hil/clock.py", "from hil.config import LabConfig"),
         ("hil/stm32f405/processor.py", "from firmware_py.rtos import Kernel"),
         ("hil/stm32f405/chip.py", "from hil.crazyflie import syslink"),

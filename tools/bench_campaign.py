@@ -1,4 +1,4 @@
-"""What Dask's workers make of a campaign: `python tools/bench.py --campaign` calls this.
+"""What the workers make of a campaign: `python tools/bench.py --campaign` calls this.
 
 The flights are those of `floaty campaign table`, of the length that the bench says.
 """
@@ -7,26 +7,26 @@ import time
 
 import psutil
 
-from hil.campaigns.cluster import FlyOne, Workers
 from hil.campaigns.config import find_spec, read_spec
-from hil.campaigns.flying import Campaign, CampaignRow, failed, fly_flight
-from hil.campaigns.sampling import draw
+from hil.campaigns.jobs import Job, Row, failed, fly_job
+from hil.campaigns.sampling import plan_of
+from hil.campaigns.workers import FlyOne, Workers
 
 FLIGHTS = 24
 EMPTY_FLIGHTS = 300
 SHORT_S, SETTLED, SHORT_FLIGHTS = 0.1, 200, 1200  # flights until memory is measured first and last
 
 
-def nothing(campaign: Campaign, index: int) -> CampaignRow:
-    """Return a row without flying: what is left is Dask and the dataset's numbers."""
-    return failed(draw(campaign.spec, index), "not flown")
+def nothing(job: Job) -> Row:
+    """Return a row without flying: what is left is drawing the flight and sending job and row."""
+    return failed(job, "not flown")
 
 
 def flights_per_s(flight_s: float, count: int) -> float:
     """Flights per second of wall time on `count` workers, after one flight of each that loads everything."""
     workers = Workers(count)
-    _timed(workers, flight_s, range(count), fly_flight)
-    wall_s = _timed(workers, flight_s, range(count, count + FLIGHTS), fly_flight)
+    _timed(workers, flight_s, range(count), fly_job)
+    wall_s = _timed(workers, flight_s, range(count, count + FLIGHTS), fly_job)
     workers.close()
     return FLIGHTS / wall_s
 
@@ -41,11 +41,11 @@ def overhead_s() -> float:
 
 
 def growth_kb() -> float:
-    """Memory that a worker and the scheduler keep per short flight [kB]."""
+    """Memory that a worker and this process keep per short flight [kB]."""
     workers = Workers(1)
-    _timed(workers, SHORT_S, range(SETTLED), fly_flight)
+    _timed(workers, SHORT_S, range(SETTLED), fly_job)
     before = _memory(workers)
-    _timed(workers, SHORT_S, range(SETTLED, SHORT_FLIGHTS), fly_flight)
+    _timed(workers, SHORT_S, range(SETTLED, SHORT_FLIGHTS), fly_job)
     grown = _memory(workers) - before
     workers.close()
     return grown / 1e3 / (SHORT_FLIGHTS - SETTLED)
@@ -54,12 +54,12 @@ def growth_kb() -> float:
 def _timed(workers: Workers, flight_s: float, indices: range, fly_one: FlyOne) -> float:
     spec = read_spec(find_spec("table")).model_copy(update={"duration_s": flight_s, "flights": 2048})
     start = time.perf_counter()
-    rows = list(workers.fly(Campaign.of(spec), lambda: False, iter(indices), fly_one))
+    rows = list(workers.fly(map(plan_of(spec).job, indices), lambda: 0, fly_one))
     assert len(rows) == len(indices)
     return time.perf_counter() - start
 
 
 def _memory(workers: Workers) -> float:
-    """Bytes of this process, in which the scheduler is, and of all workers."""
+    """Bytes of this process and of all workers."""
     here = psutil.Process()
     return sum(process.memory_info().rss for process in (here, *here.children(recursive=True)))

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from hil.experiments import find_experiment
+from hil.campaigns.run import Runner
 from hil.identify.identify import IdentifiedConstant, identify
-from hil.identify.record import KEPT, load_record
-from hil.laboratory.request import Request
-from hil.studies.sweep import Job, fly_all
+from hil.identify.record import load_record
+from hil.laboratory.request import Options
 from hil.studies.tuning import EXCITATIONS
 from hil.world.paper_table import PAPER_TABLE
 
@@ -49,16 +48,17 @@ def main(count: int, folder: Path) -> None:
     robots = {"methods": (), "methods_open": OPEN} | {
         f"drawn-{seed}": drawn(seed) for seed in range(FIRST_SEED, FIRST_SEED + count)
     }
-    jobs = [
-        Job(Request.of(find_experiment(name), overrides=settings, seed=4 * number + place), folder / f"{robot}-{name}", KEPT)
+    flights = {
+        f"{robot}-{name}": (name, Options(overrides=settings, seed=4 * number + place))
         for number, (robot, settings) in enumerate(robots.items(), 1)
         for place, name in enumerate(EXCITATIONS)
-    ]  # fmt: skip
-    fly_all(jobs, Console(stderr=True))
+    }
+    with Runner(Console(stderr=True)) as runner:
+        runner.log("coverage", flights, folder)
     found: dict[str, list[IdentifiedConstant]] = {}
     for robot in robots:
-        flights = [load_record(folder / f"{robot}-{name}", "floaty") for name in EXCITATIONS]
-        for constant in identify(flights).constants:
+        records = [load_record(folder / f"{robot}-{name}", "floaty") for name in EXCITATIONS]
+        for constant in identify(records).constants:
             if np.isfinite(constant.truth):
                 found.setdefault(constant.name, []).append(constant)
     everything = [constant for several in found.values() for constant in several]

@@ -26,9 +26,10 @@ from scipy.special import expit
 from hil.api import command_of
 from hil.campaigns.config import Spec
 from hil.campaigns.run import Rate
-from hil.campaigns.sampling import LEVELS, CubeAxis, as_flown, axes, draw, points_of, problem, request_of
+from hil.campaigns.sampling import LEVELS, CubeAxis, as_flown, axes, draw, points_of, problem
 from hil.errors import LabError
 from hil.laboratory.metrics import METRICS, Metric
+from hil.laboratory.request import Options
 
 Array = NDArray[np.float64]
 WORST = 10
@@ -144,9 +145,11 @@ def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
     found = []
     for cell in range(len(spec.experiments) * len(spec.profiles)):
         drawn = draw(spec, cell)
-        request = request_of(spec, replace(drawn, settings=spec.settings), ())
+        profile = drawn.options["profile"]
+        plain = Options(profile=profile, overrides=spec.settings, duration_s=spec.duration_s, link=spec.link)
+        request = replace(drawn, options=plain).request()
         mine = pc.and_(
-            pc.equal(flights["experiment"], drawn.experiment), pc.equal(flights["profile"], drawn.profile)
+            pc.equal(flights["experiment"], drawn.experiment), pc.equal(flights["profile"], profile)
         )
         rows = flights.filter(mine)
         for name, bound in request.limits.items():
@@ -155,9 +158,7 @@ def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
             metric = request.experiment.metrics.get(name) or METRICS[name]
             rate = Rate(len(holds) - (pc.sum(holds).as_py() or 0), len(holds))
             found.append(
-                Limited(
-                    drawn.experiment, drawn.profile, name, metric, bound, rate, values[np.isfinite(values)]
-                )
+                Limited(drawn.experiment, profile, name, metric, bound, rate, values[np.isfinite(values)])
             )
     return tuple(found)
 
@@ -236,9 +237,7 @@ def _worst(spec: Spec, flights: pa.Table, limits: tuple[Limited, ...]) -> tuple[
     found = []
     for _, index, outcome, why in sorted(ranked)[:WORST]:
         try:
-            command = (
-                command_of(request_of(spec, draw(spec, index))) or "(an experiment that no command names)"
-            )
+            command = command_of(draw(spec, index).request()) or "(an experiment that no command names)"
         except LabError as error:
             command = f"({error})"
         found.append(Worst(index, outcome, why, command))

@@ -11,9 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hil.campaigns.config import Spec, spec_text
-from hil.campaigns.dataset import about, read_flights, schema_of
+from hil.campaigns.dataset import Dataset, about
 from hil.campaigns.findings import FailureMap, Findings, Limited, find
-from hil.campaigns.flying import Campaign
 from hil.campaigns.sampling import CubeAxis, value_at
 from hil.laboratory.metrics import SHOWN
 from hil.pictures import curves
@@ -27,17 +26,16 @@ TICKS = 5
 SHADES = 10
 
 
-def write_report(folder: Path, named: str, campaign: Campaign, complete: bool) -> tuple[Path, Findings]:
+def write_report(named: str, spec: Spec, dataset: Dataset, complete: bool) -> tuple[Path, Findings]:
     """Write report and result of the dataset of a campaign, as the user names it; return report and findings."""
-    spec = campaign.spec
-    findings = find(spec, read_flights(folder, schema_of(campaign)))
+    folder, findings = dataset.folder, find(spec, dataset.table())
     histograms = [one for one in findings.limits if len(one.values) > 1]
     mapped = findings.failure_map
     page = write_page(
         folder / REPORT, "campaign.html.j2", spec=spec, found=findings, complete=complete,
         histograms=data_uri(png(lambda: _histograms(histograms))) if histograms else "",
         failure_map=data_uri(png(lambda: _map(mapped))) if mapped is not None else "",
-        named=quote(named), begun=about(campaign)["commit"],
+        named=quote(named), begun=about(dataset.plan)["commit"],
     )  # fmt: skip
     text = json.dumps(_content(spec, findings, complete), indent=2)
     (folder / RESULT).write_text(text + "\n", encoding="utf-8")

@@ -1,25 +1,36 @@
-"""Flying a campaign: which flights are left, when enough is known, and the interim result.
+"""The one way to fly many flights: workers, a dataset, progress, Ctrl-C and the decision when enough is known.
 
-The function that flies is handed in: `hil.campaigns.cluster` uses Dask's workers. Rows arrive in any order; decisions are
-made on the flights in the order of their numbers, so it is the same for every number of workers.
+A campaign, a study, the paper, seeds and tuning are plans (`hil.campaigns.jobs`); their questions are answered from the
+rows. Rows arrive in any order; decisions are made on the flights in the order of their numbers, so they are the same for
+every number of workers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+import os
+import signal
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
+from math import sqrt
+from pathlib import Path
 
-from scipy.stats import binomtest
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
 
-from hil.campaigns.config import Spec
-from hil.campaigns.dataset import Dataset, read_flights
-from hil.campaigns.flying import CampaignRow
+from hil.campaigns.dataset import Dataset
+from hil.campaigns.jobs import LOG_AND_TELEMETRY, Job, Plan, Row
+from hil.campaigns.workers import Workers
+from hil.errors import LabError
+from hil.laboratory.request import Options
 
-CONFIDENCE = 0.95
+DEVIATIONS = 1.959963984540054  # of the normal distribution, that hold 95 %
 STOP_FROM = 30  # flights; from fewer the interval is too wide to stop
 
-# From numbers of flights to their rows, in any order; ends early when interrupted.
-Flyer = Callable[[Iterator[int]], Generator[CampaignRow]]
+# From flights to their rows, in any order; ends early when interrupted.
+Flyer = Callable[[Iterator[Job]], Generator[Row]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +42,7 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's interval of the rate with CONFIDENCE."""
+        """Wilson's interval of the rate with 95 % confidence."""
         return interval(self.failed, self.flown)
 
     def __str__(self) -> str:
@@ -45,22 +56,24 @@ class Standing(Rate):
     """The interim result."""
 
     planned: int
-    complete: bool  # all flights that the campaign needs have been flown
+    complete: bool  # all flights that the plan needs have been flown
 
 
 def interval(failed: int, flown: int) -> tuple[float, float]:
     """Return Wilson's interval for a rate."""
     if flown == 0:
         return 0.0, 1.0
-    low, high = binomtest(failed, flown).proportion_ci(CONFIDENCE, "wilson")
-    return float(low), float(high)
+    share, z2 = failed / flown, DEVIATIONS * DEVIATIONS
+    centre = (failed + z2 / 2.0) / (flown + z2)
+    half = DEVIATIONS * sqrt(flown * share * (1.0 - share) + z2 / 4.0) / (flown + z2)
+    return (centre - half if failed else 0.0), (centre + half if failed < flown else 1.0)
 
 
 class Progress:
-    """Counts rows; `end` is the number of flights that the campaign needs, once it is known."""
+    """Counts rows; `end` is the number of flights that the plan needs, once it is known."""
 
-    def __init__(self, spec: Spec) -> None:
-        self._spec = spec
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
         self._waiting: dict[int, bool] = {}  # flights of which some predecessors are missing
         self._flown = self._failed = self._known = self._failed_of_known = 0
         self.end: int | None = None
@@ -73,38 +86,129 @@ class Progress:
         while self.end is None and self._known in self._waiting:
             self._failed_of_known += not self._waiting.pop(self._known)
             self._known += 1
-            if self._known == self._spec.flights or self._knows_enough():
+            if self._known == self._plan.flights or self._knows_enough():
                 self.end = self._known
 
     def _knows_enough(self) -> bool:
-        if self._spec.half_width is None or self._known < STOP_FROM:
+        if self._plan.half_width is None or self._known < STOP_FROM:
             return False
         low, high = interval(self._failed_of_known, self._known)
-        return (high - low) / 2.0 <= self._spec.half_width
+        return (high - low) / 2.0 <= self._plan.half_width
 
     @property
     def standing(self) -> Standing:
         """The interim result now."""
         if self.end is None:
-            return Standing(self._failed, self._flown, self._spec.flights, complete=False)
+            return Standing(self._failed, self._flown, self._plan.flights, complete=False)
         return Standing(self._failed_of_known, self.end, self.end, complete=True)
 
 
-def conduct(spec: Spec, dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) -> Standing:
+def conduct(dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) -> Standing:
     """Fly the flights missing in the dataset, until all are flown, enough is known or the flyer ends."""
-    progress = Progress(spec)
-    for row in read_flights(dataset.folder, dataset.schema, ["index", "passed"]).to_pylist():
+    plan, progress, there = dataset.plan, Progress(dataset.plan), set()
+    for row in dataset.table(["index", "passed"]).to_pylist():
         progress.add(row["index"], row["passed"])
+        there.add(row["index"])
     show(progress.standing)
-    there = frozenset(dataset.indices)
-    left = (index for index in range(spec.flights) if index not in there)
-    rows = flyer(left)
+    rows = flyer(plan.job(index) for index in range(plan.flights) if index not in there)
     try:
-        while progress.end is None and (row := next(rows, None)) is not None:
-            dataset.add(row)
-            progress.add(row.index, row.passed)
+        while progress.end is None and (flown := next(rows, None)) is not None:
+            dataset.add(flown)
+            progress.add(flown.job.index, flown.passed)
             show(progress.standing)
     finally:
         rows.close()
         dataset.close(progress.end)
     return progress.standing
+
+
+class Runner:
+    """Flies plans, each into a dataset. Its workers start with the first flight and stay until the `with` block ends.
+
+    `interrupted` is set by Ctrl-C, after which the flights that have begun are completed, and no other plan is flown.
+    """
+
+    def __init__(
+        self, notices: Console, workers: int | None = None, cluster: str = "", resume: bool = False
+    ) -> None:
+        if workers and cluster:
+            raise LabError(f"--workers {workers}: not together with --cluster {cluster}")
+        self._notices, self._cluster, self._resume = notices, cluster, resume
+        self._count = workers or len(os.sched_getaffinity(0))
+        self._workers: Workers | None = None
+        self._stops: list[int] = []
+
+    def __enter__(self) -> Runner:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._workers is not None:
+            self._workers.close()
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether it was asked to end early."""
+        return bool(self._stops)
+
+    def campaign(self, plan: Plan, folder: Path, replace: bool = False) -> tuple[Dataset, Standing]:
+        """Fly a plan into the dataset of a folder; a plan that was begun there may be replaced, unless it is resumed."""
+        dataset = Dataset(folder, plan, self._resume, replace)
+        with self._progress() as show, self._stops_noted():
+            return dataset, conduct(dataset, self._flown, show)
+
+    def fly(self, name: str, jobs: Sequence[Job], out: Path) -> list[Row]:
+        """Return the rows of flights, after Ctrl-C of those that are complete; their dataset is `out/campaigns/name`."""
+        return self.campaign(Plan.of(jobs), out / "campaigns" / name, replace=True)[0].rows()
+
+    def log(self, name: str, flights: Mapping[str, tuple[str, Options]], out: Path) -> list[Row]:
+        """Fly experiments, each with log and telemetry into the folder of its name in `out`; empty after Ctrl-C.
+
+        Raises `LabError` for a flight that ends with an error.
+        """
+        jobs = [
+            Job(0, experiment, options, {}, out / folder, LOG_AND_TELEMETRY)
+            for folder, (experiment, options) in flights.items()
+        ]
+        rows = self.fly(name, jobs, out)
+        for row in rows:
+            if row.outcome == "error":
+                raise LabError(f"{row.folder}: {row.error}")
+        return [] if self.interrupted else rows
+
+    def _flown(self, jobs: Iterator[Job]) -> Generator[Row]:
+        first = next(jobs, None)
+        if first is None or self._stops:
+            return
+        if self._workers is None:
+            self._workers = Workers(self._count, self._cluster)
+        yield from self._workers.fly(chain([first], jobs), lambda: len(self._stops))
+
+    @contextmanager
+    def _stops_noted(self) -> Iterator[None]:
+        """Record the signals that request an orderly end."""
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        before = [signal.signal(number, lambda got, _: self._stops.append(got)) for number in numbers]
+        try:
+            yield
+        finally:
+            for number, handler in zip(numbers, before, strict=True):
+                signal.signal(number, handler)
+
+    @contextmanager
+    def _progress(self) -> Iterator[Callable[[Standing], None]]:
+        columns = (
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(),
+        )  # fmt: skip
+        quiet = not self._notices.is_terminal
+        with Bar(*columns, console=self._notices, transient=True, disable=quiet) as bar:
+            task = bar.add_task("flying", rate="")
+
+            def show(standing: Standing) -> None:
+                low, high = standing.interval
+                speed = bar.tasks[task].speed
+                pace = f"{speed:.1f} flights/s, " if speed else ""
+                rate = f"{pace}{standing.failed} failed: {100 * low:.1f}..{100 * high:.1f} %"
+                bar.update(task, completed=standing.flown, total=standing.planned, rate=rate)
+
+            yield show

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -23,29 +23,15 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
-from hil.campaigns.config import DESIGNS, Distribution, SampledFault, Spec, Value, table_dimensions
+from hil.campaigns.config import DESIGNS, Distribution, SampledFault, Spec, Value, spec_text, table_dimensions
+from hil.campaigns.jobs import Job, Plan
 from hil.errors import LabError
 from hil.experiments import find_experiment
-from hil.laboratory.faults import Fault
-from hil.laboratory.request import Request
+from hil.laboratory.request import Options
 
 DIGITS = 9
 LEVELS = 4  # of Morris' grid, as in his paper
 _FAULT_PARTS = ("start_s", "duration_s", "size")
-
-
-@dataclass(frozen=True, slots=True)
-class Draw:
-    """The definition of flight `index`."""
-
-    index: int
-    point: int  # which of the sampling's
-    experiment: str
-    profile: str
-    seed: int
-    settings: tuple[str, ...]  # those of the spec and those that were sampled
-    faults: tuple[str, ...]
-    parameters: Mapping[str, Value]  # that were sampled, of the profile
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,24 +153,43 @@ def check_design(spec: Spec) -> None:
         )
 
 
-def draw(spec: Spec, index: int) -> Draw:
+def plan_of(spec: Spec) -> Plan:
+    """Return the flights of a campaign of experiments as they are now. Raises `LabError` for an unknown experiment."""
+    sources = {name: find_experiment(name).source for name in spec.experiments}
+
+    def job(index: int) -> Job:
+        drawn = draw(spec, index)
+        return replace(drawn, source=sources[drawn.experiment])
+
+    values = {name: _type_of(varies) for name, varies in _parameters(spec)}
+    about = {"spec": spec_text(spec)}
+    return Plan(about, spec.flights, job, spec.experiments, spec.profiles, values, spec.half_width)
+
+
+def _type_of(varies: Distribution) -> type:
+    kinds = {type(value) for value in varies.choice or (0.0,)}
+    return bool if kinds == {bool} else str if kinds & {bool, str} else float
+
+
+def draw(spec: Spec, index: int) -> Job:
     """Return flight `index` of a campaign."""
     point, cell = divmod(index, spec.cells)
     return draw_at(spec, points_of(spec, point, 1)[0], index, point, cell)
 
 
-def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cell: int) -> Draw:
+def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cell: int) -> Job:
     """Return the flight at a point of the cube."""
     repetition, which = divmod(cell, len(spec.experiments) * len(spec.profiles))
     experiment, profile = divmod(which, len(spec.profiles))
     share = dict(zip((axis.name for axis in axes(spec)), shares.tolist(), strict=True))
     parameters = {name: value_at(varies, share[name]) for name, varies in _parameters(spec)}
-    settings = (*spec.settings, *(f"{name}={_toml(value)}" for name, value in parameters.items()))
     faults = (_fault_at(number, fault, share) for number, fault in enumerate(spec.faults))
-    return Draw(
-        index, point, spec.experiments[experiment], spec.profiles[profile],
-        spec.seed + point * spec.seeds + repetition, settings, tuple(filter(None, faults)), parameters,
+    options = Options(
+        profile=spec.profiles[profile], seed=spec.seed + point * spec.seeds + repetition,
+        overrides=(*spec.settings, *(f"{name}={_toml(value)}" for name, value in parameters.items())),
+        faults=tuple(filter(None, faults)), duration_s=spec.duration_s, link=spec.link,
     )  # fmt: skip
+    return Job(index, spec.experiments[experiment], options, parameters, limits=spec.limits)
 
 
 def _fault_at(number: int, fault: SampledFault, share: Mapping[str, float]) -> str:
@@ -225,19 +230,6 @@ def _toml(value: Value) -> str:
     return json.dumps(value) if isinstance(value, str) else repr(value)
 
 
-def request_of(spec: Spec, drawn: Draw, faults: tuple[Fault, ...] | None = None) -> Request:
-    """Return the request of a flight; `faults` replace those drawn. Raises `LabError` for what cannot be flown."""
-    return Request.of(
-        find_experiment(drawn.experiment),
-        profile=drawn.profile,
-        overrides=drawn.settings,
-        seed=drawn.seed,
-        duration_s=spec.duration_s,
-        link=spec.link,
-        faults=drawn.faults if faults is None else faults,
-    )
-
-
 def check_spec(spec: Spec) -> None:
     """Raise `LabError` for mistakes that can be found before flying: unknown names, values out of range.
 
@@ -246,10 +238,10 @@ def check_spec(spec: Spec) -> None:
     check_design(spec)
     width = len(axes(spec))
     for cell in range(len(spec.experiments) * len(spec.profiles)):
-        request_of(spec, draw_at(spec, np.full(width, 0.999), 0, 0, cell))
+        draw_at(spec, np.full(width, 0.999), 0, 0, cell).request()
     for column, axis in enumerate(axes(spec)):
         count = len(axis.varies.choice) if axis.varies and axis.varies.choice else 1
         for share in (0.001, *((part + 0.5) / count for part in range(count)), 0.999):
             shares = np.full(width, 0.999)  # so that every fault occurs
             shares[column] = share
-            request_of(spec, draw_at(spec, shares, 0, 0, 0))
+            draw_at(spec, shares, 0, 0, 0).request()

@@ -12,12 +12,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from hil.campaigns.config import Spec
-from hil.campaigns.flying import fly_within
-from hil.campaigns.sampling import Draw, request_of
+from hil.campaigns.jobs import Job, fly_within
 from hil.errors import LabError
 from hil.laboratory.fault_kinds import KINDS, add, either, times
 from hil.laboratory.faults import Fault, parse
-from hil.laboratory.request import Request
+from hil.laboratory.request import Options, Request
 from hil.laboratory.result import Result
 
 HALVINGS = 6  # a size is found to 1/64 of what was drawn
@@ -116,27 +115,31 @@ def harmless(name: str) -> float | None:
 class Reflight:
     """Flies reduced versions of one flight of a campaign; `said` is called with a line per flight."""
 
-    def __init__(self, spec: Spec, drawn: Draw, said: Callable[[str], None]) -> None:
+    def __init__(self, spec: Spec, drawn: Job, said: Callable[[str], None]) -> None:
         self._spec, self._drawn, self._said = spec, drawn, said
         self._outcome: str | None = None  # of the whole
 
     @property
     def whole(self) -> Trial:
         """The flight as it was drawn."""
-        return Trial(self._drawn.settings[len(self._spec.settings) :], tuple(map(parse, self._drawn.faults)))
+        options = self._drawn.options
+        return Trial(
+            tuple(options["overrides"])[len(self._spec.settings) :],
+            tuple(parse(str(fault)) for fault in options["faults"]),
+        )
 
     def request(self, trial: Trial) -> Request:
         """Return the request of a trial."""
-        drawn = replace(self._drawn, settings=(*self._spec.settings, *trial.settings))
-        return request_of(self._spec, drawn, trial.faults)
+        reduced = Options(overrides=(*self._spec.settings, *trial.settings), faults=trial.faults)
+        return replace(self._drawn, options=self._drawn.options | reduced).request()
 
     def fails(self, trial: Trial) -> bool:
         """Whether it fails with the same outcome as the whole."""
-        result = fly_within(self.request(trial), self._spec)
+        result = fly_within(self.request(trial), self._spec.limits)
         self._outcome = self._outcome or result.outcome
         failed = not result.passed and result.outcome == self._outcome
-        told = "fails" if failed else "holds" if result.passed else "fails otherwise"
-        self._said(f"{told}: {_text(trial)}{_why(result)}")
+        verdict = "fails" if failed else "holds" if result.passed else "fails otherwise"
+        self._said(f"{verdict}: {_text(trial)}{_why(result)}")
         return failed
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import click
 from rich.progress import TextColumn, TimeRemainingColumn
@@ -20,6 +20,7 @@ from hil.commands.options import (
     open_live,
     profile_option,
     progress_bar,
+    runner_options,
     seed_option,
     set_option,
     view_option,
@@ -82,7 +83,17 @@ SEEDS_MAX = 10_000
     metavar="DIR",
     help="Run folder [runs/EXPERIMENT-SEED, or -2, -3, … where another request was flown].",
 )
-def fly(experiment: str, seeds: int, target: str | None, out: Path | None, **options: Unpack[Options]) -> int:
+@runner_options
+def fly(
+    experiment: str,
+    seeds: int,
+    target: str | None,
+    out: Path | None,
+    workers: int | None,
+    cluster: str,
+    resume: bool,
+    **options: Unpack[Options],
+) -> int:
     """Fly EXPERIMENT (see `floaty list`) in the virtual laboratory.
 
     Exit code 0: all limits hold; 1: a limit fails; 2: bad input; 130: interrupted.
@@ -94,12 +105,14 @@ def fly(experiment: str, seeds: int, target: str | None, out: Path | None, **opt
     request = request_of(experiment, **options)
     if seeds > 1:
         _check_seeds(seeds, request, target)
+    elif workers or cluster or resume:
+        raise LabError("--workers, --cluster and --resume are for several --seeds")
     announce_compilation()
     if seeds > 1:
         first = request.seed
-        return _fly_many(
-            [replace(request, seed=first + index) for index in range(seeds)], out or Path("runs")
-        )
+        requests = [replace(request, seed=first + index) for index in range(seeds)]
+        crew = {"workers": workers, "cluster": cluster, "resume": resume}
+        return _fly_many(requests, options, out or Path("runs"), crew)
     from hil.laboratory.folder import folder_of, moved, reserved
 
     folder = out or folder_of(request)
@@ -155,20 +168,26 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
     return 0 if result.passed else 1
 
 
-def _fly_many(requests: list[Request], parent: Path) -> int:
+def _fly_many(requests: list[Request], options: Options, parent: Path, crew: dict[str, Any]) -> int:
     """Fly seeds in parallel processes; one row per seed, a summary at the end; returns the exit code."""
+    from hil.campaigns.jobs import Job
+    from hil.campaigns.run import Runner
     from hil.laboratory.folder import folder_of, moved
-    from hil.studies.sweep import Job, fly_all
 
-    jobs = [Job(request, folder_of(request, parent)) for request in requests]
-    whys = [why for job in jobs if (why := moved(job.request, job.folder))]
+    jobs: list[Job] = []
+    whys: list[str] = []
+    for request in requests:
+        folder = folder_of(request, parent)
+        whys += filter(None, [moved(request, folder)])
+        jobs.append(Job(0, request.experiment.reference, options | {"seed": request.seed}, {}, folder))
     for why in whys[:1]:
-        notices.print(
-            f"{why}{f', and so on: {len(whys)} of {len(jobs)}' if whys[1:] else ''}", soft_wrap=True
-        )
-    rows, interrupted = fly_all(jobs, notices)
+        more = f", and so on: {len(whys)} of {len(jobs)}" if whys[1:] else ""
+        notices.print(f"{why}{more}", soft_wrap=True)
+    name = f"{requests[0].experiment.name}-{requests[0].seed}-{requests[-1].seed}"
+    with Runner(notices, **crew) as runner:
+        rows = runner.fly(name, jobs, parent)
     print_seeds(rows)
-    if interrupted:
+    if runner.interrupted:
         notices.print(f"interrupted: {len(rows)} of {len(requests)} seeds are complete")
         return INTERRUPTED
-    return 0 if all(result.passed for result in rows) else 1
+    return 0 if all(row.passed for row in rows) else 1

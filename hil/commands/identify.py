@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from math import degrees, inf
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.table import Table
@@ -13,6 +13,7 @@ from hil.commands.options import (
     console,
     notices,
     profile_option,
+    runner_options,
     seed_option,
     wide_console,
 )
@@ -120,8 +121,16 @@ def _print_constants(found: "Identification") -> None:
 @click.option(
     "--runs", type=folder_type, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
 )  # fmt: skip
+@runner_options
 def tune(
-    profile: str, repeat: int | None, robots: int, seed: int, board: str, out: Path | None, runs: Path
+    profile: str,
+    repeat: int | None,
+    robots: int,
+    seed: int,
+    board: str,
+    out: Path | None,
+    runs: Path,
+    **crew: Any,
 ) -> int:
     """Make gains of the paper's control law for the profile's model, and fly them in lockstep with the profile's plant.
 
@@ -129,6 +138,7 @@ def tune(
     gains, or a lost robot.
     """
     require("floaty tune", "design", "scipy", "control")
+    from hil.campaigns.run import Runner
     from hil.config import load_config
     from hil.studies.tuning import TuningFlights, fly_round, rounds, write_tuned
 
@@ -137,22 +147,25 @@ def tune(
     with writing("--runs", runs):
         runs.mkdir(parents=True, exist_ok=True)
     announce_compilation()
-    flights = TuningFlights(seed, board, runs, notices)
-    flown: Iterable[Round] = (
-        [fly_round(profile, flights, robots)] if repeat is None else rounds(profile, flights, robots, repeat)
-    )
     best: Round | None = None
-    try:
-        for number, one in enumerate(flown, 1):
-            if repeat is not None:
-                console.print(f"round {number}")
-            _print_round(one)
-            if best is None or one.rms < best.rms:
-                best = one
-    except LabError as error:
-        if best is None:
-            raise
-        notices.print(f"{error}; the best earlier round counts", soft_wrap=True)
+    with Runner(notices, **crew) as runner:
+        flights = TuningFlights(seed, board, runs, runner)
+        flown: Iterable[Round] = (
+            [fly_round(profile, flights, robots)]
+            if repeat is None
+            else rounds(profile, flights, robots, repeat)
+        )
+        try:
+            for number, one in enumerate(flown, 1):
+                if repeat is not None:
+                    console.print(f"round {number}")
+                _print_round(one)
+                if best is None or one.rms < best.rms:
+                    best = one
+        except LabError as error:
+            if best is None:
+                raise
+            notices.print(f"{error}; the best earlier round counts", soft_wrap=True)
     assert best is not None
     if out is not None:
         write_tuned(out, profile, load_config(best.profile), "Model and gains by floaty tune.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -65,6 +66,21 @@ gdb_option = click.option(
     "--gdb", type=click.IntRange(0, 65535), metavar="PORT",
     help="With an image as --board: wait for GDB on this port of 127.0.0.1 (0: any); time stands still at its breakpoints.",
 )  # fmt: skip
+
+
+def runner_options(command: Callable[..., int]) -> Callable[..., int]:
+    """Add the options of a command that flies many flights."""
+    for option in (
+        click.option("--resume", is_flag=True, help="Continue what was begun in the folder; no flight is flown twice."),
+        click.option(
+            "--cluster", default="", metavar="tcp://HOST:PORT", help="A Dask scheduler whose workers fly instead."
+        ),
+        click.option(
+            "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes here; default: one per core."
+        ),
+    ):  # fmt: skip
+        command = option(command)
+    return command
 
 
 def announce_compilation() -> None:

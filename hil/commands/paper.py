@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.progress import track
@@ -17,6 +17,7 @@ from hil.commands.options import (
     console,
     notices,
     profile_option,
+    runner_options,
     seed_option,
     set_option,
     wide_console,
@@ -51,7 +52,8 @@ seeds_option = click.option(
 )
 @click.option("--only", metavar="PATTERN", help="Only these experiments, like hover or yaw-*.")
 @click.option("--no-studies", is_flag=True, help="Leave the robustness studies out.")
-def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
+@runner_options
+def paper(seeds: int, out: Path, only: str | None, no_studies: bool, **crew: Any) -> int:
     """Fly the paper's experiments on both profiles, and the robustness studies; write one report.
 
     Exit code 0: all limits hold for the default profile; 1: one fails; 2: bad input; 130: interrupted, with a report
@@ -61,25 +63,34 @@ def paper(seeds: int, out: Path, only: str | None, no_studies: bool) -> int:
     from hil.studies.paper import select
 
     studies = [] if only or no_studies else list(STUDIES.values())
-    return _fly(select(only), studies, seeds, out, mounted=not only)
+    return _fly(select(only), studies, seeds, out, crew, mounted=not only)
 
 
 @click.command()
 @click.argument("name")
 @seeds_option
 @click.option("--out", type=folder_type, metavar="DIR", help="Report and picture [runs/study-NAME].")
-def study(name: str, seeds: int, out: Path | None) -> int:
+@runner_options
+def study(name: str, seeds: int, out: Path | None, **crew: Any) -> int:
     """Fly one robustness study (see `floaty list`): faults of growing size, several variants, one picture.
 
     Exit code 0: every outcome is the expected one; 1: one is not; 2: bad input; 130: interrupted.
     """
     from hil.studies.catalogue import find_study
 
-    return _fly([], [find_study(name)], seeds, out or Path("runs") / f"study-{name}")
+    return _fly([], [find_study(name)], seeds, out or Path("runs") / f"study-{name}", crew)
 
 
-def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted: bool = False) -> int:
+def _fly(
+    rows: list[str],
+    studies: "list[Study]",
+    seeds: int,
+    out: Path,
+    crew: dict[str, Any],
+    mounted: bool = False,
+) -> int:
     require("floaty paper", "design", "scipy")
+    from hil.campaigns.run import Runner
     from hil.config import load_config
     from hil.design.analysis import analyse
     from hil.design.sweeps import point_of
@@ -90,14 +101,14 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
     from hil.studies.paper_scaling import fly_scaling
 
     announce_compilation()
-    with writing("--out", out):
+    with writing("--out", out), Runner(notices, **crew) as runner:
         out.mkdir(parents=True, exist_ok=True)
-        flown = fly_paper(rows, studies, seeds, out, notices)
-        bench = list(drag_model.measure(load_config(), 1)) if mounted and not flown.interrupted else []
+        flown = fly_paper(rows, studies, seeds, out, runner)
+        bench = list(drag_model.measure(load_config(), 1)) if mounted and not runner.interrupted else []
         shape = analyse(point_of(load_config())) if bench else None
-        constants = fly_identification(out, notices) if bench else ()
+        constants = fly_identification(out, runner) if bench else ()
         if shape is not None and constants:
-            shape = replace(shape, claims=[*shape.claims, *fly_scaling(out, notices)])
+            shape = replace(shape, claims=[*shape.claims, *fly_scaling(out, runner)])
         report = write_paper(out, flown, bench, shape, constants)
     _print_rows(flown)
     _print_studies(flown)
@@ -105,7 +116,7 @@ def _fly(rows: list[str], studies: "list[Study]", seeds: int, out: Path, mounted
         show_claims(shape)
     _print_constants(constants)
     console.print(f"  {report}", soft_wrap=True)
-    if flown.interrupted:
+    if runner.interrupted:
         notices.print("interrupted: the report has the flights that were complete")
         return INTERRUPTED
     holds = flown.holds if rows else all(result.holds for result in flown.studies)

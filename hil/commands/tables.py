@@ -12,6 +12,7 @@ from hil.clock import process_age_s
 from hil.commands.options import console, wide_console
 
 if TYPE_CHECKING:
+    from hil.campaigns.jobs import Row
     from hil.laboratory.result import Result
 
 SEED_COLUMNS = (
@@ -23,30 +24,29 @@ SEED_COLUMNS = (
 )
 
 
-def print_seeds(rows: list[Result]) -> None:
+def print_seeds(rows: list[Row]) -> None:
     """Print one row per seed and the summary."""
     if not rows:
         return
-    table = Table(title=f"{rows[0].request.experiment.name}, profile {rows[0].request.profile}")
+    job = rows[0].job
+    table = Table(title=f"{job.experiment}, profile {job.options['profile']}")
     for heading in ("seed", *(column[0] for column in SEED_COLUMNS), "hash", "verdict"):
         table.add_column(heading, justify="right")
-    for result in rows:
-        failed = ", ".join(verdict.metric for verdict in result.failed)
-        verdict = "ok" if result.passed else result.cause or f"fails: {failed}"
+    for row in rows:
         table.add_row(
-            str(result.request.seed),
+            str(row.seed),
             *(
-                " ".join(f"{result.metrics[name] * scale:.{digits}f}" for name in names)
+                " ".join(f"{row.metrics.get(name, math.nan) * scale:.{digits}f}" for name in names)
                 for _, names, scale, digits in SEED_COLUMNS
             ),
-            result.hash[:12],
-            verdict,
+            row.hash[:12],
+            "ok" if row.passed else row.error or f"fails: {', '.join(row.failed)}",
         )
     wide = wide_console(140)
     wide.print(table)
-    completed = [result.metrics for result in rows if result.outcome == "completed"]
-    lost = sum(result.outcome == "lost" for result in rows)
-    passed = sum(result.passed for result in rows)
+    completed = [row.metrics for row in rows if row.outcome == "completed"]
+    lost = sum(row.outcome == "lost" for row in rows)
+    passed = sum(row.passed for row in rows)
     console.print(f"{len(rows)} seeds: {passed} hold all limits, {lost} lost")
     if completed:
         shares, rms = (

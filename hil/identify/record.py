@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 BOARD_COLUMN = "board.t [ms]"
 INPUTS = tuple(f"controller.u{i} [rad]" for i in range(1, 5))
 EXCITATIONS = tuple(f"excite.u{i} [rad]" for i in range(1, 5))
-# The files of a run folder that are read or that tell its history.
-KEPT = ("log.parquet", "telemetry.csv", "events.jsonl", "result.json")
 RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch", "yaw"))
 FACING = np.radians(30.0)  # a choice: how far the robot may have turned on the median
 WRAP_MS = 1 << 24  # of the board's time stamps

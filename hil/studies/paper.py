@@ -1,31 +1,28 @@
 """Flying the whole paper: every row's experiment on both profiles with several seeds, and the studies.
 
-Flights of rows keep their logs in `OUT/EXPERIMENT-PROFILE-SEED`, those of studies leave only their result.
+Flights of rows keep their logs in `OUT/EXPERIMENT-PROFILE-SEED`, those of studies leave only their rows.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
+from hil.campaigns.jobs import LOG, Job, Row
+from hil.campaigns.run import Runner
 from hil.errors import LabError
-from hil.experiments import find_experiment
 from hil.laboratory.metrics import METRICS, SHOWN
-from hil.laboratory.request import Request
-from hil.laboratory.result import Result
+from hil.laboratory.request import Options
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper_rows import ROWS, PaperRow
 from hil.studies.study import Study
 from hil.studies.study_run import StudyResult, distance, flights_of, summarise
-from hil.studies.sweep import Job, fly_all
-
-KEPT = ("log.parquet", "events.jsonl", "result.json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +37,7 @@ class Spread:
     high: float
 
     @classmethod
-    def of(cls, metric: str, results: Sequence[Result]) -> Spread:
+    def of(cls, metric: str, results: Sequence[Row]) -> Spread:
         """Return the spread of a metric over some flights."""
         scale, unit = SHOWN.get(METRICS[metric].unit, (1.0, METRICS[metric].unit))
         found = np.array([result.metrics.get(metric, math.nan) * scale for result in results])
@@ -62,7 +59,7 @@ class Trials:
     """A row on one profile: its flights by seed."""
 
     profile: str
-    results: tuple[Result, ...]
+    results: tuple[Row, ...]
 
     @property
     def passed(self) -> int:
@@ -77,9 +74,7 @@ class Trials:
     @property
     def failed(self) -> list[str]:
         """Limits that failed, with how often, and why flights were lost."""
-        failures = [
-            verdict.metric for result in self.results for verdict in result.verdicts if not verdict.holds
-        ]
+        failures = [name for row in self.results for name in row.failed]
         return [f"{name} {failures.count(name)}×" for name in dict.fromkeys(failures)]
 
     @property
@@ -98,7 +93,7 @@ class Trials:
         )
         return f"misses by {beyond:.2g} {unit}".strip() if beyond > 1e-9 else ""
 
-    def representative_first(self) -> list[Result]:
+    def representative_first(self) -> list[Row]:
         """Return the flights, the one with the median error first."""
         ranked = sorted(self.results, key=_error)
         return [ranked.pop((len(ranked) - 1) // 2), *ranked] if ranked else []
@@ -158,55 +153,36 @@ def select(pattern: str | None) -> list[str]:
     return chosen
 
 
-def fly_paper(
-    rows: Sequence[str], studies: Sequence[Study], seeds: int, out: Path, notices: Console
-) -> Paper:
-    """Fly rows and studies; after Ctrl-C the result holds what is complete."""
-    jobs: dict[Hashable, Job] = {}
-    trials: dict[tuple[str, str], list[Hashable]] = {}
-    for name in rows:
-        for profile in PROFILES:
-            requests = [
-                Request.of(find_experiment(name), profile=profile, seed=seed) for seed in range(1, seeds + 1)
-            ]
-            trials[name, profile] = [_key(request) for request in requests]
-            for request in requests:
-                jobs[_key(request)] = Job(request, out / f"{name}-{profile}-{request.seed}", KEPT)
+def fly_paper(names: Sequence[str], studies: Sequence[Study], seeds: int, out: Path, runner: Runner) -> Paper:
+    """Fly rows and studies, equal flights once; after Ctrl-C the result holds what is complete."""
+    trials = {
+        (name, profile): [
+            Job(0, name, Options(profile=profile, seed=seed), {}, out / f"{name}-{profile}-{seed}", LOG)
+            for seed in range(1, seeds + 1)
+        ]
+        for name in names
+        for profile in PROFILES
+    }
     cells = {study.name: list(flights_of(study, seeds)) for study in studies}
-    for study_name, planned in cells.items():
-        for number, (_, _, request) in enumerate(planned):
-            jobs.setdefault(_key(request), Job(request, out / f"study-{study_name}-{number}", ()))
-    results, interrupted = fly_all(list(jobs.values()), notices)
-    landed = {result.folder: result for result in results}
-    flown = {key: landed[job.folder] for key, job in jobs.items() if job.folder in landed}
+    jobs: dict[str, Job] = {}
+    for job in chain(*trials.values(), *cells.values()):
+        jobs.setdefault(job.text, job)
+    flown = {row.job.text: row for row in runner.fly("paper", list(jobs.values()), out)}
 
     def of(name: str, profile: str) -> Trials:
-        return Trials(profile, tuple(flown[key] for key in trials[name, profile] if key in flown))
+        planned = trials[name, profile]
+        return Trials(profile, tuple(flown[job.text] for job in planned if job.text in flown))
 
     return Paper(
-        tuple((name, ROWS[name], tuple(of(name, profile) for profile in PROFILES)) for name in rows),
+        tuple((name, ROWS[name], tuple(of(name, profile) for profile in PROFILES)) for name in names),
         tuple(
-            summarise(
-                study,
-                [
-                    (variant, size, flown[_key(request)])
-                    for variant, size, request in cells[study.name]
-                    if _key(request) in flown
-                ],
-            )
+            summarise(study, [(job, flown[job.text]) for job in cells[study.name] if job.text in flown])
             for study in studies
         ),
-        interrupted,
+        runner.interrupted,
     )
 
 
-def _key(request: Request) -> Hashable:
-    """Return the key of equal flights: studies share those without a fault."""
-    return (
-        request.experiment.name, request.profile, request.overrides, request.faults, request.seed, request.duration_s
-    )  # fmt: skip
-
-
-def _error(result: Result) -> tuple[bool, float]:
+def _error(row: Row) -> tuple[bool, float]:
     """Return an order of flights from good to bad."""
-    return result.outcome != "completed", distance(result.metrics)
+    return row.outcome != "completed", distance(row.metrics)

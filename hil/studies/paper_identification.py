@@ -6,19 +6,19 @@ two flights are flown here, and one with an excitation of u1 for the methods tha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
-
+from hil.campaigns.jobs import Row
+from hil.campaigns.run import Runner
+from hil.config import DEFAULT_PROFILE
 from hil.design.axes import ROLL
 from hil.errors import LabError
-from hil.experiments import find_experiment
 from hil.identify.identify import Identification, identify, interval_text
-from hil.identify.record import KEPT, load_record
+from hil.identify.record import load_record
 from hil.identify.two_controllers import SIGMAS, closed_loop, input_constant
-from hil.laboratory.request import Request
-from hil.studies.sweep import Job, fly_all
+from hil.laboratory.request import Options
 
 FLIGHTS = ("two-controllers-1", "two-controllers-2", "identify-u1")
 STARRED = (-60.0, -48.5)  # [1/s2] paper, Methods: c* of the two controllers
@@ -51,20 +51,20 @@ class PaperConstant:
     joint: str
 
 
-def fly_identification(out: Path, notices: Console) -> tuple[PaperConstant, ...]:
+def fly_identification(out: Path, runner: Runner) -> tuple[PaperConstant, ...]:
     """Fly and identify; empty after Ctrl-C."""
-    folders = [out / name for name in FLIGHTS]
-    jobs = [
-        Job(Request.of(find_experiment(name), seed=1), folder, KEPT)
-        for name, folder in zip(FLIGHTS, folders, strict=True)
-    ]
-    results, interrupted = fly_all(jobs, notices)
-    if interrupted:
-        return ()
-    for result in results:
-        if result.outcome != "completed":
-            raise LabError(f"{result.folder}: {result.cause}")
-    return constants(identify([load_record(folder, "floaty") for folder in folders]))
+    rows = runner.log("identification", {name: (name, Options(seed=1)) for name in FLIGHTS}, out)
+    return constants(identified(rows)) if rows else ()
+
+
+def identified(rows: Sequence[Row]) -> Identification:
+    """Return what flights of one robot show. Raises `LabError` for one that was lost."""
+    for row in rows:
+        if row.outcome != "completed":
+            raise LabError(f"{row.folder}: {row.error}")
+    return identify(
+        [load_record(row.folder, row.job.options.get("profile", DEFAULT_PROFILE)) for row in rows]
+    )
 
 
 def constants(found: Identification) -> tuple[PaperConstant, ...]:

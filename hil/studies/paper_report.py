@@ -15,6 +15,7 @@ from typing import Any
 from hil.config import load_config
 from hil.design.analysis import Analysis
 from hil.design.analysis import write as write_design
+from hil.experiments import find_experiment
 from hil.installation import commit, versions
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
@@ -104,9 +105,9 @@ def _figures(both: Sequence[Trials]) -> list[tuple[str, list[PageFigure]]]:
         ordered = trials.representative_first()
         if not ordered:
             continue
-        logs = [load_log(result.folder) for result in ordered]
-        own = pictures_of(ordered[0].request.experiment)
-        marks = marks_of_flight(logs[0], ordered[0].cause if ordered[0].outcome == "lost" else None)
+        logs = [load_log(row.folder) for row in ordered]
+        own = pictures_of(find_experiment(ordered[0].job.experiment))
+        marks = marks_of_flight(logs[0], ordered[0].error if ordered[0].outcome == "lost" else None)
         drawn = [draw(one, marks, *(logs if own else logs[:1])) for one in own or OF_EVERY_FLIGHT]
         shown = [replace(one, name=f"{trials.profile}-{one.name}", alone=True) for one in drawn]
         figures.append((trials.profile, shown))
@@ -131,28 +132,28 @@ def _content(paper: Paper) -> dict[str, Any]:
     }
 
 
-def _trials(row: PaperRow, trials: Trials) -> dict[str, Any]:
+def _trials(shown: PaperRow, trials: Trials) -> dict[str, Any]:
     return {
         "holds": trials.holds,
-        "missed": {name: gap for name in row.claims if (gap := trials.missed(row, name))},
+        "missed": {name: gap for name in shown.claims if (gap := trials.missed(shown, name))},
         "metrics": {
             name: {
                 key: value if not isinstance(value, float) or math.isfinite(value) else None
                 for key, value in asdict(Spread.of(name, trials.results)).items()
             }
-            for name in row.claims
+            for name in shown.claims
         },
         "flights": [
             {
-                "seed": result.request.seed,
-                "outcome": result.outcome,
-                "cause": result.cause,
-                "passed": result.passed,
-                "failed": [verdict.metric for verdict in result.verdicts if not verdict.holds],
-                "hash": result.hash,
-                "folder": result.folder.name,
+                "seed": row.seed,
+                "outcome": row.outcome,
+                "cause": row.error or None,
+                "passed": row.passed,
+                "failed": row.failed,
+                "hash": row.hash,
+                "folder": row.folder.name,
             }
-            for result in trials.results
+            for row in trials.results
         ],
     }
 

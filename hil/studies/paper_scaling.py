@@ -9,16 +9,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
+from hil.campaigns.run import Runner
 from hil.config import load_config
 from hil.design.claims import AGREES, DIFFERS, SCALING, Claim
-from hil.errors import LabError
-from hil.experiments import find_experiment
-from hil.identify.identify import identify
-from hil.identify.record import KEPT, load_record
-from hil.laboratory.request import Request
-from hil.studies.sweep import Job, fly_all
+from hil.laboratory.request import Options
+from hil.studies.paper_identification import identified
 
 PROFILES = ("design-half", "design-paper", "design-double")
 FLIGHTS = {"yaw_u3": "identify-u3", "roll_u1": "identify-u1"}
@@ -29,31 +25,29 @@ PAPER, NEAR = -1.0, 0.15  # exponent over the length, and the deviation that "go
 AGAINST = "At the same hover angle; with servos that are as slow at every size."
 
 
-def fly_scaling(out: Path, notices: Console) -> list[Claim]:
+def fly_scaling(out: Path, runner: Runner) -> list[Claim]:
     """Fly and identify; empty after Ctrl-C. Raises `LabError` for a robot that is lost or not identified."""
-    jobs = [
-        Job(
-            Request.of(
-                find_experiment(name),
-                profile=profile,
-                overrides=(f"excitation.{name[-2:]}={AMPLITUDES[name]}",),
-                duration_s=DURATION_S,
-            ),
-            out / f"{profile}-{name}",
-            KEPT,
-        )
-        for profile in PROFILES
-        for name in FLIGHTS.values()
-    ]
-    results, interrupted = fly_all(jobs, notices)
-    if interrupted:
+    rows = runner.log(
+        "scaling",
+        {
+            f"{profile}-{name}": (
+                name,
+                Options(
+                    profile=profile, overrides=(f"excitation.{name[-2:]}={AMPLITUDES[name]}",), seed=1,
+                    duration_s=DURATION_S,
+                ),
+            )
+            for profile in PROFILES
+            for name in FLIGHTS.values()
+        },
+        out,
+    )  # fmt: skip
+    if not rows:
         return []
-    for result in results:
-        if result.outcome != "completed":
-            raise LabError(f"{result.folder}: {result.cause}")
+    of_each = len(FLIGHTS)
     found = {
-        profile: identify([load_record(out / f"{profile}-{name}", profile) for name in FLIGHTS.values()])
-        for profile in PROFILES
+        profile: identified(rows[of_each * number : of_each * (number + 1)])
+        for number, profile in enumerate(PROFILES)
     }
     length = np.array([load_config(profile).geometry.footprint for profile in PROFILES])
     claims = []

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from hil.experiments import find_experiment
-from hil.laboratory.request import Request
-from hil.laboratory.result import Result
+from hil.campaigns.config import Value
+from hil.campaigns.jobs import Job, Row
+from hil.laboratory.request import Options
 from hil.studies.study import Expected, Study, Variant
 
 OUTCOMES = ("holds", "degrades", "failsafe", "lost", "error")  # from good to bad
@@ -82,53 +82,49 @@ class StudyResult:
         )
 
 
-def flights_of(study: Study, seeds: int) -> Iterator[tuple[Variant, float, Request]]:
-    """Yield every flight of a study."""
-    experiment = find_experiment(study.experiment)
+def flights_of(study: Study, seeds: int) -> Iterator[Job]:
+    """Yield every flight of a study; only the row of each is kept."""
     for variant in study.variants:
         for size in study.sizes:
             change = variant.change(size)
-            settings, faults = (*variant.settings, *change.settings), change.faults
+            values: dict[str, Value] = {"study": study.name, "variant": variant.name, "size": float(size)}
             for seed in range(1, seeds + 1):
-                yield (
-                    variant,
-                    size,
-                    Request.of(
-                        experiment,
-                        profile=variant.profile,
-                        overrides=settings,
-                        seed=seed,
-                        duration_s=study.duration_s,
-                        faults=faults,
-                    ),
-                )
+                options = Options(
+                    profile=variant.profile, overrides=(*variant.settings, *change.settings), seed=seed,
+                    duration_s=study.duration_s, faults=change.faults,
+                )  # fmt: skip
+                yield Job(0, study.experiment, options, values)
 
 
-def outcome_of(result: Result) -> str:
+def outcome_of(row: Row) -> str:
     """Return the outcome of a flight, one of OUTCOMES.
 
     lost: it ended as a crash; failsafe: the supervisor, or a reset, opened the loop for a while; degrades: a limit fails.
     """
-    if result.outcome not in ("completed", "reset"):
-        return "lost" if result.outcome == "lost" else "error"
-    if result.outcome == "reset" or result.metrics["failsafe"] > 0:
+    if row.outcome not in ("completed", "reset"):
+        return "lost" if row.outcome == "lost" else "error"
+    if row.outcome == "reset" or row.metrics["failsafe"] > 0:
         return "failsafe"
-    return "holds" if result.passed else "degrades"
+    return "holds" if row.passed else "degrades"
 
 
-def summarise(study: Study, flown: list[tuple[Variant, float, Result]]) -> StudyResult:
-    """Return the result of a study from the flights that were flown."""
+def summarise(study: Study, flown: Iterable[tuple[Job, Row]]) -> StudyResult:
+    """Return the result of a study from those of its flights that were flown."""
+    by_cell: dict[tuple[Value, Value], list[Row]] = {}
+    for job, row in flown:
+        by_cell.setdefault((job.values["variant"], job.values["size"]), []).append(row)
     curves = []
     for variant in study.variants:
-        cells = []
-        for size in study.sizes:
-            results = [result for v, s, result in flown if v is variant and s == size]
-            if results:
-                outcomes = tuple(map(outcome_of, results))
-                errors = tuple(distance(r.metrics) for r in results if r.outcome == "completed")
-                cells.append(Cell(size, outcomes, errors))
+        cells = tuple(
+            Cell(
+                size, tuple(map(outcome_of, rows)),
+                tuple(distance(row.metrics) for row in rows if row.outcome == "completed"),
+            )
+            for size in study.sizes
+            if (rows := by_cell.get((variant.name, size)))
+        )  # fmt: skip
         if cells:
-            curves.append(Curve(variant, tuple(cells)))
+            curves.append(Curve(variant, cells))
     return StudyResult(study, tuple(curves))
 
 

@@ -6,13 +6,13 @@ and a link alone; the plant's truth is used only to fly other robots.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import get_args
 
-from rich.console import Console
-
+from hil.campaigns.jobs import Row
+from hil.campaigns.run import Runner
 from hil.config import LabConfig, base_name, load_config
 from hil.design.axes import AXES, gains_in
 from hil.design.loop import Timing, build
@@ -20,17 +20,15 @@ from hil.design.margins import peak_of
 from hil.design.profile import changes, toml_text
 from hil.design.tune import GainTask, TunedAxis, by_regulator, design, judged, refuse_late
 from hil.errors import LabError, writing
-from hil.experiments import find_experiment
 from hil.identify.flow import flow_of
 from hil.identify.identify import identify
 from hil.identify.profile_out import write_profile
-from hil.identify.record import KEPT, load_record
+from hil.identify.record import load_record
 from hil.identify.robots import FLAP_RATE, Robots, robots_of
-from hil.laboratory.request import Request
-from hil.laboratory.result import Result
+from hil.laboratory.request import Options
+from hil.laboratory.result import read_result
 from hil.laboratory.robot import Streams
 from hil.studies.study_run import distance
-from hil.studies.sweep import Job, fly_all
 from hil.world.config import ConstantName
 from hil.world.plant import Plant
 
@@ -48,46 +46,38 @@ class TuningFlights:
     seed: int
     board: str
     folder: Path
-    notices: Console
+    runner: Runner
 
-    def hover(self, name: str, profile: str, *others: tuple[str, ...]) -> list[Result]:
+    def hover(self, name: str, profile: str, *others: tuple[str, ...]) -> list[Row]:
         """Fly a hover of a profile's robot, and of robots that differ by settings. Raises `LabError` for an error."""
-        experiment = find_experiment("hover")
         return self._fly(
-            Job(
-                Request.of(
-                    experiment,
-                    profile=profile,
-                    overrides=settings,
-                    seed=self.seed,
-                    duration_s=HOVER_S,
-                    board=self.board,
-                ),
-                self.folder / (f"{name}-{number}" if number else name),
-                KEPT,
-            )
-            for number, settings in enumerate([(), *others])
-        )
+            name,
+            {
+                f"{name}-{number}" if number else name: (
+                    "hover",
+                    Options(
+                        profile=profile, overrides=settings, seed=self.seed, duration_s=HOVER_S, board=self.board
+                    ),
+                )
+                for number, settings in enumerate([(), *others])
+            },
+        )  # fmt: skip
 
-    def excitations(self, profile: str) -> list[Result]:
+    def excitations(self, profile: str) -> list[Row]:
         """Fly an excitation of each input."""
         return self._fly(
-            Job(
-                Request.of(find_experiment(name), profile=profile, seed=self.seed + number, board=self.board),
-                self.folder / name,
-                KEPT,
-            )
-            for number, name in enumerate(EXCITATIONS)
+            "excitations",
+            {
+                name: (name, Options(profile=profile, seed=self.seed + number, board=self.board))
+                for number, name in enumerate(EXCITATIONS)
+            },
         )
 
-    def _fly(self, jobs: Iterator[Job]) -> list[Result]:
-        results, interrupted = fly_all(list(jobs), self.notices)
-        if interrupted:
+    def _fly(self, name: str, flights: Mapping[str, tuple[str, Options]]) -> list[Row]:
+        rows = self.runner.log(name, flights, self.folder)
+        if not rows:
             raise KeyboardInterrupt
-        for result in results:
-            if result.outcome == "error":
-                raise LabError(f"{result.folder}: {result.cause}")
-        return results
+        return rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +89,7 @@ class Tuned:
     age_s: float
     jitter_s: float  # by which the oldest of a hundred poses is older than the mean
     config: LabConfig  # with the new gains
-    before: Result
+    before: Row
 
     @property
     def least_delay_s(self) -> float:
@@ -118,9 +108,9 @@ def tune(profile: str, flights: TuningFlights, count: int) -> Tuned:
     (before,) = flights.hover("before", profile)
     if before.outcome == "lost":
         raise LabError(
-            f"{profile}: its own gains lose the robot ({before.cause}): no hover to measure the flow with"
+            f"{profile}: its own gains lose the robot ({before.error}): no hover to measure the flow with"
         )
-    pose = before.ages[0]
+    pose = read_result(before.folder).ages[0]
     age_s, jitter_s = 1e-6 * pose.mean_us, 1e-6 * (pose.p99_us - pose.mean_us)
     timing = Timing.of(config, age_s)
     record = load_record(before.folder, profile)
@@ -174,11 +164,11 @@ def worst_settings(tuned: Tuned, config: LabConfig) -> list[tuple[str, ...]]:
     return [settings for _, settings in sorted(ranked, reverse=True)[:FLOWN]]
 
 
-def rms(result: Result) -> float:
+def rms(row: Row) -> float:
     """Return the rms distance from the goal [m], infinite for a robot that was lost."""
-    if result.outcome != "completed":
+    if row.outcome != "completed":
         return float("inf")
-    return distance(result.metrics)
+    return distance(row.metrics)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +176,7 @@ class Round:
     """One round: tuned gains and their flights, the profile's robot first, then the worst."""
 
     tuned: Tuned
-    flown: tuple[Result, ...]
+    flown: tuple[Row, ...]
     given: str  # the profile that was tuned
     written: Path  # the one with the new gains
 
@@ -224,18 +214,17 @@ def rounds(profile: str, flights: TuningFlights, count: int, most: int) -> Itera
     for number in range(1, most + 1):
         folder = flights.folder / f"round-{number}"
         own = replace(flights, folder=folder, seed=flights.seed + 10 * (number - 1))
-        for result in own.excitations(profile):
-            if result.outcome != "completed":
-                raise LabError(
-                    f"round {number} ends: {result.request.experiment.name} lost the robot: {result.cause}"
-                )
+        rows = own.excitations(profile)
+        for row in rows:
+            if row.outcome != "completed":
+                raise LabError(f"round {number} ends: {row.job.experiment} lost the robot: {row.error}")
         model = folder / "model.toml"
-        records = [load_record(folder / name, profile) for name in EXCITATIONS]
+        records = [load_record(row.folder, profile) for row in rows]
         write_profile(model, profile, identify(records))
         one = fly_round(str(model), own, count)
         yield one
         if one.flown[0].outcome != "completed":
-            raise LabError(f"round {number} ends: the new gains lose the robot: {one.flown[0].cause}")
+            raise LabError(f"round {number} ends: the new gains lose the robot: {one.flown[0].error}")
         if one.rms > BETTER * last:
             return
         last, profile = one.rms, one.profile

@@ -40,7 +40,6 @@ from hil.api import command_of, request_of
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.fault_kinds import KINDS, add
 from hil.laboratory.robot import attributes_of, specimen
-from hil.studies.sweep import Job, fly_all
 from hil.testing import Flights, Waypoints, faults, trajectories
 from support.choices import choice
 
@@ -98,8 +97,6 @@ CALLS = (
     Call(faults, {"start_s": (0.0, 1.0), "duration_s": (0.0, 1.0), "size": (0.0, 1.0)}),
     Call(trajectories, {"reach_m": 0.1, "turn_rad": 0.1, "every_s": 1.0, "most": 2}),
     Call(Waypoints, {"every_s": 1.0, "goals": ((0.0, 0.0, 0.0, 0.0),)}),
-    Call(Job, {"request": request_of("hover"), "folder": Path("here"), "keep": ()}),
-    Call(fly_all, {"jobs": [], "notices": None}),
 )  # fmt: skip
 FLYING = (fly, request_of, Flights.fly, Request.of)
 

@@ -4,13 +4,10 @@ import math
 import os
 import signal
 import time
-from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 
 from hil.campaigns.config import Spec
-from hil.campaigns.flying import Campaign, CampaignRow
-from hil.campaigns.sampling import draw
+from hil.campaigns.jobs import Job, Row
 from hil.laboratory.metrics import METRICS
 
 BAD_PUSH = 8.0  # [N] from here on the planted robot fails
@@ -31,43 +28,34 @@ def spec_of(**values: object) -> Spec:
     return Spec.model_validate(tree | values)
 
 
-def planted(campaign: Campaign, index: int) -> CampaignRow:
+def planted(job: Job) -> Row:
     """A flight that fails by its push alone, at once."""
-    drawn = draw(campaign.spec, index)
-    size = float(drawn.faults[0].partition("=")[2]) if drawn.faults else 0.0
+    faults = job.options["faults"]
+    size = float(str(faults[0]).partition("=")[2]) if faults else 0.0
     metrics = dict.fromkeys(METRICS, 0.0) | {"max_y": size / 100.0, "flown": 0.3, "rms_x": math.nan}
     passed = size < BAD_PUSH
-    return CampaignRow(
-        **asdict(drawn), outcome="completed", error="", passed=passed, hash=f"{index:064x}", metrics=metrics,
-        holds={"in_box": passed},
-    )  # fmt: skip
+    return Row(job, "completed", "", passed, f"{job.index:064x}", metrics, {"in_box": passed})
 
 
-def raising(campaign: Campaign, index: int) -> CampaignRow:
+def raising(job: Job) -> Row:
     """The third flight raises."""
-    if index == 3:
+    if job.index == 3:
         raise ZeroDivisionError("planted")
-    return planted(campaign, index)
+    return planted(job)
 
 
-def killing(campaign: Campaign, index: int) -> CampaignRow:
+def killing(job: Job) -> Row:
     """The third flight kills its process, each time; the fifth the first time only."""
-    once = Path(campaign.spec.settings[0])  # a path of the test's
-    if index == 3 or (index == 5 and not once.exists()):
-        if index == 5:
+    once = Path(job.options["overrides"][0])  # a path of the test's
+    if job.index == 3 or (job.index == 5 and not once.exists()):
+        if job.index == 5:
             once.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return planted(campaign, index)
+    return planted(job)
 
 
-def hanging(campaign: Campaign, index: int) -> CampaignRow:
+def hanging(job: Job) -> Row:
     """The third flight hangs where nobody can ask it for anything."""
-    while index == 3:
+    while job.index == 3:
         time.sleep(0.05)
-    return planted(campaign, index)
-
-
-def in_order(campaign: Campaign, indices: Iterator[int]) -> Iterator[CampaignRow]:
-    """What workers do, one flight after the other."""
-    for index in indices:
-        yield planted(campaign, index)
+    return planted(job)

@@ -14,11 +14,12 @@ import pytest
 from scipy.stats import binomtest
 
 from hil.campaigns.config import Spec
-from hil.campaigns.dataset import ARRIVING, FLIGHTS, Dataset, read_flights, schema_of
+from hil.campaigns.dataset import ARRIVING, FLIGHTS, Dataset
 from hil.campaigns.findings import find
-from hil.campaigns.flying import Campaign, CampaignRow, fly_flight
+from hil.campaigns.jobs import Job, Row, fly_job
 from hil.campaigns.report import write_report
 from hil.campaigns.run import Flyer, Progress, Standing, conduct, interval
+from hil.campaigns.sampling import draw, plan_of
 from hil.errors import LabError
 from support.campaigns import BAD_PUSH, planted, spec_of
 from support.full_disk import small_files
@@ -30,34 +31,33 @@ def nothing(standing: Standing) -> None:
 
 
 def flown_into(folder: Path, spec: Spec, flyer: Flyer, resume: bool = False) -> Standing:
-    dataset = Dataset(folder, Campaign.of(spec), resume)
-    return conduct(spec, dataset, flyer, nothing)
+    return conduct(Dataset(folder, plan_of(spec), resume), flyer, nothing)
 
 
-def workers(spec: Spec, count: int, asked: list[int] | None = None) -> Flyer:
+def workers(count: int, asked: list[int] | None = None) -> Flyer:
     """`count` workers, whose flights come in an order of their own."""
-    campaign, rng = Campaign.of(spec), random.Random(count)
+    rng = random.Random(count)
 
-    def fly(indices: Iterator[int]) -> Iterator[CampaignRow]:
-        under_way: list[int] = []
-        while under_way := under_way + list(itertools.islice(indices, count - len(under_way))):
-            index = under_way.pop(rng.randrange(len(under_way)))
+    def fly(jobs: Iterator[Job]) -> Iterator[Row]:
+        under_way: list[Job] = []
+        while under_way := under_way + list(itertools.islice(jobs, count - len(under_way))):
+            job = under_way.pop(rng.randrange(len(under_way)))
             if asked is not None:
-                asked.append(index)
-            yield planted(campaign, index)
+                asked.append(job.index)
+            yield planted(job)
 
     return fly  # type: ignore[return-value]
 
 
 def bytes_of(folder: Path) -> bytes:
-    (file,) = (folder / FLIGHTS).iterdir()
-    return file.read_bytes()
+    assert not (folder / ARRIVING).exists()
+    return (folder / FLIGHTS).read_bytes()
 
 
 @pytest.mark.parametrize("stop", ["", "failure rate known to ±10 %"])
 def test_the_dataset_is_the_same_for_any_number_of_workers(tmp_path: Path, stop: str) -> None:
     spec = spec_of(flights=200, stop=stop)
-    standings = [flown_into(tmp_path / str(n), spec, workers(spec, n)) for n in (1, 2, 17)]
+    standings = [flown_into(tmp_path / str(n), spec, workers(n)) for n in (1, 2, 17)]
     assert len({bytes_of(tmp_path / str(n)) for n in (1, 2, 17)}) == 1
     assert len(set(standings)) == 1
     assert standings[0].complete
@@ -66,13 +66,13 @@ def test_the_dataset_is_the_same_for_any_number_of_workers(tmp_path: Path, stop:
 
 def test_a_row_says_all_of_its_flight_and_columns_have_units(tmp_path: Path) -> None:
     spec = spec_of()
-    flown_into(tmp_path / "out", spec, workers(spec, 1))
+    flown_into(tmp_path / "out", spec, workers(1))
     table = pq.read_table(tmp_path / "out" / FLIGHTS)
     row = table.to_pylist()[7]
-    expected = planted(Campaign.of(spec), 7)
+    expected = planted(draw(spec, 7))
     assert (row["index"], row["seed"], row["hash"]) == (7, 8, expected.hash)
-    assert row["parameter.actuators.tau"] == expected.parameters["actuators.tau"]
-    assert tuple(row["faults"]) == expected.faults
+    assert row["parameter.actuators.tau"] == expected.job.values["actuators.tau"]
+    assert tuple(row["faults"]) == expected.job.options["faults"]
     assert row["metric.max_y"] == expected.metrics["max_y"]
     assert row["holds.in_box"] is expected.holds["in_box"]
     assert table.schema.field("metric.max_y").metadata == {b"unit": b"m"}
@@ -81,50 +81,48 @@ def test_a_row_says_all_of_its_flight_and_columns_have_units(tmp_path: Path) -> 
 def test_a_campaign_that_was_interrupted_flies_the_rest_and_nothing_twice(tmp_path: Path) -> None:
     spec = spec_of()
     asked: list[int] = []
-    whole = workers(spec, 3, asked)
+    whole = workers(3, asked)
     first = flown_into(tmp_path / "out", spec, limited(whole, 11))
     assert (first.flown, first.complete) == (11, False)
     then = flown_into(tmp_path / "out", spec, whole, resume=True)
     assert then.complete
     assert sorted(asked) == list(range(40))
-    flown_into(tmp_path / "straight", spec, workers(spec, 1))
+    flown_into(tmp_path / "straight", spec, workers(1))
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "straight")
 
 
 def limited(flyer: Flyer, count: int) -> Flyer:
     """Workers that are interrupted after `count` flights."""
 
-    def fly(indices: Iterator[int]) -> Iterator[CampaignRow]:
-        yield from itertools.islice(flyer(indices), count)
+    def fly(jobs: Iterator[Job]) -> Iterator[Row]:
+        yield from itertools.islice(flyer(jobs), count)
 
     return fly  # type: ignore[return-value]
 
 
 def flown_and_killed(folder: Path, when: str) -> None:
-    """Fly eleven flights in files of four, and die."""
-    rows = Dataset(folder, Campaign.of(spec_of()), resume=False)
+    """Fly eleven flights, and die in the middle of a line, or between the file and the end of the lines that became it."""
+    rows = Dataset(folder, plan_of(spec_of()), resume=False)
     unlink = Path.unlink
 
     def die_once_packed(path: Path, missing_ok: bool = False) -> None:
-        if when == "packing" and path.name == ARRIVING and len(rows.indices) == 8:
+        if path.name == ARRIVING:
             os.kill(os.getpid(), signal.SIGKILL)
         unlink(path, missing_ok)
 
     Path.unlink = die_once_packed  # type: ignore[method-assign, assignment]
     for index in range(11):
-        rows.add(planted(Campaign.of(spec_of()), index))
+        rows.add(planted(draw(spec_of(), index)))
+    if when == "packing":
+        rows.close()
     with (folder / ARRIVING).open("a") as file:
         file.write('{"index": 11, "exper')
         file.flush()
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-@pytest.mark.parametrize(("when", "kept"), [("writing", 11), ("packing", 8)])
-def test_kill_9_loses_no_row_that_was_there_and_repeats_none(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, when: str, kept: int
-) -> None:
-    """Killed in the middle of a line, and between a new file and the end of the lines that became it."""
-    monkeypatch.setattr("hil.campaigns.dataset.ROWS_PER_FILE", 4)
+@pytest.mark.parametrize("when", ["writing", "packing"])
+def test_kill_9_loses_no_row_that_was_there_and_repeats_none(tmp_path: Path, when: str) -> None:
     child = os.fork()
     if child == 0:
         try:
@@ -133,11 +131,10 @@ def test_kill_9_loses_no_row_that_was_there_and_repeats_none(
             os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
     assert (tmp_path / "out" / ARRIVING).is_file()
-    spec = spec_of()
     asked: list[int] = []
-    assert flown_into(tmp_path / "out", spec, workers(spec, 2, asked), resume=True).complete
-    assert sorted(asked) == list(range(kept, 40))
-    flown_into(tmp_path / "straight", spec, workers(spec, 1))
+    assert flown_into(tmp_path / "out", spec_of(), workers(2, asked), resume=True).complete
+    assert sorted(asked) == list(range(11, 40))
+    flown_into(tmp_path / "straight", spec_of(), workers(1))
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "straight")
 
 
@@ -147,11 +144,11 @@ def test_a_full_disk_is_one_line_and_what_is_there_is_kept(tmp_path: Path, limit
     spec = spec_of(flights=100)
     asked: list[int] = []
     with small_files(limit), pytest.raises(LabError, match="cannot be written") as refused:
-        flown_into(tmp_path / "out", spec, workers(spec, 1, asked))
+        flown_into(tmp_path / "out", spec, workers(1, asked))
     assert "\n" not in str(refused.value)
     there = len(asked) - 1
     assert 1 <= there < 99
-    assert flown_into(tmp_path / "out", spec, workers(spec, 1, asked), resume=True).complete
+    assert flown_into(tmp_path / "out", spec, workers(1, asked), resume=True).complete
     assert asked == [*range(there + 1), *range(there, 100)], (
         "only the flight that found no room is flown again"
     )
@@ -159,30 +156,29 @@ def test_a_full_disk_is_one_line_and_what_is_there_is_kept(tmp_path: Path, limit
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_no_room_for_a_flight_s_own_files_ends_the_campaign_and_is_no_row() -> None:
-    campaign = Campaign.of(spec_of(flights=1))
     with small_files(10_000), pytest.raises(LabError, match=r"flight 0: .*File too large"):
-        fly_flight(campaign, 0)
+        fly_job(draw(spec_of(flights=1), 0))
     gc.collect()  # the telemetry log that found no room
 
 
 def test_a_folder_is_not_mistaken_for_another_campaign(tmp_path: Path) -> None:
     spec = spec_of()
-    flown_into(tmp_path / "out", spec, limited(workers(spec, 1), 3))
+    flown_into(tmp_path / "out", spec, limited(workers(1), 3))
     with pytest.raises(LabError, match="holds a campaign; --resume continues it"):
-        flown_into(tmp_path / "out", spec, workers(spec, 1))
+        flown_into(tmp_path / "out", spec, workers(1))
     with pytest.raises(LabError, match=r"--resume: spec\.seed was 1 and is 9: choose another --out"):
-        flown_into(tmp_path / "out", spec_of(seed=9), workers(spec, 1), resume=True)
+        flown_into(tmp_path / "out", spec_of(seed=9), workers(1), resume=True)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").touch()
     with pytest.raises(LabError, match="not empty and holds no campaign"):
-        flown_into(tmp_path / "other", spec, workers(spec, 1))
+        flown_into(tmp_path / "other", spec, workers(1))
     with pytest.raises(LabError, match="cannot be written"):
-        flown_into(Path("/proc/floaty"), spec, workers(spec, 1))
+        flown_into(Path("/proc/floaty"), spec, workers(1))
 
 
 def test_flying_stops_at_the_first_flight_by_which_the_rate_is_known_well_enough(tmp_path: Path) -> None:
     spec = spec_of(flights=2000, stop="failure rate known to ±6 %")
-    standing = flown_into(tmp_path / "out", spec, workers(spec, 3))
+    standing = flown_into(tmp_path / "out", spec, workers(3))
     table = pq.read_table(tmp_path / "out" / FLIGHTS)
     failed = [not one for one in table["passed"].to_pylist()]
     assert table["index"].to_pylist() == list(range(standing.flown))
@@ -202,7 +198,7 @@ def test_the_interval_is_wilson_s() -> None:
 
 
 def test_what_comes_beyond_the_end_does_not_count() -> None:
-    progress = Progress(spec_of(flights=1000, stop="failure rate known to ±5 %"))
+    progress = Progress(plan_of(spec_of(flights=1000, stop="failure rate known to ±5 %")))
     for index in reversed(range(200)):  # all hold: 38 are enough
         progress.add(index, True)
     assert progress.end is not None
@@ -212,10 +208,9 @@ def test_what_comes_beyond_the_end_does_not_count() -> None:
 
 def test_what_was_planted_is_found(tmp_path: Path) -> None:
     spec = spec_of(flights=256, sampling="sobol", table={"constants": ["roll_u1"]})
-    campaign = Campaign.of(spec)
-    flown_into(tmp_path, spec, workers(spec, 2))
-    found = find(spec, read_flights(tmp_path, schema_of(campaign)))
-    expected = [not planted(campaign, n).passed for n in range(256)]
+    flown_into(tmp_path, spec, workers(2))
+    found = find(spec, Dataset(tmp_path, plan_of(spec), resume=True).table())
+    expected = [not planted(draw(spec, n)).passed for n in range(256)]
     assert (found.rate.failed, found.rate.flown) == (sum(expected), 256)
     mapped, *others = found.influences
     assert mapped.method == "logistic map"
@@ -235,9 +230,10 @@ def test_what_was_planted_is_found(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_the_report_has_rates_influences_commands_and_pictures(tmp_path: Path) -> None:
     spec = spec_of(flights=128, sampling="sobol")
-    campaign = Campaign.of(spec)
-    flown_into(tmp_path, spec, workers(spec, 2))
-    path, found = write_report(tmp_path, "my spec.toml", campaign, complete=True)
+    flown_into(tmp_path, spec, workers(2))
+    path, found = write_report(
+        "my spec.toml", spec, Dataset(tmp_path, plan_of(spec), resume=True), complete=True
+    )
     page = Page(path.read_text(encoding="utf-8"))
     assert [len(page.tables[name]) for name in ("limits", "worst")] == [1 + len(found.limits), 1 + 10]
     assert len(page.tables["influences"]) == 1 + len(found.influences) > 2
@@ -250,13 +246,10 @@ def test_the_report_has_rates_influences_commands_and_pictures(tmp_path: Path) -
 @pytest.mark.long
 def test_a_report_of_nothing_and_of_nothing_that_failed_can_be_written(tmp_path: Path) -> None:
     spec = spec_of(faults=[])
-    Dataset(tmp_path, Campaign.of(spec), resume=False).close()
-    file = Path("spec.toml")
-    assert (
-        "not complete" in write_report(tmp_path, str(file), Campaign.of(spec), complete=False)[0].read_text()
-    )
-    flown_into(tmp_path, spec, workers(spec, 1), resume=True)
-    text = write_report(tmp_path, str(file), Campaign.of(spec), complete=True)[0].read_text()
+    dataset = Dataset(tmp_path, plan_of(spec), resume=False)
+    assert "not complete" in write_report("spec.toml", spec, dataset, complete=False)[0].read_text()
+    flown_into(tmp_path, spec, workers(1), resume=True)
+    text = write_report("spec.toml", spec, dataset, complete=True)[0].read_text()
     assert "No flight failed a limit." in text
 
 
@@ -267,8 +260,8 @@ def test_a_design_has_the_indices_that_it_is_for(
     tmp_path: Path, sampling: str, flights: int, method: str
 ) -> None:
     spec = spec_of(sampling=sampling, flights=flights)
-    flown_into(tmp_path, spec, workers(spec, 2))
-    found = find(spec, read_flights(tmp_path, schema_of(Campaign.of(spec))))
+    flown_into(tmp_path, spec, workers(2))
+    found = find(spec, Dataset(tmp_path, plan_of(spec), resume=True).table())
     (failing,) = (one for one in found.influences if one.figure == "failing" and one.method == method)
     assert failing.by_axis["actuators.tau"] == pytest.approx(0.0, abs=1e-9)
     assert failing.by_axis["fault 1 push.y size"] > 0.1
@@ -276,18 +269,17 @@ def test_a_design_has_the_indices_that_it_is_for(
 
 def test_flights_without_an_end_are_failures_and_told_apart(tmp_path: Path) -> None:
     spec = spec_of(flights=3, settings=["limits.hover.unsee=1"])
-    campaign = Campaign.of(spec)
-    rows = Dataset(tmp_path, campaign, False)
+    rows = Dataset(tmp_path, plan_of(spec), False)
     for index in range(3):
-        rows.add(fly_flight(campaign, index))
+        rows.add(fly_job(draw(spec, index)))
     rows.close(3)
-    found = find(spec_of(flights=3), read_flights(tmp_path, rows.schema))
+    found = find(spec_of(flights=3), rows.table())
     assert (found.rate.failed, found.worst) == (3, ())
     assert found.errors == ("3×, first flight 0: limit on 'unsee': no such metric; did you mean unseen?",)
 
 
 @pytest.mark.parametrize(("limit", "value"), [("simulated_s", 1.2), ("wall_s", 1e-6)])
 def test_a_flight_beyond_a_limit_of_time_is_a_row_that_says_which(limit: str, value: float) -> None:
-    row = fly_flight(Campaign.of(spec_of(limits={limit: value})), 0)
+    row = fly_job(draw(spec_of(limits={limit: value}), 0))
     assert (row.outcome, row.passed, row.hash) == ("error", False, "")
     assert row.error == f"TooLongError: limits.{limit} = {value:g}: the flight had not ended"

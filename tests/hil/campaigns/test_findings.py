@@ -1,6 +1,6 @@
 """Edges of a campaign: when it ends, which flights have a fault, what counts as worst, how a figure is ranked."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.campaigns.config import Distribution
-from hil.campaigns.dataset import Dataset, read_flights, schema_of, table_of
+from hil.campaigns.dataset import Dataset, schema_of, table_of
 from hil.campaigns.findings import Limited, Rate, find
-from hil.campaigns.flying import Campaign, CampaignRow
+from hil.campaigns.jobs import Row
 from hil.campaigns.run import STOP_FROM, Progress, interval
-from hil.campaigns.sampling import as_flown, axes, draw, points_of, value_at
+from hil.campaigns.sampling import as_flown, axes, draw, plan_of, points_of, value_at
 from hil.laboratory.metrics import METRICS
 from support.campaigns import BAD_PUSH, planted, spec_of
 
@@ -65,7 +65,7 @@ def test_a_campaign_of_n_flights_ends_with_the_last_of_them_and_not_before() -> 
 def test_a_fault_happens_with_its_probability_and_is_marked_where_it_does(probability: float) -> None:
     (push,) = spec_of().faults
     spec = spec_of(flights=200, faults=[push.model_dump() | {"probability": probability}])
-    happened = np.array([bool(draw(spec, index).faults) for index in range(200)])
+    happened = np.array([bool(draw(spec, index).options["faults"]) for index in range(200)])
     assert happened.mean() == pytest.approx(probability, abs=0.08)
     column = [axis.name for axis in axes(spec)].index("fault 1 push.y happens")
     flown = as_flown(spec, points_of(spec))
@@ -83,7 +83,7 @@ def test_a_logarithmic_axis_goes_from_end_to_end_by_equal_factors(share: float) 
 
 def test_points_of_several_seeds_have_seeds_of_their_own() -> None:
     spec = spec_of(flights=12, seeds=3, seed=100)
-    assert [draw(spec, index).seed for index in range(12)] == list(range(100, 112))
+    assert [draw(spec, index).options["seed"] for index in range(12)] == list(range(100, 112))
 
 
 @pytest.mark.parametrize(("bound", "good", "bad"), [("max", "1", "4"), ("min", "4", "1")])
@@ -93,11 +93,10 @@ def test_quantiles_count_from_good_to_bad(bound: str, good: str, bad: str) -> No
     assert (limited.quantile(0.0), limited.quantile(1.0)) == (good, bad)
 
 
-def rows_of(*changes: dict[str, object]) -> list[CampaignRow]:
-    campaign = Campaign.of(spec_of(flights=len(changes)))
+def rows_of(*changes: dict[str, object]) -> list[Row]:
     rows = []
     for index, change in enumerate(changes):
-        row = planted(campaign, index)
+        row = planted(draw(spec_of(flights=len(changes)), index))
         metrics = {**row.metrics, **change.pop("metrics", {})}  # type: ignore[dict-item]
         rows.append(replace(row, passed=False, metrics=metrics, **change))
     return rows
@@ -114,35 +113,33 @@ def test_the_worst_flights_are_those_lost_first_then_those_far_beyond_a_limit() 
         {"metrics": {"rms_x": 0.5}, "holds": {"in_box": True}},
     )
     spec = spec_of(flights=5, settings=["limits.hover.in_box=0.9"])
-    table = table_of([asdict(row) for row in rows], schema_of(Campaign.of(spec)))
+    table = table_of([row.columns() for row in rows], schema_of(plan_of(spec)))
     found = find(spec, table)
     assert [one.index for one in found.worst] == [3, 1, 2, 0, 4]
     assert (found.rate.failed, found.rate.flown) == (5, 5)
 
 
 def test_rows_beyond_the_end_are_dropped_and_a_row_that_came_twice_counts_once(tmp_path: Path) -> None:
-    campaign = Campaign.of(spec_of())
-    rows = Dataset(tmp_path, campaign, False)
+    spec = spec_of()
+    rows = Dataset(tmp_path, plan_of(spec), False)
     for index in (3, 0, 1, 1, 2, 0, 4):
-        rows.add(planted(campaign, index))
+        rows.add(planted(draw(spec, index)))
     rows.close(4)
-    assert read_flights(tmp_path, rows.schema, ["index"])["index"].to_pylist() == [0, 1, 2, 3]
-    assert rows.indices == {0, 1, 2, 3}
+    assert rows.table(["index"])["index"].to_pylist() == [0, 1, 2, 3]
 
 
 def test_a_campaign_of_one_flight_has_one_row(tmp_path: Path) -> None:
-    campaign = Campaign.of(spec_of(flights=1))
-    rows = Dataset(tmp_path, campaign, False)
-    rows.add(planted(campaign, 0))
+    spec = spec_of(flights=1)
+    rows = Dataset(tmp_path, plan_of(spec), False)
+    rows.add(planted(draw(spec, 0)))
     rows.close(1)
-    assert read_flights(tmp_path, rows.schema, ["index"])["index"].to_pylist() == [0]
+    assert rows.table(["index"])["index"].to_pylist() == [0]
 
 
 def test_every_point_has_the_row_of_its_flight() -> None:
     """Two profiles fly each point: flights 2 n and 2 n + 1."""
     spec = spec_of(flights=120, profiles=["floaty", "as-flown"])
-    campaign = Campaign.of(spec)
-    table = table_of([asdict(planted(campaign, index)) for index in range(120)], schema_of(campaign))
+    table = table_of([planted(draw(spec, index)).columns() for index in range(120)], schema_of(plan_of(spec)))
     mapped = find(spec, table).failure_map
     assert mapped is not None
     size = [axis.name for axis in mapped.axes].index("fault 1 push.y size")

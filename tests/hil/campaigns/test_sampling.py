@@ -27,7 +27,7 @@ def test_a_flight_depends_on_its_number_and_on_nothing_that_was_drawn_before(sam
     backwards = [draw(again, index) for index in reversed(range(spec.flights))]
     assert forwards == backwards[::-1]
     assert points_of(spec).tolist() == [points_of(spec, n, 1)[0].tolist() for n in range(spec.points)]
-    assert len({one.settings for one in forwards}) > 3
+    assert len({one.text for one in forwards}) > 3
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
@@ -92,7 +92,7 @@ def test_every_choice_is_as_likely_as_the_others() -> None:
 
 def test_a_fault_happens_in_its_share_of_the_flights_with_its_distributed_size() -> None:
     spec = spec_of(flights=512, sampling="sobol")
-    faults = [draw(spec, index).faults for index in range(512)]
+    faults = [draw(spec, index).options["faults"] for index in range(512)]
     sizes = [float(fault[0].partition("=")[2]) for fault in faults if fault]
     assert len(sizes) == pytest.approx(256, abs=2)
     assert stats.kstest(sizes, stats.uniform(1.0, 11.0).cdf).pvalue > 0.2
@@ -104,16 +104,16 @@ def test_each_point_is_flown_by_every_experiment_profile_and_seed() -> None:
         experiments=["hover", "yaw-step"], profiles=["floaty", "as-flown"], seeds=2, seed=10, flights=16
     )
     drawn = [draw(spec, index) for index in range(16)]
-    assert {one.point for one in drawn} == {0, 1}
-    first = [one for one in drawn if one.point == 0]
-    assert len({(one.experiment, one.profile, one.seed) for one in first}) == 8
-    assert len({one.settings for one in first}) == 1
-    assert {one.seed for one in drawn} == {10, 11, 12, 13}
+    values = [one.values["actuators.tau"] for one in drawn]
+    assert (len(set(values[:8])), len(set(values[8:])), len(set(values))) == (1, 1, 2), "two points"
+    first = {(one.experiment, one.options["profile"], one.options["seed"]) for one in drawn[:8]}
+    assert len(first) == 8
+    assert {one.options["seed"] for one in drawn} == {10, 11, 12, 13}
 
 
 def test_the_table_s_constants_lie_within_its_uncertainty_and_fill_it() -> None:
     spec = spec_of(table={"distribution": "uniform"}, parameters={}, faults=[], flights=256, sampling="sobol")
-    drawn = [draw(spec, index).parameters for index in range(256)]
+    drawn = [draw(spec, index).values for index in range(256)]
     assert drawn[0].keys() == {f"plant.constant_factors.{name}" for name in PAPER_TABLE.keys() - {"z_vz"}}
     for name in PAPER_TABLE.keys() - {"z_vz"}:
         value, error = PAPER_TABLE[name]
@@ -127,7 +127,7 @@ def test_the_table_s_uncertainty_as_a_deviation_stays_where_the_plant_can_be() -
         table={"distribution": "normal", "constants": ["roll_roll"]}, parameters={}, faults=[], flights=512,
         sampling="sobol",
     )  # fmt: skip
-    factors = [float(draw(spec, n).parameters["plant.constant_factors.roll_roll"]) for n in range(512)]
+    factors = [float(draw(spec, n).values["plant.constant_factors.roll_roll"]) for n in range(512)]
     expected = stats.truncnorm(-1.0 / 0.625, 3.0 / 0.625, 1.0, 0.625)  # -16 +- 10
     assert stats.kstest(factors, expected.cdf).pvalue > 0.2
     assert 0.0 <= min(factors) < 0.05
@@ -151,7 +151,7 @@ def test_a_number_of_flights_that_a_design_has_not_is_refused_with_one_that_it_h
 def test_a_campaign_over_seeds_alone_has_no_axes() -> None:
     spec = spec_of(parameters={}, faults=[], flights=3)
     assert axes(spec) == ()
-    assert [draw(spec, index).seed for index in range(3)] == [1, 2, 3]
+    assert [draw(spec, index).options["seed"] for index in range(3)] == [1, 2, 3]
 
 
 def test_nothing_warns_that_a_sample_is_no_power_of_two() -> None:

@@ -106,7 +106,7 @@ def test_a_flight_that_fails_in_another_manner_is_not_the_one_to_be_shrunk(
         SimpleNamespace(passed=False, outcome=name, verdicts=(), failed=(), cause="")
         for name in ("lost", "completed")
     ]
-    monkeypatch.setattr("hil.campaigns.shrink.fly_within", lambda request, spec: results.pop(0))
+    monkeypatch.setattr("hil.campaigns.shrink.fly_within", lambda request, limits: results.pop(0))
     spec = spec_of()
     reflight = Reflight(spec, draw(spec, 0), lambda line: None)
     assert reflight.fails(reflight.whole)
@@ -166,12 +166,10 @@ size = 2.0
 
 def test_what_is_shrunk_is_the_flight_that_was_drawn() -> None:
     spec = spec_of(flights=8, sampling="sobol")
-    drawn = next(one for one in (draw(spec, index) for index in range(8)) if one.faults)
+    drawn = next(one for one in (draw(spec, index) for index in range(8)) if one.options["faults"])
     reflight = Reflight(spec, drawn, print)
-    assert reflight.whole == Trial(drawn.settings, tuple(map(parse, drawn.faults)))
+    settings, faults = drawn.options["overrides"], drawn.options["faults"]
+    assert reflight.whole == Trial(tuple(settings), tuple(parse(str(fault)) for fault in faults))
     request = reflight.request(reflight.whole)
-    assert (request.seed, request.overrides, request.faults) == (
-        drawn.seed,
-        drawn.settings,
-        drawn.faults,
-    )
+    assert (request.seed, request.overrides) == (drawn.options["seed"], settings)
+    assert request.planned_faults == reflight.whole.faults

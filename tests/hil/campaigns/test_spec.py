@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hil.campaigns.config import find_spec, read_spec
-from hil.campaigns.sampling import check_spec, draw, request_of
+from hil.campaigns.sampling import check_spec, draw
 from support.command import Cli
 
 HOVER = 'experiments = ["hover"]\nflights = 64\n'
@@ -15,7 +15,7 @@ def test_the_example_flies_the_hover_on_every_robot_that_the_table_allows() -> N
     spec = read_spec(find_spec("table"))
     check_spec(spec)
     assert (spec.flights, spec.experiments) == (1000, ("hover",))
-    factors = request_of(spec, draw(spec, 999)).config.plant.constant_factors
+    factors = draw(spec, 999).request().config.plant.constant_factors
     assert len(factors) == 13
     assert spec.table is not None
     assert spec.table.constants == "all"
@@ -114,6 +114,5 @@ def test_files_that_a_spec_names_begin_at_its_folder(tmp_path: Path) -> None:
 def test_a_missing_extra_says_how_to_install_it(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.errors.find_spec", lambda name: None)
     assert cli("campaign", "table") == 2
-    told = cli.err
-    assert "floaty campaign: distributed is missing: " in told
-    assert "pip install 'dask[distributed]" in told
+    assert "floaty campaign: SALib is missing: " in cli.err
+    assert "pip install 'dask[distributed]" in cli.err

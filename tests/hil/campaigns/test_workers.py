@@ -1,25 +1,27 @@
-"""Flights on Dask's processes: the same rows as without them, whatever becomes of a worker."""
+"""Flights on worker processes, here and of a scheduler: the same rows as without them, whatever becomes of a worker."""
 
-import gc
-import os
+import multiprocessing
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-import pyarrow.parquet as pq
+import dask
 import pytest
 from distributed import LocalCluster
-from distributed.worker_state_machine import StateMachineEvent
 
-from hil.campaigns.cluster import FlyOne, Workers
 from hil.campaigns.config import Spec
-from hil.campaigns.dataset import FLIGHTS, Dataset
-from hil.campaigns.flying import Campaign, CampaignRow, fly_flight
+from hil.campaigns.dataset import Dataset
+from hil.campaigns.jobs import Row, fly_job
 from hil.campaigns.run import Standing, conduct
+from hil.campaigns.sampling import draw, plan_of
+from hil.campaigns.workers import DIED, FlyOne, Workers
 from hil.errors import LabError
 from support.campaigns import hanging, killing, planted, raising, spec_of
 from support.command import Cli
+from support.paths import ROOT
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("default")]
 
@@ -31,28 +33,26 @@ def crew() -> Iterator[Workers]:
     workers.close()
 
 
-def rows_of(crew: Workers, spec: Spec, fly_one: FlyOne) -> dict[int, CampaignRow]:
-    rows = list(crew.fly(Campaign.of(spec), lambda: False, iter(range(spec.flights)), fly_one))
-    assert len({row.index for row in rows}) == len(rows), "none twice"
-    return {row.index: row for row in rows}
+def rows_of(crew: Workers, spec: Spec, fly_one: FlyOne) -> dict[int, Row]:
+    plan = plan_of(spec)
+    rows = list(crew.fly(map(plan.job, range(spec.flights)), lambda: 0, fly_one))
+    assert len({row.job.index for row in rows}) == len(rows), "none twice"
+    return {row.job.index: row for row in rows}
 
 
 def test_flights_are_the_same_as_in_this_process(crew: Workers) -> None:
     spec = spec_of(flights=4)
-    rows = rows_of(crew, spec, fly_flight)
+    rows = rows_of(crew, spec, fly_job)
     assert len({row.hash for row in rows.values()}) == 4
     for index in (0, 3):
-        row = fly_flight(Campaign.of(spec), index)
-        assert (row.hash, row.faults, row.outcome) == (
-            rows[index].hash, rows[index].faults, rows[index].outcome,
-        )  # fmt: skip
+        assert str(fly_job(draw(spec, index)).columns()) == str(rows[index].columns())
 
 
 def test_a_flight_that_raises_is_a_row_with_its_error(crew: Workers) -> None:
     spec = spec_of(flights=8)
     rows = rows_of(crew, spec, raising)
     assert (rows[3].outcome, rows[3].error, rows[3].passed) == ("error", "ZeroDivisionError: planted", False)
-    assert all(rows[n].hash == planted(Campaign.of(spec), n).hash for n in range(8) if n != 3)
+    assert all(rows[n].hash == planted(draw(spec, n)).hash for n in range(8) if n != 3)
 
 
 def test_the_flight_that_kills_its_worker_each_time_is_a_row_and_all_others_are_flown(
@@ -73,48 +73,68 @@ def test_a_flight_that_never_ends_is_a_row_and_the_workers_go_on(crew: Workers) 
 
 
 def test_a_worker_killed_from_outside_costs_no_flight(crew: Workers) -> None:
-    spec = spec_of(flights=30)
-    flights = crew.fly(Campaign.of(spec), lambda: False, iter(range(30)), planted)
+    flights = crew.fly(map(plan_of(spec_of(flights=30)).job, range(30)), lambda: 0, planted)
     rows = [next(flights)]
-    assert crew.cluster is not None
-    victim = next(nanny.pid for nanny in crew.cluster.workers.values() if nanny.pid)
-    os.kill(victim, signal.SIGKILL)
+    multiprocessing.active_children()[0].kill()
     rows += flights
-    assert sorted(row.index for row in rows) == list(range(30))
+    assert sorted(row.job.index for row in rows) == list(range(30))
     assert {row.outcome for row in rows} == {"completed"}
-
-
-def events_in_memory() -> int:
-    gc.collect()
-    return sum(isinstance(thing, StateMachineEvent) for thing in gc.get_objects())
-
-
-def test_workers_keep_no_history_of_the_flights_that_they_have_flown(crew: Workers) -> None:
-    rows_of(crew, spec_of(flights=100), planted)
-    assert max(crew.client.run(events_in_memory).values()) < 30
 
 
 def test_an_interrupt_ends_it_with_what_is_there(crew: Workers) -> None:
     stops: list[int] = []
     rows = []
-    for row in crew.fly(Campaign.of(spec_of(flights=500)), lambda: bool(stops), iter(range(500)), planted):
+    for row in crew.fly(map(plan_of(spec_of(flights=500)).job, range(500)), lambda: len(stops), planted):
         rows.append(row)
         if len(rows) == 5:
             stops.append(signal.SIGINT)
     assert 5 <= len(rows) < 20
 
 
+def test_workers_end_with_a_program_that_is_killed() -> None:
+    code = (
+        "import time\n"
+        "from hil.campaigns.sampling import draw\n"
+        "from hil.campaigns.workers import Workers\n"
+        "from support.campaigns import planted, spec_of\n"
+        "print(len(list(Workers(2).fly((draw(spec_of(), n) for n in range(4)), lambda: 0, planted))), flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    program = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT / "tests"
+    )
+    assert program.stdout is not None
+    assert program.stdout.readline() == "4\n"
+    program.kill()
+    assert program.communicate(timeout=20.0)[0] == "", (
+        "the workers, which have this output as well, have closed it"
+    )
+
+
 def test_a_cluster_that_is_there_flies_the_same_dataset(tmp_path: Path) -> None:
     spec = spec_of(flights=20)
-    campaign = Campaign.of(spec)
     with LocalCluster(
         n_workers=1, threads_per_worker=2, dashboard_address=":0", silence_logs=50
     ) as there:  # fmt: skip
         crew = Workers(0, there.scheduler_address)
-        flyer = partial(crew.fly, campaign, lambda: False, fly_one=planted)
-        conduct(spec, Dataset(tmp_path / "cluster", campaign, False), flyer, _nothing)
+        flyer = partial(crew.fly, stopped=lambda: 0, fly_one=planted)
+        dataset = Dataset(tmp_path / "cluster", plan_of(spec), False)
+        conduct(dataset, flyer, _nothing)
         crew.close()
-    assert pq.read_table(tmp_path / "cluster" / FLIGHTS)["index"].to_pylist() == list(range(20))
+    assert dataset.table()["index"].to_pylist() == list(range(20))
+
+
+def test_a_flight_that_kills_the_cluster_s_worker_each_time_is_a_row(tmp_path: Path) -> None:
+    spec = spec_of(flights=6, settings=[str(tmp_path / "once")])
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs=50) as there,
+    ):
+        crew = Workers(0, there.scheduler_address)
+        rows = rows_of(crew, spec, killing)
+        crew.close()
+    assert sorted(rows) == list(range(6))
+    assert rows[3].error == DIED
 
 
 def _nothing(standing: Standing) -> None:
@@ -122,7 +142,7 @@ def _nothing(standing: Standing) -> None:
 
 
 def test_a_cluster_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hil.campaigns.cluster.CONNECT_S", 1.0)
+    monkeypatch.setattr("hil.campaigns.workers.CONNECT_S", 1.0)
     with pytest.raises(LabError, match=r"--cluster tcp://127\.0\.0\.1:9: no workers"):
         Workers(0, "tcp://127.0.0.1:9")
 

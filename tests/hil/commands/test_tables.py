@@ -3,11 +3,12 @@
 from dataclasses import replace
 from math import radians
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from hil.campaigns.jobs import Job, Row
+from hil.campaigns.run import Runner
 from hil.commands.compare import _print_seeds
 from hil.commands.tables import SEED_COLUMNS, print_result, print_seeds
 from hil.experiments import EXPERIMENTS
@@ -26,8 +27,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Result:
     return read_result(folder)
 
 
-def made(flown: Result, rms: float, holds: bool, outcome: str = "completed") -> Result:
-    """A flight with the same error on every axis and one limit."""
+def made(rms: float, holds: bool, outcome: str = "completed") -> Row:
+    """The row of a flight with the same error on every axis and one limit."""
     names = [name for _, group, _, _ in SEED_COLUMNS for name in group]
     metrics = {
         **dict.fromkeys(names, 0.5),
@@ -35,12 +36,12 @@ def made(flown: Result, rms: float, holds: bool, outcome: str = "completed") -> 
         "attitude_max": radians(9.0),
     }
     metrics |= {"flown": 0.1} | {f"within_6cm_{axis}": 0.9 if holds else 0.5 for axis in "xyz"}
-    verdict = Verdict("rms_x", rms, 0.02, holds, "m", "max")
-    return replace(flown, outcome=outcome, metrics=metrics, verdicts=(verdict,), cause=None)  # type: ignore[arg-type]
+    job = Job(0, "hover", {"profile": "floaty"}, {})
+    return Row(job, outcome, "", holds, "0" * 64, metrics, {"rms_x": holds})
 
 
-def test_means_are_those_of_the_completed_flights(flown: Result, capsys: pytest.CaptureFixture[str]) -> None:
-    print_seeds([made(flown, 0.01, True), made(flown, 0.03, False), made(flown, 0.5, False, "lost")])
+def test_means_are_those_of_the_completed_flights(capsys: pytest.CaptureFixture[str]) -> None:
+    print_seeds([made(0.01, True), made(0.03, False), made(0.5, False, "lost")])
     shown = capsys.readouterr().out
     assert "3 seeds: 1 hold all limits, 1 lost" in shown
     assert (
@@ -55,7 +56,8 @@ def test_a_limit_that_holds_is_ok_and_one_that_does_not_fails(
     flown: Result, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for holds, mark in ((True, "ok"), (False, "FAILS")):
-        print_result(made(flown, 0.01, holds))
+        verdict = Verdict("rms_x", 0.01, 0.02, holds, "m", "max")
+        print_result(replace(flown, metrics=flown.metrics | {"rms_x": 0.01}, verdicts=(verdict,)))
         (line,) = [line for line in capsys.readouterr().out.splitlines() if "rms_x" in line]
         assert [cell.strip() for cell in line.split("│")[-3:-1]] == ["<= 2 cm", mark]
 
@@ -68,23 +70,18 @@ def test_every_metric_of_the_tables_exists() -> None:
     ("passed", "code"), [((True, True, True), 0), ((True, False, True), 1), ((False,) * 3, 1)]
 )
 def test_seeds_count_up_and_one_that_fails_is_exit_code_one(
-    cli: Cli,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    flown: Result,
-    passed: tuple[bool, ...],
-    code: int,
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, passed: tuple[bool, ...], code: int
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    jobs: list[Any] = []
+    jobs: list[Job] = []
 
-    def fly_all(wanted: list[Any], notices: object) -> tuple[list[Result], bool]:
+    def fly_all(runner: Runner, name: str, wanted: list[Job], out: Path) -> list[Row]:
         jobs.extend(wanted)
-        return [made(flown, 0.01, holds) for holds in passed], False
+        return [made(0.01, holds) for holds in passed]
 
-    monkeypatch.setattr("hil.studies.sweep.fly_all", fly_all)
+    monkeypatch.setattr(Runner, "fly", fly_all)
     assert cli("fly", "hover", "--seeds", "3", "--seed", "5") == code
-    assert [job.request.seed for job in jobs] == [5, 6, 7]
+    assert [job.options["seed"] for job in jobs] == [5, 6, 7]
     assert len({job.folder for job in jobs}) == 3
 
 

@@ -14,14 +14,13 @@ from typing import Any
 
 import pytest
 
+from hil.campaigns.jobs import Job, Row, fly_job
 from hil.config import load_config
 from hil.design.analysis import analyse
 from hil.design.sweeps import point_of
 from hil.experiments import EXPERIMENTS
-from hil.laboratory.metrics import METRICS, Verdict
-from hil.laboratory.request import Request
-from hil.laboratory.result import Result
-from hil.laboratory.run import fly
+from hil.laboratory.metrics import METRICS
+from hil.laboratory.request import Options
 from hil.studies.catalogue import PROFILES
 from hil.studies.paper import Paper, Spread, Trials
 from hil.studies.paper_report import write_paper
@@ -41,9 +40,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    folder = tmp_path_factory.mktemp("flight") / "run"
-    return fly(Request.of(EXPERIMENTS["hover"], duration_s=0.3), folder)
+def result() -> Row:
+    return fly_job(Job(0, "hover", Options(duration_s=0.3), {}))
 
 
 def content(folder: Path) -> dict[str, Any]:
@@ -66,8 +64,9 @@ def test_a_row_shows_metrics_that_exist_and_says_where_the_paper_claims_them(nam
 @pytest.mark.long
 def test_every_flight_keeps_its_log_and_nothing_big_besides(flown: Path) -> None:
     folders = {path.name for path in flown.iterdir() if path.is_dir()}
-    assert folders == {f"hover-{profile}-{seed}" for profile in PROFILES for seed in (1, 2)}
-    for name in folders:
+    flights = {f"hover-{profile}-{seed}" for profile in PROFILES for seed in (1, 2)}
+    assert folders == flights | {"campaigns"}
+    for name in flights:
         assert {path.name for path in (flown / name).iterdir()} == {
             "log.parquet",
             "events.jsonl",
@@ -123,16 +122,13 @@ def test_the_report_tells_the_papers_value_and_ours(flown: Path) -> None:
     assert figures.links == ["report.html"]
 
 
-def trials(result: Result, *passed: bool) -> Trials:
+def trials(result: Row, *passed: bool) -> Trials:
     """Flights of which some failed a limit."""
-    flights = (
-        dataclasses.replace(result, verdicts=(Verdict("max_x", 0.0 if one else 1.0, 0.1, one, "m", "max"),))
-        for one in passed
-    )
+    flights = (dataclasses.replace(result, passed=one, holds={"max_x": one}) for one in passed)
     return Trials("floaty", tuple(flights))
 
 
-def test_every_seed_of_the_default_profile_must_hold(result: Result) -> None:
+def test_every_seed_of_the_default_profile_must_hold(result: Row) -> None:
     row = ROWS["hover"]
     good, bad = trials(result, True, True), trials(result, True, False)
     assert Paper((("hover", row, (good, bad)),), (), False).holds, "the other profile shows what it shows"
@@ -142,7 +138,7 @@ def test_every_seed_of_the_default_profile_must_hold(result: Result) -> None:
     assert bad.failed == ["max_x 1×"]
 
 
-def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -> None:
+def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Row) -> None:
     row = PaperRow(
         "t",
         "c",
@@ -151,7 +147,7 @@ def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -
         "why",
     )
     slow, fast = (
-        dataclasses.replace(result, verdicts=(), metrics={"settle": settle, "peak_rate": rate})
+        dataclasses.replace(result, passed=True, holds={}, metrics={"settle": settle, "peak_rate": rate})
         for settle, rate in ((0.75, math.radians(70)), (0.45, math.radians(90)))
     )
     good, bad = Trials("floaty", (fast, fast)), Trials("as-flown", (slow, fast))  # the mean: 0.6 s, 80 deg/s
@@ -165,7 +161,7 @@ def test_what_misses_the_paper_is_told_whatever_the_limits_say(result: Result) -
 
 
 @pytest.mark.long
-def test_the_badges_say_which_kind_of_verdict_they_are(result: Result, tmp_path: Path) -> None:
+def test_the_badges_say_which_kind_of_verdict_they_are(result: Row, tmp_path: Path) -> None:
     good = trials(result, True, True)
     row = PaperRow("t", "c", "p", {"rms_x": MetricClaim("0", 0.0)}, "why")
     study = StudyResult(
@@ -197,7 +193,7 @@ def test_the_badges_say_which_kind_of_verdict_they_are(result: Result, tmp_path:
     assert studies.links == ["report.html", "t.html"]
 
 
-def test_the_representative_trial_has_the_median_error(result: Result) -> None:
+def test_the_representative_trial_has_the_median_error(result: Row) -> None:
     flights = [
         dataclasses.replace(result, metrics={**result.metrics, "rms_x": error})
         for error in (0.5, 0.1, 0.3, 0.2, 0.4)
@@ -206,7 +202,7 @@ def test_the_representative_trial_has_the_median_error(result: Result) -> None:
     assert [one.metrics["rms_x"] for one in ordered] == [0.3, 0.1, 0.2, 0.4, 0.5]
 
 
-def test_a_figure_that_no_flight_has_is_a_dash(result: Result) -> None:
+def test_a_figure_that_no_flight_has_is_a_dash(result: Row) -> None:
     assert str(Spread.of("held_up_to", [result])) == "–"
     assert str(Spread.of("lost", [result])) == "0"
 

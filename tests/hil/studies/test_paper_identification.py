@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from hil.campaigns.run import Runner
 from hil.studies.paper import Paper
 from hil.studies.paper_identification import COLUMNS, WHY, PaperConstant, fly_identification
 from hil.studies.paper_report import write_paper
@@ -19,7 +20,8 @@ def number(text: str) -> float:
 
 @pytest.mark.long
 def test_the_papers_method_misses_what_the_others_find(tmp_path: Path) -> None:
-    a, c, b, first, second = fly_identification(tmp_path, Console(quiet=True))
+    with Runner(Console(quiet=True)) as runner:
+        a, c, b, first, second = fly_identification(tmp_path, runner)
     assert [row.arithmetic for row in (a, c)] == ["230", "-14"]
     assert [row.truth for row in (a, c, b, first, second)] == ["230", "-16", "-40", "-62", "-50.5"]
     assert [row.paper for row in (first, second)] == ["-60", "-48.5"]

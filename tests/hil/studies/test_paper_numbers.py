@@ -15,7 +15,7 @@ from hil.studies.tuning import Round, rms
 
 
 def result(outcome: str = "completed", passed: bool = True, **metrics: float) -> Any:
-    return SimpleNamespace(outcome=outcome, passed=passed, metrics={"failsafe": 0.0} | metrics, verdicts=())
+    return SimpleNamespace(outcome=outcome, passed=passed, metrics={"failsafe": 0.0} | metrics, failed=[])
 
 
 def placed(x: float, y: float = 0.0, z: float = 0.0, **more: Any) -> Any:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from hil.campaigns.run import Runner
 from hil.config import load_config
 from hil.design.claims import AGREES
 from hil.design.sweeps import point_of
@@ -15,7 +16,8 @@ from hil.world.geometry import weigh
 
 @pytest.mark.long
 def test_flights_of_three_sizes_show_that_agility_goes_with_one_over_the_length(tmp_path: Path) -> None:
-    claims = fly_scaling(tmp_path, Console(quiet=True))
+    with Runner(Console(quiet=True)) as runner:
+        claims = fly_scaling(tmp_path, runner)
     assert [claim.title.split()[0] for claim in claims] == ["yaw", "roll"]
     for claim in claims:
         exponent, half = (float(part) for part in claim.ours.split(" (")[0].split(" ± "))

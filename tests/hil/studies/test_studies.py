@@ -7,43 +7,29 @@ from pathlib import Path
 
 import pytest
 
+from hil.campaigns.jobs import Job, Row, fly_job
 from hil.commands.app import main
 from hil.config import load_config
-from hil.experiments import EXPERIMENTS
-from hil.laboratory.faults import parse
-from hil.laboratory.request import Request
-from hil.laboratory.result import Result
-from hil.laboratory.run import fly
+from hil.laboratory.request import Options
 from hil.studies.catalogue import STUDIES
 from hil.studies.study import Change, Expected, Study, Variant
 from hil.studies.study_figures import picture
 from hil.studies.study_run import OUTCOMES, Cell, Curve, StudyResult, flights_of, outcome_of, summarise
 
 
-def flight(
-    folder: Path, profile: str, settings: tuple[str, ...], fault: str, seconds: float, seed: int = 1
-) -> Result:
-    faults = (parse(fault),) if fault else ()
-    return fly(
-        Request.of(
-            EXPERIMENTS["hover"],
-            profile=profile,
-            overrides=settings,
-            seed=seed,
-            duration_s=seconds,
-            faults=faults,
-        ),
-        folder,
-    )
+def flight(settings: tuple[str, ...], fault: str, seconds: float) -> Row:
+    options = Options(overrides=settings, duration_s=seconds, faults=(fault,) if fault else ())
+    return fly_job(Job(0, "hover", options, {}))
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
 def test_every_flight_of_every_study_can_be_asked_for(study: Study) -> None:
     flights = list(flights_of(study, 1))
     assert len(flights) == len(study.variants) * len(study.sizes)
-    for variant, size, request in flights:
-        assert request.config == load_config(variant.profile, request.overrides)
-        assert request.duration_s == study.duration_s, size
+    for job in flights:
+        request = job.request()
+        assert request.config == load_config(job.options["profile"], request.overrides)
+        assert request.duration_s == study.duration_s, job.values
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
@@ -64,7 +50,8 @@ def test_sizes_of_a_study_change_the_flight(study: Study) -> None:
 def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
     study = STUDIES["model-error"]
     (variant,) = (v for v in study.variants if v.name == "floaty, inputs +")
-    (request,) = (r for v, size, r in flights_of(study, 1) if v is variant and size == 30)
+    cell = {"study": "model-error", "variant": variant.name, "size": 30.0}
+    (request,) = (job.request() for job in flights_of(study, 1) if job.values == cell)
     right, wrong = load_config().model.model_dump(), request.config.model.model_dump()
     ratio = {name: wrong[name] / right[name] for name in right}
     inputs = {name for name in right if name[-2:] in ("u1", "u2", "u3", "u4")}
@@ -83,13 +70,13 @@ def test_a_model_error_scales_the_constants_of_its_part_and_no_other() -> None:
         (("tunnel.speed=7",), "", "lost"),
     ],
 )
-def test_outcomes_are_told_apart(tmp_path: Path, settings: tuple[str, ...], fault: str, outcome: str) -> None:
-    result = flight(tmp_path / "run", "floaty", settings, fault, 2.0)
+def test_outcomes_are_told_apart(settings: tuple[str, ...], fault: str, outcome: str) -> None:
+    result = flight(settings, fault, 2.0)
     assert outcome_of(result) == outcome, result.metrics
 
 
-def test_a_flight_that_stopped_on_an_error_is_no_outcome_of_the_robot(tmp_path: Path) -> None:
-    result = flight(tmp_path / "run", "floaty", (), "", 0.1)
+def test_a_flight_that_stopped_on_an_error_is_no_outcome_of_the_robot() -> None:
+    result = flight((), "", 0.1)
     assert outcome_of(dataclasses.replace(result, outcome="error")) == "error"
 
 
@@ -140,26 +127,24 @@ def test_the_typical_outcome_is_the_median_and_the_worse_of_two() -> None:
 
 
 @pytest.mark.long
-def test_the_predictors_cliff(tmp_path: Path) -> None:
+def test_the_predictors_cliff() -> None:
     """The author's gains at 40 ms: lost without the predictor, not with it (a prototype: 20 of 20, 0)."""
-    study = STUDIES["latency"]
     cells = {
-        (variant.name, request.seed): outcome_of(
-            flight(tmp_path / "run", variant.profile, request.overrides, "", study.duration_s, request.seed)
-        )
-        for variant, size, request in flights_of(study, 3)
-        if variant.name in ("as-flown, no predictor", "as-flown, measured age") and size == 40
+        (job.values["variant"], job.options["seed"]): outcome_of(fly_job(job))
+        for job in flights_of(STUDIES["latency"], 3)
+        if job.values["variant"] in ("as-flown, no predictor", "as-flown, measured age")
+        and job.values["size"] == 40
     }
     assert len(cells) == 6
     for (name, seed), outcome in cells.items():
-        assert outcome == ("lost" if "no predictor" in name else "holds"), (name, seed)
+        assert outcome == ("lost" if "no predictor" in str(name) else "holds"), (name, seed)
 
 
 @pytest.mark.long
-def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold(tmp_path: Path) -> None:
+def test_a_study_that_was_cut_short_has_a_picture_and_does_not_hold() -> None:
     study = STUDIES["loss"]
-    variant, size, request = next(flights_of(study, 1))
-    result = summarise(study, [(variant, size, fly(request, tmp_path / "run"))])
+    job = next(flights_of(study, 1))
+    result = summarise(study, [(job, fly_job(job))])
     assert [len(curve.cells) for curve in result.curves] == [1]
     assert not result.holds
     assert picture(result).startswith(b"\x89PNG")
@@ -174,6 +159,7 @@ def test_a_study_can_be_flown_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         main()
     assert left.value.code == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "campaigns",
         "report.html",
         "result.json",
         "studies.html",
