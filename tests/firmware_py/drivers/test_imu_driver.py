@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.board import ImuCounts
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
-from firmware_py.core.structs import RATE, Control, Estimator, Input, Sampling
+from firmware_py.core.structs import RATE, Control, Estimator, Input, Report, Sampling
 from firmware_py.drivers.imu import acceleration, body_of, rates
 from hil.config import load_config
 
@@ -39,5 +39,7 @@ def test_the_core_turns_and_scales_the_gyro_as_the_driver_does() -> None:
     data.fields.gyro_samples = np.int32(10)
     data.fields.gyro_bias[:] = ZERO
     entry.reset(parameters.arg, estimator.arg)
-    entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg, Sampling.allocate().arg)
+    entry.estimate(
+        parameters.arg, data.arg, estimator.arg, control.arg, Sampling.allocate().arg, Report.allocate().arg
+    )
     assert estimator.fields.now[RATE : RATE + 3] == pytest.approx(rates(COUNTS, ZERO), rel=1e-6)

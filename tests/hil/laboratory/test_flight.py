@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ground_station.tracker import Quality
+from hil.campaigns.jobs import Job, row_of
 from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_again, find_experiment
@@ -247,7 +248,7 @@ def test_a_lost_flight_says_so_in_every_table(tmp_path: Path, capsys: pytest.Cap
     assert {verdict.metric for verdict in result.verdicts if verdict.holds} == set()
     assert [verdict.metric for verdict in result.failed] == ["lost"]
     print_result(result)
-    print_seeds([result])
+    print_seeds([row_of(Job(0, "hover", {"profile": "floaty"}, {}), result)])
     shown = capsys.readouterr().out
     share = next(line for line in shown.splitlines() if "within_6cm_x" in line)
     assert f"100 % of {result.metrics['flown']:.4g} s" in share
