@@ -40,8 +40,9 @@ COMMANDS = {
 }
 
 
-# What became of options that no longer exist.
+# What became of options and commands that no longer exist.
 MOVED = {
+    "deploy export": "floaty deploy write DIR",
     "--baud": "--set serial.baud=N",
     "--natnet": "--set capture.natnet=3.1",
     "--natnet-port": "--set capture.port=PORT",
@@ -104,7 +105,9 @@ def main() -> None:
         moved = MOVED.get(error.option_name)
         sys.exit(_refuse(f"{error.option_name}: now {moved}" if moved else error.format_message()))
     except click.ClickException as error:
-        sys.exit(_refuse(error.format_message()))
+        command = " ".join(sys.argv[1:3])
+        moved = MOVED.get(command) if isinstance(error, click.UsageError) else None
+        sys.exit(_refuse(f"{command}: now {moved}" if moved else error.format_message()))
     except (click.Abort, KeyboardInterrupt):
         sys.exit(INTERRUPTED)
     sys.exit(code if isinstance(code, int) else 0)

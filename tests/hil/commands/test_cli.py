@@ -71,6 +71,7 @@ def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
         (["serve", "--gdb", "3333"], "--gdb 3333: needs one board and an image as --board"),
         (["fly", "hover", "--bogus"], "No such option"),
         (["serve", "--baud", "9600"], "--baud: now --set serial.baud=N"),
+        (["deploy", "export", "app"], "deploy export: now floaty deploy write DIR"),
         (["fly"], "Missing argument"),
         (["report", "nowhere"], "nowhere"),
         (["view", "nowhere"], "nowhere"),
