@@ -225,7 +225,9 @@ def report_state(data: Input, estimator: Estimator, control: Control, report: Re
     report_quaternion(report)
     for flap in range(4):
         report.flap[flap] = estimator.now[FLAP + flap] + (control.flap[flap] - control.command[flap])
-    report.age = i32(estimator.pose_age_us // AGE_UNIT_US)
+    report.age = i32(0)
+    if estimator.pose_age_us > 0:
+        report.age = i32(estimator.pose_age_us // AGE_UNIT_US)
     if report.age > AGE_LIMIT:
         report.age = i32(AGE_LIMIT)
     rejected = estimator.refused + estimator.too_old + estimator.invalid

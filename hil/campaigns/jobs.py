@@ -21,7 +21,7 @@ from typing import Any
 from hil.campaigns.config import FlightLimits, Value
 from hil.config import DEFAULT_PROFILE
 from hil.errors import LabError, blame
-from hil.experiments import find_experiment
+from hil.experiments import find_again, find_experiment
 from hil.laboratory.experiment import Source
 from hil.laboratory.flight import Flight
 from hil.laboratory.folder import reserved
@@ -153,10 +153,10 @@ def fly_job(job: Job) -> Row:
     limited = (
         job.limits is not None
     )  # one of many that were sampled: the others are flown whatever becomes of it
+    if find_again(job.experiment, job.source) is None:
+        raise LabError(f"experiment {job.experiment}: its file has changed since the first flight")
     try:
-        request = job.request()
-        if request.experiment.source == job.source:
-            return row_of(job, _flown(job, request))
+        return row_of(job, _flown(job, job.request()))
     except LabError as error:
         if not limited:
             raise
@@ -167,7 +167,6 @@ def fly_job(job: Job) -> Row:
         return failed(job, blame(error))
     except Exception as error:
         return failed(job, f"{type(error).__name__}: {blame(error)}")
-    raise LabError(f"experiment {job.experiment}: its file has changed since the first flight")
 
 
 def _flown(job: Job, request: Request) -> Result:

@@ -59,7 +59,7 @@ def test_sdist_and_wheel_are_complete_and_the_wheel_flies_from_an_empty_folder(t
     assert ["commit", commit()] in [line.split() for line in others]
     run(empty, floaty, "fly", "hover", "--duration", "2")
     flown = read_result(empty / "runs" / "hover-1")
-    assert (flown.passed, flown.commit) == (True, commit())
+    assert (flown.passed, flown.program.commit) == (True, commit())
     found = run(empty, floaty, "campaign", "table", "--shrink", "1000", code=2).stderr
     assert "the campaign has flights 0..999" in found
     refused = run(empty, floaty, "view", "runs/hover-1", code=2).stderr

@@ -42,6 +42,7 @@ def fly() -> None:
         t = 0.01 * tick
         for _ in range(int(rng.choice([0, 1, 2], p=[0.45, 0.5, 0.05]))):
             yaw = 3.0 * math.sin(0.5 * t) + 2.0 * (tick // 400)
+            fields.poses_absolute = tick >= TICKS // 2
             position = 0.3 * np.sin([t, 1.3 * t, 0.7 * t]) + 1e-3 * rng.standard_normal(3)
             position[0] += 1.8 if 1500 <= tick < 1560 else 0.0  # beyond the bound
             q = np.array([math.cos(yaw / 2), 0.05 * math.sin(3 * t), 0.05 * math.cos(t), math.sin(yaw / 2)])

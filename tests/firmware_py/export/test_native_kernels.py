@@ -32,7 +32,7 @@ from support.core_streams import BUILD, one_nan, wild_words
 STRUCTS = (Parameters, Input, Estimator, Control, Sampling, Supervisor, Report)
 
 SHAPES = {"x": 16, "dx": 16, "first": 16, "other": 16, "command": (32, 4), "P": (16, 16), "M": (16, 16), "q": 4,
-          "attitude": 16, "pose": 16}  # fmt: skip
+          "attitude": 16, "pose": 16, "place": 3}  # fmt: skip
 RANGES = {"flap": (0, 4), "state": (0, 16), "row": (0, 32), "offset": (0, 13), "turns": (-637, 638),
           "quarters": (0, 2), "word": (0, 65536), "ticks": (-(2**31), 2**31), "first": (0, 504), "last": (-1, 500),
           "tick": (0, 2000), "time_us": (-1, 10**9 + 1), "by_us": (0, 10**9 + 1), "cause": (0, 12)}  # fmt: skip
@@ -80,6 +80,7 @@ def struct_block(rng: np.random.Generator, struct: type[Struct]) -> Any:
         fields.phase, fields.samples = rng.integers(10), rng.choice((0, 1, 510, 511))
         fields.first[:] = rng.integers(-(2**15), 2**15, 3)
         fields.sums[:] = rng.integers(-(2**24), 2**24, 3)
+        fields.unchanged, fields.recovering = rng.integers(0, 21), rng.integers(0, 101)
     if struct is Supervisor:
         for name in ("silent_us", "low_us", "down_us", "watchdog_us", "episode_us", "gap_us", "outside_us"):
             setattr(block.fields, name, rng.choice((-1, 0, 1000, 5_000_000, LONG_US)))

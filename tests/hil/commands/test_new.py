@@ -86,7 +86,7 @@ def test_a_project_flies_and_its_tests_pass(
     monkeypatch.chdir("law")
     assert cli("fly", "hover", "--profile", "profile.toml", "--duration", "3") == 0
     flown = read_result(Path("runs/hover-1"))
-    assert flown.logic  # the hash of the controller that flew
+    assert flown.program.logic  # the hash of the controller that flew
     assert "logic.integral" in load_log(Path("runs/hover-1")).column_names
     assert [verdict.metric for verdict in flown.verdicts][:3] == ["lost", "in_box", "within_6cm_y"]
     pytester.runpytest_inprocess().assert_outcomes(passed=4)

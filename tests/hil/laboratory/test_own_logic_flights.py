@@ -38,9 +38,9 @@ def test_modules_that_compute_what_the_core_does_make_the_same_flight(tmp_path: 
     profile = make_project(tmp_path, AS_BUILT_IN, ESTIMATOR)
     usual, own = go(tmp_path / "usual", "floaty", 0.5), go(tmp_path / "own", profile, 0.5)
     assert own.hash == usual.hash
-    assert len(own.logic) == 64
-    assert json.loads((tmp_path / "own" / "result.json").read_text())["logic"] == own.logic
-    assert usual.logic == ""
+    assert len(own.program.logic) == 64
+    assert json.loads((tmp_path / "own" / "result.json").read_text())["logic"] == own.program.logic
+    assert usual.program.logic == ""
 
 
 @pytest.mark.long
@@ -113,7 +113,7 @@ def test_the_same_flight_on_another_board_is_alike_to_the_last_bit(
 
 @pytest.mark.long
 def test_without_numba_the_same_text_makes_the_same_flight(failed: Result) -> None:
-    command = ("hover", "--duration", "0.01", "--profile", failed.profile)
+    command = ("hover", "--duration", "0.01", "--profile", failed.request.profile)
     hashes = set()
     for plain in ("0", "1"):
         out = failed.folder.parent / f"plain-{plain}"

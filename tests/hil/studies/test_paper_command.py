@@ -40,8 +40,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def result() -> Row:
-    return fly_job(Job(0, "hover", Options(duration_s=0.3), {}))
+def result(tmp_path_factory: pytest.TempPathFactory) -> Row:
+    folder = tmp_path_factory.mktemp("flown") / "hover-1"
+    return fly_job(Job(0, "hover", Options(duration_s=0.3), {}, folder))
 
 
 def content(folder: Path) -> dict[str, Any]:

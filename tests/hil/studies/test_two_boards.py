@@ -152,7 +152,8 @@ def test_two_folders_of_runs_are_a_row_per_seed(cli: Cli, flown: Path, tmp_path:
         other(flown, tmp_path / "second" / f"hover-{seed}", bumped)
         for name in ("first", "second"):
             folder = tmp_path / name / f"hover-{seed}"
-            write_result(replace(read_result(folder), seed=seed))
+            result = read_result(folder)
+            write_result(replace(result, request=replace(result.request, seed=seed)))
     shutil.copytree(flown, tmp_path / "first" / "hover-3")  # has no partner
     found = seeds_of(tmp_path / "first", tmp_path / "second")
     assert [one.seed for one in found] == [2, 10]
@@ -163,7 +164,8 @@ def test_two_folders_of_runs_are_a_row_per_seed(cli: Cli, flown: Path, tmp_path:
     with pytest.raises(LabError, match="neither two runs nor folders with runs of the same names"):
         seeds_of(tmp_path / "first", flown.parent)
     shutil.copytree(flown, tmp_path / "alone")
-    write_result(replace(read_result(tmp_path / "alone"), seed=2))
+    result = read_result(tmp_path / "alone")
+    write_result(replace(result, request=replace(result.request, seed=2)))
     assert cli("compare", tmp_path / "alone", tmp_path / "second" / "hover-2") == 1
     assert "first servo count: row 101" in cli.out
     page = (tmp_path / "second" / "hover-2" / "compare.html").read_text(encoding="utf-8")

@@ -239,10 +239,10 @@ def test_flights_take_what_the_mark_says_and_options_go_before_it(pytester: pyte
 
         @pytest.mark.floaty(seeds=[7], boards=["c"], profiles=["as-flown"])
         def test_it(floaty):
-            flown = floaty.fly(duration_s=0.1).result
-            assert (flown.seed, flown.board, flown.profile) == (7, "c", "as-flown")
-            other = floaty.fly(duration_s=0.1, seed=9, board="python", profile="floaty").result
-            assert (other.seed, other.board, other.profile) == (9, "python", "floaty")
+            flown = floaty.fly(duration_s=0.1).result.request
+            assert (flown.seed, flown.bench.board, flown.profile) == (7, "c", "as-flown")
+            other = floaty.fly(duration_s=0.1, seed=9, board="python", profile="floaty").result.request
+            assert (other.seed, other.bench.board, other.profile) == (9, "python", "floaty")
         """)
     pytester.runpytest_inprocess().assert_outcomes(passed=1)
 
