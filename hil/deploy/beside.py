@@ -2,7 +2,9 @@
 
 The two are never equal bit for bit: boot time, gyro zero, the estimator's phase and the board's microsecond differ
 (`hil.studies.two_boards`). The bounds are about four times what these make of an image that is right, in a hover of 4 s with
-a push and a link that is cut; the position then differs by 0.4 mm, the servo counts by 330 (rms).
+a push and a link that is cut; the position then differs by 0.4 mm, the servo counts by 330 (rms). The first pose after the
+cut is about as old as the filter's horizon, and the phase decides whether it is fused: where one board takes it and the other
+waits for the next one, the estimate differs by 5 cm in one row of 400, which is 2.7 mm rms.
 """
 
 from __future__ import annotations
@@ -60,13 +62,13 @@ def _share(difference: NDArray[np.float64]) -> float:
 BOUNDS = (
     Bound("position, rms", ("truth.x", "truth.y", "truth.z"), _rms, 2.0, "mm", 1e3),
     Bound("body rates, rms", ("truth.p", "truth.q", "truth.r"), _rms, 0.15, "rad/s"),
-    Bound("estimated position, rms", ("estimate.x", "estimate.y", "estimate.z"), _rms, 2.0, "mm", 1e3),
+    Bound("estimated position, rms", ("estimate.x", "estimate.y", "estimate.z"), _rms, 4.0, "mm", 1e3),
     Bound("estimated rates, mean", ("estimate.p", "estimate.q", "estimate.r"), _mean, 0.004, "rad/s"),
     Bound("servo counts, rms", tuple(f"motor.m{servo}" for servo in range(1, 5)), _rms, 1300.0),
     Bound("servo counts, mean", tuple(f"motor.m{servo}" for servo in range(1, 5)), _mean, 60.0),
     Bound("age of poses, mean", ("estimator.pose_age_us",), _mean, 1.5, "ms", 1e-3),
     Bound("poses fused", ("estimator.fused",), _end, 2.0),
-    Bound("poses not fused", tuple(f"estimator.{name}" for name in ("refused", "jumps", "too_old", "invalid")), _end, 0.0),
+    Bound("poses not fused", tuple(f"estimator.{name}" for name in ("refused", "jumps", "too_old", "invalid")), _end, 1.0),
     Bound("supervisor's state, share of time", ("supervisor.state",), _share, 3.0, "%", 100.0),
 )  # fmt: skip
 
