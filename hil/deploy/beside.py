@@ -3,8 +3,8 @@
 The two are never equal bit for bit: boot time, gyro zero, the estimator's phase and the board's microsecond differ
 (`hil.studies.two_boards`). The bounds are about four times what these make of an image that is right, in a hover of 4 s with
 a push and a link that is cut; the position then differs by 0.4 mm, the servo counts by 330 (rms). The first pose after the
-cut is about as old as the filter's horizon, and the phase decides whether it is fused: where one board takes it and the other
-waits for the next one, the estimate differs by 5 cm in one row of 400, which is 2.7 mm rms.
+cut is about as old as the filter's horizon, and the phase decides whether it is fused: where one board takes it and the
+other waits for the next one, the estimate differs by 5 cm in one row of 400, which is 2.7 mm rms.
 """
 
 from __future__ import annotations
