@@ -149,7 +149,7 @@ def lockstep_flight(
     executor: Executor = PYTHON_BOARD,
     clock: Clock | None = None,
 ) -> Flight:
-    """Return a flight over a modelled link; by default paced if the request says so."""
+    """Return a flight over a modelled link. Without a clock it is paced if the request is in real time."""
     clock = clock or (Paced() if request.bench.realtime else FreeRunning())
     return Flight(request, clock, partial(ModelledLine, telemetry), executor)
 
