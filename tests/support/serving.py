@@ -147,7 +147,7 @@ def serve(*arguments: str, motive: bool = False) -> Iterator[Served]:
 
 @contextmanager
 def station(lab: Served, uri: str, *arguments: str | Path, mocap: str = "") -> Iterator[Served]:
-    """The ground station as a process of its own, with any link and a laboratory's cameras or others."""
+    """Run the ground station as its own process: any link, the cameras of a laboratory or others."""
     command = ("station", "--link", uri, "--mocap", mocap or lab.motive, *arguments)
     with started(*command, environment=lab.environment) as typed:
         yield typed
