@@ -150,13 +150,13 @@ class TooLongError(Exception):
 
 def fly_job(job: Job) -> Row:
     """Fly. Raises `LabError` when there is no room on the disk, or an experiment's file has changed."""
-    limited = (
-        job.limits is not None
-    )  # one of many that were sampled: the others are flown whatever becomes of it
-    if find_again(job.experiment, job.source) is None:
+    # One of many that were sampled: the others are flown whatever becomes of it.
+    limited = job.limits is not None
+    experiment = find_again(job.experiment, job.source)
+    if experiment is None:
         raise LabError(f"experiment {job.experiment}: its file has changed since the first flight")
     try:
-        return row_of(job, _flown(job, job.request()))
+        return row_of(job, _flown(job, Request.of(experiment, **job.options)))
     except LabError as error:
         if not limited:
             raise

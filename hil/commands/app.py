@@ -101,13 +101,10 @@ def main() -> None:
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
         sys.exit(2)
-    except click.NoSuchOption as error:
-        moved = MOVED.get(error.option_name)
-        sys.exit(_refuse(f"{error.option_name}: now {moved}" if moved else error.format_message()))
     except click.ClickException as error:
-        command = " ".join(sys.argv[1:3])
-        moved = MOVED.get(command) if isinstance(error, click.UsageError) else None
-        sys.exit(_refuse(f"{command}: now {moved}" if moved else error.format_message()))
+        typed = error.option_name if isinstance(error, click.NoSuchOption) else " ".join(sys.argv[1:3])
+        moved = MOVED.get(typed)
+        sys.exit(_refuse(f"{typed}: now {moved}" if moved else error.format_message()))
     except (click.Abort, KeyboardInterrupt):
         sys.exit(INTERRUPTED)
     sys.exit(code if isinstance(code, int) else 0)
