@@ -21,41 +21,31 @@ class Board(Protocol):
 
     def read_imu(self) -> ImuCounts:
         """Return the registers of the BMI088 as they are now."""
-        ...
 
     def read_battery_mv(self) -> int:
         """Return the supply voltage [mV]."""
-        ...
 
     def write_compare(self, counts: Sequence[int]) -> None:
         """Load the four servo compare registers [timer counts of 1/21 us]; they act from the next PWM period on."""
-        ...
 
     def radio_send(self, data: bytes) -> bool:
         """Hand a packet to the radio chip; False when its queue is full."""
-        ...
 
     @property
     def uart_overruns(self) -> int:
         """Bytes lost because the UART's receive buffer was full."""
-        ...
 
     def uart_read(self) -> bytes:
         """Return all that the UART's receiver has gathered, and make room."""
-        ...
 
     def uart_write(self, data: bytes) -> bool:
         """Hand bytes to the UART; False when they do not fit into its transmit buffer, which then takes none."""
-        ...
 
     def debug_write(self, text: str) -> None:
         """Write a line to the debug console."""
-        ...
 
     def reset(self) -> None:
         """Reset the processor, as its own instruction does; EEPROM and deck memory keep what they have."""
-        ...
 
     def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
         """Let a part of the robot fail, by MAVLink's numbers; hardware that cannot do that answers UNSUPPORTED."""
-        ...

@@ -19,12 +19,10 @@ class SupervisorState(Protocol):
     @property
     def state(self) -> State:
         """What it does."""
-        ...
 
     @property
     def cause(self) -> Cause:
         """Why it is in its failsafe."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,15 +19,12 @@ class GoalSource(Protocol):
 
     def flies(self, now_us: int) -> bool:
         """Whether there is something to fly to."""
-        ...
 
     def forsaken(self, now_us: int) -> bool:
         """Whether set-points led the robot and have stopped arriving."""
-        ...
 
     def abort(self) -> None:
         """Give up the plan, because the robot may not fly."""
-        ...
 
 
 class Supervisor:

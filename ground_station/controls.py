@@ -5,8 +5,6 @@ poses are still sent. `Dialogue` is what all protocols have in common: a script 
 comes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from enum import Enum

@@ -38,20 +38,15 @@ class MocapSource(Protocol):
 
     def open(self) -> None:
         """Connect; raises `MocapError`."""
-        ...
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
         """The next frame, None when none comes in time."""
-        ...
 
     def notices(self) -> list[str]:
         """Lines for the user since the last call."""
-        ...
 
     def summary(self) -> str:
         """A few words on its state."""
-        ...
 
     def close(self) -> None:
         """Disconnect."""
-        ...

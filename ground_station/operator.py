@@ -4,8 +4,6 @@ A request to the board is answered while poses are sent; the next line waits for
 refused request is one line and changes nothing. `say` answers at the terminal, `note` records what was done.
 """
 
-from __future__ import annotations
-
 import shlex
 from collections import deque
 from collections.abc import Callable, Generator, Sequence

@@ -3,8 +3,6 @@
 It knows nothing of the laboratory: its part of a profile arrives as `GroundSettings`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace

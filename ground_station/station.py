@@ -26,20 +26,16 @@ class Link(Protocol):
 
     def start_telemetry(self, now_us: int) -> None:
         """Ask the board for its telemetry."""
-        ...
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:
         """Send a tracked pose and the goal in the form that the board needs."""
-        ...
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
         """The telemetry in `data`, empty if it is something else; `WireError` if it is malformed."""
-        ...
 
     @property
     def latency(self) -> LinkLatency:
         """From `send` to the board."""
-        ...
 
 
 @dataclass(slots=True)

@@ -3,8 +3,6 @@
 A thread reads, so that the flight never waits. The only file that knows prompt_toolkit.
 """
 
-from __future__ import annotations
-
 import os
 import queue
 import signal

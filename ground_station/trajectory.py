@@ -26,7 +26,6 @@ class Trajectory(Protocol):
 
     def at(self, t_us: int) -> Goal:
         """The goal at `t_us`."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

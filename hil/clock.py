@@ -22,19 +22,15 @@ class Clock(Protocol):
 
     def start(self, now_us: int) -> None:
         """Start the clock at the simulated instant."""
-        ...
 
     def wait_until(self, now_us: int) -> int:
         """Wait for a simulated instant, or an earlier one at which something arrives from outside; returns which it is."""
-        ...
 
     def serve(self, now_us: int) -> None:
         """Read what arrived from outside, at the instant that `wait_until` returned."""
-        ...
 
     def notices(self) -> list[str]:
         """Lines for the user since the last call."""
-        ...
 
 
 class FreeRunning:

@@ -5,8 +5,6 @@ semaphore to a task of priority 5, which waits for the next tick and gives a sem
 drains the queue: four activations. simpy has no priorities, so its version only wakes the same tasks as often.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator
 from time import perf_counter
 from typing import Any

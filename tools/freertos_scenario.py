@@ -3,8 +3,6 @@
 The formats of scenario and trace stand in tests/vectors/README.md. Exit code 2 for a file or a mode that is no good.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Generator

@@ -3,8 +3,6 @@
 mkdocs-gen-files runs this while `make docs` builds the site. `pages` returns their text, so that a test reads what is built.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping

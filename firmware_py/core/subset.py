@@ -11,8 +11,6 @@ microcontroller can be compared byte by byte. Kernels are compiled by numba (`fi
 NUMBA_DISABLE_JIT=1 they stay plain Python that a debugger can step through.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

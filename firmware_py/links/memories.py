@@ -34,11 +34,9 @@ class Memory(Protocol):
 
     def read(self, address: int, length: int) -> bytes:
         """Return `length` bytes."""
-        ...
 
     def write(self, address: int, data: bytes) -> None:
         """Store bytes."""
-        ...
 
 
 class Storage:

@@ -1,7 +1,5 @@
 """What the scheduler knows of one task: its control block, data only."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from typing import Any, Final
 

@@ -3,8 +3,6 @@
 Waiting and working calls are used with `yield from`. Times are ticks of 1 ms, except for `work`, which is microseconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator, Iterable
 from typing import Any, TypeVarTuple
 

@@ -4,8 +4,6 @@ A full queue drops the newest item once its timeout is over and counts it in `dr
 which stands for "nothing came". Waiting tasks are served by priority, first come first served among equals.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Generator, Iterable
 from typing import Generic, TypeVar

@@ -9,8 +9,6 @@ Ready tasks of one priority form a ring, as in FreeRTOS: a list whose last eleme
 is skipped. New tasks go in front of the last element, which makes the order equal to FreeRTOS's in every corner.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable
 from typing import Any, Final

@@ -3,8 +3,6 @@
 To the trace they are queues, as they are in FreeRTOS: take is Q_RECV, give is Q_SEND.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterable
 
 from firmware_py.rtos.control_block import ControlBlock

@@ -4,8 +4,6 @@ An activation of a task lasts from the instant at which it becomes ready after a
 response time is that duration, its start latency the part before it first runs. The kernel keeps the counts in the tasks.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A task's function returns a generator. It gives up the processor by yielding 0 a
 yielding n; tasks never do this themselves but through `yield from` a kernel call.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterable
 
 from firmware_py.rtos.control_block import SUSPENDED, ControlBlock

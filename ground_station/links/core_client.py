@@ -43,31 +43,25 @@ class Packets(Protocol):
 
     def send(self, data: bytes) -> None:
         """Send to the board; raises `LinkError`."""
-        ...
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Return the next packet within that time, else None; raises `LinkError`."""
-        ...
 
     @property
     def ready(self) -> bool:
         """Whether nothing waits to be sent."""
-        ...
 
     def send_any(self, packet: bytes) -> None:
         """Send a whole packet of any port; raises `LinkError`."""
-        ...
 
     def received(self, timeout_s: float = 0.0) -> list[bytes]:
         """Return the whole packets received since the last call of this or `receive`, or the first within that time.
 
         Raises `LinkError`.
         """
-        ...
 
     def close(self) -> None:
         """Close the link."""
-        ...
 
 
 class SilenceError(LinkError):

@@ -1,7 +1,5 @@
 """Which back end serves a link's URI: one table; each is imported on demand, because its package is an extra."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@
 which reading detects, or a line is incomplete, and its flight is flown again.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

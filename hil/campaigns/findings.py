@@ -9,8 +9,6 @@ Which sampling a measure of influence needs:
                     without a fault to with it
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The report of a campaign: `report.html`, which is self-contained, and `result.json` for programs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from shlex import quote

@@ -10,8 +10,6 @@ logarithm.
     saltelli, morris  the designs that Sobol's and Morris' indices need (SALib): N (D + 2) and N (D + 1) points of D axes
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ durations are halved towards harmless as long as it still fails. So no single pa
 combination may still exist.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

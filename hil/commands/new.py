@@ -1,7 +1,5 @@
 """`floaty new`: a small project for the user's own control law, with profile, experiments and tests, ready to fly."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

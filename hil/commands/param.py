@@ -1,7 +1,5 @@
 """`floaty param`: the parameters of a board, real or virtual, without flying it."""
 
-from __future__ import annotations
-
 import click
 
 from ground_station.controls import Action, Request, Settings

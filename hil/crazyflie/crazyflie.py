@@ -3,8 +3,6 @@
 Of the image it knows what all of Bitcraze's firmware has: a console, the clock of usec_time.c, `assertFail`.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ A table is an array of entries in flash, groups beginning and ending with entrie
 contents counts those in between.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -58,31 +58,24 @@ class PoweredProcessor(Protocol):
     @property
     def battery_V(self) -> float:
         """Supply voltage."""
-        ...
 
     def start(self, now_us: int) -> None:
         """Boot the firmware."""
-        ...
 
     def stop(self, now_us: int) -> None:
         """Lose power."""
-        ...
 
     def greet(self, now_us: int) -> None:
         """Note that a new client is on the radio."""
-        ...
 
     def received(self, now_us: int, data: bytes, broadcast: bool) -> None:
         """Take a packet from the radio."""
-        ...
 
     def polled(self, now_us: int) -> None:
         """Note an empty packet from the radio."""
-        ...
 
     def retuned(self, now_us: int) -> None:
         """Note that a client has moved the radio to another channel or data rate."""
-        ...
 
 
 class Nrf51:

@@ -4,8 +4,6 @@ The sensors are register files, as their data sheets number them; the IMU's coun
 data-ready, which is the gyro's interrupt on PC14.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 

@@ -7,8 +7,6 @@ cut is about as old as the filter's horizon, and the phase decides whether it is
 other waits for the next one, the estimate differs by 5 cm in one row of 400, which is 2.7 mm rms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

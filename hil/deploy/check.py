@@ -4,8 +4,6 @@ The reference is the board of every other flight: the core's Python compiled by 
 plain Python, as C for this machine, and as machine code of the Cortex-M4.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass

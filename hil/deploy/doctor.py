@@ -4,8 +4,6 @@ Nothing moves. The core that is tried has memory of its own; for half a second t
 it seeks its gyro's zero anew.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import median

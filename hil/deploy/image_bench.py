@@ -4,8 +4,6 @@ What a client can write is compared with the table of parameters that the profil
 registers that make 400 Hz of them. Nothing flies here.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
@@ -53,19 +51,15 @@ class ParameterBoard(Protocol):
 
     def scalar(self, name: str) -> Scalar | None:
         """Return the type of a parameter, None when the board has none of that name."""
-        ...
 
     def value(self, name: str) -> float:
         """Return a parameter as a client reads it."""
-        ...
 
     def write(self, name: str, value: float) -> None:
         """Write a parameter as a client does."""
-        ...
 
     def field(self, parameter: AppParameter) -> float:
         """Return the number in memory that a parameter acts on."""
-        ...
 
 
 def check_parameters(

@@ -1,7 +1,5 @@
 """What `floaty deploy check --elf` proves of everything around the core that was linked, and what it does not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

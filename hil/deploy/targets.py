@@ -1,7 +1,5 @@
 """The implementations of the flight core that `floaty deploy check` can put beside the one that flies."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace

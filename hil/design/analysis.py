@@ -1,7 +1,5 @@
 """Everything that `floaty design` computes for one robot, and the files that it writes: pictures, table, page."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass

@@ -4,8 +4,6 @@ The robot is level in its updraft, so that each plate's force depends on its ver
 at once are one array.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

@@ -9,8 +9,6 @@ Symbols of the paper's Methods. Constants have their names in a profile's [model
 centre of mass push sideways when the robot turns, which neither the Table nor the model on board contains.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

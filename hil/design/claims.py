@@ -4,8 +4,6 @@ Sections: "Embodied intelligence through design optimization" with Fig. robustne
 derivation of scaling analysis", "Force analysis", "Torque analysis" and the Table of dynamics constants.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import degrees

@@ -1,7 +1,5 @@
 """Pictures of a design: the robot itself, its stability, its hover angle, its reach, and its laws of scale."""
 
-from __future__ import annotations
-
 from math import degrees
 
 import numpy as np

@@ -5,8 +5,6 @@ and rate, not the flap angles. Its gains minimise the stationary cost under gust
 weights by Bryson's rule. `floaty design --write` puts them into a profile.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import radians
 

@@ -3,8 +3,6 @@
 States: velocity x, y, z (W), small turns about x, y, z, rates about x, y, z (B). Inputs: the paper's u1..u4 [rad].
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The stability margins of an axis' loop that is opened between command and servo, and how late its poses may be."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

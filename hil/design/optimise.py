@@ -5,8 +5,6 @@ stable in roll and pitch and steers sideways with one sign at openings up to `RE
 robot like the paper's reverses its sign there (its steady x per u2). All shapes tried are kept, for the Pareto picture.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

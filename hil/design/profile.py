@@ -1,7 +1,5 @@
 """A design as a profile that flies: its geometry, its design point, its own model on board, and gains for it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 from math import degrees

@@ -1,7 +1,5 @@
 """Sweeps over the shape: where roll is stable, which hover angle leaves most authority, the effect of size and mass."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import radians

@@ -4,8 +4,6 @@ The coefficient is that of the plates and does not change with shape, mass or sp
 airspeed and hover angle fix. Openings are flap angles, positive for every flap.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -6,8 +6,6 @@ considers until no robot is worse. A robot that moves too much for the box or th
 more than any motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, radians

@@ -20,15 +20,12 @@ class Uart(Protocol):
     @property
     def overruns(self) -> int:
         """Bytes that found the receive buffer full."""
-        ...
 
     def read(self) -> bytes:
         """Return what has been received since the last time."""
-        ...
 
     def write(self, now_us: int, data: bytes) -> bool:
         """Send bytes; False when they do not fit into the transmit buffer."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,6 @@ An image has the constants of the profile that it was exported with. Before the 
 one, as an operator writes them. Constants that differ are reported first, those without a parameter again when they stay.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 from firmware_py.config import FirmwareConfig

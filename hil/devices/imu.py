@@ -4,8 +4,6 @@ One `sample` is one data-ready: call it once per millisecond, after `plant.advan
 white noise, rounding, saturation (`hil.devices.imu_counts`).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

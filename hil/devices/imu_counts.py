@@ -3,8 +3,6 @@
 Sensor frame S is B turned about z, as the chip is soldered on the original board; counts come in S.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -8,8 +8,6 @@ three markers are far from one line, and they spread far enough for both noise f
 what is seen.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

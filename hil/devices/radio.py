@@ -9,8 +9,6 @@ poll that it meets is computed (the first of the pause) or drawn (any later one:
 its phase uniform). Connecting and disconnecting are not modelled: the host repeats for ever.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass

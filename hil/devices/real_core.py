@@ -5,8 +5,6 @@ there; after it, the board tells a CRC of all its bytes. What the call should ha
 where the CRC confirms that, nothing has to be read, otherwise all memory is. So what flies is what the board computed.
 """
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from zlib import crc32
 

@@ -85,15 +85,12 @@ class Wall(Protocol):
 
     def wall_us(self) -> int:
         """Return what the wall clock shows."""
-        ...
 
     def late_us(self, now_us: int) -> int:
         """Return by how much an instant of simulated time is over."""
-        ...
 
     def shift(self, by_us: int) -> None:
         """Let simulated time be later by that, or earlier."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,6 @@ Exchanging two labels leaves the fitted pose unchanged or turns it by 180 degree
 in the mean error; a body that fits badly is not tracked, as in Motive.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ has not taken the plant has to wait, and with `PACKETS` packets that it has not 
 longer. What was lost is sent again, with all behind it. `firmware_py.wire.core_port` has the board's half.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from itertools import islice

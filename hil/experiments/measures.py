@@ -4,8 +4,6 @@ Every function takes the rows after the release, of a flight that may have ended
 which no limit accepts. The names of the results are those of `hil.laboratory.metrics.METRICS`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 

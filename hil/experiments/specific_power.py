@@ -5,8 +5,6 @@ that the paper assumes for a hover, 75-90 % with pistons and 60-75 % with turbin
 The two quadcopters that the authors flew: their measurements. Floaty is not included: its power comes from a flight's log.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ With them the design predicts how far another controller lets the robot move. Th
 took, so that limits, limit cycles and excitations do not count as disturbance. The cameras' noise counts as flow.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from hil.design.axes import ANGLE, DELAY, PITCH, POSITION, RATE, ROLL, VELOCITY, Axis, Robot, dynamics

@@ -5,8 +5,6 @@ the paper's method. A constant is `identified` when the joint fit's 95 % interva
 log, `weak` when its sign and size are known, else `not identifiable`; then its number is only where the fit stopped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import isnan, nan

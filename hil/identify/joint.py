@@ -9,8 +9,6 @@ the predicted outputs (`scipy.optimize.least_squares`), started from the former.
 of the periods explains, they are model errors: the intervals grow with them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

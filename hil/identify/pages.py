@@ -5,8 +5,6 @@ autocorrelation from line to line, and the response over one period, measured, s
 row, on a flight that was not fitted where there is one. For the paper's method one picture that explains its result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

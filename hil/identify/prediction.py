@@ -5,8 +5,6 @@ are the flow's accelerations of one step, the noise of the sensors, and the erro
 the telemetry to the next.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -5,8 +5,6 @@ Other constants keep their values of that profile unless the flights contradict 
 more with these: so the profile's model responds as the robot did even where single constants cannot be separated.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ of the board's clock; a pose's instant comes from the ground's clock, which runs
 two, the telemetry's latency, is a few milliseconds and is estimated from the data (`hil.identify.spectra`).
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

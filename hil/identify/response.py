@@ -1,7 +1,5 @@
 """The frequency responses of flaps and axes as telemetry shows them, behind servo lag and delay."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -4,8 +4,6 @@
 as in the reported intervals. A profile without one counts every constant as known to `UNKNOWN_SHARE`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

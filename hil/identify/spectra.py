@@ -6,8 +6,6 @@ excitation; the scatter about it is disturbance of any colour, and gives the cov
 signals, of the mean.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

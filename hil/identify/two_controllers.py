@@ -8,8 +8,6 @@ It does not recover a known plant. A' is the derivative of the same A, so that j
 robot does: least squares find b* near 0 and c* near the mean of -w^2 over the spectrum (`hil.identify.pages` shows it).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

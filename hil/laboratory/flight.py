@@ -4,8 +4,6 @@ The line makes the robot and connects it to the ground: `hil.laboratory.lockstep
 time line, `hil.servers.linked` connects the robot to a ground station in a process of its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,36 +52,28 @@ class Line(Protocol):
     @property
     def robot(self) -> Robot:
         """The robot at its end."""
-        ...
 
     @property
     def trajectory(self) -> Trajectory:
         """The trajectory that the ground station flies."""
-        ...
 
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
         """The channels to record: of the line itself, and of the ground station."""
-        ...
 
     def begin(self, release: Callable[[int], None]) -> None:
         """Have the release planned, for an instant that is not over: once, now or when the robot is ready."""
-        ...
 
     def command(self, now_us: int, packet: bytes) -> None:
         """Hand the board a CRTP packet of the operator."""
-        ...
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
         """Return the messages since the last call: (source, text)."""
-        ...
 
     def finish(self, lab: Laboratory) -> None:
         """Let the ground station end in an orderly manner after the flight."""
-        ...
 
     def close(self) -> None:
         """Release all resources."""
-        ...
 
 
 LineOf = Callable[[Request, Site, Laboratory], Line]  # makes the line of a flight

@@ -4,8 +4,6 @@ Without a wall clock the firmware runs by itself up to the next hardware event. 
 for its turn, and bytes from outside arrive in between.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from hil.clock import Clock, FreeRunning

@@ -1,7 +1,5 @@
 """A flight in lockstep: the radio or the serial line modelled, the ground station on the same time line."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable
 from contextlib import ExitStack, closing

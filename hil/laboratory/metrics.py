@@ -5,8 +5,6 @@ which the robot was seen; the rest of the flight is the metric `unseen`. A lost 
 its limit on `lost` admits the loss.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal

@@ -5,8 +5,6 @@ flaps, link, tracker and ages. `flight.free` is 1 from the trajectory's start on
 until the robot has left the flow: that is what metrics and limits are of.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from math import nan, sqrt

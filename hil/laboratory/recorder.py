@@ -66,11 +66,9 @@ class Onlooker(Protocol):
 
     def rows(self, batch: pa.RecordBatch) -> None:
         """Take the next rows; the schema of all of them is that of the log."""
-        ...
 
     def note(self, t_us: int, source: str, text: str) -> None:
         """Take a line of text."""
-        ...
 
 
 class Recorder:

@@ -4,8 +4,6 @@
 `report.html`. Whatever ends the flight (its time, a crash, Ctrl-C, an error in a task), the data up to then are kept.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from contextlib import ExitStack, closing

@@ -6,8 +6,6 @@ Lines come back: how many rows were taken, and what was typed there. So a pictur
 closed or never opens delays nothing: what it does not take is dropped and counted.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

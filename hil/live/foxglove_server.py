@@ -3,8 +3,6 @@
 A parameter that is changed there becomes a line for the station's operator; its new value is shown when the board has it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 

@@ -4,8 +4,6 @@ A TARGET is `window` (rerun's viewer), `web` (the same in a browser), `connect:H
 `foxglove` (a WebSocket server for Foxglove). Rows come in at standard input, lines go out at standard output.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -30,15 +28,12 @@ class Screen(Protocol):
 
     def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
         """Show the next rows, and texts up to them."""
-        ...
 
     def know(self, values: Mapping[str, float]) -> None:
         """Show values of the board's parameters."""
-        ...
 
     def close(self) -> None:
         """End."""
-        ...
 
 
 def open_screen(target: str, typed: Callable[[str], None]) -> Screen:

@@ -1,7 +1,5 @@
 """A flight in rerun's viewer while it happens: in its window, in a browser, or in a viewer that is already open."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,5 @@
 """What survives a restart of the server: each board's EEPROM and deck memory, in two files of a folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hil.devices.board import Memory

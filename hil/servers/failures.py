@@ -4,8 +4,6 @@ A failure lasts until its unit is set to OK, and replaces the one before, so tha
 acts once. Instance 0 stands for all of a unit; flaps are 1 to 4, every other unit has one instance.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Who stands beside the tunnel: lets a robot go once it flies in its holder, and puts it back when it is lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from firmware_py.wire.supervisor import State

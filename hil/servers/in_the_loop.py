@@ -4,8 +4,6 @@ The board flies by its own tasks with the samples of the virtual IMU (`hil.devic
 and the modelled radio with its faults are those of a flight in lockstep, behind which the corrections go to the board.
 """
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path

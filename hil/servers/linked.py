@@ -5,8 +5,6 @@ has its poses from a virtual Motive, as in the laboratory. The robot is released
 for a second; then the experiment's script and faults begin to count, and the station's trajectory as well.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Faults typed into the terminal of a running server: each line acts at once."""
 
-from __future__ import annotations
-
 import difflib
 import os
 from collections.abc import Callable

@@ -37,11 +37,9 @@ class Endpoint(Protocol):
 
     def send(self, data: bytes) -> None:
         """Pass bytes of the board on to the client, if there is one."""
-        ...
 
     def close(self) -> None:
         """Give everything back; to close it again changes nothing."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,5 @@
 """A robot for clients outside: its radio chip with the power switch, its UDP port, the far end of its serial line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Robots for real clients, paced: one laboratory whose time follows the wall clock and that answers sockets in between."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from functools import partial

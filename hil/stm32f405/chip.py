@@ -5,8 +5,6 @@ be done; what is compiled calls no Python. Cycles are those of `firmware_py.expo
 is taken to keep up with the core.
 """
 
-from __future__ import annotations
-
 import mmap
 from enum import IntFlag
 from functools import cache

@@ -31,23 +31,18 @@ class Debuggee(Protocol):
 
     def watch(self, kind: int, address: int, size: int, on: bool) -> None:
         """Stop after writes (2), reads (3) or both (4) of memory, or no longer; raises `LabError` where it cannot."""
-        ...
 
     def read(self, address: int, size: int) -> bytes:
         """Return memory; raises `LabError` where there is none."""
-        ...
 
     def write(self, address: int, data: bytes) -> None:
         """Change memory, code too; raises `LabError` where there is none."""
-        ...
 
     def register(self, name: str) -> int:
         """Return a register, without its sign."""
-        ...
 
     def set_register(self, name: str, value: int) -> None:
         """Change a register."""
-        ...
 
 
 class Wish(Enum):

@@ -3,8 +3,6 @@
 Run times and switches are counted by the machine itself, whenever the scheduler's pointer to the running task has moved.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar

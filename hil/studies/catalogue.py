@@ -5,8 +5,6 @@ unless the study says otherwise. Expectations were measured over at least 5 seed
 for latency and jitter other seeds were flown as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from hil.config import DEFAULT_PROFILE, load_config

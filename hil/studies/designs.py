@@ -4,8 +4,6 @@ All three are isolated plates of one drag coefficient, with gains by `hil.design
 design's the hover angle on board is the one that carries the robot; gains and model stay those of the design.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -9,8 +9,6 @@ Torques are about the centre of mass. Two sweeps as in the paper's figure drag_m
 the same angle in opposite directions, (b) flaps 1 and 3 in the same direction; the others stay at the hover angle.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Iterator, Sequence

@@ -4,8 +4,6 @@ Methods, eq. (roll_dynamics_input_const): from c* of two flights with gains on r
 two flights are flown here, and one with an excitation of u1 for the methods that need it: four minutes of flight.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ The masses go with the cube of the length, so that the updraft goes with its roo
 fly an excitation of u3 and one of u1, and `floaty identify` finds from the telemetry alone the acceleration per input.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

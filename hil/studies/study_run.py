@@ -1,7 +1,5 @@
 """The result of a study: the outcome of every flight and cell, and whether it was expected."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 

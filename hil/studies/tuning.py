@@ -4,8 +4,6 @@ A round of `--repeat` begins one step earlier: it flies the excitations and iden
 and a link alone; the plant's truth is used only to fly other robots.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

@@ -5,8 +5,6 @@ differ is on the boards: when they were powered, which samples at rest gave the 
 estimator runs, what else is on the air, and how long the board's microsecond is (`clock.board_us`, which images have).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

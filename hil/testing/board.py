@@ -1,7 +1,5 @@
 """A board without a world: the firmware alone, in simulated time, which passes only in `run` and `expect`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from firmware_py.board import ImuCounts

@@ -1,7 +1,5 @@
 """The fixture `floaty`: flights into folders of the test's own, and boards without a world."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re

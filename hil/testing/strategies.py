@@ -4,8 +4,6 @@ A failing flight shrinks to the first kind of fault that fails, to the size near
 begin; a trajectory to the fewest goals nearest to home.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

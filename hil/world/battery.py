@@ -3,8 +3,6 @@
 The cells are alike and in series. Voltages are those of one cell; the board measures the mean of its cells.
 """
 
-from __future__ import annotations
-
 import math
 
 from firmware_py.elementary import exp

@@ -4,8 +4,6 @@ A flap is a flat part and a strip bent up along one edge. It turns about an axis
 are A + B cos phi + C sin phi (Rodrigues), stated for flap 2 in the quadrant (+,+); the others are mirror images.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -4,8 +4,6 @@ Everything that depends on the plate model (trim, its own constants L, its lift 
 compiled model itself; only the target constants T are typed, with their source.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

@@ -4,8 +4,6 @@ BLAS and LAPACK, behind numpy's `@` and `numpy.linalg`, choose their code by pro
 nothing that flies uses them. Made for the few small matrices of a flight.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ Frames: F has its origin on the body's z axis where the flap axes meet, and is p
 (+,+) of F when its angle is 0; the others are mirror images. An impossible geometry is refused here, in one line.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

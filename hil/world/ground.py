@@ -3,8 +3,6 @@
 A foot is a spring and a damper that only push, and dry friction, smooth at rest.
 """
 
-from __future__ import annotations
-
 import math
 
 from hil.world import layout as at

@@ -1,7 +1,5 @@
 """How the plant moves in one millisecond: gusts, servos, rigid body by the midpoint rule, end of a flight; compiled."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ The truth lives on a grid of whole milliseconds from time 0: `advance(now_us)` d
 `now_us`. The same generator and the same calls give the same bits however the time to an instant is divided into calls.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ Plates (paper, "Force analysis"): F_k = 1/2 rho C_D A_k (w_k.n_k)|w_k.n_k| n_k w
 The correction (docs/explanation/plant.md) then scales and adds so that the linearisation equals a chosen set of constants.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

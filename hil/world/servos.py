@@ -6,8 +6,6 @@ period starts at time 0. Source: the Crazyflie firmware's motors.c as the author
 changed it for servos.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 TIMER_MHZ = 21

@@ -4,8 +4,6 @@ The air is computed inside the plant's kernel (`hil.world.plates`); `Tunnel` wri
 up, origin in the middle of the tunnel's exit, hover point `hover_height` above it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
