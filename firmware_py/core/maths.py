@@ -1,7 +1,8 @@
 """Float32 functions built from + - * / and sqrt only, so that every target gives the same bits.
 
 The sin, cos and atan kernels are the classic single-precision minimax polynomials (degree 7, 8 and 9 on a quarter or
-eighth turn) after Cody-Waite reduction; no libm is used because no two libms agree on all points.
+eighth turn) after Cody-Waite reduction; no libm is used because no two libms agree on all points. tanh is a rational
+function of degree 4 over 4 in the square, whose largest relative error on 0..9.02 linear programming has minimised.
 """
 
 from firmware_py.core.subset import Integer, f32, i32, kernel, sqrt
@@ -32,6 +33,15 @@ ATAN_7 = f32(-1.38776856032e-1)
 ATAN_9 = f32(8.05374449538e-2)
 TAN_EIGHTH = f32(0.414213562373095)
 QUARTER_PI = f32(0.785398163397448)
+TANH_LIMIT = f32(9.02)  # from here on tanh rounds to 1
+TANH_2 = f32(1.33797657e-1)  # over
+TANH_4 = f32(3.49408947e-3)
+TANH_6 = f32(2.05843183e-5)
+TANH_8 = f32(1.33201119e-8)
+TANH_UNDER_2 = f32(4.67130810e-1)
+TANH_UNDER_4 = f32(2.58712866e-2)
+TANH_UNDER_6 = f32(3.28317973e-4)
+TANH_UNDER_8 = f32(7.76247022e-7)
 
 
 @kernel
@@ -154,3 +164,23 @@ def wrap(angle: f32) -> f32:
     x = clamp(angle, -ANGLE_LIMIT, ANGLE_LIMIT)
     turns = quarter_turns(x * f32(0.25))
     return clamp(x - f32(turns) * TWO_PI, -PI, PI)
+
+
+@kernel
+def tanh(x: f32) -> f32:
+    """Hyperbolic tangent, within 4e-7 of the exact one and inside [-1, 1]; NaN stays NaN."""
+    if x > TANH_LIMIT:
+        return ONE
+    if x < -TANH_LIMIT:
+        return -ONE
+    square = x * x
+    over = ONE + square * (TANH_2 + square * (TANH_4 + square * (TANH_6 + square * TANH_8)))
+    under = ONE + square * (
+        TANH_UNDER_2 + square * (TANH_UNDER_4 + square * (TANH_UNDER_6 + square * TANH_UNDER_8))
+    )
+    y = x * over / under
+    if y > ONE:
+        return ONE
+    if y < -ONE:
+        return -ONE
+    return y

@@ -1,10 +1,10 @@
 """The typed subset of Python in which the flight core is written, and how it runs.
 
-Subset: module constants `f32(..)`, `i32(..)` and plain ints; state structs (`class Name(Struct)` with `f32`, `i32` or
-`Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs; `for` over `range`,
-`if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons, `and`/`or`/`not`; calls of
-other kernels; `abs`, `sqrt`, `elapsed`. Floats never meet ints without `f32(..)`, and every constant is explicitly float32:
-numba would otherwise compute in double where CPython and C do not.
+Subset: module constants `f32(..)`, `i32(..)`, plain ints and arrays `constant(..)`; state structs (`class Name(Struct)`
+with `f32`, `i32` or `Annotated[F32s, ...]` annotations); functions marked `@kernel` with annotated scalars and structs;
+`for` over `range`, `if`/`elif`/`else`; `+ - * /` on float32, `+ - * // %` on small non-negative int32; comparisons,
+`and`/`or`/`not`; calls of other kernels; `abs`, `sqrt`, `elapsed`. Floats never meet ints without `f32(..)`, and every
+constant is explicitly float32: numba would otherwise compute in double where CPython and C do not.
 
 A struct is one block of memory with the layout of the C struct (naturally aligned), so that plain Python, numba and the
 microcontroller can be compared byte by byte. Kernels are compiled by numba (`firmware_py.compiling`); with
@@ -39,6 +39,15 @@ def elapsed(later: Integer, earlier: Integer) -> i32:
 
 F32s: TypeAlias = NDArray[np.float32]
 I32s: TypeAlias = NDArray[np.int32]
+
+
+def constant(*rows: float | Sequence[float]) -> F32s:
+    """Return an array of float32 that never changes: numbers for a vector, one tuple per row for a matrix."""
+    array = np.array(rows, f32)
+    array.flags.writeable = False
+    return array
+
+
 S = TypeVar("S", bound="Struct")
 S_co = TypeVar("S_co", bound="Struct", covariant=True)
 Memory: TypeAlias = Sequence[S]  # a one-element array of structs: what an entry kernel takes

@@ -6,7 +6,7 @@ The default core has none; then only the calls remain.
 from collections.abc import Iterable, Mapping
 
 from firmware_py.config import LogicConfig
-from firmware_py.export.reading import literal
+from firmware_py.export.literals import literal
 from firmware_py.logic.budget import ARGUMENT, STRUCT
 from firmware_py.logic.loading import Logic, load_logic
 from firmware_py.logic.plugs import ANSWERING, BLOCKS, CALLS, OWN

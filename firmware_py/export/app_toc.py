@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 
 from firmware_py.config import FirmwareConfig
 from firmware_py.core.subset import f32
-from firmware_py.export.reading import float_literal
+from firmware_py.export.literals import float_literal
 from firmware_py.logic.loading import load_logic
 from firmware_py.table import CORE_PARAMETERS, CORE_VARIABLES, CoreParameter, Place, value_in
 from firmware_py.wire.parameters import ABSOLUTE

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from firmware_py.export.errors import ExportError, refusal
 from firmware_py.export.hints import CONSTRUCTS, FUNCTIONS, instead
-from firmware_py.export.reading import constant_literal
+from firmware_py.export.literals import constant_literal
 from firmware_py.export.syntax import (
     BOOL,
     F32,

@@ -223,7 +223,9 @@ def constant_definition(constant: Constant) -> str:
         return f"#define {constant.c_name} {constant.text}{comment}"
     if constant.kind == I32:
         return f"enum {{ {constant.c_name} = {constant.text} }};{comment}"
-    return f"static const float {constant.c_name} = {constant.text};{comment}"
+    sizes = "".join(f"[{size}]" for size in constant.kind.shape)
+    text = f"static const float {constant.c_name}{sizes} = {constant.text};"
+    return "\n".join(textwrap.wrap(text, WIDTH, subsequent_indent="    ", break_on_hyphens=False)) + comment
 
 
 def _returns(body: list[ast.stmt]) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 _MATHS = "from firmware_py.core.maths"
 _NONE = "there is none: put it together from + - * / and sqrt, as firmware_py/core/maths.py does"
 _LOOP = "a loop over range(..)"
-_FIELD = "a field Annotated[F32s, n] of the memory struct"
+_FIELD = "a field Annotated[F32s, n] of the memory struct, or constant(..) at the top of the file"
 FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
     **dict.fromkeys(("abs", "absolute", "fabs"), "abs(x)"),
     "sqrt": "sqrt(x), from firmware_py.core.subset",
@@ -15,6 +15,7 @@ FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
     **dict.fromkeys(("arctan2", "atan2"), f"atan2(y, x), {_MATHS}"),
     **dict.fromkeys(("arctan", "atan"), f"atan2(x, ONE), {_MATHS}"),
     **dict.fromkeys(("arcsin", "asin"), f"asin(x), {_MATHS}"),
+    "tanh": f"tanh(x), {_MATHS}",
     "clip": f"clamp(x, low, high), {_MATHS}",
     "pi": f"PI, {_MATHS}",
     **dict.fromkeys(("isfinite", "isnan", "isinf"), f"finite(x), {_MATHS}"),
@@ -24,7 +25,7 @@ FUNCTIONS: Mapping[str, str] = {  # of numpy and math, and of Python itself
     **dict.fromkeys(("dot", "matmul", "inner", "sum", "mean", "cumsum"), _LOOP),
     **dict.fromkeys(("zeros", "ones", "empty", "array", "asarray", "full", "copy"), _FIELD),
     **dict.fromkeys(("power", "pow", "square"), "x * x"),
-    **dict.fromkeys(("exp", "log", "tan", "tanh", "hypot"), _NONE),
+    **dict.fromkeys(("exp", "log", "tan", "hypot"), _NONE),
     "print": "a field of the memory struct marked Logged(unit)",
 }
 OUTSIDE = ("numpy", "math")  # modules whose functions have their like in the core

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from firmware_py.export.errors import refusal
-from firmware_py.export.syntax import C_KEYWORDS, Kernel
+from firmware_py.export.syntax import C_KEYWORDS, Constant, Kernel
 
 Block = tuple[int, ...]
 
@@ -59,20 +59,28 @@ def find_writes(kernel: Kernel) -> None:
     """Find the kernels that a kernel calls, and the names through which it writes; those called come first."""
     aliases: dict[str, str] = {}
     for node in ast.walk(kernel.node):
-        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Attribute) and _alias_of(node):
+        if (
+            isinstance(node, ast.Assign)
+            and isinstance(node.value, ast.Attribute | ast.Name)
+            and _alias_of(node)
+        ):
             aliases[_alias_of(node)] = _root(node.value)
-    roots: set[str] = set()
+    roots: dict[str, ast.AST] = {}
     for node in ast.walk(kernel.node):
         if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store):
-            roots.add(_root(node))
+            roots[_root(node)] = node
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
             callee = kernel.scope.names.get(node.func.id)
             if isinstance(callee, Kernel):
                 _check_above(kernel, callee, node)
                 kernel.calls |= {callee.c_name} | callee.calls
                 pairs = zip(node.args, callee.arguments, strict=False)
-                roots |= {_root(argument) for argument, name in pairs if name in callee.writes}
-    kernel.writes = roots | {aliases[root] for root in roots if root in aliases}
+                roots |= {_root(argument): node for argument, name in pairs if name in callee.writes}
+    roots |= {aliases[root]: node for root, node in roots.items() if root in aliases}
+    for root, node in roots.items():
+        if isinstance(kernel.scope.names.get(root), Constant) and root not in kernel.arguments:
+            raise refusal(kernel.path, node, f"{root} is a constant and is written")
+    kernel.writes = set(roots)
 
 
 def _check_above(kernel: Kernel, callee: Kernel, node: ast.Call) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.core.structs import Parameters
 from firmware_py.export.app_logic import own_bytes, own_memory
-from firmware_py.export.reading import literal
+from firmware_py.export.literals import literal
 
 TEMPLATE = """\
 /* The parameters of a profile. Written by `floaty deploy`; edit the profile, not this file. */

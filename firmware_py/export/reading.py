@@ -7,19 +7,17 @@ import ast
 import io
 import tokenize
 from collections.abc import Mapping
+from math import prod
 from typing import Any
-
-import numpy as np
 
 from firmware_py.core.subset import Logged, Settable, Tunable
 from firmware_py.export import hints
 from firmware_py.export.errors import ExportError, refusal
+from firmware_py.export.literals import array_literal, constant_literal
 from firmware_py.export.syntax import (
     ARRAYS,
     C_KEYWORDS,
     ENTRY,
-    F32,
-    I32,
     OWN,
     PACKAGE,
     SCALARS,
@@ -37,6 +35,7 @@ from firmware_py.export.syntax import (
 )
 
 MARKS: Mapping[str, type[Any]] = {"Tunable": Tunable, "Logged": Logged, "Settable": Settable}
+MOST_NUMBERS = 65536  # in the constant arrays of a module: 256 KiB, a quarter of the flash
 MARK_FORM = 'Tunable(default, "unit", low=.., high=..) of a parameter, or Logged("unit") of the memory'
 
 
@@ -91,6 +90,7 @@ class _Reader:
         self.module = module
         self._tree = tree
         self._done = done
+        self._numbers = 0  # in constant arrays
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
             if token.type == tokenize.COMMENT:
                 own_line = not token.line[: token.start[1]].strip()
@@ -154,15 +154,26 @@ class _Reader:
             if isinstance(source, Module) and node.value.attr in source.names:
                 self._take(name, source.names[node.value.attr], node)
                 return
-        literal = constant_literal(node.value)
+        literal = self._array(name, node.value) or constant_literal(node.value)
         if literal is None:
-            raise refusal(
-                self.module.path, node, f"constant {name} is neither f32(number) nor a 32-bit integer"
-            )
+            reason = f"constant {name} is none of f32(number), a 32-bit integer and constant(numbers)"
+            raise refusal(self.module.path, node, reason)
         kind, text = literal
-        shared = self.module.name == SHARED
+        shared = self.module.name == SHARED and not kind.rank
         c_name = f"FLOATY_{name}" if shared else name
         self._define(name, Constant(c_name, kind, text, self.module.comment(node), shared), node)
+
+    def _array(self, name: str, node: ast.expr) -> tuple[Kind, str] | None:
+        """Return type and C literal of `constant(..)`; None for anything else."""
+        match node:
+            case ast.Call(func=ast.Name(id="constant"), args=rows, keywords=[]):
+                kind, text = array_literal(self.module.path, node, name, rows)
+                self._numbers += prod(kind.shape)
+                if self._numbers > MOST_NUMBERS:
+                    reason = f"{name}: {self._numbers} numbers in the constant arrays of this file: at most {MOST_NUMBERS}"
+                    raise refusal(self.module.path, node, reason)
+                return kind, text
+        return None
 
     def _struct(self, node: ast.ClassDef) -> StructType:
         if [ast.unparse(base) for base in node.bases] != ["Struct"]:
@@ -267,39 +278,3 @@ class _Reader:
         if name in C_KEYWORDS:
             raise refusal(self.module.path, node, f"{name} is a word of C")
         return name
-
-
-def constant_literal(node: ast.expr) -> tuple[Kind, str] | None:
-    """Return type and C literal of `f32(number)`, `i32(integer)` or an integer; None for anything else."""
-    match node:
-        case ast.Call(func=ast.Name(id="f32"), args=[argument], keywords=[]):
-            number = _number(argument)
-            with np.errstate(over="ignore"):
-                value = np.float32(0 if number is None else number)
-            return (F32, float_literal(value)) if number is not None and np.isfinite(value) else None
-        case ast.Call(func=ast.Name(id="i32"), args=[argument], keywords=[]):
-            node = argument
-    number = _number(node)
-    if isinstance(number, int) and -(2**31) < number < 2**31:
-        return I32, str(number)
-    return None
-
-
-def float_literal(value: np.float32) -> str:
-    """Return the shortest decimal that every correct compiler reads as this very float."""
-    text = str(value)
-    return f"{text if '.' in text or 'e' in text else text + '.0'}f"
-
-
-def literal(value: np.float32 | np.int32) -> str:
-    """Return the C literal of a number."""
-    return float_literal(value) if isinstance(value, np.float32) else str(value)
-
-
-def _number(node: ast.expr) -> int | float | None:
-    match node:
-        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
-            return value
-        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
-            return -value
-    return None

@@ -43,7 +43,7 @@ ARRAYS = {"F32s": "f32", "I32s": "i32"}
 
 @dataclass(slots=True)
 class Constant:
-    """A module constant; `text` is its C literal, of which the value is exact."""
+    """A module constant, a number or an array; `text` is its C literal, of which the values are exact."""
 
     c_name: str
     kind: Kind

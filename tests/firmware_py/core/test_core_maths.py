@@ -132,3 +132,27 @@ def test_clamp_is_numpys_and_takes_nan_to_the_lower_bound(x: float, a: float, b:
 @given(any_number)
 def test_finite_is_numpys(x: float) -> None:
     assert bool(maths.finite(f32(x))) == bool(np.isfinite(x))
+
+
+@law
+@given(finite)
+@example(9.019999504089355)
+@example(-9.020000457763672)
+@example(1e-45)
+@example(LARGEST)
+def test_hyperbolic_tangent_is_exact_to_4e_7_and_never_beyond_one(x: float) -> None:
+    got = float(maths.tanh(f32(x)))
+    assert got == pytest.approx(math.tanh(x), abs=4e-7)
+    assert abs(got) <= 1.0
+    assert math.copysign(1, got) == math.copysign(1, x)
+
+
+def test_hyperbolic_tangent_is_exact_to_4e_7_of_its_value_everywhere() -> None:
+    x = np.concatenate([np.linspace(-9.1, 9.1, 40_001), np.logspace(-30, 0, 2_001)]).astype(f32)
+    x = x[x != 0]
+    exact = np.tanh(x.astype(float))
+    assert np.abs(np.array([maths.tanh(a) for a in x]) / exact - 1).max() < 4e-7
+
+
+def test_hyperbolic_tangent_of_no_number_is_none() -> None:
+    assert np.isnan(maths.tanh(f32(math.nan)))

@@ -10,9 +10,9 @@ from firmware_py.config import parameters_of
 from firmware_py.core import structs
 from firmware_py.export.c99 import ExportError, Translation, core_texts, translate
 from firmware_py.export.compilers import Compiler, compilers
+from firmware_py.export.literals import float_literal
 from firmware_py.export.native import build
 from firmware_py.export.profile_c import profile_hash, profile_source
-from firmware_py.export.reading import float_literal
 from firmware_py.logic.plugs import ANSWERING, CALLS
 from hil.config import load_config
 from support.core_streams import BUILD
@@ -166,8 +166,8 @@ REFUSED_KERNELS = [
     ("@kernel\nasync def f(x: f32) -> f32:\n    '''Do.'''\n", 1, "AsyncFunctionDef at the top of a module"),
     ("@kernel\ndef f(x: f32) -> f32:\n    '''Do.'''\n    return g(x)\n\n@kernel\ndef g(x: f32) -> f32:\n    '''Do.'''\n"
      "    return f(x)\n", 3, "g is defined below its caller"),
-    ("HALF = 0.5\n", 0, "constant HALF is neither f32(number) nor a 32-bit integer"),
-    ("HALF = f32(1e39)\n", 0, "constant HALF is neither f32(number) nor a 32-bit integer"),
+    ("HALF = 0.5\n", 0, "constant HALF is none of f32(number), a 32-bit integer and constant(numbers)"),
+    ("HALF = f32(1e39)\n", 0, "constant HALF is none of f32(number), a 32-bit integer and constant(numbers)"),
     ("class Thing:\n    pass\n", 0, "class Thing is not a Struct"),
     ("class Thing(Struct):\n    x: float\n", 1, "field type float"),
     ("class Thing(Struct):\n    x: f32 = 0\n", 1, "a struct has nothing but fields"),

@@ -280,7 +280,8 @@ def test_a_mistake_is_told_with_file_line_and_what_is_expected(
             "np.zeros(3)",
             "np.zeros is outside the subset: write a field Annotated[F32s, n] of the memory struct",
         ),
-        ("np.tanh(own.gain_iy)", "np.tanh is outside the subset: there is none"),
+        ("np.exp(own.gain_iy)", "np.exp is outside the subset: there is none"),
+        ("np.tanh(own.gain_iy)", "np.tanh is outside the subset: write tanh(x), from firmware_py.core.maths"),
         ("np.i0(own.gain_iy)", "np.i0 is outside the subset"),
     ],
 )
@@ -342,7 +343,10 @@ def test_a_mistake_in_a_module_is_one_line_and_exit_code_two_wherever_it_would_f
         assert cli(*command, "--profile", "profile.toml") == 2
         said = cli.err
         at = f"controller.py:{line_of(LAW, 'DT =')}"
-        assert said == f"floaty: {at}: constant DT is neither f32(number) nor a 32-bit integer\n"
+        assert (
+            said
+            == f"floaty: {at}: constant DT is none of f32(number), a 32-bit integer and constant(numbers)\n"
+        )
 
 
 def test_paths_begin_at_the_profile_that_names_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
