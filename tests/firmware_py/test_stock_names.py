@@ -53,12 +53,6 @@ def test_every_parameter_that_clients_use_has_its_stock_type_access_and_persiste
     assert {name: texts.get(name) for name in STOCK["parameters"]} == STOCK["parameters"]
 
 
-def test_no_name_is_there_twice(client: CrtpClient) -> None:
-    for table in (client.firmware.variables, client.firmware.parameters):
-        names = [item.name for item in table]
-        assert len(set(names)) == len(names)
-
-
 def test_what_has_no_effect_is_kept_and_what_is_persistent_survives(client: CrtpClient, tables) -> None:
     _, params = tables
     for name, value in (

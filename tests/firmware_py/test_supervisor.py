@@ -10,17 +10,15 @@ from firmware_py.core import structs
 from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
 from firmware_py.core.supervisor import (
-    BATTERY_LOW_US,
     DOWN_US,
     EPISODE_GAP_US,
     EPISODE_LIMIT_US,
 )
 from firmware_py.links.platform import supervisor_bits
-from firmware_py.wire import crtp
 from firmware_py.wire.crtp import Correction
 from firmware_py.wire.supervisor import Cause, State
 from support.crtp_client import LOC, LOG, PARAM, SUPERVISOR, CrtpClient
-from support.firmware_bench import HOVER_COUNTS, LEVEL
+from support.firmware_bench import HOVER_COUNTS
 from support.mavlink_client import MavlinkClient
 from support.supervisor_bench import SupervisorBench
 
@@ -152,15 +150,6 @@ def test_angles_from_outside_last_as_long_as_a_client_is_there(make, silence_us,
     sign_of_life(client)
     client.run(client.now_us + 20_000)
     assert client.writes[-1][1] == angles
-
-
-def test_emergency_stop_beats_flaps_from_outside(flying: CrtpClient) -> None:
-    flying.send(PARAM, 3, b"\0extCtrl\0manual\0\x08\1")
-    flying.run(flying.now_us + 20_000)
-    assert flying.writes[-1][1] != HOVER_COUNTS
-    stop(flying)
-    flying.run(flying.now_us + 20_000)
-    assert flying.writes[-1][1] == HOVER_COUNTS
 
 
 def had_a_frozen_gyro(bench: SupervisorBench) -> None:
@@ -328,19 +317,6 @@ def test_silence_lasts_for_hours() -> None:
     assert bench.fly(10_000) == MODE_FLY
 
 
-def test_a_voltage_that_sags_for_less_than_five_seconds_does_no_harm() -> None:
-    bench = in_flight(lambda bench: None)
-    for voltage_mv, time_us in (
-        (3000, BATTERY_LOW_US - 10_000),
-        (3900, 10_000),
-        (3000, BATTERY_LOW_US - 10_000),
-    ):
-        bench.data.battery_mv = voltage_mv
-        assert bench.fly(time_us) == MODE_FLY
-    bench.fly(10_000)
-    assert bench.view.cause is Cause.LOW_BATTERY
-
-
 def test_a_board_that_is_disarmed_while_it_calibrates_is_in_failsafe() -> None:
     bench = SupervisorBench()
     bench.view.arm(False)
@@ -464,30 +440,6 @@ def test_recovery_is_refused_while_the_battery_is_low(flying: CrtpClient) -> Non
     flying.battery_mv = 3100
     assert after(flying, 5_300_000)[1] is Cause.LOW_BATTERY
     assert flying.one(SUPERVISOR, 1, b"\2") == b"\x82\0\0"
-
-
-def test_silence_is_a_parameter(flying: CrtpClient) -> None:
-    flying.send(PARAM, 3, b"\0supervisor\0poseTimeout\0\x09" + struct.pack("<H", 100))
-    flying.events = type(flying.events)()  # no more poses
-    flying.events.at(flying.now_us // 1000 * 1000 + 1000, flying._sample)
-    assert after(flying, 80_000)[0] is State.FLYING
-    assert after(flying, 40_000) == (State.FAILSAFE, Cause.SILENCE)
-    assert flying.console == ["supervisor: failsafe, silence"]
-
-
-def test_one_outlier_pose_changes_neither_the_state_nor_the_estimate(flying: CrtpClient) -> None:
-    counters = flying.firmware.signals.counters
-    resets = counters[6]
-    flying.run(flying.now_us + 18_000)  # of two poses that were true in one tick the later counts
-    for outlier in ((0.85, 0.0, 0.0), (0.0, -0.8, -1.4), (0.3, 0.3, 0.3)):
-        flying.send(LOC, 1, crtp.encode_ext_pose(outlier, LEVEL, 40_000)[1:])
-        for _ in range(20):
-            flying.run(flying.now_us + 10_000)
-            assert state(flying)[0] is State.FLYING
-            assert flying.firmware.signals.estimate[:3] == pytest.approx(OFF_CENTRE, abs=5e-3)
-    assert counters[6] == resets
-    assert counters[1] == 3
-    assert flying.console == []
 
 
 def test_an_estimator_at_its_bounds_is_a_failsafe_that_ends_half_a_second_after_it_is_back(

@@ -10,16 +10,10 @@ import pymavlink.dialects.v20.common as dialect
 import pytest
 from scipy.spatial.transform import Rotation
 
-from firmware_py.firmware import Firmware
 from firmware_py.wire import telemetry
 from firmware_py.wire.mavlink import POSES
 from firmware_py.wire.mavlink_layouts import NUMBERS
 from firmware_py.wire.supervisor import Cause, State
-from hil.config import load_config
-from hil.devices.board import VirtualBoard
-from hil.devices.config import SerialConfig
-from hil.devices.uart import VirtualSerial
-from hil.events import EventQueue
 from support.firmware_bench import LEVEL, FirmwareBench
 from support.mavlink_client import GYRO_ZERO_US, STREAMS, MavlinkClient, codec, count
 
@@ -28,10 +22,6 @@ IGNORE_POSITION, IGNORE_YAW, IGNORE_REST = 0x7, 0x400, 0x9F8
 
 
 WIDE = ("box.radius=5", "box.above=5")  # goals at (1, 2, 3)
-
-
-def value_of(firmware: Firmware, name: str) -> float:
-    return next(one for one in firmware.parameters if one.name == name).read()
 
 
 @pytest.fixture
@@ -101,22 +91,6 @@ def test_odometry_closes_the_loop_unless_it_is_an_autopilots(estimator: int, exp
     assert client.firmware.signals.supervisor.state is expected
 
 
-def test_an_impossible_goal_changes_nothing(client: MavlinkClient) -> None:
-    client.send("set_position_target_local_ned", 0, 1, 1, 1, IGNORE_REST, *[0] * 9, math.inf, 0)
-    client.pose(((0.1, 0.2, 1.45), LEVEL))
-    client.run(client.now_us + 2000)
-    assert last_pose(client)[0] == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
-    assert client.stack.refused == 1
-
-
-def test_an_impossible_pose_is_refused(client: MavlinkClient) -> None:
-    client.run(GYRO_ZERO_US)
-    client.send("att_pos_mocap", 0, LEVEL, 3e38, 0.0, 0.0)
-    client.run(client.now_us + 20_000)
-    assert client.stack.refused == 1
-    assert client.firmware.signals.supervisor.state is State.WAITING
-
-
 def test_poses_close_the_loop_and_silence_opens_it() -> None:
     client = MavlinkClient()
     client.poses(GYRO_ZERO_US, 1_000_000)
@@ -179,45 +153,6 @@ def test_the_clock_is_asked_ten_times_a_second_until_five_answers_came_then_twic
     client.run(3_000_000)
     asked_ms = [t_us // 1000 for t_us, message in client.messages if message.get_type() == "TIMESYNC"]
     assert asked_ms == [97, 194, 291, 388, 485, 582, 1069, 1556, 2043, 2530]
-
-
-@pytest.mark.parametrize(("baud", "interval_us"), [(57_600, 40_000), (115_200, 20_000), (921_600, 20_000)])
-def test_the_age_is_true_on_a_line_that_is_busy_both_ways(baud: int, interval_us: int) -> None:
-    events = EventQueue()
-    line = VirtualSerial(SerialConfig(baud=baud), events, np.random.default_rng(1))
-    board = VirtualBoard(lambda *servo: None, lambda *radio: True, lambda *console: None, line)
-    firmware = Firmware(load_config(), board, mavlink=True)
-    board.run_on(firmware.kernel, events)
-    station, parser, ages_ms = codec(255, 190), codec(0, 0), []
-    lag_us, ahead_us = 20_000, 123_456_789_000
-
-    def on_ground(now_us: int, data: bytes) -> None:
-        for message in parser.parse_buffer(bytearray(data)) or ():
-            if message.get_type() == "TIMESYNC":
-                answer = station.timesync_encode((now_us + ahead_us) * 1000, message.ts1)
-                line.uplink(now_us, answer.pack(station))
-            elif message.get_type() == "NAMED_VALUE_FLOAT" and message.name == "age_ms":
-                ages_ms.append(message.value)
-
-    def pose(now_us: int) -> None:
-        taken_us = now_us + ahead_us - lag_us
-        line.uplink(now_us, station.att_pos_mocap_encode(taken_us, LEVEL, 0, 0, -1.15).pack(station))
-        events.at(now_us + 20_000, pose)
-
-    line.connect(lambda now_us: firmware.uart_ready(), on_ground)
-    # As our own station does.
-    request = station.command_long_encode(1, 1, 511, 0, 350, interval_us, 0, 0, 0, 0, 0)
-    line.uplink(0, request.pack(station))
-    events.at(103_700, pose)
-    now_us = 0
-    while now_us < 9_050_000:
-        now_us = min(wake for wake in (9_050_000, events.next_us, firmware.next_wake_us) if wake is not None)
-        events.run(now_us)
-        firmware.run(now_us)
-    assert line.down.busy_us > 0.07 * now_us
-    on_line_us = 1000 + 10_000_000 * (48 + 1) / baud  # the adapter, the frame, and the silence that ends it
-    age_ms = float(np.median(ages_ms[-5:]))  # now and then a pose has to wait for an answer before it
-    assert age_ms == pytest.approx((lag_us + on_line_us) * 1e-3, abs=0.3)
 
 
 @pytest.mark.parametrize("lag_us", [600_000, -20_000])
@@ -324,25 +259,6 @@ def test_messages_of_one_period_carry_one_time_stamp(client: MavlinkClient) -> N
     assert [m.time_usec for m in client.of("DEBUG_FLOAT_ARRAY")] == [1000 * stamp for stamp in stamps_ms]
 
 
-def test_position_and_attitude_are_those_in_the_world() -> None:
-    client = MavlinkClient(*WIDE)
-    target(client, (1.0, -2.0, -3.0), -0.5)
-    R_WB = Rotation.from_euler("ZYX", (0.6, 0.05, -0.04))
-    x, y, z, w = R_WB.as_quat()
-    for at_us in range(100_000, 1_500_000, 20_000):
-        client.events.at(at_us, lambda now_us: client.pose(((1.02, 2.03, 3.04), (w, x, y, z)), now_us))
-    client.run(1_510_000)
-    position, attitude = client.of("LOCAL_POSITION_NED")[-1], client.of("ATTITUDE")[-1]
-    quaternion = client.of("ATTITUDE_QUATERNION")[-1]
-    assert (position.x, position.y, position.z) == pytest.approx((1.02, -2.03, -3.04), abs=5e-3)
-    NED, FRD = Rotation.from_euler("x", math.pi), Rotation.from_euler("x", math.pi)
-    expected = NED.inv() * R_WB * FRD
-    yaw, pitch, roll = expected.as_euler("ZYX")
-    assert (attitude.roll, attitude.pitch, attitude.yaw) == pytest.approx((roll, pitch, yaw), abs=0.05)
-    sent = Rotation.from_quat((quaternion.q2, quaternion.q3, quaternion.q4, quaternion.q1))
-    assert (sent.inv() * expected).magnitude() < 0.05
-
-
 @pytest.mark.parametrize("goal_yaw", [-0.5, 2.0])
 def test_the_reported_velocity_is_the_derivative_of_the_reported_position(goal_yaw: float) -> None:
     client = MavlinkClient()
@@ -439,23 +355,6 @@ def test_when_the_line_is_full_replies_wait_and_what_nobody_asked_for_is_dropped
     assert all((b - a) % 256 == 1 for a, b in pairwise(sequence))
 
 
-def test_on_a_full_line_every_stream_gets_its_share(client: MavlinkClient) -> None:
-    slow_line(client, bytes_per_ms=1)
-    fast = {30: "ATTITUDE", 31: "ATTITUDE_QUATERNION", 32: "LOCAL_POSITION_NED", 36: "SERVO_OUTPUT_RAW"}
-    for number in fast:
-        client.command(511, number, 10_000)  # together 16 kB/s; the line takes 1
-    client.messages.clear()
-    client.run(client.now_us + 20_000_000)
-    counts = count(message for _, message in client.messages)
-    shares = [counts[name] for name in fast.values()]
-    assert min(shares) > 50
-    assert max(shares) - min(shares) <= 1
-    slow = [counts[name] for name in ("HEARTBEAT", "SYS_STATUS", "BATTERY_STATUS", "ESTIMATOR_STATUS")]
-    assert min(slow) >= 17  # of 20
-    assert counts["ODOMETRY"] >= 3  # of 4
-    assert client.stack.dropped > 7000
-
-
 def test_more_streams_than_the_queue_takes_have_their_turns_too(client: MavlinkClient) -> None:
     slow_line(client, bytes_per_ms=1)
     numbers = (
@@ -530,13 +429,6 @@ def test_a_parameter_is_read_by_index_and_by_name(client: MavlinkClient) -> None
         by_name = client.one("param_request_read", 1, 1, name.encode(), -1)
         by_index = client.one("param_request_read", 1, 1, b"", listed.param_index)
         assert by_name.to_dict() == by_index.to_dict() == listed.to_dict()
-
-
-def test_a_parameter_that_was_set_is_in_force_and_echoed_each_time(client: MavlinkClient) -> None:
-    for _ in range(2):
-        answer = client.one("param_set", 1, 1, b"EXT_Z_P", 2.5, dialect.MAV_PARAM_TYPE_REAL32)
-        assert (answer.param_id, answer.param_value) == ("EXT_Z_P", 2.5)
-    assert value_of(client.firmware, "extCtrl.z_P") == 2.5
 
 
 @pytest.mark.parametrize(
@@ -665,17 +557,6 @@ def test_a_command_for_all_is_obeyed(client: MavlinkClient, target: tuple[int, i
     assert not client.firmware.signals.supervisor.armed
 
 
-def test_arming_and_disarming_twice_is_acknowledged_twice(client: MavlinkClient) -> None:
-    for _ in range(2):
-        assert client.command(400, 0)[0].result == 0
-    assert not client.firmware.signals.supervisor.armed
-    client.run(client.now_us + 1_100_000)
-    assert client.of("HEARTBEAT")[-1].base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED == 0
-    for _ in range(2):
-        assert client.command(400, 1)[0].result == 0
-    assert client.firmware.signals.supervisor.armed
-
-
 @pytest.mark.parametrize("params", [(185, 1), (400, 0, 21196)])
 def test_a_forced_stop_is_latched(client: MavlinkClient, params: tuple[float, ...]) -> None:
     assert client.command(*params)[0].result == 0  # type: ignore[arg-type]
@@ -768,13 +649,6 @@ def test_the_heartbeat_says_armed_only_while_the_flaps_are_under_control() -> No
 def test_a_parameter_that_cannot_be_is_denied(client: MavlinkClient, params: tuple[float, ...]) -> None:
     assert client.command(*params)[0].result == DENIED  # type: ignore[arg-type]
     assert client.firmware.signals.supervisor.armed
-
-
-def test_stored_parameters_are_in_force_after_the_next_boot(client: MavlinkClient) -> None:
-    client.one("param_set", 1, 1, b"EXT_Z_P", 2.5, 9)
-    assert client.command(245, 1)[0].result == 0
-    after = Firmware(load_config(), client)
-    assert value_of(after, "extCtrl.z_P") == 2.5
 
 
 @pytest.mark.parametrize("params", [(410,), (512, 242)])

@@ -179,23 +179,6 @@ def test_a_plain_receive_lets_a_more_urgent_sender_go_on_when_the_receiver_gives
     assert order == [1, "goes on", "sent", 2, None]
 
 
-def test_two_kernels_know_nothing_of_each_other():
-    woke = {}
-
-    def sleeper(kernel, name, ticks):
-        yield from kernel.delay(ticks)
-        woke[name] = kernel.now_us
-
-    kernels = Kernel(), Kernel(preemption=False)
-    for number, kernel in enumerate(kernels):
-        kernel.create_task("sleeper", 1, sleeper, kernel, number, number + 1)
-        kernel.start()
-    for us in range(0, 3_000, 500):
-        for kernel in kernels:
-            kernel.run(us)
-    assert woke == {0: 1_000, 1: 2_000}
-
-
 def test_a_task_that_raises_is_named_with_the_time_and_the_others_can_go_on():
     kernel = Kernel()
     ticks = []

@@ -359,11 +359,6 @@ def test_faults_of_whole_poses_act_on_those_of_markers_too() -> None:
         assert math.dist(frame.p_WB, got.p_WB) == pytest.approx(0.3)
 
 
-def test_same_seed_same_frames() -> None:
-    first, again, other = ([frame for frame, _ in frames(50, seed)] for seed in (3, 3, 4))
-    assert first == again != other
-
-
 def test_markers_leave_all_other_randomness_as_it_was() -> None:
     """The air around the held robot, the gyro's noise, and which frames are lost."""
     seen: list[list[object]] = []

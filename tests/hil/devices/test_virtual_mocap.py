@@ -107,7 +107,3 @@ def test_frames_arrive_later_and_never_out_of_order() -> None:
     assert arrival_us(5_000) == 63_000
     mocap.more_latency_us = 0.0
     assert [arrival_us(t) for t in (10_000, 20_000, 30_000)] == [63_000, 63_000, 68_000]
-
-
-def test_same_seed_same_frames() -> None:
-    assert frames(50, MocapConfig(), 3) == frames(50, MocapConfig(), 3) != frames(50, MocapConfig(), 4)

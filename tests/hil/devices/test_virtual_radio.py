@@ -262,18 +262,6 @@ def test_uplink_jitter_delays_within_its_bound_and_can_be_switched_in_flight():
     assert len(bench.on_board) == 501
 
 
-def test_same_seed_same_arrivals():
-    def arrivals(seed):
-        bench = RadioWithEnds(seed=seed, uplink_loss=0.2, downlink_loss=0.2)
-        bench.pose_every(20_000, 100)
-        bench.telemetry_every(20_000, 400, burst=4)
-        bench.events.run(3_000_000)
-        return bench.on_board, bench.on_ground
-
-    assert arrivals(5) == arrivals(5)
-    assert arrivals(5) != arrivals(6)
-
-
 def test_ground_station_expects_the_latency_that_this_link_has():
     bench = RadioWithEnds()
     bench.pose_every(20_000, 3000)

@@ -206,15 +206,6 @@ def test_what_passes_a_pulled_cable_is_lost_and_counted():
     assert (bench.line.up.cut_bytes, bench.line.down.cut_bytes) == (4, 9)
 
 
-def test_same_seed_same_wrong_bits():
-    def arrived(seed):
-        bench = LineWithEnds(seed, downlink_bit_error_rate=1e-3)
-        bench.write(0, bytes(1000))
-        return bench.run().on_ground
-
-    assert arrived(3) == arrived(3) != arrived(4)
-
-
 messages = st.lists(st.tuples(st.integers(0, 3000), st.binary(min_size=1, max_size=300)), max_size=40)
 
 

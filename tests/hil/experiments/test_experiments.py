@@ -23,7 +23,6 @@ from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import ALWAYS, METRICS
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
-from hil.laboratory.result import Result
 from hil.laboratory.run import fly
 from hil.pictures.gallery import pictures_of
 from hil.pictures.panels import Plot, Still
@@ -32,20 +31,11 @@ from hil.world.body import SIGNS
 from hil.world.config import TunnelConfig
 from hil.world.correction import TABLE
 from hil.world.plant import Plant
+from support.flights import explain, flown
 
 FAMILIES = ("yaw-", "height-sine", "y-square", "pushes", "side-wind-", "occlusion", "airspeed-")
 PAPER = [name for name in EXPERIMENTS if name.startswith(FAMILIES)]
 PNG = b"\x89PNG\r\n\x1a\n"
-
-
-def flown(
-    folder: Path, name: str, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float | None = None,
-    link: str = "radio",
-) -> Result:  # fmt: skip
-    request = Request.of(
-        EXPERIMENTS[name], profile=profile, overrides=overrides, seed=seed, duration_s=duration_s, link=link
-    )
-    return fly(request, folder)
 
 
 def is_drawn(shown: Plot | Still) -> bool:
@@ -53,10 +43,6 @@ def is_drawn(shown: Plot | Still) -> bool:
     if isinstance(shown, Still):
         return shown.content.startswith(PNG)
     return all(panel.series or panel.bars for panel in shown.panels)
-
-
-def explain(result: Result) -> str:
-    return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
 
 
 # Measures against other implementations

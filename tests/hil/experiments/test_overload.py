@@ -16,19 +16,10 @@ from hil.exports.perfetto import write_perfetto
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.flight import Flight
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.request import Request
-from hil.laboratory.result import Result
-from hil.laboratory.run import fly
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures.report import write_report
+from support.flights import flown
 from support.html_page import Page
-
-
-def go(
-    folder: Path, experiment: Experiment, duration_s: float, *overrides: str, trace: bool = False
-) -> Result:
-    request = Request.of(experiment, overrides=overrides, duration_s=duration_s, trace=trace)
-    return fly(request, folder)
 
 
 def hover(script: object = None) -> Experiment:
@@ -39,7 +30,7 @@ def hover(script: object = None) -> Experiment:
 @pytest.mark.long
 def test_overload_names_the_loads_at_which_tasks_are_late_and_the_hover_fails(tmp_path: Path) -> None:
     overload = EXPERIMENTS["overload"]
-    result = go(tmp_path, overload, overload.duration_s)
+    result = flown(tmp_path, overload, duration_s=overload.duration_s)
     assert result.passed, [str(verdict) for verdict in result.verdicts]
     cost = load_config().cpu
     # The estimator's step is late once thief, IMU and step do not fit into a tick. The controller's fits beside all but a
@@ -57,7 +48,7 @@ def test_overload_names_the_loads_at_which_tasks_are_late_and_the_hover_fails(tm
 
 
 def test_processor_time_adds_up(tmp_path: Path) -> None:
-    result = go(tmp_path, hover(), 2.0)
+    result = flown(tmp_path, hover(), duration_s=2.0)
     cost = load_config().cpu
     tasks = {task.name: task for task in result.tasks}
     milliseconds = 3000
@@ -73,7 +64,7 @@ def test_processor_time_adds_up(tmp_path: Path) -> None:
 
 def test_without_costs_no_time_is_spent(tmp_path: Path) -> None:
     costs = [f"cpu.{name}=0" for name in type(load_config().cpu).model_fields]
-    result = go(tmp_path, hover(), 0.5, *costs)
+    result = flown(tmp_path, hover(), *costs, duration_s=0.5)
     assert {task.run_time_us for task in result.tasks} == {0}
 
 
@@ -89,7 +80,7 @@ def test_a_task_that_never_ends_with_interrupts_off_is_named_by_the_watchdog(tmp
 
         kernel.create_task("ROGUE", 1, rogue)
 
-    result = go(tmp_path, hover(seize), 5.0)
+    result = flown(tmp_path, hover(seize), duration_s=5.0)
     assert result.outcome == "lost"
     assert "task ROGUE at 18" in str(result.cause)
     assert "watchdog reset, STABILIZER has not run for " in str(result.cause)
@@ -110,7 +101,7 @@ def test_a_critical_section_that_ends_costs_samples_and_nothing_else(tmp_path: P
 
         kernel.create_task("RUDE", 1, rude)
 
-    result = go(tmp_path, hover(pause), 3.0)
+    result = flown(tmp_path, hover(pause), duration_s=3.0)
     assert result.outcome == "completed"
     late = load_log(tmp_path).column("late.KALMAN")[-1].as_py()
     assert 0 <= late < 5
@@ -124,7 +115,7 @@ def test_a_task_that_raises_is_named_and_the_log_is_there(tmp_path: Path) -> Non
 
         flight.robot.firmware.kernel.create_task("BUGGY", 1, buggy)
 
-    result = go(tmp_path, hover(plant_bug), 5.0)
+    result = flown(tmp_path, hover(plant_bug), duration_s=5.0)
     assert result.outcome == "error"
     assert "task BUGGY at 1205." in str(result.cause)
     assert "ZeroDivisionError: bug" in str(result.cause)
@@ -135,7 +126,7 @@ def test_an_overflowing_queue_is_counted_with_its_time(tmp_path: Path) -> None:
     def starve(flight: Flight) -> None:
         flight.robot.thief.share = 0.93
 
-    result = go(tmp_path, hover(starve), 2.0)
+    result = flown(tmp_path, hover(starve), duration_s=2.0)
     queue = next(queue for queue in result.queues if queue.name == "measurements")
     assert queue.dropped > 100
     assert queue.high_water == queue.length
@@ -152,7 +143,7 @@ def test_a_full_queue_is_noted_again_only_when_it_dropped_more(tmp_path: Path) -
         flight.events.at(500_000, lambda _: setattr(thief, "share", 0.93))
         flight.events.at(2_500_000, lambda _: setattr(thief, "share", 0.0))
 
-    result = go(tmp_path, hover(starve), 5.0)
+    result = flown(tmp_path, hover(starve), duration_s=5.0)
     noted: dict[str, list[int]] = {}
     for event in load_events(tmp_path):
         if match := re.fullmatch(r"queue (\w+) is full: (\d+) dropped so far", event["text"]):
@@ -165,8 +156,8 @@ def test_a_full_queue_is_noted_again_only_when_it_dropped_more(tmp_path: Path) -
 
 
 def test_perfetto_has_a_track_per_task_and_the_slices_of_the_schedule(tmp_path: Path) -> None:
-    plain = go(tmp_path / "plain", hover(), 0.3)
-    traced = go(tmp_path / "traced", hover(), 0.3, trace=True)
+    plain = flown(tmp_path / "plain", hover(), duration_s=0.3)
+    traced = flown(tmp_path / "traced", hover(), duration_s=0.3, trace=True)
     assert traced.hash == plain.hash
     trace = Trace()
     trace.ParseFromString(write_perfetto(tmp_path / "traced").read_bytes())
@@ -188,7 +179,7 @@ def test_perfetto_has_a_track_per_task_and_the_slices_of_the_schedule(tmp_path: 
 
 
 def test_schedule_of_every_flight_covers_fifty_milliseconds(tmp_path: Path) -> None:
-    go(tmp_path, hover(), 0.3)
+    flown(tmp_path, hover(), duration_s=0.3)
     times = pyarrow.parquet.read_table(tmp_path / "schedule.parquet").column("us").to_pylist()
     assert times[0] == 1_000_000
     assert times[-1] == 1_050_000

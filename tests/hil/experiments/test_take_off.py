@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hil.experiments import EXPERIMENTS
 from hil.experiments.take_off import CONTROLLER_ON, FANS_OFF, LANDING_FROM, STANDING_Z
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.request import Request
-from hil.laboratory.result import Result
-from hil.laboratory.run import fly
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.plant import Plant
+from support.flights import flown
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 GROUND = PlantConfig().ground
@@ -32,10 +29,6 @@ def standing(**changes: float) -> Plant:
     plant = Plant(GeometryConfig(), config, calm, ServoConfig(), np.random.default_rng(1))
     plant.tunnel.set_fan_factor(0.0)
     return plant
-
-
-def flown(folder: Path, *, profile: str = "floaty", seed: int = 1) -> Result:
-    return fly(Request.of(EXPERIMENTS["take-off-landing"], profile=profile, seed=seed), folder)
 
 
 def test_a_robot_at_rest_sinks_in_by_its_weight() -> None:
@@ -116,13 +109,13 @@ def test_the_net_ends_where_the_feet_are_above_it() -> None:
     ],
 )
 def test_take_off_and_landing_hold_their_limits(tmp_path: Path, profile: str, seed: int) -> None:
-    result = flown(tmp_path / "run", profile=profile, seed=seed)
+    result = flown(tmp_path / "run", "take-off-landing", profile=profile, seed=seed)
     assert result.passed, [str(verdict) for verdict in result.verdicts if not verdict.holds]
 
 
 @pytest.mark.long
 def test_the_operator_closes_the_loop_and_opens_it_again(tmp_path: Path) -> None:
-    flown(tmp_path / "run")
+    flown(tmp_path / "run", "take-off-landing")
     log = free_flight(load_log(tmp_path / "run"))
     times = 1e-6 * (column(log, "t") - column(log, "t")[0])
     z, state = column(log, "truth.z"), column(log, "supervisor.state")

@@ -14,26 +14,22 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import fly
+from support.flights import hover
 
 HOVER = EXPERIMENTS["hover"]
 DURATION_S = 1.5
 
 
-def go(folder: Path, board: str, *overrides: str) -> Result:
-    return fly(Request.of(HOVER, overrides=overrides, duration_s=DURATION_S, board=board), folder)
-
-
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    return go(tmp_path_factory.mktemp("python"), "python")
+    return hover(tmp_path_factory.mktemp("python"), board="python", duration_s=DURATION_S)
 
 
 @pytest.mark.parametrize("board", ["c", "cortex-m4"])
 def test_a_flight_on_another_board_is_recorded_alike_to_the_last_bit(
     tmp_path: Path, python: Result, board: str
 ) -> None:
-    result = go(tmp_path, board)
+    result = hover(tmp_path, board=board, duration_s=DURATION_S)
     assert result.passed
     assert load_log(tmp_path).equals(load_log(python.folder))  # truth, estimate, counts and all the rest
     assert result.hash == python.hash
@@ -42,7 +38,7 @@ def test_a_flight_on_another_board_is_recorded_alike_to_the_last_bit(
 
 @pytest.mark.long
 def test_the_costs_of_the_profile_are_what_the_machine_code_takes(tmp_path: Path, python: Result) -> None:
-    result = go(tmp_path, "cortex-m4")
+    result = hover(tmp_path, board="cortex-m4", duration_s=DURATION_S)
     assert python.usage is None
     assert result.usage is not None
     cpu, entries = load_config().cpu, result.usage.entries
@@ -58,7 +54,14 @@ def test_the_costs_of_the_profile_are_what_the_machine_code_takes(tmp_path: Path
 
 @pytest.mark.long
 def test_measured_costs_are_the_processor_time_of_the_tasks(tmp_path: Path) -> None:
-    result = go(tmp_path, "cortex-m4", "cpu.measured=true", "cpu.estimator_us=0", "cpu.controller_us=0")
+    result = hover(
+        tmp_path,
+        "cpu.measured=true",
+        "cpu.estimator_us=0",
+        "cpu.controller_us=0",
+        board="cortex-m4",
+        duration_s=DURATION_S,
+    )
     assert result.passed
     assert result.usage is not None
     entries = result.usage.entries
@@ -75,7 +78,7 @@ def test_measured_costs_are_the_processor_time_of_the_tasks(tmp_path: Path) -> N
 def test_the_report_shows_what_the_board_takes(tmp_path: Path) -> None:
     from hil.pictures.report import write_report
 
-    go(tmp_path, "cortex-m4")
+    hover(tmp_path, board="cortex-m4", duration_s=DURATION_S)
     page = write_report(tmp_path).read_text(encoding="utf-8")
     assert "<td>cortex-m4</td>" in page
     assert "instructions" in page

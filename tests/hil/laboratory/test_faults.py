@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -33,6 +34,7 @@ from hil.world.config import GeometryConfig, PlantConfig, ServoConfig
 from hil.world.plant import Plant
 from hil.world.tunnel import TunnelConfig
 from support.command import Cli
+from support.flights import hover
 
 HOVER = EXPERIMENTS["hover"]
 Settings = tuple[str, ...]
@@ -47,17 +49,9 @@ RELEASE_S = load_config().flight.release_us * 1e-6
 
 
 def go(
-    folder: Path,
-    *faults: str,
-    seed: int = 1,
-    duration_s: float = 3.0,
-    link: str = RADIO,
-    settings: Settings = (),
+    folder: Path, *faults: str, settings: Settings = (), duration_s: float = 3.0, **options: Any
 ) -> Result:
-    request = Request.of(
-        HOVER, overrides=settings, seed=seed, duration_s=duration_s, link=link, faults=faults
-    )
-    return fly(request, folder)
+    return hover(folder, *settings, faults=faults, duration_s=duration_s, **options)
 
 
 # What a text means

@@ -11,29 +11,18 @@ from ground_station.tracker import Quality
 from hil.campaigns.jobs import Job, row_of
 from hil.commands.tables import print_result, print_seeds
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS, find_again, find_experiment
-from hil.laboratory.faults import parse
+from hil.experiments import EXPERIMENTS, find_again
 from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import ALWAYS, METRICS, column, judge
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import LOCKSTEP, Bench, Request
-from hil.laboratory.result import Result, read_result
+from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.pictures.report import write_report
+from support.flights import explain, flown, hover
 from support.full_disk import small_files
 
 HOVER = EXPERIMENTS["hover"]
-
-
-def hover(
-    folder: Path, *overrides: str, profile: str = "floaty", seed: int = 1, duration_s: float = 30.0
-) -> Result:
-    request = Request.of(HOVER, profile=profile, overrides=overrides, seed=seed, duration_s=duration_s)
-    return fly(request, folder)
-
-
-def explain(result: Result) -> str:
-    return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (10, 1234))])
@@ -64,8 +53,7 @@ def test_without_the_predictor_the_authors_gains_lose_the_robot(tmp_path: Path, 
 
 @pytest.mark.long
 def test_log_events_and_report_know_what_the_tracker_refused(tmp_path: Path) -> None:
-    outlier = parse("mocap.outlier@1:0.05=0.5")
-    result = fly(Request.of(HOVER, duration_s=2.0, faults=[outlier]), tmp_path / "run")
+    result = hover(tmp_path / "run", duration_s=2.0, faults=["mocap.outlier@1:0.05=0.5"])
     log = load_log(result.folder)
     assert column(log, "tracker.refused")[-1] == result.metrics["frames_refused"] == 10
     assert set(column(log, "tracker.quality")[20:]) == {Quality.REFUSED, Quality.TRACKED}
@@ -97,8 +85,7 @@ HEALTHY = (
 @pytest.mark.parametrize(("name", "faults"), HEALTHY)
 def test_the_tracker_refuses_no_healthy_pose(tmp_path: Path, name: str, faults: tuple[str, ...]) -> None:
     duration_s = 4.0 if faults else None
-    request = Request.of(EXPERIMENTS[name], duration_s=duration_s, faults=[parse(text) for text in faults])
-    fly(request, tmp_path / "run")
+    flown(tmp_path / "run", name, duration_s=duration_s, faults=faults)
     log = load_log(tmp_path / "run")
     assert column(log, "tracker.refused")[-1] == column(log, "tracker.restarts")[-1] == 0
 
@@ -128,12 +115,6 @@ def test_a_flow_too_weak_ends_as_a_crash_with_its_cause(tmp_path: Path) -> None:
     assert not result.passed
     assert any("lost" in event["text"] for event in load_events(result.folder))
     assert load_log(result.folder).num_rows < 3000
-
-
-def test_leaving_the_flow_sideways_is_named(tmp_path: Path) -> None:
-    result = hover(tmp_path / "run", "tunnel.side_wind=[3.0, 0.0, 0.0]")
-    assert result.outcome == "lost"
-    assert "left the flow" in str(result.cause)
 
 
 def test_ctrl_c_keeps_what_was_flown(tmp_path: Path) -> None:
@@ -183,11 +164,6 @@ def test_estimate_follows_the_truth(tmp_path: Path) -> None:
     assert np.sqrt((p[late] ** 2).mean()) < 0.15
 
 
-def test_pose_is_about_forty_milliseconds_old(tmp_path: Path) -> None:
-    result = hover(tmp_path / "run", duration_s=5.0)
-    assert result.metrics["age_mean"] == pytest.approx(0.042, abs=0.002)
-
-
 def test_a_killed_run_is_readable_up_to_its_last_second(tmp_path: Path) -> None:
     result = hover(tmp_path / "run", duration_s=0.5)
     (result.folder / "result.json").unlink()
@@ -211,18 +187,6 @@ def open_files() -> list[Path]:
     return [link.readlink() for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
 
 
-def test_a_folder_with_other_things_in_it_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.txt").write_text("years of work")
-    with pytest.raises(LabError, match="not empty"):
-        hover(tmp_path)
-    assert (tmp_path / "thesis.txt").exists()
-
-
-def test_an_unknown_experiment_names_the_nearest() -> None:
-    with pytest.raises(LabError, match="did you mean hover"):
-        find_experiment("hovre")
-
-
 def test_judge_fails_what_is_not_a_number_and_refuses_unknown_metrics() -> None:
     values = dict.fromkeys(METRICS, float("nan"))
     assert not judge(values, {"rms_x": 1.0}, {})[0].holds
@@ -243,8 +207,7 @@ def test_a_lost_flight_holds_no_limit_unless_its_limit_on_the_loss_admits_it() -
 
 
 def test_a_lost_flight_says_so_in_every_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    request = Request.of(HOVER, duration_s=3.0, faults=[parse("wind.fan@0.5=0.3")])
-    result = fly(request, tmp_path / "run")
+    result = hover(tmp_path / "run", duration_s=3.0, faults=["wind.fan@0.5=0.3"])
     assert {verdict.metric for verdict in result.verdicts if verdict.holds} == set()
     assert [verdict.metric for verdict in result.failed] == ["lost"]
     print_result(result)

@@ -11,7 +11,6 @@ pytest.importorskip("cffi")
 
 from hil.errors import LabError
 from hil.experiments import find_experiment
-from hil.laboratory.faults import parse
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.result import Result
@@ -19,6 +18,7 @@ from hil.laboratory.run import fly
 from hil.laboratory.schedule import load_schedule, runs
 from hil.pictures.compare import load_flown
 from hil.studies.two_boards import two_boards
+from support.flights import hover
 
 ELF = os.environ.get("FLOATY_CF2_ELF", "")
 flies = pytest.mark.skipif(
@@ -27,9 +27,8 @@ flies = pytest.mark.skipif(
 HOVER = find_experiment("hover")
 
 
-def flown(folder: Path, duration_s: float, *faults: str, seed: int = 1, board: str = ELF) -> Result:
-    chosen = [parse(text) for text in faults]
-    return fly(Request.of(HOVER, seed=seed, duration_s=duration_s, faults=chosen, board=board), folder)
+def flown(folder: Path, duration_s: float, *faults: str, board: str = ELF) -> Result:
+    return hover(folder, duration_s=duration_s, faults=faults, board=board)
 
 
 def said(folder: Path) -> list[str]:

@@ -11,32 +11,22 @@ import numpy as np
 import pytest
 
 from firmware_py.wire.supervisor import State
-from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.request import Request
 from hil.laboratory.result import Result
-from hil.laboratory.run import fly
 from hil.pictures.report import write_report
+from support.flights import hover
 from support.own_logic import AS_BUILT_IN, ESTIMATOR, LAW, make_project
 from support.paths import ROOT
-
-HOVER = EXPERIMENTS["hover"]
-
-
-def go(
-    folder: Path, profile: str | Path, duration_s: float, *overrides: str, board: str = "python"
-) -> Result:
-    return fly(
-        Request.of(HOVER, profile=str(profile), overrides=overrides, duration_s=duration_s, board=board),
-        folder,
-    )
 
 
 @pytest.mark.long
 def test_modules_that_compute_what_the_core_does_make_the_same_flight(tmp_path: Path) -> None:
     profile = make_project(tmp_path, AS_BUILT_IN, ESTIMATOR)
-    usual, own = go(tmp_path / "usual", "floaty", 0.5), go(tmp_path / "own", profile, 0.5)
+    usual, own = (
+        hover(tmp_path / "usual", duration_s=0.5),
+        hover(tmp_path / "own", profile=str(profile), duration_s=0.5),
+    )
     assert own.hash == usual.hash
     assert len(own.program.logic) == 64
     assert json.loads((tmp_path / "own" / "result.json").read_text())["logic"] == own.program.logic
@@ -47,7 +37,9 @@ def test_modules_that_compute_what_the_core_does_make_the_same_flight(tmp_path: 
 def test_the_law_in_the_documentation_flies(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "howto" / "own-logic.md").read_text(encoding="utf-8")
     law = dedent(text.split("## A control law")[1].split("\n`control_law`")[0])
-    own = go(tmp_path / "own", make_project(tmp_path, law, "", "gain_z = 4.0"), 0.5)
+    own = hover(
+        tmp_path / "own", profile=str(make_project(tmp_path, law, "", "gain_z = 4.0")), duration_s=0.5
+    )
     assert own.passed
     assert np.abs(column(load_log(own.folder), "logic.integral")).max() > 0.0
 
@@ -57,7 +49,7 @@ def failed(tmp_path_factory: pytest.TempPathFactory) -> Result:
     """A flight whose law divides nothing by nothing after 80 ticks."""
     folder = tmp_path_factory.mktemp("failed")
     profile = make_project(folder, LAW)
-    return go(folder / "run", profile, 0.5, "logic.after=80", "logic.gain_iy=0.5")
+    return hover(folder / "run", "logic.after=80", "logic.gain_iy=0.5", profile=str(profile), duration_s=0.5)
 
 
 def test_a_law_that_puts_out_nan_is_a_failed_flight_that_names_it(failed: Result) -> None:
@@ -82,7 +74,7 @@ def test_a_law_with_an_endless_loop_is_a_failed_flight_that_names_file_and_line(
     old = "    memory.ticks = i32(memory.ticks + 1)\n"
     loop = "    for i in range(memory.ticks * 4000000):\n        memory.hidden = memory.hidden + DT\n"
     law = LAW.replace(old, old + loop)
-    result = go(tmp_path / "run", make_project(tmp_path, law), 0.1, board="c")
+    result = hover(tmp_path / "run", profile=str(make_project(tmp_path, law)), duration_s=0.1, board="c")
     line = law[: law.index("    for i in range(memory")].count("\n") + 1
     assert result.outcome == "error"
     assert result.cause is not None
@@ -106,7 +98,9 @@ def test_what_own_logic_logs_is_recorded_and_drawn(failed: Result) -> None:
 def test_the_same_flight_on_another_board_is_alike_to_the_last_bit(
     failed: Result, tmp_path: Path, board: str
 ) -> None:
-    again = go(tmp_path, failed.request.profile, 0.5, *failed.request.overrides, board=board)
+    again = hover(
+        tmp_path, *failed.request.overrides, profile=failed.request.profile, duration_s=0.5, board=board
+    )
     assert again.hash == failed.hash
     assert again.cause == failed.cause
 
@@ -131,7 +125,9 @@ def test_without_numba_the_same_text_makes_the_same_flight(failed: Result) -> No
 def test_the_laws_that_ship_hover_within_the_limits_and_alike_on_every_board(
     tmp_path: Path, profile: str
 ) -> None:
-    results = [go(tmp_path / board, profile, 30.0, board=board) for board in ("python", "c", "cortex-m4")]
+    results = [
+        hover(tmp_path / board, profile=profile, board=board) for board in ("python", "c", "cortex-m4")
+    ]
     assert [result.passed for result in results] == [True] * 3
     assert len({result.hash for result in results}) == 1
 
@@ -139,8 +135,11 @@ def test_the_laws_that_ship_hover_within_the_limits_and_alike_on_every_board(
 @pytest.mark.long
 def test_the_laws_that_ship_take_off(tmp_path: Path) -> None:
     for profile in ("original", "lqr"):
-        result = go(tmp_path / profile, profile, 2.0)
+        result = hover(tmp_path / profile, profile=profile, duration_s=2.0)
         assert result.passed, result.verdicts
         assert (
-            result.hash != go(tmp_path / "usual", "as-flown" if profile == "original" else "floaty", 2.0).hash
+            result.hash
+            != hover(
+                tmp_path / "usual", profile="as-flown" if profile == "original" else "floaty", duration_s=2.0
+            ).hash
         )

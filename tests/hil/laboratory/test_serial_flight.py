@@ -9,29 +9,15 @@ import pytest
 from pymavlink import mavutil
 
 from hil.errors import LabError
-from hil.experiments import EXPERIMENTS
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
-from hil.laboratory.request import MAVLINK, Request
+from hil.laboratory.request import MAVLINK
 from hil.laboratory.result import Result
-from hil.laboratory.run import fly
 from hil.pictures.figures import PICTURES
+from support.flights import explain, hover
 from support.serving import FLOATY
 
 KEY = "5a" * 32
-
-
-def fly_over_mavlink(
-    folder: Path, *overrides: str, seed: int = 1, duration_s: float = 10.0, experiment: str = "hover"
-) -> Result:
-    request = Request.of(
-        EXPERIMENTS[experiment], overrides=overrides, seed=seed, duration_s=duration_s, link=MAVLINK
-    )
-    return fly(request, folder)
-
-
-def explain(result: Result) -> str:
-    return f"{result.outcome} {result.cause}: {[str(v) for v in result.verdicts if not v.holds]}, {result.folder}"
 
 
 @pytest.mark.long
@@ -39,7 +25,7 @@ def explain(result: Result) -> str:
     "baud", [57_600, *(pytest.param(baud, marks=pytest.mark.long) for baud in (115_200, 460_800, 921_600))]
 )
 def test_hover_holds_its_limits_at_every_baud_rate(tmp_path: Path, baud: int) -> None:
-    result = fly_over_mavlink(tmp_path / "run", f"serial.baud={baud}", seed=3)
+    result = hover(tmp_path / "run", f"serial.baud={baud}", seed=3, duration_s=10.0, link=MAVLINK)
     assert result.passed, explain(result)
     log = load_log(result.folder)
     assert column(log, "serial.overrun")[-1] == 0
@@ -51,7 +37,7 @@ def test_hover_holds_its_limits_at_every_baud_rate(tmp_path: Path, baud: int) ->
 
 
 def test_the_budget_is_stated_before_take_off(tmp_path: Path) -> None:
-    result = fly_over_mavlink(tmp_path / "run", "serial.baud=57600", duration_s=1.0)
+    result = hover(tmp_path / "run", "serial.baud=57600", duration_s=1.0, link=MAVLINK)
     first = load_events(result.folder)[0]
     assert first["t_us"] == 0
     assert first["text"].startswith("57600 baud: uplink ")
@@ -62,23 +48,29 @@ def test_a_line_that_cannot_carry_the_poses_is_refused_before_take_off(tmp_path:
     with pytest.raises(
         LabError, match=r"9600 baud: 50 poses/s need .* lower station\.corrections_hz or raise serial\.baud"
     ):
-        fly_over_mavlink(tmp_path / "run", "serial.baud=9600")
+        hover(tmp_path / "run", "serial.baud=9600", link=MAVLINK)
 
 
 def test_same_seed_same_hash_over_the_serial_line(tmp_path: Path) -> None:
     noisy = ("serial.uplink_bit_error_rate=1e-4", "serial.downlink_bit_error_rate=1e-4")
     first, again, other = (
-        fly_over_mavlink(tmp_path / name, *noisy, seed=seed, duration_s=3.0)
+        hover(tmp_path / name, *noisy, seed=seed, duration_s=3.0, link=MAVLINK)
         for name, seed in (("a", 1), ("b", 1), ("c", 2))
     )
     assert first.hash == again.hash != other.hash
     assert (first.folder / "telemetry.csv").read_bytes() == (again.folder / "telemetry.csv").read_bytes()
 
 
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """Three seconds of hover over the line, for tests that read what is left of it."""
+    return hover(tmp_path_factory.mktemp("serial") / "run", duration_s=3.0, link=MAVLINK)
+
+
 @pytest.mark.long
 def test_wrong_bits_cost_frames_and_nothing_else(tmp_path: Path) -> None:
     noisy = ("serial.uplink_bit_error_rate=1e-4", "serial.downlink_bit_error_rate=1e-4")
-    result = fly_over_mavlink(tmp_path / "run", *noisy)
+    result = hover(tmp_path / "run", *noisy, duration_s=10.0, link=MAVLINK)
     assert result.passed, explain(result)
     log = load_log(result.folder)
     assert column(log, "serial.wrong_bits")[-1] > 20
@@ -88,13 +80,12 @@ def test_wrong_bits_cost_frames_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_a_signed_line_flies(tmp_path: Path) -> None:
-    result = fly_over_mavlink(tmp_path / "run", f"mavlink.signing_key='{KEY}'", duration_s=4.0)
+    result = hover(tmp_path / "run", f"mavlink.signing_key='{KEY}'", duration_s=4.0, link=MAVLINK)
     assert result.passed, explain(result)
     assert column(load_log(result.folder), "serial.up_bad")[-1] == 0
 
 
-def test_telemetry_over_the_line_is_the_estimate(tmp_path: Path) -> None:
-    result = fly_over_mavlink(tmp_path / "run", duration_s=3.0)
+def test_telemetry_over_the_line_is_the_estimate(result: Result) -> None:
     lines = (result.folder / "telemetry.csv").read_text().splitlines()
     names = lines[0].split(",")
     rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
@@ -114,8 +105,7 @@ def test_telemetry_over_the_line_is_the_estimate(tmp_path: Path) -> None:
         assert np.abs(told[good] - known).max() <= 2 * step, title
 
 
-def test_the_report_shows_the_line(tmp_path: Path) -> None:
-    result = fly_over_mavlink(tmp_path / "run", duration_s=2.0)
+def test_the_report_shows_the_line(result: Result) -> None:
     names = load_log(result.folder).column_names
     shown = [picture.title for picture in PICTURES if picture.needs in names]
     assert "Serial line" in shown
@@ -123,10 +113,9 @@ def test_the_report_shows_the_line(tmp_path: Path) -> None:
 
 
 def test_the_telemetry_log_has_every_byte_that_passed_the_line_in_frames_with_their_times(
-    tmp_path: Path,
+    result: Result,
 ) -> None:
     """pymavlink reads the file, the plant's UART has counted the bytes."""
-    result = fly_over_mavlink(tmp_path / "run", duration_s=2.0)
     log = load_log(result.folder)
     file = mavutil.mavlink_connection(str(result.folder / "link.tlog"))
     frames = []

@@ -14,16 +14,12 @@ from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
-from hil.laboratory.result import Result
 from hil.laboratory.run import fly
 from hil.world.battery import Battery, endurance, open_circuit_voltage
 from hil.world.config import BatteryConfig
+from support.flights import flown
 
 CONFIG = BatteryConfig()
-
-
-def flown(folder: Path, name: str, *overrides: str, duration_s: float) -> Result:
-    return fly(Request.of(EXPERIMENTS[name], overrides=overrides, duration_s=duration_s), folder)
 
 
 def test_both_of_the_papers_voltages_are_true_of_one_cell() -> None:

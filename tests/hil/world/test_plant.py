@@ -205,15 +205,6 @@ def test_time_can_be_cut_where_a_block_of_noise_ends() -> None:
     assert truth(cut) == truth(whole)
 
 
-def test_same_seed_same_bits_and_another_seed_others() -> None:
-    flights = []
-    for seed in (1, 1, 2):
-        plant = make(TunnelConfig(), seed)
-        plant.advance(100_000)
-        flights.append(truth(plant))
-    assert flights[0] == flights[1] != flights[2]
-
-
 def test_held_body_stays_and_feels_the_clamp() -> None:
     plant = make(TunnelConfig())
     q = Rotation.from_euler("ZYX", [0.4, 0.2, -0.3])
