@@ -13,21 +13,17 @@ from firmware_py.core_runner import CoreBlocks, CoreCosts, PythonRunner, RunnerF
 from firmware_py.drivers.imu import acceleration, rates
 from firmware_py.export.usage import Usage
 from firmware_py.geometry import Vector
-from firmware_py.links.console import Console
+from firmware_py.links.console import Console, Notices
 from firmware_py.links.crtp_stack import CrtpStack
-from firmware_py.links.high_level import HighLevelService
+from firmware_py.links.high_level import MEMORY_SIZE, HighLevelService
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.log import LogService
 from firmware_py.links.memories import MemoryService, Tester, memories
-from firmware_py.links.notices import Notices
-from firmware_py.links.parameters import Parameter, ParameterService
+from firmware_py.links.parameters import Parameter, ParameterService, ParameterStorage
 from firmware_py.links.platform import PlatformService
-from firmware_py.links.storage import ParameterStorage
-from firmware_py.links.trajectories import MEMORY_SIZE
 from firmware_py.logic.loading import load_logic
-from firmware_py.measurements import Measurement
 from firmware_py.parameters import parameters
-from firmware_py.pilot import Pilot
+from firmware_py.pilot import Measurement, Pilot
 from firmware_py.rtos import Kernel, Queue, WatchdogError
 from firmware_py.rtos.statistics import Statistics
 from firmware_py.running import Running, StockState
@@ -165,14 +161,12 @@ class Firmware:
         own: tuple[Parameter, ...],
     ) -> None:
         """Create the services for MAVLink clients."""
-        from firmware_py.links.mavlink_absent import answer_for_what_is_not_there
-        from firmware_py.links.mavlink_commands import CommandService
+        from firmware_py.links.mavlink_commands import CommandService, answer_for_what_is_not_there
         from firmware_py.links.mavlink_parameters import MavlinkParameters
         from firmware_py.links.mavlink_poses import PoseService
         from firmware_py.links.mavlink_setpoints import SetpointService
         from firmware_py.links.mavlink_streams import StreamService
-        from firmware_py.links.mavlink_telemetry import FlightMessages
-        from firmware_py.links.mavlink_world import World
+        from firmware_py.links.mavlink_telemetry import FlightMessages, World
 
         core, supervisor = self._core, self._supervisor
         setpoints = SetpointService(stack, running.pilot, config.home)

@@ -10,10 +10,9 @@ from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.links.high_level import Defaults
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.memories import Tester
+from firmware_py.links.parameters import ParameterStorage
 from firmware_py.links.platform import PlatformService
-from firmware_py.links.storage import ParameterStorage
-from firmware_py.measurements import Measurement
-from firmware_py.pilot import Pilot
+from firmware_py.pilot import Measurement, Pilot
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 

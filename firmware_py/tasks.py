@@ -12,8 +12,7 @@ from firmware_py.config import CpuConfig
 from firmware_py.core.structs import POSE_NO_CORRECTION
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts
-from firmware_py.measurements import ACCELEROMETER, GYRO, POSE, Measurement
-from firmware_py.pilot import Pilot, put_goal
+from firmware_py.pilot import ACCELEROMETER, GYRO, POSE, Measurement, Pilot, put_goal
 from firmware_py.planner import Motion
 from firmware_py.rtos import Kernel, Queue, Semaphore
 from firmware_py.supervisor import Supervisor, wrapped

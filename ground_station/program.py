@@ -21,8 +21,7 @@ from ground_station.links.schemes import LinkSettings, find_link
 from ground_station.live import LiveStation
 from ground_station.mocap import MocapSource
 from ground_station.sources.address import find_source
-from ground_station.sources.record import RecordingSource
-from ground_station.sources.replay import ReplaySource
+from ground_station.sources.replay import RecordingSource, ReplaySource
 from ground_station.station import GroundStation
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of

@@ -7,14 +7,67 @@ begins again when three poses fit one another, which wrong ones rarely do. The f
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from math import nan, sqrt
+from math import degrees, nan, sqrt
 
 from firmware_py.elementary import atan2
 from firmware_py.geometry import Vector
 from ground_station.config import TrackerConfig
 from ground_station.mocap import MocapFrame
 from ground_station.pose_filter import PoseFilter
-from ground_station.track_notices import TrackNotices
+
+GATHER_US = 500_000
+
+
+@dataclass(slots=True)
+class TrackNotices:
+    """Collects events until a line is due; times are those of frames."""
+
+    _refused: int = 0
+    _distance: float = 0.0  # the largest [m]
+    _angle: float = 0.0  # [rad]
+    _lost: bool = False
+    _gap_us: int | None = None  # before a track that began again
+    _due_us: int | None = None
+
+    def refused(self, t_us: int, distance: float, angle: float) -> None:
+        """A pose was refused at this distance from the prediction [m, rad]."""
+        self._refused += 1
+        self._distance = max(self._distance, distance)
+        self._angle = max(self._angle, angle)
+        self._happened(t_us)
+
+    def lost(self, t_us: int) -> None:
+        """The track was lost."""
+        self._lost = True
+        self._happened(t_us)
+
+    def begun_again(self, t_us: int, gap_us: int) -> None:
+        """A new track began `gap_us` after the last good pose."""
+        self._gap_us = gap_us
+        self._happened(t_us)
+
+    def due(self, t_us: int) -> list[str]:
+        """At most one line, by a clock that may jump."""
+        if self._due_us is None or 0 < self._due_us - t_us <= GATHER_US:
+            return []
+        notices = []
+        if self._refused:
+            poses = "1 pose" if self._refused == 1 else f"{self._refused} poses"
+            notices.append(
+                f"{poses} refused, up to {self._distance:.2f} m and {degrees(self._angle):.0f} deg from the prediction"
+            )
+        if self._gap_us is not None:
+            notices.append(f"track begun again after {self._gap_us * 1e-6:.1f} s")
+        elif self._lost:
+            notices.append("track lost")
+        self._refused, self._distance, self._angle = 0, 0.0, 0.0
+        self._lost, self._gap_us, self._due_us = False, None, None
+        return [f"motion capture: {'; '.join(notices)}"]
+
+    def _happened(self, t_us: int) -> None:
+        if self._due_us is None:
+            self._due_us = t_us + GATHER_US
+
 
 POSES = 3  # that begin a track
 FIT_US = 50_000  # between them; a later one does not confirm the others

@@ -136,7 +136,7 @@ CONFINED["click"] = CONFINED["rich"] = (
 )  # fmt: skip
 # Of a whole flight.
 CONFINED |= dict.fromkeys(("numpy.arctan2", "numpy.arcsin"), ("firmware_py/geometry.py",))
-NORMAL_NOISE = "hil/world/noise.py"
+NORMAL_NOISE = "hil/world/fixed_order.py"
 DRAWS = (
     "standard_normal",
     "exponential",

@@ -5,8 +5,7 @@ carry the last byte of the board's radio address. The pilot adds the goal from w
 """
 
 from firmware_py.links.crtp_stack import CrtpStack, Task
-from firmware_py.measurements import POSE, Measurement
-from firmware_py.pilot import Pilot
+from firmware_py.pilot import POSE, Measurement, Pilot
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import WireError, crtp, localisation

@@ -1,6 +1,8 @@
 """Commands, each acknowledged to its sender, and the small services that clients expect to be answered.
 
-A command that is repeated because its acknowledgement was lost is executed and acknowledged again.
+A command that is repeated because its acknowledgement was lost is executed and acknowledged again. Requests for what a
+Floaty does not have (missions, fences, rally points, logs, sole control) are answered with "none", because a client that
+gets no answer asks again and again. The end of a transaction, MISSION_ACK or LOG_REQUEST_END, is not answered.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,12 +12,11 @@ from firmware_py.board import Board
 from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import WARNING, MavlinkStack, Task
 from firmware_py.links.mavlink_streams import StreamService
-from firmware_py.links.parameters import Parameter
-from firmware_py.links.storage import ParameterStorage
+from firmware_py.links.parameters import Parameter, ParameterStorage
 from firmware_py.supervisor import Supervisor
+from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_frames import Message
-from firmware_py.wire.mavlink_layouts import NUMBERS
+from firmware_py.wire.mavlink_layouts import NUMBERS, Message
 from firmware_py.wire.mavlink_numbers import WRITE_ALL, Command, Mode, Result
 
 FORCE = 21196  # MAVLink's magic number for disarming in flight
@@ -168,3 +169,21 @@ def _sixth(command: Message) -> float:
 def _whole(value: float) -> int:
     """A parameter that is a whole number; -2, which none of them may be, for anything else."""
     return int(value) if isfinite(value) and value == int(value) else -2
+
+
+def answer_for_what_is_not_there(stack: MavlinkStack) -> None:
+    """Add the answers to the link."""
+
+    def refuse_control(request: Message) -> None:
+        stack.reply(services.no_control(request))
+        stack.notice(request, "no client gets control for itself alone")
+
+    def refuse_mission(message: Message) -> None:
+        stack.reply(services.refused_mission(message))
+
+    for name in mavlink.MISSION_MESSAGES:
+        stack.handle(name, refuse_mission)
+    stack.handle("MISSION_REQUEST_LIST", lambda request: stack.reply(services.no_mission(request)))
+    stack.handle("LOG_REQUEST_LIST", lambda request: stack.reply(services.no_logs()))
+    stack.handle("LOG_REQUEST_DATA", lambda request: stack.reply(services.no_log_data(request)))
+    stack.handle("CHANGE_OPERATOR_CONTROL", refuse_control)

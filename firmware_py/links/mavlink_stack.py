@@ -12,13 +12,13 @@ from collections.abc import Callable, Generator, Iterable
 
 from firmware_py.board import Board
 from firmware_py.config import CpuConfig, MavlinkConfig
-from firmware_py.links.notices import Notices
+from firmware_py.links.console import Notices
 from firmware_py.rtos import Kernel, Queue
 from firmware_py.rtos.scheduler import GO_ON
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
-from firmware_py.wire.mavlink_layouts import NUMBERS
+from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Signing
+from firmware_py.wire.mavlink_layouts import NUMBERS, Message
 
 Task = Generator[int, None, None]
 Handler = Callable[[Message], object]

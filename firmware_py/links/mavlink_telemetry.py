@@ -1,26 +1,68 @@
 """What the streams carry: the running board's values as messages, with the tick as time stamp.
 
 Our own ground station takes the flight array: the telemetry blocks as the board knows them, relative to the goal that the
-last pose was seen from. For other stations the standard's messages are absolute in W; those of rate 0 are sent only on
-SET_MESSAGE_INTERVAL or REQUEST_MESSAGE.
+last pose was seen from. For other stations the standard's messages are absolute in W (`World`); those of rate 0 are sent
+only on SET_MESSAGE_INTERVAL or REQUEST_MESSAGE.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import sqrt
 
 from firmware_py.config import StreamRates
-from firmware_py.core.structs import POSITION
-from firmware_py.geometry import Vector, conjugate, rotate
+from firmware_py.core.structs import ATTITUDE, POSITION, RATE, VELOCITY, Control, Estimator
+from firmware_py.geometry import (
+    Quaternion,
+    Vector,
+    conjugate,
+    from_euler_zyx,
+    rotate,
+    wrap_angle,
+    yaw_quaternion,
+)
 from firmware_py.links.log import LogVariable
 from firmware_py.links.mavlink_poses import PoseService
+from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack
 from firmware_py.links.mavlink_streams import Stream, interval_of
-from firmware_py.links.mavlink_world import World
 from firmware_py.rtos.statistics import ProcessorLoad
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import mavlink, telemetry
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_frames import Message
+from firmware_py.wire.mavlink_layouts import Message
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """Where the robot is in W now; the estimator only has the error from the goal against which the last pose was taken."""
+
+    estimator: Estimator
+    control: Control
+    setpoints: SetpointService
+
+    def angles(self) -> Vector:
+        """Roll, pitch, yaw of B in W."""
+        roll, pitch, yaw = self.estimator.now[ATTITUDE : ATTITUDE + 3].tolist()
+        return roll, pitch, wrap_angle(yaw + self.setpoints.frame[1])
+
+    def q_WB(self) -> Quaternion:
+        """The attitude."""
+        return from_euler_zyx(*self.angles())
+
+    def rates(self) -> Vector:
+        """Body rates p, q, r [rad/s]."""
+        p, q, r = self.estimator.now[RATE : RATE + 3].tolist()
+        return p, q, r
+
+    def motion(self) -> tuple[Vector, Vector]:
+        """p_WB [m] and v_W [m/s]."""
+        p_WG, yaw = self.setpoints.frame
+        q_WG = yaw_quaternion(yaw)
+        now = self.estimator.now
+        x, y, z = rotate(q_WG, tuple(now[POSITION : POSITION + 3].tolist()))
+        v_W = rotate(q_WG, tuple(now[VELOCITY : VELOCITY + 3].tolist()))
+        return (p_WG[0] + x, p_WG[1] + y, p_WG[2] + z), v_W
+
 
 UNKNOWN_AGE = -1.0
 VERSION = (26, 11, 0)

@@ -1,15 +1,18 @@
 """The parameter service: read, write and keep the values that may be changed while the board runs.
 
 A write is refused when the value is not a number or out of range: the console names the range. Either way the reply carries
-the value that is in force. Persistent parameters can be stored in the EEPROM and are applied at the next boot.
+the value that is in force. Persistent parameters can be stored in the upper part of the EEPROM and are applied at the next
+boot. Layout from address 1024: `FPS1`, length of the list u16, CRC-32 of the list u32, then for each parameter the length of
+its name, the name, the length of its value, the value. A list that fails these checks counts as empty.
 """
 
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from zlib import crc32
 
+from firmware_py.links.console import Notices
 from firmware_py.links.crtp_stack import CrtpStack
-from firmware_py.links.notices import Notices
-from firmware_py.links.storage import ParameterStorage
 from firmware_py.wire import WireError, toc
 from firmware_py.wire.crtp import PORT_PARAMETERS, Packet
 from firmware_py.wire.parameters import (
@@ -30,6 +33,76 @@ from firmware_py.wire.parameters import (
     encode_set_by_name_reply,
 )
 from firmware_py.wire.scalars import Scalar
+
+START = 1024  # below lies the configuration block
+_HEAD = struct.Struct("<4sHI")
+_MAGIC = b"FPS1"
+
+
+class ParameterStorage:
+    """The list in the EEPROM; `eeprom` is the memory itself."""
+
+    def __init__(self, eeprom: bytearray) -> None:
+        self._eeprom = eeprom
+
+    @property
+    def size(self) -> int:
+        """Bytes available for the list."""
+        return len(self._eeprom) - START
+
+    @property
+    def used(self) -> int:
+        """Bytes used by the list."""
+        return _HEAD.size + len(_records(self.load()))
+
+    def load(self) -> dict[str, bytes]:
+        """Return the stored values by name."""
+        magic, length, checksum = _HEAD.unpack_from(self._eeprom, START)
+        begin = START + _HEAD.size
+        records = bytes(self._eeprom[begin : begin + length])
+        if magic != _MAGIC or len(records) != length or crc32(records) != checksum:
+            return {}
+        values: dict[str, bytes] = {}
+        while records:
+            name, records = _split(records)
+            value, records = _split(records)
+            values[name.decode("latin-1")] = value
+        return values
+
+    def store(self, name: str, value: bytes) -> bool:
+        """Store a value under a name; False when the memory is full."""
+        return self.store_all({name: value})
+
+    def store_all(self, values: Mapping[str, bytes]) -> bool:
+        """Store values under their names; False, and nothing stored, when the memory is full."""
+        return self._write(self.load() | dict(values))
+
+    def clear(self, name: str) -> bool:
+        """Delete a value; False when there was none."""
+        values = self.load()
+        return values.pop(name, None) is not None and self._write(values)
+
+    def _write(self, values: dict[str, bytes]) -> bool:
+        records = _records(values)
+        content = _HEAD.pack(_MAGIC, len(records), crc32(records)) + records
+        if START + len(content) > len(self._eeprom):
+            return False
+        self._eeprom[START : START + len(content)] = content
+        return True
+
+
+def _records(values: Mapping[str, bytes]) -> bytes:
+    """The list without its head."""
+    return b"".join(
+        bytes((len(name),)) + name.encode("latin-1") + bytes((len(value),)) + value
+        for name, value in values.items()
+    )
+
+
+def _split(records: bytes) -> tuple[bytes, bytes]:
+    """Split off the first counted string."""
+    end = 1 + (records[0] if records else 0)
+    return records[1:end], records[end:]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from firmware_py.wire.crtp import (
     Packet,
     encode,
 )
-from firmware_py.wire.platform import (
+from firmware_py.wire.supervisor import (
     ARM,
     COMMAND_ARM,
     COMMAND_NOTIFY,
@@ -32,8 +32,8 @@ from firmware_py.wire.platform import (
     VERSION_DEVICE,
     VERSION_FIRMWARE,
     VERSION_PROTOCOL,
+    State,
 )
-from firmware_py.wire.supervisor import State
 
 PROTOCOL_VERSION = 12
 FIRMWARE_VERSION = "2026.11 Floaty"

@@ -19,12 +19,12 @@ from firmware_py.config import LogicConfig
 from firmware_py.core.budget import CALL_CYCLES, LoopBudget
 from firmware_py.core.guard import Guard
 from firmware_py.core.subset import Block, Struct
+from firmware_py.errors import LogicError
 from firmware_py.export.c99 import Translation, core_texts, translate
 from firmware_py.export.reading import read_modules
 from firmware_py.export.syntax import OWN as PACKAGE
 from firmware_py.logic.budget import ARGUMENT, budgeted
 from firmware_py.logic.entry import GUARD, compose
-from firmware_py.logic.errors import LogicError
 from firmware_py.logic.plugs import GROUP, POINTS, Plug, read_plug
 from firmware_py.table import CoreParameter, CoreVariable
 

@@ -5,8 +5,7 @@ Nothing here has an axis; what flies is in `mavlink`.
 
 import pymavlink.dialects.v20.common as dialect
 
-from firmware_py.wire.mavlink_frames import Message
-from firmware_py.wire.mavlink_layouts import AvailableModes, CurrentMode, ProtocolVersion
+from firmware_py.wire.mavlink_layouts import AvailableModes, CurrentMode, Message, ProtocolVersion
 from firmware_py.wire.mavlink_numbers import Mode
 
 NAME_SIZE = 16  # of a parameter

@@ -24,7 +24,8 @@ from firmware_py.wire.parameters import (
     decode_ident,
     encode_ident,
 )
-from firmware_py.wire.platform import (
+from firmware_py.wire.scalars import Scalar
+from firmware_py.wire.supervisor import (
     COMMAND_ARM,
     COMMAND_RECOVER,
     GET_BITS,
@@ -33,7 +34,6 @@ from firmware_py.wire.platform import (
     REPLY,
     SUPERVISOR_INFO,
 )
-from firmware_py.wire.scalars import Scalar
 from ground_station.controls import Action, ControlsError, Dialogue, Exchange, Request, Script, Settings
 
 PORTS = (PORT_PARAMETERS, PORT_PLATFORM, PORT_SUPERVISOR)  # whose packets `hear` takes

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 from firmware_py.wire import WireError, mavlink
 from firmware_py.wire import mavlink_services as services
-from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Message, Signing
-from firmware_py.wire.mavlink_layouts import NUMBERS
+from firmware_py.wire.mavlink_frames import FrameReceiver, FrameSender, Signing
+from firmware_py.wire.mavlink_layouts import NUMBERS, Message
 from firmware_py.wire.telemetry import Sample, state_in
 from ground_station.latency import LinkLatency
 from ground_station.links.mavlink_budget import STANDING_GOAL_HZ, link_budget

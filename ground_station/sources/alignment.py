@@ -2,10 +2,14 @@
 
 Frames: M as the system streams, C the same with z up, W the tunnel; D the rigid body as it was defined in the system,
 its axes turned z up like those of M, B the robot. C is W turned by `yaw` and moved by `origin`, B likewise in D.
+Also here: which of the bodies that a system sees is the robot.
 """
+
+from collections.abc import Sequence
 
 from firmware_py.geometry import Quaternion, Vector, conjugate, multiply, rotate, yaw_quaternion
 from ground_station.config import Axes, CaptureConfig
+from ground_station.errors import MocapError
 
 
 def with_z_up(p: Vector, q: Quaternion) -> tuple[Vector, Quaternion]:
@@ -30,3 +34,13 @@ class Alignment:
         a, b, c = self._p_CW
         p_WB = rotate(self._q_WC, (p_CD[0] + x - a, p_CD[1] + y - b, p_CD[2] + z - c))
         return p_WB, multiply(multiply(self._q_WC, q_CD), self._q_DB)
+
+
+def choose_body(wanted: str, names: Sequence[str]) -> str:
+    """The name of the body to follow, out of those there are; `MocapError` when it is not clear which."""
+    if wanted in names:
+        return wanted
+    if not wanted and len(names) == 1:
+        return names[0]
+    what = f"no body {wanted!r}" if wanted else "body=NAME is missing"
+    raise MocapError(f"{what}; there are: {', '.join(names) or 'none'}")

@@ -15,9 +15,8 @@ from ground_station.clock import clock_us
 from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
-from ground_station.sources.alignment import Alignment
-from ground_station.sources.bodies import choose_body
-from ground_station.sources.capture_lines import Arrival, Body, decode_line
+from ground_station.sources.alignment import Alignment, choose_body
+from ground_station.sources.motioncapture_process import Arrival, Body, decode_line
 from ground_station.sources.silence import Silence
 
 CONNECT_TIMEOUT_US = 5_500_000  # the process gives up after 5 s without a frame

@@ -29,8 +29,7 @@ from firmware_py.wire.core_port import (
     read,
     write,
 )
-from firmware_py.wire.platform import PLATFORM_VERSION, VERSION_FIRMWARE
-from firmware_py.wire.supervisor import State
+from firmware_py.wire.supervisor import PLATFORM_VERSION, VERSION_FIRMWARE, State
 from ground_station.clock import clock_us, wait
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient, SilenceError

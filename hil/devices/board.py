@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
+from firmware_py.rtos import TICK_US
 from firmware_py.wire.mavlink_numbers import Result
 from hil.devices.board_firmware import Processor
 from hil.events import EventQueue
@@ -153,3 +154,16 @@ class VirtualBoard:
         result = self._fail(self.now_us, unit, failing, instance)
         self._let_hardware_go_first()
         return result
+
+
+class Thief:
+    """How much of every tick it takes, 0..1; may change at any time."""
+
+    __slots__ = ("share",)
+
+    def __init__(self) -> None:
+        self.share = 0.0
+
+    def taken_us(self) -> int:
+        """Return what it takes of the present tick."""
+        return round(self.share * TICK_US)

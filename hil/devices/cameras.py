@@ -16,7 +16,7 @@ from firmware_py.geometry import IDENTITY, Quaternion, Vector, multiply, rotate
 from ground_station.mocap import MocapFrame
 from hil.devices.config import MocapConfig
 from hil.devices.markers import Sighting
-from hil.world.noise import normal
+from hil.world.fixed_order import normal
 from hil.world.plant import Plant
 
 if TYPE_CHECKING:

@@ -1,22 +1,64 @@
 """The BMI088 on the virtual board: angular rate and specific force at the centre of mass to int16 counts at 1 kHz.
 
 One `sample` is one data-ready: call it once per millisecond, after `plant.advance`. Chain: second-order low pass, bias,
-white noise, rounding, saturation (`hil.devices.imu_counts`).
+white noise, rounding, saturation; compiled. Sensor frame S is B turned about z, as the chip is soldered on the original
+board; counts come in S.
 """
 
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware_py.board import ImuCounts
-from firmware_py.elementary import tan
-from hil.devices import imu_counts as at
+from firmware_py.elementary import cos, sin, tan
 from hil.devices.config import ImuConfig
-from hil.devices.imu_counts import COS, SIN, View, channels
 from hil.errors import LabError
+from hil.world import layout as at
+from hil.world.fixed_order import compiled, normal
 from hil.world.motion import GRAVITY
-from hil.world.noise import normal
 from hil.world.plant import Plant
+
+S_AZIMUTH = -math.pi / 4  # [rad] of S's x axis in B: then p = (gx + gy)/sqrt2, q = (gy - gx)/sqrt2, r = gz
+
+View = NDArray[np.float64]
+
+
+# Layout of the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
+NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, FIELDS = range(13)
+COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)
+
+
+@compiled
+def channel(row: View, truth: float, draw: float) -> int:
+    """Filter (transposed form II, b = B0 (1, 2, 1)), disturb and round one channel; returns counts."""
+    low = row[B0] * truth + row[NOW_1]
+    row[NOW_1] = 2.0 * row[B0] * truth - row[A1] * low + row[NOW_2]
+    row[NOW_2] = row[B0] * truth - row[A2] * low
+    if row[STUCK] == 0.0:
+        value = row[SCALE] * (low + row[BIAS] + row[FAULT_BIAS] + row[NOISE] * draw)
+        row[COUNT] = min(max(math.floor(value + 0.5), -row[RANGE]), row[RANGE] - 1.0)
+    return int(row[COUNT])
+
+
+@compiled
+def channels(rows: View, truth: View, draws: View) -> ImuCounts:
+    """Turn rates and specific force of the plant's array, in B, into S and then into counts."""
+    ox, oy, fx, fy = (
+        truth[at.OMEGA],
+        truth[at.OMEGA + 1],
+        truth[at.SPECIFIC_FORCE],
+        truth[at.SPECIFIC_FORCE + 1],
+    )
+    return (
+        channel(rows[0], COS * ox + SIN * oy, draws[0]),
+        channel(rows[1], COS * oy - SIN * ox, draws[1]),
+        channel(rows[2], truth[at.OMEGA + 2], draws[2]),
+        channel(rows[3], COS * fx + SIN * fy, draws[3]),
+        channel(rows[4], COS * fy - SIN * fx, draws[4]),
+        channel(rows[5], truth[at.SPECIFIC_FORCE + 2], draws[5]),
+    )
+
 
 SAMPLE_RATE = 1000.0  # [Hz]
 GYRO_COUNTS = 32768 / math.radians(2000)  # per rad/s; data sheet, range +-2000 deg/s
@@ -41,14 +83,14 @@ class VirtualImu:
 
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._rows = rows = np.zeros((6, at.FIELDS))
+        self._rows = rows = np.zeros((6, FIELDS))
         self._noise = np.repeat([config.gyro_noise, config.accel_noise], 3)
-        rows[:, at.SCALE] = np.repeat([GYRO_COUNTS, ACCEL_COUNTS], 3)
-        rows[:, at.BIAS] = normal(rng, 6) * np.repeat([config.gyro_bias, config.accel_bias], 3)
-        rows[:3, [at.B0, at.A1, at.A2]] = low_pass(config.gyro_bandwidth)
-        rows[3:, [at.B0, at.A1, at.A2]] = low_pass(config.accel_bandwidth)
+        rows[:, SCALE] = np.repeat([GYRO_COUNTS, ACCEL_COUNTS], 3)
+        rows[:, BIAS] = normal(rng, 6) * np.repeat([config.gyro_bias, config.accel_bias], 3)
+        rows[:3, [B0, A1, A2]] = low_pass(config.gyro_bandwidth)
+        rows[3:, [B0, A1, A2]] = low_pass(config.accel_bandwidth)
         self._draws: list[View] = []
-        rows[:, at.RANGE] = COUNTS
+        rows[:, RANGE] = COUNTS
         self.rate_range: float = COUNTS / GYRO_COUNTS
         self.frozen: bool = False
         self.silent: bool = False
@@ -66,22 +108,22 @@ class VirtualImu:
         if not 0.0 <= scale <= 1000.0:
             raise LabError(f"IMU noise scale = {scale}: outside 0..1000")
         self.noise_scale: float = scale
-        self._rows[:, at.NOISE] = scale * self._noise
+        self._rows[:, NOISE] = scale * self._noise
 
     def set_rate_bias(self, p: float, q: float, r: float) -> None:
         """Move the gyro's zero, on top of the specimen's own bias [rad/s, B]."""
         self.rate_bias = (p, q, r)
-        self._rows[:3, at.FAULT_BIAS] = COS * p + SIN * q, COS * q - SIN * p, r
+        self._rows[:3, FAULT_BIAS] = COS * p + SIN * q, COS * q - SIN * p, r
 
     def set_rate_range(self, rate: float) -> None:
         """Make the gyro saturate at +-`rate` [rad/s, about the axes of S] or, if that is less, at its full scale."""
         self.rate_range = rate
-        self._rows[:3, at.RANGE] = min(max(round(rate * GYRO_COUNTS), 1), COUNTS)
+        self._rows[:3, RANGE] = min(max(round(rate * GYRO_COUNTS), 1), COUNTS)
 
     def freeze(self, frozen: bool) -> None:
         """Repeat the last sample from now on, or end that."""
         self.frozen = frozen
-        self._rows[:, at.STUCK] = float(frozen)
+        self._rows[:, STUCK] = float(frozen)
 
     def silence(self, silent: bool) -> None:
         """Raise no data-ready interrupt from now on, or end that."""

@@ -14,8 +14,7 @@ from firmware_py.geometry import Quaternion, Vector, rotation_matrix
 from hil.devices.config import MarkersConfig
 from hil.devices.markers import COUNT, NO_POINTS, Cameras, Mask, Points, Sighting, marker_places
 from hil.world.config import GeometryConfig, GroundConfig
-from hil.world.fixed_order import eigen, product
-from hil.world.noise import normal
+from hil.world.fixed_order import eigen, normal, product
 
 NOISE_ROWS = 512  # exposures of noise drawn at once
 SPREAD = 0.01  # [m] root of the sum of squared distances from the best line through markers; below, they count as collinear

@@ -21,7 +21,7 @@ from hil.laboratory.metrics import BOX, column, position_error
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from hil.devices.thief import Thief
+    from hil.devices.board import Thief
     from hil.laboratory.flight import Flight
     from hil.laboratory.robot import Robot
 

@@ -18,13 +18,12 @@ import numpy as np
 from ground_station.mocap import MocapFrame
 from hil.config import LabConfig, load_config
 from hil.crazyflie.shockburst import Air
-from hil.devices.board import InjectFailure, Memory, VirtualBoard, unsupported
+from hil.devices.board import InjectFailure, Memory, Thief, VirtualBoard, unsupported
 from hil.devices.board_firmware import Executor, PowerOn, PythonBoard
 from hil.devices.cameras import VirtualMocap
 from hil.devices.imu import VirtualImu
 from hil.devices.markers import Sighting
 from hil.devices.rigid_body import make_markers
-from hil.devices.thief import Thief
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue

@@ -19,14 +19,13 @@ from hil.laboratory.metrics import METRICS, SHOWN, short_of
 from hil.laboratory.recorder import load_events, load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
-from hil.pictures.close_ups import close_ups
 from hil.pictures.curves import own_logic, with_marks
 from hil.pictures.figures import LATENCY_BUDGET, OWN_LOGIC, PICTURES, SCHEDULE
 from hil.pictures.gallery import pictures_of
 from hil.pictures.links import link_to
 from hil.pictures.pages import draw, write_page, zoomable
 from hil.pictures.panels import marks_of_flight
-from hil.pictures.story import story_of
+from hil.pictures.story import close_ups, story_of
 
 REPORT = "report.html"
 TEMPLATE = "report.html.j2"

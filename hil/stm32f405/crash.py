@@ -14,8 +14,8 @@ from pathlib import PurePath
 from struct import unpack, unpack_from
 
 from hil.errors import LabError
-from hil.stm32f405.call_frames import LR, PC, SP
 from hil.stm32f405.chip import Chip
+from hil.stm32f405.debug_info import LR, PC, SP
 from hil.stm32f405.freertos import FreeRtos, stacked_registers
 from hil.stm32f405.image import Image
 

@@ -23,8 +23,8 @@ from hil.config import LabConfig
 from hil.design.authority import pressure_at, wrenches
 from hil.laboratory.robot import Streams
 from hil.world.body import SIGNS
+from hil.world.fixed_order import normal
 from hil.world.layout import STEP_US
-from hil.world.noise import normal
 from hil.world.plant import Plant
 
 Wrench = NDArray[np.float64]  # (6,): force [N] and torque [N m] in B

@@ -9,8 +9,7 @@ from firmware_py.geometry import Vector
 from firmware_py.rtos import TaskReport
 from hil.config import LabConfig
 from hil.devices.board import VirtualBoard
-from hil.devices.imu import ACCEL_COUNTS, COUNTS, GYRO_COUNTS
-from hil.devices.imu_counts import COS, SIN
+from hil.devices.imu import ACCEL_COUNTS, COS, COUNTS, GYRO_COUNTS, SIN
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.world.motion import GRAVITY

@@ -1,16 +1,19 @@
 """Linear algebra, and the elementary functions compiled, in a fixed order: the same bits on every processor.
 
 BLAS and LAPACK, behind numpy's `@` and `numpy.linalg`, choose their code by processor and sum in another order on each; so
-nothing that flies uses them. Made for the few small matrices of a flight.
+nothing that flies uses them. Made for the few small matrices of a flight. Normal noise has the same bits everywhere, too.
 """
 
 import math
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py import elementary
-from hil.world.compiled import compiled
+from firmware_py import compiling, elementary
+
+compiled = compiling.compiler(Path(__file__).parent, Path(elementary.__file__))
+
 
 Matrix = NDArray[np.float64]
 
@@ -89,3 +92,14 @@ def fit_polynomial(x: Matrix, y: Matrix, order: int) -> Matrix:
             values_before, values = values, (x - middle) * values - (share * values_before if degree else 0.0)
             before, now, norm_before = now, following, norm
     return fit
+
+
+STEPS = 65536.0  # per standard deviation
+
+
+def normal(rng: np.random.Generator, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
+    """Return numbers of the standard normal distribution, rounded to 1 / `STEPS`.
+
+    Beyond 3.65, numpy takes a logarithm of the C library, which differs in its last bit; rounding removes that.
+    """
+    return np.asarray(np.rint(rng.standard_normal(shape) * STEPS) / STEPS)

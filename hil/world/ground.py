@@ -6,7 +6,7 @@ A foot is a spring and a damper that only push, and dry friction, smooth at rest
 import math
 
 from hil.world import layout as at
-from hil.world.compiled import compiled
+from hil.world.fixed_order import compiled
 from hil.world.plates import State
 
 CREEP = 0.02  # [m/s] below this speed friction fades

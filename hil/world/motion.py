@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.world import layout as at
-from hil.world.compiled import compiled
-from hil.world.fixed_order import atan2, exp
+from hil.world.fixed_order import atan2, compiled, exp
 from hil.world.ground import stand
 from hil.world.plates import State, drag
 

@@ -16,9 +16,9 @@ from hil.world import layout as at
 from hil.world.body import SIGNS, place_plates
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.correction import Constants, calm, linearise, trim_and_correct
+from hil.world.fixed_order import normal
 from hil.world.geometry import weigh
 from hil.world.motion import advance, evaluate
-from hil.world.noise import normal
 from hil.world.plates import State
 from hil.world.servos import commanded_angles, next_period_us
 from hil.world.tunnel import Tunnel

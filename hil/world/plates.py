@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from firmware_py.elementary import tan
 from hil.world import layout as at
-from hil.world.compiled import compiled
-from hil.world.fixed_order import sine_ahead
+from hil.world.fixed_order import compiled, sine_ahead
 
 # Slope of the wind beyond which identified stiffness does not grow.
 TILT_MAX = tan(math.radians(35.0))

@@ -15,8 +15,7 @@ from ground_station.config import CaptureConfig
 from ground_station.mocap import MocapFrame, MocapSource
 from ground_station.sources.motioncapture_client import MotioncaptureSource
 from ground_station.sources.optitrack import OptitrackSource
-from ground_station.sources.record import COLUMNS, RecordingSource
-from ground_station.sources.replay import ReplaySource
+from ground_station.sources.replay import COLUMNS, RecordingSource, ReplaySource
 from support.motive_bench import moving, needs, seen
 
 FRAMES = 20

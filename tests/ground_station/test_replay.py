@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from ground_station.clock import clock_us
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
-from ground_station.sources.record import RecordingSource
-from ground_station.sources.replay import TELEMETRY_COLUMNS, ReplaySource, read_frames
+from ground_station.sources.replay import TELEMETRY_COLUMNS, RecordingSource, ReplaySource, read_frames
 
 FRAMES_SEEN = [
     MocapFrame(1_000_000 + 5000 * number, (0.1 * number, -1 / 3, 1e-17), (0.5, -0.5, 0.1 + 0.2, 1e-300), number % 3 != 0)
@@ -69,7 +68,7 @@ def test_a_record_on_disk_is_never_much_more_than_a_second_old(
     path = tmp_path / "frames.csv"
     recording = RecordingSource(Played(FRAMES_SEEN), path)
     for number in range(len(FRAMES_SEEN)):  # few bytes: no buffer is ever full
-        monkeypatch.setattr("ground_station.sources.record.clock_us", lambda now_us=number * 500_000: now_us)
+        monkeypatch.setattr("ground_station.sources.replay.clock_us", lambda now_us=number * 500_000: now_us)
         recording.receive(0.0)
         # not closed, as after a crash
         written_us = [arrival_us for arrival_us, _ in read_frames(path)]

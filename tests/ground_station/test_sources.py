@@ -9,8 +9,7 @@ from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame
 from ground_station.sources.address import find_source
 from ground_station.sources.alignment import Alignment
-from ground_station.sources.natnet_stream import MISTIMED_FRAMES, NatnetStream
-from ground_station.sources.server_clock import ServerClock
+from ground_station.sources.natnet_stream import MISTIMED_FRAMES, NatnetStream, ServerClock
 from ground_station.sources.silence import SILENCE_US, Silence
 from support import natnet_packets as packets
 from support.motive_bench import moving

@@ -21,8 +21,8 @@ from ground_station.config import CaptureConfig
 from ground_station.errors import MocapError
 from ground_station.mocap import MocapFrame, MocapSource, judged
 from ground_station.sources.address import find_source
-from ground_station.sources.capture_lines import Arrival, decode_line, encode_arrival, encode_error
 from ground_station.sources.motioncapture_client import MotioncaptureSource, settings_of
+from ground_station.sources.motioncapture_process import Arrival, decode_line, encode_arrival, encode_error
 from support.motive_bench import MotiveBench, moving, needs, seen
 from support.paths import ROOT
 from support.qualisys_server import qualisys_server

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.config import parameters_of
 from firmware_py.links.console import pieces
 from firmware_py.links.crtp_stack import PORT_QUEUE
-from firmware_py.links.storage import ParameterStorage
+from firmware_py.links.parameters import ParameterStorage
 from firmware_py.wire import crtp, telemetry
 from firmware_py.wire.localisation import unpack_quaternion
 from firmware_py.wire.scalars import LOG_SCALARS, Scalar

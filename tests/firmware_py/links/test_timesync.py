@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_py.links.timesync import DRIFT_PPM, LONGEST_US, UNKNOWN_US, WINDOW, RemoteClock
+from firmware_py.links.mavlink_poses import DRIFT_PPM, LONGEST_US, UNKNOWN_US, WINDOW, RemoteClock
 
 AHEAD_US = 1_700_000_000_000_000  # a station with the time of day against a board that counts from boot
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.links.storage import ParameterStorage
+from firmware_py.links.parameters import ParameterStorage
 from hil.config import load_config
 from hil.errors import LabError
 from hil.servers.server import Server

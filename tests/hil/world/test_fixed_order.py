@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from hil.world.fixed_order import eigen, fit_polynomial, product
-from hil.world.noise import STEPS, normal
+from hil.world.fixed_order import STEPS, eigen, fit_polynomial, normal, product
 
 shapes = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))
 seeds = st.integers(0, 2**32)
