@@ -6,25 +6,12 @@ reboot, as on the Crazyflie. The board arms itself at boot.
 """
 
 from collections.abc import Callable
-from typing import Protocol
 
 from firmware_py.core import structs
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks
+from firmware_py.pilot import Pilot
 from firmware_py.wire.supervisor import Cause, State
-
-
-class GoalSource(Protocol):
-    """Knows where to fly."""
-
-    def flies(self, now_us: int) -> bool:
-        """Whether there is something to fly to."""
-
-    def forsaken(self, now_us: int) -> bool:
-        """Whether set-points led the robot and have stopped arriving."""
-
-    def abort(self) -> None:
-        """Give up the plan, because the robot may not fly."""
 
 
 class Supervisor:
@@ -34,7 +21,7 @@ class Supervisor:
         self,
         core: CoreBlocks,
         announce: Callable[[str], None],
-        goals: GoalSource,
+        goals: Pilot,
         connected: Callable[[], bool],
     ) -> None:
         self.state = State.CALIBRATING

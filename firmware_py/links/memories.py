@@ -6,7 +6,6 @@ returns it, writing compares with it and counts differences.
 
 import struct
 from collections.abc import Sequence
-from typing import Protocol
 
 from firmware_py.links.crtp_stack import CrtpStack
 from firmware_py.wire import WireError
@@ -25,22 +24,8 @@ _NO_SERIAL = bytes(8)
 _DECK_SERIAL = bytes((0x0D, 0xF1, 0x0A, 0x7B, 0, 0, 0, 1))  # of the one-wire chip
 
 
-class Memory(Protocol):
-    """A memory as clients see it; addresses are checked by the service."""
-
-    type: int
-    size: int
-    serial: bytes
-
-    def read(self, address: int, length: int) -> bytes:
-        """Return `length` bytes."""
-
-    def write(self, address: int, data: bytes) -> None:
-        """Store bytes."""
-
-
-class Storage:
-    """A memory of real bytes."""
+class Memory:
+    """A memory of real bytes as clients see it; addresses are checked by the service."""
 
     def __init__(self, type: int, content: bytearray, serial: bytes = _NO_SERIAL) -> None:
         self.type = type
@@ -57,24 +42,16 @@ class Storage:
         self._content[address : address + len(data)] = data
 
 
-class Tester:
+class Tester(Memory):
     """The memory tester; `errors` counts wrong bytes."""
 
-    type = TYPE_TESTER
-    size = TESTER_SIZE
-    serial = _NO_SERIAL
-
     def __init__(self) -> None:
+        super().__init__(TYPE_TESTER, bytearray(index & 0xFF for index in range(TESTER_SIZE)))
         self.errors = 0
 
-    def read(self, address: int, length: int) -> bytes:
-        """Return the expected bytes."""
-        return bytes(index & 0xFF for index in range(address, address + length))
-
     def write(self, address: int, data: bytes) -> None:
-        """Compare."""
-        expected = self.read(address, len(data))
-        self.errors += sum(a != b for a, b in zip(data, expected, strict=True))
+        """Compare with the expected bytes."""
+        self.errors += sum(a != b for a, b in zip(data, self.read(address, len(data)), strict=True))
 
 
 class MemoryService:
@@ -123,8 +100,8 @@ def memories(
 ) -> tuple[Memory, ...]:
     """Return the memories of a Floaty board."""
     return (
-        Storage(TYPE_EEPROM, eeprom),
-        Storage(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
+        Memory(TYPE_EEPROM, eeprom),
+        Memory(TYPE_ONE_WIRE, deck_memory, _DECK_SERIAL),
         tester,
-        Storage(TYPE_TRAJECTORIES, trajectories),
+        Memory(TYPE_TRAJECTORIES, trajectories),
     )

@@ -6,7 +6,6 @@ registers that make 400 Hz of them. Nothing flies here.
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -46,24 +45,8 @@ SERVO_OUTPUTS: tuple[tuple[str, str, int, int], ...] = (  # register, of, mask, 
 )  # fmt: skip
 
 
-class ParameterBoard(Protocol):
-    """A board whose parameters a client writes, and whose memory can be read."""
-
-    def scalar(self, name: str) -> Scalar | None:
-        """Return the type of a parameter, None when the board has none of that name."""
-
-    def value(self, name: str) -> float:
-        """Return a parameter as a client reads it."""
-
-    def write(self, name: str, value: float) -> None:
-        """Write a parameter as a client does."""
-
-    def field(self, parameter: AppParameter) -> float:
-        """Return the number in memory that a parameter acts on."""
-
-
 def check_parameters(
-    table: Sequence[AppParameter], board: ParameterBoard, progress: Callable[[int], None] = lambda done: None
+    table: Sequence[AppParameter], board: "ImageBench", progress: Callable[[int], None] = lambda done: None
 ) -> Iterator[str]:
     """Yield every way in which a board's parameters differ from the table; the board is left as it was."""
     for done, parameter in enumerate(table):
@@ -71,7 +54,7 @@ def check_parameters(
         progress(done + 1)
 
 
-def _check_parameter(parameter: AppParameter, board: ParameterBoard) -> Iterator[str]:
+def _check_parameter(parameter: AppParameter, board: "ImageBench") -> Iterator[str]:
     name, expected_type = parameter.name, parameter.scalar
     scalar = board.scalar(name)
     if scalar is None:

@@ -19,7 +19,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from math import nan
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from firmware_py.wire.scalars import Scalar
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
+from hil.clock import Paced
 from hil.crazyflie.log_table import ImageVariable
 from hil.crazyflie.shockburst import syslink_us
 from hil.devices.board_firmware import PowerOn
@@ -80,26 +81,13 @@ class _Clock:
         return ()
 
 
-class Wall(Protocol):
-    """The wall clock, and how simulated time lies on it."""
-
-    def wall_us(self) -> int:
-        """Return what the wall clock shows."""
-
-    def late_us(self, now_us: int) -> int:
-        """Return by how much an instant of simulated time is over."""
-
-    def shift(self, by_us: int) -> None:
-        """Let simulated time be later by that, or earlier."""
-
-
 @dataclass(frozen=True, slots=True)
 class RealBoard:
     """A board that is to fly in the loop; `moving`: its servos move as well."""
 
     client: CoreClient
     moving: bool
-    wall: Wall
+    wall: Paced  # the wall clock, and how simulated time lies on it
     needs_polls: ClassVar[bool] = False
 
     def wire_us(self, data: bytes) -> int:

@@ -33,7 +33,7 @@ TABLE = app_parameters(load_config())
 
 
 class AppBoard:
-    """The exported app on a board of memory, as `ParameterBoard`."""
+    """The exported app on a board of memory, as `ImageBench`."""
 
     def __init__(self, app: App) -> None:
         self.app = app
