@@ -28,7 +28,7 @@ from firmware_py.fast import FOLDER, RECORD, digest  # noqa: E402 - from here, a
 
 PACKAGES = ("firmware_py", "ground_station", "hil")
 MODULES = {
-    "firmware_py": "firmware geometry measurements pilot planner supervisor tasks",
+    "firmware_py": "firmware geometry pilot planner supervisor tasks",
     "firmware_py/links": "crtp_stack localisation log",
     "firmware_py/rtos": "control_block kernel queue scheduler semaphore task timer",
     "firmware_py/wire": "crtp log telemetry",
