@@ -42,10 +42,10 @@ def campaign(
     file = find_spec(spec)
     read = read_spec(file)
     check_spec(read)
+    if shrink is not None and shrink >= read.flights:
+        raise LabError(f"--shrink {shrink}: the campaign has flights 0..{read.flights - 1}")
     announce_compilation()
     if shrink is not None:
-        if shrink >= read.flights:
-            raise LabError(f"--shrink {shrink}: the campaign has flights 0..{read.flights - 1}")
         return _shrink(read, draw(read, shrink))
     with Runner(notices, workers, cluster, resume) as runner:
         dataset, standing = runner.campaign(plan_of(read), out or Path("runs") / f"campaign-{file.stem}")

@@ -66,8 +66,8 @@ def design(
         return
     from hil.design.analysis import analyse, write
 
-    announce_compilation()
     point = point_of(profile, overrides, speed, angle, length, mass)
+    announce_compilation()
     if write_to is not None:
         write_profile(
             point,
@@ -120,9 +120,9 @@ def optimise(
     from hil.design.claims import robot_lines
     from hil.pictures.drawing import png
 
-    announce_compilation()
     if updrafts[0] >= updrafts[1]:
         raise LabError(f"--updrafts {updrafts[0]:g} {updrafts[1]:g}: expected the least first")
+    announce_compilation()
     found = search.optimise(point_of(profile, overrides, None, None), figure, seed, generations)
     best, front = found.best, search.front(found.tried, figure)
     if write_to is not None:

@@ -83,13 +83,16 @@ def runner_options(command: Callable[..., int]) -> Callable[..., int]:
     return command
 
 
+COMPILING = "first run on this machine: compiling flight core and plant, once, some ten seconds"
+
+
 def announce_compilation() -> None:
     """Announce that the first run compiles, because that takes a while."""
     from firmware_py.compiling import is_kept
     from hil.world.motion import advance
 
     if not is_kept(advance):
-        notices.print("first run on this machine: compiling flight core and plant, once, some ten seconds")
+        notices.print(COMPILING, soft_wrap=True)
 
 
 def say(text: str) -> None:
