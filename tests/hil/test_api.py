@@ -105,24 +105,6 @@ def test_a_request_is_flown_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        ({"seed": 1, "faults": ["push.w@1"]}, "unknown kind 'push.w'"),
-        ({"duration_s": -1.0}, "--duration -1: expected seconds"),
-        ({"duration_s": math.nan}, "--duration nan"),
-        ({"board": "arm"}, "--board arm: expected"),
-        ({"profile": "flaoty"}, "did you mean floaty"),
-        ({"overrides": ["tunnel.sped=7"]}, "did you mean speed"),
-    ],
-)
-def test_bad_options_are_one_line(options: dict[str, object], told: str) -> None:
-    with pytest.raises(LabError, match=told) as error:
-        fly("hover", **options)  # type: ignore[arg-type]
-    assert "\n" not in str(error.value)
-    assert not Path("runs").exists()
-
-
-@pytest.mark.parametrize(
     "options",
     [
         pytest.param({}, marks=pytest.mark.long),

@@ -1,25 +1,18 @@
 """`floaty serve` as a process of its own: what Motive says there, and flights that need nothing but what it says."""
 
-import json
 import re
 import select
 import socket
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from ground_station.config import CaptureConfig
 from ground_station.sources.address import find_source
 from support.mavproxy_program import MavProxy, mavproxy_here
-from support.motive_bench import FROM_MOTIVE, needs
-from support.paths import SUPPORT
-from support.serving import PATIENCE_S, Served, free_port, serve, station
+from support.serving import PATIENCE_S, Served, serve, station
 
 HOVER = 0.1  # off home at most [m]; the paper hovers within centimetres
 AGE_MS = 5.0  # off the cameras' latency at most: the loopback interface and a busy machine
@@ -37,74 +30,6 @@ def test_whichever_axis_points_up_the_printed_address_shows_the_robot_in_its_hol
         receiver.close()
     assert frame is not None
     assert frame.p_WB == pytest.approx((0.0, 0.0, 1.15), abs=0.05)
-
-
-@needs("natnet")
-def test_the_cameras_pose_is_what_a_client_gets() -> None:
-    """Against what our own client makes of the same stream; the noise makes each frame one of a kind.
-
-    The body is tracked by markers here, with noise that Motive would refuse.
-    """
-    noise = ("--set", "markers.noise=0.02", "--set", "markers.max_error=1")
-    with serve("--udp", "0", *noise, motive=True) as lab:
-        port = lab.motive.split(":")[2]
-        receiver = find_source(lab.motive, CaptureConfig())
-        receiver.open()
-        script = str(SUPPORT / "natnet_clients.py")
-        command = [sys.executable, script, "natnet", port, "unicast", "50"]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE)
-        frames = []
-        deadline = time.monotonic() + PATIENCE_S
-        while process.poll() is None and time.monotonic() < deadline:
-            if (frame := receiver.receive(0.1)) is not None:
-                frames.append(frame)
-        process.kill()
-        out, _ = process.communicate()
-        markers = subprocess.run(
-            [sys.executable, script, "natnet-markers", port, "unicast", "5"],
-            capture_output=True,
-            timeout=PATIENCE_S,
-        )
-    receiver.close()
-    assert_markers(markers.stdout)
-    rows = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]
-    assert len(rows) == 50
-    places = np.array([frame.p_WB for frame in frames])
-    for _, name, p, q, tracked in rows:
-        assert (name, tracked) == ("floaty", True)
-        distances = np.linalg.norm(places - FROM_MOTIVE @ p, axis=1)
-        assert distances.min() < 1e-6
-        R_WB = Rotation.from_quat(np.roll(frames[int(distances.argmin())].q_WB, -1)).as_matrix()
-        assert FROM_MOTIVE @ Rotation.from_quat(q).as_matrix() @ FROM_MOTIVE.T == pytest.approx(
-            R_WB, abs=1e-5
-        )
-
-
-def assert_markers(out: bytes) -> None:
-    """The markers of each frame fit the model: as well as the frame itself says."""
-    (described,), *rows = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]
-    places = np.array([p for _, p in described])
-    assert places.shape == (8, 3)
-    assert len(rows) == 5
-    for _, (error,), labelled, unlabelled in rows:
-        assert ([occluded for *_, occluded, _ in labelled], unlabelled) == ([False] * 8, [])
-        points = np.array([p for _, _, p, _, _ in labelled])
-        around, model = points - points.mean(axis=0), places - places.mean(axis=0)
-        turn, _ = Rotation.align_vectors(around, model)
-        off = np.linalg.norm(around - turn.apply(model), axis=1)
-        assert off == pytest.approx([residual for *_, residual in labelled], abs=1e-5)
-        assert error == pytest.approx(off.mean(), abs=1e-5)
-
-
-@needs("natnet")
-def test_markers_can_be_taken_off() -> None:
-    with serve("--udp", "0", "--set", "markers.enabled=false", motive=True) as lab:
-        port = lab.motive.split(":")[2]
-        script = str(SUPPORT / "natnet_clients.py")
-        command = [sys.executable, script, "natnet-markers", port, "unicast", "1"]
-        out = subprocess.run(command, capture_output=True, timeout=PATIENCE_S).stdout
-    described, (_, error, *markers) = [json.loads(line) for line in out.splitlines() if line.startswith(b"[")]
-    assert (described, error, markers) == ([[]], [0.0], [[], []])
 
 
 def is_taken(port: int) -> bool:
@@ -201,19 +126,6 @@ def test_a_station_in_another_process_flies_and_flies_again_when_motive_is_back(
     assert age is not None, shown
     assert float(age[1]) == pytest.approx(40.0, abs=AGE_MS)
     assert not any("Traceback" in line for line in typed.lines)
-
-
-def test_a_wrong_body_or_no_motive_is_one_line_and_exit_code_two() -> None:
-    nobody = f"127.0.0.1:{free_port()}"
-    with serve("--udp", "0", motive=True) as lab:
-        for mocap, message in (
-            (f"optitrack:{nobody}", f"{nobody}: no NatNet server answers"),
-            (f"{lab.motive},body=wand", "no body 'wand'; there are: floaty"),
-        ):
-            with station(lab, lab.udp_uris[0], mocap=mocap) as typed:
-                assert typed.process.wait(60) == 2
-                typed.listen()
-            assert typed.lines == [f"floaty: --mocap {mocap}: {message}"]
 
 
 def assert_still_flying(lab: Served, duration_s: float) -> None:

@@ -13,7 +13,7 @@ from firmware_py.wire.supervisor import State
 from firmware_py.wire.telemetry import Sample
 from ground_station.clock import clock_us
 from ground_station.errors import LinkError
-from ground_station.links.live_link import MAX_AGE_US, SILENCE_TIMEOUT_US, LiveLink
+from ground_station.links.live_link import SILENCE_TIMEOUT_US, LiveLink
 from ground_station.links.schemes import LinkSettings, find_link
 from ground_station.mocap import MocapFrame
 from ground_station.trajectory import Goal
@@ -100,16 +100,6 @@ def test_poses_fly_the_board_and_silence_ends_it(link: LiveLink) -> None:
     link.send(clock_us(), fresh(0.0), HOME)
     wait_until(lambda: bool(samples(link) or True) and link.supervisor_state == State.FAILSAFE)
     assert link.sent <= sent + 1
-
-
-def test_a_pose_that_is_too_old_stays_here_and_is_counted(link: LiveLink) -> None:
-    link.open(lambda: False)
-    late = link.late
-    link.send(clock_us(), fresh(0.0, MAX_AGE_US + 10_000), HOME)
-    wait_until(lambda: link.late == late + 1)
-    sent = link.sent
-    link.send(clock_us(), fresh(0.0), HOME)
-    wait_until(lambda: link.sent == sent + 1)
 
 
 def test_a_link_may_be_closed_twice_and_opened_again(link: LiveLink) -> None:

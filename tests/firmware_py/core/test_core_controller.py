@@ -181,13 +181,6 @@ def test_feedback_is_the_papers_in_the_heading_frame(state: list[float], target:
     assert loop.u == pytest.approx(np.array(expected), abs=1e-5)
 
 
-def test_rate_and_tilt_gains_of_pitch_act() -> None:
-    loop = Loop("as-flown")
-    loop.forget_height_priority()
-    loop.step([0] * 7 + [0.2, 0, 0, 3.0, 0])
-    assert loop.u[1] == pytest.approx(-0.15 * 0.2 - 0.03 * 3.0, abs=SMALL)
-
-
 def test_height_error_is_integrated_at_100_hz_up_to_its_limit_and_forgotten_when_the_loop_opens() -> None:
     loop = Loop()
     for step in range(1, 31):
@@ -240,12 +233,6 @@ def test_attitude_inputs_are_realised_exactly_whenever_any_height_allows_it(u: t
         candidates = np.linspace(low, high, 101)
         assert abs(realised[3] - u[3]) <= np.abs(candidates - u[3]).min() + SMALL  # height gives way least
     assert low - SMALL <= realised[3] <= high + SMALL or low > high
-
-
-def test_height_gives_way_first_and_comes_back() -> None:
-    assert allocate((0, 0, 0.4, 0.0)).u == pytest.approx([0, 0, 0.4, 0.0], abs=SMALL)
-    assert allocate((0, 0, 0.4, 0.3)).u == pytest.approx([0, 0, 0.4, HOVER - 0.4], abs=SMALL)
-    assert allocate((0, 0, 0.4, -0.5)).u == pytest.approx([0, 0, 0.4, HOVER + 0.4 - 0.9], abs=SMALL)
 
 
 # Modes

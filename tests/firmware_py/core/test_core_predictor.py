@@ -55,19 +55,6 @@ def test_the_age_that_is_reported_is_the_poses_own_whether_it_is_used_or_not(pre
     assert int(core.fields.pose_age_us) == 44_000
 
 
-@pytest.mark.parametrize(
-    "age_us", [0, 4_000, 10_000, 23_000, 38_000, 40_000, 44_000, 77_000, 100_000, 120_000, 124_999]
-)
-def test_motion_is_predicted_to_now_from_poses_of_any_age(age_us: int) -> None:
-    core = no_couplings(Core())
-    glide(core, 300, age_us)
-    position, yaw = glide_error(core, 300)
-    assert position < 1e-3
-    assert yaw < 2e-3
-    assert core.now[3:6] == pytest.approx(VELOCITY, abs=5e-3)
-    assert "refused" not in core.counters
-
-
 @pytest.mark.parametrize("age_us", [20_000, 40_000, 120_000])
 def test_without_prediction_the_estimate_lags_by_the_age(age_us: int) -> None:
     core = no_couplings(Core(predict=0))
@@ -146,19 +133,6 @@ def test_pose_without_age_counts_as_40_ms_old() -> None:
             core.tick()
     assert told.counters["fused"] > 40
     assert told.estimator.bytes() == untold.estimator.bytes()
-
-
-def test_younger_pose_waits_for_its_instant() -> None:
-    core = Core()
-    glide(core, 60, 40_000)
-    fused, x = core.fields.fused, core.x
-    assert core.pose((0.02, 0, 0), LEVEL, 10_000) == POSE_ON_TIME
-    for _ in range(3):
-        core.tick()
-        assert core.fields.fused == fused
-    core.tick()
-    assert core.fields.fused + core.fields.refused == fused + 1
-    assert (core.x != x).any()
 
 
 ages = st.lists(st.integers(0, 4), min_size=30, max_size=60)

@@ -92,18 +92,7 @@ def test_any_three_markers_are_far_from_one_line() -> None:
 # The fit
 
 
-@given(places, turns, st.sets(st.integers(0, COUNT - 1), min_size=3))
-def test_exact_points_give_the_pose_whichever_are_seen(p_WB: Array, turn: Rotation, rows: set[int]) -> None:
-    seen = np.isin(np.arange(COUNT), list(rows))
-    points = turn.apply(PLACES) + p_WB
-    fit = RigidBody(PLACES).fit(np.where(seen[:, None], points, np.nan), seen)
-    assert fit is not None
-    assert fit.p_WB == pytest.approx(p_WB, abs=1e-12)
-    assert (turn.inv() * Rotation.from_quat(fit.q_WB, scalar_first=True)).magnitude() < 1e-6
-    assert fit.points == pytest.approx(points, abs=1e-12)
-
-
-@given(places, turns, st.integers(0, 2**32), st.sets(st.integers(0, COUNT - 1), min_size=4))
+@given(places, turns, st.integers(0, 2**32), st.sets(st.integers(0, COUNT - 1), min_size=3))
 def test_noisy_points_give_the_pose_of_scipys_kabsch(
     p_WB: Array, turn: Rotation, seed: int, rows: set[int]
 ) -> None:
@@ -297,14 +286,6 @@ def test_hovering_shows_all_markers_and_lying_on_the_side_hides_some(tilt: int, 
         turn = Rotation.from_rotvec(np.radians(tilt) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))
         seen.append(look(EXACT, turn).bits.bit_count())
     assert min(seen) == fewest
-
-
-def test_few_cameras_lose_what_the_body_hides() -> None:
-    """Upside down, two cameras on one side do not see the posts behind the plate: by geometry, not by chance."""
-    config = MarkersConfig(enabled=True, noise=0.0, cameras=2, min_cameras=2, camera_height=4.0)
-    upside_down = look(config, Rotation.from_euler("x", 180, degrees=True))
-    assert not upside_down.seen[4:6].any()
-    assert upside_down.seen[:4].all()
 
 
 def test_as_many_cameras_as_must_see_a_marker_are_there() -> None:

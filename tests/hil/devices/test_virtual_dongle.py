@@ -285,15 +285,6 @@ def test_safelink_brings_everything_once_and_in_order(up: float, down: float, be
     assert [bytes((packet[0] & 0xF3,)) + packet[1:] for packet in bench.stms[0].packets] == sent_up
 
 
-def test_losses_are_those_that_were_asked_for() -> None:
-    bench = DongleWithBoards(uplink_loss=0.3, downlink_loss=0.2)
-    bench.dongle.control(0x06, 0, b"")  # no retries
-    answered = sum(bench.exchange(b"\x10hello") != b"\x00" for _ in range(4000))
-    bench.wait(1000)
-    assert answered / 4000 == pytest.approx(0.7 * 0.8, abs=0.025)
-    assert len(bench.stms[0].packets) / 4000 == pytest.approx(0.7, abs=0.025)
-
-
 def test_without_acknowledgements_a_packet_is_sent_once_and_nobody_answers() -> None:
     bench, answers = DongleWithBoards(uplink_loss=0.5), []
     bench.dongle.control(0x10, 0, b"")
@@ -302,17 +293,6 @@ def test_without_acknowledgements_a_packet_is_sent_once_and_nobody_answers() -> 
         bench.wait(5000)
     assert len(bench.stms[0].packets) / 2000 == pytest.approx(0.5, abs=0.04)
     assert answers == []
-
-
-def test_bit_errors_cost_long_packets_more_than_short_ones() -> None:
-    def share(size: int) -> float:
-        bench = DongleWithBoards(uplink_bit_error_rate=2e-3, downlink_bit_error_rate=2e-3)
-        bench.dongle.control(0x06, 0, b"")
-        return sum(bench.exchange(bytes([0x10] * size)) != b"\x00" for _ in range(2000)) / 2000
-
-    for size in (1, 31):
-        bits = 2 * 73 + 8 * (size + RSSI_ACK_SIZE)
-        assert share(size) == pytest.approx((1 - 2e-3) ** bits, abs=0.035)
 
 
 @pytest.mark.parametrize("direction", ["uplink_loss", "downlink_loss"])
@@ -396,16 +376,6 @@ def test_every_try_that_the_board_hears_is_passed_on_unless_safelink_knows_it(
     assert bench.exchange(b"\x14hello") == b"\x00"
     bench.wait(1000)
     assert bench.stms[0].packets == [b"\x14hello"] * passed_on
-
-
-def test_without_safelink_a_packet_that_comes_twice_is_passed_on_twice() -> None:
-    bench = DongleWithBoards()
-    for on, passed_on in ((1, 1), (0, 3)):
-        assert bench.exchange(bytes((0xFF, 0x05, on))) == bytes((1, 0xFF, 0x05, on))
-        for _ in range(2):
-            bench.exchange(b"\x14hello")  # the counter that safelink expects first
-        bench.wait(1000)
-        assert len(bench.stms[0].packets) == passed_on
 
 
 def test_a_command_that_names_none_does_nothing() -> None:

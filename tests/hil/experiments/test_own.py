@@ -75,11 +75,6 @@ def test_a_trajectory_without_a_goal_at_some_instant_is_refused_before_the_fligh
     assert "\n" not in str(error.value)
 
 
-def test_a_limit_that_no_metric_has_is_refused_before_the_flight() -> None:
-    with pytest.raises(LabError, match="limit on 'rms_q': no such metric; did you mean rms_"):
-        Request.of(Experiment("mine", "", 0.3, {"rms_q": 1.0}))
-
-
 # Files
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
 from firmware_py.wire.crtp import PORT_CONSOLE
@@ -11,7 +10,7 @@ from hil.config import load_config
 from hil.crazyflie.nrf51 import Power
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
-from hil.laboratory.faults import Fault, Switchboard, parse
+from hil.laboratory.faults import Fault, parse
 from hil.laboratory.laboratory import Laboratory
 from hil.laboratory.robot import Ports, Robot, Site, Streams, nobody_listens
 from hil.servers.holder import Holder
@@ -42,19 +41,6 @@ class Bench:
 
     def robot(self, number: int = 1) -> Robot:
         return self.server.lab.robots[number - 1]
-
-
-def test_a_robot_is_let_go_when_it_has_flown_in_its_holder_for_a_second_and_hovers() -> None:
-    bench = Bench()
-    said = bench.fly(6.0)
-    flying, released = (
-        next(i for i, text in enumerate(said) if words in text)
-        for words in ("supervisor: flying", "released")
-    )
-    assert flying < released
-    assert bench.robot().free
-    assert not any("lost" in text for text in said)
-    assert np.abs(bench.robot().plant.p_WB - np.array([0.0, 0.0, 1.15])).max() < 0.1
 
 
 def test_a_robot_flies_in_its_holder_for_a_second_before_each_release() -> None:
@@ -241,13 +227,6 @@ def test_a_typed_line_that_says_nothing_possible_is_answered_and_changes_nothing
     type_line(line)
     assert answer in " ".join(answers)
     assert bench.server.switchboards[0].active == []
-
-
-def test_a_fault_that_does_not_concern_a_robot_is_refused_when_it_shall_act_now() -> None:
-    bench = Bench()
-    board = Switchboard(bench.robot())
-    with pytest.raises(LabError, match="serial line"):
-        board.act(parse("serial.cut@0"), 0)
 
 
 def test_a_packet_to_a_board_without_power_is_lost() -> None:

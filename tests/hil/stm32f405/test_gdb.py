@@ -32,7 +32,6 @@ from support.stm32_machine import FirmwareOnChip
 
 RAM = 0x2000_0000
 ASSERTION = 3  # of `enum planted`
-TASK_SIZE = 68  # of a control block of the tests' own kernel
 
 
 @pytest.fixture(scope="module")
@@ -331,35 +330,6 @@ def test_a_breakpoint_where_crashes_are_reported_stops_for_both() -> None:
     assert answers[-2:] == [b"T05thread:1;", pack("<I", place).hex().encode()]
 
 
-def test_tasks_are_threads_with_their_own_registers() -> None:
-    def packets(image: Image) -> list[bytes]:
-        return [b"QStartNoAckMode", b"Z0,%x,2" % image.symbol("send_line").address, b"c", b"c", b"qfThreadInfo", b"qC",
-                *(b"qThreadExtraInfo,%x" % (image.symbol("tasks").address + TASK_SIZE * n) for n in range(6)),
-                b"Hg%x" % (image.symbol("tasks").address + 3 * TASK_SIZE), b"p0f", b"p0d", b"P0f=00000000",
-                b"Hg0", b"p0f", b"D"]  # fmt: skip
-
-    machine, answers = on_chip(packets, 40_000)
-    image, said = machine.image, contents(answers)[3:]
-    tasks = [image.symbol("tasks").address + TASK_SIZE * number for number in range(6)]
-    assert said[0] == b"T05thread:%x;" % tasks[0]
-    assert {int(one, 16) for one in said[1][1:].split(b",")} == set(tasks)
-    assert said[2] == b"QC%x" % tasks[0]
-    infos = [bytes.fromhex(one.decode()).decode() for one in said[3:9]]
-    assert infos[0] == "REPORT, running, priority 2"
-    assert infos[3:] == [
-        "FILTER, blocked, priority 3",
-        "FROZEN, suspended, priority 3",
-        "IDLE, ready, priority 0",
-    ]
-    select, pc, sp, refused, machines, own_pc = said[9:15]
-    assert (select, refused, machines) == (b"OK", b"E0e", b"OK")
-    # FILTER waits for samples, on its own stack; the machine itself stands at the breakpoint.
-    assert image.function_at(int.from_bytes(bytes.fromhex(pc.decode()), "little")) in ("receive", "filter")
-    begin = image.symbol("stacks").address + 3 * 1024
-    assert begin < int.from_bytes(bytes.fromhex(sp.decode()), "little") <= begin + 1024
-    assert int.from_bytes(bytes.fromhex(own_pc.decode()), "little") == image.symbol("send_line").address
-
-
 @pytest.mark.parametrize(("kind", "name"), [(b"2", "xTickCount"), (b"3", "planted"), (b"4", "planted")])
 def test_a_watchpoint_stops_after_the_access(kind: bytes, name: str) -> None:
     def packets(image: Image) -> list[bytes]:
@@ -386,29 +356,6 @@ def test_a_watchpoint_stops_after_the_access(kind: bytes, name: str) -> None:
     assert machine.image.function_at(pc) in {"xTickCount": ("tick",), "planted": ("report", "go_wrong")}[name]
     if name == "xTickCount":
         assert said[4] == b"01000000"
-
-
-@pytest.mark.long
-def test_a_run_that_a_debugger_stopped_and_stepped_is_the_run_without_one() -> None:
-    def packets(image: Image) -> list[bytes]:
-        switch = image.symbol("vTaskSwitchContext").address
-        return [
-            b"QStartNoAckMode",
-            b"Z0,%x,2" % switch,
-            *[b"c"] * 20,
-            *[b"s"] * 50,
-            b"z0,%x,2" % switch,
-            b"D",
-        ]
-
-    stopped, answers = on_chip(packets, 30_000)
-    assert len(re.findall(rb"T05thread:[0-9a-f]+;", answers)) == 70
-    alone = FirmwareOnChip()
-    while alone.chip.now_us < 30_000:
-        alone.run(30_000)
-    assert bytes(stopped.chip.ram) == bytes(alone.chip.ram)
-    assert stopped.chip.state.now == alone.chip.state.now
-    assert stopped.chip.state.instructions == alone.chip.state.instructions
 
 
 def test_the_chip_waits_for_its_debugger_and_stands_at_its_first_instruction() -> None:
