@@ -53,6 +53,7 @@ class SideBySide:
         self._blocks = blocks
         self._inputs = blocks.inputs
         self._tick = 0
+        self.reached: set[tuple[int, int]] = set()  # the supervisor's states, each with its cause
 
     def call(self, name: str) -> int:
         """Execute an entry point on the reference, and on every target that has not differed yet."""
@@ -63,6 +64,8 @@ class SideBySide:
             for block in self._inputs.intersection(taken):
                 target.blocks.named[block].memory[:] = self._blocks.named[block].memory
         result = self._reference.call(name)
+        supervisor = self._blocks.supervisor.fields
+        self.reached.add((int(supervisor.state), int(supervisor.cause)))
         memories = {block: self._blocks.named[block].bytes() for block in taken}
         for target in running:
             target.calls += 1

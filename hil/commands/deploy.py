@@ -85,27 +85,37 @@ def check(
 ) -> int:
     """Fly with numba, plain Python, C and Cortex-M4 machine code side by side; compare the core's memory bit for bit.
 
-    Without EXPERIMENT: hover, yaw step and a hover with faults, 10 000 ticks of 10 ms. Exit code 0: no bit differs; 1: one
+    Without EXPERIMENT: hover, yaw step, a hover with faults, 10 000 ticks of 10 ms, and flights that take the supervisor
+    through all states and causes. Exit code 0: no bit differs; 1: one
     does; 2: bad input; 130: interrupted. With --elf 1 also when anything else in the firmware is not as in PROFILE.
     """
     from hil.config import settings_of
-    from hil.deploy.check import check_flight, plan
-    from hil.deploy.targets import CORTEX_M4, Toolbox, target_names
+    from hil.deploy.check import check_flight, plan, reached
+    from hil.deploy.targets import CORTEX_M4, TARGETS, Toolbox, target_names
 
     if source and firmware:
         raise LabError("--source and --elf: one or the other")
     names = target_names(CORTEX_M4 if firmware and target_text is None else target_text)
-    flights = plan(experiment, every, **options)
+    fresh = not source and not firmware and set(names) <= set(TARGETS)
+    flights = plan(experiment, every, fresh, **options)
     toolbox = Toolbox(names, flights[0].config.logic, _read(source) if source else None, firmware)
+    failing = (
+        toolbox
+        if flights[-1].config.logic == flights[0].config.logic
+        else Toolbox(names, flights[-1].config.logic)
+    )
     announce_compilation()
     checked: list[Checked] = []
     for request in flights:
         with _progress(str(request.experiment.name)) as show:
-            checked.append(check_flight(request, toolbox.factories, show))
+            tools = failing if request is flights[-1] else toolbox
+            checked.append(check_flight(request, tools.factories, show))
         _print_flight(checked[-1])
         if checked[-1].outcome == "interrupted" or checked[-1].failed:
             break
     _print_sum(checked)
+    seen, missed = reached(checked)
+    console.print(f"supervisor: reached {seen}{f'; not {missed}' if missed else ''}", soft_wrap=True)
     if toolbox.machine_code is not None:
         _print_machine_code(toolbox.machine_code)
     counted = {} if toolbox.machine_code is None else toolbox.machine_code.entries

@@ -1,5 +1,7 @@
 """An image flies beside the Python board from one seed: what may differ, by how much, and what does.
 
+A second flight takes the supervisor through its states, which have to be the same in the same order.
+
 The two are never equal bit for bit: boot time, gyro zero, the estimator's phase and the board's microsecond differ
 (`hil.studies.two_boards`). The bounds are about four times what these make of an image that is right, in a hover of 4 s with
 a push and a link that is cut; the position then differs by 0.4 mm, the servo counts by 330 (rms). The first pose after the
@@ -8,7 +10,9 @@ other waits for the next one, the estimate differs by 5 cm in one row of 400, wh
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,16 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.export.boards import PYTHON
-from hil.experiments import find_experiment
-from hil.laboratory.faults import parse
+from hil.deploy.drill import DRILL
+from hil.experiments.hover import HOVER
 from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import column, free_flight
-from hil.laboratory.request import Request
+from hil.laboratory.recorder import load_events
+from hil.laboratory.request import Options, Request
 from hil.laboratory.result import Result
 from hil.laboratory.run import fly
 from hil.pictures.compare import FlownRun, load_flown
 
 SECONDS, SEED = 4.0, 1
+ANNOUNCED = "supervisor: "
 FAULTS = ("push.y@0.5=1", "radio.cut@2:0.8")
 
 
@@ -104,29 +110,50 @@ def compare_flights(first: FlownRun, second: FlownRun) -> Iterator[Compared]:
 
 def fly_beside_python(
     image: Path, profile: str, overrides: tuple[str, ...], progress: Callable[[str, int, Flight], None]
-) -> tuple[list[Compared], list[str]]:
-    """Fly an image and the Python board; return the differences, and what ended one of the flights otherwise."""
+) -> tuple[list[Compared], list[str], list[str]]:
+    """Fly an image and the Python board; return the differences, and which ends and which states were others."""
+    options: Options = {"profile": profile, "overrides": overrides, "seed": SEED}
+    disturbed: Options = {**options, "duration_s": SECONDS, "faults": FAULTS}
+    requests = Request.of(HOVER, **disturbed), Request.of(DRILL, **options)
     with TemporaryDirectory(prefix="floaty-") as folder:
-        results: list[Result] = []
-        for name, board in (("python", PYTHON), ("image", str(image))):
-            request = Request.of(
-                find_experiment("hover"),
-                profile=profile,
-                overrides=overrides,
-                seed=SEED,
-                duration_s=SECONDS,
-                faults=list(map(parse, FAULTS)),
-                board=board,
-            )
+        pairs = [
+            _fly_both(request, image, Path(folder) / request.experiment.name, progress)
+            for request in requests
+        ]
+        hovers, drills = ([result.folder for result in pair] for pair in pairs)
+        ends = [text for pair in pairs for text in _ends(*pair)]
+        return list(compare_flights(*map(load_flown, hovers))), ends, list(compare_states(*drills))
 
-            def show(now_us: int, flight: Flight, name: str = name) -> None:
-                progress(name, now_us, flight)
 
-            results.append(fly(request, Path(folder) / name, progress=show))
-            if results[-1].outcome == "interrupted":
-                raise KeyboardInterrupt
-        runs = [load_flown(result.folder) for result in results]
-        return list(compare_flights(*runs)), list(_ends(*results))
+def _fly_both(
+    request: Request, image: Path, folder: Path, progress: Callable[[str, int, Flight], None]
+) -> tuple[Result, Result]:
+    """Fly a request on the Python board and on an image; Ctrl-C raises `KeyboardInterrupt`."""
+    results = []
+    for name, board in (("python", PYTHON), ("image", str(image))):
+        on_board = replace(request, bench=replace(request.bench, board=board))
+        shown = f"{request.experiment.name}, {name}"
+        results.append(fly(on_board, folder / name, progress=partial(progress, shown)))
+        if results[-1].outcome == "interrupted":
+            raise KeyboardInterrupt
+    return results[0], results[1]
+
+
+def states_of(folder: Path) -> list[str]:
+    """Return the states, with their causes, that the supervisor of a flight announced on its console."""
+    texts = (
+        event["text"].partition(ANNOUNCED) for event in load_events(folder) if event["source"] == "board"
+    )
+    return [state for _, found, state in texts if found]
+
+
+def compare_states(python: Path, image: Path) -> Iterator[str]:
+    """Yield the first state of the supervisor that one board reached, and the other did not."""
+    both = zip_longest(states_of(python), states_of(image), fillvalue="the end")
+    for number, (first, second) in enumerate(both, 1):
+        if first != second:
+            yield f"number {number} differs: python {first}, image {second}"
+            return
 
 
 def _ends(python: Result, image: Result) -> Iterator[str]:

@@ -1,7 +1,8 @@
 """Flights in which every implementation of the flight core runs beside the one that flies, compared after every call.
 
 The reference is the board of every other flight: the core's Python compiled by numba. The targets are the same source as
-plain Python, as C for this machine, and as machine code of the Cortex-M4.
+plain Python, as C for this machine, and as machine code of the Cortex-M4. After its last step a flight makes the two calls
+of a board whose controller has stopped and then flies by another gyro.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,14 +10,19 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Unpack
 
+from firmware_py.config import LogicConfig
 from firmware_py.core_runner import CoreBlocks, CoreRunner, RunnerFactory
 from firmware_py.export.errors import ExportError
 from firmware_py.export.side_by_side import ComparedTarget, SideBySide
 from firmware_py.rtos import TaskError, WatchdogError
+from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
+from hil.deploy.drill import DRILL, FAILURE
 from hil.devices.board_firmware import PythonBoard
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
+from hil.experiments.hover import HOVER
+from hil.laboratory.experiment import Experiment
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
@@ -39,6 +45,7 @@ class Checked:
     request: Request
     outcome: str  # completed, lost (and why), interrupted, error (and which)
     targets: tuple[ComparedTarget, ...]
+    reached: frozenset[tuple[State, Cause]]  # by the supervisor
 
     @property
     def failed(self) -> bool:
@@ -75,37 +82,62 @@ def check_flight(
         try:
             end = flight.run(lambda now_us: progress(now_us, flight))
             outcome = "interrupted" if end.interrupted else f"lost: {end.lost}" if end.lost else "completed"
+            for name in ("lose_control", "begin_afresh"):
+                made[0].call(name)
         except WatchdogError as error:
             outcome = f"lost: {error}"
+        except LinkError as error:
+            outcome = f"error: board {error}"
         except TaskError as error:
             if not isinstance(error.__cause__, LinkError):
                 raise
             outcome = f"error: board {error.__cause__}"
         finally:
             flight.close()
-    return Checked(request, outcome, tuple(made[0].targets))
+    reached = frozenset((State(state), Cause(cause)) for state, cause in made[0].reached)
+    return Checked(request, outcome, tuple(made[0].targets), reached)
 
 
-def plan(experiment: str | None, every: bool, **options: Unpack[Options]) -> list[Request]:
-    """Return the flights to check: one experiment, every one, or by default hover, yaw step and a hover with faults."""
+def reached(checked: Sequence[Checked]) -> tuple[str, str]:
+    """Return which of the supervisor's states and causes flights reached, and which none of them reached, as text."""
+    states, causes = map(set, zip(*{pair for one in checked for pair in one.reached}, strict=True))
+    there = {_word(state): state in states for state in State}
+    there |= {_word(cause): cause in causes for cause in Cause if cause}
+    seen = (name for name, was_there in there.items() if was_there)
+    return ", ".join(seen), ", ".join(name for name, was_there in there.items() if not was_there)
+
+
+def _word(one: State | Cause) -> str:
+    return one.name.lower().replace("_", " ")
+
+
+def plan(
+    experiment: str | None, every: bool, own_logic: bool = True, **options: Unpack[Options]
+) -> list[Request]:
+    """Return the flights to check: one experiment, every one, or by default hover and yaw step.
+
+    All but the first have with them a hover with faults, and those that take the supervisor through its states. What
+    only own logic can cause needs targets that are built for it (`own_logic`), and a profile that has none itself.
+    """
     duration_s, faults = options.get("duration_s"), options.get("faults", ())
     if every and experiment is not None:
         raise LabError(f"{experiment} and --all: one or the other")
     if faults and experiment is None:
         raise LabError(f"--fault {faults[0]}: for which EXPERIMENT?")
 
-    def request(name: str, length_s: float | None, faults: Sequence[Fault | str] = ()) -> Request:
+    def request(one: Experiment, length_s: float | None, faults: Sequence[Fault | str] = ()) -> Request:
         chosen: Options = {**options, "duration_s": length_s, "faults": faults}
-        return Request.of(find_experiment(name), **chosen)
+        return Request.of(one, **chosen)
 
     if experiment is not None:
-        return [request(experiment, duration_s, faults)]
+        return [request(find_experiment(experiment), duration_s, faults)]
     if every:
-        flights = [
-            request(one.name, duration_s or min(one.duration_s, LONGEST_S)) for one in EXPERIMENTS.values()
-        ]
+        flights = [request(one, duration_s or min(one.duration_s, LONGEST_S)) for one in EXPERIMENTS.values()]
     else:
-        flights = [request(name, duration_s) for name in DEFAULT]
+        flights = [request(find_experiment(name), duration_s) for name in DEFAULT]
     length_s = duration_s or FAULTY_S
     faulty = [fault for fault in map(parse, FAULTS) if fault.start_s < length_s]
-    return [*flights, request("hover", length_s, faulty)]
+    flights += request(HOVER, length_s, faulty), request(DRILL, None)
+    if own_logic and flights[0].config.logic == LogicConfig():
+        flights.append(request(FAILURE, None))
+    return flights

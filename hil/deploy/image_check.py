@@ -18,7 +18,7 @@ UNPROVEN = (
     "values of log variables; limits that the laboratory's own parameters do not have",
     "absolute poses and the stock commander, manual angles, poses through the app channel",
     "port 10: calls for a host, hardware in the loop (`floaty deploy check --targets LINK` does on a board)",
-    "restart after a crash; low battery; parameters stored in the EEPROM; decks, USB, flash wait states",
+    "restart after a crash; parameters stored in the EEPROM; decks, USB, flash wait states",
     "differences in flight below the bounds above",
 )
 Show = Callable[[str, int, int], None]  # (what, done, of how many)
@@ -55,9 +55,12 @@ def check_image(elf: Path, profile: str, overrides: tuple[str, ...], show: Show)
     def progress(name: str, now_us: int, flight: Flight) -> None:
         show(f"flight, {name}", now_us, flight.end_us)
 
-    compared, ends = fly_beside_python(elf, profile, overrides, progress)
+    compared, ends, states = fly_beside_python(elf, profile, overrides, progress)
     yield from (Finding("flight", text, False) for text in ends)
     yield from (Finding("flight", str(one), one.held) for one in compared)
+    yield from _all(
+        states, "states", "the supervisor's states and causes are the Python board's, in their order"
+    )
 
 
 def has_app(elf: Path) -> tuple[bool, tuple[MemoryUse, ...]]:

@@ -13,11 +13,13 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from firmware_py.core import structs
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner, RunnerFactory
 from firmware_py.export.c99 import translate
 from firmware_py.export.plain import PlainRunner
 from firmware_py.extras import install_command
-from hil.deploy.check import Checked, check_flight, plan
+from firmware_py.logic.plugs import CALLS
+from hil.deploy.check import Checked, check_flight, plan, reached
 from hil.deploy.targets import TARGETS
 from hil.devices.board_firmware import PythonBoard
 from hil.laboratory.lockstep import lockstep_flight
@@ -117,9 +119,41 @@ def test_a_target_that_has_differed_does_not_hide_the_others() -> None:
 def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> None:
     flights: list[Request] = plan(None, False)
     assert [(one.experiment.name, bool(one.faults)) for one in flights] == [
-        ("hover", False), ("yaw-step", False), ("hover", True),
+        ("hover", False), ("yaw-step", False), ("hover", True), ("supervisor", True), ("failing-logic", False),
     ]  # fmt: skip
     assert sum(one.duration_s + one.config.flight.release_us * 1e-6 for one in flights) >= 100.0
+
+
+def test_the_check_reaches_every_state_and_cause_of_the_core_and_every_entry_point() -> None:
+    called: set[str] = set()
+
+    class Noting(PythonRunner):
+        def call(self, name: str) -> int:
+            called.add(name)
+            return super().call(name)
+
+    def flown(request: Request) -> Checked:
+        return check_flight(request, lambda stack: {"noting": Noting}, lambda now_us, flight: None)
+
+    checked = [flown(request) for request in plan(None, False)[-2:]]
+    values = {
+        kind: {value for name, value in vars(structs).items() if name.startswith(kind)}
+        for kind in ("STATE_", "CAUSE_")
+    }
+    pairs = {pair for one in checked for pair in one.reached}
+    assert [{int(pair[place]) for pair in pairs} for place in (0, 1)] == [values["STATE_"], values["CAUSE_"]]
+    assert reached(checked)[1] == ""
+    assert reached(checked[:1])[1] == "controller not finite, estimator not finite"
+    assert called == CALLS.keys()
+
+
+@pytest.mark.parametrize(
+    ("own_logic", "profile"),
+    [(False, "floaty"), (True, "lqr")],
+    ids=["targets without it", "a profile with it"],
+)
+def test_logic_that_fails_is_flown_where_targets_are_built_for_it(own_logic: bool, profile: str) -> None:
+    assert plan(None, False, own_logic, profile=profile)[-1].experiment.name == "supervisor"
 
 
 SOMETHING_OF_EACH = ("--duration", "0.8", "--fault", "mocap.latency@0.2:0.4=150", "--fault", "push.y@0.4=2")
@@ -147,6 +181,8 @@ def test_ten_thousand_ticks_of_hover_yaw_step_and_faults_do_not_differ_in_a_bit(
     assert cli("deploy", "check") == 0
     sums = re.search(r"^(\d+) ticks, .*: no bit differs$", cli.out, re.MULTILINE)
     assert int(sums[1]) >= 10_000
+    assert "supervisor: reached calibrating, waiting, flying, failsafe, silence, " in cli.out
+    assert "; not" not in cli.out
 
 
 class Watch(PythonRunner):

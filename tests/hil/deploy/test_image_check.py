@@ -1,6 +1,7 @@
 """`floaty deploy check --elf`: what is compared of an app around the core, tried on the app and in flights."""
 
 import ctypes
+import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,11 +15,12 @@ from firmware_py.core.structs import Input, Parameters
 from firmware_py.export.app_toc import AppParameter, app_parameters
 from firmware_py.wire.scalars import PARAMETER_SCALARS, Scalar
 from hil.config import load_config
-from hil.deploy.beside import compare_flights
+from hil.deploy.beside import compare_flights, compare_states
 from hil.deploy.image_bench import TARGET, check_parameters
 from hil.deploy.image_check import check_image, check_memory
 from hil.experiments import find_experiment
 from hil.laboratory.faults import parse
+from hil.laboratory.recorder import EVENTS
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.pictures.compare import FlownRun, load_flown
@@ -147,14 +149,25 @@ def test_flights_are_compared_by_what_their_bounds_say(flown: Callable[..., Flow
     assert not any(one.held for one in compare_flights(right, empty))
 
 
+def test_the_first_state_that_one_board_does_not_reach_is_found(tmp_path: Path) -> None:
+    folders = tmp_path / "python", tmp_path / "image"
+    states = (["waiting", "flying", "failsafe, silence"], ["waiting", "flying"])
+    for folder, prefix, texts in zip(folders, ("", "FLOATY: "), states, strict=True):
+        folder.mkdir()
+        events = ({"t_us": 0, "source": "board", "text": f"{prefix}supervisor: {text}"} for text in texts)
+        (folder / EVENTS).write_text("".join(f"{json.dumps(event)}\n" for event in events), encoding="utf-8")
+    assert list(compare_states(folders[0], folders[0])) == []
+    assert list(compare_states(*folders)) == ["number 3 differs: python failsafe, silence, image the end"]
+
+
 @pytest.mark.long
 @flies
 def test_an_image_of_the_profile_passes_and_one_of_another_does_not() -> None:
     shown: list[str] = []
     findings = list(check_image(Path(ELF), "floaty", (), lambda what, done, total: shown.append(what)))
     assert [one for one in findings if not one.good] == []
-    assert {"params", "switches", "watch", "servos", "flight"} <= {one.subject for one in findings}
-    assert {"boot", "parameters", "flight, python", "flight, image"} <= set(shown)
+    assert {"params", "switches", "watch", "servos", "flight", "states"} <= {one.subject for one in findings}
+    assert {"boot", "parameters", "hover, python", "hover, image", "supervisor, image"} <= set(shown)
     other = check_image(Path(ELF), "floaty", ("controller.gain_z=3.1",), lambda *_: None)
     found = {one.subject: one.text for one in other if not one.good}
     assert found["constants"].startswith("gain_z = 3.0, in the profile 3.0999999")
