@@ -17,7 +17,10 @@ from firmware_py.export.errors import ExportError
 from firmware_py.extras import install_command
 
 SYSTEM_COMPILERS = ("gcc", "clang", "cc")
-HOST_FLAGS = ("-O2", "-shared", "-fPIC", "-std=c99", "-fno-sanitize=all", "-Wall", "-Wextra", "-Werror")
+HOST_FLAGS = (
+    "-O2", "-shared", "-fPIC", "-std=c99", "-fno-sanitize=all",
+    "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror",  # callbacks take what unicorn gives
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,7 +66,6 @@ void meter_block(void *engine, uint64_t address, uint32_t size, void *user)
 {
     struct meter *meter = user;
     uint64_t begin = address - meter->flash, end = begin + size;
-    (void)engine;
     meter->instructions += meter->instructions_before[end / 2] - meter->instructions_before[begin / 2];
     meter->cycles += meter->cycles_before[end / 2] - meter->cycles_before[begin / 2];
     if (address != meter->next)

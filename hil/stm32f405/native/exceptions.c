@@ -4,24 +4,19 @@ Unicorn knows the exception number and with it the handler mode and its stack, e
 stacked at once where the chip would only reserve their place. */
 #include "machine.h"
 
-/* Registers by unicorn's numbers. */
-enum {
-    R_FPSCR = 6, R_LR = 10, R_PC = 11, R_D0 = 14, R_R0 = 66, R_R12 = 78, R_MSP = 115, R_PSP = 116, R_CONTROL = 117,
-    R_XPSR = 120, R_PRIMASK = 123, R_BASEPRI = 124, R_FAULTMASK = 126,
-};
-enum { SPSEL = 2, FPCA = 4, ENTRY_CYCLES = 12, RETURN_CYCLES = 10, ALIGNED = 1 << 9, THUMB = 1 << 24 };
+enum { SPSEL = 2, FPCA = 4, ENTRY_CYCLES = 12, RETURN_CYCLES = 10, ALIGNED = 1 << 9 };
 enum { USE_PSP = 4, NO_FLOATS = 16, TO_THREAD = 8 }; /* bits of EXC_RETURN */
 enum { FORCED = 1 << 30 };
 #define UNUSED 0xA5A5A5A5u /* what FreeRTOS fills a stack with */
 
-static uint32_t get(struct machine *m, int number)
+uint32_t get_register(struct machine *m, int number)
 {
     uint32_t value = 0;
     m->engine.reg_read(m->engine.uc, number, &value);
     return value;
 }
 
-static void set(struct machine *m, int number, uint32_t value)
+void set_register(struct machine *m, int number, uint32_t value)
 {
     m->engine.reg_write(m->engine.uc, number, &value);
 }
@@ -116,12 +111,12 @@ unsigned next_exception(struct machine *m, int waking)
     int own = best_urgency < 0 ? best_urgency : group(m, best_urgency);
     if (own >= running_urgency(m))
         return 0;
-    uint32_t base = get(m, R_BASEPRI);
+    uint32_t base = get_register(m, R_BASEPRI);
     if (base && own >= group(m, (int)base))
         return 0;
-    if (!waking && own >= 0 && get(m, R_PRIMASK) & 1)
+    if (!waking && own >= 0 && get_register(m, R_PRIMASK) & 1)
         return 0;
-    if (!waking && own >= -1 && get(m, R_FAULTMASK) & 1)
+    if (!waking && own >= -1 && get_register(m, R_FAULTMASK) & 1)
         return 0;
     return best;
 }
@@ -137,10 +132,10 @@ static void lock_up(struct machine *m, uint32_t pc)
 
 void enter(struct machine *m, unsigned exception, uint32_t return_address)
 {
-    uint32_t control = get(m, R_CONTROL), xpsr = get(m, R_XPSR);
+    uint32_t control = get_register(m, R_CONTROL), xpsr = get_register(m, R_XPSR);
     int handler = xpsr & 0x1FF, process = !handler && control & SPSEL, floats = control & FPCA;
     int stack = process ? R_PSP : R_MSP;
-    uint32_t sp = get(m, stack), padding = sp & 4, frame = (sp - (floats ? 0x68 : 0x20)) & ~7u;
+    uint32_t sp = get_register(m, stack), padding = sp & 4, frame = (sp - (floats ? 0x68 : 0x20)) & ~7u;
     uint32_t *place = word(m, frame), *end = word(m, frame + (floats ? 0x64 : 0x1C));
     if (process && m->canary && *word(m, m->stack_begin) != UNUSED) /* it overflowed, and may have returned since */
         note_overflow(m);
@@ -156,22 +151,22 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     }
     if (place) {
         for (int i = 0; i < 4; i++)
-            place[i] = get(m, R_R0 + i);
-        place[4] = get(m, R_R12);
-        place[5] = get(m, R_LR);
+            place[i] = get_register(m, R_R0 + i);
+        place[4] = get_register(m, R_R12);
+        place[5] = get_register(m, R_LR);
         place[6] = return_address & ~1u;
         place[7] = (xpsr & ~(uint32_t)ALIGNED) | (padding ? ALIGNED : 0);
         if (floats) {
             for (int i = 0; i < 8; i++)
                 m->engine.reg_read(m->engine.uc, R_D0 + i, &place[8 + 2 * i]);
-            place[24] = get(m, R_FPSCR);
+            place[24] = get_register(m, R_FPSCR);
         }
-        set(m, stack, frame);
+        set_register(m, stack, frame);
     }
     uint32_t exc_return = 0xFFFFFFE1 | (handler ? 0 : TO_THREAD) | (process ? USE_PSP : 0) | (floats ? 0 : NO_FLOATS);
-    set(m, R_CONTROL, control & ~(uint32_t)(SPSEL | FPCA));
-    set(m, R_XPSR, (xpsr & 0xF80F0000) | THUMB | exception);
-    set(m, R_LR, exc_return);
+    set_register(m, R_CONTROL, control & ~(uint32_t)(SPSEL | FPCA));
+    set_register(m, R_XPSR, (xpsr & 0xF80F0000) | THUMB | exception);
+    set_register(m, R_LR, exc_return);
     if (process)
         m->task_return = exc_return;
     m->pending[exception >> 6] &= ~(1ull << (exception & 63));
@@ -181,7 +176,7 @@ void enter(struct machine *m, unsigned exception, uint32_t return_address)
     m->now += ENTRY_CYCLES;
     uint32_t *vector = word(m, m->vtor + 4 * exception);
     m->pc = vector ? *vector : 0;
-    set(m, R_PC, m->pc);
+    set_register(m, R_PC, m->pc);
 }
 
 /* Whether a task is not ready. */
@@ -231,15 +226,15 @@ static void look_at_task(struct machine *m)
 
 void leave(struct machine *m, uint32_t exc_return)
 {
-    unsigned exception = get(m, R_XPSR) & 0x1FF;
-    uint32_t control = get(m, R_CONTROL);
+    unsigned exception = get_register(m, R_XPSR) & 0x1FF;
+    uint32_t control = get_register(m, R_CONTROL);
     int process = exc_return & USE_PSP, floats = !(exc_return & NO_FLOATS), stack = process ? R_PSP : R_MSP;
     m->active[exception >> 6] &= ~(1ull << (exception & 63));
     if (exception != NMI)
-        set(m, R_FAULTMASK, 0);
+        set_register(m, R_FAULTMASK, 0);
     if (m->line[exception >> 6] >> (exception & 63) & 1)
         set_pending(m, exception);
-    uint32_t frame = get(m, stack), *place = word(m, frame), *end = word(m, frame + (floats ? 0x64 : 0x1C));
+    uint32_t frame = get_register(m, stack), *place = word(m, frame), *end = word(m, frame + (floats ? 0x64 : 0x1C));
     if (!place || !end) {
         raise_fault(m, BUS_FAULT, 1 << 11, exc_return); /* UNSTKERR */
         return;
@@ -248,21 +243,21 @@ void leave(struct machine *m, uint32_t exc_return)
     for (int i = 0; i < 8; i++)
         saved[i] = place[i];
     for (int i = 0; i < 4; i++)
-        set(m, R_R0 + i, saved[i]);
-    set(m, R_R12, saved[4]);
-    set(m, R_LR, saved[5]);
+        set_register(m, R_R0 + i, saved[i]);
+    set_register(m, R_R12, saved[4]);
+    set_register(m, R_LR, saved[5]);
     if (floats) {
         for (int i = 0; i < 8; i++)
             m->engine.reg_write(m->engine.uc, R_D0 + i, &place[8 + 2 * i]);
-        set(m, R_FPSCR, place[24]);
+        set_register(m, R_FPSCR, place[24]);
     }
-    set(m, stack, frame + (floats ? 0x68 : 0x20) + (saved[7] & ALIGNED ? 4 : 0));
+    set_register(m, stack, frame + (floats ? 0x68 : 0x20) + (saved[7] & ALIGNED ? 4 : 0));
     uint32_t number = exc_return & TO_THREAD ? 0 : saved[7] & 0x1FF;
-    set(m, R_XPSR, (saved[7] & ~0x3FFu) | THUMB | number);
-    set(m, R_CONTROL, (control & 1) | (!number && process ? SPSEL : 0) | (floats ? FPCA : 0));
+    set_register(m, R_XPSR, (saved[7] & ~0x3FFu) | THUMB | number);
+    set_register(m, R_CONTROL, (control & 1) | (!number && process ? SPSEL : 0) | (floats ? FPCA : 0));
     m->now += RETURN_CYCLES;
     m->pc = saved[6];
-    set(m, R_PC, m->pc | 1);
+    set_register(m, R_PC, m->pc | 1);
     if (m->kernel.current_place && (exception == PENDSV || exception == SVC))
         look_at_task(m);
 }
@@ -298,7 +293,7 @@ static uint32_t tick_value(struct machine *m)
 
 static uint32_t icsr(struct machine *m)
 {
-    uint32_t active = get(m, R_XPSR) & 0x1FF;
+    uint32_t active = get_register(m, R_XPSR) & 0x1FF;
     return active | (m->pending[0] >> PENDSV & 1) << 28 | (m->pending[0] >> SYSTICK & 1) << 26;
 }
 
@@ -372,7 +367,6 @@ uint64_t system_read(uc_engine *uc, uint64_t offset, unsigned size, void *user)
 {
     struct machine *m = user;
     uint32_t at = (uint32_t)offset, value = 0;
-    (void)uc;
     if (!priority_byte(m, at))
         return system_word(m, at & ~3u) >> 8 * (at & 3);
     for (unsigned i = 0; i < size; i++)
@@ -397,7 +391,6 @@ void system_write(uc_engine *uc, uint64_t offset, unsigned size, uint64_t given,
 {
     struct machine *m = user;
     uint32_t at = (uint32_t)offset, value = (uint32_t)given, index = (at & 0x7F) / 4;
-    (void)uc;
     if (priority_byte(m, at)) {
         for (unsigned i = 0; i < size && priority_byte(m, at + i); i++)
             *priority_byte(m, at + i) = (uint8_t)(value >> 8 * i) & 0xF0; /* four bits are there, chapter 12.2 */

@@ -1,13 +1,14 @@
 /* The machine as a whole: it runs code from block to block, lets what is due happen in between, and stops for the outside. */
 #include "machine.h"
 
+#include <stddef.h>
 #include <string.h>
 
 enum { HOOK_INTR = 1, HOOK_CODE = 4, HOOK_BLOCK = 8, HOOK_READ = 0x400, HOOK_WRITE = 0x800, HOOK_TLB = 0x20000, HOOK_INVALID = 0x3F0 /* accesses where nothing is */ };
 enum { READ_UNMAPPED = 6, WRITE_UNMAPPED, FETCH_UNMAPPED, INVALID = 10, WRITE_PROTECTED = 12, FETCH_PROTECTED = 14 };
 enum { ACCESS_FETCH = 18, RIGHT_READ = 1, RIGHT_WRITE = 2, RIGHT_EXECUTE = 4, FLUSH_TLB = 11 | 1 << 30 };
 enum { TRAP_SVC = 2, TRAP_BREAKPOINT = 7, TRAP_RETURN = 8, TRAP_NO_FLOATS = 17, TRAP_STATE = 18 };
-enum { R_LR = 10, R_PC = 11, R_SP = 12, R_R0 = 66, R_MSP = 115, R_XPSR = 120, REFILL = 3, NOWHERE = 0xFFFFFFFE, THUMB = 1 << 24 };
+enum { REFILL = 3, NOWHERE = 0xFFFFFFFE };
 
 struct page { /* uc_tlb_entry */
     uint64_t address;
@@ -95,9 +96,7 @@ static int in_task(const struct machine *m)
 /* In a task; exceptions have a stack of their own. */
 static void look_at_stack_pointer(struct machine *m)
 {
-    uint32_t sp = 0;
-    m->engine.reg_read(m->engine.uc, R_SP, &sp);
-    if (sp < m->stack_begin)
+    if (get_register(m, R_SP) < m->stack_begin)
         note_overflow(m);
 }
 
@@ -105,7 +104,6 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
     uint32_t resumed = m->resume;
-    (void)uc;
     m->resume = NOWHERE;
     if (m->stepping && m->stepping++ > 1) { /* the instruction was the last of its block */
         stop(m, (uint32_t)address);
@@ -136,8 +134,7 @@ static void on_block(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 static void on_trap(uc_engine *uc, uint32_t number, void *user)
 {
     struct machine *m = user;
-    uint32_t pc = 0;
-    m->engine.reg_read(uc, R_PC, &pc);
+    uint32_t pc = get_register(m, R_PC);
     switch (number) {
     case TRAP_SVC: enter(m, SVC, pc); break;
     case TRAP_RETURN:
@@ -155,10 +152,6 @@ static void on_trap(uc_engine *uc, uint32_t number, void *user)
 static int on_invalid(uc_engine *uc, int type, uint64_t address, int size, int64_t value, void *user)
 {
     struct machine *m = user;
-    (void)uc;
-    (void)type;
-    (void)size;
-    (void)value;
     m->fault_address = (uint32_t)address;
     return 0;
 }
@@ -183,8 +176,6 @@ static int on_page(uc_engine *uc, uint64_t address, int type, struct page *page,
 static void on_break(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
-    (void)uc;
-    (void)size;
     if (m->skip_at == (uint32_t)address) {
         m->skip_at = NOWHERE;
         return;
@@ -220,8 +211,7 @@ static void on_sleep(uc_engine *uc, uint64_t address, uint32_t size, void *user)
         enter(m, exception, after);
     } else { /* masked: it goes on behind the instruction */
         m->pc = after;
-        after |= 1;
-        m->engine.reg_write(uc, R_PC, &after);
+        set_register(m, R_PC, after | 1);
     }
 }
 
@@ -229,10 +219,8 @@ static void on_sleep(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 static void on_division(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
-    uint32_t divisor = 0, at = (uint32_t)address & (FLASH_SIZE - 1), number = m->flash[at + 2] & 15;
-    (void)size;
-    m->engine.reg_read(uc, number == 14 ? R_LR : R_R0 + (int)number, &divisor);
-    if (divisor || m->divided || m->stepping)
+    uint32_t at = (uint32_t)address & (FLASH_SIZE - 1), number = m->flash[at + 2] & 15;
+    if (get_register(m, number == 14 ? R_LR : R_R0 + (int)number) || m->divided || m->stepping)
         return;
     m->divided = 1;
     m->resume = (uint32_t)address;
@@ -299,36 +287,22 @@ int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flas
 /* Reset the processor; time and the pins' levels go on. `cause` stands in RCC's register of causes. */
 void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
 {
-    uint32_t words[2], zero = 0, thumb = 1u << 24;
-    memset(m->enabled, 0, sizeof m->enabled);
-    memset(m->pending, 0, sizeof m->pending);
-    memset(m->active, 0, sizeof m->active);
-    memset(m->line, 0, sizeof m->line);
-    memset(m->priority, 0, sizeof m->priority);
-    memset(m->timer, 0, sizeof m->timer);
-    memset(m->bus, 0, sizeof m->bus);
-    memset(m->dma, 0, sizeof m->dma);
-    memset(m->plain, 0, sizeof m->plain);
-    memset(m->exti, 0, sizeof m->exti);
-    memset(m->output, 0, sizeof m->output);
-    memset(m->compare, 0, sizeof m->compare);
+    uint32_t words[2];
+    memset(&m->enabled, 0, sizeof *m - offsetof(struct machine, enabled));
     for (unsigned slot = 0; slot < SLOTS; slot++)
         m->due[slot] = NEVER;
     m->next_due = NEVER;
-    for (unsigned n = 0; n < USARTS; n++) {
-        memset(&m->usart[n], 0, sizeof m->usart[n]);
+    for (unsigned n = 0; n < USARTS; n++)
         m->usart[n].sr = 0xC0;
-    }
     for (unsigned n = 0; n < TIMERS; n++)
         m->timer[n].arr = n == 1 || n == 4 ? 0xFFFFFFFF : 0xFFFF;
     m->enabled[0] = 0xFFFF; /* the system's own exceptions */
     m->stack_begin = m->canary = m->overflow = 0;
     for (unsigned i = 0; i < m->task_count; i++)
         m->task[i].busy_since = 0;
-    m->attention = m->asleep = m->locked = m->why = m->watchdog_on = m->watchdog_prescaler = 0;
+    m->attention = m->asleep = m->locked = m->why = m->watchdog_on = 0;
     m->watchdog_reload = 0xFFF;
     m->vtor = vectors;
-    m->aircr = m->shcsr = m->cfsr = m->hfsr = m->bfar = m->scr = m->cpacr = m->tick_ctrl = m->tick_load = 0;
     m->ccr = 0x200;
     m->fpccr = 0xC0000000;
     m->random = 0x2545F491;
@@ -338,13 +312,13 @@ void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause)
     words[0] &= ~3u; /* as the register does, B1.4.7 */
     m->resume = m->skip_at = NOWHERE;
     for (int i = 0; i < 13; i++)
-        m->engine.reg_write(m->engine.uc, 66 + i, &zero);
-    m->engine.reg_write(m->engine.uc, 120, &thumb);
-    m->engine.reg_write(m->engine.uc, 123, &zero);
-    m->engine.reg_write(m->engine.uc, 124, &zero);
-    m->engine.reg_write(m->engine.uc, 126, &zero);
-    m->engine.reg_write(m->engine.uc, 117, &zero);
-    m->engine.reg_write(m->engine.uc, R_MSP, &words[0]);
+        set_register(m, R_R0 + i, 0);
+    set_register(m, R_XPSR, THUMB);
+    set_register(m, R_PRIMASK, 0);
+    set_register(m, R_BASEPRI, 0);
+    set_register(m, R_FAULTMASK, 0);
+    set_register(m, R_CONTROL, 0);
+    set_register(m, R_MSP, words[0]);
     m->pc = words[1] & ~1u;
 }
 
@@ -362,11 +336,9 @@ static int is_new_low_writer(struct machine *m)
 
 static void fault_of(struct machine *m, int error)
 {
-    uint32_t pc = 0, xpsr = 0;
-    m->engine.reg_read(m->engine.uc, R_PC, &pc);
-    m->engine.reg_read(m->engine.uc, R_XPSR, &xpsr);
+    uint32_t pc = get_register(m, R_PC);
     m->pc = pc & ~1u;
-    if (!(xpsr & THUMB)) { /* whatever is at that address */
+    if (!(get_register(m, R_XPSR) & THUMB)) { /* whatever is at that address */
         raise_fault(m, USAGE_FAULT, 1 << 17, pc);
     } else if ((error == READ_UNMAPPED || error == FETCH_UNMAPPED) && m->fault_address < FLASH_SIZE) {
         m->resume = m->pc; /* the alias of flash, which is mapped when this has been reported */
@@ -398,8 +370,7 @@ static void execute(struct machine *m, uint64_t count_of)
     if (error && !m->stopping) {
         fault_of(m, error);
     } else if (!m->stopping) {
-        m->engine.reg_read(m->engine.uc, R_PC, &m->pc);
-        m->pc &= ~1u;
+        m->pc = get_register(m, R_PC) & ~1u;
         m->asleep = !m->stepping; /* nothing else ends it */
     }
 }
@@ -446,8 +417,6 @@ uint32_t machine_run(struct machine *m, uint64_t until)
 static void on_step(uc_engine *uc, uint64_t address, uint32_t size, void *user)
 {
     struct machine *m = user;
-    (void)uc;
-    (void)size;
     if (!m->first_step && !m->stopping) {
         m->resume = (uint32_t)address;
         stop(m, (uint32_t)address);
@@ -509,9 +478,6 @@ static void on_access(uc_engine *uc, int type, uint64_t address, int size, int64
 {
     struct watchpoint *w = user;
     uint32_t first = (uint32_t)address;
-    (void)uc;
-    (void)type;
-    (void)value;
     if (first >= w->address + w->size || first + (uint32_t)size <= w->address)
         return;
     w->machine->watch_address = first > w->address ? first : w->address;

@@ -44,6 +44,12 @@ enum {
     WHY_LOW_WRITE = 2048,
 };
 
+/* Registers by unicorn's numbers. */
+enum {
+    R_FPSCR = 6, R_LR = 10, R_PC = 11, R_SP = 12, R_D0 = 14, R_R0 = 66, R_R12 = 78, R_MSP = 115, R_PSP = 116, R_CONTROL = 117,
+    R_XPSR = 120, R_PRIMASK = 123, R_BASEPRI = 124, R_FAULTMASK = 126, THUMB = 1 << 24, /* the last is a bit of XPSR */
+};
+
 #define NEVER UINT64_MAX
 
 typedef struct uc_engine uc_engine;
@@ -125,7 +131,6 @@ struct machine {
     uint32_t pc, why, asleep, watchdog_on;
     uint32_t fault_address, unknown_count;
     uint32_t unknown[16];
-    uint32_t compare[TIMERS][4];
     uint64_t owed, taken; /* cycles that something outside takes before all tasks, but not before interrupts; has taken */
     uint32_t tracing, task_count, switch_count;
     struct kernel kernel;
@@ -154,7 +159,11 @@ struct machine {
     uint32_t low_writers[LOW_WRITERS], low_writer_count; /* instructions that were reported */
     uint32_t canary; /* the last word of the running task's stack was never used when it got the processor */
 
-    /* Exceptions */
+    uint32_t input[PORTS];
+    struct device device[DEVICES];
+    uint32_t devices;
+
+    /* From here on a reset clears everything. Exceptions: */
     uint64_t enabled[2], pending[2], active[2], line[2];
     uint8_t priority[EXCEPTIONS];
     uint32_t vtor, aircr, shcsr, cfsr, hfsr, bfar, scr, ccr, cpacr, fpccr;
@@ -162,14 +171,12 @@ struct machine {
     uint32_t tick_ctrl, tick_load;
     uint64_t tick_since;
     uint32_t exti[6]; /* IMR EMR RTSR FTSR SWIER PR */
-    uint32_t input[PORTS], output[PORTS];
+    uint32_t output[PORTS], compare[TIMERS][4];
     uint32_t watchdog_prescaler, watchdog_reload, random;
     struct timer timer[TIMERS];
     struct bus bus[BUSES];
     struct usart usart[USARTS];
     struct dma dma[DMAS];
-    struct device device[DEVICES];
-    uint32_t devices;
     uint32_t plain[PERIPHERALS_SIZE / 4]; /* registers that only keep what is written */
 };
 
@@ -188,6 +195,8 @@ void machine_pin(struct machine *m, uint32_t port, uint32_t pin, uint32_t high);
 uint32_t usart_feed(struct machine *m, unsigned n, const uint8_t *bytes, uint32_t size);
 
 /* exceptions.c */
+uint32_t get_register(struct machine *m, int number);
+void set_register(struct machine *m, int number, uint32_t value);
 void set_line(struct machine *m, unsigned irq, int high);
 void set_pending(struct machine *m, unsigned exception);
 unsigned next_exception(struct machine *m, int waking);

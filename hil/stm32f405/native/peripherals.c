@@ -154,8 +154,6 @@ uint64_t peripheral_read(uc_engine *uc, uint64_t where, unsigned size, void *use
     struct machine *m = user;
     uint32_t offset = (uint32_t)where & ~3u, at = offset & 0x3FF, shift = 8 * ((uint32_t)where & 3), value;
     struct range range = find(offset);
-    (void)uc;
-    (void)size;
     switch (range.kind) {
     case TIMER: value = timer_read(m, range.index, at); break;
     case BUS: value = bus_read(m, range.index, at); break;
@@ -181,7 +179,6 @@ void peripheral_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t giv
     struct machine *m = user;
     uint32_t offset = (uint32_t)where, at = offset & 0x3FF, value = (uint32_t)given;
     struct range range = find(offset);
-    (void)uc;
     switch (range.kind) {
     case TIMER: timer_write(m, range.index, at, value); break;
     case BUS: bus_write(m, range.index, at, value); break;
@@ -200,8 +197,6 @@ uint64_t usb_read(uc_engine *uc, uint64_t where, unsigned size, void *user)
 {
     struct machine *m = user;
     uint32_t offset = (uint32_t)where;
-    (void)uc;
-    (void)size;
     if (offset == 0x10) /* GRSTCTL: idle, and no reset is under way */
         return 0x80000000;
     if (offset == 0x60804) /* RNG: a number is ready */
@@ -219,9 +214,4 @@ uint64_t usb_read(uc_engine *uc, uint64_t where, unsigned size, void *user)
 
 void usb_write(uc_engine *uc, uint64_t where, unsigned size, uint64_t value, void *user)
 {
-    (void)uc;
-    (void)where;
-    (void)size;
-    (void)value;
-    (void)user;
 }
