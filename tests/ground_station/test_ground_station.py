@@ -84,14 +84,6 @@ def test_correction_is_scipys_pose_in_the_goal_frame(p, goal, goal_yaw, roll, pi
     assert (ours.inv() * R_GW * R_WB).magnitude() < 1e-7
 
 
-def test_every_fourth_frame_is_sent_at_once():
-    bench = StationWithPackets()
-    bench.frames(20)
-    assert bench.numbers() == [0, 4, 8, 12, 16]
-    assert [now_us for now_us, _ in bench.sent] == [38_000 + 20_000 * k for k in range(5)]
-    assert (bench.station.counters.frames, bench.station.counters.sent) == (20, 5)
-
-
 @pytest.mark.parametrize("camera_hz", [50, 60, 90, 100, 120, 180, 200, 240, 360, 1000])
 def test_fifty_corrections_leave_per_second_whatever_the_cameras_rate(camera_hz):
     bench = StationWithPackets()

@@ -229,13 +229,6 @@ def test_others_are_not_listened_to():
     assert bench.link.board == 1
 
 
-def test_an_array_of_another_name_is_no_telemetry():
-    bench = LinkWithCodec()
-    bench.pose(0)
-    other = dialect.MAVLink_debug_float_array_message(0, b"other", 0, [0.0] * 58)
-    assert bench.hear(0, other, *telemetry(20))[0].timestamp_ms == 20
-
-
 def test_texts_and_refusals_are_collected():
     bench = LinkWithCodec()
     text = dialect.MAVLink_statustext_message(4, b"supervisor: failsafe, silence")
@@ -273,13 +266,6 @@ def test_a_refusal_without_a_reason_is_told_in_the_standard_s_words(result, word
 # Time
 
 
-def test_the_board_is_told_the_time_that_it_asks_for():
-    bench = LinkWithCodec()
-    bench.hear(123_456, dialect.MAVLink_timesync_message(0, 777))
-    (_, answer), *_ = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)
-    assert (answer.tc1, answer.ts1) == (123_456_000, 777)
-
-
 def test_the_round_trip_is_that_of_the_own_request_only():
     bench = LinkWithCodec()
     bench.pose(1_000_000)
@@ -289,17 +275,6 @@ def test_the_round_trip_is_that_of_the_own_request_only():
     assert bench.link.round_trip_us is None
     bench.hear(1_004_200, dialect.MAVLink_timesync_message(5, request.ts1))
     assert bench.link.round_trip_us == 4200
-
-
-def test_the_latency_is_half_of_the_round_trip_and_assumed_before():
-    bench = LinkWithCodec()
-    assert str(bench.link.latency) == "serial (assumed)"
-    assert bench.link.latency.us == 900
-    bench.pose(1_000_000)
-    ((_, request),) = bench.of(dialect.MAVLINK_MSG_ID_TIMESYNC)
-    bench.hear(1_004_200, dialect.MAVLink_timesync_message(5, request.ts1))
-    assert str(bench.link.latency) == "serial"
-    assert bench.link.latency.us == 2100
 
 
 def test_what_is_read_late_counts_from_its_arrival():

@@ -14,7 +14,7 @@ import pytest
 from unicorn import UC_HOOK_BLOCK, UC_HOOK_CODE
 
 from firmware_py.config import parameters_of
-from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
+from firmware_py.core_runner import CoreBlocks, CoreRunner
 from firmware_py.export.arm_image import CoreImage, build_image, build_meter
 from firmware_py.export.c99 import Translation, translate
 from firmware_py.export.cortex_m4 import CortexM4Runner
@@ -127,23 +127,6 @@ def feed(blocks: CoreBlocks, tick: int) -> None:
 
 def memory(blocks: CoreBlocks) -> list[bytes]:
     return [block.bytes() for block in blocks.named.values()]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["image", "optimised"])
-def test_machine_code_gives_the_bits_of_python(kind: str, request: pytest.FixtureRequest) -> None:
-    blocks, _ = started(request.getfixturevalue(kind))
-    python = CoreBlocks(parameters_of(CONFIG), PythonRunner)
-    python.run.call("reset")
-    for tick in range(300):
-        for each in (blocks, python):
-            feed(each, tick)
-        if tick % 2:
-            assert blocks.run.call("file_pose") == python.run.call("file_pose")
-        for each in (blocks, python):
-            each.run.call("estimate")
-            each.run.call("control")
-        assert memory(blocks) == memory(python), tick
 
 
 @pytest.mark.parametrize("kind", ["image", "optimised"])

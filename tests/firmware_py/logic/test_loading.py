@@ -1,6 +1,7 @@
 """What a module of the user's may hold, and what it is told when it does not: file, line, and what to write instead."""
 
 from pathlib import Path
+from textwrap import indent
 
 import pytest
 
@@ -28,6 +29,42 @@ GAIN = '    gain_iy: Annotated[f32, Tunable(-0.4, "rad/m/s", low=-2.0, high=2.0)
 HOOK = "estimator: Estimator, control: Control, own: Gains, memory: Memory) -> None:"
 IMPORTS = "from typing import Annotated\n"
 CALLS_NUMPY = (IMPORTS, IMPORTS + "import numpy as np\n")
+
+
+IN_THE_LAW = [
+    ("control.u[1] = 0.5", 0, "float literal 0.5 without f32(..)"),
+    ("control.u[1] += ZERO", 0, "AugAssign statement: write x = x + y"),
+    ("control.u[1] = max(ZERO, own.gain_iy)", 0, "call of max, which is no kernel: write an if"),
+    ("control.u[1] = own.gain_iy ** 2", 0, "Pow of f32 and i32: write x * x"),
+    ("while True:\n    return", 0, "While statement: write a loop over range(..)"),
+    ("control.u[1] = np.dot(own.gain_iy, ZERO)", 0,
+     "call np.dot(..) is no plain call of a kernel: write a loop over range(..)"),
+    ("control.u[1] = clamp(x=ZERO, low=ZERO, high=ZERO)", 0, "write the arguments in their order, without names"),
+    ("control.u[1] = own.gain_iy * 2", 0, "Mult of f32 and i32: write f32(..) around the integer"),
+    ("if 0 < own.gain_iy:\n    control.u[1] = ZERO", 0, "comparison of i32 and f32: write f32(..) around the integer"),
+    ("if ZERO < own.gain_iy < ZERO:\n    control.u[1] = ZERO", 0, "own.gain_iy < ZERO: write a < b and b < c"),
+    ("if own.gain_iy:\n    control.u[1] = ZERO", 0, "the condition is f32, not bool: write a comparison"),
+    ("first, second = ZERO, ZERO", 0, "Assign statement: write one assignment for each value"),
+    ("control.u[0:2] = ZERO", 0, "slice: write a loop over range(..)"),
+    ("control.u[POSITION + 4] = ZERO", 0, "index POSITION + 4, which is 4: f32 array of 4 has 0..3"),
+    ("for flap in range(2, 5):\n    control.u[flap - 1] = control.u[flap]", 1,
+     "index flap, which is 2..4: f32 array of 4 has 0..3"),
+    ("for flap in range(4):\n    control.u[flap - 1] = ZERO", 1, "index flap - 1, which is -1..2: f32 array of 4 has 0..3"),
+    ("control.u[1] = own.gain_jy", 0, "own.gain_jy is no field of a struct"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("statement", "line", "told"), IN_THE_LAW, ids=[row[0] for row in IN_THE_LAW])
+def test_a_statement_outside_the_subset_is_told_with_file_line_and_what_to_write(
+    tmp_path: Path, statement: str, line: int, told: str
+) -> None:
+    text = changed(LAW, IN_LAW, IN_LAW + indent(f"{statement}\n", "    "))
+    with pytest.raises(LabError) as error:
+        own_config(tmp_path, text)
+    first = line_of(text, IN_LAW) + 1
+    assert str(error.value).startswith(f"{tmp_path / 'controller.py'}:{first + line}: ")
+    assert told in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -75,108 +112,6 @@ CALLS_NUMPY = (IMPORTS, IMPORTS + "import numpy as np\n")
             IN_LAW + "    own.after = i32(1)\n",
             "@kernel\ndef control_law",
             "control_law writes own: it may write control and memory",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[1] = 0.5\n",
-            "    control.u[1]",
-            "float literal 0.5 without f32(..)",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[1] += ZERO\n",
-            "    control.u[1]",
-            "AugAssign statement: write x = x + y",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[1] = max(ZERO, own.gain_iy)\n",
-            "    control.u[1]",
-            "call of max, which is no kernel: write an if",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[1] = own.gain_iy ** 2\n",
-            "    control.u[1]",
-            "Pow of f32 and i32: write x * x",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    while True:\n        return\n",
-            "    while",
-            "While statement: write a loop over range(..)",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[1] = np.dot(own.gain_iy, ZERO)\n",
-            "    control.u[1]",
-            "call np.dot(..) is no plain call of a kernel: write a loop over range(..)",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[1] = clamp(x=ZERO, low=ZERO, high=ZERO)\n",
-            "    control.u[1]",
-            "write the arguments in their order, without names",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[1] = own.gain_iy * 2\n",
-            "    control.u[1]",
-            "Mult of f32 and i32: write f32(..) around the integer",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    if 0 < own.gain_iy:\n        control.u[1] = ZERO\n",
-            "    if 0",
-            "comparison of i32 and f32: write f32(..) around the integer",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    if ZERO < own.gain_iy < ZERO:\n        control.u[1] = ZERO\n",
-            "    if ZERO",
-            "own.gain_iy < ZERO: write a < b and b < c",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    if own.gain_iy:\n        control.u[1] = ZERO\n",
-            "    if own",
-            "the condition is f32, not bool: write a comparison",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    first, second = ZERO, ZERO\n",
-            "    first",
-            "Assign statement: write one assignment for each value",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[0:2] = ZERO\n",
-            "    control.u[0:2]",
-            "slice: write a loop over range(..)",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[POSITION + 4] = ZERO\n",
-            "    control.u[POSITION",
-            "index POSITION + 4, which is 4: f32 array of 4 has 0..3",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    for flap in range(2, 5):\n        control.u[flap - 1] = control.u[flap]\n",
-            "        control.u[flap - 1]",
-            "index flap, which is 2..4: f32 array of 4 has 0..3",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    for flap in range(4):\n        control.u[flap - 1] = ZERO\n",
-            "        control.u[flap - 1]",
-            "index flap - 1, which is -1..2: f32 array of 4 has 0..3",
-        ),
-        (
-            IN_LAW,
-            IN_LAW + "    control.u[1] = own.gain_jy\n",
-            "    control.u[1]",
-            "own.gain_jy is no field of a struct",
         ),
         (
             GAIN,

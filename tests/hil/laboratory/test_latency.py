@@ -1,8 +1,6 @@
 """Where the age of a pose comes from: the budget of its stages, and that the age on board is the true one."""
 
 import math
-import select
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from firmware_py.signals import COUNTERS
-from ground_station.clock import clock_us
-from ground_station.config import CaptureConfig
 from ground_station.latency import (
     SENT_POSES,
     STAGES,
@@ -25,15 +21,12 @@ from ground_station.latency import (
     row_of,
 )
 from ground_station.mocap import MocapFrame
-from ground_station.sources.address import find_source
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.ages import STATION_CLOCK, ages_of, reported_ages, with_goals_sent
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import MAVLINK, RADIO, Request
 from hil.laboratory.run import fly
-from hil.servers.dongle_server import Readers
-from hil.servers.motive import Streaming, VirtualMotive
 
 HOME = (0.0, 0.0, 1.15)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -146,51 +139,6 @@ def test_cut_telemetry_is_read_up_to_the_cut(tmp_path: Path) -> None:
     assert budget_line(ages_of(reported_ages(telemetry.parent), log, RADIO)) == budget_line(result.ages)
     telemetry.write_text(text.splitlines(keepends=True)[0])
     assert ages_of(reported_ages(telemetry.parent), log, RADIO) == ()
-
-
-@pytest.mark.realtime
-def test_instants_of_the_way_survive_motive_and_the_clock_of_its_computer() -> None:
-    """Stamps against stamps: how long anything takes here does not matter."""
-    readers: Readers = {}
-    motive = VirtualMotive(Streaming(0, (4, 1), multicast=False), {1: "floaty"}, readers)
-    stop, latency_us, processing_us = threading.Event(), 38_000, 18_000
-    taken: dict[float, tuple[int, int]] = {}  # clock before and after, by x
-
-    def serve() -> None:
-        number = 0
-        while not stop.is_set():
-            for reader in select.select(readers, (), (), 0.004)[0]:
-                readers[reader](0)
-            number += 1
-            x = number / 1024  # exact in float32
-            shown = MocapFrame(0, (x, 0.0, 1.0), UPRIGHT, True, latency_us - processing_us, latency_us)
-            before_us = clock_us()
-            motive.take(1, shown, latency_us)
-            taken[x] = before_us, clock_us()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    source = find_source(f"optitrack:127.0.0.1:{motive.port}", CaptureConfig())
-    try:
-        source.open()
-        start_us = clock_us()
-        frames: list[MocapFrame] = []
-        while len(frames) < 50 and clock_us() - start_us < 10_000_000:
-            pose = source.receive(0.5)
-            if pose is not None and clock_us() - start_us > 1_800_000:  # after four echoes
-                frames.append(pose)
-        source.close()
-    finally:
-        stop.set()
-        thread.join()
-        motive.close()
-    assert len(frames) == 50
-    for pose in frames:
-        before_us, after_us = taken[pose.p_WB[0]]
-        instants = (pose.t_us, pose.received_us, pose.transmitted_us)
-        for instant, ahead_us in zip(instants, (latency_us, processing_us, 0), strict=True):
-            assert instant is not None
-            assert before_us - ahead_us - 1000 <= instant <= after_us - ahead_us + 1000
 
 
 def test_a_log_gets_the_goals_that_the_station_recorded_at_their_time(tmp_path: Path) -> None:

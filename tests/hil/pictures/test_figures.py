@@ -79,18 +79,6 @@ def test_a_task_has_one_colour_in_every_figure_whatever_tasks_are_there() -> Non
     assert drawn == [("SENSORS", 200, sensors), ("KALMAN", 100, kalman), ("KALMAN", 100, kalman)]
 
 
-def test_the_time_since_the_last_fused_pose_shows_a_dropout_and_nothing_before_the_first_pose() -> None:
-    rows = log([0, 0, 1, 1, 2, *60 * [2], 3])
-    since = curves.since_fusion(rows)[:, 0]
-    assert np.isnan(since[:2]).all()
-    assert since[2:6].tolist() == [0.0, 10.0, 0.0, 10.0]
-    assert since[-2:].tolist() == [600.0, 0.0]
-    shown = rows.append_column("estimator.pose_age_us", pa.array([39_400] * rows.num_rows))
-    ages, without = figures.age(shown).panels
-    assert ages.series[0].values.tolist() == [39.4] * rows.num_rows, "also with the predictor off"
-    assert without.series[0].values[-2] == 600.0
-
-
 @pytest.mark.parametrize("cut", [1, 3, 5, 30])
 def test_the_time_since_the_last_fused_pose_goes_on_over_batches(cut: int) -> None:
     rows = log([0, 0, 1, 1, 2, *60 * [2], 3])

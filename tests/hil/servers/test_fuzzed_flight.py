@@ -1,4 +1,4 @@
-"""A robot that is flown by its station while another client sends random bytes: nothing is lost.
+"""A robot that is flown by its station while another client sends random bytes: nothing is lost, on either protocol.
 
 The client sends 5,000 packets per second, some 85 kB/s, as fast as the radio's queue takes them. What is left out are
 requests that are a client's right, see `support.random_requests`.
@@ -13,7 +13,9 @@ from firmware_py.wire import crtp, high_level
 from hil.clock import FreeRunning
 from hil.config import load_config
 from hil.servers.server import Server
-from support.random_requests import random_packet
+from support.mavlink_client import STATION, codec
+from support.mavlink_lab import MavlinkLab
+from support.random_requests import harmless_message, random_packet, spoilt
 
 PERIOD_US = 200
 
@@ -70,3 +72,23 @@ def test_random_packets_of_a_connected_client_lose_nothing(
     assert not any("lost" in line or "failsafe" in line for line in fuzzed.said)
     lines = [line for line in fuzzed.said if "commander" in line]
     assert len(lines) < 40 + 4 * duration_s  # throttled: there are some twenty kinds
+
+
+@pytest.mark.long
+def test_random_messages_and_bytes_on_the_serial_line_lose_nothing() -> None:
+    lab, rng, sender = MavlinkLab(flying=True), np.random.default_rng(4), codec(*STATION)
+    lab.run(4.5)
+    assert lab.robot.free
+
+    def flood(now_us: int) -> None:
+        """Send a message that must not be obeyed, one that is spoilt, or bytes."""
+        frame, kind = bytes(harmless_message(rng).pack(sender)), rng.random()
+        lab._uplink(now_us, frame if kind < 0.7 else spoilt(rng, frame) if kind < 0.9 else rng.bytes(40))
+
+    lab.robot.events.every(1000, lab.robot.events.now_us + 1, flood)
+    for _ in range(100):
+        lab.run(0.1)
+        assert np.abs(lab.place - lab.robot.config.flight.home).max() < 0.15, lab.said[-5:]
+    assert lab.robot.firmware.mavlink is not None
+    assert lab.robot.firmware.mavlink.bad > 500
+    assert not any("lost" in line or "failsafe" in line for line in lab.said)

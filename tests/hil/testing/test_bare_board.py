@@ -4,13 +4,10 @@ import math
 
 import pytest
 
-from firmware_py.config import LogicConfig
-from firmware_py.export.boards import BOARDS, runner_of
 from firmware_py.wire import crtp
 from firmware_py.wire.crtp import Packet
 from hil.config import load_config
 from hil.errors import LabError
-from hil.laboratory.lockstep import BUILD
 from hil.testing.board import BareBoard, UnmetExpectation
 
 POSE = crtp.encode_ext_pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 40_000)
@@ -127,16 +124,3 @@ def test_with_a_serial_line_it_speaks_mavlink() -> None:
     board.run(ms=100)
     answers = [message for _, data in board.sent[count:] for message in parser.parse_buffer(data) or []]
     assert any(message.get_type() == "TIMESYNC" and message.ts1 == 77 for message in answers)
-
-
-@pytest.mark.long
-def test_every_target_runs_the_same_board() -> None:
-    seen = []
-    for name in BOARDS:
-        board = BareBoard(load_config(), runner_of(name, BUILD, LogicConfig()))
-        board.expect("gyro zero", within_ms=2000)
-        board.receive(POSE, every_ms=20)
-        board.feed_imu(omega_B=(0.3, 0.2, 0.1))
-        board.run(ms=300)
-        seen.append((board.counts, board.console))
-    assert seen[0] == seen[1] == seen[2]
