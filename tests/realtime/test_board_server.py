@@ -2,14 +2,12 @@
 
 import gc
 import random
-import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -19,15 +17,10 @@ import cflib.crtp
 import pytest
 from cflib.bootloader import Bootloader, FlashArtifact, Target
 from cflib.bootloader.boottypes import TargetTypes
-from cflib.crazyflie import Crazyflie
-from cflib.crazyflie.mem import MemoryElement
-from cflib.crtp.crtpstack import CRTPPacket, CRTPPort
-from cflib.utils.encoding import compress_quaternion
 from cflib.utils.power_switch import PowerSwitch
 
 from hil.servers.dongle_plugin import Backend
 from support.cflib_client import CflibClient
-from support.paths import SUPPORT
 from support.plugged_dongle import plug
 from support.serving import PATIENCE_S, Served, serve
 
@@ -96,75 +89,6 @@ def test_a_log_block_has_the_boards_values_at_its_rate(client: CflibClient) -> N
     assert [later[0] - earlier[0] for earlier, later in pairwise(rows)] == [10] * 99
     assert all(3.6 < values["pm.vbat"] < 4.2 for _, values in rows)
     assert median(values["acc.z"] for _, values in rows) == pytest.approx(1.0, abs=0.2)
-
-
-def test_application_channel_and_memories_answer(client: CflibClient) -> None:
-    assert client.answer(app_echo, client.cf, bytes(range(30))) == (bytes(range(30)),)
-    memories = client.cf.mem
-    (tester,) = memories.get_mems(MemoryElement.TYPE_MEMORY_TESTER)
-    client.answer(tester.read_data, 5, 500)
-    assert tester.readValidationSuccess
-    client.answer(tester.write_data, 5, 500)
-    assert client.rows(2, 10, "memTst.errCntW")[-1][1]["memTst.errCntW"] == 0
-    (deck,) = memories.get_mems(MemoryElement.TYPE_1W)
-    assert (deck.valid, deck.elements["Board name"]) == (True, "bcFloaty")
-    (eeprom,) = memories.get_mems(MemoryElement.TYPE_I2C)
-    client.answer(eeprom.update)
-    assert (eeprom.valid, eeprom.elements["radio_address"]) == (True, 0xE7E7E7E7E7)
-    for trim in (0.25, 0.0):
-        eeprom.elements["pitch_trim"] = trim
-        client.answer(eeprom.write_data)
-        eeprom.elements.clear()
-        client.answer(eeprom.update)
-        assert (eeprom.valid, eeprom.elements["pitch_trim"]) == (True, trim)
-
-
-def test_a_position_arrives_and_a_stop_lasts_until_the_recovery(client: CflibClient) -> None:
-    client.cf.extpos.send_extpos(0.5, 0.25, -0.125)
-    places = [tuple(values.values()) for _, values in client.rows(20, 10, "locSrv.x", "locSrv.y", "locSrv.z")]
-    assert places[-1] == (0.5, 0.25, -0.125)
-    client.cf.param.set_value("floaty.stop", 1)
-    assert client.heard("supervisor: failsafe, emergency stop\n")
-    assert client.rows(5, 10, "supervisor.cause")[-1][1]["supervisor.cause"] == 3
-    client.cf.supervisor.send_crash_recovery_request()
-    assert client.rows(20, 10, "supervisor.cause")[-1][1]["supervisor.cause"] != 3
-    assert client.cf.supervisor.is_armed
-
-
-@pytest.mark.parametrize("packed", [False, True], ids=["extpose", "packed"])
-def test_poses_are_flown_and_their_end_is_announced(client: CflibClient, packed: bool) -> None:
-    goal, stop = (0.01, -0.02, 0.03), threading.Event()
-    client.set("extPose.absolute", 0)
-
-    def send() -> None:
-        while not stop.wait(0.02):
-            if packed:
-                packet = CRTPPacket()
-                packet.set_header(CRTPPort.LOCALIZATION, 1)
-                mm = (round(1000 * value) for value in goal)
-                packet.data = struct.pack("<BBhhhI", 9, 0xE7, *mm, compress_quaternion((0, 0, 0, 1)))
-                client.cf.send_packet(packet)
-            else:
-                client.cf.extpos.send_extpose(*goal, 0, 0, 0, 1)
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        names = ("stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "locSrv.poses")
-        rows = [values for _, values in client.rows(100, 10, *names)]
-    finally:
-        stop.set()
-        sender.join()
-    # The board lies still while its flaps fly it: its model moves the estimate about the poses by a centimetre or two.
-    assert [median(row[name] for row in rows) for name in names[:3]] == pytest.approx(goal, abs=0.01)
-    assert 25 <= rows[-1]["locSrv.poses"] - rows[0]["locSrv.poses"] <= 50
-    assert client.heard("supervisor: failsafe, silence\n")
-    assert "supervisor: flying\n" in client.console
-
-
-def app_echo(cf: Crazyflie, data: bytes, callback: Callable[[bytes], None]) -> None:
-    cf.appchannel.packet_received.add_callback(lambda packet: callback(bytes(packet)))
-    cf.appchannel.send_packet(data)
 
 
 def test_a_power_cycle_is_noticed_and_stored_parameters_come_back(served: Served, cache: Path) -> None:
@@ -286,27 +210,6 @@ def test_ten_boards_on_one_dongle(cache: Path) -> None:
         for thread in closing:
             thread.join(PATIENCE_S)
         assert all(client.gone.is_set() for client in clients)
-
-
-def test_a_scan_of_the_channels_that_was_interrupted_leaves_a_board_that_recovers(cache: Path) -> None:
-    with serve("--radio", "--radio-port", "0") as served:
-        scan = subprocess.Popen(
-            (sys.executable, str(SUPPORT / "radio_scan.py")), env=served.environment, stdout=subprocess.PIPE, text=True
-        )  # fmt: skip
-        assert scan.stdout is not None
-        while scan.stdout.readline().strip() != "20":
-            assert scan.poll() is None
-        scan.send_signal(signal.SIGINT)
-        scan.communicate(timeout=PATIENCE_S)
-        moved = served.wait_for("a client moved the radio to", PATIENCE_S)
-        where = next(word.rstrip(";") for word in moved.split() if word.startswith("radio://"))
-        assert where not in served.radio_uris
-        plug(served)
-        CflibClient(where, cache).ready().close()
-        served.forget()
-        served.type("restart")
-        served.wait_for("gyro zero", PATIENCE_S)
-        CflibClient(served.radio_uris[0], cache).ready().close()
 
 
 def test_the_built_in_station_flies_and_ctrl_c_ends_in_order() -> None:

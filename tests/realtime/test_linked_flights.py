@@ -26,22 +26,6 @@ def fly(folder: Path, *arguments: str) -> dict[str, Any]:
     return result
 
 
-def test_a_link_that_leads_nowhere_is_one_line_and_exit_code_two(tmp_path: Path) -> None:
-    command = [
-        *FLOATY,
-        "fly",
-        "hover",
-        "--link",
-        "radio://0/81/2M/E7E7E7E7E7",
-        "--out",
-        str(tmp_path / "run"),
-    ]
-    shown = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert shown.returncode == 2
-    assert f"expected radio, mavlink, {DONGLE}" in shown.stderr
-    assert len(shown.stderr.strip().splitlines()) == 1
-
-
 def test_the_complete_laboratory_flies_hover_within_its_limits(tmp_path: Path) -> None:
     """Motive, station process and virtual dongle for 8 s; the limits leave a busy machine room, the ages less."""
     result = fly(tmp_path / "run", *HOVER, "--link", DONGLE, "--duration", "8")
@@ -119,16 +103,6 @@ def test_faults_of_every_layer_act_on_every_link(tmp_path: Path, link: str, faul
     blind = any("cut" in fault or "dropout" in fault for fault in faults)
     assert (state[free] == 3).any() == blind  # 0.7 s of silence is the failsafe, and it ends by itself
     assert state[-1] == 2
-
-
-def test_a_fault_typed_at_a_running_server_acts_at_once() -> None:
-    with serve("--udp", "0", "--station") as served:
-        served.wait_for("board 1: released", 60.0)
-        served.type("push.w=1")
-        served.wait_for("unknown kind 'push.w'", 20.0)
-        served.type("push.z:0.2=20")
-        served.wait_for(r"fault push\.z:0\.2=20 begins", 20.0)
-        served.wait_for("it is put back", 60.0)
 
 
 def test_faults_of_the_command_line_begin_after_the_release() -> None:

@@ -76,24 +76,6 @@ def test_a_dialogue_flies_and_every_change_is_an_event(end: str, tmp_path: Path)
     assert result["metrics"]["flown"] > 0.0
 
 
-def test_a_station_that_is_killed_leaves_a_flight_that_can_be_reported(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    with serve("--udp", "0", motive=True) as lab, station(lab, lab.udp_uris[0], "--out", folder) as typed:
-        typed.wait_for("^connected", PATIENCE_S)
-        wait_for_event(folder, "hover begins")
-        typed.type("mark before the end")
-        typed.wait_for("^mark", PATIENCE_S)
-        while load_log(folder).num_rows < 400:
-            time.sleep(0.1)
-        typed.process.kill()
-        typed.process.wait()
-    assert not (folder / "result.json").exists()
-    subprocess.run([*FLOATY, "report", str(folder)], check=True, timeout=60)
-    report = (folder / "report.html").read_text(encoding="utf-8")
-    assert "the process ended before the flight did" in report
-    assert "mark before the end" in report
-
-
 def test_parameters_are_set_and_saved_without_flying() -> None:
     for end in ("udp", "mavlink"):
         with serve(*ENDS[end]) as lab:

@@ -755,23 +755,3 @@ def test_statistics_show_a_task_that_starves():
     _, report = statistics.reports()
     assert (report.activations, report.worst_response_us, report.deadline_misses) == (0, 9_000, 1)
     assert statistics.load() == 1.0
-
-
-def test_start_latencies_fall_into_their_class():
-    kernel = Kernel()
-    wakes = [kernel.create_binary_semaphore("first"), kernel.create_binary_semaphore("second")]
-
-    def body(wake):
-        while True:
-            yield from wake.take()
-            yield from kernel.work(150)
-
-    for priority, wake in zip((2, 1), wakes, strict=True):
-        kernel.create_task(wake.name, priority, body, wake)
-    statistics = Statistics(kernel, {})
-    kernel.start()
-    run_until(kernel, 5_000, [(us, wake.give_from_isr) for us in (1_100, 2_100) for wake in wakes])
-    first, second = statistics.reports()
-    assert first.latency_histogram == (3, *[0] * 11)
-    assert second.latency_histogram == (1, 0, 0, 0, 0, 2, *[0] * 6)  # 150 us: between 100 and 200
-    assert second.worst_latency_us == 150

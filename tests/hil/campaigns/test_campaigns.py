@@ -18,7 +18,7 @@ from hil.campaigns.dataset import ARRIVING, FLIGHTS, Dataset
 from hil.campaigns.findings import find
 from hil.campaigns.jobs import Job, Row, fly_job
 from hil.campaigns.report import write_report
-from hil.campaigns.run import Flyer, Progress, Standing, conduct, interval
+from hil.campaigns.run import Flyer, Standing, conduct, interval
 from hil.campaigns.sampling import draw, plan_of
 from hil.errors import LabError
 from support.campaigns import BAD_PUSH, planted, spec_of
@@ -195,15 +195,6 @@ def test_the_interval_is_wilson_s() -> None:
     assert interval(0, 0) == (0.0, 1.0)
     low, high = interval(1, 10)
     assert (low, high) == pytest.approx((0.01787621, 0.40415005), abs=1e-6)  # statsmodels, proportion_confint
-
-
-def test_what_comes_beyond_the_end_does_not_count() -> None:
-    progress = Progress(plan_of(spec_of(flights=1000, stop="failure rate known to ±5 %")))
-    for index in reversed(range(200)):  # all hold: 38 are enough
-        progress.add(index, True)
-    assert progress.end is not None
-    assert progress.standing == Standing(0, progress.end, progress.end, complete=True)
-    assert 30 <= progress.end < 60
 
 
 def test_what_was_planted_is_found(tmp_path: Path) -> None:

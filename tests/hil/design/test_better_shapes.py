@@ -19,11 +19,8 @@ from hil.design.sweeps import Point, authorities, flat_high
 from hil.design.trim import coefficient_of, scaled
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.laboratory.metrics import column
-from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.world.body import SIGNS
 from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import weigh
 from hil.world.plant import Plant
@@ -32,8 +29,6 @@ from support.command import Cli
 CONFIG = load_config()
 PAPER = Point(CONFIG.geometry, coefficient_of(CONFIG), math.radians(28.0), 0.0, 0.9)
 DESIGNS = ("design-flat", "design-paper", "design-best")
-# Paper, eq. (input_signals).
-MIX = np.array([[1, 1, -1, -1], [1, -1, -1, 1], [-1, -1, -1, -1], [-1, 1, -1, 1]], float)
 
 
 def point_of(profile: str) -> Point:
@@ -168,40 +163,6 @@ def test_the_steady_side_step_is_that_of_the_simulated_linear_model() -> None:
     flow = np.block([[A, b[:, None]], [np.zeros((1, 4))]])
     early, late = (expm(flow * t)[0, 3] for t in (10.0, 11.0))
     assert late - early == pytest.approx(model.steady(PITCH), rel=1e-3)
-
-
-def measured_agility(profile: Path, folder: Path) -> float:
-    """Yaw acceleration per u3 [1/s2], by least squares over a yaw step as it was flown."""
-    fly(
-        Request.of(
-            EXPERIMENTS["yaw-step"],
-            profile=str(profile),
-            overrides=("tunnel.turbulence=none",),
-            seed=1,
-            duration_s=4.0,
-        ),
-        folder,
-    )
-    log = load_log(folder)
-    t, rate = 1e-6 * column(log, "t"), column(log, "truth.r")
-    flaps = column(log, *(f"truth.flap_{number}" for number in (1, 2, 3, 4)))
-    u3 = (flaps - SIGNS * PAPER.opening) @ MIX[:, 2] / 4
-    rows = np.abs(u3) > 0.003
-    slope = np.gradient(rate, t)
-    found, *_ = np.linalg.lstsq(np.column_stack((u3[rows], rate[rows])), slope[rows], rcond=None)
-    return float(found[0])
-
-
-@pytest.mark.long
-def test_agility_measured_in_flight_goes_with_one_over_the_size(tmp_path: Path) -> None:
-    agility = {}
-    for length in (0.5, 1.0, 2.0):
-        point = Point(scaled(PAPER.geometry, length, length**3), PAPER.coefficient, PAPER.opening, 0.0, 0.9)
-        profile = tmp_path / f"{length:g}.toml"
-        profile.write_text(profile_text(point, gains_of(point.linear), "similar", length))
-        agility[length] = measured_agility(profile, tmp_path / f"{length:g}")
-    for length, found in agility.items():
-        assert found * length == pytest.approx(agility[1.0], rel=0.1), agility
 
 
 @pytest.mark.long

@@ -1,7 +1,6 @@
 """Whole flights over the serial line: limits at every baud rate, determinism, wrong bits, signatures, what does not fit."""
 
 import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -135,25 +134,6 @@ def test_the_telemetry_log_has_every_byte_that_passed_the_line_in_frames_with_th
     assert len(poses) > 140
     age_us = [t_us - message.time_usec for t_us, message in poses]
     assert np.median(age_us) == pytest.approx(38_000, abs=300), "camera and processing, before it is sent"
-
-
-@pytest.mark.realtime
-def test_the_station_flies_a_board_behind_a_pty_in_real_time(tmp_path: Path) -> None:
-    line = tmp_path / "uart"
-    done = subprocess.run(
-        [*FLOATY, "fly", "hover", "--seed", "2", "--link", f"mavlink:{line}", "--duration", "3", "--out",
-         str(tmp_path / "run")],
-        capture_output=True, text=True, timeout=90,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    log = load_log(tmp_path / "run")
-    assert column(log, "serial.up_bytes")[-1] > 100 * 48  # poses
-    assert not line.is_symlink()
-    file = mavutil.mavlink_connection(str(tmp_path / "run" / "link.tlog"))
-    first = file.recv_match(type="ATT_POS_MOCAP")
-    file.close()
-    assert first is not None
-    assert abs(first._timestamp - time.time()) < 120, "since 1970"
 
 
 @pytest.mark.long

@@ -3,12 +3,8 @@
 import dataclasses
 import json
 import math
-import os
 import re
-import signal
 import statistics
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -218,44 +214,6 @@ def test_a_figure_that_no_flight_has_is_a_dash(result: Row) -> None:
 )
 def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:
     assert message in cli.refusal(*arguments)
-
-
-@pytest.mark.long
-def test_ctrl_c_keeps_what_was_flown_and_writes_the_report(tmp_path: Path) -> None:
-    seeds = 10 * (os.cpu_count() or 1)
-    command = [
-        sys.executable,
-        "-m",
-        "hil.commands",
-        "paper",
-        "--only",
-        "hover",
-        "--seeds",
-        f"{seeds}",
-        "--out",
-        "out",
-    ]
-    process = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    while not (
-        tmp_path / "out" / "hover-floaty-1"
-    ).exists():  # in the air: it lands before the report is written
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(0.05)
-    process.send_signal(signal.SIGINT)
-    shown, _ = process.communicate(timeout=120)
-    assert process.returncode == 130, shown
-    told = content(tmp_path / "out")
-    assert told["interrupted"] is True
-    flights = told["rows"][0]["profiles"]["floaty"]["flights"]
-    assert 1 <= len(flights) < seeds
-    assert "interrupted" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.long
