@@ -21,6 +21,7 @@ from firmware_py.export.boards import PYTHON
 from ground_station import trajectory
 from hil.arguments import Known, checked
 from hil.config import DEFAULT_PROFILE
+from hil.demonstrations import Demonstrations, demonstrations_of
 from hil.errors import LabError
 from hil.experiments import find_again, find_experiment
 from hil.laboratory.experiment import Experiment
@@ -197,6 +198,10 @@ class Run:
         release_us = column(self.free, "t")[:1]
         frame.index = (frame["t"] - (release_us[0] if len(release_us) else 0)) * 1e-6
         return frame.rename_axis("s")
+
+    def to_dataset(self) -> Demonstrations:
+        """Return what the control law saw and did, for imitation learning: observations (N, 20), actions (N, 4)."""
+        return demonstrations_of(self.log, self.request.config)
 
     @property
     def units(self) -> Mapping[str, str]:

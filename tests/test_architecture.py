@@ -27,6 +27,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     "hil.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
     "hil.crazyflie": ("hil", "firmware_py.wire.scalars", "firmware_py.elementary", "firmware_py.section"),
+    "hil.learn": ("hil", "ground_station", "firmware_py"),
+    "hil.demonstrations": ("hil", "firmware_py"),
     "hil": (
         "hil", "ground_station",
         "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
@@ -45,12 +47,12 @@ FLOORS = (
     ("devices",),
     ("config",),
     ("laboratory",),
-    ("experiments",),
+    ("experiments", "demonstrations"),
     ("pictures", "exports"),
     ("servers", "live"),
     ("api", "design"),
     ("identify", "campaigns"),
-    ("studies", "deploy", "testing"),
+    ("studies", "deploy", "testing", "learn"),
     ("commands",),
 )
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -63,6 +65,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "numba": ("firmware_py/compiling.py",),
     "rerun": ("hil/pictures/viewer/",),
     "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
+    "gymnasium": ("hil/learn/",),
     "youplot": ("hil/pictures/pages.py",),
     "time": (
         "hil/clock.py", "hil/commands/listing.py",
@@ -115,7 +118,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "perfetto": ("hil/exports/perfetto.py",),
     "matplotlib": ("hil/pictures/", "hil/studies/", "hil/design/", "hil/identify/", "hil/campaigns/report.py"),
     "pyarrow": ("hil/api.py", "hil/exports/", "hil/laboratory/", "hil/experiments/", "hil/pictures/", "hil/studies/",
-        "hil/live/", "hil/campaigns/",
+        "hil/live/", "hil/campaigns/", "hil/demonstrations.py",
     ),
 }  # fmt: skip
 # BLAS, LAPACK, the C library's functions and numpy's vector code have other last bits on other processors, so they

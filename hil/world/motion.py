@@ -11,7 +11,6 @@ from hil.world.ground import stand
 from hil.world.plates import State, drag
 
 GRAVITY = 9.81  # [m/s2]
-STEP = at.STEP_US * 1e-6  # [s]
 
 
 @compiled
@@ -137,12 +136,12 @@ def watch(s: State) -> None:
 
 
 @compiled
-def step(s: State, draws: NDArray[np.float64]) -> None:
-    """Advance the plant by one millisecond with 14 unit normal `draws`; ACC and ALPHA hold for the start."""
+def step(s: State, draws: NDArray[np.float64], step_us: float) -> None:
+    """Advance the plant by one step with 14 unit normal `draws`; ACC and ALPHA hold for the start."""
     for i in range(14):
         s[at.GUSTS + i] = s[at.GUST_DECAY + i] * s[at.GUSTS + i] + s[at.GUST_KICK + i] * draws[i]
     start_us = s[at.TIME_US]
-    middle_us, end_us = start_us + 0.5 * at.STEP_US, start_us + at.STEP_US
+    middle_us, end_us = start_us + 0.5 * step_us, start_us + step_us
     s[at.TIME_US] = end_us
     drive_servos(s, start_us, middle_us)
     if s[at.HELD] != 0.0:
@@ -150,13 +149,14 @@ def step(s: State, draws: NDArray[np.float64]) -> None:
         evaluate(s)
         return
 
+    duration = step_us * 1e-6  # [s]
     px, py, pz = s[at.P], s[at.P + 1], s[at.P + 2]
     vx, vy, vz = s[at.V], s[at.V + 1], s[at.V + 2]
     qw, qx, qy, qz = s[at.Q], s[at.Q + 1], s[at.Q + 2], s[at.Q + 3]
     ox, oy, oz = s[at.OMEGA], s[at.OMEGA + 1], s[at.OMEGA + 2]
     # To the middle with the rates at the start, then to the end with those at the middle.
     for part in range(2):
-        h = 0.5 * STEP if part == 0 else STEP
+        h = 0.5 * duration if part == 0 else duration
         s[at.P], s[at.P + 1], s[at.P + 2] = px + h * s[at.V], py + h * s[at.V + 1], pz + h * s[at.V + 2]
         s[at.V], s[at.V + 1], s[at.V + 2] = vx + h * s[at.ACC], vy + h * s[at.ACC + 1], vz + h * s[at.ACC + 2]
         rotate(s, qw, qx, qy, qz, h)
@@ -177,7 +177,7 @@ def advance(s: State, draws: NDArray[np.float64], now_us: int) -> bool:
         if row == draws.shape[0]:
             s[at.NOISE_ROW] = 0.0
             return True
-        step(s, draws[row])
+        step(s, draws[row], at.STEP_US)
         row += 1
     s[at.NOISE_ROW] = row
     return False

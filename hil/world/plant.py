@@ -55,6 +55,7 @@ class Plant:
         truth (layout.SIZE,) everything; state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
         p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
         wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
+        zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed;
         servo_trim (4,) [rad] and servo_speed (4,), pushes (6,) force [N, W] and torque [N m, B]: the values last set;
         specific_force_B (3,) at the centre of mass; flow_W (3,) air there; plate_forces_W (5, 3) base and four flaps as
         isolated plates (without the identified correction, so they do not add up to the whole force).
@@ -89,7 +90,7 @@ class Plant:
         s[at.LIMIT_COS_TILT] = cos(limits.tilt)
 
         s[at.SERVO_TAU], s[at.SERVO_RATE], s[at.DEAD_BAND] = servos.tau, servos.rate_limit, servos.dead_band
-        self._zero_offset = servos.zero_offset
+        self.zero_offset = servos.zero_offset
         self.servo_trim, self.servo_speed = self._view(at.SERVO_TRIM, 4), self._view(at.SERVO_SPEED, 4)
         self.pushes = self._view(at.PUSH, 6)
         for servo in range(4):
@@ -149,7 +150,7 @@ class Plant:
             return
         self._counts = counts
         self.advance(now_us)
-        self._commanded = commanded_angles(counts, self._zero_offset, self._commanded)
+        self._commanded = commanded_angles(counts, self.zero_offset, self._commanded)
         s = self._s
         # An earlier change may have been latched since the last millisecond: then this one queues behind it.
         at_us, angles = (at.AFTER_US, at.AFTER) if s[at.NEXT_US] <= now_us else (at.NEXT_US, at.NEXT)

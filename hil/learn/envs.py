@@ -1,0 +1,321 @@
+"""Environments for gymnasium: one robot in the whole laboratory, or many in the fast model.
+
+Observations and actions are those of `firmware_py.core.observation`, float32; a step is the controller's, 10 ms. An episode
+ends when the robot is lost (terminated) or after `duration_s` (truncated).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from firmware_py.core.observation import ACTIONS, OBSERVATIONS
+from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
+from firmware_py.geometry import to_euler_zyx, wrap_angle
+from ground_station.trajectory import Goal, Offsets, Sine, Trajectory
+from hil.campaigns.config import find_spec, read_spec
+from hil.campaigns.sampling import draw
+from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
+from hil.devices.board_firmware import PythonBoard
+from hil.errors import LabError
+from hil.laboratory.experiment import Experiment
+from hil.laboratory.faults import Fault
+from hil.laboratory.flight import Flight
+from hil.laboratory.lockstep import lockstep_flight
+from hil.laboratory.request import Request
+from hil.learn import law
+from hil.learn.batch import (
+    CONTROL_US,
+    DELAY_MAX,
+    Actions,
+    EstimateErrors,
+    Fleet,
+    observe_board,
+    reward_of,
+    tilt_of,
+)
+from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, Task, draw_episode, find_task
+from hil.world.plant import Plant
+
+Fidelity = Literal["fast", "firmware"]
+JUST_BEFORE_US = 1  # a step ends so long before the controller acts, after the estimator
+# Position error and velocity [m, m/s], angles [rad], rates [rad/s], flaps [rad], actions: what a board's estimate reaches.
+REACH = np.repeat(np.array([10.0, 20.0, np.pi, 40.0, np.pi, 1.0], np.float32), (3, 3, 3, 3, 4, 4))
+OBSERVATION_SPACE = Box(-REACH, REACH, dtype=np.float32)
+ACTION_SPACE = Box(-1.0, 1.0, (ACTIONS,), np.float32)
+Info = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """What an environment is made with. Raises `LabError` for values that no flight can have."""
+
+    profile: str = DEFAULT_PROFILE  # of the board, and of the robot where no `robots` are drawn
+    overrides: Overrides = ()  # "section.key=value"
+    robots: str = ""  # a campaign, by name or path: its parameters are drawn for each episode
+    robot_count: int = 100  # that are drawn in all
+    duration_s: float = 10.0
+    faults: Sequence[Fault | str] = ()  # of every episode; fidelity firmware only
+    pose_delay_us: int = 0  # that the board does not compensate for; fidelity fast only
+    errors: EstimateErrors = field(default_factory=EstimateErrors)  # of the estimate; fidelity fast only
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.duration_s <= 3600.0:
+            raise LabError(f"duration_s = {self.duration_s!r}: expected seconds, above 0 and up to 3600")
+        if not 0 <= self.pose_delay_us <= DELAY_MAX * CONTROL_US:
+            raise LabError(f"pose_delay_us = {self.pose_delay_us!r}: expected 0..{DELAY_MAX * CONTROL_US}")
+        if self.robot_count < 1:
+            raise LabError(f"robot_count = {self.robot_count!r}: expected 1 or more")
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an episode."""
+        return round(self.duration_s * 1e6 / CONTROL_US)
+
+    def settings(self) -> list[tuple[str, ...]]:
+        """Return the settings of every robot that an episode may draw."""
+        own = settings_of(self.overrides)
+        if not self.robots:
+            return [own]
+        spec = read_spec(find_spec(self.robots))
+        spec = spec.model_copy(update={"flights": self.robot_count * spec.cells})
+        drawn = (draw(spec, index * spec.cells).options for index in range(self.robot_count))
+        return [(*settings_of(options.get("overrides", ())), *own) for options in drawn]
+
+
+def make_env(task: str, fidelity: Fidelity = "fast", **setup: Any) -> gymnasium.Env[Actions, Actions]:
+    """Return the environment of a task with one robot; the keywords are those of `Setup`. Raises `LabError`."""
+    if fidelity not in ("fast", "firmware"):
+        raise LabError(f"fidelity = {fidelity!r}: expected fast or firmware")
+    return (FirmwareEnv if fidelity == "firmware" else FastEnv)(find_task(task), _setup(setup))
+
+
+def make_vec(task: str, num_envs: int = 1, fidelity: Fidelity = "fast", **setup: Any) -> FastVectorEnv:
+    """Return the environment of a task with many robots in one process. Raises `LabError`."""
+    if fidelity != "fast":
+        raise LabError(
+            f'fidelity = {fidelity!r}: many in one process are fast; else vectorization_mode="sync" or "async"'
+        )
+    if num_envs < 1:
+        raise LabError(f"num_envs = {num_envs!r}: expected 1 or more")
+    return FastVectorEnv(find_task(task), num_envs, _setup(setup))
+
+
+def _setup(values: dict[str, Any]) -> Setup:
+    values.pop("render_mode", None)
+    try:
+        return Setup(**values)
+    except TypeError as error:
+        raise LabError(
+            f"{str(error).removeprefix('Setup.__init__() ')}: expected {', '.join(Setup.__annotations__)}"
+        ) from None
+
+
+class FastVectorEnv(VectorEnv[Actions, Actions, NDArray[Any]]):
+    """Many robots at once; an episode that ends is replaced in the same step (`info["final_obs"]` has its last one)."""
+
+    def __init__(self, task: Task, num_envs: int, setup: Setup) -> None:
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = OBSERVATION_SPACE, ACTION_SPACE
+        self.observation_space = batch_space(OBSERVATION_SPACE, num_envs)
+        self.action_space = batch_space(ACTION_SPACE, num_envs)
+        self._task, self._setup = task, setup
+        self._fleet = fleet_of(setup, num_envs)
+        self._observations = np.zeros((num_envs, OBSERVATIONS), np.float32)
+        self._rewards, self._steps = np.zeros(num_envs), np.zeros(num_envs, np.int64)
+        self._streams: list[np.random.Generator] = []
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: Info | None = None
+    ) -> tuple[Actions, Info]:
+        """Begin all episodes; robot n has the seed + n."""
+        seeds = [seed + n for n in range(self.num_envs)] if isinstance(seed, int) else seed
+        if seeds is not None or not self._streams:
+            self._streams = [seeding.np_random(one)[0] for one in seeds or [None] * self.num_envs]
+            self.np_random = self._streams[0].spawn(1)[0]  # for what all share
+        for n in range(self.num_envs):
+            self._begin(n)
+        return self._observations.copy(), {}
+
+    def step(
+        self, actions: Actions
+    ) -> tuple[Actions, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
+        """Advance all robots by 10 ms."""
+        limited = np.array(actions, np.float32).reshape(self.num_envs, ACTIONS)
+        self._fleet.advance(limited, self.np_random, self._observations, self._rewards)
+        np.clip(self._observations, -REACH, REACH, out=self._observations)
+        self._steps += 1
+        lost = self._fleet.lost
+        late = (self._steps >= self._setup.steps) & ~lost
+        info: Info = {}
+        if (over := lost | late).any():
+            info = {"final_obs": self._observations.copy(), "_final_obs": over}
+            for n in np.flatnonzero(over):
+                self._begin(int(n))
+        return self._observations.copy(), self._rewards.copy(), lost, late, info
+
+    def _begin(self, n: int) -> None:
+        rng = self._streams[n]
+        episode = draw_episode(self._task, rng, self._setup.duration_s)
+        self._fleet.begin(n, episode, rng, self._observations[n])
+        self._steps[n] = 0
+
+
+class FastEnv(gymnasium.Env[Actions, Actions]):
+    """One robot in the fast model."""
+
+    def __init__(self, task: Task, setup: Setup) -> None:
+        self.observation_space, self.action_space = OBSERVATION_SPACE, ACTION_SPACE
+        self._task, self._setup = task, setup
+        self._fleet = fleet_of(setup, 1)
+        self._observation, self._reward = np.zeros((1, OBSERVATIONS), np.float32), np.zeros(1)
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Actions, Info]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        episode = draw_episode(self._task, self.np_random, self._setup.duration_s)
+        self._fleet.begin(0, episode, self.np_random, self._observation[0])
+        self._steps = 0
+        return self._observation[0].copy(), {}
+
+    def step(self, action: Actions) -> tuple[Actions, float, bool, bool, Info]:
+        """Advance the robot by 10 ms."""
+        limited = np.array(action, np.float32).reshape(1, ACTIONS)
+        self._fleet.advance(limited, self.np_random, self._observation, self._reward)
+        self._steps += 1
+        lost = bool(self._fleet.lost[0])
+        return (
+            np.clip(self._observation[0], -REACH, REACH),
+            float(self._reward[0]),
+            lost,
+            self._steps >= self._setup.steps,
+            {},
+        )
+
+    @property
+    def truth(self) -> NDArray[np.float64]:
+        """The plant's array, `hil.world.layout`."""
+        truth: NDArray[np.float64] = self._fleet.plants[0]
+        return truth
+
+
+class FirmwareEnv(gymnasium.Env[Actions, Actions]):
+    """One robot in the laboratory: emulated board, estimator, radio, cameras, faults. Flies its action as own logic.
+
+    `flight` is that of the present episode.
+    """
+
+    def __init__(self, task: Task, setup: Setup) -> None:
+        self.observation_space, self.action_space = OBSERVATION_SPACE, ACTION_SPACE
+        self._task, self._setup = task, setup
+        self._robots = setup.settings()
+        self._previous = np.zeros(ACTIONS, np.float32)
+        self._blocks: CoreBlocks | None = None
+        self.flight: Flight | None = None
+
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Actions, Info]:
+        """Boot the board and fly up to the release."""
+        super().reset(seed=seed)
+        self.close()
+        episode = draw_episode(self._task, self.np_random, self._setup.duration_s)
+        request = self._request(episode, int(self.np_random.integers(1 << 31)))
+        self.flight = lockstep_flight(request, executor=PythonBoard(self._runner))
+        self._previous[:] = 0.0
+        self._run_until(self.flight.release_us - JUST_BEFORE_US)
+        return self._observe(), {}
+
+    def step(self, action: Actions) -> tuple[Actions, float, bool, bool, Info]:
+        """Hand the action to the control law, and fly up to its next step."""
+        flight = self.flight
+        if flight is None or self._blocks is None:
+            raise gymnasium.error.ResetNeeded("step: call reset first")
+        limited = np.clip(np.asarray(action, np.float32).reshape(ACTIONS), -1.0, 1.0)
+        own: Any = self._blocks.named["controller_own"].fields
+        own.u1, own.u2, own.u3, own.u4 = limited
+        change = float(((limited - self._previous) ** 2).sum())
+        self._previous[:] = limited
+        self._run_until(flight.now_us + CONTROL_US)
+        plant, goal = flight.robot.plant, flight.line.trajectory.at(flight.now_us)
+        flight.robot.look(flight.now_us)
+        distance = math.dist(plant.p_WB.tolist(), goal.p_WG)
+        yaw = to_euler_zyx(tuple(plant.q_WB.tolist()))[2]
+        reward = reward_of(distance, tilt_of(plant.truth), wrap_angle(yaw - goal.yaw), change)
+        over = flight.now_us - flight.release_us >= (self._setup.steps - 0.5) * CONTROL_US
+        return self._observe(), reward, plant.lost is not None, over, {}
+
+    def close(self) -> None:
+        """End the flight."""
+        if self.flight is not None:
+            self.flight.close()
+            self.flight = None
+
+    def _run_until(self, us: int) -> None:
+        assert self.flight is not None
+        self.flight.lab.end_at(us)
+        self.flight.lab.run()
+
+    def _observe(self) -> Actions:
+        assert self._blocks is not None
+        out = np.zeros(OBSERVATIONS, np.float32)
+        observe_board(self._blocks.parameters.arg, self._blocks.estimator.arg, self._previous, out)
+        return np.clip(out, -REACH, REACH)
+
+    def _runner(self, blocks: CoreBlocks) -> CoreRunner:
+        self._blocks = blocks
+        return PythonRunner(blocks)
+
+    def _request(self, episode: Episode, seed: int) -> Request:
+        setup, settings = self._setup, self._robots[int(episode.robot * len(self._robots))]
+        experiment = Experiment(
+            f"learn-{self._task.name}", self._task.summary, setup.duration_s + 0.1, {},
+            trajectory=PathOf(episode), faults=pushes_of(episode),
+        )  # fmt: skip
+        start = ", ".join(map(repr, episode.start.tolist()))
+        own = (f"flight.start_offset=[{start}]", f'logic.controller="{Path(law.__file__)}"')
+        return Request.of(
+            experiment, profile=setup.profile, overrides=(*settings, *own), seed=seed, faults=setup.faults
+        )
+
+
+@dataclass(frozen=True)
+class PathOf:
+    """Makes the trajectory of an episode."""
+
+    episode: Episode
+
+    def __call__(self, home: Goal, start_us: int) -> Trajectory:
+        """Return the goal's path from the release on."""
+        signals = zip(AXES, self.episode.amplitude.tolist(), self.episode.frequency_hz.tolist(), strict=True)
+        return Offsets(home, start_us, **{axis: Sine(size, hz) for axis, size, hz in signals})
+
+
+def pushes_of(episode: Episode) -> tuple[Fault, ...]:
+    """Return the pushes of an episode as faults."""
+    drawn = zip(episode.push_at.tolist(), episode.push_kind.tolist(), episode.push_size.tolist(), strict=True)
+    return tuple(Fault(PUSH_KINDS[kind], at, PUSH_S, size) for at, kind, size in drawn if at < np.inf)
+
+
+def fleet_of(setup: Setup, count: int) -> Fleet:
+    """Return the fast robots of a setup. Raises `LabError` for what only the whole laboratory has."""
+    if setup.faults:
+        raise LabError(f'faults = {setup.faults!r}: need fidelity="firmware"')
+    unused, _ = seeding.np_random(0)  # these plants never advance
+    worlds = [
+        Plant(world.geometry, world.plant, world.tunnel, world.actuators, unused, world.flight.home)
+        for world in (load_config(setup.profile, settings) for settings in setup.settings())
+    ]
+    board = load_config(setup.profile, settings_of(setup.overrides))
+    return Fleet(board, worlds, count, setup.pose_delay_us, setup.errors)

@@ -1,0 +1,218 @@
+"""The environments: spaces, seeds, agreement of the two fidelities, and what the law on board sees."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import hil.learn
+from hil.errors import LabError
+from hil.learn.envs import FastEnv, FirmwareEnv, make_env
+from hil.learn.tasks import TASKS
+from hil.world import layout as at
+
+STILL = ["tunnel.turbulence=none"]
+
+
+def actions(count: int, size: float) -> np.ndarray:
+    """Actions (count, 4) that change every 50 ms, the same in every test."""
+    rng = np.random.default_rng(7)
+    return np.repeat(rng.uniform(-size, size, (-(-count // 5), 4)), 5, axis=0)[:count].astype(np.float32)
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_s_checker_passes(task: str, fidelity: str) -> None:
+    env = gymnasium.make(f"floaty/{task}-v0", fidelity=fidelity, duration_s=0.5)
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_stable_baselines_checker_passes() -> None:
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    for fidelity in ("fast", "firmware"):
+        checker.check_env(make_env("Hover", fidelity, duration_s=0.5))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_both_fidelities_fly_alike_in_open_loop_from_the_same_seed(task: str) -> None:
+    """In calm air, for a second: 2 mm, 0.02 m/s and 10 mrad; rewards within 0.02."""
+    settings: Any = {"duration_s": 1.0, "overrides": STILL}
+    fast, whole = make_env(task, "fast", **settings), make_env(task, "firmware", **settings)
+    assert isinstance(fast, FastEnv)
+    assert isinstance(whole, FirmwareEnv)
+    fast.reset(seed=11)
+    whole.reset(seed=11)
+    for action in actions(100, 0.25):
+        mine, theirs = fast.step(action), whole.step(action)
+        assert whole.flight is not None
+        plant = whole.flight.robot.plant
+        np.testing.assert_allclose(fast.truth[at.P : at.P + 3], plant.p_WB, atol=0.002)
+        np.testing.assert_allclose(fast.truth[at.V : at.V + 3], plant.v_WB, atol=0.02)
+        np.testing.assert_allclose(fast.truth[at.Q : at.Q + 4], plant.q_WB, atol=0.005)
+        assert mine[1] == pytest.approx(theirs[1], abs=0.02)
+        assert mine[2:4] == theirs[2:4]
+    assert mine[3], "the episode is over after 100 steps"
+    whole.close()
+
+
+def test_the_law_on_board_sees_what_the_environment_returns() -> None:
+    env = make_env("Track", "firmware", duration_s=0.5)
+    assert isinstance(env, FirmwareEnv)
+    observation, _ = env.reset(seed=5)
+    for action in actions(20, 0.2):
+        following = env.step(action)[0]
+        assert env._blocks is not None
+        memory: Any = env._blocks.named["controller_memory"].fields
+        np.testing.assert_array_equal(memory.seen, observation)
+        np.testing.assert_array_equal(memory.action, action)
+        np.testing.assert_array_equal(following[16:], action)
+        observation = following
+    env.close()
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
+def test_the_same_seed_gives_the_same_bytes(fidelity: str) -> None:
+    def flown(seed: int) -> bytes:
+        env = make_env("Push", fidelity, duration_s=0.3)  # type: ignore[arg-type]
+        rows = [env.reset(seed=seed)[0]]
+        for action in actions(30, 0.3):
+            observation, reward, *_ = env.step(action)
+            rows += [observation, np.array([reward])]
+        env.close()
+        return b"".join(row.tobytes() for row in rows)
+
+    assert flown(3) == flown(3)
+    assert flown(3) != flown(4)
+
+
+def test_a_row_of_many_robots_flies_as_the_seed_of_its_own() -> None:
+    """Starts, paths and pushes; the gusts of many are one stream."""
+    many = gymnasium.make_vec("floaty/Track-v0", num_envs=3, overrides=STILL)
+    many.reset(seed=20)
+    alone = make_env("Track", overrides=STILL)
+    assert isinstance(alone, FastEnv)
+    alone.reset(seed=22)
+    for action in actions(30, 0.2):
+        many.step(np.tile(action, (3, 1)))
+        alone.step(action)
+    np.testing.assert_array_equal(
+        many.unwrapped._fleet.plants[2, at.P : at.P + 7], alone.truth[at.P : at.P + 7]
+    )  # type: ignore[attr-defined]
+
+
+def test_a_lost_robot_ends_its_episode_and_begins_another_in_the_same_step() -> None:
+    many = gymnasium.make_vec("floaty/Hover-v0", num_envs=4, duration_s=5.0)
+    many.reset(seed=1)
+    full = np.ones((4, 4), np.float32)
+    for _ in range(500):
+        observations, _, lost, late, info = many.step(full)
+        if lost.any():
+            break
+    assert lost.any()
+    assert not (lost & late).any()
+    for n in np.flatnonzero(lost):
+        assert abs(info["final_obs"][n]).max() > abs(observations[n]).max()
+        assert not observations[n, 16:].any(), "a new episode has no previous action"
+    for n in np.flatnonzero(~lost):
+        np.testing.assert_array_equal(info["final_obs"][n], observations[n])
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
+def test_an_episode_is_truncated_after_its_duration(fidelity: str) -> None:
+    env = make_env("Hover", fidelity, duration_s=0.07)  # type: ignore[arg-type]
+    env.reset(seed=1)
+    ends = [env.step(np.zeros(4, np.float32))[2:4] for _ in range(7)]
+    assert ends == [(False, False)] * 6 + [(False, True)]
+    env.close()
+
+
+def test_an_age_of_the_pose_delays_the_observation_of_the_cameras_alone() -> None:
+    quiet: Any = {"overrides": STILL, "errors": hil.learn.EstimateErrors(0.0, 0.0, 0.0, 0.0)}
+    now, late = make_env("Hover", **quiet), make_env("Hover", pose_delay_us=50_000, **quiet)
+    seen = {env: [env.reset(seed=2)[0]] for env in (now, late)}
+    for action in actions(40, 0.3):
+        for env, rows in seen.items():
+            rows.append(env.step(action)[0])
+    fresh, old = np.array(seen[now]), np.array(seen[late])
+    np.testing.assert_array_equal(old[5:, :9], fresh[:-5, :9])
+    np.testing.assert_array_equal(old[:, 9:], fresh[:, 9:])
+
+
+def test_robots_are_drawn_from_the_campaign_s_distributions_in_both_fidelities() -> None:
+    options: Any = {"robots": "table", "robot_count": 5, "overrides": STILL, "duration_s": 0.2}
+    fast, whole = make_env("Hover", "fast", **options), make_env("Hover", "firmware", **options)
+    assert isinstance(fast, FastEnv)
+    assert isinstance(whole, FirmwareEnv)
+    lags = set()
+    for seed in range(8):
+        fast.reset(seed=seed)
+        whole.reset(seed=seed)
+        assert whole.flight is not None
+        lags.add(float(fast.truth[at.SERVO_TAU]))
+        assert fast.truth[at.SERVO_TAU] == whole.flight.config.actuators.tau
+        assert 0.040 <= fast.truth[at.SERVO_TAU] <= 0.060
+    assert 2 < len(lags) <= 5
+    whole.close()
+
+
+def test_faults_act_in_the_laboratory() -> None:
+    env = make_env("Hover", "firmware", duration_s=1.0, faults=["servo.stuck.2@0.1"])
+    assert isinstance(env, FirmwareEnv)
+    env.reset(seed=1)
+    for action in actions(60, 0.5):
+        env.step(action)
+    assert env.flight is not None
+    assert env.flight.robot.plant.servo_speed.tolist() == [1.0, 0.0, 1.0, 1.0]
+    env.close()
+
+
+def test_the_errors_of_the_fast_model_are_those_of_the_laboratory_s_hover() -> None:
+    """Within a factor of two, for position, velocity, attitude and rates."""
+    run = hil.fly("hover", duration_s=5.0, seed=3, folder="errors-of-the-estimate", replace=True)
+    frame = run.to_pandas()[lambda rows: rows["flight.free"] > 0]
+    goal = frame[["goal.x", "goal.y", "goal.z"]].to_numpy()
+    groups = {"position": "x y z", "velocity": "vx vy vz", "rate": "p q r"}
+    errors = hil.learn.EstimateErrors()
+    for name, columns in groups.items():
+        truth = frame[[f"truth.{one}" for one in columns.split()]].to_numpy()
+        found = frame[[f"estimate.{one}" for one in columns.split()]].to_numpy() + (
+            goal if name == "position" else 0.0
+        )
+        if name == "rate":  # the gyro's mean of a step
+            truth = (truth + np.roll(truth, 1, axis=0)) / 2
+        rms = float(np.sqrt(np.mean((found - truth)[1:] ** 2)))
+        assert (
+            0.5 < rms / getattr(errors, name) < 4.0
+            if name == "rate"
+            else 0.5 < rms / getattr(errors, name) < 2.0
+        )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"task": "Hoover"}, "task 'Hoover': unknown; did you mean Hover?"),
+        ({"task": "Hover", "fidelity": "slow"}, "fidelity = 'slow': expected fast or firmware"),
+        ({"task": "Hover", "duration_s": 0.0}, "duration_s = 0.0: expected seconds, above 0 and up to 3600"),
+        ({"task": "Hover", "pose_delay_us": 130_000}, "pose_delay_us = 130000: expected 0..120000"),
+        ({"task": "Hover", "robots": "tabel"}, "campaign 'tabel': neither the name of a campaign"),
+        ({"task": "Hover", "robot_count": 0}, "robot_count = 0: expected 1 or more"),
+        ({"task": "Hover", "profile": "nosuch"}, "profile 'nosuch'"),
+        ({"task": "Hover", "faults": ["mocap.dropout@1"]}, 'need fidelity="firmware"'),
+        ({"task": "Hover", "durations": 3}, "unexpected keyword argument 'durations': expected profile"),
+        ({"task": "Hover", "num_envs": 0}, "num_envs = 0: expected 1 or more"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: dict[str, Any], message: str) -> None:
+    make = hil.learn.envs.make_vec if "num_envs" in arguments else make_env
+    with pytest.raises(LabError) as refused:
+        make(**arguments)
+    assert message in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_step_before_the_reset_is_refused() -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset first"):
+        make_env("Hover", "firmware").step(np.zeros(4, np.float32))
