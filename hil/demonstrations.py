@@ -16,7 +16,7 @@ from firmware_py.config import FirmwareConfig, parameters_of
 from firmware_py.core.observation import ACTIONS, OBSERVATIONS, observe
 from firmware_py.core.structs import Estimator
 from firmware_py.wire.supervisor import State
-from hil.world.compiled import compiled
+from hil.world.fixed_order import compiled
 
 STATE = [f"estimate.{name}" for name in (*"xyz", "vx", "vy", "vz", "roll", "pitch", "yaw", *"pqr")]
 STATE += [f"estimate.flap_{number}" for number in (1, 2, 3, 4)]

@@ -24,10 +24,8 @@ from firmware_py.core.structs import ATTITUDE, FLAP, RATE, Control, Estimator
 from hil.config import LabConfig
 from hil.learn.tasks import PUSH_S, PUSHES, Episode
 from hil.world import layout as at
-from hil.world.compiled import compiled
-from hil.world.fixed_order import atan2, exp, sine_ahead
+from hil.world.fixed_order import atan2, compiled, exp, normal, sine_ahead
 from hil.world.motion import evaluate, step
-from hil.world.noise import normal
 from hil.world.plant import Plant
 from hil.world.servos import MIDDLE_COUNTS, PERIOD_COUNTS, RAD_PER_COUNT, TIMER_MHZ
 

@@ -1,5 +1,7 @@
 """A flight as data for imitation learning."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,8 +9,8 @@ from firmware_py.wire.supervisor import State
 from hil import fly
 
 
-def test_a_dataset_has_what_the_law_saw_and_did_in_every_step_of_the_closed_loop() -> None:
-    run = fly("yaw-step", duration_s=2.0, seed=4, folder="demonstrations", replace=True)
+def test_a_dataset_has_what_the_law_saw_and_did_in_every_step_of_the_closed_loop(tmp_path: Path) -> None:
+    run = fly("yaw-step", duration_s=2.0, seed=4, folder=tmp_path / "run")
     data, log = run.to_dataset(), run.to_pandas().reset_index()
     closed = log[log["supervisor.state"] == State.FLYING].reset_index()
     np.testing.assert_array_equal(data.t_us, closed["t"])
