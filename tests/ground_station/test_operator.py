@@ -219,13 +219,6 @@ def test_a_value_has_flown_well_after_five_seconds_within_ten_centimetres(bench,
     assert (bench.operator._good["extCtrl.y_P"] == 1.5) == well
 
 
-def test_what_is_saved_survives_a_boot(bench):
-    assert bench.type("set extCtrl.y_P 1.5", "save", wait_us=2_000_000)[-1] == "saved"
-    bench.reboot()
-    assert bench.value("extCtrl.y_P") == 1.5
-    assert bench.noted[-1] == "saved"
-
-
 def test_stop_waits_for_nothing_and_lasts_until_a_reboot(bench):
     bench.type("params", *["mark x"] * 3, "stop", wait_us=100_000)
     assert bench.firmware.signals.supervisor.stopped

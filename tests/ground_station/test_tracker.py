@@ -183,16 +183,6 @@ def test_the_attitude_is_of_unit_length_from_the_first_pose_on_and_however_long_
 
 
 @pytest.mark.long
-def test_false_refusals_are_rarer_than_one_in_3800() -> None:
-    """Three times as many frames of a robot at rest, nominal noise."""
-    rng = np.random.default_rng(5)
-    tracker = tracking()
-    for number in range(100, 11_500):
-        assert tracker.take(noisy(rng, number)).quality is Quality.TRACKED
-    assert tracker.counters.refused == 0
-
-
-@pytest.mark.long
 def test_distances_are_distributed_as_chi2_when_the_robot_moves_as_assumed() -> None:
     one = PoseFilter(0.005, 0.0005, 0.004, CONFIG.acceleration, CONFIG.angular_acceleration)
     rng, p, v = np.random.default_rng(5), np.zeros(3), np.zeros(3)

@@ -1,7 +1,6 @@
 """`floaty serve` and unmodified cflib: by radio with and without losses, by UDP, in this and in other processes."""
 
 import gc
-import random
 import socket
 import subprocess
 import sys
@@ -15,8 +14,7 @@ from statistics import median
 
 import cflib.crtp
 import pytest
-from cflib.bootloader import Bootloader, FlashArtifact, Target
-from cflib.bootloader.boottypes import TargetTypes
+from cflib.bootloader import Bootloader
 from cflib.utils.power_switch import PowerSwitch
 
 from hil.servers.dongle_plugin import Backend
@@ -105,23 +103,6 @@ def test_a_power_cycle_is_noticed_and_stored_parameters_come_back(served: Served
         assert again.cf.param.get_value("extCtrl.vz_P") == "0.75"
         assert float(again.cf.param.get_value("extCtrl.yaw_P")) == pytest.approx(1.2)
         assert again.answer(again.cf.param.persistent_clear, "extCtrl.vz_P") == ("extCtrl.vz_P", True)
-
-
-def test_flashing_is_byte_identical_and_the_board_comes_back(
-    served: Served, tmp_path: Path, cache: Path
-) -> None:
-    image = random.Random(7).randbytes(2 * 1024 + 77)
-    (tmp_path / "image.bin").write_bytes(image)
-    tool = Bootloader(served.radio_uris[0])
-    assert tool.start_bootloader(warm_boot=True)
-    for target, name, start in ((TargetTypes.STM32, "stm32", 16), (TargetTypes.NRF51, "nrf51", 88)):
-        tool._internal_flash(FlashArtifact(image, Target("cf2", name, "fw", [], []), None))
-        while tool._cload.link.receive_packet(1) is not None:  # cflib trips over a late answer
-            pass
-        assert b"".join(tool._cload.read_flash(target, start + n) for n in range(3))[: len(image)] == image
-    assert tool.reset_to_firmware()
-    tool.close()
-    CflibClient(served.radio_uris[0], cache).ready().close()
 
 
 def test_a_board_that_is_off_or_left_in_its_bootloader_gets_its_button_pressed(

@@ -38,7 +38,7 @@ from firmware_py.wire.supervisor import Cause, State
 from ground_station.errors import LinkError
 from ground_station.links.core_client import CoreClient
 from hil.config import load_config
-from hil.deploy.check import FAULTS, check_flight
+from hil.deploy.check import check_flight
 from hil.devices.real_core import RealCore
 from hil.errors import LabError
 from hil.experiments import find_experiment
@@ -285,27 +285,6 @@ def test_a_flight_on_the_app_has_the_bits_of_python_after_every_call_in_any_loss
     assert (checked.outcome, target.ticks) == ("completed", 300)
     assert target.calls > 700
     assert (client.repeated > 100) == (mess > 0)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("mess", [0.0, 0.1])
-def test_a_flight_with_fourteen_faults_has_the_bits_of_python_on_the_app(app: App, mess: float) -> None:
-    client, _ = client_of(app, mess)
-    request = Request.of(find_experiment("hover"), duration_s=65.0, faults=tuple(map(parse, FAULTS)))
-    checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
-    assert checked.equal
-    assert checked.targets[0].ticks == 6600
-
-
-@pytest.mark.long
-def test_own_logic_is_executed_on_the_app_too(tmp_path: Path) -> None:
-    request = Request.of(find_experiment("hover"), profile=str(make_project(tmp_path)), duration_s=0.5)
-    app = App(build_app(tmp_path / "app", request.config), tmp_path / "copy.so")
-    app.boot()
-    client, _ = client_of(app)
-    checked = check_flight(request, lambda stack: {"app": partial(RealCore, client=client)}, lambda *_: None)
-    assert checked.equal
-    assert checked.targets[0].calls > 300
 
 
 @pytest.mark.long

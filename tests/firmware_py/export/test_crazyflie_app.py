@@ -820,17 +820,6 @@ def test_poses_are_read_as_the_laboratory_reads_them(app: App, data: bytes) -> N
         assert fields == pytest.approx((x, y, z, qw, qx, qy, qz), abs=0, rel=0, nan_ok=True)
 
 
-@pytest.mark.parametrize(("age", "known"), [(b"", False), (b"\x50", True), (b"\xff", False)])
-def test_a_pose_without_an_age_has_the_profiles(app: App, age: bytes, known: bool) -> None:
-    app.boot()
-    app.set("delayComp.defaultAge", 60_000)
-    for step in range(1, 320):
-        if step % 20 == 5:
-            app.radio(struct.pack("<B7f", 8, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0) + age)
-        app.step(step)
-    assert 400 <= app.log("locSrv.age") <= 510 if known else app.log("locSrv.age") == 600
-
-
 # The folder and its build for the board
 
 

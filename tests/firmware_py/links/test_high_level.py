@@ -356,13 +356,6 @@ def test_robot_that_was_pushed_out_of_the_box_may_return(boxed: Flyer) -> None:
     assert boxed.order(boxed.commander.go_to, 0.31, 0.0, 1.15, 0.0, 1.0) == ENOEXEC
 
 
-def test_set_point_outside_the_box_leaves_the_last_one_in_force(boxed: Flyer) -> None:
-    boxed.post(boxed.low_level.send_position_setpoint, 0.1, 0.0, 1.2, 0.0)
-    boxed.post(boxed.low_level.send_position_setpoint, 1.0, 0.0, 1.2, 0.0)
-    assert boxed.goal() == pytest.approx([0.1, 0.0, 1.2], abs=1e-6)
-    assert any(line.startswith("commander: set-point refused: it leaves the box") for line in boxed.console)
-
-
 @pytest.mark.parametrize("place", [(0.0, 0.0, 1.1), (0.95, 0.0, 0.0), (0.7, 0.7, 0.0), (0.0, 0.0, -2.1)])
 def test_pose_that_cannot_be_a_correction_changes_nothing_and_is_reported_once(
     relative: Flyer, place: tuple[float, float, float]

@@ -54,12 +54,6 @@ def test_external_pose_is_cflibs_bytes_and_the_age(p, age_us):
     assert len(ours) == 1 + 30
 
 
-def test_external_pose_of_one_two_three_has_these_bytes():
-    golden = "6d08" + struct.pack("<7f", 1, 2, 3, -0.5, 0.5, 0.5, 0.5).hex()
-    assert cflib_ext_pose((1, 2, 3), (-0.5, 0.5, 0.5, 0.5)).hex() == golden
-    assert crtp.encode_ext_pose((1, 2, 3), Q, 40_000).hex() == golden + "50"
-
-
 @given(st.tuples(metres, metres, metres), st.integers(-1000, 1_000_000))
 def test_pose_survives_the_wire_with_its_age_to_half_a_unit(p, age_us):
     message = crtp.decode_ext_pose(crtp.decode(crtp.encode_ext_pose(p, Q, age_us)).data)

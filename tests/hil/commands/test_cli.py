@@ -76,6 +76,7 @@ def test_a_failed_limit_is_exit_code_one(cli: Cli) -> None:
         (["report", "nowhere"], "nowhere"),
         (["view", "nowhere"], "nowhere"),
         (["flyy"], "No such command"),
+        (["study", "latensy"], "study 'latensy': unknown; did you mean latency?"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_two(cli: Cli, arguments: list[str], message: str) -> None:

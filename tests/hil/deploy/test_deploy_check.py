@@ -20,12 +20,10 @@ from firmware_py.export.plain import PlainRunner
 from firmware_py.extras import install_command
 from firmware_py.logic.plugs import CALLS
 from hil.deploy.check import Checked, check_flight, plan, reached
-from hil.deploy.targets import TARGETS
 from hil.devices.board_firmware import PythonBoard
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from support.command import Cli
-from support.core_streams import MEMORY
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -157,20 +155,6 @@ def test_logic_that_fails_is_flown_where_targets_are_built_for_it(own_logic: boo
 
 
 SOMETHING_OF_EACH = ("--duration", "0.8", "--fault", "mocap.latency@0.2:0.4=150", "--fault", "push.y@0.4=2")
-
-
-@pytest.mark.long
-def test_all_targets_are_equal_in_a_short_flight_with_faults(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, built: Path
-) -> None:
-    monkeypatch.chdir(built)
-    assert cli("deploy", "check", "yaw-step", *SOMETHING_OF_EACH) == 0
-    shown = cli.out
-    assert [line.split()[0] for line in shown.splitlines() if line.endswith("equal")] == list(TARGETS)
-    assert "180 ticks, numba beside plain, c-O0, c-O2, cortex-m4: no bit differs" in shown
-    assert re.search(rf"flash \d+ B, RAM {MEMORY} B, stack \d+ B\n", shown)
-    mean, worst = map(int, re.search(r"per tick: mean (\d+), worst (\d+)", shown).groups())
-    assert 10_000 < mean <= worst < 200_000
 
 
 @pytest.mark.long

@@ -43,14 +43,6 @@ def test_hover_with_the_authors_gains_swings_in_y_and_survives(tmp_path: Path) -
         assert np.mean([result.metrics[f"within_6cm_{axis}"] for result in results]) > 0.95
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
-@pytest.mark.long
-def test_without_the_predictor_the_authors_gains_lose_the_robot(tmp_path: Path, seed: int) -> None:
-    result = hover(tmp_path / "run", "predictor.enabled=false", profile="as-flown", seed=seed)
-    assert result.outcome == "lost", explain(result)
-    assert result.cause is not None
-
-
 @pytest.mark.long
 def test_log_events_and_report_know_what_the_tracker_refused(tmp_path: Path) -> None:
     result = hover(tmp_path / "run", duration_s=2.0, faults=["mocap.outlier@1:0.05=0.5"])

@@ -17,7 +17,6 @@ from cflib.crazyflie.mem.trajectory_memory import Poly4D
 from cflib.positioning import position_hl_commander
 from cflib.positioning.position_hl_commander import PositionHlCommander
 from numpy.polynomial import Polynomial
-from scipy.spatial.transform import Rotation
 
 from firmware_py.geometry import to_euler_zyx
 from firmware_py.planner import Phase
@@ -31,7 +30,6 @@ POSE_PERIOD_US = 20_000
 LOOK_PERIOD_US = 10_000
 TRAJECTORIES = 3  # the memory's number
 RMS_M = 0.06
-NOTHING = (0.0, 0.0, 0.0)
 
 
 class Script:
@@ -180,28 +178,3 @@ def test_the_position_commander_goes_from_place_to_place() -> None:
         commander.back(0.05)
         commander.go_to(0.0, 0.0, 1.1)
     assert script.follows(2.2 + 4 * 0.1 + 0.4)
-
-
-@pytest.mark.long
-def test_set_points_of_a_position_are_followed() -> None:
-    script = Script(station=True)
-    for place in ((0, 0, 1.1), (-0.1, 0, 1.1), (0, 0, 1.1), (0, 0, 1.0)):
-        for _ in range(50):
-            script.low_level.send_position_setpoint(*place, 90)
-            script.wait(0.1)
-    script.low_level.send_stop_setpoint()
-    script.low_level.send_notify_setpoint_stop()
-    assert script.follows(20.0)
-
-
-@pytest.mark.long
-def test_set_points_of_the_full_state_are_followed() -> None:
-    script = Script(station=True)
-    for z, yaw, duration_s in ((1.1, 0.0, 4.0), (1.1, 0.7, 2.0), (1.0, 0.0, 2.0)):
-        q = Rotation.from_euler("z", yaw).as_quat()
-        for _ in range(round(duration_s / 0.2)):
-            script.low_level.send_full_state_setpoint((0.0, 0.0, z), NOTHING, NOTHING, q, 0.0, 0.0, 0.0)
-            script.wait(0.2)
-    script.low_level.send_stop_setpoint()
-    script.low_level.send_notify_setpoint_stop()
-    assert script.follows(8.0)

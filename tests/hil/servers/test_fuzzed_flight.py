@@ -56,7 +56,9 @@ def go_to(place: tuple[float, float, float]) -> bytes:
     return crtp.encode(crtp.Packet(high_level.PORT, 0, fields))
 
 
-@pytest.mark.parametrize("absolute", [False, True], ids=["corrections", "absolute poses"])
+@pytest.mark.parametrize(
+    "absolute", [False, pytest.param(True, marks=pytest.mark.long)], ids=["corrections", "absolute poses"]
+)
 @pytest.mark.parametrize(
     ("seed", "duration_s"), [(1, 2.5), *(pytest.param(s, 30.0, marks=pytest.mark.long) for s in (2, 3, 4))]
 )

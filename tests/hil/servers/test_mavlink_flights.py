@@ -58,7 +58,9 @@ def rms_cm(places: list[Any], goal: tuple[float, ...]) -> Any:
     return 100 * np.sqrt(np.mean((np.array(places) - goal[:3]) ** 2, axis=0))
 
 
-@pytest.mark.parametrize("kind", POSES)
+@pytest.mark.parametrize(
+    "kind", ["odometry", *(pytest.param(kind, marks=pytest.mark.long) for kind in (*POSES,)[:2])]
+)
 def test_poses_of_every_kind_fly_the_robot_to_its_goals(kind: str) -> None:
     lab = MavlinkLab()
     fly_on(kind, lab)
@@ -71,7 +73,13 @@ def test_poses_of_every_kind_fly_the_robot_to_its_goals(kind: str) -> None:
     assert ages_ms[-1] == pytest.approx(40.5, abs=2.0)  # camera 20, processing 18, line 1.5 to 4
 
 
-@pytest.mark.parametrize("poses", ["crtp corrections", "crtp poses", "mavlink"])
+@pytest.mark.parametrize(
+    "poses",
+    [
+        "mavlink",
+        *(pytest.param(f"crtp {poses}", marks=pytest.mark.long) for poses in ("corrections", "poses")),
+    ],
+)
 def test_offboard_flies_to_its_goals_and_holds_the_last_one_when_they_stop(poses: str) -> None:
     absolute = poses == "crtp poses"
     lab = MavlinkLab(

@@ -169,13 +169,3 @@ def test_a_study_can_be_flown_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert told["as_expected"] is True
     assert [len(variant["cells"]) for variant in told["variants"]] == [7, 7]
     assert told["variants"][0]["cells"][0]["outcomes"] == ["holds"]
-
-
-def test_an_unknown_study_is_one_line_and_exit_code_two(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["floaty", "study", "latensy"])
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert left.value.code == 2
-    assert capsys.readouterr().err == "floaty: study 'latensy': unknown; did you mean latency?\n"

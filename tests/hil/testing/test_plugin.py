@@ -135,21 +135,6 @@ def test_a_flight_that_no_command_names_is_flown_again_by_its_test(pytester: pyt
 
 
 @pytest.mark.long
-def test_of_many_flights_the_last_is_shown(strict: pytest.Pytester) -> None:
-    strict.makepyfile("""
-        def test_it(floaty):
-            for seed in range(1, 6):
-                flight = floaty.fly(duration_s=0.1, seed=seed)
-            assert flight.metrics["flown"] > 1.0
-        """)
-    result = strict.runpytest_inprocess()
-    shown = result.stdout.str().partition("floaty flights")[2]
-    assert re.findall(r"hover, seed (\d)", shown) == ["5"]
-    assert "(4 flights before that are not shown)" in shown
-    assert [path.rpartition("/")[2] for path in kept(strict)] == ["5"]
-
-
-@pytest.mark.long
 def test_hypothesis_shrinks_a_failing_flight_without_a_word_about_fixtures(pytester: pytest.Pytester) -> None:
     pytester.makepyfile("""
         from hypothesis import given, settings
