@@ -47,12 +47,19 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
     return compiled
 
 
-def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """Return the call of a function on these arguments; a compiled one then looks at their types only now."""
+def typed(function: Callable[..., Any], *examples: Any) -> Callable[..., Any]:
+    """Return a function for arguments of the types of these: a compiled one then looks at types no more."""
     compiled = getattr(function, "compile", None)
-    if compiled is None:
-        return partial(function, *arguments)
-    return partial(compiled(tuple(map(numba.typeof, arguments))), *arguments)
+    return (
+        function
+        if compiled is None
+        else cast(Callable[..., Any], compiled(tuple(map(numba.typeof, examples))))
+    )
+
+
+def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """Return the call of a function on these arguments."""
+    return partial(typed(function, *arguments), *arguments)
 
 
 def is_kept(function: Callable[..., Any]) -> bool:

@@ -69,7 +69,7 @@ class CoreBlocks:
         self, parameters: Block[Parameters], runner: RunnerFactory, logic: "Logic | None" = None
     ) -> None:
         self.parameters = parameters
-        self.data = Input.allocate()  # written by the estimator task, but for the mode: the stabilizer
+        self.data = Input.allocate()  # by the estimator task; gyro: the sensors task, mode: the stabilizer
         self.estimator = Estimator.allocate()  # by the estimator task; its `now` is the stabilizer's mailbox
         self.control = Control.allocate()  # written by the stabilizer task
         self.sampling = Sampling.allocate()  # by both
@@ -97,21 +97,27 @@ class CoreBlocks:
 class PythonRunner:
     """Runs the Python sources: compiled by numba, or plain with NUMBA_DISABLE_JIT=1."""
 
-    __slots__ = ("_blocks", "_calls")
+    __slots__ = ("_calls",)
 
     def __init__(self, blocks: CoreBlocks) -> None:
-        self._blocks = blocks
-        self._calls: dict[str, Callable[[], Any]] = {}
+        self._calls = _Calls(blocks)
 
     def call(self, name: str) -> int:
         """Execute an entry point; its first call compiles it."""
-        return int((self._calls.get(name) or self._bind(name))() or 0)
+        return self._calls[name]() or 0
 
-    def _bind(self, name: str) -> Callable[[], Any]:
+
+class _Calls(dict[str, Callable[[], Any]]):
+    """The entry points by name, each bound to its blocks when it is first looked up."""
+
+    def __init__(self, blocks: CoreBlocks) -> None:
+        self._blocks = blocks
+
+    def __missing__(self, name: str) -> Callable[[], Any]:
         blocks = self._blocks
         module = entry if blocks.logic is None else blocks.logic.loaded.entry
         arguments = (blocks.named[block].arg for block in blocks.calls[name])
-        return self._calls.setdefault(name, bound(getattr(module, name), *arguments))
+        return self.setdefault(name, bound(getattr(module, name), *arguments))
 
 
 class ConfiguredCosts:

@@ -23,7 +23,7 @@ from firmware_py.links.parameters import Parameter, ParameterService, ParameterS
 from firmware_py.links.platform import PlatformService
 from firmware_py.logic.loading import load_logic
 from firmware_py.parameters import parameters
-from firmware_py.pilot import Measurement, Pilot
+from firmware_py.pilot import Arrived, Pilot
 from firmware_py.rtos import Kernel, Queue, WatchdogError
 from firmware_py.rtos.statistics import Statistics
 from firmware_py.running import Running, StockState
@@ -89,11 +89,11 @@ class Firmware:
         self._imu_ready = self.kernel.create_binary_semaphore("imuReady")
         data_ready = self.kernel.create_binary_semaphore("dataReady")
         estimator_run = self.kernel.create_binary_semaphore("runTaskSemaphore")
-        self.measurements: Queue[Measurement] = self.kernel.create_queue(MEASUREMENT_QUEUE, "measurements")
+        self.measurements: Queue[Arrived] = self.kernel.create_queue(MEASUREMENT_QUEUE, "measurements")
         kernel, cost, costs = self.kernel, config.cpu, costs_of(core.run, config.cpu)
         kernel.create_task(
             "SENSORS", 4, sensors_task,
-            kernel, cost, board, self._imu_ready, self.measurements, data_ready, core,
+            kernel, cost, board, self._imu_ready, data_ready, core, self._zero_found,
         )  # fmt: skip
         kernel.create_task(
             "STABILIZER", 5, stabilizer_task,
@@ -101,8 +101,7 @@ class Firmware:
         )  # fmt: skip
         kernel.create_task(
             "KALMAN", 2, estimator_task,
-            kernel, cost, estimator_run, self.measurements, core, costs, self.pilot, self._zero_found,
-            self._pose_refused,
+            kernel, cost, estimator_run, self.measurements, core, costs, self.pilot, self._pose_refused,
         )  # fmt: skip
         kernel.create_task("PWRMGNT", 0, power_task, kernel, board, core)
         self.mavlink = self._mavlink_stack(config) if mavlink else None

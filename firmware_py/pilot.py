@@ -5,12 +5,9 @@ A pose is seen from the goal, which the planner moves in X, at the instant at wh
 idle, corrections are errors already (the goal is X's origin); with absolute poses there is nothing to fly to: the goal stays
 under the robot, and the supervisor keeps the flaps at hover.
 
-A `Measurement` is what travels in the measurement queue, from the sensors and the radio to the estimator.
+A pose travels as `Arrived` through the measurement queue, from the radio or the UART to the estimator.
 """
 
-from typing import Final, Literal
-
-from firmware_py.board import ImuCounts
 from firmware_py.core.structs import (
     GOAL_ABSOLUTE,
     GOAL_NONE,
@@ -25,16 +22,9 @@ from firmware_py.geometry import Vector, to_euler_zyx
 from firmware_py.planner import Motion, Path, Phase, Planner, stay
 from firmware_py.wire.crtp import Correction
 
-GYRO: Final = 0
-ACCELEROMETER: Final = 1  # not used by the filter, as in the original, but it takes its place in the queue
-POSE: Final = 2
-
 # When a pose arrived on board [us], the pose, whether it is absolute, and the goal at the instant at which it was true, in
 # the frame of the pose; None: the goal is not known.
 Arrived = tuple[int, Correction, bool, Motion | None]
-# Kind and value; plain tuples, because two are made every millisecond.
-Measurement = tuple[Literal[0, 1], ImuCounts] | tuple[Literal[2], Arrived]
-
 
 ORIGIN = Motion((0.0, 0.0, 0.0), 0.0)
 SETPOINT_SILENCE_US = 2_000_000  # Crazyflie firmware: COMMANDER_WDT_TIMEOUT_SHUTDOWN

@@ -12,7 +12,7 @@ from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.memories import Tester
 from firmware_py.links.parameters import ParameterStorage
 from firmware_py.links.platform import PlatformService
-from firmware_py.pilot import Measurement, Pilot
+from firmware_py.pilot import Arrived, Pilot
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 
@@ -35,7 +35,7 @@ class Running:
     board: Board
     core: CoreBlocks
     supervisor: Supervisor
-    measurements: Queue[Measurement]
+    measurements: Queue[Arrived]
     stack: CrtpStack
     localisation: LocalisationService
     platform: PlatformService

@@ -12,7 +12,7 @@ from firmware_py.config import CpuConfig
 from firmware_py.core.structs import POSE_NO_CORRECTION
 from firmware_py.core.subset import i32
 from firmware_py.core_runner import CoreBlocks, CoreCosts
-from firmware_py.pilot import ACCELEROMETER, GYRO, POSE, Measurement, Pilot, put_goal
+from firmware_py.pilot import Arrived, Pilot, put_goal
 from firmware_py.planner import Motion
 from firmware_py.rtos import Kernel, Queue, Semaphore
 from firmware_py.supervisor import Supervisor, wrapped
@@ -29,19 +29,19 @@ def sensors_task(
     cost: CpuConfig,
     board: Board,
     imu_ready: Semaphore,
-    measurements: Queue[Measurement],
     data_ready: Semaphore,
     core: CoreBlocks,
+    zero_found: Callable[[], None],
 ) -> Task:
     """Read the IMU whenever it has data."""
-    cost_us, gyro = cost.sensors_us, core.data.fields.gyro
+    cost_us, gyro = cost.sensors_us, core.data.fields.gyro.data
     while True:
         yield from imu_ready.take()
         yield from kernel.work(cost_us)
-        counts = board.read_imu()
-        gyro[0], gyro[1], gyro[2] = counts[:3]
-        yield from measurements.send_nowait((GYRO, counts))
-        yield from measurements.send_nowait((ACCELEROMETER, counts))
+        gyro[0], gyro[1], gyro[2] = board.read_imu()[:3]
+        if core.run.call("take_sample"):
+            zero_found()
+            yield from kernel.yield_if_pending()
         yield from data_ready.give_nowait()
 
 
@@ -56,13 +56,13 @@ def stabilizer_task(
     costs: CoreCosts,
 ) -> Task:
     """Run at 1 kHz on the tick edge after each IMU sample; control at 100 Hz."""
-    data = core.data.fields
+    tick = core.data.cell("tick")
     while True:
         if (yield from data_ready.take(DATA_TIMEOUT)):
             yield from kernel.delay_until(kernel.tick_count + 1)
         core.watchdog_fed_us = kernel.now_us
         yield from kernel.work(cost.stabilizer_us)
-        data.tick = i32(kernel.tick_count)
+        tick[0] = kernel.tick_count
         control_runs = core.run.call("begin_step")
         yield from estimator_run.give_nowait()
         if control_runs:
@@ -77,30 +77,22 @@ def estimator_task(
     kernel: Kernel,
     cost: CpuConfig,
     estimator_run: Semaphore,
-    measurements: Queue[Measurement],
+    measurements: Queue[Arrived],
     core: CoreBlocks,
     costs: CoreCosts,
     pilot: Pilot,
-    zero_found: Callable[[], None],
     pose_refused: Callable[[Correction], None],
 ) -> Task:
-    """Take measurements at 1 kHz, estimate at 100 Hz."""
-    sampling, sample = core.sampling.fields, core.data.fields.gyro_sample
+    """Take poses at 1 kHz, estimate at 100 Hz."""
+    estimate_due = core.sampling.cell("estimate_due")
     while True:
         yield from estimator_run.take()
         yield from kernel.work(cost.kalman_us)
-        while (measurement := measurements.receive_nowait()) is not None:
-            if measurement[0] == GYRO:
-                sample[0], sample[1], sample[2] = measurement[1][:3]
-                if core.run.call("take_sample"):
-                    zero_found()
-                    yield from kernel.yield_if_pending()
-            elif measurement[0] == POSE:
-                answer = hand_pose_to_core(kernel, core, *measurement[1])
-                if answer == POSE_NO_CORRECTION:
-                    pose_refused(measurement[1][1])
-                    yield from kernel.yield_if_pending()
-        if sampling.estimate_due:
+        while (arrived := measurements.receive_nowait()) is not None:
+            if hand_pose_to_core(kernel, core, *arrived) == POSE_NO_CORRECTION:
+                pose_refused(arrived[1])
+                yield from kernel.yield_if_pending()
+        if estimate_due[0]:
             yield from kernel.work(costs.estimate_us())
             put_goal(core.data.fields, pilot.frame(kernel.now_us))
             core.run.call("estimate")

@@ -79,11 +79,11 @@ def seek_zero(data: Input, sampling: Sampling) -> i32:
     """
     for axis in range(3):
         if sampling.samples == 0:
-            sampling.first[axis] = data.gyro_sample[axis]
+            sampling.first[axis] = data.gyro[axis]
             sampling.sums[axis] = i32(0)
             sampling.squares[axis] = ZERO
-        difference = f32(data.gyro_sample[axis]) - f32(sampling.first[axis])
-        sampling.sums[axis] = i32(sampling.sums[axis] + data.gyro_sample[axis])
+        difference = f32(data.gyro[axis]) - f32(sampling.first[axis])
+        sampling.sums[axis] = i32(sampling.sums[axis] + data.gyro[axis])
         sampling.squares[axis] = sampling.squares[axis] + difference * difference
     sampling.samples = i32(sampling.samples + 1)
     if sampling.samples < WINDOW:
@@ -108,7 +108,7 @@ def seek_zero(data: Input, sampling: Sampling) -> i32:
 def take_sample(data: Input, sampling: Sampling) -> i32:
     """Take a sample of the gyro; returns whether the gyro's zero has been found with it."""
     for axis in range(3):
-        data.gyro_sum[axis] = i32(data.gyro_sum[axis] + data.gyro_sample[axis])
+        data.gyro_sum[axis] = i32(data.gyro_sum[axis] + data.gyro[axis])
     data.gyro_samples = i32(data.gyro_samples + 1)
     if sampling.calibrated != 0:
         return i32(0)

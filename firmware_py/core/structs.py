@@ -197,7 +197,6 @@ class Input(Struct):
     now_us: i32
     gyro: Annotated[I32s, 3]  # [counts] the newest sample, sensor frame
     gyro_again: i32  # 1: it is the last one again, because the next is late on a link
-    gyro_sample: Annotated[I32s, 3]  # [counts] the sample to take
     gyro_sum: Annotated[I32s, 3]  # [counts] sum over the samples since the last tick, sensor frame
     gyro_samples: i32
     gyro_bias: Annotated[F32s, 3]  # [counts] the gyro's zero

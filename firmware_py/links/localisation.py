@@ -5,7 +5,7 @@ carry the last byte of the board's radio address. The pilot adds the goal from w
 """
 
 from firmware_py.links.crtp_stack import CrtpStack, Task
-from firmware_py.pilot import POSE, Measurement, Pilot
+from firmware_py.pilot import Arrived, Pilot
 from firmware_py.rtos import Queue
 from firmware_py.supervisor import Supervisor
 from firmware_py.wire import WireError, crtp, localisation
@@ -20,7 +20,7 @@ class LocalisationService:
     def __init__(
         self,
         stack: CrtpStack,
-        measurements: Queue[Measurement],
+        measurements: Queue[Arrived],
         supervisor: Supervisor,
         pilot: Pilot,
         address: int,
@@ -64,4 +64,4 @@ class LocalisationService:
 
     def _measure(self, now_us: int, pose: Correction) -> Task:
         self.last = pose
-        yield from self._measurements.send((POSE, self._pilot.measured(pose, now_us)), 0)
+        yield from self._measurements.send(self._pilot.measured(pose, now_us), 0)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from firmware_py.links.localisation import LocalisationService
 from firmware_py.links.mavlink_setpoints import SetpointService
 from firmware_py.links.mavlink_stack import MavlinkStack, Task
-from firmware_py.pilot import POSE, Measurement
+from firmware_py.pilot import Arrived
 from firmware_py.rtos import Queue
 from firmware_py.wire import mavlink
 from firmware_py.wire import mavlink_services as services
@@ -104,7 +104,7 @@ class PoseService:
     def __init__(
         self,
         stack: MavlinkStack,
-        measurements: Queue[Measurement],
+        measurements: Queue[Arrived],
         localisation: LocalisationService,
         setpoints: SetpointService,
     ) -> None:
@@ -128,7 +128,7 @@ class PoseService:
         goal = self._setpoints.see_pose()
         self.age_us = self._age_us(now_us, pose.t_us)
         self._localisation.last = Correction(pose.p_WB, pose.q_WB, self.age_us)
-        self._measurements.send_nowait((POSE, (now_us, self._localisation.last, True, goal)))
+        self._measurements.send_nowait((now_us, self._localisation.last, True, goal))
 
     def _age_us(self, now_us: int, t_us: int) -> int | None:
         """How long ago the sender's clock showed `t_us`; None when that is not known."""

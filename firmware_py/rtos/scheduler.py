@@ -81,7 +81,7 @@ class Scheduler:
             raise KernelError("run before start")
         if now_us < self.now_us:
             raise KernelError(f"time runs backwards: from {self.now_us} us to {now_us} us")
-        self._until_us = max(now_us, until_us)
+        self._until_us = until_us if until_us > now_us else now_us
         wake_us = self.next_wake_us
         if self._interrupted and (wake_us is None or wake_us > now_us):
             wake_us = now_us

@@ -36,7 +36,7 @@ class Semaphore:
         if self.count:
             kernel.count_call()
         else:
-            deadline = kernel.deadline(timeout)
+            deadline = timeout if timeout < 0 else kernel.tick_count + timeout
             while self.count == 0:
                 if not kernel.wait_in(self._takers, deadline, "Q_RECV", self.number):
                     return False

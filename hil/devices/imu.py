@@ -6,11 +6,13 @@ board; counts come in S.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.board import ImuCounts
+from firmware_py.compiling import typed
 from firmware_py.elementary import cos, sin, tan
 from hil.devices.config import ImuConfig
 from hil.errors import LabError
@@ -90,6 +92,7 @@ class VirtualImu:
         rows[:3, [B0, A1, A2]] = low_pass(config.gyro_bandwidth)
         rows[3:, [B0, A1, A2]] = low_pass(config.accel_bandwidth)
         self._draws: list[View] = []
+        self._channels: Callable[..., ImuCounts] | None = None  # for arrays like those of the first sample
         rows[:, RANGE] = COUNTS
         self.rate_range: float = COUNTS / GYRO_COUNTS
         self.frozen: bool = False
@@ -101,7 +104,10 @@ class VirtualImu:
         """Return gyro x y z and accelerometer x y z counts, in S, of the plant as it is now."""
         if not self._draws:
             self._draws = list(normal(self._rng, (NOISE_ROWS, 6)))
-        return channels(self._rows, plant.truth, self._draws.pop())
+        draws = self._draws.pop()
+        if self._channels is None:
+            self._channels = typed(channels, self._rows, plant.truth, draws)
+        return self._channels(self._rows, plant.truth, draws)
 
     def set_noise_scale(self, scale: float) -> None:
         """Scale the white noise of all channels; 1 as configured."""

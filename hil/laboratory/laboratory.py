@@ -28,7 +28,6 @@ class Laboratory:
         self.robots: list[Robot] = []
         self.now_us = 0
         self.end_us = NEVER_US
-        self._alone = False  # one robot and no wall clock: no turns to take
 
     def run(self, progress: Progress | None = None) -> None:
         """Go from one instant at which anything happens to the next, until `end_us`; may be called again.
@@ -42,16 +41,20 @@ class Laboratory:
 
     def _run(self, progress: Progress | None) -> None:
         clock, next_progress_us = self.clock, self.now_us
-        self._alone = not clock.paced and len(self.robots) == 1
         self._run_firmware()
         while self.now_us < min(WARM_UP_US, self.end_us):
             self._step(FREE)
         clock.start(self.now_us)
+        alone = not clock.paced and len(self.robots) == 1
         while self.now_us < self.end_us:
-            self._step(clock)
+            if alone:
+                self._step_alone()
+            else:
+                self._step(clock)
             if progress is not None and self.now_us >= next_progress_us:
                 progress(self.now_us)
                 next_progress_us = self.now_us + PROGRESS_PERIOD_US
+        self._run_firmware()
 
     def end_at(self, us: int) -> None:
         """End `run` at an instant."""
@@ -61,18 +64,26 @@ class Laboratory:
         """End `run` after the present instant."""
         self.end_us = self.now_us
 
+    def _step_alone(self) -> None:
+        """Run the only robot's firmware by itself up to the hardware's next event, and let that happen."""
+        robot = self.robots[0]
+        robot.run(self.now_us, self._next_event_us() - 1)
+        now_us = self._next_event_us()
+        robot.advance(now_us)
+        self.events.run(now_us)
+        self.now_us = now_us
+
     def _step(self, clock: Clock) -> None:
         events = self.events
         now_us = self._next_event_us()
-        if not self._alone:
-            robot, wake_us, other_us = self._first_to_wake()
-            if robot is not None and wake_us < now_us:
-                if clock.paced:
-                    now_us = wake_us
-                else:
-                    robot.run(max(wake_us, min(now_us, other_us) - 1))
-                    if other_us < now_us or (events.next_us is not None and events.next_us < now_us):
-                        return  # another robot comes first, or a task has triggered hardware that acts earlier
+        robot, wake_us, other_us = self._first_to_wake()
+        if robot is not None and wake_us < now_us:
+            if clock.paced:
+                now_us = wake_us
+            else:
+                robot.run(max(wake_us, min(now_us, other_us) - 1))
+                if other_us < now_us or (events.next_us is not None and events.next_us < now_us):
+                    return  # another robot comes first, or a task has triggered hardware that acts earlier
         if clock.paced:
             now_us = clock.wait_until(now_us)
         for robot in self.robots:
@@ -89,12 +100,9 @@ class Laboratory:
         return end_us if next_us is None or next_us > end_us else next_us
 
     def _run_firmware(self) -> None:
-        """Run the firmware of this instant; a single robot's goes on up to the next hardware event."""
-        if self._alone:
-            self.robots[0].run(self.now_us, self._next_event_us() - 1)
-        else:
-            for robot in self.robots:
-                robot.run(self.now_us)
+        """Run the firmware of this instant."""
+        for robot in self.robots:
+            robot.run(self.now_us)
 
     def _first_to_wake(self) -> tuple[Robot | None, int, int]:
         """Return the robot whose firmware acts first, when, and when the next one does."""

@@ -91,7 +91,7 @@ class Gyro:
         self.data, self.sampling = Input.allocate(), Sampling.allocate()
 
     def add(self, *counts: int) -> bool:
-        self.data.fields.gyro_sample[:] = counts
+        self.data.fields.gyro[:] = counts
         return bool(entry.take_sample(self.data.arg, self.sampling.arg))
 
     @property
@@ -140,7 +140,7 @@ def test_samples_are_summed_from_tick_to_tick() -> None:
     data = core.data.fields
     for _ in range(2):
         for k in range(10):
-            data.gyro_sample[:] = k, -k, 1
+            data.gyro[:] = k, -k, 1
             core.run.call("take_sample")
         assert (data.gyro_sum.tolist(), data.gyro_samples) == ([45, -45, 10], 10)
         core.run.call("estimate")

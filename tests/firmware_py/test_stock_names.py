@@ -138,6 +138,6 @@ def test_the_gyros_variance_is_that_of_the_samples_its_zero_is_from() -> None:
     samples = np.rint(rng.normal(0, (1.0, 2.0, 0.5), (512, 3))).astype(int).tolist()
     data, sampling = Input.allocate(), Sampling.allocate()
     for number, sample in enumerate(samples):
-        data.fields.gyro_sample[:] = sample
+        data.fields.gyro[:] = sample
         assert entry.take_sample(data.arg, sampling.arg) == (number == 511)
     assert sampling.fields.variance == pytest.approx(np.var(samples, axis=0), rel=1e-5)

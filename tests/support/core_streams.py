@@ -218,7 +218,7 @@ def record_plausible(seed: int, ticks: int) -> Recording:
         fields.mode = rng.choice(3, p=[0.1, 0.8, 0.1])
         fields.manual[:] = rng.normal(0, 1, 4)
         fields.tick, fields.now_us = tick, 1000 * tick
-        fields.gyro[:] = fields.gyro_sample[:] = rng.normal(0, 300, 3)
+        fields.gyro[:] = rng.normal(0, 300, 3)
         fields.battery_mv, fields.manual_mode = rng.integers(3000, 4000), rng.choice(3, p=[0.8, 0.1, 0.1])
         fields.idle, fields.connected, fields.by_words = rng.random(3) < 0.1
         fields.words[:] = rng.integers(65536, size=4)

@@ -124,13 +124,13 @@ def test_a_task_that_raises_is_named_and_the_log_is_there(tmp_path: Path) -> Non
 
 def test_an_overflowing_queue_is_counted_with_its_time(tmp_path: Path) -> None:
     def starve(flight: Flight) -> None:
-        flight.robot.thief.share = 0.93
+        flight.robot.thief.share = 0.97
 
     result = flown(tmp_path, hover(starve), duration_s=2.0)
-    queue = next(queue for queue in result.queues if queue.name == "measurements")
+    queue = next(queue for queue in result.queues if queue.name == "syslink")
     assert queue.dropped > 100
     assert queue.high_water == queue.length
-    noted = [event for event in load_events(tmp_path) if "queue measurements is full" in event["text"]]
+    noted = [event for event in load_events(tmp_path) if "queue syslink is full" in event["text"]]
     assert noted
     assert noted[0]["t_us"] < 1_000_000
 
@@ -140,7 +140,7 @@ def test_a_full_queue_is_noted_again_only_when_it_dropped_more(tmp_path: Path) -
 
     def starve(flight: Flight) -> None:
         thief = flight.robot.thief
-        flight.events.at(500_000, lambda _: setattr(thief, "share", 0.93))
+        flight.events.at(500_000, lambda _: setattr(thief, "share", 0.97))
         flight.events.at(2_500_000, lambda _: setattr(thief, "share", 0.0))
 
     result = flown(tmp_path, hover(starve), duration_s=5.0)
@@ -149,7 +149,7 @@ def test_a_full_queue_is_noted_again_only_when_it_dropped_more(tmp_path: Path) -
         if match := re.fullmatch(r"queue (\w+) is full: (\d+) dropped so far", event["text"]):
             noted.setdefault(match[1], []).append(int(match[2]))
     dropped = {queue.name: queue.dropped for queue in result.queues if queue.dropped}
-    assert len(noted["measurements"]) > 1
+    assert len(noted["syslink"]) > 1
     for name, counts in noted.items():
         assert counts == sorted(set(counts)), name
     assert {name: counts[-1] for name, counts in noted.items()} == dropped

@@ -97,7 +97,7 @@ def test_curves_and_states_stand_at_seconds_from_the_release() -> None:
     board = figures.board(log([0, 0, 0, 0], **counts, **states))
     _, queue, lanes = board.panels
     assert queue.series[0].times == pytest.approx([0.0, 0.01, 0.02, 0.03])
-    assert queue.label == "queue [measurements]", "poses, gyro and accelerometer samples"
+    assert queue.label == "queue [measurements]", "poses"
     shown = [(bar.lane, bar.name, bar.begin_s, bar.end_s) for bar in lanes.bars]
     second = functools.partial(pytest.approx, abs=1e-9)
     assert shown == [

@@ -148,7 +148,6 @@ static void take_measurements(stabilizerStep_t step) {
   FloatyPose pose;
   floaty_gyro(floaty_input.gyro);
   floaty_input.gyro_again = !floaty_hil_sample(floaty_input.gyro);
-  memcpy(floaty_input.gyro_sample, floaty_input.gyro, sizeof floaty_input.gyro_sample);
   floaty_input.tick = (int32_t)step;
   controlled = call_begin_step() != 0;
   call_take_sample();
