@@ -34,8 +34,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "firmware_py.firmware", "firmware_py.core_runner", "firmware_py.export", "firmware_py.board",
         "firmware_py.config", "firmware_py.signals", "firmware_py.rtos",
         "firmware_py.wire", "firmware_py.geometry", "firmware_py.elementary", "firmware_py.compiling",
-        "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic", "firmware_py.section",
-        "firmware_py.table",
+        "firmware_py.errors", "firmware_py.extras", "firmware_py.fast", "firmware_py.logic", "firmware_py.policy",
+        "firmware_py.section", "firmware_py.table",
     ),
 }  # fmt: skip
 
@@ -82,6 +82,8 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "multiprocessing": ("hil/campaigns/workers.py",),
     "concurrent": ("hil/campaigns/workers.py",),
     "unicorn": ("firmware_py/export/cortex_m4.py", "hil/stm32f405/chip.py"),
+    "onnx": ("firmware_py/policy/reading.py",),
+    "safetensors": ("firmware_py/policy/reading.py",),
     "elftools": ("firmware_py/export/elf.py",),
     "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
     "cffi": ("hil/stm32f405/chip.py",),

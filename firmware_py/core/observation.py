@@ -49,20 +49,20 @@ def observe(parameters: Parameters, estimator: Estimator, previous: F32s, out: F
 
 
 @kernel
-def limited(action: f32) -> f32:
-    """Return an action inside -1..1; NaN stays NaN, which the guard notices."""
-    if action > ONE:
-        return ONE
-    if action < -ONE:
-        return -ONE
-    return action
+def limited(x: f32, limit: f32) -> f32:
+    """Return x inside +-limit; NaN stays NaN, which the guard notices."""
+    if x > limit:
+        return limit
+    if x < -limit:
+        return -limit
+    return x
 
 
 @kernel
 def act(parameters: Parameters, action: F32s, control: Control) -> None:
     """Limit the action (4,) in place, and write the inputs u1..u4 [rad] that it means; the allocation follows."""
     for i in range(ACTIONS):
-        action[i] = limited(action[i])
+        action[i] = limited(action[i], ONE)
     control.u[0] = parameters.limit_u * action[0]
     control.u[1] = parameters.limit_u * action[1]
     control.u[2] = parameters.limit_u3 * action[2]

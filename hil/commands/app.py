@@ -19,6 +19,7 @@ from hil.installation import describe
 COMMANDS = {
     "fly": "fly.fly",
     "new": "new.new",
+    "policy": "new.policy",
     "list": "listing.list_experiments",
     "runs": "listing.runs",
     "view": "pictures.view",

@@ -1,36 +1,135 @@
-"""`floaty new`: a small project for the user's own control law, with profile, experiments and tests, ready to fly."""
+"""`floaty new` and `floaty policy`: folders with a control law, profile and tests, ready to fly.
+
+The first has a small law of the user's own, with experiments, the second a trained network as a law.
+"""
+
+from __future__ import annotations
 
 import re
+import textwrap
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from firmware_py.errors import FirmwareError
 from hil.commands.options import console
-from hil.errors import LabError
+from hil.errors import LabError, require
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 TEMPLATES = Path(__file__).parent / "project"  # NAME.in
+POLICY_TEMPLATES = Path(__file__).parent / "policy_project"
 NAMED = {"gitignore": ".gitignore"}  # files that would act on the template itself
+TOLERANCE = 1e-4  # of an action, -1..1
+ROOM = 0.9  # of the control slot: the cycles are those of one compiler, on some states
 
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 def new(folder: Path) -> None:
     """Make a project in DIR, which is new or empty: controller.py, profile.toml, experiments.py, tests, README.md."""
-    name = re.sub(r"[^a-z0-9]+", "-", folder.resolve().name.lower()).strip("-")
-    if not name:
-        raise LabError(f"new {folder}: a project's name, its folder's, has letters a to z or digits")
-    try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise LabError(f"new {folder}: it exists and is not empty; choose a folder that is new or empty")
-        for template in sorted(TEMPLATES.rglob("*.in")):
-            place = template.relative_to(TEMPLATES).with_suffix("")
-            path = folder / NAMED.get(str(place), place)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            text = template.read_text(encoding="utf-8").replace("{{ name }}", name)
-            path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise LabError(f"new {folder}: {error.strerror or error}") from None
+    write_project("new", TEMPLATES, folder, name=project_name("new", folder))
     console.print(
         f"cd {folder}; floaty fly hover --profile profile.toml; pytest; see README.md for more",
         soft_wrap=True, markup=False,
     )  # fmt: skip
+
+
+@click.command()
+@click.argument("file", metavar="FILE", type=click.Path(path_type=Path, dir_okay=False))
+@click.option(
+    "--out", "folder", required=True, metavar="DIR", type=click.Path(path_type=Path),
+    help="The folder to write, new or empty: controller.py, profile.toml, README.md, tests.",
+)  # fmt: skip
+def policy(file: Path, folder: Path) -> None:
+    """Write the control law of a trained policy: FILE.onnx or FILE.safetensors, a perceptron with tanh or ReLU.
+
+    Its input is the observation and its output the action of firmware_py/core/observation.py. The law is called as machine
+    code of the Cortex-M4, compared with FILE, and refused when a call exceeds its control slot.
+    """
+    from firmware_py.policy.measuring import Figures, measure
+    from firmware_py.policy.reading import LIBRARIES, read_policy
+    from hil.config import load_config
+    from hil.laboratory.lockstep import BUILD
+
+    if file.suffix in LIBRARIES:
+        require(f"policy {file}", "policy", LIBRARIES[file.suffix])
+    require_empty("policy --out", folder)
+    values: dict[str, Any] = {
+        "name": project_name("policy --out", folder),
+        "source": file.name,
+        "constant": _constant,
+    }
+    with TemporaryDirectory() as scratch:
+        try:
+            network, answer = read_policy(file)
+            values |= {"policy": network, "activations": {layer.activation for layer in network.layers}}
+            write_project("policy", POLICY_TEMPLATES, Path(scratch), **values, figures=Figures(0, 0, 0, 0.0))
+            figures = measure(load_config(f"{scratch}/profile.toml"), network, answer, BUILD)
+        except (FirmwareError, LabError) as error:
+            raise LabError(f"policy {file}: {str(error).replace(f'{scratch}/', '')}") from None
+    if figures.share > ROOM:
+        raise LabError(
+            f"policy {file}: {network.shape}: {figures}; at most {ROOM:.0%} of the slot are allowed"
+        )
+    if not figures.difference <= TOLERANCE:
+        text = f"the law's actions differ by {figures.difference:.2g} from the file's: at most {TOLERANCE:g}"
+        raise LabError(f"policy {file}: {text}")
+    write_project("policy", POLICY_TEMPLATES, folder, **values, figures=figures)
+    console.print(f"{network.shape}, {network.numbers} weights and biases: {figures}", soft_wrap=True)
+    console.print(
+        f"largest difference from {file.name}: {figures.difference:.1e} of an action", soft_wrap=True
+    )
+    console.print(f"floaty fly hover --profile {folder / 'profile.toml'}", soft_wrap=True, markup=False)
+
+
+def project_name(command: str, folder: Path) -> str:
+    """Return the name of the project in a folder."""
+    name = re.sub(r"[^a-z0-9]+", "-", folder.resolve().name.lower()).strip("-")
+    if not name:
+        raise LabError(f"{command} {folder}: a project's name, its folder's, has letters a to z or digits")
+    return name
+
+
+def require_empty(command: str, folder: Path) -> None:
+    """Raise `LabError` for a folder that has content, and for what is no folder."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise LabError(
+            f"{command} {folder}: it exists and is not empty; choose a folder that is new or empty"
+        )
+
+
+def write_project(command: str, templates: Path, folder: Path, **values: object) -> None:
+    """Write the files of a folder of templates, with the values in them, into one that is new or empty."""
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    )
+    try:
+        require_empty(command, folder)
+        for template in sorted(templates.rglob("*.in")):
+            place = template.relative_to(templates).with_suffix("")
+            path = folder / NAMED.get(str(place), place)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            text = environment.from_string(template.read_text(encoding="utf-8")).render(values)
+            path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LabError(f"{command} {folder}: {error.strerror or error}") from None
+
+
+def _constant(values: NDArray[np.float32]) -> str:
+    """Return an array as a constant of the subset, each row on lines of its own."""
+    if values.ndim == 1:
+        return f"constant({_wrapped(', '.join(map(str, values)))})"
+    rows = (f"({', '.join(map(str, row))}{',' * (len(row) == 1)})," for row in values)
+    return f"constant({''.join(map(_wrapped, rows))})"
+
+
+def _wrapped(text: str) -> str:
+    lines = textwrap.wrap(text, 116, break_on_hyphens=False, break_long_words=False)
+    return "".join(f"\n    {line}" for line in lines) + "\n" * (not text.endswith(","))

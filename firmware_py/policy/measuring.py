@@ -1,0 +1,83 @@
+"""Measures a learned law as machine code of the Cortex-M4: processor time, memory, and how far it is from its policy.
+
+Cycles are those of `firmware_py/export/cortex_m4.py` for one step of the controller. The weights are read from flash, for
+which five cycles are added per line of 16 bytes: the emulator counts the waits for instructions only.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from firmware_py.config import FirmwareConfig, parameters_of
+from firmware_py.core.budget import CALL_CYCLES
+from firmware_py.core.observation import OBSERVATIONS
+from firmware_py.core.structs import MODE_FLY, STATES
+from firmware_py.core_runner import CoreBlocks
+from firmware_py.export.arm_image import build_image, build_meter
+from firmware_py.export.c99 import translate
+from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
+from firmware_py.export.usage import CLOCK_MHZ
+from firmware_py.logic.loading import load_logic, translation_of
+from firmware_py.policy.network import Policy
+from firmware_py.policy.reading import Answer
+
+CALLS = 32
+# The largest position [m], velocity [m/s], attitude [rad], rate [rad/s] and flap deviation [rad] of a call's estimate.
+REACH = np.repeat([0.3, 0.5, 0.3, 2.0, 0.4], (3, 3, 3, 3, 4))
+GOLDEN = 0.6180339887498949  # its multiples modulo 1 fill the interval evenly
+LINE_BYTES, WAIT_STATES = 16, 5  # of the flash of an STM32F405 at 168 MHz
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What the law takes of the board, and its largest difference from the policy's actions."""
+
+    cycles: int  # of the longest call
+    flash_bytes: int  # more than the default core
+    ram_bytes: int  # likewise
+    difference: float
+
+    @property
+    def share(self) -> float:
+        """The share of its control slot that a call takes."""
+        return self.cycles / CALL_CYCLES
+
+    def __str__(self) -> str:
+        time = f"{self.cycles} cycles per call ({self.cycles / CLOCK_MHZ:.0f} us of a Cortex-M4)"
+        slot = f"{self.share:.0%} of its control slot of {CALL_CYCLES}"
+        return f"{time}, {slot}; flash {self.flash_bytes} B, RAM {self.ram_bytes} B"
+
+
+def measure(config: FirmwareConfig, policy: Policy, answer: Answer, build: Path) -> Figures:
+    """Call the law of a profile on states all over the flight envelope; `build` keeps what is compiled.
+
+    Raises `ExportError` when the emulator or the compiler is missing.
+    """
+    find_emulator()
+    core, flown = translate(), translation_of(config.logic)
+    default = build_image(core.source, core.header, build)
+    image, meter = build_image(flown.source, flown.header, build), build_meter(build)
+    blocks = CoreBlocks(
+        parameters_of(config), lambda blocks: CortexM4Runner(blocks, image, meter), load_logic(config.logic)
+    )
+    assert isinstance(blocks.run, CortexM4Runner)
+    memory = blocks.named["controller_memory"].memory
+    blocks.data.fields.mode = np.int32(MODE_FLY)
+    observations, actions = np.empty((CALLS, OBSERVATIONS), np.float32), np.empty((CALLS, 4), np.float32)
+    for call in range(CALLS):
+        steps = call * STATES + np.arange(1, STATES + 1)
+        blocks.estimator.fields.now[:] = REACH * (2 * (steps * GOLDEN % 1) - 1)
+        blocks.run.call("control")
+        observations[call], actions[call] = memory["observation"][0], memory["action"][0]
+    expected = np.clip(answer(observations), -1, 1)
+    lines = -(-4 * (policy.numbers + 2 * OBSERVATIONS) // LINE_BYTES)
+    own = [
+        block.memory.nbytes for name, block in blocks.named.items() if name in ("controller_memory", "guard")
+    ]
+    return Figures(
+        blocks.run.load["control"].worst_cycles + WAIT_STATES * lines,
+        len(image.code) - len(default.code),
+        sum(own),
+        float(np.abs(actions - expected).max()),
+    )

@@ -1,0 +1,99 @@
+"""`floaty policy`: the law that it writes answers as the file's framework does, on every target, and flies."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.config import parameters_of
+from firmware_py.core.structs import MODE_FLY
+from firmware_py.core_runner import CoreBlocks, PythonRunner
+from firmware_py.export.boards import runner_of
+from firmware_py.logic.loading import load_logic
+from firmware_py.policy.reading import read_policy
+from hil.config import load_config
+from hil.laboratory.result import read_result
+from support.command import Cli
+from support.paths import ROOT
+from support.policies import network, write_onnx
+
+pytest.importorskip("onnx")
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+FILES = ["README.md", "controller.py", "profile.toml", "tests/test_policy.py"]
+
+
+def files_in(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_policy_becomes_a_law_with_the_answers_of_its_framework(cli: Cli) -> None:
+    file = write_onnx(Path("hover.onnx"), network(), before=("Sub", "Div", "Clip"))
+    assert cli("policy", file, "--out", "law") == 0, cli.err
+    assert files_in(Path("law")) == FILES
+    first, second, _ = cli.out.splitlines()
+    assert first.startswith("20-64-40-4, 4108 weights and biases: ")
+    assert "us of a Cortex-M4), 11% of its control slot of 672000; flash 1" in first
+    assert second.startswith("largest difference from hover.onnx: ")
+    assert first.partition(": ")[2] in (Path("law") / FILES[0]).read_text(encoding="utf-8")
+
+    config, (_, answer) = load_config("law/profile.toml"), read_policy(file)
+    logic, build = load_logic(config.logic), ROOT / "runs" / "build"
+    runners = (PythonRunner, runner_of("c", build, config.logic), runner_of("cortex-m4", build, config.logic))
+    targets = [CoreBlocks(parameters_of(config), runner, logic) for runner in runners]
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        state, target = rng.normal(0, 0.3, 16), rng.normal(0, 0.1, 4)
+        for blocks in targets:
+            blocks.data.fields.mode = MODE_FLY
+            blocks.estimator.fields.now[:], blocks.parameters.fields.target[:] = state, target
+            blocks.run.call("control")
+        memories = {blocks.named["controller_memory"].bytes() for blocks in targets}
+        assert len(memories) == 1
+        memory = targets[0].named["controller_memory"].memory
+        expected = np.clip(answer(memory["observation"])[0], -1, 1)
+        assert np.abs(memory["action"][0] - expected).max() < 1e-5
+        assert np.abs(expected).max() > 0.01
+
+
+@pytest.mark.long
+def test_forty_thousand_weights_exceed_the_control_slot(cli: Cli) -> None:
+    file = write_onnx(Path("large.onnx"), network(sizes=(180, 201)))
+    assert "; at most 90% of the slot are allowed\n" in cli.refusal("policy", file, "--out", "law")
+    assert "20-180-201-4: 6" in cli.err
+    assert " of its control slot of 672000; flash 16" in cli.err
+    assert not Path("law").exists()
+
+
+def test_more_numbers_than_the_flash_has_room_for_are_one_line(cli: Cli) -> None:
+    file = write_onnx(Path("huge.onnx"), network(sizes=(256, 256)))
+    reason = "numbers in the constant arrays of this file: at most 65536"
+    assert reason in cli.refusal("policy", file, "--out", "law")
+    assert cli.err.startswith("floaty: policy huge.onnx: controller.py:")
+
+
+def test_a_file_or_folder_that_cannot_be_used_is_one_line(cli: Cli) -> None:
+    file = write_onnx(Path("bad.onnx"), network(), "Sigmoid")
+    assert "bad.onnx: Sigmoid /Sigmoid_1: a policy consists of " in cli.refusal(
+        "policy", file, "--out", "law"
+    )
+    assert "net.pt: .pt: expected a file .onnx or" in cli.refusal("policy", "net.pt", "--out", "law")
+    Path("taken").mkdir()
+    Path("taken/work").touch()
+    assert "policy --out taken: it exists and is not empty" in cli.refusal("policy", file, "--out", "taken")
+    assert not Path("law").exists()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("activation", ["Tanh", "Relu"])
+def test_a_policy_as_good_as_the_built_in_law_flies_and_its_tests_pass(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, pytester: pytest.Pytester, activation: str
+) -> None:
+    monkeypatch.chdir(pytester.path)
+    file = write_onnx(Path("hover.onnx"), network(activation.lower()), activation)
+    assert cli("policy", file, "--out", "law") == 0
+    assert (
+        cli("fly", "hover", "--profile", "law/profile.toml", "--duration", "3", "--board", "cortex-m4") == 0
+    )
+    assert read_result(Path("runs/hover-1")).program.logic
+    pytester.runpytest_inprocess("law").assert_outcomes(passed=2)
