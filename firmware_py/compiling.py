@@ -1,72 +1,277 @@
 """Compilation by numba: IEEE arithmetic as it is written, kept on disk, and never older than its sources.
 
-Without fast maths LLVM neither reorders nor fuses, so every processor computes the same bits. Numba decides by the file of
-the function alone whether its cached code is current, not by the files of what was inlined; here the content of all
-sources counts, wherever the cache lies (`__pycache__`, `NUMBA_CACHE_DIR`). Stale code is overwritten.
+Without fast maths LLVM neither reorders nor fuses, so every processor computes the same bits. A call on memory that stays
+where it is (`bound`) is kept as machine code, which a later process loads without numba: that alone takes longer than a
+short flight. Every other call goes through numba's dispatcher and its own cache. Kept code counts for the content of all
+sources, wherever it lies (`__pycache__`, `NUMBA_CACHE_DIR`). Stale code is overwritten.
 """
 
+import ctypes
 import hashlib
 import inspect
+import os
+import struct
 import sys
 from collections.abc import Callable
-from functools import partial
+from functools import cache, cached_property, partial, update_wrapper
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-# Numba would load the BLAS of scipy, which takes longer than all the rest of it; nothing that is compiled here uses one.
-if hide_scipy := "scipy" not in sys.modules:
-    sys.modules["scipy"] = None  # type: ignore[assignment] # an import fails
-import numba
-import numba.np.arraymath  # which looks for it, when the first function is compiled or loaded
-
-if hide_scipy:
-    del sys.modules["scipy"]
-
-PLAIN = bool(getattr(numba.config, "DISABLE_JIT"))  # noqa: B009 - set by numba at run time
+PLAIN = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
+SUFFIX = ".machine"
+WHOLE = ("None", "bool", "int", "i32", "int32")  # what a bound function may return
+# What kept code may call, by its name in C; numba never frees the memory of others.
+FOREIGN = {"NRT_MemInfo_call_dtor": "abort", "numba_ldexp": "ldexp"} | {
+    name: name for name in ("sqrt", "sqrtf", "memset", "memcpy", "memmove")
+}
+METHOD = "kept_method"
+NO_ARGUMENTS = 4  # `METH_NOARGS`
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+ctypes.pythonapi.PyCFunction_NewEx.restype = ctypes.py_object
+ctypes.pythonapi.PyCFunction_NewEx.argtypes = (ctypes.c_void_p, ctypes.py_object, ctypes.py_object)
 
 
 def compiler(*sources: Path) -> Callable[[Function], Function]:
     """Return the decorator of functions that depend on nothing but `sources`, files or folders, and their own file."""
     shared = hashlib.sha256(f"{np.__version__} {sys.version}".encode())
-    for source in (Path(__file__), *sources):
+    for source in (Path(__file__), *sources, *_version_of_numba()):
         for path in sorted(source.glob("*.py")) if source.is_dir() else (source,):
             shared.update(path.read_bytes())
 
     def compiled(function: Function) -> Function:
-        dispatcher: Any = numba.njit(cache=True, error_model="numpy", fastmath=False)(function)
-        if not PLAIN:
-            stamp = shared.copy()
-            stamp.update(Path(inspect.getfile(function)).read_bytes())
-            _kept(dispatcher)._source_stamp = stamp.hexdigest()
-        return cast(Function, dispatcher)
+        if PLAIN:
+            return function
+        stamp = shared.copy()
+        stamp.update(Path(inspect.getfile(function)).read_bytes())
+        return cast(Function, Compiled(function, stamp.hexdigest()))
 
     return compiled
 
 
-def typed(function: Callable[..., Any], *examples: Any) -> Callable[..., Any]:
-    """Return a function for arguments of the types of these: a compiled one then looks at types no more."""
-    compiled = getattr(function, "compile", None)
-    return (
-        function
-        if compiled is None
-        else cast(Callable[..., Any], compiled(tuple(map(numba.typeof, examples))))
-    )
+def _version_of_numba() -> list[Path]:
+    found = find_spec("numba")
+    return [Path(found.origin).with_name("_version.py")] if found is not None and found.origin else []
+
+
+class Compiled:
+    """A function that numba compiles when it is first called, also from another one."""
+
+    def __init__(self, function: Callable[..., Any], stamp: str) -> None:
+        self.__wrapped__: Callable[..., Any]
+        self.__name__: str
+        update_wrapper(self, function)
+        self.stamp = stamp
+        returned = function.__annotations__.get("return")
+        self.whole = getattr(returned, "__name__", str(returned)) in WHOLE
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        """Numba's dispatcher, whose cache follows all sources; numba itself looks at the function's file alone."""
+        dispatcher = _numba().njit(cache=True, error_model="numpy", fastmath=False)(self.__wrapped__)
+        dispatcher._cache._cache_file._source_stamp = self.stamp
+        return dispatcher
+
+    @property
+    def _numba_type_(self) -> Any:
+        return self.dispatcher._numba_type_
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function through numba."""
+        return self.dispatcher(*arguments)
+
+    def files(self, kinds: str = "*") -> list[Path]:
+        """Return the files of kept code for arguments of certain kinds, in each folder where it may lie."""
+        name = f"{self.__wrapped__.__module__}.{self.__name__}-{kinds}-{self.stamp[:24]}{SUFFIX}"
+        return [folder / name for folder in _folders(Path(inspect.getfile(self.__wrapped__)))]
 
 
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """Return the call of a function on these arguments."""
-    return partial(typed(function, *arguments), *arguments)
+    """Return the call of a function on these arguments; where all are arrays, on their memory as it is then."""
+    if not isinstance(function, Compiled):
+        return partial(function, *arguments)
+    if not function.whole or not all(map(_stays, arguments)):
+        return partial(function.dispatcher, *arguments)
+    method = _kept(function, arguments)
+    if method is None:
+        return partial(function.dispatcher, *arguments)
+    places = struct.pack(f"{len(arguments)}P", *(one.ctypes.data for one in arguments))
+    # the last argument, which nothing reads, keeps the memory as long as the call
+    return cast(
+        Callable[[], Any], ctypes.pythonapi.PyCFunction_NewEx(ctypes.byref(method), places, arguments)
+    )
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
     """Return whether a function has been compiled on this machine already."""
-    return PLAIN or bool(_kept(function)._load_index())
+    if not isinstance(function, Compiled):
+        return True
+    return any(next(path.parent.glob(path.name), None) for path in function.files())
 
 
-def _kept(dispatcher: Any) -> Any:
-    """Return numba's index of the cached code of a function."""
-    return dispatcher._cache._cache_file
+def _stays(argument: Any) -> bool:
+    return isinstance(argument, np.ndarray) and argument.flags.c_contiguous
+
+
+def _folders(source: Path) -> list[Path]:
+    """Return where code may be kept, the first choice first."""
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        return [Path(chosen)]
+    return [source.parent / "__pycache__", Path.home() / ".cache" / "floaty"]
+
+
+class _Method(ctypes.Structure):
+    """CPython's `PyMethodDef`."""
+
+    _fields_: ClassVar = [
+        ("name", ctypes.c_char_p),
+        ("address", ctypes.c_void_p),
+        ("flags", ctypes.c_int),
+        ("doc", ctypes.c_char_p),
+    ]
+
+
+_LOADED: dict[tuple[str, str, str], tuple[_Method, Any]] = {}  # with what holds its machine code
+
+
+def _kept(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> _Method | None:
+    """Return the machine code of a function on arrays of the kinds of these; None where it needs numba."""
+    kinds = [(one.dtype.str, one.shape) for one in arguments]
+    digest = hashlib.sha256(f"{kinds} {_processor()}".encode()).hexdigest()[:16]
+    key = (function.__wrapped__.__module__, function.__name__, digest)
+    if key not in _LOADED:
+        files = function.files(digest)
+        content = next((path.read_bytes() for path in files if path.is_file()), b"")
+        if not content:
+            content = _machine_code(function, arguments)
+            if not content:
+                return None
+            _keep(files, content)
+        _LOADED[key] = _load(function.__name__, content)
+    return _LOADED[key][0]
+
+
+def _keep(files: list[Path], content: bytes) -> None:
+    """Write kept code into the first folder that allows it, and remove what it replaces."""
+    for path in files:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial_file = path.with_name(f"{path.name}.{os.getpid()}")
+            partial_file.write_bytes(content)
+            partial_file.replace(path)
+        except OSError:
+            continue
+        for older in path.parent.glob(f"{path.name.rsplit('-', 1)[0]}-*{SUFFIX}"):
+            if older != path:
+                older.unlink(missing_ok=True)
+        return
+
+
+@cache
+def _processor() -> str:
+    """Return for which processor numba compiles: this one, unless the environment names another."""
+    from llvmlite import binding
+
+    features = sorted(name for name, there in binding.get_host_cpu_features().items() if there)
+    chosen = [os.environ.get(f"NUMBA_CPU_{what}") for what in ("NAME", "FEATURES")]
+    return f"{binding.get_host_cpu_name()} {features} {chosen}"
+
+
+def _machine_code(function: Compiled, arguments: tuple[NDArray[Any], ...]) -> bytes:
+    """Return the object file of a method without arguments, whose self has the addresses of the arrays.
+
+    Empty where the code needs numba.
+    """
+    from llvmlite import binding
+
+    numba = _numba()
+    names = [f"a{index}" for index in range(len(arguments))]
+    scope: dict[str, Any] = {"function": function, "carray": numba.carray}
+    for name, argument in zip(names, arguments, strict=True):
+        scope |= {f"{name}_shape": argument.shape, f"{name}_kind": argument.dtype}
+    call = f"function({', '.join(f'carray({name}, {name}_shape, {name}_kind)' for name in names)})"
+    nothing = str(function.__wrapped__.__annotations__.get("return")) == "None"
+    body = f"{call}\n    return 0" if nothing else f"return {call}"
+    exec(f"def on_arrays({', '.join(names)}):\n    {body}", scope)
+    signature = numba.types.int64(*[numba.types.voidptr] * len(arguments))
+    options = {
+        "error_model": "numpy",
+        "fastmath": False,
+        "no_cpython_wrapper": True,
+        "no_cfunc_wrapper": True,
+    }
+    dispatcher = numba.njit(**options)(scope["on_arrays"])
+    dispatcher.compile(signature)
+    done = dispatcher.overloads[signature.args]
+    module = done.library._final_module.clone()
+    called = {one.name for one in module.functions if one.is_declaration and not one.name.startswith("llvm.")}
+    if called - FOREIGN.keys():
+        return b""
+    module.link_in(binding.parse_assembly(_method_text(done.fndesc.llvm_func_name, len(arguments))))
+    return bytes(done.library.codegen._tm.emit_object(module))
+
+
+def _method_text(name: str, count: int) -> str:
+    """Return a method as LLVM's text; numba's function returns 0 unless it fails, and its answer through a pointer."""
+    lines = [
+        f"declare i32 @{name}(ptr, ptr{', ptr' * count})",
+        "declare ptr @PyBytes_AsString(ptr)",
+        "declare ptr @PyLong_FromLongLong(i64)",
+        f"define ptr @{METHOD}(ptr %self, ptr %nothing) {{",
+        "  %places = call ptr @PyBytes_AsString(ptr %self)",
+        "  %answer = alloca i64",
+        "  %failure = alloca ptr",
+    ]
+    for index in range(count):
+        lines.append(f"  %place{index} = getelementptr ptr, ptr %places, i64 {index}")
+        lines.append(f"  %array{index} = load ptr, ptr %place{index}")
+    arrays = "".join(f", ptr %array{index}" for index in range(count))
+    return "\n".join(
+        [
+            *lines,
+            f"  %status = call i32 @{name}(ptr %answer, ptr %failure{arrays})",
+            "  %fine = icmp eq i32 %status, 0",
+            "  br i1 %fine, label %done, label %failed",
+            "failed:",
+            "  ret ptr null",
+            "done:",
+            "  %value = load i64, ptr %answer",
+            "  %result = call ptr @PyLong_FromLongLong(i64 %value)",
+            "  ret ptr %result",
+            "}",
+        ]
+    )
+
+
+def _load(function: str, content: bytes) -> tuple[_Method, Any]:
+    """Return the method in an object file, and what holds its machine code in memory."""
+    from llvmlite import binding
+
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    process = ctypes.CDLL(None)
+    for name, in_c in FOREIGN.items():
+        if binding.address_of_symbol(name) is None:
+            binding.add_symbol(name, ctypes.cast(process[in_c], ctypes.c_void_p).value)
+    machine = binding.Target.from_default_triple().create_target_machine()
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
+    engine.add_object_file(binding.ObjectFileRef.from_data(content))
+    engine.finalize_object()
+    return _Method(function.encode(), engine.get_function_address(METHOD), NO_ARGUMENTS, None), engine
+
+
+@cache
+def _numba() -> Any:
+    """Return numba, without the BLAS of scipy, which takes longer to load than all the rest: nothing here uses one."""
+    if hide_scipy := "scipy" not in sys.modules:
+        sys.modules["scipy"] = None  # type: ignore[assignment] # an import fails
+    import numba
+    import numba.np.arraymath  # which looks for it, when the first function is compiled or loaded
+
+    if hide_scipy:
+        del sys.modules["scipy"]
+    return numba

@@ -63,6 +63,7 @@ CORE_LIBRARIES = {"numpy", "typing"}
 # Module or attribute -> the files that alone may use it.
 CONFINED: dict[str, tuple[str, ...]] = {
     "numba": ("firmware_py/compiling.py",),
+    "llvmlite": ("firmware_py/compiling.py",),
     "rerun": ("hil/pictures/viewer/",),
     "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
     "gymnasium": ("hil/learn/",),
@@ -85,7 +86,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "onnx": ("firmware_py/policy/reading.py",),
     "safetensors": ("firmware_py/policy/reading.py",),
     "elftools": ("firmware_py/export/elf.py",),
-    "ctypes": ("firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
+    "ctypes": ("firmware_py/compiling.py", "firmware_py/export/cortex_m4.py", "firmware_py/export/native.py"),
     "cffi": ("hil/stm32f405/chip.py",),
     "subprocess": (
         "hil/installation.py", "hil/live/", "hil/servers/linked.py",

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.board import ImuCounts
-from firmware_py.compiling import typed
+from firmware_py.compiling import bound
 from firmware_py.elementary import cos, sin, tan
 from hil.devices.config import ImuConfig
 from hil.errors import LabError
@@ -24,6 +24,8 @@ from hil.world.plant import Plant
 S_AZIMUTH = -math.pi / 4  # [rad] of S's x axis in B: then p = (gx + gy)/sqrt2, q = (gy - gx)/sqrt2, r = gz
 
 View = NDArray[np.float64]
+Counts = NDArray[np.int64]  # (7,) those of a sample, then the rows of noise that are left
+LEFT = 6
 
 
 # Layout of the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
@@ -44,22 +46,22 @@ def channel(row: View, truth: float, draw: float) -> int:
 
 
 @compiled
-def channels(rows: View, truth: View, draws: View) -> ImuCounts:
-    """Turn rates and specific force of the plant's array, in B, into S and then into counts."""
+def channels(rows: View, truth: View, draws: View, counts: Counts) -> None:
+    """Turn rates and specific force of the plant's array, in B, into S and then into counts, with the next row of noise."""
     ox, oy, fx, fy = (
         truth[at.OMEGA],
         truth[at.OMEGA + 1],
         truth[at.SPECIFIC_FORCE],
         truth[at.SPECIFIC_FORCE + 1],
     )
-    return (
-        channel(rows[0], COS * ox + SIN * oy, draws[0]),
-        channel(rows[1], COS * oy - SIN * ox, draws[1]),
-        channel(rows[2], truth[at.OMEGA + 2], draws[2]),
-        channel(rows[3], COS * fx + SIN * fy, draws[3]),
-        channel(rows[4], COS * fy - SIN * fx, draws[4]),
-        channel(rows[5], truth[at.SPECIFIC_FORCE + 2], draws[5]),
-    )
+    counts[LEFT] -= 1
+    noise = draws[counts[LEFT]]
+    counts[0] = channel(rows[0], COS * ox + SIN * oy, noise[0])
+    counts[1] = channel(rows[1], COS * oy - SIN * ox, noise[1])
+    counts[2] = channel(rows[2], truth[at.OMEGA + 2], noise[2])
+    counts[3] = channel(rows[3], COS * fx + SIN * fy, noise[3])
+    counts[4] = channel(rows[4], COS * fy - SIN * fx, noise[4])
+    counts[5] = channel(rows[5], truth[at.SPECIFIC_FORCE + 2], noise[5])
 
 
 SAMPLE_RATE = 1000.0  # [Hz]
@@ -91,8 +93,11 @@ class VirtualImu:
         rows[:, BIAS] = normal(rng, 6) * np.repeat([config.gyro_bias, config.accel_bias], 3)
         rows[:3, [B0, A1, A2]] = low_pass(config.gyro_bandwidth)
         rows[3:, [B0, A1, A2]] = low_pass(config.accel_bandwidth)
-        self._draws: list[View] = []
-        self._channels: Callable[..., ImuCounts] | None = None  # for arrays like those of the first sample
+        self._draws: View = np.zeros((NOISE_ROWS, 6))
+        self._counts: Counts = np.zeros(7, np.int64)
+        self._left = 0  # rows of noise
+        self._measure: Callable[[], object]
+        self._truth: View | None = None  # of the plant that was sampled last
         rows[:, RANGE] = COUNTS
         self.rate_range: float = COUNTS / GYRO_COUNTS
         self.frozen: bool = False
@@ -102,12 +107,15 @@ class VirtualImu:
 
     def sample(self, plant: Plant) -> ImuCounts:
         """Return gyro x y z and accelerometer x y z counts, in S, of the plant as it is now."""
-        if not self._draws:
-            self._draws = list(normal(self._rng, (NOISE_ROWS, 6)))
-        draws = self._draws.pop()
-        if self._channels is None:
-            self._channels = typed(channels, self._rows, plant.truth, draws)
-        return self._channels(self._rows, plant.truth, draws)
+        if self._truth is not plant.truth:
+            self._truth = plant.truth
+            self._measure = bound(channels, self._rows, plant.truth, self._draws, self._counts)
+        if self._left == 0:
+            self._draws[:] = normal(self._rng, (NOISE_ROWS, 6))
+            self._counts[LEFT] = NOISE_ROWS
+        self._measure()
+        *counts, self._left = self._counts.tolist()
+        return tuple(counts)
 
     def set_noise_scale(self, scale: float) -> None:
         """Scale the white noise of all channels; 1 as configured."""

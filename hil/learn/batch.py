@@ -11,11 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.compiling import compiler
 from firmware_py.config import parameters_of
 from firmware_py.core.guard import allocate
 from firmware_py.core.observation import ACTIONS, act, observe
@@ -24,7 +26,7 @@ from firmware_py.core.structs import ATTITUDE, FLAP, RATE, Control, Estimator
 from hil.config import LabConfig
 from hil.learn.tasks import PUSH_S, PUSHES, Episode
 from hil.world import layout as at
-from hil.world.fixed_order import atan2, compiled, exp, normal, sine_ahead
+from hil.world.fixed_order import SOURCES, atan2, exp, normal, sine_ahead
 from hil.world.motion import evaluate, step
 from hil.world.plant import Plant
 from hil.world.servos import MIDDLE_COUNTS, PERIOD_COUNTS, RAD_PER_COUNT, TIMER_MHZ
@@ -35,6 +37,7 @@ SEEN = 9  # position, velocity in W, and Euler angles, which come from the camer
 ERRORS = SEEN + 3  # and the rates, from the gyro
 GUSTS = 14
 Array = NDArray[np.float64]
+compiled = compiler(Path(__file__).parent, *SOURCES)
 Actions = NDArray[np.float32]
 
 

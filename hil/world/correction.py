@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.compiling import bound
 from firmware_py.elementary import cos, sin
 from hil.world import layout as at
 from hil.world.body import MIX
@@ -81,7 +82,7 @@ def accelerations(c: State, cause: str, amount: float) -> State:
         s[at.Q], s[at.Q + 1 + "xyz".index(cause[1])] = cos(amount / 2), sin(amount / 2)
     else:
         s[at.OMEGA + "xyz".index(cause[1])] = amount
-    evaluate(s)
+    bound(evaluate, s)()
     return np.concatenate([s[at.ACC : at.ACC + 3], s[at.ALPHA : at.ALPHA + 3]])
 
 
@@ -125,7 +126,7 @@ def trim_and_correct(s: State, config: PlantConfig, weight: Weight) -> None:
     design[at.MASS], design[at.DRAG_FACTOR], design[at.CORRECTED] = weight.mass, 1.0, 0.0
     design[at.INERTIA : at.INERTIA + 3] = weight.inertia
     design[at.PRESSURE] = 1.0
-    evaluate(design)
+    bound(evaluate, design)()
     s[at.PRESSURE] = design[at.PRESSURE] = weight.mass * GRAVITY / design[at.DRAG + 2]
     s[at.AIRSPEED] = config.airspeed
     s[at.CORRECTED] = float(config.variant != "plate")

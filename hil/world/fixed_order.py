@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from firmware_py import compiling, elementary
 
-compiled = compiling.compiler(Path(__file__).parent, Path(elementary.__file__))
+# What compiled functions of the laboratory depend on, besides their own files.
+SOURCES = (
+    Path(__file__).parent,
+    Path(elementary.__file__),
+    Path(elementary.__file__).with_name("core"),
+)
+compiled = compiling.compiler(*SOURCES)
 
 
 Matrix = NDArray[np.float64]

@@ -170,10 +170,10 @@ def step(s: State, draws: NDArray[np.float64], step_us: float) -> None:
 
 
 @compiled
-def advance(s: State, draws: NDArray[np.float64], now_us: int) -> bool:
-    """Do every step that ends at or before `now_us`; return True when the draws ran out before that."""
+def advance(s: State, draws: NDArray[np.float64], now_us: NDArray[np.int64]) -> bool:
+    """Do every step that ends at or before `now_us[0]`; return True when the draws ran out before that."""
     row = int(s[at.NOISE_ROW])
-    while s[at.TIME_US] + at.STEP_US <= now_us:
+    while s[at.TIME_US] + at.STEP_US <= now_us[0]:
         if row == draws.shape[0]:
             s[at.NOISE_ROW] = 0.0
             return True

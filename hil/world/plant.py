@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiling import typed
+from firmware_py.compiling import bound
 from firmware_py.elementary import cos
 from hil.errors import LabError
 from hil.world import layout as at
@@ -103,8 +103,10 @@ class Plant:
 
         self._rng = rng_gust
         self._draws = normal(rng_gust, (NOISE_ROWS, 14))
-        self._step = typed(advance, s, self._draws, 0)
+        self._now_us = np.zeros(1, np.int64)
         self._due_us = 0  # until then the truth stays
+        self._evaluate = bound(evaluate, s)
+        self._advance = bound(advance, s, self._draws, self._now_us)
         self.truth, self.state = self._view(0, at.SIZE), self._view(at.P, 17)
         self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
         self.omega_B, self.flaps = self._view(at.OMEGA, 3), self._view(at.FLAPS, 4)
@@ -139,14 +141,15 @@ class Plant:
         s[at.V : at.V + 3], s[at.OMEGA : at.OMEGA + 3] = v_WB, omega_B
         if flaps is not None:
             s[at.FLAPS : at.FLAPS + 4] = flaps
-        evaluate(s)
+        self._evaluate()
 
     def advance(self, now_us: int) -> None:
         """Bring the truth to the last whole millisecond at or before `now_us`."""
         if now_us < self._due_us:
             return
-        while self._step(self._s, self._draws, now_us):
-            self._draws = normal(self._rng, self._draws.shape)
+        self._now_us[0] = now_us
+        while self._advance():
+            self._draws[:] = normal(self._rng, self._draws.shape)
         self._due_us = now_us - now_us % at.STEP_US + at.STEP_US
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
@@ -175,7 +178,7 @@ class Plant:
         s = self._s
         s[at.HELD] = 1.0
         s[at.V : at.V + 3] = s[at.OMEGA : at.OMEGA + 3] = 0.0
-        evaluate(s)
+        self._evaluate()
 
     def put_back(self, p_WB: Vector) -> None:
         """Clamp the body upright at a place, with all causes of a loss cleared; the flaps stay as they are."""
@@ -186,7 +189,7 @@ class Plant:
     def release(self) -> None:
         """Release the body."""
         self._s[at.HELD] = 0.0
-        evaluate(self._s)
+        self._evaluate()
 
     def push(self, force_W: Vector, torque_B: Vector = (0.0, 0.0, 0.0)) -> None:
         """Apply a force [N, W] at the centre of mass and a torque [N m, B] until the next call."""
@@ -209,5 +212,5 @@ class Plant:
         """Return force [N] and torque [N m], (3,) each in B, on the robot fixed level in the design's uniform flow."""
         s = calm(self._s, self._airspeed)
         s[at.FLAPS : at.FLAPS + 4] = flaps
-        evaluate(s)
+        bound(evaluate, s)()
         return s[at.DRAG : at.DRAG + 3], s[at.DRAG + 3 : at.DRAG + 6]
