@@ -19,8 +19,7 @@ from firmware_py.export.c99 import translate
 from firmware_py.export.cortex_m4 import CortexM4Runner, find_emulator
 from firmware_py.export.usage import CLOCK_MHZ
 from firmware_py.logic.loading import load_logic, translation_of
-from firmware_py.policy.network import Policy
-from firmware_py.policy.reading import Answer
+from firmware_py.policy.reading import Policy
 
 CALLS = 32
 # The largest position [m], velocity [m/s], attitude [rad], rate [rad/s] and flap deviation [rad] of a call's estimate.
@@ -49,7 +48,7 @@ class Figures:
         return f"{time}, {slot}; flash {self.flash_bytes} B, RAM {self.ram_bytes} B"
 
 
-def measure(config: FirmwareConfig, policy: Policy, answer: Answer, build: Path) -> Figures:
+def measure(config: FirmwareConfig, policy: Policy, build: Path) -> Figures:
     """Call the law of a profile on states all over the flight envelope; `build` keeps what is compiled.
 
     Raises `ExportError` when the emulator or the compiler is missing.
@@ -70,8 +69,8 @@ def measure(config: FirmwareConfig, policy: Policy, answer: Answer, build: Path)
         blocks.estimator.fields.now[:] = REACH * (2 * (steps * GOLDEN % 1) - 1)
         blocks.run.call("control")
         observations[call], actions[call] = memory["observation"][0], memory["action"][0]
-    expected = np.clip(answer(observations), -1, 1)
-    lines = -(-4 * (policy.numbers + 2 * OBSERVATIONS) // LINE_BYTES)
+    expected = np.clip(policy.answer(observations), -1, 1)
+    lines = -(-4 * policy.numbers // LINE_BYTES)
     own = [
         block.memory.nbytes for name, block in blocks.named.items() if name in ("controller_memory", "guard")
     ]

@@ -1,51 +1,122 @@
-"""Reads a policy from an ONNX file, with the answers of onnx's own evaluator, or from a safetensors file.
+"""Reads a trained policy, a multilayer perceptron, from an ONNX or a safetensors file.
 
-Of an ONNX graph the chain of nodes from its input to its first output is the policy; other outputs are left out. A
-safetensors file has the tensors of a `torch.nn.Sequential`, "0.weight" (outputs, inputs) and "0.bias" and so on, perhaps
-behind a common prefix, "observation.mean" and "observation.std" (20,), and the metadata "activation", "output" (none) and
-"limit" (of the normalised observation); or those of a stable-baselines3 policy, PPO's or SAC's `state_dict`.
+Of an ONNX graph the nodes that lead from its input to its first output are the policy; other outputs are left out. The names
+in a safetensors file are those of a `torch.nn.Sequential` or of a stable-baselines3 policy (docs/howto/learned-policy.md).
 """
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.core.observation import OBSERVATIONS
-from firmware_py.policy.network import NONE, RELU, TANH, Layer, Policy, PolicyError
+from firmware_py.core.observation import ACTIONS, OBSERVATIONS
+from firmware_py.errors import FirmwareError
 
 Answer: TypeAlias = Callable[[NDArray[np.float32]], NDArray[Any]]  # observations (n, 20) to actions (n, 4)
 LIBRARIES: Mapping[str, str] = {".onnx": "onnx", ".safetensors": "safetensors"}  # by suffix
-NODES = (
-    "Gemm, MatMul, Add, Tanh and Relu, before them Sub, Div, Mul, Add and Clip, and Clip to -1..1 at the end"
-)
-OBSERVED = ("observation.mean", "observation.std")
+DENSE, SCALE, LIMIT, TANH, RELU = "dense", "scale", "limit", "tanh", "relu"
+NODES = "Gemm, MatMul, Tanh, Relu, Add, Sub, Mul and Div with constants, and Clip to -a..a"
 # Of stable-baselines3: the prefix of the hidden layers, the last layer, the usual activation, that of the output.
 KNOWN = (
-    ("mlp_extractor.policy_net.", "action_net", TANH, NONE),
+    ("mlp_extractor.policy_net.", "action_net", TANH, "none"),
     ("actor.latent_pi.", "actor.mu", RELU, TANH),
 )
+OBSERVED = ("observation.mean", "observation.std")
 
 
-def read_policy(path: Path) -> tuple[Policy, Answer]:
-    """Return a policy, and what its framework answers to observations. Raises `PolicyError`."""
+class PolicyError(FirmwareError):
+    """A policy cannot become a law; the text says what of it, and what is allowed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of a network, on the outputs of the last dense one: WEIGHTS and BIASES, FACTORS and SUMMANDS, or LIMIT."""
+
+    kind: str
+    name: str  # in the file
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    layer: int = 0  # how many dense steps there are up to this one
+    inputs: int = OBSERVATIONS
+    outputs: int = OBSERVATIONS
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """The steps from the observation to the action, and the answers of the framework."""
+
+    steps: tuple[Step, ...]
+    answer: Answer
+
+    @property
+    def numbers(self) -> int:
+        """How many constants the steps have."""
+        return sum(array.size for step in self.steps for array in step.arrays.values())
+
+    @property
+    def shape(self) -> str:
+        """The numbers of inputs and outputs of the layers, as "20-64-64-4"."""
+        return "-".join(
+            [str(OBSERVATIONS), *(str(step.outputs) for step in self.steps if step.kind == DENSE)]
+        )
+
+
+def read_policy(path: Path) -> Policy:
+    """Return the policy of a file. Raises `PolicyError` for layers, shapes and numbers that cannot become a law."""
     if path.suffix not in LIBRARIES:
         raise PolicyError(f"{path.suffix or 'no suffix'}: expected a file {' or '.join(LIBRARIES)}")
     try:
         with np.errstate(all="ignore"):  # what is not finite is refused
-            if path.suffix == ".onnx":
-                return _read_onnx(path)
-            policy = _read_safetensors(path)
+            return _read_onnx(path) if path.suffix == ".onnx" else _read_safetensors(path)
     except OSError as error:
         raise PolicyError(error.strerror or str(error)) from None
-    return policy, policy.answer
 
 
-def _read_onnx(path: Path) -> tuple[Policy, Answer]:
+def _checked(steps: Iterable[Step]) -> tuple[Step, ...]:
+    """Return the steps with the numbers of their inputs and outputs, as float32."""
+    done, width, layer = [], OBSERVATIONS, 0
+    for step in steps:
+        arrays = {name: np.atleast_1d(array).astype(np.float32) for name, array in step.arrays.items()}
+        outputs = len(arrays["WEIGHTS"]) if step.kind == DENSE else width
+        for name, array in arrays.items():
+            if step.kind == SCALE and array.size == 1:
+                arrays[name] = array = np.full(width, array.ravel()[0])
+            wanted = {"WEIGHTS": (outputs, width), "LIMIT": (1,)}.get(name, (outputs,))
+            if array.shape != wanted:
+                shapes = [" x ".join(map(str, shape)) for shape in (array.shape, wanted)]
+                raise PolicyError(f"{name.lower()} of {step.name}: {shapes[0]}; expected {shapes[1]}")
+            if not np.isfinite(array).all():
+                place = np.argwhere(~np.isfinite(array))[0].tolist()
+                text = f"element {place} is {array[tuple(place)]}: expected finite numbers"
+                raise PolicyError(f"{name.lower()} of {step.name}: {text}")
+        layer += step.kind == DENSE
+        done.append(replace(step, arrays=arrays, layer=layer, inputs=width, outputs=outputs))
+        width = outputs
+    if not layer or width != ACTIONS:
+        raise PolicyError(f"{width if layer else 'no'} outputs: an action has {ACTIONS}")
+    return tuple(done)
+
+
+def answer_of(steps: Iterable[Step], observations: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the outputs (n, 4) to observations (n, 20), computed in float64."""
+    x = observations.astype(float)
+    for step in steps:
+        first, second = (*(array.astype(float) for array in step.arrays.values()), np.zeros(1), np.zeros(1))[
+            :2
+        ]
+        if step.kind == DENSE:
+            x = (first * x[:, None, :]).sum(axis=2) + second
+        elif step.kind == SCALE:
+            x = first * x + second
+        else:
+            x = {TANH: np.tanh(x), RELU: np.maximum(x, 0.0), LIMIT: np.clip(x, -first, first)}[step.kind]
+    return x
+
+
+def _read_onnx(path: Path) -> Policy:
     import onnx
     from onnx.numpy_helper import to_array
     from onnx.reference import ReferenceEvaluator
@@ -63,11 +134,6 @@ def _read_onnx(path: Path) -> tuple[Policy, Answer]:
     for node in graph.node:
         if node.op_type == "Constant" and node.attribute[0].name == "value":
             constants[node.output[0]] = to_array(node.attribute[0].t)
-    chain = _Chain()
-    for node in _nodes_to(graph.output[0].name, graph, constants):
-        given = [constants.get(name) for name in node.input]
-        attributes = {one.name: onnx.helper.get_attribute_value(one) for one in node.attribute}
-        chain.add(node.op_type, f"{node.op_type} {node.name}".strip(), given, attributes)
     kind = graph.input[0].type.tensor_type
     number = onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type)
 
@@ -76,7 +142,12 @@ def _read_onnx(path: Path) -> tuple[Policy, Answer]:
         inputs: list[dict[str, Any]] = [{graph.input[0].name: row.astype(number)} for row in rows]
         return np.stack([np.ravel(evaluator.run(None, given)[0]) for given in inputs])
 
-    return chain.policy(), answer
+    steps = []
+    for node in _nodes_to(graph.output[0].name, graph, constants):
+        attributes = {one.name: onnx.helper.get_attribute_value(one) for one in node.attribute}
+        if node.op_type not in ("Identity", "Flatten"):
+            steps.append(_step(node, [constants.get(name) for name in node.input], attributes))
+    return Policy(_checked(steps), answer)
 
 
 def _nodes_to(output: str, graph: Any, constants: Mapping[str, Any]) -> list[Any]:
@@ -87,88 +158,36 @@ def _nodes_to(output: str, graph: Any, constants: Mapping[str, Any]) -> list[Any
         nodes.insert(0, makers[output])
         before = [name for name in nodes[0].input if name and name not in constants]
         if len(before) != 1:
-            raise PolicyError(
-                f"{nodes[0].op_type} {nodes[0].name}: {len(before)} inputs that are not constant: expected 1"
-            )
+            name = f"{nodes[0].op_type} {nodes[0].name}"
+            raise PolicyError(f"{name}: {len(before)} inputs that are not constant: expected 1")
         output = before[0]
     return nodes
 
 
-class _Chain:
-    """Collects the layers of an ONNX graph, node by node."""
-
-    def __init__(self) -> None:
-        self._scale, self._offset = np.ones(OBSERVATIONS), np.zeros(OBSERVATIONS)
-        self._limit = np.inf
-        self._layers: list[Layer] = []
-        self._closed = False  # an action has been limited: nothing follows
-
-    def policy(self) -> Policy:
-        """Return what the nodes make."""
-        scale, offset = self._scale.astype(np.float32), self._offset.astype(np.float32)
-        return Policy(scale, offset, self._limit, tuple(self._layers))
-
-    def add(
-        self, kind: str, name: str, given: list[NDArray[Any] | None], attributes: Mapping[str, Any]
-    ) -> None:
-        """Add a node; `given` are its inputs that are constant."""
-        if kind in ("Identity", "Flatten"):
-            return
-        if not self._closed:
-            if kind == "Clip" and self._clip(given, attributes):
-                return
-            if kind in ("Gemm", "MatMul") and self._product(name, given, attributes):
-                return
-            if self._layers and kind in ("Tanh", "Relu") and self._layers[-1].activation == NONE:
-                self._layers[-1] = replace(self._layers[-1], activation=kind.lower())
-                return
-            if kind in ("Sub", "Div", "Mul", "Add") and self._shift_or_scale(kind, given):
-                return
-        raise PolicyError(f"{name}: a policy consists of {NODES}")
-
-    def _clip(self, given: list[NDArray[Any] | None], attributes: Mapping[str, Any]) -> bool:
-        low, high = [*given[1:], attributes.get("min"), attributes.get("max")][:2]
-        if low is None or high is None or float(low) != -float(high) or self._limit < np.inf:
-            return False
-        if not self._layers:
-            self._limit = float(high)
-        self._closed = bool(self._layers)
-        return not self._layers or float(high) == 1.0
-
-    def _product(self, name: str, given: list[NDArray[Any] | None], attributes: Mapping[str, Any]) -> bool:
-        weights = given[1]
-        plain = attributes.get("alpha", 1.0) == attributes.get("beta", 1.0) == 1.0
-        if weights is None or not plain or attributes.get("transA") or given[0] is not None:
-            return False
-        weights = weights if attributes.get("transB") else weights.T
-        biases = given[2] if len(given) > 2 else None
-        biases = np.zeros(weights.shape[:1]) if biases is None else np.ravel(biases)
-        self._layers.append(Layer(name, weights.astype(np.float32), biases.astype(np.float32)))
-        return True
-
-    def _shift_or_scale(self, kind: str, given: list[NDArray[Any] | None]) -> bool:
-        """Take a sum or product with a constant: into the normalisation, or into the bias of a layer."""
-        numbers = [np.ravel(one).astype(float) for one in given if one is not None]
-        if len(numbers) != 1 or (kind in ("Sub", "Div") and given[0] is not None):
-            return False
-        if self._layers:
-            layer = self._layers[-1]
-            if (
-                kind != "Add"
-                or layer.activation != NONE
-                or numbers[0].shape not in (layer.biases.shape, (1,))
-            ):
-                return False
-            self._layers[-1] = replace(layer, biases=(layer.biases + numbers[0]).astype(np.float32))
-            return True
-        if self._limit < np.inf or len(numbers[0]) not in (1, OBSERVATIONS):
-            return False
-        factor = numbers[0] if kind == "Mul" else 1.0 / numbers[0] if kind == "Div" else 1.0
-        self._scale = self._scale * factor
-        self._offset = self._offset * factor
-        if kind in ("Add", "Sub"):
-            self._offset = self._offset + (numbers[0] if kind == "Add" else -numbers[0])
-        return True
+def _step(node: Any, given: list[NDArray[Any] | None], attributes: Mapping[str, Any]) -> Step:
+    """Return the step that a node stands for; `given` are its inputs that are constant."""
+    kind, name = str(node.op_type), f"{node.op_type} {node.name}".strip()
+    known = [np.asarray(one, float) for one in given if one is not None]
+    forward = given[0] is None  # the first input is the observation's
+    if kind in ("Tanh", "Relu"):
+        return Step(kind.lower(), name)
+    if kind in ("Add", "Mul") or (kind in ("Sub", "Div") and forward):
+        value = np.ravel(known[0])
+        factors = value if kind == "Mul" else 1.0 / value if kind == "Div" else np.ones(1)
+        summands = value if kind == "Add" else -value if kind == "Sub" else np.zeros(1)
+        return Step(SCALE, name, {"FACTORS": factors, "SUMMANDS": summands})
+    if kind == "Clip":
+        ends = [*known, *(np.asarray(attributes[key]) for key in ("min", "max") if key in attributes)]
+        if len(ends) == 2 and ends[0] == -ends[1] < 0:
+            return Step(LIMIT, name, {"LIMIT": ends[1]})
+    plain = attributes.get("alpha", 1.0) == attributes.get("beta", 1.0) == 1.0 and not attributes.get(
+        "transA"
+    )
+    if kind in ("Gemm", "MatMul") and forward and plain:
+        weights = known[0] if attributes.get("transB") else known[0].T
+        biases = np.ravel(known[1]) if len(known) > 1 else np.zeros(weights.shape[:1])
+        return Step(DENSE, name, {"WEIGHTS": weights, "BIASES": biases})
+    raise PolicyError(f"{name}: a policy consists of {NODES}")
 
 
 def _read_safetensors(path: Path) -> Policy:
@@ -177,33 +196,38 @@ def _read_safetensors(path: Path) -> Policy:
     try:
         with safe_open(path, framework="numpy") as file:
             metadata: dict[str, str] = file.metadata() or {}
-            tensors = {name: np.asarray(file.get_tensor(name), np.float32) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: np.asarray(file.get_tensor(name), float) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, TypeError, ValueError) as error:
         raise PolicyError(f"not a valid safetensors file: {error}") from None
-    mean = tensors.get(OBSERVED[0], np.zeros(OBSERVATIONS, np.float32)).astype(float)
-    std = tensors.get(OBSERVED[1], np.ones(OBSERVATIONS, np.float32)).astype(float)
-    if mean.shape != std.shape or not (std > 0).all():
-        raise PolicyError(
-            f"{' and '.join(OBSERVED)}: expected {OBSERVATIONS} numbers each, the second positive"
-        )
+    steps = _checked(_steps_of(tensors, metadata))
+    return Policy(steps, lambda observations: answer_of(steps, observations))
+
+
+def _steps_of(tensors: Mapping[str, NDArray[Any]], metadata: Mapping[str, str]) -> Iterator[Step]:
     names, activation, output = _layers_of(tensors, metadata)
-    layers = []
+    for kind in (activation, output):
+        if kind not in (TANH, RELU, "none"):
+            raise PolicyError(f"activation = {kind}: expected tanh, relu or none")
+    if tensors.keys() & set(OBSERVED):
+        mean, std = (
+            tensors.get(name, np.array(default)) for name, default in zip(OBSERVED, (0, 1), strict=True)
+        )
+        yield Step(SCALE, "observation.mean", {"FACTORS": np.ones(1), "SUMMANDS": -mean})
+        yield Step(SCALE, "observation.std", {"FACTORS": 1 / std, "SUMMANDS": np.zeros(1)})
+    if "limit" in metadata:
+        if not re.fullmatch(r"\d+(\.\d*)?", metadata["limit"]):
+            raise PolicyError(f"metadata limit = {metadata['limit']}: expected a positive number")
+        yield Step(LIMIT, "metadata limit", {"LIMIT": np.array([float(metadata["limit"])])})
     for name in names:
         if f"{name}.bias" not in tensors:
             raise PolicyError(f"{name}.weight has no {name}.bias")
+        yield Step(DENSE, name, {"WEIGHTS": tensors[f"{name}.weight"], "BIASES": tensors[f"{name}.bias"]})
         kind = output if name == names[-1] else activation
-        layers.append(Layer(name, tensors[f"{name}.weight"], tensors[f"{name}.bias"], kind))
-    try:
-        limit = float(metadata.get("limit", "inf"))
-    except ValueError:
-        raise PolicyError(f"metadata limit = {metadata['limit']}: expected a number") from None
-    scale, offset = (1.0 / std).astype(np.float32), (-mean / std).astype(np.float32)
-    return Policy(scale, offset, limit, tuple(layers))
+        if kind != "none":
+            yield Step(kind, name)
 
 
-def _layers_of(
-    tensors: Mapping[str, NDArray[np.float32]], metadata: Mapping[str, str]
-) -> tuple[list[str], str, str]:
+def _layers_of(tensors: Mapping[str, Any], metadata: Mapping[str, str]) -> tuple[list[str], str, str]:
     """Return the names of the layers in their order, the activation between them, and that of the output."""
     for prefix, last, usual, output in KNOWN:
         if f"{last}.weight" in tensors:
@@ -216,7 +240,7 @@ def _layers_of(
         raise PolicyError(f"tensor {name}: expected 0.weight, 0.bias, 2.weight …, {' and '.join(OBSERVED)}")
     if "activation" not in metadata:
         raise PolicyError("the metadata has no activation: expected tanh or relu")
-    return _in_order(others), metadata["activation"], metadata.get("output", NONE)
+    return _in_order(others), metadata["activation"], metadata.get("output", "none")
 
 
 def _in_order(names: list[str]) -> list[str]:

@@ -66,10 +66,9 @@ def policy(file: Path, folder: Path) -> None:
     }
     with TemporaryDirectory() as scratch:
         try:
-            network, answer = read_policy(file)
-            values |= {"policy": network, "activations": {layer.activation for layer in network.layers}}
+            values["policy"] = network = read_policy(file)
             write_project("policy", POLICY_TEMPLATES, Path(scratch), **values, figures=Figures(0, 0, 0, 0.0))
-            figures = measure(load_config(f"{scratch}/profile.toml"), network, answer, BUILD)
+            figures = measure(load_config(f"{scratch}/profile.toml"), network, BUILD)
         except (FirmwareError, LabError) as error:
             raise LabError(f"policy {file}: {str(error).replace(f'{scratch}/', '')}") from None
     if figures.share > ROOM:
@@ -80,7 +79,7 @@ def policy(file: Path, folder: Path) -> None:
         text = f"the law's actions differ by {figures.difference:.2g} from the file's: at most {TOLERANCE:g}"
         raise LabError(f"policy {file}: {text}")
     write_project("policy", POLICY_TEMPLATES, folder, **values, figures=figures)
-    console.print(f"{network.shape}, {network.numbers} weights and biases: {figures}", soft_wrap=True)
+    console.print(f"{network.shape}, {network.numbers} constants: {figures}", soft_wrap=True)
     console.print(
         f"largest difference from {file.name}: {figures.difference:.1e} of an action", soft_wrap=True
     )
