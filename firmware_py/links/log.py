@@ -27,10 +27,10 @@ class LogVariable:
     name: str
     scalar: Scalar
     unit: str
-    read: Callable[[], float]
+    read: Callable[[], int | float]
 
 
-Item = tuple[Scalar, Callable[[], float]]
+Item = tuple[Scalar, Callable[[], int | float]]  # compiled code would make a float of what may be whole
 
 
 @dataclass(slots=True)

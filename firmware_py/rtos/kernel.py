@@ -28,6 +28,7 @@ class Kernel(Scheduler):
         self.queues: list[Queue[Any]] = []
         self._timers = TimerService(self)
         self._first: Task | None = None  # the task that `start` runs first
+        self._idle_place = 0  # of the idle task among `tasks`
 
     def create_task(
         self,
@@ -83,6 +84,7 @@ class Kernel(Scheduler):
         """Create the idle and the timer service task; the tasks begin at the first `run`."""
         if self._started:
             raise KernelError("the scheduler was started already")
+        self._idle_place = len(self.tasks)
         self._idle = self.create_task("IDLE", 0, self._idle_task)
         self.create_task("Tmr Svc", SERVICE_PRIORITY, self._timers.run)
         assert self._first is not None
@@ -100,13 +102,13 @@ class Kernel(Scheduler):
 
     def run_times_us(self) -> list[int]:
         """Return the run time of every task, in the order of their creation."""
-        idle, current, current_left_us = self._idle, self.current, self._work_end_us - self.now_us
+        current, current_left_us = self.current, self._work_end_us - self.now_us
         times_us = [
-            0 if task is idle else task.work_us - (current_left_us if task is current else task.work_left_us)
-            for task in self.tasks
+            task.work_us - (current_left_us if task is current else task.work_left_us) for task in self.tasks
         ]
-        rest_us = self.now_us - sum(times_us)
-        return [rest_us if task is idle else us for task, us in zip(self.tasks, times_us, strict=True)]
+        times_us[self._idle_place] = 0
+        times_us[self._idle_place] = self.now_us - sum(times_us)
+        return times_us
 
     def work(self, duration_us: int) -> Iterable[int]:
         """Take processor time; others may run in between."""

@@ -240,11 +240,11 @@ def _scheduler_channels(firmware: BoardFirmware) -> tuple[Channel, ...]:
     queues = [queue for queue in scheduler.queues if queue.name == MEASUREMENTS]
     timed = [task for task in tasks if task.name in DEADLINES_US]
 
-    def counts() -> tuple[int, ...]:
-        return (
-            sum(queue.high_water for queue in queues), sum(queue.dropped for queue in queues),
-            *[task.deadline_misses for task in timed], *scheduler.run_times_us()[: len(tasks)],
-        )  # fmt: skip
+    def counts() -> list[int]:
+        counts = [sum([queue.high_water for queue in queues]), sum([queue.dropped for queue in queues])]
+        counts += [task.deadline_misses for task in timed]
+        counts += scheduler.run_times_us()[: len(tasks)]
+        return counts
 
     quantities = (
         quantity("rtos", "measurements_high_water measurements_dropped"),
