@@ -130,11 +130,9 @@ class ConfiguredCosts:
         self._cpu = cpu
 
     def estimate_us(self) -> int:
-        """Return the estimator's figure."""
         return self._cpu.estimator_us
 
     def control_us(self) -> int:
-        """Return the controller's figure."""
         return self._cpu.controller_us
 
 

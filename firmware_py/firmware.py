@@ -180,7 +180,6 @@ class Firmware:
 
     @property
     def log_numbers(self) -> dict[str, int]:
-        """The numbers of the log variables in the table of contents."""
         return {variable.name: number for number, variable in enumerate(self.variables)}
 
     @property
@@ -190,13 +189,11 @@ class Firmware:
 
     @property
     def overrun(self) -> str:
-        """Which loop of own logic first exceeded the budget of its call, as one line; empty: none."""
         core = self._core
         return "" if core.logic is None else core.logic.overrun(core.named)
 
     @property
     def next_wake_us(self) -> int | None:
-        """The next instant at which the firmware acts without an interrupt."""
         return self.kernel.next_wake_us
 
     def imu_ready(self) -> None:

@@ -96,7 +96,6 @@ SETTINGS = (
 
 
 def stock_variables(running: Running) -> Iterator[LogVariable]:
-    """Yield the log variables."""
     stack, supervisor, core = running.stack, running.supervisor, running.core
     parameters = core.parameters.fields
 
@@ -135,7 +134,6 @@ def _target(running: Running) -> tuple[Vector, float]:
 
 
 def stock_parameters(running: Running) -> Iterator[Parameter]:
-    """Yield the parameters."""
     for setting in SETTINGS:
         limit = INTEGER_LIMITS.get(setting.scalar)
         low, high = (-FLOAT_LIMIT, FLOAT_LIMIT) if limit is None else (0, limit)

@@ -41,7 +41,6 @@ class Supervisor:
 
     @property
     def armed(self) -> bool:
-        """Whether the robot is armed."""
         return bool(self._fields.armed)
 
     @property
@@ -56,7 +55,6 @@ class Supervisor:
 
     @property
     def battery_empty(self) -> bool:
-        """Whether the battery counts as empty."""
         return bool(self._fields.battery_empty)
 
     @property
@@ -86,7 +84,6 @@ class Supervisor:
 
     @property
     def battery_mv(self) -> int:
-        """The supply voltage [mV]."""
         return int(self._data.battery_mv)
 
     def look(self, now_us: int) -> None:

@@ -77,8 +77,6 @@ def whole_names(listed: str) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A field as it is declared."""
-
     block: str
     name: str
     base: str
@@ -169,7 +167,6 @@ def value_in(config: object, key: str) -> float:
 
 
 def profile_keys(section: str) -> Iterator[ProfileKey]:
-    """Yield the keys of a section of the profile."""
     for field in _FIELDS:
         for mark in field.marks:
             if isinstance(mark, Settable) and mark.section == section:

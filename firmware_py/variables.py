@@ -49,7 +49,6 @@ def log_variables(running: Running) -> tuple[LogVariable, ...]:
 
 
 def _declared(core: CoreBlocks, variable: CoreVariable) -> LogVariable:
-    """Return a variable of the table of variables."""
     place = variable.place
     read = partial(core.named[place.block].memory[place.field].item, 0, *place.index)
     return LogVariable(variable.name, variable.scalar, variable.unit, read)

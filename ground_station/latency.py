@@ -70,7 +70,6 @@ def _stage(name: str, times: Sequence[float]) -> Stage:
 
 
 def budget_line(budget: Sequence[Stage]) -> str:
-    """The budget in one line."""
     if not budget:
         return "no pose sent"
     pose, *parts = budget

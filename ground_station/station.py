@@ -40,8 +40,6 @@ class Link(Protocol):
 
 @dataclass(slots=True)
 class StationCounters:
-    """Counters of the ground station."""
-
     frames: int = 0  # from motion capture
     invalid: int = 0  # of these, not tracked, refused or not a pose
     sent: int = 0  # handed to the link

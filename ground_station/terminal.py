@@ -53,7 +53,6 @@ class Terminal:
         return lines
 
     def close(self) -> None:
-        """Restore the terminal."""
         self._closing = True
         if self._session is None:
             return

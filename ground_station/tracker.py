@@ -95,8 +95,6 @@ class Track:
 
 @dataclass(slots=True)
 class TrackerCounters:
-    """Counters of frames."""
-
     refused: int = 0
     restarts: int = 0  # tracks begun but the first
 

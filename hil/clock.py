@@ -43,7 +43,6 @@ class FreeRunning:
         """Nothing: it is always now."""
 
     def wait_until(self, now_us: int) -> int:
-        """Return at once."""
         return now_us
 
     def serve(self, now_us: int) -> None:
@@ -78,7 +77,6 @@ class Paced:
         self._next_notice_us = 0
 
     def start(self, now_us: int) -> None:
-        """Start the clock at the simulated instant."""
         self._start_ns = time.monotonic_ns() - now_us * 1000
 
     def shift(self, by_us: int) -> None:

@@ -69,7 +69,6 @@ class LabConfig(FirmwareConfig):
 
 
 def profile_names() -> list[str]:
-    """Return the names of the profiles that ship."""
     return sorted({path.stem for folder in _FOLDERS if folder.is_dir() for path in folder.glob("*.toml")})
 
 

@@ -189,7 +189,6 @@ class Figures:
         self.table.add_column("compared", justify="right")
 
     def add(self, name: str, value: float, unit: str, compared: str = "", digits: int = 2) -> None:
-        """Take a figure."""
         self.table.add_row(name, f"{value:.{digits}f} {unit}", compared)
         self.values[f"{name} [{unit}]"] = round(value, 4)
 

@@ -255,7 +255,6 @@ class ScenarioRun:
         return callback
 
     def _perform(self, operation: Operation, wake: PlannedWake) -> Generator[int, None, int]:
-        """Do one operation in the running task."""
         name, operands = operation
         signature, call = OPERATIONS[name]
         result = yield from call(self.kernel, *self._meant(signature, [*operands, wake][: len(signature)]))

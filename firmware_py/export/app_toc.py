@@ -210,7 +210,6 @@ def app_parameters(config: FirmwareConfig) -> tuple[AppParameter, ...]:
 
 
 def toc_source(config: FirmwareConfig) -> str:
-    """Return floaty_toc.c."""
     logic = load_logic(config.logic)
     table = app_parameters(config)
     variables = (*CORE_VARIABLES, *(() if logic is None else logic.loaded.variables))

@@ -9,7 +9,6 @@ C_TYPES = {"B": "uint8_t", "b": "int8_t", "H": "uint16_t", "h": "int16_t", "I": 
 
 
 def wire_header() -> str:
-    """Return floaty_wire.h."""
     constants = (
         "PORT_CORE",
         "CHANNEL_CALLS",

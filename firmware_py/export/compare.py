@@ -59,7 +59,6 @@ def _nan(words: NDArray[np.uint32]) -> NDArray[np.bool_]:
 
 
 def _value(words: NDArray[np.uint32], index: np.intp, floats: NDArray[np.bool_]) -> float:
-    """Return a word as the number that it is."""
     word = words[index : index + 1]
     return float(str(word.view(f32)[0])) if floats[index] else int(word.view(i32)[0])
 

@@ -134,7 +134,6 @@ class CortexM4Runner:
 
     @property
     def usage(self) -> Usage:
-        """What the core has used so far."""
         return Usage(len(self.image.code), self.ram_bytes, self.stack_bytes, self.load)
 
     def _look_ahead(self, name: str) -> int:

@@ -151,7 +151,6 @@ class Elf:
             raise ExportError(f"{self.path}: truncated: {len(self._content)} of at least {max(ends)} bytes")
 
     def _segments(self) -> list[Segment]:
-        """Return what is loaded."""
         begin, count = unpack_from("<I", self._content, 28)[0], unpack_from("<H", self._content, 44)[0]
         found = []
         for index in range(count):

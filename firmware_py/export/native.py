@@ -49,7 +49,6 @@ class NativeRunner:
             self._calls[name] = partial(function, *(places[block] for block in taken))
 
     def call(self, name: str) -> int:
-        """Execute an entry point."""
         return self._calls[name]() or 0
 
 

@@ -84,8 +84,6 @@ def _imported_modules(node: ast.stmt) -> list[str]:
 
 
 class _Reader:
-    """Reads one module."""
-
     def __init__(self, module: Module, text: str, tree: ast.Module, done: dict[str, Module]) -> None:
         self.module = module
         self._tree = tree

@@ -16,7 +16,6 @@ class EntryLoad:
     worst_cycles: int = 0
 
     def add(self, instructions: int, cycles: int) -> None:
-        """Add one call."""
         self.calls += 1
         self.instructions += instructions
         self.cycles += cycles

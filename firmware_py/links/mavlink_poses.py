@@ -34,8 +34,6 @@ SLACK_US = 1000  # some take their time stamps in whole milliseconds
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """One answer."""
-
     t_us: int  # when it arrived, our clock
     offset_us: int  # remote clock less ours
     half_us: int  # half of the round trip

@@ -64,17 +64,14 @@ class MavlinkStack:
 
     @property
     def frames(self) -> int:
-        """Frames received."""
         return self.counters.frames
 
     @property
     def lost(self) -> int:
-        """Frames lost."""
         return self.counters.lost
 
     @property
     def bad(self) -> int:
-        """Frames that were damaged or not correctly signed."""
         return self.counters.bad
 
     @property
@@ -93,7 +90,6 @@ class MavlinkStack:
         return self.kernel.now_us - self._heard_us < SILENCE_US
 
     def uart_ready(self) -> None:
-        """Interrupt: the UART has bytes."""
         self._received.give_from_isr()
 
     def handle(self, name: str, handler: Handler) -> None:

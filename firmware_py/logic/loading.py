@@ -43,12 +43,10 @@ class Loaded:
 
     @property
     def parameters(self) -> tuple[CoreParameter, ...]:
-        """All parameters."""
         return tuple(parameter for plug in self.plugs for parameter in plug.parameters)
 
     @property
     def variables(self) -> tuple[CoreVariable, ...]:
-        """All log variables."""
         return tuple(variable for plug in self.plugs for variable in plug.variables)
 
 

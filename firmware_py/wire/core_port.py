@@ -254,7 +254,6 @@ def read(offset: int, size: int) -> tuple[Kind, bytes]:
 
 
 def health() -> tuple[Kind, bytes]:
-    """Ask how the board is."""
     return Kind.HEALTH, b""
 
 

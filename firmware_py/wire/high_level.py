@@ -56,8 +56,6 @@ class VerticalWithVelocity(NamedTuple):
 
 
 class GoTo(NamedTuple):
-    """GO_TO."""
-
     groups: int
     relative: bool
     linear: bool
@@ -80,8 +78,6 @@ class Start(NamedTuple):
 
 
 class Define(NamedTuple):
-    """DEFINE."""
-
     trajectory: int
     location: int
     type: int

@@ -321,7 +321,6 @@ def flight_array(t_us: int, values: Sequence[float]) -> Message:
 
 
 def read_flight_array(message: Message) -> tuple[Sample, ...]:
-    """The samples in a `flight_array`."""
     if message.name != FLIGHT_ARRAY:
         raise WireError(f"array {message.name!r}: not {FLIGHT_ARRAY!r}")
     values, timestamp_ms = iter(message.data), message.time_usec // 1000 & TIMESTAMP_MASK

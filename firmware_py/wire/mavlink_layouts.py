@@ -119,8 +119,6 @@ class AvailableModes(_Later):
 
 
 class CurrentMode(_Later):
-    """CURRENT_MODE."""
-
     id = 436
     msgname = "CURRENT_MODE"
     fieldnames = ("standard_mode", "custom_mode", "intended_custom_mode")

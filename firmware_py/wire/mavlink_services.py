@@ -94,7 +94,6 @@ def timesync(tc1_ns: int, ts1_ns: int) -> Message:
 
 
 def ping_answer(request: Message) -> Message:
-    """The answer to a PING."""
     return dialect.MAVLink_ping_message(
         request.time_usec, request.seq, request.get_srcSystem(), request.get_srcComponent()
     )

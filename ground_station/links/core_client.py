@@ -102,12 +102,10 @@ class CoreClient:
         return answers
 
     def memory(self, size: int) -> bytes:
-        """Read the memory, all of it."""
         pieces = [read(offset, min(READ_MAX, size - offset)) for offset in range(0, size, READ_MAX)]
         return b"".join(answer.body for answer in self.execute(pieces))
 
     def close(self) -> None:
-        """Close the link."""
         self.packets.close()
 
     def _exchange(self, requests: Sequence[Request]) -> list[CoreAnswer]:

@@ -133,7 +133,6 @@ class CrazyradioLink(LiveLink):
         return self._lost
 
     def check(self) -> None:
-        """Raise `LinkError` when the link is lost."""
         super().check()
         now_us = clock_us()
         # cflib does not notice a reboot.
@@ -176,11 +175,9 @@ class CrazyradioLink(LiveLink):
         }
 
     def ask(self, now_us: int, request: Request) -> None:
-        """Begin an operator's request."""
         self._controls.ask(now_us, request)
 
     def answer(self, now_us: int) -> Answer | None:
-        """Return the answer once, when it is there."""
         return self._controls.answer(now_us)
 
     def start_telemetry(self, now_us: int) -> None:
@@ -255,7 +252,6 @@ class CrazyradioLink(LiveLink):
         self._rate = float(rate)
 
     def summary(self) -> str:
-        """Return one line on the state of the link."""
         radio = f"  quality {self.quality:.0f} %  {self._rate:.0f} exchanges/s" if self._rate else ""
         return f"corrections {self.sent} sent, {self.late} late{radio}"
 

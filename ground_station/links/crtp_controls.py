@@ -58,7 +58,6 @@ class CrtpControls(Dialogue[Packet]):
         self._table = table
 
     def ask(self, now_us: int, request: Request) -> None:
-        """Begin."""
         scripts: dict[Action, Callable[[], Script[Packet]]] = {
             Action.LIST: lambda: self._list(request.name),
             Action.READ: lambda: self._read(request.name),

@@ -28,5 +28,4 @@ class FrameLog:
             self._file.flush()
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()

@@ -28,7 +28,6 @@ class LoopbackLink:
         self._logs = LogBlocks(transmit, log_table)
 
     def start_telemetry(self, now_us: int) -> None:
-        """Ask the board for its telemetry."""
         self._logs.request(now_us)
 
     def send(self, now_us: int, frame: MocapFrame, goal: Goal) -> None:

@@ -94,7 +94,6 @@ class MavlinkLink:
     # Uplink
 
     def start_telemetry(self, now_us: int) -> None:
-        """Ask the board for telemetry."""
         self._asked = True
         self._samples = 0
         self._look_after(now_us)

@@ -30,7 +30,6 @@ class MavlinkControls(Dialogue[Message]):
         self._names: tuple[str, ...] = ()  # of the board's parameters, once they were listed
 
     def ask(self, now_us: int, request: Request) -> None:
-        """Begin."""
         scripts: dict[Action, Callable[[], Script[Message]]] = {
             Action.LIST: self._list,
             Action.READ: lambda: self._read(request.name),
@@ -119,7 +118,6 @@ class MavlinkControls(Dialogue[Message]):
 
 
 def _warning(message: Message) -> str | None:
-    """Return the text of a warning."""
     is_warning = message.get_type() == "STATUSTEXT" and message.severity <= WARNING
     return message.text if is_warning else None
 

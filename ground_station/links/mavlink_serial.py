@@ -157,12 +157,10 @@ class MavlinkSerialLink(LiveLink):
         return self._port.failure if self._port is not None else "closed"
 
     def check(self) -> None:
-        """Raise `LinkError` when the link is lost."""
         self.receive(clock_us(), b"")
         super().check()
 
     def mute(self) -> None:
-        """Send no more poses until `open`."""
         with self._link_lock:
             self._link.forget()
         super().mute()
@@ -173,7 +171,6 @@ class MavlinkSerialLink(LiveLink):
             port.close()
 
     def start_telemetry(self, now_us: int) -> None:
-        """Ask the board for its telemetry."""
         with self._link_lock:
             self._link.start_telemetry(now_us)
 
@@ -182,12 +179,10 @@ class MavlinkSerialLink(LiveLink):
             self._link.send(now_us, frame, goal)
 
     def ask(self, now_us: int, request: Request) -> None:
-        """Begin an operator's request."""
         with self._link_lock:
             self._link.controls.ask(now_us, request)
 
     def answer(self, now_us: int) -> Answer | None:
-        """Return the answer once, when it is there."""
         with self._link_lock:
             return self._link.controls.answer(now_us)
 
@@ -196,7 +191,6 @@ class MavlinkSerialLink(LiveLink):
             self._do(partial(port.write, data))
 
     def receive(self, now_us: int, data: bytes) -> Sequence[Sample]:
-        """The telemetry in what arrived at `now_us`."""
         link = self._link
         with self._link_lock:
             samples = link.receive(now_us, data, clock_us())
@@ -210,7 +204,6 @@ class MavlinkSerialLink(LiveLink):
         return samples
 
     def summary(self) -> str:
-        """Return one line on the state of the link."""
         frames, round_trip_us = self._link.counters, self._link.round_trip_us
         round_trip = "?" if round_trip_us is None else f"{round_trip_us / 1000:.1f}"
         return (

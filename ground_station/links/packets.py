@@ -37,12 +37,10 @@ class CflibPackets:
             raise LinkError(f"{uri}: no driver for this link")
 
     def send(self, data: bytes) -> None:
-        """Send to the board."""
         self._driver.send_packet(CRTPPacket(HEADER, list(data)))
         self._check()
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Return the next packet on the port within that time, else None."""
         end_us = clock_us() + round(timeout_s * 1e6)
         while True:
             left_s = (end_us - clock_us()) * 1e-6
@@ -65,7 +63,6 @@ class CflibPackets:
         self._check()
 
     def received(self, timeout_s: float = 0.0) -> list[bytes]:
-        """Return the whole packets received since the last call of this or `receive`, or the first within that time."""
         came: list[bytes] = []
         while (packet := self._driver.receive_packet(0 if came else timeout_s)) is not None:
             came.append(bytes((packet.header,)) + bytes(packet.data))
@@ -73,7 +70,6 @@ class CflibPackets:
         return came
 
     def close(self) -> None:
-        """Close the link."""
         self._driver.close()
 
     def _lose(self, text: str) -> None:

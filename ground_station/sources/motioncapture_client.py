@@ -88,7 +88,6 @@ class MotioncaptureSource:
         return choose_body(self._capture.body, list(names))
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
-        """The next frame, None when none comes in time."""
         deadline_us = clock_us() + round(timeout_s * 1e6)
         while True:
             now_us = clock_us()
@@ -102,13 +101,11 @@ class MotioncaptureSource:
                 return frame
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call."""
         notices = self._notices.copy()
         self._notices.clear()
         return notices
 
     def summary(self) -> str:
-        """A few words on its state."""
         return f"mocap {self._age_us / 1000:.1f} ms old (assumed), {self._lost} lost, {self._malformed} malformed"
 
     def close(self) -> None:

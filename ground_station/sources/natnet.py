@@ -152,7 +152,6 @@ Message = ServerInfo | ModelDefinition | Frame | Echo | Response | Other
 
 
 def packet(message: MessageId, payload: bytes = b"") -> bytes:
-    """The bytes of a packet."""
     return message.to_bytes(2, "little") + len(payload).to_bytes(2, "little") + payload
 
 

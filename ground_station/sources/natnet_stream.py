@@ -80,8 +80,6 @@ NOWHERE: tuple[Vector, Quaternion] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 @dataclass(slots=True)
 class StreamCounters:
-    """Counters of the stream."""
-
     frames: int = 0  # passed on
     lost: int = 0  # of these, without a pose
     dropped: int = 0  # twice, or after a newer one

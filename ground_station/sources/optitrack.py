@@ -64,7 +64,6 @@ class OptitrackSource:
         )
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
-        """The next frame, None when none comes in time."""
         deadline_us = clock_us() + round(timeout_s * 1e6)
         while True:
             data = self._next_packet(0.0)
@@ -78,18 +77,15 @@ class OptitrackSource:
                 return frame
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call."""
         notices = self._stream.notices.copy()
         self._stream.notices.clear()
         return notices
 
     def summary(self) -> str:
-        """A few words on its state."""
         counters = self._stream.counters
         return f"mocap {counters.lost} lost, {counters.dropped} dropped, {counters.malformed} malformed"
 
     def close(self) -> None:
-        """Disconnect."""
         for index, each in enumerate(self._sockets):
             if index == 0 and self._address:
                 with suppress(OSError):

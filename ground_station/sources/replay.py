@@ -44,7 +44,6 @@ class RecordingSource:
             self._file = self._path.open("a", encoding="utf-8", newline="\n")
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
-        """The next frame, None when none comes in time."""
         frame = self._source.receive(timeout_s)
         if frame is not None and self._file is not None:
             try:
@@ -54,16 +53,13 @@ class RecordingSource:
         return frame
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call."""
         notices, self._notices = self._notices, []
         return self._source.notices() + notices
 
     def summary(self) -> str:
-        """A few words on its state."""
         return self._source.summary()
 
     def close(self) -> None:
-        """Disconnect and close the file."""
         self._source.close()
         file, self._file = self._file, None
         if file is not None:
@@ -111,7 +107,6 @@ class ReplaySource:
         )
 
     def receive(self, timeout_s: float) -> MocapFrame | None:
-        """The next frame, None when none comes in time."""
         now_us = clock_us()
         # A caller that only polls is not ready yet, so the replay does not start.
         if self._shift_us is None and timeout_s > 0:
@@ -131,12 +126,10 @@ class ReplaySource:
         return MocapFrame(frame.t_us + self._shift_us, frame.p_WB, frame.q_WB, frame.valid)
 
     def notices(self) -> list[str]:
-        """Lines for the user since the last call."""
         notices, self._notices = self._notices, []
         return notices
 
     def summary(self) -> str:
-        """A few words on its state."""
         return f"mocap {self._next} of {len(self._frames)} replayed"
 
     def close(self) -> None:

@@ -171,7 +171,6 @@ def schema_of(plan: Plan) -> pa.Schema:
 
 
 def table_of(rows: Iterable[dict[str, Any]], schema: pa.Schema) -> pa.Table:
-    """Return rows by column as a table."""
     flat, columns = list(rows), []
     for field in schema:
         values = [row.get(field.name) for row in flat]

@@ -82,8 +82,6 @@ class Air:
 
 @dataclass(slots=True)
 class AirCounters:
-    """Counters of exchanges."""
-
     exchanges: int = 0
     retried: int = 0  # repetitions by the dongle
     unanswered: int = 0  # exchanges in which all tries were lost

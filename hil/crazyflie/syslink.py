@@ -15,7 +15,6 @@ EMPTY = b"\xff"  # a radio packet without contents
 
 
 def encode(kind: int, data: bytes) -> bytes:
-    """Return the frame."""
     body = bytes((kind, len(data))) + data
     return START + body + _sums(body)
 

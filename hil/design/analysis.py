@@ -24,8 +24,6 @@ CHECKED = 200  # openings at which plant and plate equations are compared
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """The results."""
-
     point: Point
     robot: list[tuple[str, str]]
     inputs: list[tuple[str, str, str]]  # input, alone, about the hover

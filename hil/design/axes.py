@@ -94,7 +94,6 @@ def robot_of(config: LabConfig, delay_s: float = OWN_DELAY_S) -> dict[str, float
 
 
 def gains_in(config: LabConfig, axis: Axis) -> Matrix:
-    """Return the gains of an axis in a profile."""
     return np.array([getattr(config.controller, name) for name in axis.gains])
 
 

@@ -17,8 +17,6 @@ FINE_S = 1e-4  # to which their margin is found
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """The margins."""
-
     stable: bool
     gain: float  # factor on the gain up to which it is stable, infinite without
     least_gain: float  # factor below 1 down to which it is stable, 0 without

@@ -40,8 +40,6 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """The result of an optimisation."""
-
     best: Tried
     reference: Tried
     tried: tuple[Tried, ...]

@@ -99,11 +99,9 @@ class VirtualBoard:
         return self._booted_us + (self._kernel.now_us if self._kernel else 0)
 
     def read_imu(self) -> ImuCounts:
-        """Return the last sample."""
         return self.imu
 
     def read_battery_mv(self) -> int:
-        """Return the supply voltage."""
         return self.battery_mv
 
     def write_compare(self, counts: Sequence[int]) -> None:
@@ -120,11 +118,9 @@ class VirtualBoard:
 
     @property
     def uart_overruns(self) -> int:
-        """Bytes that found the UART's receive buffer full."""
         return self._uart.overruns if self._uart else 0
 
     def uart_read(self) -> bytes:
-        """Return what the UART has received since the last time."""
         return self._uart.read() if self._uart else b""
 
     def uart_write(self, data: bytes) -> bool:
@@ -141,7 +137,6 @@ class VirtualBoard:
             self._kernel.stop_before(self._events.next_us - self._booted_us)
 
     def debug_write(self, text: str) -> None:
-        """Hand a line to the console."""
         self._console(self.now_us, text)
 
     def reset(self) -> None:

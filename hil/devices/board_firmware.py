@@ -29,8 +29,6 @@ Trace = Callable[
 
 
 class Variable(Protocol):
-    """A log variable."""
-
     @property
     def name(self) -> str:
         """Its group and name."""
@@ -268,5 +266,4 @@ class PythonBoard:
         return syslink_us(data)
 
     def boot(self, start: PowerOn) -> Firmware:
-        """Boot it."""
         return Firmware(start.config, start.board, start.serial, self.runner)

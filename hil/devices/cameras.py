@@ -107,7 +107,6 @@ class VirtualMocap:
 
 
 def _direction(rng: np.random.Generator) -> Vector:
-    """Return a random unit vector."""
     x, y, z = normal(rng, 3).tolist()
     s = 1.0 / math.sqrt(x * x + y * y + z * z)
     return (s * x, s * y, s * z)

@@ -48,7 +48,6 @@ class ChipSupervisor:
 
     @property
     def state(self) -> State:
-        """What it does."""
         number = int(self._state.read()) if self._state else State.CALIBRATING
         return (
             State(number) if number in tuple(State) else State.CALIBRATING
@@ -56,7 +55,6 @@ class ChipSupervisor:
 
     @property
     def cause(self) -> Cause:
-        """Why it is in its failsafe."""
         number = int(self._cause.read()) if self._cause else Cause.NONE
         return Cause(number) if number in tuple(Cause) else Cause.NONE
 
@@ -99,7 +97,6 @@ class ChipImage:
         return 0
 
     def boot(self, start: PowerOn) -> ImageFirmware:
-        """Switch it on."""
         return ImageFirmware(self, start.board, start.rest, polls=not start.polled)
 
 
@@ -136,7 +133,6 @@ class ImageFirmware:
         self.kernel.begin(WARM_UP_US)
 
     def differences(self, config: FirmwareConfig) -> str:
-        """Return in what the core of an image with the app differs from a profile, in one line; empty if in nothing."""
         if not self.image.has("floaty_parameters"):
             return ""
         parameters = parameters_of(config).memory
@@ -154,15 +150,12 @@ class ImageFirmware:
     # Interrupts and time
 
     def imu_ready(self) -> None:
-        """The IMU has a new sample."""
         self.parts.sample(self._board.read_imu())
 
     def radio_received(self, data: bytes, broadcast: bool = False) -> None:
-        """The radio chip has a packet."""
         self._crazyflie.radio_received(data, broadcast)
 
     def radio_polled(self) -> None:
-        """The radio chip has an empty packet."""
         self.radio_received(syslink.EMPTY)
 
     def uart_ready(self) -> None:
@@ -184,11 +177,9 @@ class ImageFirmware:
 
     @property
     def resets(self) -> int:
-        """How often it has begun anew."""
         return sum(self._crazyflie.resets.values())
 
     def report(self) -> ImageReport:
-        """Return what is left of its memory, and how often it has begun anew."""
         kernel, code = self._crazyflie.tasks, hashlib.sha256(self.image.code).hexdigest()
         try:
             tasks = [] if kernel is None or not kernel.running else kernel.tasks()

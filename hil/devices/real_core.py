@@ -98,12 +98,10 @@ class RealCore:
         return self._microseconds(self._filed_cycles + self._look_ahead("estimate").cycles)
 
     def control_us(self) -> int:
-        """Return the processor time of the controller's next call."""
         return self._microseconds(self._look_ahead("control").cycles)
 
     @property
     def usage(self) -> Usage:
-        """What the core has taken so far."""
         return Usage(None, self.about.size, None, self.load)
 
     def _look_ahead(self, name: str) -> Called:

@@ -171,7 +171,6 @@ class VirtualSerial:
 
     @property
     def overruns(self) -> int:
-        """Bytes that found the board's receive buffer full."""
         return self.up.overrun_bytes
 
     def read(self) -> bytes:

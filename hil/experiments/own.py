@@ -75,7 +75,6 @@ def entries() -> dict[str, EntryPoint]:
 
 
 def package_of(entry: EntryPoint) -> str:
-    """Return the package of an entry point, and its version."""
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.module
 
 

@@ -153,7 +153,6 @@ class Flight:
         self.events.at(end_us if self._trace_all else start_us + WINDOW_US, self.schedule.end)
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return the channels to record."""
         robot = self.robot
         channels = flight_channels(robot, self.line.trajectory)
         markers = (marker_channel(robot.mocap),) if robot.mocap.markers else ()

@@ -127,14 +127,12 @@ class ModelledLine:
         self.radio.uplink(now_us, packet)
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
-        """The station's messages."""
         return [("station", line) for line in self.station.notices()]
 
     def finish(self, lab: Laboratory) -> None:
         """Nothing: the station ends with its time line."""
 
     def close(self) -> None:
-        """Close the station's files."""
         with ExitStack() as closing:  # all of them, even on a full disk
             for written in (self._telemetry, self._frames):
                 if written is not None:

@@ -115,7 +115,6 @@ _RESULT = TypeAdapter(Result)
 
 
 def write_result(result: Result) -> None:
-    """Write `result.json`."""
     values = _RESULT.dump_python(result, mode="json")
     flat = {**values.pop("request"), **values.pop("program"), **values}
     (result.folder / RESULT).write_text(json.dumps(flat, indent=2) + "\n", encoding="utf-8")

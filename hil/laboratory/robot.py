@@ -182,26 +182,22 @@ class Robot:
 
     @property
     def next_wake_us(self) -> int | None:
-        """The next instant at which the firmware acts without an interrupt."""
         if not self.powered:
             return None
         wake_us = self.firmware.kernel.next_wake_us
         return None if wake_us is None else wake_us + self.booted_us
 
     def run(self, now_us: int, until_us: int = 0) -> None:
-        """Run the firmware's tasks up to this instant, until all are blocked or busy; and on to a later one, if given."""
         if self.powered:
             self.firmware.kernel.run(now_us - self.booted_us, until_us - self.booted_us)
 
     def advance(self, now_us: int) -> None:
-        """Bring the processor's clock to this instant, before hardware acts; nothing was due before it."""
         if self.powered and now_us - self.booted_us > self.firmware.kernel.now_us:
             self.firmware.kernel.advance(now_us - self.booted_us)
 
     # Body
 
     def release(self) -> None:
-        """Release the body."""
         self.plant.release()
         self.free = True
 
@@ -230,12 +226,10 @@ class Robot:
             self.firmware.radio_received(data, broadcast)
 
     def polled(self, now_us: int) -> None:
-        """The radio chip has an empty packet."""
         if self.powered:
             self.firmware.radio_polled()
 
     def uart_ready(self, now_us: int) -> None:
-        """The UART has bytes."""
         if self.powered:
             self.firmware.uart_ready()
 

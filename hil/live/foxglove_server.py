@@ -30,17 +30,14 @@ class FoxgloveScreen(ServerListener):
         self.address = f"ws://{LOOPBACK}:{self._server.port}"
 
     def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
-        """Show the next rows, and texts up to them."""
         log_rows(rows, self._context)
         log_texts(events, self._context)
 
     def know(self, values: Mapping[str, float]) -> None:
-        """Show values of the board's parameters."""
         self._values |= values
         self._server.publish_parameter_values(self._parameters(values))
 
     def close(self) -> None:
-        """End the server."""
         self._server.stop()
 
     def on_get_parameters(

@@ -33,7 +33,6 @@ class RerunScreen:
         self._flight: RerunFlight | None = None
 
     def show(self, rows: pa.Table, events: Iterable[Mapping[str, Any]]) -> None:
-        """Show the next rows, and texts up to them."""
         if self._flight is None:
             self._recording.send_blueprint(blueprint(rows.schema, live=True))
             self._flight = RerunFlight(self._recording, rows.schema)

@@ -109,7 +109,6 @@ def load_flown(folder: Path) -> FlownRun:
 
 
 def compare(a: FlownRun, b: FlownRun) -> Comparison:
-    """Compare two runs."""
     names_a, names_b = a.log.column_names, b.log.column_names
     common = [name for name in names_a if name in names_b]
     flown_s = tuple(_flown_s(run) for run in (a, b))

@@ -47,7 +47,6 @@ def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
 
 
 def figure_of(plot: Plot, marks: Marks) -> Figure:
-    """Return the figure of panels."""
     figure, axes = stack([panel.height for panel in plot.panels])
     for one, panel in zip(axes, plot.panels, strict=True):
         one.margins(x=0)

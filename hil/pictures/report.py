@@ -115,7 +115,6 @@ def metric_rows(result: Result) -> list[MetricRow]:
 
 
 def fault_rows(faults: Iterable[Fault]) -> list[FaultRow]:
-    """Return one row per fault."""
     rows = []
     for fault in faults:
         kind = KINDS[fault.kind]

@@ -63,7 +63,6 @@ class Connection:
         self._received = b""
 
     def send(self, kind: bytes, data: bytes) -> None:
-        """Send one frame."""
         self._sequence = (self._sequence + 1) & 0xFF
         self._socket.sendall(frame(kind, self._sequence, data))
 
@@ -83,7 +82,6 @@ class Connection:
             self._received += data
 
     def close(self) -> None:
-        """Unplug."""
         self._socket.close()
 
 

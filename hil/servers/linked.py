@@ -136,7 +136,6 @@ class StationProcess:
         return line, (clock,)
 
     def command(self, now_us: int, packet: bytes) -> None:
-        """Hand the operator's packet to the board as its radio does."""
         self.robot.packet_received(now_us, packet)
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
@@ -200,7 +199,6 @@ class StationProcess:
             self._station.wait()
 
     def close(self) -> None:
-        """Close what was opened."""
         self._kill()
         self._output.close()
         self._typed.close()

@@ -169,7 +169,6 @@ class VirtualMotive:
         readers[self._socket] = self._read
 
     def close(self) -> None:
-        """Stop serving."""
         del self._readers[self._socket]
         for each in (self._socket, *self._groups):
             each.close()

@@ -51,7 +51,6 @@ def encode_models(models: ModelDefinition, version: Version) -> bytes:
 
 
 def encode_frame(frame: Frame, version: Version) -> bytes:
-    """A frame of data."""
     nothing = _section((), version)
     assets = nothing if version >= (4, 1) else b""
     parts = (

@@ -163,7 +163,6 @@ class UdpEnd:
             self._received(now_us, self._socket.recv(READ_SIZE))
 
     def close(self) -> None:
-        """Close the socket."""
         self._readers.pop(self._socket, None)
         self._socket.close()
 

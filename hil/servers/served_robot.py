@@ -198,11 +198,9 @@ class ServedRobot:
 
     @property
     def battery_V(self) -> float:
-        """Supply voltage."""
         return self.robot.board.battery_mv * 1e-3
 
     def start(self, now_us: int) -> None:
-        """Boot the firmware."""
         self.nrf51.tune(self._settings_at_boot())
         self.robot.boot(now_us)
         self._open_udp(now_us)
@@ -219,11 +217,9 @@ class ServedRobot:
             self.udp.end_session()
 
     def received(self, now_us: int, data: bytes, broadcast: bool) -> None:
-        """Take a packet from the radio chip."""
         self.robot.packet_received(now_us, data, broadcast)
 
     def polled(self, now_us: int) -> None:
-        """Notice an empty packet from the radio chip."""
         self.robot.polled(now_us)
 
     def retuned(self, now_us: int) -> None:

@@ -89,7 +89,6 @@ class Ends:
         return self.motive
 
     def close(self) -> None:
-        """Close all sockets."""
         for robot in self.robots:
             robot.close()
         if self._dongles is not None:

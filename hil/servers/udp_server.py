@@ -93,7 +93,6 @@ class UdpServer:
                 pass
 
     def _read(self, now_us: int) -> None:
-        """Take one datagram."""
         assert self._socket is not None
         try:
             data, client = self._socket.recvfrom(2048)

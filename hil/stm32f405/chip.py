@@ -233,7 +233,6 @@ class Chip:
         return array[begin : begin + size]
 
     def write(self, address: int, data: bytes) -> None:
-        """Change memory, code too, or registers. Raises `LabError` where there is none."""
         for base, end, _, write in self._registers:
             if base <= address and address + len(data) <= end:
                 for at in range(0, len(data), 4):
@@ -268,14 +267,12 @@ class Chip:
         return int(self.state.task_return)
 
     def set_register(self, name: str, value: int) -> None:
-        """Change a register."""
         if name == "pc":
             self.state.pc = value & ~1
         else:
             self._cpu.reg_write(self._numbers[name], value)
 
     def watch(self, kind: int, address: int, size: int, on: bool) -> None:
-        """Stop a run after writes (2), reads (3) or both (4) of memory, or no longer. Raises `LabError` without room."""
         if not self._library.machine_watch(self.state, kind, address, size, int(on)):
             raise LabError("more watchpoints than there is room for, or none there")
         self._cpu.ctl_flush_tb()

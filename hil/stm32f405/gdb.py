@@ -69,7 +69,6 @@ class GdbServer:
         return self._protocol.has_breakpoint(address)
 
     def close(self) -> None:
-        """Give the port back."""
         self._part()
         self._listener.close()
 

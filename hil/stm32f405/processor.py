@@ -84,7 +84,6 @@ class ChipProcessor:
         return min(own_us, ready_us)
 
     def advance(self, now_us: int) -> None:
-        """Bring the chip to an instant."""
         self.run(now_us)
 
     def run(self, now_us: int, until_us: int = 0) -> None:
@@ -109,7 +108,6 @@ class ChipProcessor:
         self._pass_switches_on()
 
     def stop_before(self, us: int) -> None:
-        """Let the chip run no further than to the microsecond before that one."""
         self._limit_us = min(self._limit_us, us - 1)
 
     def occupy(self, name: str, taken_us: Callable[[], int]) -> None:
@@ -134,7 +132,6 @@ class ChipProcessor:
 
     @property
     def current(self) -> ChipTask:
-        """Return the task that has the processor."""
         state = self.chip.state
         if not state.task_count:
             return ChipTask("-", 0, 0)
@@ -174,7 +171,6 @@ class ChipProcessor:
         return (block, us) if block else None
 
     def set_trace(self, trace: Trace | None) -> None:
-        """Report every task that gets the processor, or no longer."""
         self.trace = trace
         self.chip.state.tracing = trace is not None
         self.chip.state.switch_count = 0

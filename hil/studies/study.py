@@ -40,8 +40,6 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One curve of a study."""
-
     name: str
     change: Callable[[float], Change]
     expected: Expected

@@ -48,8 +48,6 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class StudyResult:
-    """A study as it was flown."""
-
     study: Study
     curves: tuple[Curve, ...]
 

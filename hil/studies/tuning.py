@@ -80,8 +80,6 @@ class TuningFlights:
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """The result of tuning."""
-
     axes: tuple[TunedAxis, ...]
     robots: Robots
     age_s: float

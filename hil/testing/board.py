@@ -35,13 +35,11 @@ class SerialPins:
         self._received += data
 
     def read(self) -> bytes:
-        """Return what has been received since the last time."""
         data = bytes(self._received)
         self._received.clear()
         return data
 
     def write(self, now_us: int, data: bytes) -> bool:
-        """Store what the firmware sends."""
         self._sent.append((now_us, data))
         return True
 

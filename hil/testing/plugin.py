@@ -35,7 +35,6 @@ MARK = (
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options."""
     group = parser.getgroup("floaty", "flights in the Floaty virtual laboratory")
     group.addoption(
         "--floaty-board", action="append", default=[], metavar="BOARD[,BOARD]",

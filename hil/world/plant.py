@@ -187,7 +187,6 @@ class Plant:
         self.hold()
 
     def release(self) -> None:
-        """Release the body."""
         self._s[at.HELD] = 0.0
         self._evaluate()
 
