@@ -604,6 +604,24 @@ def test_broken_state_does_not_reach_the_controller_while_the_filter_waits() -> 
     assert_sane(core)
 
 
+def test_the_report_has_the_attitude_twice_every_pose_once_and_the_flaps_as_they_stand() -> None:
+    core = settled((0.1, 0.2, 0.3), quaternion(0.3, -0.2, 1.0))
+    for p, age_us in (((0.6, 0.2, 0.3), 40_000), ((math.nan, 0, 0), 40_000), ((0, 0, 0), 200_000)):
+        core.pose(p, LEVEL, age_us)
+        core.tick()
+    feed(core, 20, (0.6, 0.2, 0.3), quaternion(0.3, -0.2, 1.0))
+    core.fly()
+    core.tick(command=core.control.fields.command.copy())
+    report, counters = core.report.fields, core.counters
+    angles = Rotation.from_quat(report.quaternion, scalar_first=True).as_euler("ZYX")[::-1]
+    assert angles == pytest.approx(report.attitude, abs=1e-5)
+    assert min(counters[name] for name in ("fused", "refused", "jumps", "too_old", "invalid")) > 0
+    assert report.poses == sum(counters.values()) > report.rejected
+    hover = math.radians(25) * np.array([1, -1, 1, -1])
+    assert report.flap == pytest.approx(core.now[12:] + hover, abs=1e-5)
+    assert np.abs(core.now[12:]).max() > 0.01
+
+
 def test_reset_forgets_everything_but_the_counters() -> None:
     used, fresh = feed(Core(), 99, (0.1, 0.2, 0.3), quaternion(yaw=1.0)), Core()
     for age_us in (0, 10_000, 20_000, 30_000):
