@@ -4,6 +4,7 @@
 `report.html`. Whatever ends the flight (its time, a crash, Ctrl-C, an error in a task), the data up to then are kept.
 """
 
+import gc
 import math
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -37,6 +38,8 @@ from hil.laboratory.result import (
 
 LOADED_US = 250_000  # every part of the core has been called by then
 
+COLLECTIONS = (100_000, 20, 50)  # Python's usual ones take a tenth of a flight, which makes little garbage
+
 # (request, telemetry log, what is closed after the flight)
 MakeFlight = Callable[[Request, Path | None, ExitStack], Flight]
 
@@ -54,6 +57,8 @@ def fly(
     """
     prepare(folder)
     with ExitStack() as stack:
+        stack.callback(gc.set_threshold, *gc.get_threshold())
+        gc.set_threshold(*COLLECTIONS)
         try:
             flight = flight_of(request, folder / TELEMETRY, stack)
         except BaseException:

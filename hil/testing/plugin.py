@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
+import sys
 from collections.abc import Generator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from hil.testing.choices import Marked, Wanted
     from hil.testing.flights import Flights, Item
 
+HYPOTHESIS = "hypothesispytest"  # the name of its plugin
 CHOICE = "floaty_choice"  # the parameter of a test that flies on several
 KEEP = ("failed", "all", "none")
 FOLDER = "runs/pytest"  # in pytest's root folder
@@ -133,6 +135,9 @@ def pytest_runtest_makereport(
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Remove the run folders that are not kept; until now a longer-lived fixture may have read them."""
+    # its summary would load all of Hypothesis, also where no test has used it
+    if "hypothesis" not in sys.modules and session.config.pluginmanager.has_plugin(HYPOTHESIS):
+        session.config.pluginmanager.unregister(name=HYPOTHESIS)
     keep = session.config.getoption("floaty_keep")
     for flown in session.config.stash[ALL]:
         if not (keep == "all" or (keep == "failed" and flown.failed)):
