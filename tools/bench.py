@@ -13,11 +13,13 @@ many events in which nothing happens.
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from heapq import heapreplace
 from pathlib import Path
 
@@ -26,11 +28,13 @@ from bench_kernel import kernel_run, simpy_run, us_per_activation
 from rich.console import Console
 from rich.table import Table
 
+from firmware_py.compiling import bound
 from firmware_py.config import parameters_of
 from firmware_py.core import entry
 from firmware_py.core.structs import Control, Estimator, Input, Report, Sampling, Supervisor
 from firmware_py.extras import install_command
 from firmware_py.fast import STALE, STATE
+from hil.commands.app import COMMANDS
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
 from hil.laboratory.lockstep import lockstep_flight
@@ -46,6 +50,7 @@ IMAGE_S = 5.0  # of flight
 # Of the events of a hover: IMU, exposures, their frames, rows of the log, and what the radio does.
 EVENT_PERIODS_US = (1000, 5000, 5000, 10_000, 4000, 4000, 4000)
 ROTORPY_S = 5.0
+HOVER = "fly hover --duration 6"
 
 
 def best(measure: Callable[[], float]) -> float:
@@ -90,6 +95,10 @@ def core_us() -> tuple[float, float]:
     data.fields.pose_quaternion[:] = 1.0, 0.0, 0.0, 0.0
     data.fields.mode = 1
     ticks = 0
+    file_pose = bound(entry.file_pose, parameters.arg, data.arg, estimator.arg, sampling.arg, supervisor.arg)
+    tick = bound(
+        entry.estimate, parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg, report.arg
+    )
 
     def estimate() -> None:
         nonlocal ticks
@@ -97,12 +106,10 @@ def core_us() -> tuple[float, float]:
         data.fields.gyro_samples = 10
         if ticks % 2:
             data.fields.pose_age_us = 33_000
-            entry.file_pose(parameters.arg, data.arg, estimator.arg, sampling.arg, supervisor.arg)
-        entry.estimate(parameters.arg, data.arg, estimator.arg, control.arg, sampling.arg, report.arg)
+            file_pose()
+        tick()
 
-    def steer() -> None:
-        entry.control(parameters.arg, data.arg, estimator.arg, control.arg)
-
+    steer = bound(entry.control, parameters.arg, data.arg, estimator.arg, control.arg)
     return us_per_call(estimate, 20_000), us_per_call(steer, 20_000)
 
 
@@ -135,6 +142,16 @@ def start_up_s(cache: Path | None) -> float:
     start = time.perf_counter()
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, check=True)
     return time.perf_counter() - start
+
+
+def command_s(*words: str) -> float:
+    """Processor time of a process of Python, from its start to its end."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        subprocess.run([sys.executable, *words], cwd=folder, env=environment, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def image_factor(elf: str) -> float:
@@ -193,6 +210,18 @@ class Figures:
         self.values[f"{name} [{unit}]"] = round(value, 4)
 
 
+def add_commands(figures: Figures) -> None:
+    """Add what the command line costs: the slowest `--help`, and a short flight from Enter to the prompt."""
+    empty = best(lambda: command_s("-c", ""))
+
+    def add(name: str, seconds: float) -> None:
+        figures.add(name, seconds, "s", f"{seconds / empty:.0f} x an empty Python")
+
+    helps = [best(partial(command_s, "-m", "hil.commands", name, "--help")) for name in COMMANDS]
+    add("slowest --help", max(helps))
+    add(f"floaty {HOVER}", best(lambda: command_s("-m", "hil.commands", *HOVER.split())))
+
+
 def add_campaign(figures: Figures) -> None:
     """Add a campaign's throughput on one worker and on one per core, and what Dask costs."""
     from bench_campaign import flights_per_s, growth_kb, overhead_s  # the extra `campaign`
@@ -246,6 +275,7 @@ def main() -> None:
     figures.add("simpy on the same scenario", simpy_us, "us", f"{simpy_us / kernel_us:.1f} x ours")
     part("recorder and telemetry log, per ms", (recorded - bare) / simulated_s * 1e3, 1.0)
     figures.add("start to first tick, warm", best(lambda: start_up_s(None)), "s")
+    add_commands(figures)
     if elf := os.environ.get("FLOATY_CF2_ELF"):
         figures.add("whole binary in the emulated chip", image_factor(elf), "x real time", digits=1)
     if options.compile:
