@@ -45,7 +45,7 @@ def sensors_task(
         yield from data_ready.give_nowait()
 
 
-def stabilizer_task(
+def stabilizer_task(  # noqa: PLR0913 - what a task uses is wired once
     kernel: Kernel,
     cost: CpuConfig,
     board: Board,
@@ -73,7 +73,7 @@ def stabilizer_task(
             board.write_compare(core.control.fields.count.tolist())
 
 
-def estimator_task(
+def estimator_task(  # noqa: PLR0913 - what a task uses is wired once
     kernel: Kernel,
     cost: CpuConfig,
     estimator_run: Semaphore,

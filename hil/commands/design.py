@@ -1,7 +1,7 @@
 """`floaty design`: the robot of a profile as a design."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ from rich.table import Table
 
 from hil.commands.options import (
     announce_compilation,
+    asked_as,
     console,
     profile_option,
     seed_option,
@@ -23,6 +24,32 @@ if TYPE_CHECKING:
     from hil.design.sweeps import Point
 
 SPEED_MAX = 60.0  # [m/s] the greatest that a profile allows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Robot:
+    """The options of `floaty design`."""
+
+    profile: str
+    overrides: tuple[str, ...]
+    speed: float | None = None  # [m/s]
+    angle: float | None = None  # [deg]
+    length: float = 1.0
+    mass: float = 1.0
+    write_to: Path | None
+    out: Path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search(Robot):
+    """The options of `floaty design optimise`."""
+
+    seed: int
+    figure: str
+    generations: int
+    updrafts: tuple[float, float]  # [m/s]
+
+
 write_option = click.option(
     "--write",
     "write_to",
@@ -49,34 +76,21 @@ out_option = click.option(
 )
 @write_option
 @out_option
-def design(
-    context: click.Context,
-    profile: str,
-    overrides: tuple[str, ...],
-    speed: float | None,
-    angle: float | None,
-    length: float,
-    mass: float,
-    write_to: Path | None,
-    out: Path,
-) -> None:
+@asked_as(Robot)
+def design(context: click.Context, robot: Robot) -> None:
     """Trim, constants, poles, authority and sweeps of a profile's robot, beside the paper's claims of its design."""
     require("floaty design", "design", "scipy", "control")
     if context.invoked_subcommand is not None:
         return
     from hil.design.analysis import analyse, write
 
-    point = point_of(profile, overrides, speed, angle, length, mass)
+    point = point_of(robot)
     announce_compilation()
-    if write_to is not None:
-        write_profile(
-            point,
-            write_to,
-            f"The robot of {profile}, lengths times {length:g}, masses times {mass:g}.",
-            length,
-        )
+    if robot.write_to is not None:
+        about = f"The robot of {robot.profile}, lengths times {robot.length:g}, masses times {robot.mass:g}."
+        write_profile(point, robot.write_to, about, robot.length)
     found = analyse(point)
-    page = write(found, folder_for(out))
+    page = write(found, folder_for(robot.out))
     show(found)
     console.print(f"report  {page}", soft_wrap=True)
 
@@ -104,40 +118,30 @@ def design(
 )
 @write_option
 @out_option
-def optimise(
-    profile: str,
-    overrides: tuple[str, ...],
-    seed: int,
-    figure: str,
-    generations: int,
-    updrafts: tuple[float, float],
-    write_to: Path | None,
-    out: Path,
-) -> None:
+@asked_as(Search)
+def optimise(asked: Search) -> None:
     """Find the kink, centre of mass, base plate and strip with the largest figure, at the profile's span, mass and speed."""
     from hil.design import figures
     from hil.design import optimise as search
     from hil.design.claims import robot_lines
     from hil.pictures.drawing import png
 
+    profile, figure, updrafts = asked.profile, asked.figure, asked.updrafts
     if updrafts[0] >= updrafts[1]:
         raise LabError(f"--updrafts {updrafts[0]:g} {updrafts[1]:g}: expected the least first")
     announce_compilation()
-    found = search.optimise(point_of(profile, overrides, None, None), figure, seed, generations)
+    found = search.optimise(point_of(asked), figure, asked.seed, asked.generations)
     best, front = found.best, search.front(found.tried, figure)
-    if write_to is not None:
-        write_profile(
-            best.point,
-            write_to,
-            f"What floaty design optimise --figure {figure} --seed {seed} derived from {profile}.",
-        )
+    if asked.write_to is not None:
+        about = f"What floaty design optimise --figure {figure} --seed {asked.seed} derived from {profile}."
+        write_profile(best.point, asked.write_to, about)
     named = {profile: found.reference, "best": best}
     marks = {name: tuple(search.places((one,), figure)[0].tolist()) for name, one in named.items()}
     axes = (
         "stability: -f_αα [1/s²]",
         figure + (" / that of the profile's robot" if figure == "least-authority" else ""),
     )
-    picture = folder_for(out) / f"pareto-{figure}.png"
+    picture = folder_for(asked.out) / f"pareto-{figure}.png"
     picture.write_bytes(png(lambda: figures.pareto(axes, search.places(found.tried, figure), front, marks)))
     for name, value in robot_lines(best.point):
         console.print(f"{name:38} {value}", soft_wrap=True)
@@ -160,21 +164,15 @@ def write_profile(point: "Point", path: Path, about: str, length: float = 1.0) -
     console.print(f"profile {path}", soft_wrap=True)
 
 
-def point_of(
-    profile: str,
-    overrides: tuple[str, ...],
-    speed: float | None,
-    angle: float | None,
-    length: float = 1.0,
-    mass: float = 1.0,
-) -> "Point":
+def point_of(robot: Robot) -> "Point":
     """Return a profile's robot, or a similar one, at its design hover or at the hover of another speed or angle."""
     from hil.config import load_config
     from hil.design.sweeps import point_of as own_point_of
     from hil.design.trim import opening_at, scaled
 
-    point = own_point_of(load_config(profile, overrides))
-    geometry, opening = scaled(point.geometry, length, mass), point.opening
+    speed, angle = robot.speed, robot.angle
+    point = own_point_of(load_config(robot.profile, robot.overrides))
+    geometry, opening = scaled(point.geometry, robot.length, robot.mass), point.opening
     if speed is not None and angle is not None:
         raise LabError(f"--speed {speed:g} --angle {angle:g}: one follows from the other; give one of them")
     if speed is not None:

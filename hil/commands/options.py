@@ -7,8 +7,9 @@ import sys
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from rich.console import Console
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from hil.live.feed import LiveView
 
 INTERRUPTED = 130
+Asked = TypeVar("Asked")
 
 console = Console(highlight=False)
 notices = Console(stderr=True, highlight=False)
@@ -84,6 +86,19 @@ def runner_options(command: Callable[..., int]) -> Callable[..., int]:
 
 
 COMPILING = "first run on this machine: compiling flight core and plant, once, some ten seconds"
+
+
+def asked_as(kind: type[Asked]) -> Callable[[Callable[..., int | None]], Callable[..., int | None]]:
+    """Return the decorator of a command that takes its options as one value of a frozen dataclass."""
+
+    def decorator(command: Callable[..., int | None]) -> Callable[..., int | None]:
+        @wraps(command)
+        def call(*context: click.Context, **options: Any) -> int | None:
+            return command(*context, kind(**options))
+
+        return call
+
+    return decorator
 
 
 def announce_compilation() -> None:

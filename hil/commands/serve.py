@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import click
 
 from hil.commands.options import (
     announce_compilation,
+    asked_as,
     close_live,
     fault_option,
     gdb_option,
@@ -34,6 +36,27 @@ if TYPE_CHECKING:
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
 BOARDS_MAX = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The options of `floaty serve`."""
+
+    udp: int | None
+    radio: bool
+    radio_port: int
+    mavlink: str | None
+    board: str | None
+    gdb: int | None
+    boards: int
+    station: str | None
+    motive: bool
+    state: Path | None
+    target: str | None
+    faults: tuple[str, ...]
+    seed: int
+    profile: str
+    overrides: tuple[str, ...]
 
 
 @click.command()
@@ -74,23 +97,8 @@ BOARDS_MAX = 10
 @seed_option
 @profile_option
 @set_option
-def serve(
-    udp: int | None,
-    radio: bool,
-    radio_port: int,
-    mavlink: str | None,
-    board: str | None,
-    gdb: int | None,
-    boards: int,
-    station: str | None,
-    motive: bool,
-    state: Path | None,
-    target: str | None,
-    faults: tuple[str, ...],
-    seed: int,
-    profile: str,
-    overrides: tuple[str, ...],
-) -> int:
+@asked_as(Asked)
+def serve(asked: Asked) -> int:
     """Serve robots in virtual tunnels, in real time, until Ctrl-C.
 
     Without --udp, --radio or --mavlink the first board is on UDP. A robot is held until it flies: corrections come from
@@ -102,11 +110,11 @@ def serve(
 
     While it runs, a line like push.y=2 or mocap.dropout:0.5 injects that fault at once; help lists the other commands.
     """
-    if udp is None and not radio and mavlink is None:
-        udp = UDP_PORT
-    _check_options(udp, mavlink, board, gdb, boards)
-    if mavlink is not None:
-        require(f"--mavlink {mavlink}", "mavlink", "pymavlink")
+    if asked.udp is None and not asked.radio and asked.mavlink is None:
+        asked = replace(asked, udp=UDP_PORT)
+    _check_options(asked)
+    if asked.mavlink is not None:
+        require(f"--mavlink {asked.mavlink}", "mavlink", "pymavlink")
     from hil.config import load_config
     from hil.laboratory.fault_kinds import MARKERS_ON
     from hil.laboratory.faults import check, parse
@@ -115,28 +123,29 @@ def serve(
     from hil.servers.live_faults import LiveFaults
     from hil.servers.motive import streaming_of
     from hil.servers.serial_server import parse_addresses
-    from hil.servers.server import Server
+    from hil.servers.server import Plan, Server
 
-    markers = (MARKERS_ON,) if motive else ()
+    markers = (MARKERS_ON,) if asked.motive else ()
     poses = (
-        () if station == "corrections" else ("predictor.absolute=true",)
+        () if asked.station == "corrections" else ("predictor.absolute=true",)
     )  # as Bitcraze's programs send them
-    config = load_config(profile, (*markers, *poses, *overrides))
-    ends = parse_addresses(mavlink, boards) if mavlink is not None else []
-    planned = [parse(text) for text in faults]
+    config = load_config(asked.profile, (*markers, *poses, *asked.overrides))
+    ends = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
+    planned = [parse(text) for text in asked.faults]
     check(planned, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
     announce_compilation()
     stack = click.get_current_context().with_resource(ExitStack())
-    port = debugger(gdb, Path(board or ""), stack)
-    executor = PYTHON_BOARD if board is None else image_at(board, None, port)
-    view = open_live(target)
-    server = Server(config, boards, seed, say, bool(ends), planned, state, view, executor)
+    port = debugger(asked.gdb, Path(asked.board or ""), stack)
+    executor = PYTHON_BOARD if asked.board is None else image_at(asked.board, None, port)
+    view = open_live(asked.target)
+    plan = Plan(config, asked.boards, asked.seed, bool(ends), planned, asked.state, executor)
+    server = Server(plan, say, view)
     try:
-        streaming = streaming_of(config.capture) if motive else None
-        _open_ends(server.ends, udp, radio_port if radio else None, ends, streaming)
-        if station is not None:
+        streaming = streaming_of(config.capture) if asked.motive else None
+        _open_ends(server.ends, asked.udp, asked.radio_port if asked.radio else None, ends, streaming)
+        if asked.station is not None:
             for robot in server.ends.robots:
-                robot.fly(station == "poses")
+                robot.fly(asked.station == "poses")
         LiveFaults(server, say).listen(sys.stdin)
         stops = stop_signals()
         say("serving; Ctrl-C ends")
@@ -150,14 +159,13 @@ def serve(
     return 0
 
 
-def _check_options(
-    udp: int | None, mavlink: str | None, board: str | None, gdb: int | None, boards: int
-) -> None:
+def _check_options(asked: Asked) -> None:
     """Raise `LabError` for options that contradict each other."""
+    udp, board, gdb, boards = asked.udp, asked.board, asked.gdb, asked.boards
     if udp is not None and udp + boards - 1 > 65535:
         raise LabError(f"--udp {udp}: there are no {boards} ports from there on")
-    if board is not None and mavlink is not None:
-        raise LabError(f"--mavlink {mavlink}: {board} speaks CRTP over its radio, not MAVLink")
+    if board is not None and asked.mavlink is not None:
+        raise LabError(f"--mavlink {asked.mavlink}: {board} speaks CRTP over its radio, not MAVLink")
     if gdb is not None and (board is None or boards > 1):
         raise LabError(f"--gdb {gdb}: needs one board and an image as --board")
 

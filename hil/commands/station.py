@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from ground_station.links.schemes import LinkSettings
 from ground_station.trajectory import Goal, Trajectory
 from hil.commands.options import (
     INTERRUPTED,
+    asked_as,
     close_live,
     open_live,
     profile_option,
@@ -30,6 +32,24 @@ from hil.errors import LabError
 if TYPE_CHECKING:
     from ground_station.program import GroundSettings
     from hil.config import LabConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The options of `floaty station`."""
+
+    uri: str
+    mocap: str | None
+    named: str
+    start_s: float
+    duration: float | None
+    log: Path | None
+    record: Path | None
+    tlog: Path | None
+    out: Path | None
+    target: str | None
+    profile: str
+    overrides: tuple[str, ...]
 
 
 @click.command()
@@ -70,20 +90,8 @@ if TYPE_CHECKING:
 @view_option
 @profile_option
 @set_option
-def station(
-    uri: str,
-    mocap: str | None,
-    named: str,
-    start_s: float,
-    duration: float | None,
-    log: Path | None,
-    record: Path | None,
-    tlog: Path | None,
-    out: Path | None,
-    target: str | None,
-    profile: str,
-    overrides: tuple[str, ...],
-) -> int:
+@asked_as(Asked)
+def station(asked: Asked) -> int:
     """Fly EXPERIMENT, by default hover, with a board, real or virtual: poses in, poses or corrections out at 50 Hz.
 
     `floaty list` names the experiments. Telemetry is shown and logged.
@@ -103,14 +111,15 @@ def station(
     from hil.laboratory.recorder import OPERATOR
     from hil.laboratory.request import REAL, Bench, Request
 
-    config = load_config(profile, overrides)
-    experiment = find_experiment(named)
-    _check_files(log, record, tlog, out, uri)
-    view = open_live(target)
+    config = load_config(asked.profile, asked.overrides)
+    experiment = find_experiment(asked.named)
+    _check_files(asked)
+    uri, out = asked.uri, asked.out
+    view = open_live(asked.target)
     flight = None
     if out is not None or view is not None:
         bench = Bench(link=uri, board=REAL)
-        request = Request(experiment, profile, overrides, 0, experiment.duration_s, (), bench)
+        request = Request(experiment, asked.profile, asked.overrides, 0, experiment.duration_s, (), bench)
         flight = RealFlight(out, request, say, onlooker=view)
 
     def report(text: str) -> None:
@@ -123,7 +132,7 @@ def station(
             flight.note(OPERATOR, text)
 
     operator = Operator(
-        _trajectory_of, say, note, view.know if view is not None and target == "foxglove" else None
+        _trajectory_of, say, note, view.know if view is not None and asked.target == "foxglove" else None
     )
     terminal = Terminal(lambda: (*COMMANDS, *EXPERIMENTS, *operator.known))
 
@@ -132,13 +141,15 @@ def station(
             operator.take(line)
         operator.turn(cockpit, now_us)
 
-    telemetry = flight.telemetry if flight is not None and out is not None else log
-    session = Session(uri, mocap, experiment.trajectory, start_s, telemetry, record, tlog)
+    telemetry = flight.telemetry if flight is not None and out is not None else asked.log
+    session = Session(
+        uri, asked.mocap, experiment.trajectory, asked.start_s, telemetry, asked.record, asked.tlog
+    )
     stops = stop_signals()
     hands = [steer] if flight is None else [steer, flight.turn]
     failure = ""
     try:
-        fly(settings_of(config), session, report, run_until(lambda: bool(stops), duration), hands)
+        fly(settings_of(config), session, report, run_until(lambda: bool(stops), asked.duration), hands)
     except (LinkError, MocapError, OSError, ImportError) as error:
         failure = why(error, uri)
     finally:
@@ -155,17 +166,17 @@ def station(
     return INTERRUPTED if result.outcome == "interrupted" else 1
 
 
-def _check_files(
-    log: Path | None, record: Path | None, tlog: Path | None, out: Path | None, uri: str
-) -> None:
+def _check_files(asked: Asked) -> None:
     """Raise `LabError` for files that cannot be written, or not with these options."""
-    if out is not None and log is not None:
-        raise LabError(f"--log {log}: --out {out} has a telemetry.csv of its own")
-    for option, path in (("--log", log), ("--record", record), ("--tlog", tlog)):
+    if asked.out is not None and asked.log is not None:
+        raise LabError(f"--log {asked.log}: --out {asked.out} has a telemetry.csv of its own")
+    for option, path in (("--log", asked.log), ("--record", asked.record), ("--tlog", asked.tlog)):
         if path is not None and not path.parent.is_dir():
             raise LabError(f"{option} {path}: there is no folder {path.parent}")
-    if tlog is not None and not uri.startswith("mavlink:"):
-        raise LabError(f"--tlog {tlog}: --link {uri}: only mavlink:DEVICE[,BAUD] has frames of MAVLink")
+    if asked.tlog is not None and not asked.uri.startswith("mavlink:"):
+        raise LabError(
+            f"--tlog {asked.tlog}: --link {asked.uri}: only mavlink:DEVICE[,BAUD] has frames of MAVLink"
+        )
 
 
 def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -144,40 +145,42 @@ class Shown:
         return (*flight_channels(robot, home), line, battery_channel(robot.battery), *markers, *own)
 
 
-class Server:
-    """`count` robots that are let go when they fly, and put back when they are lost; `run` them after opening ends.
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is served: `count` robots of a profile, and what happens to them.
 
-    `faults` act from the first release of each robot on. `say` gets lines for the user, `onlooker` sees the
-    first robot. EEPROM and deck memories are kept in the folder `state`; `executor` what is on board.
+    `faults` act from the first release of each robot on. EEPROM and deck memories are kept in the folder `state`;
+    `executor` is what is on board.
     """
 
-    def __init__(
-        self,
-        config: LabConfig,
-        count: int,
-        seed: int,
-        say: Callable[[str], None],
-        mavlink: bool = False,
-        faults: Sequence[Fault] = (),
-        state: Path | None = None,
-        onlooker: Onlooker | None = None,
-        executor: Executor = PYTHON_BOARD,
-    ) -> None:
+    config: LabConfig
+    count: int = 1
+    seed: int = 1
+    mavlink: bool = False
+    faults: Sequence[Fault] = ()
+    state: Path | None = None
+    executor: Executor = PYTHON_BOARD
+
+
+class Server:
+    """Robots that are let go when they fly, and put back when they are lost; `run` them after opening ends.
+
+    `say` gets lines for the user, `onlooker` sees the first robot.
+    """
+
+    def __init__(self, plan: Plan, say: Callable[[str], None], onlooker: Onlooker | None = None) -> None:
+        config = plan.config
         self.clock = Paced()
         self.lab = Laboratory(self.clock)
-        self.ends = Ends(self.lab, self.clock.readers, config, seed)
+        self.ends = Ends(self.lab, self.clock.readers, config, plan.seed)
         self.switchboards: list[Switchboard] = []
-        self._say = say
-        self._faults = faults
-        self._state = state
-        self._onlooker = onlooker
-        self._executor = executor
+        self._plan, self._say, self._onlooker = plan, say, onlooker
         self._shown: Shown | None = None
-        for number in range(1, count + 1):
-            own = with_system(config, config.mavlink.system + number - 1) if mavlink else config
-            self._add(number, own, Streams.of_seed(seed + number - 1), mavlink)
+        for number in range(1, plan.count + 1):
+            own = with_system(config, config.mavlink.system + number - 1) if plan.mavlink else config
+            self._add(number, own, Streams.of_seed(plan.seed + number - 1))
 
-    def _add(self, number: int, config: LabConfig, streams: Streams, mavlink: bool) -> None:
+    def _add(self, number: int, config: LabConfig, streams: Streams) -> None:
         def say(source: str, text: str) -> None:
             self._say(f"board {number}: {text}")
             if number == 1 and self._onlooker is not None:
@@ -186,8 +189,8 @@ class Server:
         def fail(now_us: int, unit: int, failing: int, instance: int) -> Result:
             return Failures(robot, switchboard).inject(now_us, unit, failing, instance)
 
-        site = Site(config, self.lab.events, streams, say, self._executor)
-        served = ServedRobot(number, site, self._say, mavlink, self._state, fail)
+        site = Site(config, self.lab.events, streams, say, self._plan.executor)
+        served = ServedRobot(number, site, self._say, self._plan.mavlink, self._plan.state, fail)
         robot = served.robot
         robot.plant.hold()
         self.lab.robots.append(robot)
@@ -201,7 +204,7 @@ class Server:
             robot.release()
             say("lab", "released")
             if not planned:
-                switchboard.plan(self._faults, now_us, NEVER_US)
+                switchboard.plan(self._plan.faults, now_us, NEVER_US)
             planned = True
 
         holder = Holder(robot, let_go)

@@ -12,7 +12,7 @@ import pytest
 from firmware_py.wire import crtp, high_level
 from hil.clock import FreeRunning
 from hil.config import load_config
-from hil.servers.server import Server
+from hil.servers.server import Plan, Server
 from support.mavlink_client import STATION, codec
 from support.mavlink_lab import MavlinkLab
 from support.random_requests import harmless_message, random_packet, spoilt
@@ -26,7 +26,7 @@ class Fuzzed:
     def __init__(self, seed: int, absolute: bool) -> None:
         self.said: list[str] = []
         config = load_config("floaty", [f"predictor.absolute={absolute}"])
-        self.server = Server(config, 1, 1, self.said.append)
+        self.server = Server(Plan(config), self.said.append)
         self.server.lab.clock = FreeRunning()
         (self.served,) = self.server.ends.robots
         self.served.fly(absolute)
