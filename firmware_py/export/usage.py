@@ -16,11 +16,7 @@ class EntryLoad:
     worst_cycles: int = 0
 
     def add(self, instructions: int, cycles: int) -> None:
-        self.calls += 1
-        self.instructions += instructions
-        self.cycles += cycles
-        self.worst_instructions = max(self.worst_instructions, instructions)
-        self.worst_cycles = max(self.worst_cycles, cycles)
+        self.merge(EntryLoad(1, instructions, cycles, instructions, cycles))
 
     def merge(self, other: "EntryLoad") -> None:
         """Add what another load has counted."""

@@ -7,6 +7,7 @@ NatNet SDK, PacketClient.
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -239,8 +240,11 @@ def _model_definition(reader: Reader) -> ModelDefinition:
             reader.u32()  # bytes
         if kind == 1:
             bodies.append(_description(reader))
-        else:
-            _pass_over(reader, kind)
+            continue
+        if kind not in PASSED_OVER:
+            raise MocapError(f"NatNet model definition: {kind} is not a kind of model")
+        for part in PASSED_OVER[kind]:
+            reader.take(part) if isinstance(part, int) else part(reader)
     return ModelDefinition(tuple(bodies))
 
 
@@ -254,37 +258,24 @@ def _description(reader: Reader) -> BodyDescription:
     return BodyDescription(name, number, parent, offset, tuple(markers))
 
 
-def _pass_over(reader: Reader, kind: int) -> None:
-    """Read a description of no use: marker set, skeleton, force plate, device, camera, asset."""
-    if kind == 0:
+def _descriptions(reader: Reader) -> None:
+    for _ in range(reader.count(25)):
+        _description(reader)
+
+
+def _asset_markers(reader: Reader) -> None:
+    for _ in range(reader.count(23)):
         reader.text()
-        reader.texts()
-    elif kind == 2:
-        reader.text()
-        reader.u32()
-        for _ in range(reader.count(25)):
-            _description(reader)
-    elif kind == 3:
-        reader.u32()
-        reader.text()
-        reader.take(4 * (2 + 3 + 144 + 12) + 8)  # size, origin, calibration, corners, types
-        reader.texts()
-    elif kind == 4:
-        reader.u32()
-        reader.text()
-        reader.text()
-        reader.take(8)
-        reader.texts()
-    elif kind == 5:
-        reader.text()
-        reader.take(28)
-    elif kind == 6:
-        reader.text()
-        reader.take(8)
-        for _ in range(reader.count(25)):
-            _description(reader)
-        for _ in range(reader.count(23)):
-            reader.text()
-            reader.take(22)  # id, position, size, parameters
-    else:
-        raise MocapError(f"NatNet model definition: {kind} is not a kind of model")
+        reader.take(22)  # id, position, size, parameters
+
+
+# The parts of descriptions of no use, by kind; a number is that many bytes.
+PASSED_OVER: dict[int, tuple[Callable[[Reader], object] | int, ...]] = {
+    0: (Reader.text, Reader.texts),  # marker set
+    2: (Reader.text, Reader.u32, _descriptions),  # skeleton
+    # Force plate: size, origin, calibration, corners, types
+    3: (Reader.u32, Reader.text, 4 * (2 + 3 + 144 + 12) + 8, Reader.texts),
+    4: (Reader.u32, Reader.text, Reader.text, 8, Reader.texts),  # device
+    5: (Reader.text, 28),  # camera
+    6: (Reader.text, 8, _descriptions, _asset_markers),  # asset
+}

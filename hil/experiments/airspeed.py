@@ -7,20 +7,15 @@ would need 56 % more lift than at 10 m/s, and a flat plate of Floaty's size has 
 flaps opened through zero.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from math import degrees, radians, sqrt
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.metrics import BOX, column, position_error
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 DESIGN_SPEED, DESIGN_ANGLE = 10.0, radians(25.0)  # [m/s], [rad] paper
 LIFT_PER_RAD = 2.3 / 9.81  # share of the weight; paper, Table: z per u4

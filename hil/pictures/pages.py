@@ -9,18 +9,16 @@ import base64
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from numpy.typing import NDArray
 from youplot.vendor import uplot_css, uplot_js
 
 from hil.pictures.panels import Marks, Panel, Plot, Series, Signal, Still
 from hil.pictures.picture import Picture
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 STRETCHES = 1500  # of a thinned line
 NOTHING = Marks()
