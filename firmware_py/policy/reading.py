@@ -134,13 +134,18 @@ def _read_onnx(path: Path) -> Policy:
     for node in graph.node:
         if node.op_type == "Constant" and node.attribute[0].name == "value":
             constants[node.output[0]] = to_array(node.attribute[0].t)
-    kind = graph.input[0].type.tensor_type
+    given = [one for one in graph.input if one.name not in constants]
+    if len(given) != 1 or not graph.output:
+        raise PolicyError(
+            f"{len(given)} inputs and {len(graph.output)} outputs: expected the observation and the action"
+        )
+    kind = given[0].type.tensor_type
     number = onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type)
 
     def answer(observations: NDArray[np.float32]) -> NDArray[Any]:
         rows = observations if len(kind.shape.dim) == 1 else observations[:, None, :]
-        inputs: list[dict[str, Any]] = [{graph.input[0].name: row.astype(number)} for row in rows]
-        return np.stack([np.ravel(evaluator.run(None, given)[0]) for given in inputs])
+        inputs: list[dict[str, Any]] = [{given[0].name: row.astype(number)} for row in rows]
+        return np.stack([np.ravel(evaluator.run(None, one)[0]) for one in inputs])
 
     steps = []
     for node in _nodes_to(graph.output[0].name, graph, constants):

@@ -100,6 +100,17 @@ def test_a_node_of_two_paths_is_named(tmp_path: Path) -> None:
         read_policy(path)
 
 
+def test_a_graph_of_two_inputs_is_refused(tmp_path: Path) -> None:
+    path = write_onnx(tmp_path / "net.onnx", random_network(20, 20, 4))
+    model = onnx.load(path)
+    model.graph.input.append(onnx.helper.make_tensor_value_info("goal", onnx.TensorProto.FLOAT, [3]))
+    onnx.save(model, path)
+    with pytest.raises(
+        PolicyError, match=r"^2 inputs and 1 outputs: expected the observation and the action$"
+    ):
+        read_policy(path)
+
+
 def stored(path: Path, layers: Layers, names: tuple[str, ...], metadata: Any = None, **others: Any) -> Path:
     """Write a network to a safetensors file; `others` are tensors with _ in place of the point."""
     tensors = {name.replace("_", ".", 1): np.asarray(value, np.float32) for name, value in others.items()}
