@@ -58,7 +58,7 @@ def reward_of(distance: float, tilt: float, yaw_error: float, change: float) -> 
 
     `distance` from the goal [m], `tilt` [rad], `yaw_error` [rad], and the sum of the squared changes of the action.
     """
-    near = 1.0 / (1.0 + (distance / 0.05) * (distance / 0.05))
+    near = 1.0 / (1.0 + (distance / 0.03) * (distance / 0.03))
     level = 1.0 / (1.0 + (tilt / 0.15) * (tilt / 0.15))
     turned = 1.0 / (1.0 + (yaw_error / 0.2) * (yaw_error / 0.2))
     return 0.6 * near + 0.2 * level + 0.2 * turned - 0.005 * change

@@ -1,0 +1,85 @@
+"""Control steps per second of the environments, beside RotorPy's batched quadrotors: `python tools/bench_learn.py`.
+
+Processor time of one core and actions of 0. RotorPy's environment needs the extra `bench`, torch, torchdiffeq, roma and
+stable-baselines3.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from firmware_py.fast import STATE
+from hil.learn.envs import make_env, make_vec
+
+MANY, FAST_STEPS, WHOLE_STEPS, PEER_STEPS = 1024, 100, 900, 30
+REPEATS = 3
+
+
+def steps_per_s(step: Callable[[], object], count: int, robots: int) -> float:
+    """Control steps of all robots per second of processor time: the best of a few measurements."""
+    found = []
+    for _ in range(REPEATS):
+        start = time.process_time()
+        for _ in range(count):
+            step()
+        found.append(count * robots / (time.process_time() - start))
+    return max(found)
+
+
+def fast() -> float:
+    env, still = make_vec("Hover", MANY), np.zeros((MANY, 4), np.float32)
+    env.reset(seed=1)
+    env.step(still)
+    return steps_per_s(lambda: env.step(still), FAST_STEPS, MANY)
+
+
+def whole() -> float:
+    env, still = (
+        make_env("Hover", "firmware", duration_s=REPEATS * WHOLE_STEPS / 100 + 1),
+        np.zeros(4, np.float32),
+    )
+    env.reset(seed=1)
+    env.step(still)
+    return steps_per_s(lambda: env.step(still), WHOLE_STEPS, 1)
+
+
+def rotorpy() -> float:
+    import torch
+    from rotorpy.learning.quadrotor_environments import QuadrotorEnv
+    from rotorpy.vehicles.crazyflie_params import quad_params
+
+    torch.set_num_threads(1)
+    zeros = torch.zeros(MANY, 3, dtype=torch.float64)
+    states = {
+        "x": zeros,
+        "v": zeros,
+        "w": zeros,
+        "wind": zeros,
+        "rotor_speeds": torch.full((MANY, 4), 1788.53).double(),
+    }
+    states |= {"q": torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(MANY, 1).double()}
+    env = QuadrotorEnv(MANY, states, "cmd_motor_speeds", quad_params=quad_params, max_time=60)
+    env.reset()
+    still = np.zeros((MANY, 4))
+    return steps_per_s(lambda: env.step(still), PEER_STEPS, MANY)
+
+
+def main() -> None:
+    table = Table(title=f"control steps of 10 ms per second and core: {STATE}")
+    table.add_column("environment")
+    table.add_column("steps/s", justify="right")
+    table.add_row(f"fast, {MANY} robots", f"{fast():,.0f}")
+    table.add_row("firmware, one robot in the whole laboratory", f"{whole():,.0f}")
+    try:
+        table.add_row(f"RotorPy, {MANY} quadrotors", f"{rotorpy():,.0f}")
+    except (ImportError, NameError) as error:  # without torchdiffeq it imports, but lacks a name
+        print(f"RotorPy is left out: {error}", file=sys.stderr)
+    Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    main()
