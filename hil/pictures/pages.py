@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, StrictUndefined
 from numpy.typing import NDArray
 from youplot.vendor import uplot_css, uplot_js
 
@@ -24,6 +24,7 @@ STRETCHES = 1500  # of a thinned line
 NOTHING = Marks()
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    bytecode_cache=FileSystemBytecodeCache(),  # compiling them takes as long as filling them
     autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
 )  # fmt: skip
 
