@@ -56,12 +56,13 @@ def stabilizer_task(  # noqa: PLR0913 - what a task uses is wired once
     costs: CoreCosts,
 ) -> Task:
     """Run at 1 kHz on the tick edge after each IMU sample; control at 100 Hz."""
-    tick = core.data.cell("tick")
+    cost_us, tick = cost.stabilizer_us, core.data.cell("tick")
     while True:
         if (yield from data_ready.take(DATA_TIMEOUT)):
             yield from kernel.delay_until(kernel.tick_count + 1)
         core.watchdog_fed_us = kernel.now_us
-        yield from kernel.work(cost.stabilizer_us)
+        if cost_us:
+            yield from kernel.work(cost_us)
         tick[0] = kernel.tick_count
         control_runs = core.run.call("begin_step")
         yield from estimator_run.give_nowait()
@@ -84,10 +85,11 @@ def estimator_task(  # noqa: PLR0913 - what a task uses is wired once
     pose_refused: Callable[[Correction], None],
 ) -> Task:
     """Take poses at 1 kHz, estimate at 100 Hz."""
-    estimate_due = core.sampling.cell("estimate_due")
+    cost_us, estimate_due = cost.kalman_us, core.sampling.cell("estimate_due")
     while True:
         yield from estimator_run.take()
-        yield from kernel.work(cost.kalman_us)
+        if cost_us:
+            yield from kernel.work(cost_us)
         while (arrived := measurements.receive_nowait()) is not None:
             if hand_pose_to_core(kernel, core, *arrived) == POSE_NO_CORRECTION:
                 pose_refused(arrived[1])
