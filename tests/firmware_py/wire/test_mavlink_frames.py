@@ -132,6 +132,11 @@ def test_chunks_of_any_size_give_the_same_messages(key: bytes | None) -> None:
         assert receiver.counters.skipped_bytes == receiver.counters.lost == 0
 
 
+def test_a_payload_of_zeros_keeps_its_first_byte() -> None:
+    message = dialect.MAVLink_timesync_message(0, 0)
+    assert FrameSender(7, 9).encode(0, message) == golden(peer(), [message])[0]
+
+
 def test_version_1_is_read() -> None:
     frames = [
         message.pack(peer(), force_mavlink1=True)
