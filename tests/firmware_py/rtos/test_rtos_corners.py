@@ -6,6 +6,7 @@ Priorities start at 2: the timer service task has 1.
 import pytest
 
 from firmware_py.rtos import FOREVER, Kernel, Statistics
+from support.kernel_tasks import start
 
 
 @pytest.fixture
@@ -54,18 +55,14 @@ def priority_at(kernel, task, instants_us):
 def test_a_holder_keeps_the_priority_of_the_next_waiter_when_one_gives_up(kernel):
     mutex = kernel.create_mutex("mutex")
     holder = kernel.create_task("holder", 2, holder_of(kernel, [mutex], 9_500))
-    kernel.create_task("high", 5, taker_of(kernel, mutex, 2, 2))
-    kernel.create_task("middle", 4, taker_of(kernel, mutex, 1, 6))
-    kernel.start()
+    start(kernel, high=(5, taker_of(kernel, mutex, 2, 2)), middle=(4, taker_of(kernel, mutex, 1, 6)))
     assert priority_at(kernel, holder, [500, 1_500, 2_500, 4_500, 7_500]) == [2, 4, 5, 4, 2]
 
 
 def test_a_holder_falls_back_only_when_the_last_of_equal_waiters_gives_up(kernel):
     mutex = kernel.create_mutex("mutex")
     holder = kernel.create_task("holder", 2, holder_of(kernel, [mutex], 9_500))
-    kernel.create_task("first", 4, taker_of(kernel, mutex, 1, 2))
-    kernel.create_task("second", 4, taker_of(kernel, mutex, 2, 4))
-    kernel.start()
+    start(kernel, first=(4, taker_of(kernel, mutex, 1, 2)), second=(4, taker_of(kernel, mutex, 2, 4)))
     assert priority_at(kernel, holder, [1_500, 2_500, 3_500, 5_500, 6_500]) == [4, 4, 4, 4, 2]
 
 
@@ -78,17 +75,14 @@ def test_a_holder_is_not_lowered_below_its_own_priority_by_a_waiter_that_is_less
         yield from mutex.give()
 
     holder = kernel.create_task("holder", 3, body)
-    kernel.create_task("low", 2, taker_of(kernel, mutex, 1, FOREVER))
-    kernel.create_task("high", 5, taker_of(kernel, mutex, 2, 2))
-    kernel.start()
+    start(kernel, low=(2, taker_of(kernel, mutex, 1, FOREVER)), high=(5, taker_of(kernel, mutex, 2, 2)))
     assert priority_at(kernel, holder, [1_500, 2_500, 4_500]) == [3, 5, 3]
 
 
 def test_a_holder_of_two_mutexes_keeps_what_was_lent_until_it_gives_both(kernel):
     mutexes = [kernel.create_mutex("one"), kernel.create_mutex("two")]
     holder = kernel.create_task("holder", 2, holder_of(kernel, mutexes, 5_500))
-    kernel.create_task("high", 5, taker_of(kernel, mutexes[0], 1, 2))
-    kernel.start()
+    start(kernel, high=(5, taker_of(kernel, mutexes[0], 1, 2)))
     assert priority_at(kernel, holder, [1_500, 3_500, 5_400, 5_550]) == [5, 5, 5, 2]
 
 
@@ -101,8 +95,7 @@ def test_a_priority_set_while_one_is_lent_counts_when_the_mutex_is_given(kernel)
         yield from kernel.delay(2)
         yield from holder.priority_set(3)
 
-    kernel.create_task("boss", 6, boss)
-    kernel.start()
+    start(kernel, boss=(6, boss))
     assert priority_at(kernel, holder, [1_500, 2_500, 4_550]) == [5, 5, 3]
 
 
@@ -135,8 +128,7 @@ def test_waiters_stand_in_the_order_of_the_priority_they_have_now(kernel, how):
         yield from kernel.delay(1)
         yield from queue.send("second")
 
-    kernel.create_task("boss", 6, boss)
-    kernel.start()
+    start(kernel, boss=(6, boss))
     kernel.run(20_000)
     order = ["changed", "other"] if how == "set" else ["other", "changed"]
     assert served == list(zip(order, ["first", "second"], strict=True))
@@ -157,8 +149,7 @@ def test_a_notification_does_not_wake_a_task_that_was_suspended_while_it_waited_
         yield from kernel.delay(8)
         yield from waiter_task.resume()
 
-    kernel.create_task("boss", 2, boss)
-    kernel.start()
+    start(kernel, boss=(2, boss))
     kernel.run(20_000)
     assert got == [(2, 8_000)]
 
@@ -178,8 +169,7 @@ def test_resume_does_not_disturb_a_task_that_waits():
         yield from kernel.delay(2)
         yield from queue.send("item")
 
-    kernel.create_task("boss", 2, boss)
-    kernel.start()
+    start(kernel, boss=(2, boss))
     kernel.run(5_000)
     assert [event[:2] for event in events if event[2] == "receiver"] == [
         (0, "READY"),
@@ -209,8 +199,7 @@ def test_a_task_suspended_while_it_waits_goes_on_waiting_for_the_rest_of_its_tim
         for task in receivers:
             yield from task.resume()
 
-    kernel.create_task("boss", 4, boss)
-    kernel.start()
+    start(kernel, boss=(4, boss))
     kernel.run(20_000)
     assert ended_us == [5_000, 9_000]
 
@@ -229,9 +218,7 @@ def test_without_preemption_a_yield_while_the_scheduler_is_suspended_is_lost():
         order.append("second")
         yield from ()
 
-    kernel.create_task("second", 2, second)
-    kernel.create_task("first", 2, first)
-    kernel.start()
+    start(kernel, second=(2, second), first=(2, first))
     kernel.run(0)
     assert order == ["first", "second"]
 
@@ -250,9 +237,7 @@ def test_a_task_of_equal_priority_that_woke_meanwhile_runs_when_the_scheduler_re
         yield from semaphore.take()
         order.append("second")
 
-    kernel.create_task("first", 2, first)
-    kernel.create_task("second", 2, second)
-    kernel.start()
+    start(kernel, first=(2, first), second=(2, second))
     run_with(kernel, 600, (300, semaphore.give_from_isr))
     assert order == ["second", "first"]
 
@@ -266,9 +251,7 @@ def test_a_tick_that_is_due_while_the_scheduler_is_suspended_does_not_stop_the_c
         yield from kernel.work(3_000)
         yield from kernel.resume_all()
 
-    kernel.create_task("sleeper", 3, sleeper)
-    kernel.create_task("worker", 2, worker)
-    kernel.start()
+    start(kernel, sleeper=(3, sleeper), worker=(2, worker))
     kernel.run(100)
     assert kernel.next_wake_us == 3_000
 
@@ -284,9 +267,7 @@ def test_a_slice_ends_at_a_tick_and_not_at_the_interrupt_that_makes_another_task
         yield from semaphore.take()
         woke_us.append(kernel.now_us)
 
-    kernel.create_task("worker", 2, worker)
-    kernel.create_task("other", 2, other)
-    kernel.start()
+    start(kernel, worker=(2, worker), other=(2, other))
     run_with(kernel, 5_000, (3_500, semaphore.give_from_isr))
     assert woke_us == [4_000]
 

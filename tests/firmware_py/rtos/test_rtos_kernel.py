@@ -10,6 +10,7 @@ from firmware_py.rtos import FOREVER, Kernel, KernelError, Statistics, StuckTask
 from firmware_py.rtos.scheduler import STUCK_CALLS
 from firmware_py.rtos.statistics import LATENCY_BOUNDS_US
 from firmware_py.rtos.timer import COMMAND_QUEUE_LENGTH
+from support.kernel_tasks import start
 
 
 def run_until(kernel, end_us, interrupts=()):
@@ -57,9 +58,7 @@ def test_a_queue_never_holds_more_than_its_length_and_loses_only_what_it_counts(
             received.append((yield from queue.receive()))
             yield from kernel.work(work_us)
 
-    kernel.create_task("receiver", 1, receiver)
-    kernel.create_task("sender", 2, sender)
-    kernel.start()
+    start(kernel, receiver=(1, receiver), sender=(2, sender))
     run_until(kernel, 500_000, [(us, lambda n=n: send_from_isr(n)) for n, us in enumerate(sorted(from_isr))])
     assert max(waiting) <= queue.high_water <= length
     assert len(queue) == 0
@@ -77,8 +76,7 @@ def test_nothing_falls_due_while_all_tasks_wait_for_interrupts():
         yield from semaphore.take()
         yield from kernel.delay(3)
 
-    kernel.create_task("taker", 1, taker)
-    kernel.start()
+    start(kernel, taker=(1, taker))
     kernel.run(0)
     assert kernel.next_wake_us is None
     kernel.run(1_234_567)
@@ -100,8 +98,7 @@ def test_a_task_of_priority_0_runs_at_the_interrupt_that_wakes_it():
             woke_us.append(kernel.now_us)
             yield from kernel.work(2_500)
 
-    kernel.create_task("background", 0, background)
-    kernel.start()
+    start(kernel, background=(0, background))
     instants_us = [300, 20_300, 40_300, 60_300, 80_300]
     run_until(kernel, 100_000, [(us, semaphore.give_from_isr) for us in instants_us])
     assert woke_us == instants_us
@@ -120,9 +117,7 @@ def test_an_interrupt_at_the_instant_at_which_work_ends_comes_first():
         yield from semaphore.take()
         order.append("interrupt")
 
-    kernel.create_task("low", 1, low)
-    kernel.create_task("high", 2, high)
-    kernel.start()
+    start(kernel, low=(1, low), high=(2, high))
     run_until(kernel, 700, [(700, semaphore.give_from_isr)])
     assert order == ["interrupt", "work ends"]
 
@@ -172,9 +167,7 @@ def test_a_plain_receive_lets_a_more_urgent_sender_go_on_when_the_receiver_gives
         yield from queue.send(2)
         order.append("sent")
 
-    kernel.create_task("receiver", 1, receiver)
-    kernel.create_task("sender", 2, sender)
-    kernel.start()
+    start(kernel, receiver=(1, receiver), sender=(2, sender))
     kernel.run(20)
     assert order == [1, "goes on", "sent", 2, None]
 
@@ -193,9 +186,7 @@ def test_a_task_that_raises_is_named_with_the_time_and_the_others_can_go_on():
             yield from kernel.delay(1)
             ticks.append(kernel.tick_count)
 
-    kernel.create_task("careless", 1, careless)
-    kernel.create_task("careful", 2, careful)
-    kernel.start()
+    start(kernel, careless=(1, careless), careful=(2, careful))
     with pytest.raises(TaskError, match=r"task careless at 2\.345 ms: ValueError: no such gain") as caught:
         kernel.run(10_000)
     assert isinstance(caught.value.__cause__, ValueError)
@@ -276,8 +267,7 @@ def test_a_wait_for_an_instant_that_has_passed_is_named():
         kernel.block(None, kernel.tick_count)  # what no call of the kernel does: each checks that it may wait
         yield 0
 
-    kernel.create_task("late", 1, body)
-    kernel.start()
+    start(kernel, late=(1, body))
     with pytest.raises(
         StuckTaskError, match=r"task late at 3\.000 ms: waits for 3\.000 ms, which has passed"
     ):
@@ -293,9 +283,7 @@ def test_two_tasks_that_hand_each_other_the_processor_for_ever_are_stuck():
             yield from other.give()
             yield from own.take()
 
-    kernel.create_task("a", 2, player, ping, pong)
-    kernel.create_task("b", 2, player, pong, ping)
-    kernel.start()
+    start(kernel, a=(2, player, ping, pong), b=(2, player, pong, ping))
     with pytest.raises(StuckTaskError, match=f"{STUCK_CALLS} switches at one instant"):
         kernel.run(0)
 
@@ -381,8 +369,7 @@ NO_WAIT = "must not wait while the scheduler is suspended"
 )
 def test_what_freertos_asserts_against_is_an_error_of_the_task(body, complaint):
     kernel = Kernel()
-    kernel.create_task("task", 1, body, kernel)
-    kernel.start()
+    start(kernel, task=(1, body, kernel))
     with pytest.raises(TaskError, match=r"^task task at 0\.000 ms: ") as caught:
         kernel.run(1_000)
     assert complaint in str(caught.value)
@@ -407,8 +394,7 @@ def test_what_need_not_wait_is_allowed_while_the_scheduler_is_suspended():
         yield from kernel.delay(0)
         yield from kernel.resume_all()
 
-    kernel.create_task("task", 1, body)
-    kernel.start()
+    start(kernel, task=(1, body))
     kernel.run(0)
     assert results == [None, True, False, True, True, 1]
 
@@ -421,8 +407,7 @@ def test_a_free_mutex_cannot_be_given():
     def body():
         results.append((yield from mutex.give()))
 
-    kernel.create_task("task", 1, body)
-    kernel.start()
+    start(kernel, task=(1, body))
     kernel.run(0)
     results.append(mutex.give_from_isr())
     assert results == [False, False]
@@ -432,8 +417,7 @@ def test_a_free_mutex_cannot_be_given():
 def test_a_held_mutex_cannot_be_given_from_an_interrupt():
     kernel = Kernel()
     mutex = kernel.create_mutex("lock")
-    kernel.create_task("task", 1, doing(lambda _: mutex.take()), kernel)
-    kernel.start()
+    start(kernel, task=(1, doing(lambda _: mutex.take()), kernel))
     kernel.run(0)
     with pytest.raises(KernelError, match=r"^mutex lock: given from an interrupt, held by task$"):
         mutex.give_from_isr()
@@ -462,8 +446,7 @@ def objects_of(kernel):
 def test_a_task_cannot_make_the_calls_of_interrupts(call, who):
     kernel = Kernel()
     objects = objects_of(kernel)
-    kernel.create_task("task", 2, doing(lambda _: call(objects) and ()), kernel)
-    kernel.start()
+    start(kernel, task=(2, doing(lambda _: call(objects) and ()), kernel))
     with pytest.raises(
         TaskError, match=f"KernelError: {who} is for interrupts, and was called by task task$"
     ):
@@ -502,8 +485,7 @@ def test_an_interrupt_cannot_make_the_calls_of_tasks(call, traced):
 def test_a_board_whose_task_has_raised_still_takes_interrupts():
     kernel = Kernel()
     semaphore = kernel.create_binary_semaphore("semaphore")
-    kernel.create_task("task", 1, doing(lambda kernel: kernel.resume_all()), kernel)
-    kernel.start()
+    start(kernel, task=(1, doing(lambda kernel: kernel.resume_all()), kernel))
     with pytest.raises(TaskError):
         kernel.run(0)
     assert semaphore.give_from_isr()
@@ -532,9 +514,7 @@ def test_a_give_lets_a_taker_of_higher_priority_run_at_once(give):
         yield from semaphore.take()
         order.append("high")
 
-    kernel.create_task("low", 1, low)
-    kernel.create_task("high", 2, high)
-    kernel.start()
+    start(kernel, low=(1, low), high=(2, high))
     kernel.run(1_000)
     assert order == ["high", "low"]
     assert [who for _, event, who, *_ in lines if event == "Q_SEND"] == ["low"]
@@ -549,8 +529,7 @@ def test_a_give_without_waiting_that_finds_the_semaphore_full_is_counted_and_wak
         yield from semaphore.give_nowait()
         yield from semaphore.give_nowait()
 
-    kernel.create_task("task", 1, body)
-    kernel.start()
+    start(kernel, task=(1, body))
     kernel.run(0)
     assert (semaphore.count, semaphore.overruns) == (1, 1)
     assert [event for _, event, who, *_ in lines if who == "task" and event.startswith("Q_")] == [
@@ -569,9 +548,7 @@ def test_nothing_pends_for_a_task_that_woke_nobody_above_itself():
         semaphore.give_nowait()
         pending.append(tuple(kernel.yield_if_pending()))
 
-    kernel.create_task("high", 2, high)
-    kernel.create_task("low", 1, doing(lambda _: semaphore.take()), kernel)
-    kernel.start()
+    start(kernel, high=(2, high), low=(1, doing(lambda _: semaphore.take()), kernel))
     kernel.run(2_000)
     assert pending == [()]
 
@@ -595,8 +572,7 @@ def test_a_task_that_waits_for_a_mutex_it_holds_is_an_error_when_a_lent_priority
 
     kernel.create_task("holder", 1, holder)
     lender_task = kernel.create_task("lender", 3, lender)
-    kernel.create_task("boss", 4, boss)
-    kernel.start()
+    start(kernel, boss=(4, boss))
     with pytest.raises(
         TaskError, match=r"^task holder at 5\.000 ms: .*lock: holder waited for it and holds it"
     ):
@@ -615,8 +591,7 @@ def test_a_late_timer_that_finds_no_place_for_its_reload_is_an_error_of_the_time
         for _ in range(COMMAND_QUEUE_LENGTH):
             yield from timer.stop()
 
-    kernel.create_task("task", 2, body)
-    kernel.start()
+    start(kernel, task=(2, body))
     with pytest.raises(TaskError, match=r"^task Tmr Svc at 5\.000 ms: .* timer late: no place to reload it"):
         kernel.run(10_000)
 
@@ -629,8 +604,7 @@ def test_a_timer_callback_that_leaves_the_scheduler_suspended_is_an_error_of_the
         yield from ()
 
     timer = kernel.create_timer("timer", 1, False, callback)
-    kernel.create_task("task", 2, doing(lambda _: timer.start()), kernel)
-    kernel.start()
+    start(kernel, task=(2, doing(lambda _: timer.start()), kernel))
     with pytest.raises(TaskError, match=rf"^task Tmr Svc at 1\.000 ms: .*{NO_WAIT}"):
         kernel.run(2_000)
 
