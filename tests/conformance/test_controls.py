@@ -10,11 +10,9 @@ import pytest
 from firmware_py import table
 from firmware_py.firmware import Firmware
 from firmware_py.wire import crtp
-from firmware_py.wire.parameters import TYPE_EXTENDED, TYPE_READ_ONLY
-from firmware_py.wire.scalars import PARAMETER_SCALARS
 from firmware_py.wire.supervisor import Cause, State
 from ground_station.controls import PATIENCE_US, REPEAT_US, Action, Answer, Request
-from ground_station.links.crtp_controls import CrtpControls, Entry
+from ground_station.links.crtp_controls import CrtpControls
 from ground_station.links.mavlink import MavlinkLink, MavlinkLinkConfig
 from ground_station.links.mavlink_controls import MavlinkControls
 from hil.config import load_config
@@ -47,14 +45,9 @@ class CrtpBench(CrtpClient):
     def __init__(self) -> None:
         self.lossy = lambda: False
         super().__init__()
-        self.entries = {
-            name: Entry(
-                number, PARAMETER_SCALARS[kind & 0x0F], not kind & TYPE_READ_ONLY, bool(kind & TYPE_EXTENDED)
-            )
-            for name, (number, kind) in self.toc(2).items()
-        }
-        self.listed = len(self.entries)
-        self.controls = CrtpControls(self._up, lambda: self.entries)
+        self.known = self.entries()
+        self.listed = len(self.known)
+        self.controls = CrtpControls(self._up, lambda: self.known)
         self.sent.clear()
 
     def _up(self, data: bytes) -> None:
@@ -285,5 +278,5 @@ def test_a_parameter_that_can_only_be_read_is_not_written() -> None:
     bench = CrtpBench()
     assert ask(bench, Action.WRITE, "cpu.flash", 1.0).error == "cpu.flash: can only be read"
     assert dict(ask(bench, Action.READ, "cpu.flash").values) == {"cpu.flash": 1024}
-    bench.entries["cpu.id1"] = replace(bench.entries["cpu.id1"], number=9999)
+    bench.known["cpu.id1"] = replace(bench.known["cpu.id1"], number=9999)
     assert "does not report it" in ask(bench, Action.READ, "cpu.id1").error

@@ -6,11 +6,9 @@ from types import SimpleNamespace
 import pytest
 
 from firmware_py.wire import crtp
-from firmware_py.wire.parameters import TYPE_EXTENDED, TYPE_READ_ONLY
-from firmware_py.wire.scalars import PARAMETER_SCALARS
 from firmware_py.wire.supervisor import State
 from ground_station.controls import ControlsError
-from ground_station.links.crtp_controls import CrtpControls, Entry
+from ground_station.links.crtp_controls import CrtpControls
 from ground_station.mocap import MocapFrame
 from ground_station.operator import COMMANDS, HELP, LINES, WELL_US, Operator
 from ground_station.trajectory import FlightPlan, Goal, Hold, Offsets, Step
@@ -32,12 +30,7 @@ class Bench(CrtpClient):
 
     def __init__(self):
         super().__init__()
-        entries = {
-            name: Entry(
-                number, PARAMETER_SCALARS[kind & 0x0F], not kind & TYPE_READ_ONLY, bool(kind & TYPE_EXTENDED)
-            )
-            for name, (number, kind) in self.toc(2).items()
-        }
+        entries = self.entries()
         self.heard = inf  # packets that still reach the board
         self.controls = CrtpControls(self._up, lambda: entries)
         self.said, self.noted, self.place = [], [], HOME.p_WG

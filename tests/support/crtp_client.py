@@ -4,7 +4,9 @@ import struct
 
 from firmware_py.firmware import Firmware
 from firmware_py.wire import crtp
+from firmware_py.wire.parameters import TYPE_EXTENDED, TYPE_READ_ONLY
 from firmware_py.wire.scalars import LOG_SCALARS, PARAMETER_SCALARS
+from ground_station.links.crtp_controls import Entry
 from hil.config import load_config
 from hil.events import EventQueue
 from support.firmware_bench import FirmwareBench
@@ -59,6 +61,15 @@ class CrtpClient(FirmwareBench):
             assert rest == b""
             table[f"{group.decode()}.{name.decode()}"] = (number, reply[3])
         return table
+
+    def entries(self) -> dict[str, Entry]:
+        """What a client makes of the table of parameters."""
+        return {
+            name: Entry(
+                number, PARAMETER_SCALARS[kind & 0x0F], not kind & TYPE_READ_ONLY, bool(kind & TYPE_EXTENDED)
+            )
+            for name, (number, kind) in self.toc(PARAM).items()
+        }
 
     def read(self, table: dict[str, tuple[int, int]], name: str) -> float:
         number, kind = table[name]

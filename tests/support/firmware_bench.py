@@ -1,15 +1,13 @@
 """The firmware as a whole on a board of plain numbers, in simulated time."""
 
-from collections.abc import Sequence
 from contextlib import suppress
 
-from firmware_py.board import DECK_MEMORY_SIZE, EEPROM_SIZE, ImuCounts
 from firmware_py.firmware import Firmware
 from firmware_py.wire import WireError, crtp
-from firmware_py.wire.mavlink_numbers import Result
 from firmware_py.wire.telemetry import Sample
 from ground_station.links.log_blocks import LogBlocks
 from hil.config import load_config
+from hil.devices.board import VirtualBoard
 from hil.events import EventQueue
 
 HOVER_COUNTS = [
@@ -19,25 +17,29 @@ HOVER_COUNTS = [
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
-class FirmwareBench:
+class FirmwareBench(VirtualBoard):
     """A board without a world: still IMU, pins that remember, and the loop of the harness."""
 
+    now_us = 0  # of the hardware, which the test leads
+
     def __init__(self) -> None:
+        self.writes: list[tuple[int, list[int]]] = []
+        self.console: list[str] = []
+        super().__init__(
+            lambda now_us, counts: self.writes.append((self.now_us, list(counts))),
+            lambda now_us, data: True,
+            lambda now_us, text: self.console.append(text),
+            reset=lambda now_us: self.resets_us.append(self.now_us),
+        )
         self.events = EventQueue()
-        self.imu: ImuCounts = (3, -2, 1, 0, 0, 1365)
+        self.measure((3, -2, 1, 0, 0, 1365))
         self.imu_alive = True
         self.imu_noise = 1  # of the last bit; 0: frozen
         self.radio_open = True
         self.polling = True  # the dongle asks all the time, as every real one
-        self.writes: list[tuple[int, list[int]]] = []
         self.sent: list[tuple[int, bytes]] = []
         self.samples: list[Sample] = []  # of telemetry, once `stream` has asked for it
-        self.console: list[str] = []
         self.resets_us: list[int] = []
-        self.now_us = 0
-        self.battery_mv = 3900
-        self.eeprom = bytearray(b"\xff" * EEPROM_SIZE)
-        self.deck_memory = bytearray(b"\xff" * DECK_MEMORY_SIZE)
         self.firmware = Firmware(load_config(), self)
         self._to_station: list[bytes] = []
         self._logs = LogBlocks(
@@ -45,29 +47,11 @@ class FirmwareBench:
         )
         self.events.at(1000, self._sample)
 
-    def read_imu(self) -> ImuCounts:
-        return self.imu
-
-    def read_battery_mv(self) -> int:
-        return self.battery_mv
-
-    def write_compare(self, counts: Sequence[int]) -> None:
-        self.writes.append((self.now_us, list(counts)))
-
     def radio_send(self, data: bytes) -> bool:
         if self.radio_open:
             self.sent.append((self.now_us, data))
             self._to_station.append(data)
         return self.radio_open
-
-    def debug_write(self, text: str) -> None:
-        self.console.append(text)
-
-    def reset(self) -> None:
-        self.resets_us.append(self.now_us)
-
-    def inject_failure(self, unit: int, failing: int, instance: int) -> Result:
-        return Result.UNSUPPORTED  # as hardware that flies
 
     def _sample(self, now_us: int) -> None:
         if self.imu_alive:

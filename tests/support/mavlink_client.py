@@ -24,12 +24,13 @@ HOME: Pose = ((0.0, 0.0, 1.15), LEVEL)  # W, z up
 class MavlinkClient(FirmwareBench):
     """`messages` is what pymavlink found in the board's bytes, with the instant at which they left."""
 
+    uart_overruns = 0
+
     def __init__(self, *overrides: str, station: tuple[int, int] = STATION) -> None:
         self.codec = codec(*station)
         self.parser = codec(0, 0)
         self.messages: list[tuple[int, Any]] = []
         self.uplink = bytearray()
-        self.uart_overruns = 0
         self.uart_room = 1 << 30  # bytes that the transmit buffer still takes
         self.clock_ahead_us: int | None = None  # of the station; None: it does not answer
         super().__init__()
