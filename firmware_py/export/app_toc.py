@@ -160,19 +160,17 @@ static void switch_written(uint8_t *wanted, uint8_t *before, volatile bool *on, 
 
 static void stop_written(void) {
   static uint8_t before;
-  switch_written(&stop_wanted, &before, &floaty_requests[FLOATY_REQUEST_STOP],
-                 &floaty_requests[FLOATY_REQUEST_RECOVER]);
+  switch_written(&stop_wanted, &before, &floaty_requests.stop, &floaty_requests.recover);
 }
 
 static void armed_written(void) {
   static uint8_t before = 1;
-  switch_written(&armed_wanted, &before, &floaty_requests[FLOATY_REQUEST_ARM],
-                 &floaty_requests[FLOATY_REQUEST_DISARM]);
+  switch_written(&armed_wanted, &before, &floaty_requests.arm, &floaty_requests.disarm);
 }
 
 static void reset_written(void) {
   if (reset_wanted) {
-    floaty_requests[FLOATY_RESET] = true;
+    floaty_requests.reset = true;
   }
   reset_wanted = 0;
 }

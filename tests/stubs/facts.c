@@ -8,7 +8,6 @@
 #include <stddef.h>
 
 #include "FreeRTOS.h"
-#include "crc32.h"
 #include "queue.h"
 #include "task.h"
 
@@ -56,8 +55,6 @@ _Static_assert(SAME(QueueHandle_t, struct QueueDefinition *), "queue");
 VALUE(queueSEND_TO_BACK, 0)
 FUNCTION(xQueueGenericCreateStatic, QueueHandle_t, UBaseType_t, UBaseType_t, uint8_t *, StaticQueue_t *, uint8_t)
 FUNCTION(xQueueGenericSend, BaseType_t, QueueHandle_t, const void *, TickType_t, BaseType_t)
-FUNCTION(xQueueGenericReset, BaseType_t, QueueHandle_t, BaseType_t)
-TYPE(xQueueReset(NULL), BaseType_t)
 FUNCTION(xQueueReceive, BaseType_t, QueueHandle_t, void *, TickType_t)
 TYPE(xQueueCreateStatic(1, 1, NULL, NULL), QueueHandle_t)
 TYPE(xQueueSend(NULL, NULL, 0), BaseType_t)
@@ -70,7 +67,6 @@ FUNCTION(xTaskCreateStatic, TaskHandle_t, TaskFunction_t, const char *, uint32_t
 
 /* app.h, app_channel.h, crtp.h, debug.h, pm.h, system.h and others of one or two names */
 FUNCTION(appInit, void, void)
-FUNCTION(crc32CalculateBuffer, uint32_t, const void *, size_t)
 FUNCTION(systemWaitStart, void, void)
 FUNCTION(cfAssertNormalStartTest, bool, void)
 FUNCTION(watchdogNormalStartTest, bool, void)

@@ -107,7 +107,6 @@ class App:
         for test in (c.estimatorOutOfTreeTest, c.watchdogNormalStartTest, c.cfAssertNormalStartTest):
             test.restype = ctypes.c_bool
         self.now = ctypes.c_uint64.in_dll(c, "stub_now_us")
-        self.hil_mode = ctypes.c_uint8.in_dll(c, "floaty_hil_mode")
         self.gyro_noise = 1  # of the last bit, from step to step; 0: frozen
         self.gyro = (ctypes.c_int32 * 3).in_dll(c, "stub_gyro")
         self.battery = ctypes.c_float.in_dll(c, "stub_battery")
