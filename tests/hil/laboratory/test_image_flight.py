@@ -89,7 +89,7 @@ def test_what_sets_the_image_apart_from_the_python_board_is_measured(tmp_path: P
 def test_an_experiments_settings_reach_the_image_before_its_release(tmp_path: Path) -> None:
     request = Request.of(find_experiment("yaw-step"), board=ELF)
     result = fly(request, tmp_path)
-    assert result.passed, [verdict for verdict in result.verdicts if not verdict.passed]
+    assert result.passed, [verdict for verdict in result.verdicts if not verdict.holds]
     events = load_events(tmp_path)
     (told,) = (event for event in events if event["text"].startswith("set over the radio: "))
     assert "RandConsts.openMin -0.192" in told["text"]
