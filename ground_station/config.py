@@ -95,3 +95,19 @@ class CaptureConfig(Section):
         "vicon, qualisys, vrpn: exposure to arrival, since their client reports no times [us]; "
         "chosen, to be measured",
     )
+
+
+class GroundConfig(Section):
+    """All that a ground station needs to know, from a profile or a file of its own."""
+
+    station: StationConfig = Field(default_factory=StationConfig)
+    tracker: TrackerConfig = Field(default_factory=TrackerConfig)
+    capture: CaptureConfig = Field(default_factory=CaptureConfig)
+    frame_period_us: int = number(5_000, "[1000, 1_000_000]", "between two frames of the cameras [us]")
+    home: tuple[float, float, float] = Field((0.0, 0.0, 1.15), description="of the goal, W [m]")
+    baud: int = number(921_600, "[9600, 3_000_000]", "of a serial line whose address names none")
+    signing_key: str = Field(
+        "",
+        pattern="^([0-9a-fA-F]{64})?$",
+        description="MAVLink 2 signing, 32 bytes in hexadecimal; empty: unsigned",
+    )

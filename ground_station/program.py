@@ -1,6 +1,6 @@
 """The ground station as a program: cameras, link, tracker, trajectory and records wired together, until stopped.
 
-It knows nothing of the laboratory: its part of a profile arrives as `GroundSettings`.
+It does not depend on the laboratory: its part of a profile arrives as `GroundConfig`.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,12 +8,13 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from firmware_py.extras import install_command
 from firmware_py.wire import WireError
 from firmware_py.wire.supervisor import State
 from ground_station.clock import clock_us, epoch_us, wait
-from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
+from ground_station.config import CaptureConfig, GroundConfig
 from ground_station.controls import Answer, Request
-from ground_station.errors import MocapError
+from ground_station.errors import LinkError, MocapError
 from ground_station.frame_rate import FrameRate
 from ground_station.links.frame_log import FrameLog
 from ground_station.links.live_link import LiveLink
@@ -28,18 +29,6 @@ from ground_station.tracker import tracker_of
 from ground_station.trajectory import FlightPlan, Goal, Trajectory
 
 ASK_PERIOD_S = 0.002  # between two polls for an answer
-
-
-@dataclass(frozen=True, slots=True)
-class GroundSettings:
-    """The ground station's part of a profile."""
-
-    station: StationConfig
-    tracker: TrackerConfig
-    capture: CaptureConfig
-    frame_period_us: int  # of the cameras
-    home: tuple[float, float, float]  # of the goal, W [m]
-    link: LinkSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +57,7 @@ Hand = Callable[[Cockpit, int], None]  # called in every turn of the station's l
 
 
 def fly(
-    settings: GroundSettings,
+    settings: GroundConfig,
     session: Session,
     say: Callable[[str], None],
     stopping: Callable[[], bool],
@@ -85,7 +74,7 @@ def fly(
             frames = FrameLog(session.tlog, epoch_us())
             opened.callback(frames.close)
             note_frame = frames.note
-        link = find_link(session.uri, replace(settings.link, note_frame=note_frame))
+        link = find_link(session.uri, replace(link_settings(settings), note_frame=note_frame))
         tracker = tracker_of(settings.tracker, settings.frame_period_us)
         played = source = _open_source(session.mocap, settings.capture)
         opened.callback(lambda: source.close())
@@ -127,6 +116,28 @@ def run_until(stopping: Callable[[], bool], duration_s: float | None) -> Callabl
     """Return the function that says when to end: when stopped, or after a duration from now on."""
     start_us = clock_us()
     return lambda: stopping() or (duration_s is not None and clock_us() - start_us > duration_s * 1e6)
+
+
+def link_settings(settings: GroundConfig) -> LinkSettings:
+    """Return what the links need; a link never sends more poses than the cameras deliver."""
+    return LinkSettings(
+        corrections_hz=min(settings.station.corrections_hz, 1e6 / settings.frame_period_us),
+        latency_us=settings.station.link_latency_us,
+        baud=settings.baud,
+        signing_key=bytes.fromhex(settings.signing_key),
+    )
+
+
+def why(error: Exception, uri: str) -> str:
+    """Return the line with the reason why a session on this link ended."""
+    if isinstance(error, LinkError):
+        return f"--link {error}"
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror or error}"
+    if isinstance(error, ImportError):
+        extra = "mavlink" if uri.startswith("mavlink") else "radio"
+        return f"--link {uri}: {error}: {install_command(extra)}"
+    return str(error)
 
 
 def _open_source(mocap: str | None, capture: CaptureConfig) -> MocapSource:

@@ -6,7 +6,7 @@ from ground_station.controls import Action, Request, Settings
 from ground_station.errors import LinkError
 from ground_station.links.schemes import find_link
 from hil.commands.options import profile_option, say, set_option
-from hil.commands.station import settings_of, why
+from hil.commands.station import settings_of
 from hil.errors import LabError
 
 link_option = click.option(
@@ -86,12 +86,12 @@ def _setting(text: str) -> tuple[str, float]:
 
 def _ask(uri: str, profile: str, overrides: tuple[str, ...], requests: list[Request]) -> list[Settings]:
     """Send requests over a link; return the values of each answer. Raises `LabError` for the first one refused."""
-    from ground_station.program import ask
+    from ground_station.program import ask, link_settings, why
     from hil.config import load_config
 
     settings = settings_of(load_config(profile, overrides))
     try:
-        link = find_link(uri, settings.link)
+        link = find_link(uri, link_settings(settings))
         link.open(lambda: False)
     except (LinkError, ImportError) as error:
         raise LabError(why(error, uri)) from None

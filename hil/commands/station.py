@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from firmware_py.extras import install_command
+from ground_station.config import GroundConfig
 from ground_station.controls import ControlsError
 from ground_station.errors import LinkError, MocapError
-from ground_station.links.schemes import LinkSettings
 from ground_station.trajectory import Goal, Trajectory
 from hil.commands.options import (
     INTERRUPTED,
@@ -30,7 +29,6 @@ from hil.commands.tables import print_result
 from hil.errors import LabError
 
 if TYPE_CHECKING:
-    from ground_station.program import GroundSettings
     from hil.config import LabConfig
 
 
@@ -103,7 +101,7 @@ def station(asked: Asked) -> int:
     Exit code with --out: as `floaty fly`, by the limits of EXPERIMENT on what the cameras saw.
     """
     from ground_station.operator import COMMANDS, Operator
-    from ground_station.program import Cockpit, Session, fly, run_until
+    from ground_station.program import Cockpit, Session, fly, run_until, why
     from ground_station.terminal import Terminal
     from hil.config import load_config
     from hil.experiments import EXPERIMENTS, find_experiment
@@ -188,26 +186,14 @@ def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
         raise ControlsError(str(error)) from None
 
 
-def why(error: Exception, uri: str) -> str:
-    """Return the line with the reason why the station gave up."""
-    if isinstance(error, LinkError):
-        return f"--link {error}"
-    if isinstance(error, OSError):
-        return f"{error.filename}: {error.strerror or error}"
-    if isinstance(error, ImportError):
-        return (
-            f"--link {uri}: {error}: {install_command('mavlink' if uri.startswith('mavlink') else 'radio')}"
-        )
-    return str(error)
-
-
-def settings_of(config: LabConfig) -> GroundSettings:
+def settings_of(config: LabConfig) -> GroundConfig:
     """Return the ground station's settings of a profile."""
-    from ground_station.program import GroundSettings
-
-    corrections_hz = min(config.station.corrections_hz, 1e6 / config.mocap.period_us)
-    link = LinkSettings(
-        corrections_hz, config.station.link_latency_us, config.serial.baud, bytes.fromhex(config.mavlink.signing_key)
-    )  # fmt: skip
-    period_us, home = config.mocap.period_us, config.flight.home
-    return GroundSettings(config.station, config.tracker, config.capture, period_us, home, link)
+    return GroundConfig(
+        station=config.station,
+        tracker=config.tracker,
+        capture=config.capture,
+        frame_period_us=config.mocap.period_us,
+        home=config.flight.home,
+        baud=config.serial.baud,
+        signing_key=config.mavlink.signing_key,
+    )

@@ -1,8 +1,9 @@
 """The ground station of a laboratory, in real time: cameras while a board connects, records and what they are good for."""
 
 import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -81,9 +82,13 @@ def test_while_the_board_connects_the_cameras_are_served() -> None:
     assert not any("frames" in line for line in said)
 
 
-def station(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [*FLOATY, "station", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+ALONE = (sys.executable, "-m", "ground_station")
+
+
+def station(
+    *arguments: str, command: Sequence[str] = (*FLOATY, "station")
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=60)
 
 
 @pytest.mark.long
@@ -104,7 +109,7 @@ def test_a_flight_is_recorded_and_its_record_flown_again(tmp_path: Path) -> None
         assert len(recorded) > 800
         assert max(abs(frame.p_WB[2] - 1.15) for _, frame in recorded) < 0.1
         begin_s = time.monotonic()
-        shown = station("--link", link, "--mocap", f"replay:{frames}")
+        shown = station("--link", link, "--mocap", f"replay:{frames}", command=ALONE)
         assert shown.returncode == 0, shown.stdout + shown.stderr
         assert f"the recording is over: {len(recorded)} frames" in shown.stdout
         assert time.monotonic() - begin_s > (recorded[-1][0] - recorded[0][0]) * 1e-6

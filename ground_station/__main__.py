@@ -1,0 +1,82 @@
+"""The ground station alone: `python -m ground_station --link URI` holds the robot at home.
+
+It needs nothing of the laboratory. `floaty station` flies the same session and adds experiments, run folders and pictures.
+"""
+
+import argparse
+import signal
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from ground_station.config import GroundConfig
+from ground_station.controls import ControlsError
+from ground_station.errors import LinkError, MocapError
+from ground_station.operator import COMMANDS, Operator
+from ground_station.program import Cockpit, Session, fly, run_until, why
+from ground_station.terminal import Terminal
+from ground_station.trajectory import Goal, Hold, Trajectory
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fly until Ctrl-C; return the exit code: 0, or 2 with one line for what cannot be flown."""
+    parser = argparse.ArgumentParser(
+        "ground_station", description="Send poses to a board that hovers at home."
+    )
+    parser.add_argument(
+        "--link", required=True, metavar="URI", help="radio://…, udp://HOST:PORT or mavlink:DEVICE[,BAUD]"
+    )
+    parser.add_argument(
+        "--mocap", metavar="SYSTEM", help="such as optitrack:HOST, or replay:PATH; overrides [capture]"
+    )
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE", help="TOML with [station], [tracker], [capture], home, …"
+    )
+    parser.add_argument("--duration", type=float, metavar="S", help="default: until Ctrl-C")
+    parser.add_argument("--log", type=Path, metavar="FILE", help="telemetry as CSV")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="frames of motion capture as CSV")
+    asked = parser.parse_args(arguments)
+    try:
+        tree = tomllib.loads(asked.settings.read_text("utf-8")) if asked.settings is not None else {}
+        settings = GroundConfig.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        return _refuse(f"--settings {asked.settings}: {key} = {first['input']!r}: {first['msg']}")
+    except (OSError, ValueError) as error:
+        return _refuse(f"--settings {asked.settings}: {error}")
+    session = Session(asked.link, asked.mocap, lambda home, _: Hold(home), log=asked.log, record=asked.record)
+    operator = Operator(_no_experiment, print, lambda _: None)
+    terminal = Terminal(lambda: (*COMMANDS, *operator.known))
+    stops: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _: stops.append(received))
+
+    def steer(cockpit: Cockpit, now_us: int) -> None:
+        for line in terminal.lines():
+            operator.take(line)
+        operator.turn(cockpit, now_us)
+
+    try:
+        fly(settings, session, print, run_until(lambda: bool(stops), asked.duration), [steer])
+    except (LinkError, MocapError, OSError, ImportError) as error:
+        return _refuse(why(error, asked.link))
+    finally:
+        terminal.close()
+    return 0
+
+
+def _no_experiment(name: str) -> Callable[[Goal, int], Trajectory]:
+    raise ControlsError(f"fly {name}: only `floaty station` has experiments; here: goal X Y Z [YAW]")
+
+
+def _refuse(line: str) -> int:
+    print(line, file=sys.stderr)
+    return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())
