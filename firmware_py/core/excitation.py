@@ -1,16 +1,21 @@
 """The excitation: a known signal on top of the inputs, for identification; off unless a parameter switches it on.
 
-It repeats every 20 s. The multisine's lines are the odd multiples of 0.05 Hz from the lower to the upper frequency. They go
-round the four inputs: u1 has the first, u2 the second, and so on, so that no two inputs share a line and all can be excited
-at once. What squares and products of inputs do lies on even multiples, where nothing is looked for. The phases are
-Schroeder's, which keep the peaks low. The chirp sweeps the band and is for one input at a time.
+The multisine's lines are the odd multiples of 0.05 Hz from the lower to the upper frequency. They go round the four inputs:
+u1 has the first, u2 the second, and so on, so that no two inputs share a line and all can be excited at once. What squares
+and products of inputs do lies on even multiples, where nothing is looked for. Its phases are as good as random and change
+every 22 s: each realisation lasts 2 s, in which the response settles, and a period of 20 s, so that what is not linear in
+the response scatters from one realisation to the next. After 16 realisations the first follows again. The chirp sweeps the
+band every 20 s and is for one input at a time.
 """
 
-from firmware_py.core.maths import HALF, PI, TWO_PI, ZERO, clamp, cos, sin
+from firmware_py.core.maths import HALF, TWO_PI, ZERO, clamp, cos, sin
 from firmware_py.core.structs import EXCITE_CHIRP, EXCITE_OFF, Control, Parameters
 from firmware_py.core.subset import Integer, f32, i32, kernel, sqrt
 
 PERIOD = 2000  # ticks
+REALISATION = 2200  # ticks: 2 s that settle, and a period
+REALISATIONS = 16
+PHASES = 8191  # a prime: squares of the remainders are well mixed
 ODD_LINES_PER_HZ = f32(10.0)
 INPUTS = 4
 TICK = f32(0.01)
@@ -20,16 +25,26 @@ ROOT_2 = f32(1.41421356)
 
 
 @kernel
+def phase(line: Integer, realisation: Integer) -> f32:
+    """Return the phase [rad] of a line in a realisation: the same on every machine, and as good as random."""
+    mixed = (37 * line + 101 * realisation + 17) % PHASES
+    mixed = (mixed * mixed + line) % PHASES
+    mixed = (mixed * mixed + realisation) % PHASES
+    return f32(TWO_PI * f32(mixed) / f32(PHASES))
+
+
+@kernel
 def multisine(first: Integer, last: Integer, tick: Integer) -> f32:
     """Return the sum of every fourth odd line from `first` to `last`, of rms 1; line n is the multiple 2 n + 1."""
     if last < first:
         return ZERO
     lines = (last - first) // INPUTS + 1
+    realisation = tick // REALISATION
     total = ZERO
     for index in range(lines):
-        turn = ((2 * (first + INPUTS * index) + 1) * tick) % PERIOD
-        schroeder = (index * (index + 1)) % (2 * lines)
-        total = total + cos(TWO_PI * f32(turn) / f32(PERIOD) - PI * f32(schroeder) / f32(lines))
+        line = first + INPUTS * index
+        turn = ((2 * line + 1) * (tick % REALISATION)) % PERIOD
+        total = total + cos(TWO_PI * f32(turn) / f32(PERIOD) + phase(line, realisation))
     return f32(total * sqrt(f32(2.0) / f32(lines)))
 
 
@@ -51,7 +66,7 @@ def line_above(frequency: f32) -> i32:
 def excite(parameters: Parameters, control: Control) -> None:
     """Add the excitation of this tick to the inputs u; call it once per tick."""
     tick = control.excite_tick
-    if tick < 0 or tick >= PERIOD:
+    if tick < 0 or tick >= REALISATION * REALISATIONS:
         tick = i32(0)
     low = clamp(parameters.excite_low, ZERO, NYQUIST)
     high = clamp(parameters.excite_high, ZERO, NYQUIST)
@@ -62,11 +77,11 @@ def excite(parameters: Parameters, control: Control) -> None:
         if parameters.excite_kind != EXCITE_OFF and parameters.excite_rms[i] > ZERO:
             wave = ZERO
             if parameters.excite_kind == EXCITE_CHIRP:
-                wave = chirp(low, high, tick)
+                wave = chirp(low, high, i32(tick % PERIOD))
             else:
                 wave = multisine(first + i, last, tick)
             control.excitation[i] = parameters.excite_rms[i] * wave
             control.u[i] = control.u[i] + control.excitation[i]
-    control.excite_tick = i32((tick + 1) % PERIOD)
+    control.excite_tick = i32((tick + 1) % (REALISATION * REALISATIONS))
     if parameters.excite_kind == EXCITE_OFF:
         control.excite_tick = i32(0)

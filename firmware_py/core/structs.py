@@ -315,7 +315,7 @@ class Control(Struct):
     word: Annotated[I32s, 4]
     count: Annotated[I32s, 4, Logged("counts", "floaty.m1 m2 m3 m4", stock="motor.m1 m2 m3 m4", type="U16")]
     excitation: Annotated[F32s, 4, Logged("rad", "excite.u1 u2 u3 u4")]  # its part of u
-    excite_tick: i32  # of its period
+    excite_tick: i32  # since it was switched on, over all realisations
 
 
 class Sampling(Struct):

@@ -61,15 +61,16 @@ def identify(
 
     if profile_out is not None and profile_out.suffix != ".toml":
         raise LabError(f"--profile-out {profile_out}: a profile's name ends in .toml")
+    held_out = None if validate is None else load_record(validate, profile)
     found = identify_records([load_record(run, profile) for run in runs])
     _print_constants(found)
     if found.excited or found.free:
-        held_out = None if validate is None else load_record(validate, profile)
         with writing("--out", out):
             out.mkdir(parents=True, exist_ok=True)
             console.print(f"  {write_pages(out, found, held_out)}", soft_wrap=True)
     if profile_out is not None:
-        write_profile(profile_out, profile, found)
+        if notice := write_profile(profile_out, profile, found):
+            console.print(f"  {notice}", soft_wrap=True)
         console.print(f"  {profile_out}   (floaty fly hover --profile {profile_out})", soft_wrap=True)
     return 0 if any(constant.verdict == IDENTIFIED for constant in found.constants) else 1
 
@@ -97,9 +98,14 @@ def _print_constants(found: "Identification") -> None:
         )  # fmt: skip
     wide_console().print(table)
     if found.excited:
-        periods = ", ".join(f"u{one.axis.input + 1}: {one.spectra.periods}" for one in found.excited)
+        periods = ", ".join(
+            f"u{one.axis.input + 1}: {one.spectra.periods} at {degrees(found.records[one.record].flap_angle):.1f} deg"
+            for one in found.excited
+        )
         console.print(
-            f"periods of 20 s: {periods}; the model misses the log by {found.estimate.misfit**0.5:.2f} of its scatter"
+            f"realisations and mean flap angles, to which the constants refer: {periods}; the model misses the log by "
+            f"{found.estimate.misfit**0.5:.2f} of its scatter",
+            soft_wrap=True,
         )
 
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from hil.laboratory.flight import Flight
 
 BEGIN_US = 2_000_000  # the robot has come to rest after its release
-PERIODS = 8  # of 20 s, after 2 s in which the response settles
-DURATION_S = 2.0 + 2.0 + 20.0 * PERIODS + 1.0
+REALISATIONS = 6  # of 22 s: 2 s in which the response settles, and a period
+DURATION_S = 2.0 + 22.0 * REALISATIONS + 1.0
 LIMITS = {"lost": 0.0}
 ALONE = {"u1": 0.05, "u2": 0.08, "u3": 0.06, "u4": 0.10}  # [rad] rms; larger ones are no longer linear
 TOGETHER = {"u1": 0.04, "u2": 0.06, "u3": 0.05, "u4": 0.08}

@@ -30,7 +30,7 @@ def flow_of(record: Record, axis: Axis, robot: Robot) -> Flow:
             f"{record.name}: {len(grid) * step:.1f} s of flight: {1.5 * WINDOW_S:g} s after the first {BEGIN_S:g} s are "
             "needed to estimate the flow"
         )
-    u = np.interp(grid, record.t, record.u[:, axis.input])
+    u = np.interp(grid, record.u_t, record.u[:, axis.input])
     poses = {
         state: np.interp(grid, record.pose_t, record.pose[:, column]) for state, column in axis.pose.items()
     }

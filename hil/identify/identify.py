@@ -1,21 +1,29 @@
 """`floaty identify`: estimates of every constant from a set of flights, by three methods, and how reliable they are.
 
 Flights with an excitation go to the instrumental variables and the joint fit, pairs without one and with different gains to
-the paper's method. A constant is `identified` when the joint fit's 95 % interval is narrow and the linear model explains the
-log, `weak` when its sign and size are known, else `not identifiable`; then its number is only where the fit stopped.
+the paper's method. Constants are those at the mean flap angles of the flights. A constant is `identified` when the joint
+fit's 95 % interval is narrow, the instruments agree, the response follows the excitation and the linear model explains the
+log; `weak` when its sign and size are known; else `not identifiable`: its number is then only where the fit stopped.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from math import isnan, nan
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from math import hypot, isnan, nan
+
+import numpy as np
 
 from hil.design.axes import AXES
 from hil.errors import LabError
 from hil.identify.joint import Estimate, Excited, excited_axes, instrumental, joint
+from hil.identify.plates import turns_of
 from hil.identify.record import Record
 from hil.identify.response import DELAY, LAG, UNIT
 from hil.identify.two_controllers import two_controllers
 from hil.laboratory.robot import Streams
+from hil.world.correction import OperatingPoint
 from hil.world.paper_table import PAPER_TABLE
 from hil.world.plant import Plant
 
@@ -23,6 +31,8 @@ IDENTIFIED, WEAK, UNKNOWN = "identified", "weak", "not identifiable"
 NARROW, KNOWN = 0.25, 0.7  # half width of the interval over the value
 EXPLAINED = 10.0  # misfit beyond which the linear model does not explain the log
 SATURATED, LOST = 0.05, 0.30  # shares of the rows
+COHERENT = 0.35  # least mean coherence of an axis with its excitation; noise alone has 1 over the realisations plus 1
+PLAUSIBLE = 10.0  # times the profile's value
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +53,11 @@ class IdentifiedConstant:
     def best(self) -> float:
         """The joint fit's value."""
         return self.joint[0]
+
+    @property
+    def differs(self) -> bool:
+        """Whether the instruments and the joint fit exclude each other."""
+        return abs(self.joint[0] - self.instrumental[0]) > hypot(self.joint[1], self.instrumental[1])
 
     @property
     def contains_truth(self) -> bool:
@@ -79,6 +94,9 @@ def identify(records: Sequence[Record]) -> Identification:
             raise LabError(
                 f"{record.name}: {record.lost_rows:.0%} of the telemetry's rows are missing; at most {LOST:.0%} may be"
             )
+    for one, other in combinations(records, 2):
+        if np.array_equal(one.t, other.t) and np.array_equal(one.rates, other.rates):
+            raise LabError(f"{other.name}: the same flight as {one.name}: each flight counts once")
     rich = tuple(record for record in records if record.excitation.any())
     free = tuple(record for record in records if not record.excitation.any())
     printed = two_controllers(free)
@@ -89,52 +107,88 @@ def identify(records: Sequence[Record]) -> Identification:
             "no constant can be identified; fly identify, or identify-u1 to identify-u4"
         )
     excited = tuple(excited_axes(rich))
-    lag = 1.0 / (rich or free)[0].config.model.flap_rate
-    by_instruments = instrumental(excited, lag)
-    fitted = joint(excited, lag, by_instruments.values) if excited else Estimate({}, {}, nan)
-    truth = _truth(records[0])
+    model = (rich or free)[0].config.model
+    by_instruments = instrumental(excited, 1.0 / model.flap_rate)
+    fitted = _joint(excited, by_instruments, rich[0]) if excited else Estimate({}, {}, nan)
     constants = []
-    for name in [name for axis in AXES for name in axis.constants] + [LAG, DELAY]:
-        printed_pair, instruments, joint_pair = (
-            printed.get(name, (nan, nan)),
+    for name, truth in _truths(records[0], rich, excited).items():
+        constant = IdentifiedConstant(
+            name, UNIT[name], PAPER_TABLE.get(name, (nan, nan)), truth, printed.get(name, (nan, nan)),
             (by_instruments.values.get(name, nan), by_instruments.errors.get(name, nan)),
-            (fitted.values.get(name, nan), fitted.errors.get(name, nan)),
-        )
-        verdict, why = _verdict(name, joint_pair, fitted, rich)
-        constants.append(
-            IdentifiedConstant(
-                name, UNIT[name], PAPER_TABLE.get(name, (nan, nan)), truth.get(name, nan), printed_pair, instruments,
-                joint_pair, verdict, why,
-            )
+            (fitted.values.get(name, nan), fitted.errors.get(name, nan)), "", "",
         )  # fmt: skip
+        own = [one for one in excited if name in (*one.axis.constants, LAG, DELAY)]
+        verdict, why = _verdict(constant, Evidence.of(fitted, rich, own), getattr(model, name, nan))
+        constants.append(replace(constant, verdict=verdict, why=why))
     return Identification(tuple(constants), excited, fitted, rich, free)
 
 
-def _truth(record: Record) -> Mapping[str, float]:
-    """Return the plant's own constants; none for a real flight."""
+def _joint(excited: Sequence[Excited], by_instruments: Estimate, record: Record) -> Estimate:
+    """Return the joint fit, begun at the instruments' constants and at the profile's."""
+    config, turns = record.config, turns_of(record)
+    begin = [by_instruments.values, {**config.model.model_dump(), **turns}]
+    return joint(excited, 1.0 / config.model.flap_rate, begin, config.plant.airspeed, turns)
+
+
+def _truths(record: Record, rich: Sequence[Record], excited: Sequence[Excited]) -> dict[str, float]:
+    """Return every constant's true value where it was excited, else where `record` flew; NaN where none is known."""
+    flown = {one.axis.name: rich[one.record] for one in reversed(excited)}
+    every: dict[str, float] = {}
+    for axis in AXES:
+        truth = truth_of(flown.get(axis.name, record))
+        every |= {name: truth.get(name, nan) for name in axis.constants}
+    return every | {LAG: truth.get(LAG, nan), DELAY: nan}
+
+
+def operating_point(record: Record) -> OperatingPoint:
+    """Return where a robot flew on the mean."""
+    u, attitude = record.u.mean(axis=0).tolist(), record.pose[:, 3:].mean(axis=0).tolist()
+    return OperatingPoint((*u,), (*attitude,), record.config.tunnel.side_wind)
+
+
+def truth_of(record: Record) -> dict[str, float]:
+    """Return the plant's own constants at the point where a simulated robot flew; none for a real flight."""
     if not record.simulated:
         return {}
     config = record.config
     plant = Plant(config.geometry, config.plant, config.tunnel, config.actuators, Streams.of_seed(1).gusts)
-    return {**asdict(plant.linearise()), LAG: config.actuators.tau}
+    return {**asdict(plant.linearise(operating_point(record))), LAG: config.actuators.tau}
 
 
-def _verdict(
-    name: str, found: tuple[float, float], fitted: Estimate, records: Sequence[Record]
-) -> tuple[str, str]:
-    value, half = found
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What speaks against a constant, besides its interval."""
+
+    misfit: float
+    saturated: float  # share of the rows of the worst record
+    coherence: float  # of the axis' clearest output with the excitation, mean over the lines
+
+    @classmethod
+    def of(cls, fitted: Estimate, records: Sequence[Record], own: Sequence[Excited]) -> Evidence:
+        """Return the evidence for a constant of the axes `own`; lag and delay are those of all axes."""
+        coherence = [float(one.spectra.coherence[:, 1:].max(axis=1).mean()) for one in own]
+        saturated = max((record.saturated for record in records), default=0.0)
+        return cls(fitted.misfit, saturated, max(coherence, default=1.0))
+
+
+def _verdict(one: IdentifiedConstant, evidence: Evidence, usual: float) -> tuple[str, str]:
+    """Return the verdict and its reason; `usual` is the constant in the profile that flew, NaN where it has none."""
+    value, half = one.joint
     if value != value:
         return UNKNOWN, "its axis is not excited"
-    if name == DELAY:
+    if one.name == DELAY:
         return WEAK, "held near the value that follows from the firmware's timing"
-    worst = max(record.saturated for record in records)
-    if worst > SATURATED:
-        return (
-            UNKNOWN,
-            f"flaps are at their limits in {worst:.0%} of a log's rows: the response is not linear",
-        )
-    if fitted.misfit > EXPLAINED:
-        return UNKNOWN, f"the linear model misses the log by {fitted.misfit**0.5:.1f} times its scatter"
+    if evidence.saturated > SATURATED:
+        share = f"{evidence.saturated:.0%}"
+        return UNKNOWN, f"flaps are at their limits in {share} of a log's rows: the response is not linear"
+    if evidence.misfit > EXPLAINED:
+        return UNKNOWN, f"the linear model misses the log by {evidence.misfit**0.5:.1f} times its scatter"
+    if evidence.coherence < COHERENT:
+        return UNKNOWN, f"coherence {evidence.coherence:.2f}: the response hardly follows the excitation"
+    if one.differs:
+        return UNKNOWN, "the instruments and the joint fit exclude each other"
+    if abs(value) > PLAUSIBLE * abs(usual):
+        return UNKNOWN, f"more than {PLAUSIBLE:g} times the profile's {usual:.4g}"
     relative = half / abs(value) if value else float("inf")
     if relative <= NARROW:
         return IDENTIFIED, f"± {relative:.0%}"

@@ -14,13 +14,14 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import t as student
 
-from hil.design.axes import ANGLE, AXES, FLAP, RATE, VELOCITY, Axis
+from hil.design.axes import ANGLE, AXES, FLAP, NUISANCES, RATE, VELOCITY, Axis
 from hil.identify.record import Array, Record
 from hil.identify.response import DELAY, LAG, flap_response, outputs, response
 from hil.identify.spectra import Complex, Spectra, period_spectra, spectra_of
+from hil.world.motion import GRAVITY
 
 CONFIDENCE = 0.95
 LAG_SPREAD = 0.2  # of the profile's lag, standard deviation
@@ -29,10 +30,13 @@ DELAY_S, DELAY_SPREAD_S = 0.013, 0.003
 # Lateness of a pose against the gyro: half its mean, and the telemetry's latency.
 LATE_S, LATE_SPREAD_S = -0.008, 0.003
 ROUNDS = 6
-# How far curvature moves a constant at the amplitudes of the experiments, standard deviation over its value; when several
-# inputs are excited at once, products of three of them lie on lines.
-CURVED, CURVED_TOGETHER = 0.04, 0.12
-ALIKE = 4  # lines over which the model's errors may be alike
+# How far the identities of flat plates may be off, standard deviations.
+STIFFNESS_SPREAD, STIFFNESS_LEAST = 0.05, 0.1  # of the value, and [rad/s/m]
+DAMPING_SPREAD, TURN_SPREAD = 0.03, 0.015  # [1/s], [m/s/rad]
+DIFFERENCE = 1e-6  # of a parameter over its size
+# Of a constant, standard deviation: curvature that `hil.identify.plates` does not straighten.
+BENT = 0.03
+SIGMAS = 1.96
 GYRO, CAMERAS = 1, 2  # places of a turn's rate and angle in its spectra
 
 
@@ -158,69 +162,112 @@ def _regress(
     return theta, covariance, misfit
 
 
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The least-squares problem of all excited axes; parameters are in units of `scale`, the poses' lateness last."""
+
+    excited: Sequence[Excited]
+    names: Sequence[str]
+    records: Sequence[int]
+    scale: Array
+    lag: float  # [s] of the profile
+    speed: float  # [m/s] of the tunnel
+    turns: Mapping[str, float]  # the plates' x_rate and y_rate
+
+    def parted(self, x: Array) -> tuple[dict[str, float], dict[int, float]]:
+        """Return constants by name, and by record how late poses are [s]."""
+        theta = (x * self.scale).tolist()
+        late = dict(zip(self.records, theta[len(self.names) :], strict=True))
+        return dict(zip(self.names, theta, strict=False)), late
+
+    def prior(self, x: Array) -> Array:
+        """Return by how much parameters differ from what is known without the flight."""
+        values, late = self.parted(x)
+        known = [(values[LAG] / self.lag - 1) / LAG_SPREAD, (values[DELAY] - DELAY_S) / DELAY_SPREAD_S]
+        known += [(late[record] - LATE_S) / LATE_SPREAD_S for record in self.records]
+        return np.array([*known, *identities(values, self.speed, self.turns)])
+
+    def errors(self, x: Array) -> Array:
+        """Return all errors in units of their scatter."""
+        values, late = self.parted(x)
+        return np.concatenate(
+            [*(whitened(one, values, late[one.record]) for one in self.excited), self.prior(x)]
+        )
+
+    def slopes(self, x: Array) -> Array:
+        """Return the derivatives of the errors, of each axis by those parameters alone that it depends on."""
+        at, known = self.errors(x), self.prior(x)
+        found = np.zeros((len(at), len(x)))
+        for column, name in enumerate([*self.names, *self.records]):
+            moved = x.copy()
+            moved[column] += DIFFERENCE
+            values, late = self.parted(moved)
+            row = 0
+            for one in self.excited:
+                end = row + 2 * len(one.spectra.w) * len(outputs(one.axis))
+                if name in (LAG, DELAY, one.record) or name in one.axis.constants:
+                    found[row:end, column] = whitened(one, values, late[one.record]) - at[row:end]
+                row = end
+            found[row:, column] = self.prior(moved) - known
+        return found / DIFFERENCE
+
+    def solved(self, x: Array) -> OptimizeResult:
+        """Return the solution that is reached from x."""
+        return least_squares(self.errors, x, self.slopes, x_scale="jac", max_nfev=100)
+
+
 def joint(
     excited: Sequence[Excited],
     lag: float,
-    start: Mapping[str, float],
-    fixed: Mapping[str, float] | None = None,
+    begin: Sequence[Mapping[str, float]],
+    speed: float,
+    turns: Mapping[str, float],
 ) -> Estimate:
-    """Return all excited axes' constants, lag and delay by the joint fit; `fixed` ones keep their values."""
-    fixed = fixed or {}
+    """Return all excited axes' constants, lag and delay by the joint fit, the best of those from several beginnings.
+
+    `lag` [s] is the profile's, `speed` [m/s] the tunnel's, `turns` the plates' x_rate and y_rate.
+    """
     names = [name for axis in AXES if any(one.axis is axis for one in excited) for name in axis.constants]
-    names = [name for name in (*names, LAG, DELAY) if name not in fixed]
+    names += [LAG, DELAY]
     records = sorted({one.record for one in excited})
-    begin = {**start, LAG: lag, DELAY: DELAY_S} | dict(fixed)
-    x0 = np.array([*(begin[name] for name in names), *(pose_lateness(excited, record) for record in records)])
-    scale = np.concatenate([np.maximum(np.abs(x0[: len(names)]), 1e-3), np.full(len(records), LATE_SPREAD_S)])
-
-    def errors(x: Array) -> Array:
-        theta = x * scale
-        values = {**begin, **dict(zip(names, theta[: len(names)], strict=True))}
-        late = dict(zip(records, theta[len(names) :], strict=True))
-        parts = [whitened(one, values, late[one.record]) for one in excited]
-        prior = [(values[LAG] / lag - 1) / LAG_SPREAD, (values[DELAY] - DELAY_S) / DELAY_SPREAD_S]
-        return np.concatenate(
-            [*parts, prior, [(late[record] - LATE_S) / LATE_SPREAD_S for record in records]]
-        )
-
-    found = least_squares(errors, x0 / scale, x_scale="jac", max_nfev=200)
-    count = len(found.fun)
-    misfit = 2 * found.cost / max(1, count - len(x0))
-    inverse = np.linalg.pinv(found.jac.T @ found.jac)
-    covariance = inverse @ _meat(excited, found.fun, found.jac) @ inverse * np.outer(scale, scale)
-    half = student.ppf(0.5 + CONFIDENCE / 2, max(1, count - len(x0))) * np.sqrt(np.diag(covariance))
-    theta = found.x * scale
-    together = len({one.record for one in excited}) < len(excited)
-    curved = 2.0 * (CURVED_TOGETHER if together else CURVED) * np.abs(theta[: len(names)])
-    curved *= [name not in (LAG, DELAY) for name in names]
-    half = np.hypot(half[: len(names)], curved)
+    late = [pose_lateness(excited, record) for record in records]
+    starts = [{LAG: lag, DELAY: DELAY_S} | dict(one) for one in begin]
+    starts += [starts[0] | {LAG: lag * (1 + LAG_SPREAD)}, starts[0] | {LAG: lag * (1 - LAG_SPREAD)}]
+    size = np.abs([starts[0][name] for name in names])
+    scale = np.concatenate([np.maximum(size, 1e-3), np.full(len(records), LATE_SPREAD_S)])
+    fit = Fit(excited, names, records, scale, lag, speed, turns)
+    solutions = [fit.solved(np.array([*(one[name] for name in names), *late]) / scale) for one in starts]
+    found = min(solutions, key=lambda result: float(result.cost))
+    misfit = 2 * found.cost / max(1, len(found.fun) - len(found.x))
+    covariance = np.linalg.pinv(found.jac.T @ found.jac) * max(1.0, misfit) * np.outer(scale, scale)
+    values = dict(zip(names, (found.x * scale).tolist(), strict=False))
+    spread = np.sqrt(np.diag(covariance))[: len(names)]
+    spread = np.hypot(spread, [0.0 if name == DELAY else BENT * abs(values[name]) for name in names])
+    half = SIGMAS * spread
     return Estimate(
-        dict(zip(names, theta.tolist()[: len(names)], strict=True)),
+        values,
         dict(zip(names, half.tolist(), strict=True)),
         float(misfit),
-        tuple(theta.tolist()[len(names) :]),
+        tuple((found.x * scale).tolist()[len(names) :]),
         covariance[: len(names), : len(names)],
     )
 
 
-def _meat(excited: Sequence[Excited], errors: Array, J: Array) -> Array:
-    """Return the information matrix with each output's actual errors: larger than the scatter, and correlated from line
-    to line, where the linear model does not explain everything.
+def identities(values: Mapping[str, float], speed: float, turns: Mapping[str, float]) -> list[float]:
+    """Return by how much constants differ from what holds for any flat plates in a flow, in units of what is usual.
+
+    A horizontal velocity tilts the wind as the same angle of the robot does (docs/explanation/plant.md).
     """
-    weights = np.ones(len(errors))
-    place = 0
-    for one in excited:
-        shown, count = len(outputs(one.axis)), len(one.spectra.w)
-        block = slice(place, place + 2 * shown * count)
-        place += 2 * shown * count
-        own = errors[block].reshape(2, count, shown)
-        power = np.mean(own**2, axis=(0, 1))
-        alike = power.copy()
-        for step in range(1, min(ALIKE, count - 1) + 1):
-            alike += 2 * (1 - step / (ALIKE + 1)) * np.mean(own[:, step:] * own[:, :-step], axis=(0, 1))
-        weights[block] = np.broadcast_to(np.maximum(np.maximum(alike, power), 1.0), own.shape).ravel()
-    meat: Array = (J * weights[:, None]).T @ J
-    return meat
+    left = []
+    if "roll_vy" in values:
+        expected = -values["roll_roll"] / speed
+        left += [(values["roll_vy"] - expected) / (STIFFNESS_SPREAD * abs(expected) + STIFFNESS_LEAST)]
+        left += [(values["y_vy"] + (GRAVITY + values["y_roll"]) / speed) / DAMPING_SPREAD]
+    if "pitch_vx" in values:
+        expected = values["pitch_pitch"] / speed
+        left += [(values["pitch_vx"] - expected) / (STIFFNESS_SPREAD * abs(expected) + STIFFNESS_LEAST)]
+        left += [(values["x_vx"] + (GRAVITY - values["x_pitch"]) / speed) / DAMPING_SPREAD]
+    return left + [(values[name] - turns[name]) / TURN_SPREAD for name in NUISANCES if name in values]
 
 
 def whitened(one: Excited, values: Mapping[str, float], late: float) -> Array:

@@ -34,7 +34,7 @@ def one_step(
     turn = [np.interp(t, record.t, record.rates[:, input])] if RATE in axis.states else []
     measured = np.stack([*turn, *shown], axis=1)
     # The mean effect until the next step; `delay` counts the half tick by which an input that is held is late.
-    u = np.interp(t - values[DELAY] + step / 2, record.t, record.u[:, input])
+    u = np.interp(t - values[DELAY] + step / 2, record.u_t, record.u[:, input])
     measured -= measured.mean(axis=0)
     u -= u.mean()
     filtered = (

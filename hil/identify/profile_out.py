@@ -1,20 +1,19 @@
 """A profile with the identified constants, based on another one: model, servo lag, trim, with the uncertainty as comments,
 and as a file beside it for `floaty tune`.
 
-Other constants keep their values of that profile unless the flights contradict them, and the identified ones are fitted once
-more with these: so the profile's model responds as the robot did even where single constants cannot be separated.
+The values of an excited axis are those of the joint fit together, also where single constants cannot be separated: with the
+identities of plates, on which the fit relies, the profile's model responds as the robot did. The constants of an axis
+of which nothing is identifiable keep their values.
 """
 
 from pathlib import Path
 
 import numpy as np
 
-from firmware_py.config import ModelConfig
 from hil.config import base_name, load_config
 from hil.design.axes import AXES, NUISANCES
 from hil.errors import LabError, writing
 from hil.identify.identify import UNKNOWN, Identification
-from hil.identify.joint import Estimate, joint
 from hil.identify.response import DELAY, LAG
 from hil.identify.robots import write_known
 from hil.world.body import MIX
@@ -23,38 +22,14 @@ from hil.world.servos import WORDS_PER_RADIAN
 TRIM_LEAST = 0.005  # [rad] least mean input for which a trim is written
 
 
-def refit(found: Identification, model: ModelConfig) -> Estimate:
-    """Return the joint fit with the unidentified constants at a model's values."""
-    fixed = {name: getattr(model, name) for name in kept(found, model)}
-    excited_constants = {name for one in found.excited for name in one.axis.constants}
-    start = {
-        constant.name: constant.best for constant in found.constants if constant.name in excited_constants
-    }
-    return joint(
-        found.excited,
-        1.0 / model.flap_rate,
-        start,
-        {k: v for k, v in fixed.items() if k in excited_constants},
-    )
+def write_profile(path: Path, profile: str, found: Identification) -> str:
+    """Write the profile and return what it changes besides the model, empty for nothing.
 
-
-def kept(found: Identification, model: ModelConfig) -> list[str]:
-    """Return the constants that are not identifiable from these flights, and agree with a model's values."""
-    return [
-        one.name
-        for one in found.constants
-        if one.verdict == UNKNOWN
-        and one.name not in (*NUISANCES, LAG, DELAY)
-        and not abs(getattr(model, one.name) - one.best) > one.joint[1]
-    ]
-
-
-def write_profile(path: Path, profile: str, found: Identification) -> None:
-    """Write the profile. Raises `LabError` when nothing was identified, or it cannot be written."""
+    Raises `LabError` when nothing was identified, or it cannot be written.
+    """
     if not any(constant.verdict != UNKNOWN and constant.name != DELAY for constant in found.constants):
         raise LabError(f"--profile-out {path}: nothing was identified that belongs in a profile")
-    model = load_config(profile).model
-    fitted = refit(found, model)
+    fitted = found.estimate
     lines = [
         f"# Identified by `floaty identify` from {', '.join(record.name for record in found.records)}.",
         f'base = "{base_name(profile)}"',
@@ -62,26 +37,28 @@ def write_profile(path: Path, profile: str, found: Identification) -> None:
     ]
     lines.append("[model]                   # value, half width of the 95 % interval, verdict")
     for axis in AXES:
+        if all(found.constant(name).verdict == UNKNOWN for name in axis.constants):
+            continue
         for name in axis.constants:
             constant = found.constant(name)
             if name in NUISANCES or name not in fitted.values:
                 continue
             text = f"{name} = {fitted.values[name]:.6g}"
             lines.append(f"{text:26}# ± {constant.joint[1]:.2g}, {constant.verdict}")
-    if names := kept(found, model):
-        lines.append(f"# as in {profile}, not identifiable from these flights: {', '.join(names)}")
     lag = found.constant(LAG)
     verdict = f"lag {1e3 * lag.joint[0]:.1f} ± {1e3 * lag.joint[1]:.1f} ms, {lag.verdict}"
     lines.append(f"{f'flap_rate = {1 / fitted.values[LAG]:.4g}':26}# {verdict}")
     lines.append(
         f"# input to gyro {1e3 * fitted.values[DELAY]:.1f} ms, of which the firmware's own timing takes 13"
     )
-    lines += ["", *_trim(found)]
+    trim = _trim(found)
+    lines += ["", *trim]
     with writing("--profile-out", path):
         path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
     config = load_config(str(path))  # an invalid profile is an error here, not at the next flight
     with writing("--profile-out", path):
         write_known(path, config, found, fitted.values[DELAY])
+    return f"servo trim changed: {trim[1].partition('# ')[2]}" if trim else ""
 
 
 def _trim(found: Identification) -> list[str]:

@@ -29,6 +29,7 @@ RATES = tuple(f"stateEstimate.{name}_rate [rad/s]" for name in ("roll", "pitch",
 FACING = np.radians(30.0)  # a choice: how far the robot may have turned on the median
 WRAP_MS = 1 << 24  # of the board's time stamps
 SHARES = (SIGNS[:, None] * MIX).T  # (4, 4) opening of each flap per input; u4 closes
+TICK_MS = 10.0  # the controller runs in every tenth millisecond, on the rates of the millisecond before
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,8 @@ class Record:
     """One flight under control. Rows of `t` (N,) and of `pose_t` (M,) are at different instants."""
 
     name: str
-    t: Array  # (N,) [s] board's clock
+    t: Array  # (N,) [s] board's clock, of the tick for which the rates were estimated
+    u_t: Array  # (N,) [s] board's clock, of the tick that commanded the inputs
     u: Array  # (N, 4) [rad] the commanded inputs, after the flaps' limits
     excitation: Array  # (N, 4) [rad] NaN-free; zero where none was reported
     rates: Array  # (N, 3) [rad/s] gyro, B
@@ -46,6 +48,11 @@ class Record:
     lost_rows: float  # share of the rows that are missing
     config: LabConfig  # the profile that flew: gains and limits
     simulated: bool  # its plant is known
+
+    @property
+    def flap_angle(self) -> float:
+        """The mean opening of all flaps [rad], to which the constants refer."""
+        return float(self.config.allocation.hover_angle + np.mean(self.u.mean(axis=0) @ SHARES))
 
     @property
     def period_s(self) -> float:
@@ -73,7 +80,7 @@ def load_record(path: Path, profile: str) -> Record:
             f"{path}: {np.count_nonzero(flown)} rows of flight under control; identification needs 100 at least"
         )
     ahead_s = float(np.median(columns[TIME_COLUMN] - board_s))
-    t = board_s[flown]
+    u_t, t = _ticks(board_s[flown])
     order = np.concatenate([[True], np.diff(t) > 0])
     if not np.all(order):
         raise LabError(f"{path}: the board's time runs backwards; one flight, in its order, is expected")
@@ -91,15 +98,28 @@ def load_record(path: Path, profile: str) -> Record:
     excitation = np.nan_to_num(np.stack([columns[name][flown] for name in EXCITATIONS], axis=1))
     rates = np.stack([columns[name][flown] for name in RATES], axis=1)
     return Record(
-        str(path), t, limited, excitation, rates, pose_t, pose, saturated,
+        str(path), t, u_t, limited, excitation, rates, pose_t, pose, saturated,
         1.0 - len(t) / (1.0 + (t[-1] - t[0]) / usual), config, simulated,
     )  # fmt: skip
 
 
+def _ticks(sampled_s: Array) -> tuple[Array, Array]:
+    """Return the ticks that commanded the inputs and that estimated the rates of rows sampled at these instants.
+
+    A row that was sampled in the last millisecond of a tick contains the next tick's rates beside this tick's inputs.
+    """
+    inputs_s = np.floor(np.round(1e3 * sampled_s) / TICK_MS) * TICK_MS * 1e-3
+    last = np.round(1e3 * (sampled_s - inputs_s)) == TICK_MS - 1.0
+    return inputs_s, inputs_s + 1e-3 * TICK_MS * last
+
+
 def _read(file: Path) -> dict[str, Array]:
     """Return the columns by their titles; a missing excitation is zero."""
-    with file.open(encoding="utf-8", newline="") as lines:
-        rows = list(csv.reader(lines))
+    try:
+        with file.open(encoding="utf-8", newline="") as lines:
+            rows = list(csv.reader(lines))
+    except (UnicodeDecodeError, csv.Error):
+        raise LabError(f"{file}: not a CSV file; identify takes run folders and {TELEMETRY}") from None
     titles = rows[0] if rows else []
     # The record of a killed process may end in half a row.
     whole = [row for row in rows[1:] if len(row) == len(titles)]

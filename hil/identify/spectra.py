@@ -1,9 +1,9 @@
-"""Spectra on the lines of the excitation, period by period: the responses, and how far each period scatters.
+"""Spectra on the lines of the excitation, realisation by realisation: the responses, and how far each one scatters.
 
-In every period of 20 s sines and cosines of all excited lines are fitted to the samples that there are, so that rows may be
-missing and the rate may be any that suffices for the lines. The mean over the periods is the cross spectrum with the
-excitation; the scatter about it is disturbance of any colour, and gives the covariance, line by line and between the
-signals, of the mean.
+The excitation's phases are new in every realisation (`firmware_py/core/excitation.py`). In each period of 20 s sines and
+cosines of all lines are fitted to the samples that there are, so that rows may be missing and the rate may be any that
+suffices for the lines. The responses per excitation have a mean over the realisations, and scatter about it: by the
+disturbance of any colour, and by everything that is not linear. This gives the covariance of the mean.
 """
 
 from collections.abc import Sequence
@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import LabError
+from hil.identify.plates import SIDEWAYS, straightened
 from hil.identify.record import Array, Record
 
 Complex = NDArray[np.complexfloating[Any, Any]]
-PERIOD_S, SPACING_HZ = 20.0, 0.05  # firmware_py/core/excitation.py
-SETTLING_S = 2.0  # left out after the excitation begins
+# firmware_py/core/excitation.py
+PERIOD_S, REALISATION_S, SPACING_HZ = 20.0, 22.0, 0.05
+SETTLING_S = 1.8  # left out of each realisation; the rest of its 2 s allows for a first row that is missing
 LEAST_PERIODS = 4
 LINE = 0.1  # of the strongest line: weaker ones do not count
-# Share of a response that curvature, dead band and couplings cause, and that averaging does not reduce.
-NOT_LINEAR = 0.03
-NEIGHBOURS = 4  # lines to either side that give the disturbance of a line
+NEIGHBOURS = 4  # lines to either side, also those between the excited ones, that give the scatter at a line
 LEAST_SAMPLES = 1.5  # per unknown of the fit
-PURE = 0.05  # share of the excitation that may differ from period to period
+PURE = 0.05  # share of the excitation that may lie off its lines, or differ in size from period to period
 # The power of w that turns a signal into an acceleration.
 POWERS = {**dict.fromkeys(range(8, 11), 1), **dict.fromkeys(range(11, 17), 2)}
 
@@ -37,9 +37,14 @@ class Spectra:
     w: Array  # (L,) [rad/s]
     Z: Complex  # (L, S) mean over the periods, per excitation
     C: Complex  # (L, S, S) covariance of that mean
-    excitation: Complex  # (L,) that Z refers to [rad]
-    periods: int
+    each: Complex  # (P, L, S) of which Z is the mean
+    excitation: Complex  # (L,) of the first period [rad]
     coherence: Array  # (L, S) of each signal with the excitation, over single periods
+
+    @property
+    def periods(self) -> int:
+        """The number of realisations."""
+        return len(self.each)
 
 
 def windows(record: Record) -> list[float]:
@@ -50,22 +55,22 @@ def windows(record: Record) -> list[float]:
             f"{record.name}: no excitation in it: from the flow's disturbance alone no constant can be identified; "
             "fly `identify`"
         )
-    start, end = record.t[excited][0] + SETTLING_S, record.t[excited][-1]
-    count = int((end - start + record.period_s) // PERIOD_S)
+    start, end = record.u_t[excited][0] + SETTLING_S, record.u_t[excited][-1]
+    count = max(0, int((end - start + record.period_s - PERIOD_S + 1e-6) // REALISATION_S + 1))
     if count < LEAST_PERIODS:
         raise LabError(
-            f"{record.name}: {end - start:.1f} s of excitation: {count} periods of {PERIOD_S:g} s after it settled; "
-            f"at least {LEAST_PERIODS} are needed"
+            f"{record.name}: {max(end - start, 0.0):.1f} s of settled excitation: {count} realisations of "
+            f"{REALISATION_S:g} s; at least {LEAST_PERIODS} are needed"
         )
-    return [float(start + PERIOD_S * index) for index in range(count)]
+    return [float(start + REALISATION_S * index) for index in range(count)]
 
 
 def excited_lines(record: Record, starts: Sequence[float]) -> list[NDArray[np.int_]]:
     """Return the lines of each input, as multiples of 0.05 Hz. Raises `LabError` for rows too far apart."""
     nyquist = 0.5 / record.period_s
     every = np.arange(1, int(0.8 * nyquist / SPACING_HZ) + 1)
-    inside = (record.t >= starts[0]) & (record.t < starts[0] + PERIOD_S)
-    t, r = record.t[inside], record.excitation[inside]
+    inside = (record.u_t >= starts[0]) & (record.u_t < starts[0] + PERIOD_S)
+    t, r = record.u_t[inside], record.excitation[inside]
     n = round(PERIOD_S / record.period_s)
     grid = starts[0] + PERIOD_S / n * np.arange(n)
     found = []
@@ -91,7 +96,12 @@ def _fit(t: Array, values: Array, w: Array, name: str) -> Complex:
             f"{name}: {len(t)} samples in a period of {PERIOD_S:g} s for {len(w)} lines: at least "
             f"{int(np.ceil(LEAST_SAMPLES * basis.shape[1]))} are needed"
         )
-    parts = np.linalg.lstsq(basis, values, rcond=None)[0]
+    try:
+        parts = np.linalg.solve(basis.T @ basis, basis.T @ values)
+    except np.linalg.LinAlgError:
+        raise LabError(
+            f"{name}: too many samples in a row are missing in a period of {PERIOD_S:g} s"
+        ) from None
     count = len(w)
     return np.asarray(parts[:count] - 1j * parts[count : 2 * count])
 
@@ -104,29 +114,40 @@ def period_spectra(record: Record) -> tuple[list[NDArray[np.int_]], Array, Compl
     starts = windows(record)
     own = excited_lines(record, starts)
     excited = np.concatenate(own)
-    lines = np.arange(1, 1 + excited.max(initial=0))  # those in between give the disturbance
+    lines = np.arange(1, 1 + excited.max(initial=0))  # those in between take up the disturbance
     if not len(lines):
         raise LabError(
             f"{record.name}: rows of {record.period_s * 1e3:.0f} ms are too far apart for the excitation's lines"
         )
     w = 2 * np.pi * SPACING_HZ * lines
-    of_board = np.concatenate([record.excitation, record.u, record.rates], axis=1)
+    straight, sideways = straightened(record)
+    commanded = np.concatenate([record.excitation, straight], axis=1)
+    of_board = np.column_stack([record.rates, sideways])
     periods = []
     for start in starts:
-        rows = (record.t >= start - 1e-6) & (record.t < start + PERIOD_S - 1e-6)
-        poses = (record.pose_t >= start - 1e-6) & (record.pose_t < start + PERIOD_S - 1e-6)
-        board = _fit(record.t[rows] - start, of_board[rows], w, record.name)
-        seen = _fit(record.pose_t[poses] - start, record.pose[poses], w, record.name)
-        periods.append(np.concatenate([board, seen], axis=1))
+        parts = []
+        for t, values in ((record.u_t, commanded), (record.t, of_board), (record.pose_t, record.pose)):
+            rows = (t >= start - 1e-6) & (t < start + PERIOD_S - 1e-6)
+            parts.append(_fit(t[rows] - start, values[rows], w, record.name))
+        rates, bent, seen = parts[1][:, :3], parts[1][:, 3], parts[2]
+        seen[:, SIDEWAYS] += bent / w**2
+        periods.append(np.concatenate([parts[0], rates, seen], axis=1))
     P = np.array(periods)
-    r = P[:, :, :4]
-    astray = float(np.sqrt(np.mean(np.abs(r - r.mean(axis=0)) ** 2) / np.mean(np.abs(r) ** 2)))
+    _refuse_impure(record.name, lines, own, np.abs(P[:, :, :4]))
+    return own, w, P
+
+
+def _refuse_impure(name: str, lines: NDArray[np.int_], own: Sequence[NDArray[np.int_]], sizes: Array) -> None:
+    """Raise `LabError` for an excitation (P, L, 4) that is not the same sum of its lines in every period."""
+    expected = np.zeros_like(sizes)
+    for i, chosen in enumerate(own):
+        expected[:, np.isin(lines, chosen), i] = sizes[:, np.isin(lines, chosen), i].mean(axis=0)
+    astray = float(np.sqrt(np.mean((sizes - expected) ** 2) / np.mean(sizes**2)))
     if astray > PURE:
         raise LabError(
-            f"{record.name}: the logged excitation does not repeat every {PERIOD_S:g} s, {astray:.0%} of it differs: are "
-            "the time stamps right?"
+            f"{name}: the logged excitation is not the same sum of lines in every period of {PERIOD_S:g} s, {astray:.0%} of "
+            "it differs: are the time stamps right?"
         )
-    return own, w, P
 
 
 def spectra_of(
@@ -134,29 +155,28 @@ def spectra_of(
 ) -> Spectra:
     """Return an input's spectra with some signals, counted as in `period_spectra` after the inputs: 8 to 16."""
     own, w_all, P = periods
-    chosen = np.isin(np.round(w_all / (2 * np.pi * SPACING_HZ)).astype(int), own[axis])
-    if not chosen.any():
+    lines = np.round(w_all / (2 * np.pi * SPACING_HZ)).astype(int)
+    places = np.flatnonzero(np.isin(lines, own[axis]))
+    if not len(places):
         raise LabError(f"{record.name}: u{axis + 1} is not excited in it")
-    columns = [4 + axis, *signals]
-    count = len(P)
-    r = P[:, :, axis][:, chosen]
-    every = P[:, :, columns]
-    scatter = every - every.mean(axis=0)
+    columns, count = [4 + axis, *signals], len(P)
+    w, r = w_all[places], P[:, places, axis]
+    every = P[:, places][:, :, columns] / r[:, :, None]
+    Z = every.mean(axis=0)
     # As accelerations the spectra have no steep slopes.
     flat = w_all[:, None] ** np.array([POWERS.get(signal, 0) for signal in columns])
-    scatter = scatter * flat
-    # The covariance of a single period, at every line.
-    each = np.einsum("pls,plt->lst", scatter, scatter.conj()) / (count - 1)
-    covariance = np.empty((chosen.sum(), len(columns), len(columns)), complex)
-    places = np.flatnonzero(chosen)
-    for row, place in enumerate(places):
-        near = each[max(0, place - NEIGHBOURS) : place + NEIGHBOURS + 1]
-        covariance[row] = near.mean(axis=0) / np.outer(flat[place], flat[place])
-    excitation = r.mean(axis=0)
-    Z = every[:, chosen].mean(axis=0) / excitation[:, None]
-    C = covariance / count / np.abs(excitation)[:, None, None] ** 2
-    power = np.abs(Z) ** 2
-    noise = np.einsum("lss->ls", C).real * count
-    outputs = np.arange(1, len(columns))
-    C[:, outputs, outputs] += NOT_LINEAR**2 * power[:, outputs]
-    return Spectra(w_all[chosen], Z, C, excitation, count, power / (power + noise))
+    scatter = P[:, :, columns]
+    scatter[:, places] -= Z * r[:, :, None]
+    scatter *= flat
+    # Of a single period, at every line; odd curvature shows on the lines between, too.
+    power_of = np.einsum("pls,plt->lst", scatter, scatter.conj()) / count
+    power_of[places] *= count / (count - 1)
+    others = np.isin(lines, np.concatenate([found for i, found in enumerate(own) if i != axis]))
+    C = np.empty((len(places), len(columns), len(columns)), complex)
+    size = np.mean(np.abs(r), axis=0)
+    for row, place in enumerate(places.tolist()):
+        near = slice(max(0, place - NEIGHBOURS), place + NEIGHBOURS + 1)
+        mean = power_of[near][~others[near]].mean(axis=0)
+        C[row] = mean / np.outer(flat[place], flat[place]) / size[row] ** 2 / count
+    power, noise = np.abs(Z) ** 2, np.einsum("lss->ls", C).real * count
+    return Spectra(w, Z, C, every, r[0], power / (power + noise))

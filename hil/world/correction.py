@@ -12,10 +12,11 @@ import numpy as np
 
 from firmware_py.compiling import bound
 from firmware_py.elementary import cos, sin
+from firmware_py.geometry import from_euler_zyx, multiply
 from hil.world import layout as at
 from hil.world.body import MIX
 from hil.world.config import PlantConfig
-from hil.world.fixed_order import fit_polynomial
+from hil.world.fixed_order import fit_polynomial, product
 from hil.world.geometry import Weight
 from hil.world.motion import GRAVITY, evaluate
 from hil.world.paper_table import PAPER_TABLE
@@ -71,6 +72,18 @@ def calm(s: State, speed: float) -> State:
     return c
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class OperatingPoint:
+    """Where a robot flies on the mean: inputs u1..u4 [rad], attitude roll, pitch, yaw [rad], side wind [m/s, W]."""
+
+    inputs: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    side_wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+LEVEL = OperatingPoint()
+
+
 def accelerations(c: State, cause: str, amount: float) -> State:
     """Return ACC (W) and ALPHA (B), (6,), of a calm plant with one cause changed by `amount`."""
     s = c.copy()
@@ -79,7 +92,9 @@ def accelerations(c: State, cause: str, amount: float) -> State:
     elif cause[0] == "v":
         s[at.V + "xyz".index(cause[1])] = amount
     elif cause[0] == "q":
-        s[at.Q], s[at.Q + 1 + "xyz".index(cause[1])] = cos(amount / 2), sin(amount / 2)
+        w, x, y, z = c[at.Q : at.Q + 4].tolist()
+        about = [sin(amount / 2) * (axis == cause[1]) for axis in "xyz"]
+        s[at.Q : at.Q + 4] = multiply((w, x, y, z), (cos(amount / 2), about[0], about[1], about[2]))
     else:
         s[at.OMEGA + "xyz".index(cause[1])] = amount
     bound(evaluate, s)()
@@ -94,9 +109,12 @@ def slope(c: State, cause: str) -> State:
     return (8 * near - far) / (12 * h)
 
 
-def linearise(s: State, speed: float) -> Constants:
-    """Return the constants of the plant in `s` about the level hover in a uniform flow of `speed` [m/s]."""
+def linearise(s: State, speed: float, point: OperatingPoint = LEVEL) -> Constants:
+    """Return the constants of the plant in `s` about a point of a uniform flow of `speed` [m/s]: the level hover."""
     c = calm(s, speed)
+    c[at.FLAPS : at.FLAPS + 4] += product(MIX, np.array(point.inputs)[:, None])[:, 0]
+    c[at.SIDE_WIND : at.SIDE_WIND + 3] = point.side_wind
+    c[at.Q : at.Q + 4] = from_euler_zyx(*point.attitude)
     u1, u2, u3, u4 = (slope(c, cause).tolist() for cause in ("u1", "u2", "u3", "u4"))
     roll, pitch, vx, vy, vz = (slope(c, cause).tolist() for cause in ("qx", "qy", "vx", "vy", "vz"))
     p, q, r = (slope(c, cause).tolist() for cause in ("ox", "oy", "oz"))

@@ -16,7 +16,7 @@ from hil.errors import LabError
 from hil.world import layout as at
 from hil.world.body import SIGNS, place_plates
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.correction import Constants, calm, linearise, trim_and_correct
+from hil.world.correction import LEVEL, Constants, OperatingPoint, calm, linearise, trim_and_correct
 from hil.world.fixed_order import normal
 from hil.world.geometry import weigh
 from hil.world.motion import advance, evaluate
@@ -203,9 +203,9 @@ class Plant:
         """The total travel of all flaps since the start [rad]."""
         return float(self._s[at.TRAVEL])
 
-    def linearise(self) -> Constants:
-        """Return the linearised dynamics about the level hover in the uniform flow of the design."""
-        return linearise(self._s, self._airspeed)
+    def linearise(self, point: OperatingPoint = LEVEL) -> Constants:
+        """Return the linearised dynamics about a point, by default the level hover, in the uniform flow of the design."""
+        return linearise(self._s, self._airspeed, point)
 
     def mounted_wrench(self, flaps: Vector) -> tuple[View, View]:
         """Return force [N] and torque [N m], (3,) each in B, on the robot fixed level in the design's uniform flow."""

@@ -7,6 +7,7 @@ from scipy.signal import chirp
 
 from firmware_py.config import SIGNALS, parameters_of
 from firmware_py.core import entry
+from firmware_py.core.excitation import PERIOD, REALISATION, REALISATIONS
 from firmware_py.core.structs import (
     EXCITE_CHIRP,
     EXCITE_MULTISINE,
@@ -19,7 +20,6 @@ from firmware_py.core.structs import (
 )
 from hil.config import load_config
 
-PERIOD = 2000
 BAND = ("excitation.low=0.2", "excitation.high=8")
 RMS = {"u1": 0.05, "u2": 0.08, "u3": 0.06, "u4": 0.07}
 
@@ -63,10 +63,24 @@ def test_an_input_has_the_same_lines_whatever_others_are_excited() -> None:
     assert not alone[:, [0, 2, 3]].any()
 
 
-def test_the_excitation_repeats_and_keeps_its_peaks_low() -> None:
-    samples = Board(EXCITE_MULTISINE, **RMS).fly(2 * PERIOD)
-    assert np.array_equal(samples[:PERIOD], samples[PERIOD:])
-    assert (np.abs(samples).max(axis=0) < 2.3 * samples.std(axis=0)).all()
+def test_a_realisation_is_periodic_and_the_next_has_other_phases_on_the_same_lines() -> None:
+    both = Board(EXCITE_MULTISINE, **RMS).fly(2 * REALISATION)
+    settling = REALISATION - PERIOD
+    for samples in (both[:REALISATION], both[REALISATION:]):
+        assert samples[:settling] == pytest.approx(samples[PERIOD:], abs=1e-6)
+    first, second = (np.fft.rfft(part, axis=0) for part in (both[settling:REALISATION], both[-PERIOD:]))
+    assert np.abs(first) == pytest.approx(np.abs(second), abs=2e-2)
+    for i in range(4):
+        lines = np.abs(first[:, i]) > 1.0
+        turned = np.angle(second[lines, i] / first[lines, i])
+        assert np.abs(np.exp(1j * turned).mean()) < 0.5  # random phases differ in all directions
+
+
+def test_the_first_realisation_follows_the_last_and_peaks_stay_low() -> None:
+    board = Board(EXCITE_MULTISINE, **RMS)
+    every = board.fly(REALISATION * REALISATIONS)
+    assert np.array_equal(board.fly(50), every[:50])
+    assert (np.abs(every).max(axis=0) < 4.0 * every.std(axis=0)).all()
 
 
 def test_a_chirp_sweeps_the_band_in_a_period() -> None:

@@ -24,7 +24,7 @@ PITCH = {
 }  # fmt: skip
 Array = NDArray[np.float64]
 MS = 1e-3
-BEGIN_MS = 3000
+BEGIN_MS, REALISATION_TICKS = 3000, 2200
 ACTUATION_MS = 4
 Change = Callable[[dict[str, Array]], dict[str, Array]]
 
@@ -37,7 +37,7 @@ def simulated(inputs: Array, matrix: Array, column: Array) -> Array:
 
 
 def flight(
-    seed: int, seconds: float = 126.0, rms: float = 0.05, disturbance: float = 1.0
+    seed: int, seconds: float = 136.0, rms: float = 0.05, disturbance: float = 1.0
 ) -> dict[str, Array]:
     """The columns of telemetry.csv of a robot that a multisine on u2 excites and gusts of 30 ms disturb."""
     rng = np.random.default_rng(seed)
@@ -50,10 +50,12 @@ def flight(
         [k["x_u2"], k["x_pitch"], -0.04, 0, k["x_vx"]],
     ])  # fmt: skip
     tick = np.arange(round(seconds * 100))
-    phase = 2 * np.pi * rng.random(19)
     lines = np.array([5 + 8 * index for index in range(19)]) / 20
     t = 0.01 * tick
-    r = np.where(tick >= BEGIN_MS // 10, np.cos(2 * np.pi * np.outer(t, lines) + phase).sum(axis=1), 0.0)
+    realisation = np.maximum(tick - BEGIN_MS // 10, 0) // REALISATION_TICKS
+    phase = 2 * np.pi * rng.random((realisation.max() + 1, 19))
+    r = np.cos(2 * np.pi * np.outer(t, lines) + phase[realisation]).sum(axis=1)
+    r = np.where(tick >= BEGIN_MS // 10, r, 0.0)
     r *= rms * np.sqrt(2 / len(lines))
     held = np.repeat(r, 10)
     late = np.concatenate([np.zeros(ACTUATION_MS), held[:-ACTUATION_MS]])
@@ -131,12 +133,12 @@ def test_another_sample_rate_does_no_harm(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("seconds", "change", "reason"),
     [
-        (40.0, keep(lambda n: np.ones(n, bool)), "periods of 20 s after it settled; at least 4"),
-        (126.0, lambda columns: columns | {EXCITATIONS[1]: 0 * columns[EXCITATIONS[1]]}, "no excitation"),
-        (126.0, keep(lambda n: np.random.default_rng(3).random(n) > 0.5), "rows are missing"),
-        (126.0, lambda columns: columns | {BOARD_COLUMN: 0.5 * columns[BOARD_COLUMN]}, "does not repeat every 20 s|periods"),
-        (126.0, lambda columns: columns | {BOARD_COLUMN: 1.02 * columns[BOARD_COLUMN]}, "does not repeat every 20 s"),
-        (126.0, keep(lambda n: np.arange(n) % 8 == 0), "samples in a period|too far apart"),
+        (40.0, keep(lambda n: np.ones(n, bool)), "1 realisations of 22 s; at least 4"),
+        (136.0, lambda columns: columns | {EXCITATIONS[1]: 0 * columns[EXCITATIONS[1]]}, "no excitation"),
+        (136.0, keep(lambda n: np.random.default_rng(3).random(n) > 0.5), "rows are missing"),
+        (136.0, lambda columns: columns | {BOARD_COLUMN: 0.5 * columns[BOARD_COLUMN]}, "not the same sum|realisations"),
+        (136.0, lambda columns: columns | {BOARD_COLUMN: 1.02 * columns[BOARD_COLUMN]}, "not the same sum of lines"),
+        (136.0, keep(lambda n: np.arange(n) % 8 == 0), "samples in a period|too far apart"),
     ],
     ids=["too short", "no excitation", "half the rows lost", "clock twice too slow", "clock 2 % fast", "6 rows a second"],
 )  # fmt: skip

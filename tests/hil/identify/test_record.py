@@ -14,8 +14,9 @@ from hil.design.loop import FREQUENCIES
 from hil.errors import LabError
 from hil.identify import spectra
 from hil.identify.flow import flow_of
-from hil.identify.identify import IDENTIFIED, UNKNOWN, WEAK, _verdict
+from hil.identify.identify import IDENTIFIED, UNKNOWN, WEAK, Evidence, IdentifiedConstant, _verdict
 from hil.identify.joint import LATE_S, Estimate
+from hil.identify.plates import straightened
 from hil.identify.record import BOARD_COLUMN, EXCITATIONS, INPUTS, RATES, WRAP_MS, Record, load_record
 from hil.identify.response import TICK_DELAYS_S, flap_response
 
@@ -90,16 +91,16 @@ def excited(seconds: float, period_s: float = 0.02, begin_s: float = 3.0) -> Rec
     r = np.zeros((len(t), 4))
     r[:, 0] = np.cos(2 * np.pi * 0.25 * t)
     zero = np.zeros((len(t), 3))
-    return Record("r", t, r, r, zero, t, np.zeros((len(t), 6)), 0.0, 0.0, CONFIG, False)
+    return Record("r", t, t, r, r, zero, t, np.zeros((len(t), 6)), 0.0, 0.0, CONFIG, False)
 
 
 @pytest.mark.parametrize("period_s", [0.01, 0.02, 0.04, 0.05])
 @pytest.mark.parametrize("begin_s", [0.0, 3.0, 0.1, 17.77])
-def test_a_record_of_exactly_as_many_periods_as_needed_is_used(period_s: float, begin_s: float) -> None:
-    enough = spectra.SETTLING_S + spectra.LEAST_PERIODS * spectra.PERIOD_S
+def test_a_record_of_exactly_as_many_realisations_as_needed_is_used(period_s: float, begin_s: float) -> None:
+    enough = spectra.SETTLING_S + 3 * spectra.REALISATION_S + spectra.PERIOD_S
     starts = spectra.windows(excited(enough, period_s, begin_s))
-    assert starts == pytest.approx([begin_s + 2.0 + 20.0 * n for n in range(4)])
-    with pytest.raises(LabError, match="3 periods of 20 s after it settled; at least 4"):
+    assert starts == pytest.approx([begin_s + 1.8 + 22.0 * n for n in range(4)])
+    with pytest.raises(LabError, match="3 realisations of 22 s; at least 4"):
         spectra.windows(excited(enough - period_s, period_s, begin_s))
 
 
@@ -107,15 +108,19 @@ def test_the_covariance_of_the_mean_is_that_of_numpy_over_the_lines_around() -> 
     rng, count, lines = np.random.default_rng(1), 5, 12
     P = rng.normal(size=(count, lines, 17)) + 1j * rng.normal(size=(count, lines, 17))
     w = 2 * np.pi * spectra.SPACING_HZ * np.arange(1, lines + 1)
-    own = [np.array([1, 6, 12]), *[np.empty(0, int)] * 3]
+    own = [np.array([1, 6, 12]), np.array([4]), *[np.empty(0, int)] * 2]
     found = spectra.spectra_of(excited(90.0), (own, w, P), 0, (4 + 3,))  # signals without a power of w
+    r = P[:, :, 0]
+    each = [np.einsum("ps,pt->st", P[:, n, [4, 7]], P[:, n, [4, 7]].conj()) / count for n in range(lines)]
     for row, line in enumerate((0, 5, 11)):
-        near = range(max(0, line - 4), min(lines, line + 5))
-        each = [np.cov(P[:, n, [4, 7]].T) for n in near]
-        excitation = P[:, line, 0].mean()
-        expected = np.mean(each, axis=0) / count / abs(excitation) ** 2
-        assert found.Z[row] == pytest.approx(P[:, line, [4, 7]].mean(axis=0) / excitation)
-        expected[1, 1] += spectra.NOT_LINEAR**2 * abs(found.Z[row, 1]) ** 2
+        responses = P[:, line, [4, 7]] / r[:, line, None]
+        assert found.Z[row] == pytest.approx(responses.mean(axis=0))
+        astray = P[:, line, [4, 7]] - found.Z[row] * r[:, line, None]
+        each[line] = np.einsum("ps,pt->st", astray, astray.conj()) / (count - 1)
+    for row, line in enumerate((0, 5, 11)):
+        near = [n for n in range(max(0, line - 4), min(lines, line + 5)) if n != 3]  # line 4 is that of u2
+        size = np.abs(r[:, line]).mean()
+        expected = np.mean([each[n] for n in near], axis=0) / count / size**2
         assert found.C[row] == pytest.approx(expected), line
 
 
@@ -134,7 +139,7 @@ def swinging(robot: Mapping[str, float], hertz: float = 2.0, seconds: float = 60
     pose[:, 1], pose[:, 3] = (wave * y * np.exp(s * LATE_S)).real, (wave * roll * np.exp(s * LATE_S)).real
     inputs, rates = np.stack([(wave * u).real, zero, zero, zero], axis=1), np.zeros((len(t), 3))
     rates[:, 0] = (wave * rate).real
-    return Record("r", t, inputs, 0 * inputs, rates, t, pose, 0.0, 0.0, CONFIG, False)
+    return Record("r", t, t, inputs, 0 * inputs, rates, t, pose, 0.0, 0.0, CONFIG, False)
 
 
 def test_a_robot_that_moves_as_its_model_says_is_disturbed_by_nothing() -> None:
@@ -164,15 +169,72 @@ def test_fifteen_seconds_of_flight_after_the_first_two_show_the_flow_and_less_do
 def test_a_constant_is_as_well_known_as_its_interval_is_narrow_whatever_its_sign(
     sign: float, share: float, verdict: str
 ) -> None:
-    fit = Estimate({}, {}, 1.0)
     value = 0.0 if share == np.inf else 64.0 * sign
-    assert _verdict("roll_u1", (value, 64.0 * min(share, 1.0)), fit, [excited(1.0)])[0] == verdict
+    found = constant((value, 64.0 * min(share, 1.0)))
+    assert _verdict(found, Evidence(1.0, 0.0, 1.0), 64.0)[0] == verdict
 
 
-def test_one_record_at_the_flaps_limits_spoils_all() -> None:
+def constant(
+    joint: tuple[float, float], instrumental: tuple[float, float] = (0.0, 100.0)
+) -> IdentifiedConstant:
+    """A constant by both fits, without its verdict."""
+    nothing = (np.nan, np.nan)
+    return IdentifiedConstant("roll_u1", "1/s²", nothing, np.nan, nothing, instrumental, joint, "", "")
+
+
+@pytest.mark.parametrize(
+    ("found", "evidence", "usual", "reason"),
+    [
+        (constant((64.0, 1.0)), Evidence(10.1, 0.0, 1.0), 64.0, "misses the log by 3.2 times"),
+        (constant((64.0, 1.0)), Evidence(1.0, 0.06, 1.0), 64.0, "at their limits in 6%"),
+        (constant((64.0, 1.0)), Evidence(1.0, 0.0, 0.34), 64.0, "coherence 0.34"),
+        (constant((64.0, 1.0), (50.0, 12.0)), Evidence(1.0, 0.0, 1.0), 64.0, "exclude each other"),
+        (constant((64.0, 1.0)), Evidence(1.0, 0.0, 1.0), -6.3, "more than 10 times the profile's -6.3"),
+    ],
+    ids=["misfit", "saturated", "incoherent", "contradicted", "implausible"],
+)  # fmt: skip
+def test_a_narrow_interval_is_not_enough(
+    found: IdentifiedConstant, evidence: Evidence, usual: float, reason: str
+) -> None:
+    assert _verdict(found, Evidence(1.0, 0.0, 1.0), 64.0)[0] == IDENTIFIED or found.differs
+    verdict, why = _verdict(found, evidence, usual)
+    assert verdict == UNKNOWN
+    assert reason in why
+
+
+def test_the_worst_record_counts_and_of_several_the_clearest_response() -> None:
     calm, limited = excited(1.0), excited(1.0)
     object.__setattr__(limited, "saturated", 0.06)
-    fit = Estimate({}, {}, 1.0)
-    assert _verdict("roll_u1", (64.0, 1.0), fit, [calm])[0] == IDENTIFIED
-    assert _verdict("roll_u1", (64.0, 1.0), fit, [calm, limited])[0] == UNKNOWN
-    assert _verdict("roll_u1", (64.0, 1.0), Estimate({}, {}, 10.1), [calm])[0] == UNKNOWN
+    assert Evidence.of(Estimate({}, {}, 1.0), [calm, limited], []).saturated == 0.06
+    assert Evidence.of(Estimate({}, {}, 1.0), [calm], []).coherence == 1.0
+
+
+def test_rates_that_were_sampled_before_the_inputs_of_their_tick_belong_to_the_next_tick(
+    tmp_path: Path,
+) -> None:
+    early = loaded(tmp_path, columns(120, begin_ms=1009))
+    late = loaded(tmp_path, columns(120, begin_ms=1008))
+    assert early.u_t[0] == late.u_t[0] == pytest.approx(1.0)
+    assert (early.t[0], late.t[0]) == (pytest.approx(1.01), pytest.approx(1.0))
+
+
+def test_a_file_that_is_not_csv_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "log.parquet"
+    path.write_bytes(b"PAR1\x15\x04\xff\xfe\x00")
+    with pytest.raises(LabError, match=r"log\.parquet: not a CSV file; identify takes run folders"):
+        load_record(path, "floaty")
+
+
+def test_u3_is_straightened_by_the_law_of_flat_plates_sin_phi_cos_phi_squared() -> None:
+    t, hover = 0.02 * np.arange(3000), CONFIG.allocation.hover_angle
+    u = np.zeros((len(t), 4))
+    u[:, 2] = 0.2 * np.sin(2 * np.pi * 0.2 * t)
+    zero = np.zeros((len(t), 3))
+    record = Record("r", t, t, u, 0 * u, zero, t, np.zeros((len(t), 6)), 0.0, 0.0, CONFIG, False)
+    straight, sideways = straightened(record)
+    high, low = (np.sin(hover + aside) * np.cos(hover + aside) ** 2 for aside in (0.2, -0.2))
+    expected = 0.5 * (high - low) / (np.cos(hover) * (1 - 3 * np.sin(hover) ** 2))
+    assert straight[1000:, 2].max() == pytest.approx(expected, rel=0.01)
+    assert expected < 0.97 * 0.2
+    assert straight[:, [1, 3]] == pytest.approx(u[:, [1, 3]])
+    assert sideways == pytest.approx(0.0, abs=1e-9)

@@ -89,7 +89,7 @@ def hover(seconds: float) -> tuple[Record, float]:
     rates = np.stack([zero, averaged[rows], zero], axis=1)
     inputs = np.stack([zero, u[rows], zero, zero], axis=1)
     return Record(
-        "hover", t, inputs, 0 * inputs, rates, MS * poses + 0.008, pose, 0.0, 0.0, CONFIG, True
+        "hover", t, t, inputs, 0 * inputs, rates, MS * poses + 0.008, pose, 0.0, 0.0, CONFIG, True
     ), per_hz  # fmt: skip
 
 
