@@ -10,11 +10,15 @@ from pydantic import Field, model_validator
 from firmware_py.section import Section, number
 
 MARKERS = 8  # on the robot
+S_AZIMUTH = -math.pi / 4  # then p = (gx + gy)/sqrt2, q = (gy - gx)/sqrt2, r = gz
 
 
 class ImuConfig(Section):
-    """The errors of this specimen of the sensor."""
+    """How the sensor is mounted, and the errors of this specimen."""
 
+    azimuth: float = number(
+        S_AZIMUTH, f"[{-math.pi}, {math.pi}]", "of the sensor's x axis in B [rad]; original firmware"
+    )
     gyro_bandwidth: float = number(116.0, "(1, 500)", "-3 dB [Hz]; original firmware, BMI088 at 1 kHz")
     accel_bandwidth: float = number(145.0, "(1, 500)", "-3 dB [Hz]; estimate for 1600 Hz OSR4")
     gyro_noise: float = number(

@@ -1,8 +1,7 @@
 """The BMI088 on the virtual board: angular rate and specific force at the centre of mass to int16 counts at 1 kHz.
 
 One `sample` is one data-ready: call it once per millisecond, after `plant.advance`. Chain: second-order low pass, bias,
-white noise, rounding, saturation; compiled. Sensor frame S is B turned about z, as the chip is soldered on the original
-board; counts come in S.
+white noise, rounding, saturation; compiled. Sensor frame S is B turned about z by `azimuth`; counts come in S.
 """
 
 import math
@@ -14,14 +13,12 @@ from numpy.typing import NDArray
 from firmware_py.board import ImuCounts
 from firmware_py.compiling import bound
 from firmware_py.elementary import cos, sin, tan
-from hil.devices.config import ImuConfig
+from hil.devices.config import S_AZIMUTH, ImuConfig
 from hil.errors import LabError
 from hil.world import layout as at
 from hil.world.fixed_order import compiled, normal
 from hil.world.motion import GRAVITY
 from hil.world.plant import Plant
-
-S_AZIMUTH = -math.pi / 4  # [rad] of S's x axis in B: then p = (gx + gy)/sqrt2, q = (gy - gx)/sqrt2, r = gz
 
 View = NDArray[np.float64]
 Counts = NDArray[np.int64]  # (7,) those of a sample, then the rows of noise that are left
@@ -29,8 +26,10 @@ LEFT = 6
 
 
 # Layout of the sensor's array: for each of six channels (gyro x y z, accelerometer x y z) a row of
-NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, FIELDS = range(13)
-COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)
+NOW_1, NOW_2, B0, A1, A2, SCALE, BIAS, NOISE, FAULT_BIAS, STUCK, RANGE, COUNT, AXIS_COS, AXIS_SIN, FIELDS = (
+    range(15)
+)
+COS, SIN = cos(S_AZIMUTH), sin(S_AZIMUTH)  # of the default
 
 
 @compiled
@@ -54,13 +53,14 @@ def channels(rows: View, truth: View, draws: View, counts: Counts) -> None:
         truth[at.SPECIFIC_FORCE],
         truth[at.SPECIFIC_FORCE + 1],
     )
+    c, s = rows[0, AXIS_COS], rows[0, AXIS_SIN]
     counts[LEFT] -= 1
     noise = draws[counts[LEFT]]
-    counts[0] = channel(rows[0], COS * ox + SIN * oy, noise[0])
-    counts[1] = channel(rows[1], COS * oy - SIN * ox, noise[1])
+    counts[0] = channel(rows[0], c * ox + s * oy, noise[0])
+    counts[1] = channel(rows[1], c * oy - s * ox, noise[1])
     counts[2] = channel(rows[2], truth[at.OMEGA + 2], noise[2])
-    counts[3] = channel(rows[3], COS * fx + SIN * fy, noise[3])
-    counts[4] = channel(rows[4], COS * fy - SIN * fx, noise[4])
+    counts[3] = channel(rows[3], c * fx + s * fy, noise[3])
+    counts[4] = channel(rows[4], c * fy - s * fx, noise[4])
     counts[5] = channel(rows[5], truth[at.SPECIFIC_FORCE + 2], noise[5])
 
 
@@ -99,6 +99,7 @@ class VirtualImu:
         self._measure: Callable[[], object]
         self._truth: View | None = None  # of the plant that was sampled last
         rows[:, RANGE] = COUNTS
+        rows[:, AXIS_COS], rows[:, AXIS_SIN] = cos(config.azimuth), sin(config.azimuth)
         self.rate_range: float = COUNTS / GYRO_COUNTS
         self.frozen: bool = False
         self.silent: bool = False
@@ -127,7 +128,8 @@ class VirtualImu:
     def set_rate_bias(self, p: float, q: float, r: float) -> None:
         """Move the gyro's zero, on top of the specimen's own bias [rad/s, B]."""
         self.rate_bias = (p, q, r)
-        self._rows[:3, FAULT_BIAS] = COS * p + SIN * q, COS * q - SIN * p, r
+        c, s = self._rows[0, [AXIS_COS, AXIS_SIN]].tolist()
+        self._rows[:3, FAULT_BIAS] = c * p + s * q, c * q - s * p, r
 
     def set_rate_range(self, rate: float) -> None:
         """Make the gyro saturate at +-`rate` [rad/s, about the axes of S] or, if that is less, at its full scale."""

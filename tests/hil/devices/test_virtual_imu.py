@@ -52,6 +52,19 @@ def test_original_firmware_reads_body_rates_and_forces_from_the_counts() -> None
     assert [0.7071 * (ax + ay), 0.7071 * (ay - ax), az] == pytest.approx(expected, abs=1.5 * ACCEL_LSB)
 
 
+def test_sensor_mounted_along_the_body_reads_body_rates_and_forces() -> None:
+    plant = make_plant()
+    tilt = Rotation.from_euler("ZYX", [0.3, -0.5, 0.7])
+    plant.place(HOME, tilt.as_quat(scalar_first=True), omega_B=(1, 2, 3))
+    imu = VirtualImu(SILENT.model_copy(update={"azimuth": 0.0}), np.random.default_rng(1))
+    imu.set_rate_bias(0.1, 0.2, 0.3)
+    counts = settled(imu, plant)
+    assert np.array(counts[:3]) * GYRO_LSB == pytest.approx([1.1, 2.2, 3.3], abs=1.5 * GYRO_LSB)
+    assert np.array(counts[3:]) * ACCEL_LSB == pytest.approx(
+        tilt.inv().apply([0, 0, 9.81]), abs=1.5 * ACCEL_LSB
+    )
+
+
 def test_low_pass_is_second_order_butterworth_at_the_sample_instants() -> None:
     plant, imu = make_plant(), VirtualImu(SILENT, np.random.default_rng(1))
     turning = np.random.default_rng(2).uniform(-3, 3, 300)
