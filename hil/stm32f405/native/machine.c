@@ -8,7 +8,7 @@ enum { HOOK_INTR = 1, HOOK_CODE = 4, HOOK_BLOCK = 8, HOOK_READ = 0x400, HOOK_WRI
 enum { READ_UNMAPPED = 6, WRITE_UNMAPPED, FETCH_UNMAPPED, INVALID = 10, WRITE_PROTECTED = 12, FETCH_PROTECTED = 14 };
 enum { ACCESS_FETCH = 18, RIGHT_READ = 1, RIGHT_WRITE = 2, RIGHT_EXECUTE = 4, FLUSH_TLB = 11 | 1 << 30 };
 enum { TRAP_SVC = 2, TRAP_BREAKPOINT = 7, TRAP_RETURN = 8, TRAP_NO_FLOATS = 17, TRAP_STATE = 18 };
-enum { REFILL = 3, NOWHERE = 0xFFFFFFFE };
+enum { REFILL = 3, NOWHERE = 0xFFFFFFFE, IT_STATE = 0x0600FC00 /* bits of XPSR, B1.4.2 */ };
 
 struct page { /* uc_tlb_entry */
     uint64_t address;
@@ -149,10 +149,20 @@ static void on_trap(uc_engine *uc, uint32_t number, void *user)
     }
 }
 
+/* Before a hook of an access in an IT block, unicorn writes the condition of that instruction into XPSR, and leaves it there: the next
+   block that it looks up would be executed under it (github.com/unicorn-engine/unicorn/issues/2309). */
+static void forget_condition(struct machine *m)
+{
+    uint32_t xpsr = get_register(m, R_XPSR);
+    if (xpsr & IT_STATE)
+        set_register(m, R_XPSR, xpsr & ~(uint32_t)IT_STATE);
+}
+
 static int on_invalid(uc_engine *uc, int type, uint64_t address, int size, int64_t value, void *user)
 {
     struct machine *m = user;
     m->fault_address = (uint32_t)address;
+    forget_condition(m);
     return 0;
 }
 
@@ -168,6 +178,8 @@ static int on_page(uc_engine *uc, uint64_t address, int type, struct page *page,
             m->engine.ctl(uc, FLUSH_TLB); /* forget that its data alone were mapped */
         executed = *known |= executed;
     }
+    if (type != ACCESS_FETCH)
+        forget_condition(m);
     page->address = address;
     page->rights = RIGHT_READ | RIGHT_WRITE | (executed ? RIGHT_EXECUTE : 0);
     return 1;
@@ -478,6 +490,7 @@ static void on_access(uc_engine *uc, int type, uint64_t address, int size, int64
 {
     struct watchpoint *w = user;
     uint32_t first = (uint32_t)address;
+    forget_condition(w->machine);
     if (first >= w->address + w->size || first + (uint32_t)size <= w->address)
         return;
     w->machine->watch_address = first > w->address ? first : w->address;
