@@ -2,29 +2,40 @@
 
 Which sampling a measure of influence needs:
 
-    PAWN            any: the median distance of the distributions inside and outside slices of an axis, 0..1
-    total Sobol     saltelli: the share of the variance that vanishes when the axis alone is fixed
+    PAWN            any: the median distance of the distributions in slices of an axis from that of all flights, 0..1;
+                    shown are axes beyond what the strongest of all axes reaches by chance in 95 % of random orders
+    total Sobol     saltelli: the share of the variance that remains when all axes but this one are fixed
     mu* of Morris   morris: the mean change of the figure over one axis
     logistic map    any, with some failures and some flights that hold: log-odds of failing over the whole axis, or from
                     without a fault to with it
 """
 
-import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
-from SALib.analyze import morris, pawn, sobol
+from SALib.analyze import morris, sobol
 from scipy.optimize import minimize
 from scipy.special import expit
 
 from hil.api import command_of
 from hil.campaigns.config import Spec
-from hil.campaigns.run import Rate
-from hil.campaigns.sampling import LEVELS, CubeAxis, as_flown, axes, draw, points_of, problem
+from hil.campaigns.run import Rate, Tally
+from hil.campaigns.sampling import (
+    LEVELS,
+    CubeAxis,
+    as_flown,
+    axes,
+    cluster_of,
+    draw,
+    points_of,
+    problem,
+    shuffled,
+)
 from hil.errors import LabError
 from hil.laboratory.metrics import METRICS, Metric
 from hil.laboratory.request import Options
@@ -33,7 +44,11 @@ Array = NDArray[np.float64]
 WORST = 10
 SLICES = 10
 MAPPED_FROM = 5  # failures, and flights that hold
-KOLMOGOROV_MEDIAN = 0.828  # median distance of a sample from its own distribution, times the root of its size
+ORDERS, CHANCE = (
+    200,
+    0.95,
+)  # random orders of the flights, and the share of them that stays below the threshold
+SHARE_KNOWN = 1.0  # half interval with which a share of the variance is shown
 PULL = 1.0  # weight of the prior that pulls the logistic map towards no influence
 
 
@@ -64,13 +79,29 @@ class Influence:
     figure: str
     method: str
     by_axis: Mapping[str, float]
-    chance: float | None = None  # the measure of an axis without any influence
+    chance: float | None = None  # what the strongest axis reaches without any influence, in 95 % of cases
+    halves: Mapping[str, float] = field(default_factory=dict)  # of the 95 % intervals by SALib
+    most: float = math.inf  # half interval with which a measure is shown
 
     @property
     def ranked(self) -> list[tuple[str, float]]:
-        """Axes above chance, the strongest first."""
-        above = [item for item in self.by_axis.items() if abs(item[1]) > (self.chance or 0.0)]
+        """Axes that are above chance and known well enough, the strongest first."""
+        above = [
+            (name, value)
+            for name, value in self.by_axis.items()
+            if abs(value) > (self.chance or 0.0) and name not in self.unknown
+        ]
         return sorted(above, key=lambda item: -abs(item[1]))
+
+    @property
+    def unknown(self) -> list[str]:
+        """Axes whose intervals are too wide."""
+        return [name for name, half in self.halves.items() if not half <= self.most]
+
+    def text(self, name: str) -> str:
+        """Return the measure of an axis, with its interval where there is one."""
+        half = f" ± {self.halves[name]:.2g}" if name in self.halves else ""
+        return f"{name} {self.by_axis[name]:.3g}{half}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +136,20 @@ class Worst:
 
 
 @dataclass(frozen=True, slots=True)
+class Cell:
+    """An experiment on a profile."""
+
+    experiment: str
+    profile: str
+    rate: Rate
+
+
+@dataclass(frozen=True, slots=True)
 class Findings:
     """All that is in the report."""
 
     rate: Rate
+    cells: tuple[Cell, ...]
     errors: tuple[str, ...]  # of flights that did not end, each text once with its count
     limits: tuple[Limited, ...]
     influences: tuple[Influence, ...]
@@ -126,10 +167,36 @@ def find(spec: Spec, flights: pa.Table) -> Findings:
     influences = [*_influences(spec, points, which, flights, limits, ~passed)]
     if mapped is not None:
         influences.insert(0, mapped.influence)
+    size = cluster_of(spec)
     return Findings(
-        Rate(int((~passed).sum()), len(passed)), _errors(flights), limits, tuple(influences), mapped,
-        _worst(spec, flights, limits),
+        _rate(flights, "passed", size, size), tuple(_cells(spec, flights)), _errors(flights), limits,
+        tuple(influences), mapped, _worst(spec, flights, limits),
     )  # fmt: skip
+
+
+def _rate(flights: pa.Table, column: str, size: int, cluster: int) -> Rate:
+    """Return how often a column is false, for clusters of `cluster` numbers of which `size` are in the table."""
+    tally = Tally(size)
+    for index, holds in zip(flights["index"].to_pylist(), flights[column].to_pylist(), strict=True):
+        if holds is not None:
+            tally.add(index // cluster, holds)
+    return tally.rate
+
+
+def _cells(spec: Spec, flights: pa.Table) -> Iterator[Cell]:
+    size = cluster_of(spec)
+    for experiment in spec.experiments:
+        for profile in spec.profiles:
+            rows = _of_cell(flights, experiment, profile)
+            own = size // len(spec.experiments) // len(spec.profiles)
+            yield Cell(experiment, profile, _rate(rows, "passed", own, size))
+
+
+def _of_cell(flights: pa.Table, experiment: str, profile: str) -> pa.Table:
+    """Return the flights of an experiment on a profile."""
+    return flights.filter(
+        pc.and_(pc.equal(flights["experiment"], experiment), pc.equal(flights["profile"], profile))
+    )
 
 
 def _errors(flights: pa.Table) -> tuple[str, ...]:
@@ -140,21 +207,17 @@ def _errors(flights: pa.Table) -> tuple[str, ...]:
 
 
 def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
-    found = []
-    for cell in range(len(spec.experiments) * len(spec.profiles)):
+    found, cells, size = [], len(spec.experiments) * len(spec.profiles), cluster_of(spec)
+    for cell in range(cells):
         drawn = draw(spec, cell)
         profile = drawn.options["profile"]
         plain = Options(profile=profile, overrides=spec.settings, duration_s=spec.duration_s, link=spec.link)
         request = replace(drawn, options=plain).request()
-        mine = pc.and_(
-            pc.equal(flights["experiment"], drawn.experiment), pc.equal(flights["profile"], profile)
-        )
-        rows = flights.filter(mine)
+        rows = _of_cell(flights, drawn.experiment, profile)
         for name, bound in request.limits.items():
-            holds = rows[f"holds.{name}"].drop_null()
             values = rows[f"metric.{name}"].to_numpy()
             metric = request.experiment.metrics.get(name) or METRICS[name]
-            rate = Rate(len(holds) - (pc.sum(holds).as_py() or 0), len(holds))
+            rate = _rate(rows, f"holds.{name}", size // cells, size)
             found.append(
                 Limited(drawn.experiment, profile, name, metric, bound, rate, values[np.isfinite(values)])
             )
@@ -199,23 +262,47 @@ def _influences(
             continue
         if spec.sampling in ("saltelli", "morris") and not there.all():
             continue  # an incomplete design gives no indices
-        method, indices, chance = _indices(spec, points[there], means)
-        found.append(Influence(figure, method, dict(zip(names, map(float, indices), strict=True)), chance))
+        found.append(_influence(spec, figure, points[there], means))
     return found
 
 
-def _indices(spec: Spec, points: Array, means: Array) -> tuple[str, Array, float | None]:
+def _influence(spec: Spec, figure: str, points: Array, means: Array) -> Influence:
+    names = [axis.name for axis in axes(spec)]
     cube = problem(points.shape[1])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # empty slices of a coarse grid
-        if spec.sampling == "saltelli":
-            found = sobol.analyze(cube, means, calc_second_order=False, seed=spec.seed)
-            return "total Sobol index", found["ST"], None
-        if spec.sampling == "morris":
-            found = morris.analyze(cube, points, means, num_levels=LEVELS, seed=spec.seed)
-            return "Morris' mu*", found["mu_star"], None
-        found = pawn.analyze(cube, points, means, S=SLICES, seed=spec.seed)
-    return "PAWN", found["median"], KOLMOGOROV_MEDIAN / (len(means) / SLICES) ** 0.5
+
+    def by_name(values: Array) -> dict[str, float]:
+        return dict(zip(names, map(float, values), strict=True))
+
+    if spec.sampling == "saltelli":
+        found = sobol.analyze(cube, means, calc_second_order=False, seed=spec.seed)
+        halves = by_name(found["ST_conf"])
+        return Influence(figure, "total Sobol index", by_name(found["ST"]), None, halves, SHARE_KNOWN)
+    if spec.sampling == "morris":
+        found = morris.analyze(cube, points, means, num_levels=LEVELS, seed=spec.seed)
+        halves = by_name(found["mu_star_conf"])
+        return Influence(figure, "Morris' mu*", by_name(found["mu_star"]), None, halves, float(np.ptp(means)))
+    inside = slices(points)
+    orders = shuffled(spec, means, ORDERS)
+    chance = np.quantile([pawn(inside, order).max() for order in orders], CHANCE)
+    return Influence(figure, "PAWN", by_name(pawn(inside, means)), float(chance))
+
+
+def slices(points: Array) -> NDArray[np.bool_]:
+    """Return which points (N, D) are in which slice of each axis, (N, D, SLICES); each has as many points."""
+    edges = np.quantile(points, np.linspace(0.0, 1.0, SLICES + 1), axis=0)
+    number = [np.searchsorted(edges[1:-1, d], points[:, d], side="right") for d in range(points.shape[1])]
+    return np.equal(np.array(number).T[:, :, None], np.arange(SLICES))
+
+
+def pawn(inside: NDArray[np.bool_], values: Array) -> Array:
+    """Return each axis' median distance (Kolmogorov-Smirnov) of the values in its slices from all values, (D,)."""
+    order = np.argsort(values, kind="stable")
+    last = np.append(np.diff(values[order]) > 0.0, True)  # of equal values the last one's place counts
+    counts = inside[order].cumsum(axis=0)
+    sizes = np.maximum(counts[-1], 1)
+    share = np.arange(1, len(values) + 1) / len(values)
+    distances = np.abs(counts / sizes - share[:, None, None])[last].max(axis=0)
+    return np.asarray(np.nanmedian(np.where(counts[-1] > 0, distances, np.nan), axis=1))
 
 
 def _worst(spec: Spec, flights: pa.Table, limits: tuple[Limited, ...]) -> tuple[Worst, ...]:

@@ -127,6 +127,7 @@ class Plan:
     profiles: tuple[str, ...]
     values: Mapping[str, type]  # drawn for each flight
     half_width: float | None = None  # of the failure rate's interval at which to stop; None: all are flown
+    cluster: int = 1  # flights in a row whose results resemble one another
 
     @classmethod
     def of(cls, jobs: Sequence[Job]) -> Plan:

@@ -47,6 +47,13 @@ def _content(spec: Spec, found: Findings, complete: bool) -> dict[str, Any]:
         "failed": found.rate.failed,
         "flown": found.rate.flown,
         "interval_95": found.rate.interval,
+        "cells": [
+            {
+                "experiment": one.experiment, "profile": one.profile,
+                "failed": one.rate.failed, "flown": one.rate.flown, "interval_95": one.rate.interval,
+            }
+            for one in found.cells
+        ],
         "errors": found.errors,
         "limits": [
             {
@@ -56,7 +63,10 @@ def _content(spec: Spec, found: Findings, complete: bool) -> dict[str, Any]:
             for one in found.limits
         ],
         "influences": [
-            {"figure": one.figure, "method": one.method, "chance": one.chance, "by_axis": dict(one.by_axis)}
+            {
+                "figure": one.figure, "method": one.method, "chance": one.chance, "by_axis": dict(one.by_axis),
+                "half_interval_95": dict(one.halves),
+            }
             for one in found.influences
         ],
         "worst": [{"index": one.index, "why": one.why, "command": one.command} for one in found.worst],

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import os
 import signal
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import chain
 from math import sqrt
 from pathlib import Path
@@ -28,6 +29,7 @@ from hil.laboratory.request import Options
 
 DEVIATIONS = 1.959963984540054  # of the normal distribution, that hold 95 %
 STOP_FROM = 30  # flights; from fewer the interval is too wide to stop
+ALIKE = 2.0  # failures
 
 # From flights to their rows, in any order; ends early when interrupted.
 Flyer = Callable[[Iterator[Job]], Generator[Row]]
@@ -39,11 +41,12 @@ class Rate:
 
     failed: int
     flown: int
+    design: float = 1.0  # variance over that of as many independent flights
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's interval of the rate with 95 % confidence."""
-        return interval(self.failed, self.flown)
+        """The rate's interval with 95 % confidence: Wilson's, for as many flights as the clusters are worth."""
+        return interval(self.failed / self.flown if self.flown else 0.0, self.flown / self.design)
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -51,7 +54,7 @@ class Rate:
         return f"{self.failed} of {self.flown}: {100 * share:.2f} % ({100 * low:.2f} to {100 * high:.2f} %)"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Standing(Rate):
     """The interim result."""
 
@@ -59,14 +62,46 @@ class Standing(Rate):
     complete: bool  # all flights that the plan needs have been flown
 
 
-def interval(failed: int, flown: int) -> tuple[float, float]:
-    """Return Wilson's interval for a rate."""
+def interval(share: float, flown: float) -> tuple[float, float]:
+    """Return Wilson's interval for a rate of independent flights."""
     if flown == 0:
         return 0.0, 1.0
-    share, z2 = failed / flown, DEVIATIONS * DEVIATIONS
-    centre = (failed + z2 / 2.0) / (flown + z2)
+    z2 = DEVIATIONS * DEVIATIONS
+    centre = (flown * share + z2 / 2.0) / (flown + z2)
     half = DEVIATIONS * sqrt(flown * share * (1.0 - share) + z2 / 4.0) / (flown + z2)
-    return (centre - half if failed else 0.0), (centre + half if failed < flown else 1.0)
+    return (centre - half if share > 0.0 else 0.0), (centre + half if share < 1.0 else 1.0)
+
+
+class Tally:
+    """Counts flights that come in clusters of `size`, whose results resemble one another: one robot in one wind.
+
+    The clusters' scatter gives the variance of the rate, as a bootstrap over the clusters would, but also for few
+    failures: these count beside `ALIKE` failures of which the whole cluster fails.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._of: Counter[int] = Counter()  # failures by cluster
+        self.failed = self.flown = self._squares = 0
+
+    def add(self, cluster: int, passed: bool) -> None:
+        """Count a flight."""
+        self.flown += 1
+        if not passed:
+            self.failed += 1
+            self._squares += 2 * self._of[cluster] + 1
+            self._of[cluster] += 1
+
+    @property
+    def rate(self) -> Rate:
+        """The rate so far."""
+        clusters, rare = self.flown / self._size, min(self.failed, self.flown - self.failed)
+        if clusters <= 1.0 or not rare:
+            return Rate(self.failed, self.flown, min(self._size, max(self.flown, 1)))
+        scatter = (self._squares - self.failed**2 / clusters) * clusters / (clusters - 1.0)
+        design = scatter * self.flown / (self.failed * (self.flown - self.failed))
+        design = (rare * design + ALIKE * self._size) / (rare + ALIKE)
+        return Rate(self.failed, self.flown, min(max(design, 1.0), self._size))
 
 
 class Progress:
@@ -75,32 +110,31 @@ class Progress:
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self._waiting: dict[int, bool] = {}  # flights of which some predecessors are missing
-        self._flown = self._failed = self._known = self._failed_of_known = 0
+        self._all, self._known = Tally(plan.cluster), Tally(plan.cluster)
         self.end: int | None = None
 
     def add(self, index: int, passed: bool) -> None:
         """Count a row."""
-        self._flown += 1
-        self._failed += not passed
+        self._all.add(index // self._plan.cluster, passed)
         self._waiting[index] = passed
-        while self.end is None and self._known in self._waiting:
-            self._failed_of_known += not self._waiting.pop(self._known)
-            self._known += 1
-            if self._known == self._plan.flights or self._knows_enough():
-                self.end = self._known
+        while self.end is None and (known := self._known.flown) in self._waiting:
+            self._known.add(known // self._plan.cluster, self._waiting.pop(known))
+            if known + 1 == self._plan.flights or self._knows_enough():
+                self.end = known + 1
 
     def _knows_enough(self) -> bool:
-        if self._plan.half_width is None or self._known < STOP_FROM:
+        known = self._known
+        if self._plan.half_width is None or known.flown < STOP_FROM or known.flown % self._plan.cluster:
             return False
-        low, high = interval(self._failed_of_known, self._known)
+        low, high = known.rate.interval
         return (high - low) / 2.0 <= self._plan.half_width
 
     @property
     def standing(self) -> Standing:
         """The interim result now."""
-        if self.end is None:
-            return Standing(self._failed, self._flown, self._plan.flights, complete=False)
-        return Standing(self._failed_of_known, self.end, self.end, complete=True)
+        tally = self._all if self.end is None else self._known
+        planned = self._plan.flights if self.end is None else self.end
+        return Standing(**asdict(tally.rate), planned=planned, complete=self.end is not None)
 
 
 def conduct(dataset: Dataset, flyer: Flyer, show: Callable[[Standing], None]) -> Standing:

@@ -7,7 +7,8 @@ logarithm.
     random            points do not depend on one another; any number of flights
     sobol             fills the cube evenly at any number of flights, best at a power of two
     latin             every axis evenly, at the number of flights that the spec says
-    saltelli, morris  the designs that Sobol's and Morris' indices need (SALib): N (D + 2) and N (D + 1) points of D axes
+    saltelli, morris  the designs that Sobol's and Morris' indices need (SALib): N (D + 2) and N (D + 1) points of D axes,
+                      of which those of a base row have the same seed
 """
 
 import json
@@ -130,6 +131,21 @@ def problem(width: int) -> dict[str, Any]:
     return {"num_vars": width, "names": [f"x{n}" for n in range(width)], "bounds": [[0.0, 1.0]] * width}
 
 
+def per_base(spec: Spec) -> int:
+    """Return how many points in a row belong to one base row of a design; 1 for other samplings."""
+    return len(axes(spec)) + {"saltelli": 2, "morris": 1}[spec.sampling] if spec.sampling in DESIGNS else 1
+
+
+def cluster_of(spec: Spec) -> int:
+    """Return how many flights in a row resemble one another: those of a point; those of a seed where nothing varies."""
+    return per_base(spec) * (spec.cells if axes(spec) else spec.cells // spec.seeds)
+
+
+def shuffled(spec: Spec, values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return values (N,) in `count` random orders, (count, N): as if no axis had any influence."""
+    return np.random.default_rng(spec.seed).permuted(np.tile(values, (count, 1)), axis=1)
+
+
 def check_design(spec: Spec) -> None:
     """Raise `LabError` when a design does not fit the number of flights."""
     if spec.sampling not in DESIGNS:
@@ -139,7 +155,7 @@ def check_design(spec: Spec) -> None:
         raise LabError(
             f"sampling = {spec.sampling!r}: needs at least two numbers that vary; there are {width}"
         )
-    step = (width + (2 if spec.sampling == "saltelli" else 1)) * spec.cells
+    step = per_base(spec) * spec.cells
     base, rest = divmod(spec.flights, step)
     power = spec.sampling != "saltelli" or base & (base - 1) == 0
     if rest or base < 2 or not power:
@@ -161,7 +177,9 @@ def plan_of(spec: Spec) -> Plan:
 
     values = {name: _type_of(varies) for name, varies in _parameters(spec)}
     about = {"spec": spec_text(spec)}
-    return Plan(about, spec.flights, job, spec.experiments, spec.profiles, values, spec.half_width)
+    return Plan(
+        about, spec.flights, job, spec.experiments, spec.profiles, values, spec.half_width, cluster_of(spec)
+    )
 
 
 def _type_of(varies: Distribution) -> type:
@@ -179,11 +197,12 @@ def draw_at(spec: Spec, shares: NDArray[np.float64], index: int, point: int, cel
     """Return the flight at a point of the cube."""
     repetition, which = divmod(cell, len(spec.experiments) * len(spec.profiles))
     experiment, profile = divmod(which, len(spec.profiles))
+    base = point // per_base(spec)  # the points of a base row differ by what is varied, not by the wind
     share = dict(zip((axis.name for axis in axes(spec)), shares.tolist(), strict=True))
     parameters = {name: value_at(varies, share[name]) for name, varies in _parameters(spec)}
     faults = (_fault_at(number, fault, share) for number, fault in enumerate(spec.faults))
     options = Options(
-        profile=spec.profiles[profile], seed=spec.seed + point * spec.seeds + repetition,
+        profile=spec.profiles[profile], seed=spec.seed + base * spec.seeds + repetition,
         overrides=(*spec.settings, *(f"{name}={_toml(value)}" for name, value in parameters.items())),
         faults=tuple(filter(None, faults)), duration_s=spec.duration_s, link=spec.link,
     )  # fmt: skip

@@ -51,8 +51,12 @@ def campaign(
         dataset, standing = runner.campaign(plan_of(read), out or Path("runs") / f"campaign-{file.stem}")
     page, findings = write_report(spec, read, dataset, standing.complete)
     console.print(f"failed: {findings.rate}", soft_wrap=True)
+    if len(findings.cells) > 1:
+        for cell in findings.cells:
+            console.print(f"  {cell.experiment}, {cell.profile}: {cell.rate}", soft_wrap=True, markup=False)
     for one in findings.limits:
-        console.print(f"  {one.name}: {one.rate}", soft_wrap=True)
+        where = f"{one.experiment}, {one.profile}" if len(findings.cells) > 1 else one.profile
+        console.print(f"  {where}, {one.name}: {one.rate}", soft_wrap=True, markup=False)
     for text in findings.errors:
         console.print(f"  did not end: {text}", soft_wrap=True, markup=False)
     for worst in findings.worst[:3]:

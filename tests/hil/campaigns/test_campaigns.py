@@ -192,8 +192,8 @@ def test_flying_stops_at_the_first_flight_by_which_the_rate_is_known_well_enough
 
 
 def test_the_interval_is_wilson_s() -> None:
-    assert interval(0, 0) == (0.0, 1.0)
-    low, high = interval(1, 10)
+    assert interval(0.0, 0) == (0.0, 1.0)
+    low, high = interval(0.1, 10)
     assert (low, high) == pytest.approx((0.01787621, 0.40415005), abs=1e-6)  # statsmodels, proportion_confint
 
 

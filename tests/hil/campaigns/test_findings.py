@@ -8,25 +8,27 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from SALib.analyze import pawn as pawn_of_salib
+from scipy.stats import bootstrap
 
 from hil.campaigns.config import Distribution
 from hil.campaigns.dataset import Dataset, schema_of, table_of
-from hil.campaigns.findings import Limited, Rate, find
+from hil.campaigns.findings import Influence, Limited, Rate, find, pawn, slices
 from hil.campaigns.jobs import Row
-from hil.campaigns.run import STOP_FROM, Progress, interval
-from hil.campaigns.sampling import as_flown, axes, draw, plan_of, points_of, value_at
+from hil.campaigns.run import STOP_FROM, Progress, Tally, interval
+from hil.campaigns.sampling import as_flown, axes, draw, plan_of, points_of, problem, shuffled, value_at
 from hil.laboratory.metrics import METRICS
 from support.campaigns import BAD_PUSH, planted, spec_of
 
 
 def half(failed: int, flown: int) -> float:
-    low, high = interval(failed, flown)
+    low, high = interval(failed / flown, flown)
     return (high - low) / 2.0
 
 
 def ended(passed: list[bool], order: list[int], flights: int, half_width: float | None) -> object:
     """What a campaign has found when its rows arrive in an order."""
-    progress = Progress(SimpleNamespace(flights=flights, half_width=half_width))  # type: ignore[arg-type]
+    progress = Progress(SimpleNamespace(flights=flights, half_width=half_width, cluster=1))  # type: ignore[arg-type]
     for index in order:
         progress.add(index, passed[index])
     return progress.end, progress.standing
@@ -54,7 +56,7 @@ def test_a_campaign_may_end_from_its_thirtieth_flight_on_and_at_the_width_itself
 
 
 def test_a_campaign_of_n_flights_ends_with_the_last_of_them_and_not_before() -> None:
-    progress = Progress(SimpleNamespace(flights=3, half_width=None))  # type: ignore[arg-type]
+    progress = Progress(SimpleNamespace(flights=3, half_width=None, cluster=1))  # type: ignore[arg-type]
     for index, end in ((2, None), (1, None), (0, 3)):
         progress.add(index, index != 1)
         assert progress.end == end
@@ -149,3 +151,89 @@ def test_every_point_has_the_row_of_its_flight() -> None:
         mapped.failed.tolist()
         == ((mapped.points[:, happens] == 1.0) & (mapped.points[:, size] >= bad)).tolist()
     )
+
+
+def pairs(count: int, rate: float, alike: float) -> np.ndarray:
+    """Return flights of two profiles at `count` points, (count, 2), which agree at least in a share of the points."""
+    rng = np.random.default_rng(4)
+    failed = rng.random((count, 2)) < rate
+    same = rng.random(count) < alike
+    failed[same, 1] = failed[same, 0]
+    return failed
+
+
+def tallied(failed: np.ndarray) -> Rate:
+    tally = Tally(failed.shape[1])
+    for cluster, flights in enumerate(failed.tolist()):
+        for one in flights:
+            tally.add(cluster, not one)
+    return tally.rate
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.9])
+def test_the_interval_of_clusters_is_that_of_a_bootstrap_over_the_clusters(alike: float) -> None:
+    failed = pairs(1000, 0.2, alike)
+    again = bootstrap((failed.mean(axis=1),), np.mean, n_resamples=2000, rng=np.random.default_rng(1))
+    low, high = tallied(failed).interval
+    assert (low, high) == pytest.approx(tuple(again.confidence_interval), abs=0.003)
+    naive = interval(failed.mean(), failed.size)
+    assert (high - low) / (naive[1] - naive[0]) == pytest.approx((1.0 + alike) ** 0.5, rel=0.05)
+
+
+def test_clusters_of_which_none_fails_count_once() -> None:
+    assert tallied(np.zeros((50, 2), bool)).interval == interval(0.0, 50)
+
+
+def test_one_failure_hardly_shows_that_a_cluster_s_flights_are_independent() -> None:
+    failed = np.zeros((50, 2), bool)
+    failed[7, 0] = True  # the variance over that of independent flights is 100 / 99
+    assert tallied(failed).design == pytest.approx((100 / 99 + 2 * 2) / 3)
+
+
+def test_a_campaign_of_pairs_ends_between_pairs_by_the_interval_of_the_pairs() -> None:
+    failed = pairs(400, 0.2, 1.0).ravel().tolist()
+    progress = Progress(SimpleNamespace(flights=800, half_width=0.06, cluster=2))  # type: ignore[arg-type]
+    for index, one in enumerate(failed):
+        progress.add(index, not one)
+    assert progress.end is not None
+    assert progress.end % 2 == 0
+    assert half(sum(failed[: progress.end : 2]), progress.end // 2) == pytest.approx(0.06, abs=0.002)
+
+
+@pytest.mark.parametrize(("sampling", "rows"), [("saltelli", 5), ("morris", 4)])
+def test_points_of_a_base_row_fly_in_the_same_wind(sampling: str, rows: int) -> None:
+    spec = spec_of(sampling=sampling, flights=8 * rows * 2, profiles=["floaty", "as-flown"], seed=10)
+    seeds = [draw(spec, index).options["seed"] for index in range(spec.flights)]
+    assert seeds == [10 + index // (2 * rows) for index in range(spec.flights)]
+    assert plan_of(spec).cluster == 2 * rows
+
+
+def test_pawn_is_that_of_salib() -> None:
+    rng = np.random.default_rng(2)
+    points = rng.random((500, 3))
+    values = points[:, 0] + 0.3 * rng.normal(size=500)
+    expected = pawn_of_salib.analyze(problem(3), points, values, S=10)["median"]
+    assert pawn(slices(points), values) == pytest.approx(expected, abs=0.005)
+
+
+def test_both_values_of_an_axis_of_two_count_for_pawn() -> None:
+    points = np.repeat([[0.0], [1.0]], 50, axis=0)
+    assert pawn(slices(points), points[:, 0]) == pytest.approx([0.5])
+
+
+def test_inert_axes_seldom_exceed_the_threshold_of_chance() -> None:
+    spec = spec_of(flights=300)
+    rng = np.random.default_rng(3)
+    beyond = 0
+    for _ in range(40):
+        points, values = rng.random((300, 8)), rng.random(300) < 0.1
+        inside = slices(points)
+        chance = np.quantile([pawn(inside, order).max() for order in shuffled(spec, values, 100)], 0.95)
+        beyond += pawn(inside, values).max() > chance
+    assert beyond <= 5
+
+
+def test_an_index_whose_interval_is_too_wide_is_not_ranked() -> None:
+    found = Influence("x", "total Sobol index", {"a": 13.5, "b": 0.4}, None, {"a": 1.1, "b": 0.1}, 1.0)
+    assert (found.ranked, found.unknown) == ([("b", 0.4)], ["a"])
+    assert found.text("b") == "b 0.4 ± 0.1"

@@ -21,6 +21,7 @@ from hil.campaigns.workers import DIED, FlyOne, Workers
 from hil.errors import LabError
 from support.campaigns import hanging, killing, planted, raising, spec_of
 from support.command import Cli
+from support.html_page import Page
 from support.paths import ROOT
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("default")]
@@ -152,13 +153,18 @@ def test_the_command_flies_reports_and_resumes(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("tiny.toml").write_text(
-        'experiments = ["hover"]\nduration_s = 0.3\nflights = 3\n'
+        'experiments = ["hover"]\nprofiles = ["floaty", "as-flown"]\nduration_s = 0.3\nflights = 4\n'
         '[parameters]\n"actuators.tau" = { uniform = [0.04, 0.06] }\n'
     )
     assert cli("campaign", "tiny.toml", "--workers", "1") == 0
     out = Path("runs/campaign-tiny")
     assert {path.name for path in out.iterdir()} == {"campaign.json", "flights", "report.html", "result.json"}
-    assert "of 3: " in cli.out
+    assert "of 4: " in cli.out
+    for name in ("floaty", "as-flown"):
+        assert f"  hover, {name}: 0 of 2" in cli.out
+        assert f"  hover, {name}, in_box: 0 of 2" in cli.out
+    page = Page((out / "report.html").read_text(encoding="utf-8"))
+    assert [row[1] for row in page.tables["cells"][1:]] == ["floaty", "as-flown"]
     before = (out / "flights" / "all.parquet").read_bytes()
     assert cli("campaign", "tiny.toml", "--resume", "--cluster", "tcp://127.0.0.1:9") == 0
     assert (out / "flights" / "all.parquet").read_bytes() == before, "nothing was left to fly"
