@@ -262,7 +262,7 @@ def test_file_keeps_to_its_room(path: Path) -> None:
         ("hil/devices/imu.py", "from numpy.random import default_rng"),
         ("hil/devices/markers.py", "import numpy as np\nx = np.cos(1.0)"),
         ("ground_station/trajectory.py", "from math import sin"),
-        ("hil/world/body.py", "x = AXIS @ vector"),
+        ("hil/world/shape.py", "x = AXIS @ vector"),
         ("hil/world/correction.py", "import numpy as np\nx = np.polynomial.polynomial.polyfit(a, b, 3)"),
         ("hil/devices/cameras.py", "x = rng.standard_normal(3)"),
     ],
@@ -455,7 +455,7 @@ def test_a_planted_completion_is_found(source: str) -> None:
 
 def test_an_objects_own_attributes_and_numbers_of_the_world_may_be_set() -> None:
     assert (
-        completes_another("self.robot = robot\nself.line: Line = line\nrobot.plant.x = 1\nself._link = link")
+        completes_another("self.robot = robot\nself.line: Line = line\nrobot.body.x = 1\nself._link = link")
         == []
     )
 

@@ -30,7 +30,6 @@ POLL_PERIOD_US = 2_000
 CONSOLE, CONSOLE_MASK = 0x00, 0xF3
 CLOCK_HIGH, TIM7_COUNT = "usecTimerHighCount", 0x4000_1424  # of the firmware's usec_time.c
 ASSERTION = "assertFail"
-SERVOS = ((4, 2), (2, 0), (2, 1), (4, 3))  # M1 to M4: TIM5_CH3, TIM3_CH1, TIM3_CH2, TIM5_CH4, counted from 0
 
 
 class Surroundings(Protocol):
@@ -42,7 +41,7 @@ class Surroundings(Protocol):
         """Return the supply voltage."""
 
     def write_compare(self, counts: Sequence[int]) -> None:
-        """Take the compare counts of the timers of M1 to M4."""
+        """Take the compare counts of the timers that drive the robot."""
 
     def radio_send(self, data: bytes) -> bool:
         """Take a packet to the host; False while the radio's queue is full."""
@@ -52,7 +51,10 @@ class Surroundings(Protocol):
 
 
 class Crazyflie:
-    """One board; `polls`: radio packets without contents come by themselves, as with a host that only listens."""
+    """One board; `polls`: radio packets without contents come by themselves, as with a host that only listens.
+
+    `outputs` are timer and channel, counted from 0, of what drives the robot.
+    """
 
     def __init__(
         self,
@@ -61,6 +63,7 @@ class Crazyflie:
         outside: Surroundings,
         polls: bool,
         debugger: GdbServer | None = None,
+        outputs: Sequence[tuple[int, int]] = (),
     ) -> None:
         self.image = image
         self.chip = chip = Chip(image.code, image.base, library, image.constants)
@@ -69,7 +72,7 @@ class Crazyflie:
         run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
         self.processor = ChipProcessor(chip, self.tasks, self._act, run)
         self.resets = {WATCHDOG: 0, SOFTWARE: 0}  # by cause, since power-on
-        self._outside = outside
+        self._outside, self._outputs = outside, outputs
         self._crashes = CrashReports(image, chip, self.tasks, ASSERTION)
         chip.crash_points |= self._crashes.addresses
         self._crashed = False  # since the reset
@@ -123,8 +126,8 @@ class Crazyflie:
             for kind, data in self._decoder.take(self.chip.sent(SYSLINK_USART)):
                 self._answer(kind, data)
         if why & Why.COMPARE:
-            counts = tuple(self.chip.state.compare[timer][channel] for timer, channel in SERVOS)
-            if all(counts) and counts != self._counts:
+            counts = tuple(self.chip.state.compare[timer][channel] for timer, channel in self._outputs)
+            if counts != self._counts:
                 self._counts = counts
                 self._outside.write_compare(counts)
         if why & (Why.LOW_READ | Why.LOW_WRITE):

@@ -16,8 +16,8 @@ from hil.design.sweeps import Point, authorities, hover_angles, scaling, stabili
 from hil.pictures.drawing import png
 from hil.pictures.pages import PageFigure, data_uri, write_page
 from hil.world import layout as at
-from hil.world.body import SIGNS
 from hil.world.motion import evaluate
+from hil.world.shape import SIGNS
 
 CHECKED = 200  # openings at which plant and plate equations are compared
 

@@ -25,8 +25,8 @@ from hil.pictures.curves import (
     SERIES_COLOURS,
 )
 from hil.pictures.drawing import WIDTH
-from hil.world.body import SIGNS
 from hil.world.geometry import weigh
+from hil.world.shape import SIGNS
 
 COLOURS = dict(zip(QUANTITIES, (*AXIS_COLOURS, ORANGE), strict=True))
 PAPER_BAND_DEG = (20.0, 25.0)

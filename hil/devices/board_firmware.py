@@ -19,6 +19,7 @@ from firmware_py.rtos import TaskReport
 from firmware_py.signals import Signals
 from firmware_py.wire.scalars import Scalar
 from hil.crazyflie.shockburst import syslink_us
+from hil.world.servos import OUTPUTS
 
 if TYPE_CHECKING:
     from hil.crazyflie.log_table import ImageParameter
@@ -230,7 +231,8 @@ class PowerOn:
     """What a board is powered on with: its pins and its profile.
 
     `serial`: its UART leads somewhere. `polled`: a host polls its radio chip, also when it has nothing to send. `rest` gives
-    the IMU's counts while the robot is at rest, before the laboratory's time begins; None for a reboot.
+    the IMU's counts while the robot is at rest, before the laboratory's time begins; None for a reboot. `outputs` are
+    timer and channel, counted from 0, of what drives the robot.
     """
 
     board: Board
@@ -238,6 +240,7 @@ class PowerOn:
     serial: bool
     polled: bool
     rest: Callable[[], ImuCounts] | None
+    outputs: Sequence[tuple[int, int]] = OUTPUTS
 
 
 class Executor(Protocol):

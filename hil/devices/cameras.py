@@ -1,4 +1,4 @@
-"""The motion capture cameras: noisy poses of the plant, late, sometimes missing or wrong.
+"""The motion capture cameras: noisy poses of the body, late, sometimes missing or wrong.
 
 A pose is the truth with noise or, with `markers.enabled`, the fit to eight markers (`hil.devices.rigid_body`).
 It computes frames and their arrival; the harness exposes at `period_us` and delivers.
@@ -16,8 +16,8 @@ from firmware_py.geometry import IDENTITY, Quaternion, Vector, multiply, rotate
 from ground_station.mocap import MocapFrame
 from hil.devices.config import MocapConfig
 from hil.devices.markers import Sighting
+from hil.world.body import Motion
 from hil.world.fixed_order import normal
-from hil.world.plant import Plant
 
 if TYPE_CHECKING:
     from hil.devices.rigid_body import VirtualMarkers
@@ -57,22 +57,22 @@ class VirtualMocap:
         self.sighting: Sighting | None = None
         self._arrival_us = 0  # of the last frame
 
-    def expose(self, now_us: int, plant: Plant) -> tuple[MocapFrame, int]:
-        """Return the frame of the plant as it is now, and its arrival at the ground station.
+    def expose(self, now_us: int, body: Motion) -> tuple[MocapFrame, int]:
+        """Return the frame of the body as it is now, and its arrival at the ground station.
 
         Frames do not overtake one another. All delay arises in the cameras' computer; the network takes no time.
         """
         latency_us = self._config.latency_us + round(self.more_latency_us)
         self._arrival_us = arrival_us = max(self._arrival_us, now_us + latency_us)
-        pose = self._pose(plant)
+        pose = self._pose(body)
         p_WB, q_WB = pose or (NOWHERE, IDENTITY)
         received_us = now_us + self._camera_us
         frame = MocapFrame(now_us, p_WB, q_WB, pose is not None, received_us, arrival_us)
         return frame, arrival_us
 
-    def _pose(self, plant: Plant) -> tuple[Vector, Quaternion] | None:
+    def _pose(self, body: Motion) -> tuple[Vector, Quaternion] | None:
         """Return the pose with its errors, None when the body is not tracked."""
-        pose = self._noisy_pose(plant) if self.markers is None else self._solved_pose(self.markers, plant)
+        pose = self._noisy_pose(body) if self.markers is None else self._solved_pose(self.markers, body)
         outlier = self.outlier > 0.0 and self._rng_outlier.random() < self.outlier
         offset = _direction(self._rng_outlier) if outlier else NOWHERE
         dropped = self.dropout > 0.0 and self._rng_dropout.random() < self.dropout
@@ -90,19 +90,19 @@ class VirtualMocap:
             q_WB = multiply(q_WB, HALF_TURN)
         return p_WB, q_WB
 
-    def _noisy_pose(self, plant: Plant) -> tuple[Vector, Quaternion]:
+    def _noisy_pose(self, body: Motion) -> tuple[Vector, Quaternion]:
         """Return the truth with the configured noise."""
         if not self._draws:
             self._draws = normal(self._rng, (NOISE_ROWS, 6)).tolist()
         x, y, z, a, b, c = self._draws.pop()
-        px, py, pz = plant.p_WB.tolist()
+        px, py, pz = body.p_WB.tolist()
         s, half = self._config.position_noise, 0.5 * self._config.rotation_noise
-        q_WB = turned(plant.q_WB.tolist(), half * a, half * b, half * c)
+        q_WB = turned(body.q_WB.tolist(), half * a, half * b, half * c)
         return (px + s * x, py + s * y, pz + s * z), q_WB
 
-    def _solved_pose(self, markers: VirtualMarkers, plant: Plant) -> tuple[Vector, Quaternion] | None:
+    def _solved_pose(self, markers: VirtualMarkers, body: Motion) -> tuple[Vector, Quaternion] | None:
         """Return the pose fitted to the markers, None when too few are visible."""
-        self.sighting = markers.look(plant.p_WB, plant.q_WB)
+        self.sighting = markers.look(body.p_WB, body.q_WB)
         return self.sighting.pose
 
 

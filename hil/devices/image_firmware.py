@@ -9,7 +9,7 @@ Of the robot's state there is what the exported app has, found by symbols; an im
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -32,6 +32,7 @@ from hil.stm32f405.freertos import HEAP, HEAP_LEAST
 from hil.stm32f405.gdb import GdbServer
 from hil.stm32f405.image import Image
 from hil.stm32f405.processor import ChipProcessor
+from hil.world.servos import OUTPUTS
 
 # The stock firmware's self-test and gyro calibration take 3.06 s. The rest lets the app's estimator step at the phase of the
 # cameras' frames at which ours does, 2 to 3 ms after a pose: in reality it is any.
@@ -97,13 +98,14 @@ class ChipImage:
         return 0
 
     def boot(self, start: PowerOn) -> ImageFirmware:
-        return ImageFirmware(self, start.board, start.rest, polls=not start.polled)
+        return ImageFirmware(self, start.board, start.rest, not start.polled, start.outputs)
 
 
 class ImageFirmware:
     """An image at power-on. `rest` gives the IMU's counts while the robot is at rest, before the laboratory's time begins.
 
-    `polls`: whether radio packets without contents come by themselves, as with a host that only listens.
+    `polls`: whether radio packets without contents come by themselves, as with a host that only listens. `outputs`: those of
+    the timers that drive the robot, by default the servos'.
     """
 
     usage: ClassVar[None] = None
@@ -111,9 +113,14 @@ class ImageFirmware:
     overrun: ClassVar[str] = ""
 
     def __init__(
-        self, flashed: ChipImage, board: Board, rest: Callable[[], ImuCounts] | None, polls: bool = True
+        self,
+        flashed: ChipImage,
+        board: Board,
+        rest: Callable[[], ImuCounts] | None,
+        polls: bool = True,
+        outputs: Sequence[tuple[int, int]] = OUTPUTS,
     ) -> None:
-        self._crazyflie = Crazyflie(flashed.image, flashed.library, board, polls, flashed.debugger)
+        self._crazyflie = Crazyflie(flashed.image, flashed.library, board, polls, flashed.debugger, outputs)
         self.image, self.chip, self.parts = flashed.image, self._crazyflie.chip, self._crazyflie.parts
         self.kernel = self.scheduler = self._crazyflie.processor
         self._board = board

@@ -1,6 +1,6 @@
 """The BMI088 on the virtual board: angular rate and specific force at the centre of mass to int16 counts at 1 kHz.
 
-One `sample` is one data-ready: call it once per millisecond, after `plant.advance`. Chain: second-order low pass, bias,
+One `sample` is one data-ready: call it once per millisecond, after `body.advance`. Chain: second-order low pass, bias,
 white noise, rounding, saturation; compiled. Sensor frame S is B turned about z by `azimuth`; counts come in S.
 """
 
@@ -15,10 +15,9 @@ from firmware_py.compiling import bound
 from firmware_py.elementary import cos, sin, tan
 from hil.devices.config import S_AZIMUTH, ImuConfig
 from hil.errors import LabError
-from hil.world import layout as at
+from hil.world.body import Motion
 from hil.world.fixed_order import compiled, normal
 from hil.world.motion import GRAVITY
-from hil.world.plant import Plant
 
 View = NDArray[np.float64]
 Counts = NDArray[np.int64]  # (7,) those of a sample, then the rows of noise that are left
@@ -45,23 +44,18 @@ def channel(row: View, truth: float, draw: float) -> int:
 
 
 @compiled
-def channels(rows: View, truth: View, draws: View, counts: Counts) -> None:
-    """Turn rates and specific force of the plant's array, in B, into S and then into counts, with the next row of noise."""
-    ox, oy, fx, fy = (
-        truth[at.OMEGA],
-        truth[at.OMEGA + 1],
-        truth[at.SPECIFIC_FORCE],
-        truth[at.SPECIFIC_FORCE + 1],
-    )
+def channels(rows: View, omega_B: View, specific_force_B: View, draws: View, counts: Counts) -> None:
+    """Turn rates and specific force into S and then into counts, with the next row of noise."""
+    ox, oy, fx, fy = omega_B[0], omega_B[1], specific_force_B[0], specific_force_B[1]
     c, s = rows[0, AXIS_COS], rows[0, AXIS_SIN]
     counts[LEFT] -= 1
     noise = draws[counts[LEFT]]
     counts[0] = channel(rows[0], c * ox + s * oy, noise[0])
     counts[1] = channel(rows[1], c * oy - s * ox, noise[1])
-    counts[2] = channel(rows[2], truth[at.OMEGA + 2], noise[2])
+    counts[2] = channel(rows[2], omega_B[2], noise[2])
     counts[3] = channel(rows[3], c * fx + s * fy, noise[3])
     counts[4] = channel(rows[4], c * fy - s * fx, noise[4])
-    counts[5] = channel(rows[5], truth[at.SPECIFIC_FORCE + 2], noise[5])
+    counts[5] = channel(rows[5], specific_force_B[2], noise[5])
 
 
 SAMPLE_RATE = 1000.0  # [Hz]
@@ -97,7 +91,7 @@ class VirtualImu:
         self._counts: Counts = np.zeros(7, np.int64)
         self._left = 0  # rows of noise
         self._measure: Callable[[], object]
-        self._truth: View | None = None  # of the plant that was sampled last
+        self._body: Motion | None = None  # sampled last
         rows[:, RANGE] = COUNTS
         rows[:, AXIS_COS], rows[:, AXIS_SIN] = cos(config.azimuth), sin(config.azimuth)
         self.rate_range: float = COUNTS / GYRO_COUNTS
@@ -106,11 +100,13 @@ class VirtualImu:
         self.set_noise_scale(1.0)
         self.set_rate_bias(0.0, 0.0, 0.0)
 
-    def sample(self, plant: Plant) -> ImuCounts:
-        """Return gyro x y z and accelerometer x y z counts, in S, of the plant as it is now."""
-        if self._truth is not plant.truth:
-            self._truth = plant.truth
-            self._measure = bound(channels, self._rows, plant.truth, self._draws, self._counts)
+    def sample(self, body: Motion) -> ImuCounts:
+        """Return gyro x y z and accelerometer x y z counts, in S, of the body as it moves now."""
+        if self._body is not body:
+            self._body = body
+            self._measure = bound(
+                channels, self._rows, body.omega_B, body.specific_force_B, self._draws, self._counts
+            )
         if self._left == 0:
             self._draws[:] = normal(self._rng, (NOISE_ROWS, 6))
             self._counts[LEFT] = NOISE_ROWS

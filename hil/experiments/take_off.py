@@ -44,7 +44,7 @@ BOOTED_US = 500_000
 
 def operate(flight: Flight) -> None:
     """Plan the operator's actions."""
-    flight.robot.plant.tunnel.set_fan_factor(0.0)
+    flight.robot.body.tunnel.set_fan_factor(0.0)
     release_us = flight.release_us
     flight.events.at(max(BOOTED_US, flight.now_us), partial(_switch, flight, False))
     flight.events.at(release_us + _us(CONTROLLER_ON), partial(_switch, flight, True))
@@ -82,7 +82,7 @@ def _ramp(flight: Flight, start_us: int, before: float, after: float) -> None:
 
 
 def _setter(flight: Flight, factor: float) -> Callable[[int], None]:
-    return lambda now_us: flight.robot.plant.tunnel.set_fan_factor(factor)
+    return lambda now_us: flight.robot.body.tunnel.set_fan_factor(factor)
 
 
 def measure(flight: pa.Table) -> Mapping[str, float]:

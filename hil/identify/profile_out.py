@@ -16,8 +16,8 @@ from hil.errors import LabError, writing
 from hil.identify.identify import UNKNOWN, Identification
 from hil.identify.response import DELAY, LAG
 from hil.identify.robots import write_known
-from hil.world.body import MIX
 from hil.world.servos import WORDS_PER_RADIAN
+from hil.world.shape import MIX
 
 TRIM_LEAST = 0.005  # [rad] least mean input for which a trim is written
 

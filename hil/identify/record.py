@@ -19,7 +19,7 @@ from hil.config import LabConfig, load_config
 from hil.errors import LabError
 from hil.laboratory.recorder import load_log, release_of
 from hil.laboratory.result import read_result
-from hil.world.body import MIX, SIGNS
+from hil.world.shape import MIX, SIGNS
 
 Array = NDArray[np.float64]
 BOARD_COLUMN = "board.t [ms]"

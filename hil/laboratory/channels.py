@@ -22,9 +22,9 @@ from hil.devices.cameras import VirtualMocap
 from hil.devices.radio import VirtualRadio
 from hil.devices.uart import VirtualSerial
 from hil.laboratory.faults import Fault
-from hil.laboratory.recorder import Channel, Quantity
 from hil.laboratory.robot import Robot
 from hil.world.battery import Battery
+from hil.world.body import Channel, Quantity
 
 if TYPE_CHECKING:
     from ground_station.links.mavlink import MavlinkLink  # needs pymavlink
@@ -42,14 +42,12 @@ def quantity(prefix: str, names: str, unit: str = "", frame: str = "") -> Quanti
 
 
 FLAPS = "flap_1 flap_2 flap_3 flap_4"
-PLATES = " ".join(f"{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz")
 STATES = (quantity("flight", "free"), quantity("supervisor", "state"))
 TRUTH = (
     quantity("truth", "x y z", "m", "W"),
     quantity("truth", "vx vy vz", "m/s", "W"),
     quantity("truth", "qw qx qy qz", "", "W"),
     quantity("truth", "p q r", "rad/s", "B"),
-    quantity("truth", FLAPS, "rad", "B"),
 )
 GOAL = (quantity("goal", "x y z", "m", "W"), quantity("goal", "yaw", "rad", "W"))
 ESTIMATE = (
@@ -209,13 +207,13 @@ def _view(array: Any) -> Callable[[], Any]:
 
 def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]:
     """Return the channels of any flight; the first column, `t`, is the recorder's own."""
-    plant, board, signals = robot.plant, robot.board, robot.firmware.signals
+    body, board, signals = robot.body, robot.board, robot.firmware.signals
     counters = (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us"))
     return (
         Channel("int8", lambda: (robot.free, signals.supervisor.state), STATES),
-        Channel("float64", _view(plant.state), TRUTH),
-        Channel("float32", _view(plant.plate_forces_W.reshape(15)), (quantity("force", PLATES, "N", "W"),)),
-        Channel("float32", _view(plant.flow_W), (quantity("flow", "x y z", "m/s", "W"),)),
+        Channel("float64", _view(body.state), TRUTH),
+        *body.channels(),
+        Channel("float32", _view(body.flow_W), (quantity("flow", "x y z", "m/s", "W"),)),
         Channel("float64", lambda: _coordinates(trajectory.at(board.now_us)), GOAL),
         Channel("float32", _view(signals.estimate), (*ESTIMATE, quantity("estimate", FLAPS, "rad", "B"))),
         Channel("float32", _view(signals.u), (INPUTS,)),

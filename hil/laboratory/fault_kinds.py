@@ -155,38 +155,30 @@ def _bias(axis: int) -> Knob:
     return Knob(lambda robot: robot.imu.rate_bias[axis], turn, add)
 
 
-def _trim(servo: int) -> Knob:
+def _setting(name: str, blend: Blend) -> Knob:
     return Knob(
-        lambda robot: float(robot.plant.servo_trim[servo]),
-        lambda robot, value: robot.plant.set_servo_fault(servo, value, robot.plant.servo_speed[servo]),
-        add,
-    )
-
-
-def _pace(servo: int) -> Knob:
-    return Knob(
-        lambda robot: float(robot.plant.servo_speed[servo]),
-        lambda robot, value: robot.plant.set_servo_fault(servo, robot.plant.servo_trim[servo], value),
-        times,
+        lambda robot: robot.body.settings[name].read(),
+        lambda robot, value: robot.body.settings[name].turn(value),
+        blend,
     )
 
 
 def _side_wind(axis: int) -> Knob:
     def turn(robot: Robot, value: float) -> None:
-        wind = list(robot.plant.tunnel.side_wind)
+        wind = list(robot.body.tunnel.side_wind)
         wind[axis] = max(-20.0, min(value, 20.0))
-        robot.plant.tunnel.set_side_wind(*wind)
+        robot.body.tunnel.set_side_wind(*wind)
 
-    return Knob(lambda robot: robot.plant.tunnel.side_wind[axis], turn, add)
+    return Knob(lambda robot: robot.body.tunnel.side_wind[axis], turn, add)
 
 
 def _push(part: int) -> Knob:
     def turn(robot: Robot, value: float) -> None:
-        pushes = robot.plant.pushes.tolist()
+        pushes = robot.body.pushes.tolist()
         pushes[part] = value
-        robot.plant.push(pushes[:3], pushes[3:])
+        robot.body.push(pushes[:3], pushes[3:])
 
-    return Knob(lambda robot: float(robot.plant.pushes[part]), turn, add)
+    return Knob(lambda robot: float(robot.body.pushes[part]), turn, add)
 
 
 UPLINK_LOSS, DOWNLINK_LOSS = _radio("uplink_loss"), _radio("downlink_loss")
@@ -213,23 +205,23 @@ SILENCE = Knob(
     lambda robot: float(robot.imu.silent), lambda robot, value: robot.imu.silence(value > 0.5), max
 )
 FANS = Knob(
-    lambda robot: robot.plant.tunnel.fan_factor,
-    lambda robot, value: robot.plant.tunnel.set_fan_factor(min(value, 2.0)),
+    lambda robot: robot.body.tunnel.fan_factor,
+    lambda robot, value: robot.body.tunnel.set_fan_factor(min(value, 2.0)),
     times,
 )
 SHADOW = Knob(
-    lambda robot: robot.plant.tunnel.shadow,
-    lambda robot, value: robot.plant.tunnel.block(0.0, 0.0, OCCLUSION_RADIUS, value),
+    lambda robot: robot.body.tunnel.shadow,
+    lambda robot, value: robot.body.tunnel.block(0.0, 0.0, OCCLUSION_RADIUS, value),
     either,
 )
 GUSTS = Knob(
-    lambda robot: robot.plant.tunnel.gust_scale,
-    lambda robot, value: robot.plant.tunnel.set_gust_scale(min(value, 5.0)),
+    lambda robot: robot.body.tunnel.gust_scale,
+    lambda robot, value: robot.body.tunnel.set_gust_scale(min(value, 5.0)),
     times,
 )
 LOAD = _attribute(lambda robot: robot.thief, "share", lambda value, size: min(value + size, 1.0))
 SAG = _attribute(lambda robot: robot.battery, "sag_V", add)
-PACES = tuple(_pace(servo) for servo in range(4))
+PACES = tuple(_setting(f"servo.pace.{number}", times) for number in (1, 2, 3, 4))
 
 DEG = math.radians(1.0)
 MS = 1e3  # us: times stay whole microseconds
@@ -325,8 +317,8 @@ KINDS: dict[str, Kind] = {
     },
     **{
         f"servo.trim.{number}": Kind(
-            f"flap {number} deviates this far from its command", "deg", 5.0, -45.0, 45.0, (_trim(number - 1),), "holds",
-            DEG,
+            f"flap {number} deviates this far from its command", "deg", 5.0, -45.0, 45.0,
+            (_setting(f"servo.trim.{number}", add),), "holds", DEG,
         )
         for number in (1, 2, 3, 4)
     },

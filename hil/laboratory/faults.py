@@ -176,7 +176,7 @@ class Switchboard:
     def _switch(self, fault: Fault, active: list[Fault], now_us: int) -> None:
         """Set the knobs of `fault` to the blend of the active faults."""
         robot = self._robot
-        robot.plant.advance(now_us)
+        robot.body.advance(now_us)
         self.active[:] = active
         for knob in KINDS[fault.kind].knobs:
             value = self._before.setdefault(knob, knob.read(robot))

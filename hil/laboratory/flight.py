@@ -24,10 +24,11 @@ from hil.laboratory.channels import (
 )
 from hil.laboratory.faults import Switchboard
 from hil.laboratory.laboratory import Laboratory, Progress
-from hil.laboratory.recorder import Channel, Recorder
+from hil.laboratory.recorder import Recorder
 from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Robot, Site, Streams
 from hil.laboratory.schedule import WINDOW_US, ScheduleTrace
+from hil.world.body import Channel
 
 RECORD_PERIOD_US = 10_000
 RECORD_PHASE_US = 250  # just after the controller
@@ -103,7 +104,7 @@ class Flight:
         self.line = line_of(request, site, self.lab)
         self.robot = self.line.robot
         self.lab.robots.append(self.robot)
-        self.robot.plant.hold()
+        self.robot.body.hold()
         self.switchboard = Switchboard(self.robot)
         request.experiment.prepare(self.robot)
         self.switchboard.prepare(self.faults)

@@ -28,10 +28,10 @@ from hil.errors import LabError
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
-from hil.laboratory.recorder import Channel
 from hil.laboratory.request import MAVLINK, Request, check_image
 from hil.laboratory.robot import PYTHON_BOARD, Ports, Robot, Site
 from hil.stm32f405.gdb import GdbServer
+from hil.world.body import Channel
 
 BUILD = Path("runs/build")
 

@@ -11,7 +11,6 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 
 from hil.errors import LabError
 from hil.laboratory.ages import at_exposure
+from hil.world.body import Channel
 
 if "pandas" not in sys.modules:
     # The first array imports pandas, to know its types, which takes a second or so in mid-flight. If pandas seems
@@ -41,24 +41,6 @@ ROWS_SHOWN = 20  # given to the onlooker together: five times a second
 OPERATOR = "operator"  # source of the events that an operator caused at the terminal
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
 PARQUET, STREAM, EVENTS = "log.parquet", "log.arrows", "events.jsonl"
-
-
-@dataclass(frozen=True, slots=True)
-class Quantity:
-    """Columns that share a unit and a frame (W, B, G, S or empty)."""
-
-    names: tuple[str, ...]
-    unit: str
-    frame: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Channel:
-    """Columns that are read together: `read` returns the values of all the quantities' columns in order (or one number)."""
-
-    dtype: str
-    read: Callable[[], Any]
-    quantities: tuple[Quantity, ...]
 
 
 class Onlooker(Protocol):

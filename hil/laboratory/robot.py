@@ -1,4 +1,4 @@
-"""One Floaty in its tunnel: plant, battery, IMU, the cameras that see it, and a board whose firmware boots and reboots.
+"""One robot in its tunnel: body, battery, IMU, the cameras that see it, and a board whose firmware boots and reboots.
 
 All instants are the laboratory's, except those of the firmware, which counts from its boot. The destination of the board's
 radio packets and the other end of its UART are handed in.
@@ -27,7 +27,8 @@ from hil.devices.rigid_body import make_markers
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue
-from hil.world.battery import Battery
+from hil.world.battery import Battery, open_circuit_voltage
+from hil.world.body import Body
 from hil.world.plant import Plant
 
 IMU_PERIOD_US = 1_000
@@ -102,10 +103,17 @@ class Robot:
         self.say = site.say
         self.free = False
         self.powered = True
-        self.plant: Plant = Plant(
-            config.geometry, config.plant, config.tunnel, config.actuators, streams.gusts, self.start_W
+        self.body: Body = Plant(
+            config.geometry,
+            config.plant,
+            config.tunnel,
+            config.actuators,
+            streams.gusts,
+            self.start_W,
+            config.battery,
         )
-        self.battery: Battery = Battery(config.battery)
+        at_rest = self.body.draw(0, open_circuit_voltage(config.battery.charge))
+        self.battery: Battery = Battery(config.battery, at_rest)
         self.imu: VirtualImu = VirtualImu(config.imu, streams.imu)
         self.mocap = VirtualMocap(
             config.mocap,
@@ -119,7 +127,7 @@ class Robot:
         self._seen_by: list[See] = []
         self._resets = 0
         self.board = VirtualBoard(
-            self.plant.set_counts,
+            self.body.set_counts,
             ports.send_packet,
             self._console,
             self.uart,
@@ -139,8 +147,10 @@ class Robot:
         self.board.boot(now_us)
         specimen = deepcopy(self.imu)  # so that the sensor's noise in flight is the same for every board
         specimen.set_noise_scale(BENCH_NOISE)
-        rest = None if now_us else lambda: specimen.sample(self.plant)
-        start = PowerOn(self.board, self.config, self.uart is not None, self._ports.polled, rest)
+        rest = None if now_us else lambda: specimen.sample(self.body)
+        start = PowerOn(
+            self.board, self.config, self.uart is not None, self._ports.polled, rest, self.body.outputs
+        )
         self.firmware = self.executor.boot(start)
         self.board.run_on(self.firmware.kernel, self.events)
         if self._thief is not None:
@@ -198,7 +208,7 @@ class Robot:
     # Body
 
     def release(self) -> None:
-        self.plant.release()
+        self.body.release()
         self.free = True
 
     def catch(self) -> None:
@@ -207,16 +217,16 @@ class Robot:
 
     def put_back(self, now_us: int) -> None:
         """Put the body into the holder, as at the start; flaps, air and faults are unchanged."""
-        self.plant.advance(now_us)
-        self.plant.put_back(self.start_W)
+        self.body.advance(now_us)
+        self.body.put_back(self.start_W)
         self.free = False
 
     def look(self, now_us: int) -> str | None:
         """Bring the truth and the battery up to this instant; returns why the flight is over, None while it is not."""
-        self.plant.advance(now_us)
-        self.battery.draw(now_us, self.plant.flap_travel)
+        self.body.advance(now_us)
+        self.battery.draw(now_us, self.body.draw(now_us, self.battery.voltage))
         self.board.supply(self.battery.millivolts)
-        return self.plant.lost
+        return self.body.lost
 
     # Interrupts
 
@@ -234,16 +244,16 @@ class Robot:
             self.firmware.uart_ready()
 
     def _sample(self, now_us: int) -> None:
-        self.plant.advance(now_us)
+        self.body.advance(now_us)
         if self.powered:
-            counts = self.imu.sample(self.plant)
+            counts = self.imu.sample(self.body)
             if not self.imu.silent:
                 self.board.measure(counts)
                 self.firmware.imu_ready()
 
     def _expose(self, now_us: int) -> None:
-        self.plant.advance(now_us)
-        frame, arrival_us = self.mocap.expose(now_us, self.plant)
+        self.body.advance(now_us)
+        frame, arrival_us = self.mocap.expose(now_us, self.body)
         sighting = self.mocap.sighting
 
         def deliver(now_us: int) -> None:

@@ -130,10 +130,9 @@ def find_goal(s: Array, home: Array, path: Array, goal: Array) -> None:
 
 
 @compiled
-def tilt_of(s: Array) -> float:
-    """Return the angle between the body's z axis and the vertical [rad]."""
-    across = math.sqrt(s[at.R + 6] * s[at.R + 6] + s[at.R + 7] * s[at.R + 7])
-    return float(atan2(across, s[at.R + 8]))
+def tilt_of(x: float, y: float, z: float) -> float:
+    """Return the angle between the body's z axis and the vertical [rad], for the vertical (x, y, z) as seen in B."""
+    return float(atan2(math.sqrt(x * x + y * y), z))
 
 
 @compiled
@@ -186,7 +185,12 @@ def advance_all(
         observe(parameters[0], estimator[0], previous[n], observations[n])
         dx, dy, dz = s[at.P] - goal[0], s[at.P + 1] - goal[1], s[at.P + 2] - goal[2]
         turned = wrapped(rings[n, newest, 8] - goal[3])
-        rewards[n] = reward_of(math.sqrt(dx * dx + dy * dy + dz * dz), tilt_of(s), turned, change)
+        rewards[n] = reward_of(
+            math.sqrt(dx * dx + dy * dy + dz * dz),
+            tilt_of(s[at.R + 6], s[at.R + 7], s[at.R + 8]),
+            turned,
+            change,
+        )
 
 
 @compiled

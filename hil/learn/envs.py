@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from firmware_py.core.observation import ACTIONS, OBSERVATIONS
 from firmware_py.core_runner import CoreBlocks, CoreRunner, PythonRunner
-from firmware_py.geometry import to_euler_zyx, wrap_angle
+from firmware_py.geometry import rotation_matrix, to_euler_zyx, wrap_angle
 from ground_station.trajectory import Goal, Offsets, Sine, Trajectory
 from hil.campaigns.config import find_spec, read_spec
 from hil.campaigns.sampling import draw
@@ -248,13 +248,14 @@ class FirmwareEnv(gymnasium.Env[Actions, Actions]):
         change = float(((limited - self._previous) ** 2).sum())
         self._previous[:] = limited
         self._run_until(flight.now_us + CONTROL_US)
-        plant, goal = flight.robot.plant, flight.line.trajectory.at(flight.now_us)
+        body, goal = flight.robot.body, flight.line.trajectory.at(flight.now_us)
         flight.robot.look(flight.now_us)
-        distance = math.dist(plant.p_WB.tolist(), goal.p_WG)
-        yaw = to_euler_zyx(tuple(plant.q_WB.tolist()))[2]
-        reward = reward_of(distance, tilt_of(plant.truth), wrap_angle(yaw - goal.yaw), change)
+        distance = math.dist(body.p_WB.tolist(), goal.p_WG)
+        up_B = rotation_matrix(tuple(body.q_WB.tolist()))[2].tolist()
+        yaw = to_euler_zyx(tuple(body.q_WB.tolist()))[2]
+        reward = reward_of(distance, tilt_of(*up_B), wrap_angle(yaw - goal.yaw), change)
         over = flight.now_us - flight.release_us >= (self._setup.steps - 0.5) * CONTROL_US
-        return self._observe(), reward, plant.lost is not None, over, {}
+        return self._observe(), reward, body.lost is not None, over, {}
 
     def close(self) -> None:
         """End the flight."""

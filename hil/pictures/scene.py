@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.world.body import MIRRORS
 from hil.world.config import GeometryConfig, GroundConfig
 from hil.world.geometry import axis_of, surfaces, triangles, weigh
+from hil.world.shape import MIRRORS
 
 Points = NDArray[np.float64]
 

@@ -30,7 +30,7 @@ class Holder:
 
     def _watch(self, now_us: int) -> None:
         robot = self._robot
-        if robot.free or robot.plant.lost is not None:
+        if robot.free or robot.body.lost is not None:
             return
         if not robot.powered or robot.firmware.signals.supervisor.state is not State.FLYING:
             self._flying_since_us = None

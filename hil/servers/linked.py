@@ -25,7 +25,6 @@ from hil.laboratory.channels import radio_channel, serial_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import WARM_UP_US, Laboratory
 from hil.laboratory.lockstep import image_at
-from hil.laboratory.recorder import Channel, Quantity
 from hil.laboratory.request import Request
 from hil.laboratory.robot import PYTHON_BOARD, Site
 from hil.servers.dongle_plugin import VARIABLE
@@ -34,6 +33,7 @@ from hil.servers.motive import Streaming
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
 from hil.servers.server import Ends, name_of
+from hil.world.body import Channel, Quantity
 
 SITE = Path(__file__).parent / "dongle_site"
 RELEASE_TIMEOUT_US = 60_000_000  # for the station to start, connect, and fly in the holder

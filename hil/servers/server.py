@@ -27,7 +27,7 @@ from hil.laboratory.channels import (
 from hil.laboratory.faults import Fault, Switchboard
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US
 from hil.laboratory.laboratory import NEVER_US, Laboratory
-from hil.laboratory.recorder import Channel, Onlooker, Recorder
+from hil.laboratory.recorder import Onlooker, Recorder
 from hil.laboratory.robot import PYTHON_BOARD, Site, Streams, with_system
 from hil.servers.dongle_server import DongleServer
 from hil.servers.failures import Failures
@@ -35,6 +35,7 @@ from hil.servers.holder import Holder
 from hil.servers.motive import Streaming, VirtualMotive
 from hil.servers.serial_server import Address
 from hil.servers.served_robot import ServedRobot
+from hil.world.body import Channel
 
 DONGLE_SEED = 10_000  # random streams of dongles: apart from those of the robots
 # Of each USB transfer: cflib and the socket of the dongle, unpaced, manage 4500 exchanges per second.
@@ -192,7 +193,7 @@ class Server:
         site = Site(config, self.lab.events, streams, say, self._plan.executor)
         served = ServedRobot(number, site, self._say, self._plan.mavlink, self._plan.state, fail)
         robot = served.robot
-        robot.plant.hold()
+        robot.body.hold()
         self.lab.robots.append(robot)
         self.ends.robots.append(served)
         switchboard = Switchboard(robot)

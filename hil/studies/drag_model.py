@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from hil.config import LabConfig
 from hil.design.authority import pressure_at, wrenches
 from hil.laboratory.robot import Streams
-from hil.world.body import SIGNS
 from hil.world.fixed_order import normal
 from hil.world.layout import STEP_US
 from hil.world.plant import Plant
+from hil.world.shape import SIGNS
 
 Wrench = NDArray[np.float64]  # (6,): force [N] and torque [N m] in B
 

@@ -8,8 +8,6 @@ import math
 from firmware_py.elementary import exp
 from hil.world.config import BatteryConfig
 
-SERVOS = 4
-
 
 def open_circuit_voltage(charge: float) -> float:
     """Return the voltage [V] of a cell without load at a `charge` of 0..1.
@@ -26,14 +24,13 @@ class Battery:
     the last call; sag_V [V] lost between each cell and the board, for a fault.
     """
 
-    def __init__(self, config: BatteryConfig) -> None:
+    def __init__(self, config: BatteryConfig, power: float = 0.0) -> None:
+        """Begin under a load of `power` [W]."""
         self.sag_V = 0.0
         self.charge = config.charge
-        self.power = config.electronics_power + SERVOS * config.servo_power
+        self.power = power
         self._config = config
-        self._at_rest = self.power
         self._time_us = 0
-        self._travel = 0.0
         self.voltage = self._loaded()
 
     @property
@@ -41,12 +38,12 @@ class Battery:
         """The voltage that the board measures, of one cell [mV]."""
         return round(1000.0 * self.voltage)
 
-    def draw(self, now_us: int, flap_travel: float) -> None:
-        """Draw the energy used until now; `flap_travel` [rad] is the total travel of all flaps since the start."""
+    def draw(self, now_us: int, power: float) -> None:
+        """Draw the robot's mean `power` [W] since the last call."""
         duration = 1e-6 * (now_us - self._time_us)
         if duration > 0.0:
-            turned, self._time_us, self._travel = flap_travel - self._travel, now_us, flap_travel
-            self.spend(self._at_rest + self._config.servo_energy * turned / duration, duration)
+            self._time_us = now_us
+            self.spend(power, duration)
 
     def spend(self, power: float, duration: float) -> None:
         """Draw `power` [W] for `duration` [s]."""

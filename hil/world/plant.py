@@ -1,4 +1,4 @@
-"""The robot in the tunnel, as the harness sees it: time passes, pulses arrive, truth can be read.
+"""Floaty in the tunnel, as the laboratory sees it (`hil.world.body`): time passes, pulses arrive, truth can be read.
 
 The truth lives on a grid of whole milliseconds from time 0: `advance(now_us)` does every step that ends at or before
 `now_us`. The same generator and the same calls give the same bits however the time to an instant is divided into calls.
@@ -8,25 +8,29 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.compiling import bound
 from firmware_py.elementary import cos
 from hil.errors import LabError
 from hil.world import layout as at
-from hil.world.body import SIGNS, place_plates
-from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.body import Channel, Quantity, Setting, Vector, View
+from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.correction import LEVEL, Constants, OperatingPoint, calm, linearise, trim_and_correct
 from hil.world.fixed_order import normal
 from hil.world.geometry import weigh
 from hil.world.motion import advance, evaluate
 from hil.world.plates import State
-from hil.world.servos import commanded_angles, next_period_us
+from hil.world.servos import OUTPUTS, commanded_angles, next_period_us
+from hil.world.shape import SIGNS, place_plates
 from hil.world.tunnel import Tunnel
 
 NOISE_ROWS = 2048  # steps of gusts drawn at once
-Vector = Sequence[float]
-View = NDArray[np.float64]
+SERVOS = 4
+LOADS = BatteryConfig()
+FLAPS = tuple(f"truth.flap_{number}" for number in (1, 2, 3, 4))
+PLATES = tuple(
+    f"force.{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz"
+)
 
 LOSS_TEXTS = {
     at.LEFT_SIDEWAYS: "left the flow: {:.2f} m from the axis",
@@ -53,7 +57,7 @@ class Plant:
     """Body, servos, tether and the air around them.
 
     Attributes (read-only numpy views of the present truth, SI):
-        truth (layout.SIZE,) everything; state (17,) p_WB, v_WB, q_WB, omega_B and flaps in one piece;
+        truth (layout.SIZE,) everything; state (13,) p_WB, v_WB, q_WB, omega_B in one piece;
         p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
         wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
         zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed;
@@ -70,9 +74,12 @@ class Plant:
         servos: ServoConfig,
         rng_gust: np.random.Generator,
         p_WB: Vector | None = None,
-        q_WB: Vector = (1.0, 0.0, 0.0, 0.0),
+        loads: BatteryConfig = LOADS,
     ) -> None:
-        """Start at rest with the flaps at the hover angle, at the hover point unless `p_WB` [m] says otherwise."""
+        """Start level, at rest, the flaps at the hover angle, at the hover point unless `p_WB` [m] says otherwise.
+
+        Of the battery's configuration it takes what its servos and its electronics draw.
+        """
         self.tunnel: Tunnel
         s, self.tunnel = assemble(geometry, config, tunnel)
         self._s, self._airspeed = s, config.airspeed
@@ -94,6 +101,11 @@ class Plant:
         self.zero_offset = servos.zero_offset
         self.servo_trim, self.servo_speed = self._view(at.SERVO_TRIM, 4), self._view(at.SERVO_SPEED, 4)
         self.pushes = self._view(at.PUSH, 6)
+        self.settings = {
+            f"{what}.{servo + 1}": of(servo)
+            for servo in range(4)
+            for what, of in (("servo.trim", self._trim), ("servo.pace", self._pace))
+        }
         for servo in range(4):
             self.set_servo_fault(servo, servos.trim_error[servo], servos.speed[servo])
         self._counts: Sequence[int] = ()
@@ -107,14 +119,21 @@ class Plant:
         self._due_us = 0  # until then the truth stays
         self._evaluate = bound(evaluate, s)
         self._advance = bound(advance, s, self._draws, self._now_us)
-        self.truth, self.state = self._view(0, at.SIZE), self._view(at.P, 17)
+        self.truth, self.state = self._view(0, at.SIZE), self._view(at.P, 13)
         self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
         self.omega_B, self.flaps = self._view(at.OMEGA, 3), self._view(at.FLAPS, 4)
         self.specific_force_B, self.flow_W = self._view(at.SPECIFIC_FORCE, 3), self._view(at.FLOW, 3)
         self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
         self.wrench_B = self._view(at.DRAG, 6)
         self.plate_forces_W = self._view(at.PLATE_FORCES, 15).reshape(5, 3)
-        self.place((0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB, q_WB, flaps=self._commanded)
+        self.place(
+            (0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB,
+            (1.0, 0.0, 0.0, 0.0),
+            flaps=self._commanded,
+        )
+        self._at_rest = loads.electronics_power + SERVOS * loads.servo_power  # [W]
+        self._servo_energy, self._power = loads.servo_energy, self._at_rest
+        self._drawn_us, self._drawn_travel = 0, self.flap_travel
 
     def _view(self, start: int, count: int) -> View:
         view = self._s[start : start + count]
@@ -166,6 +185,28 @@ class Plant:
         s[at_us], s[angles : angles + 4] = next_period_us(now_us), self._commanded
 
     @property
+    def outputs(self) -> Sequence[tuple[int, int]]:
+        """The timer channels that the servos are connected to."""
+        return OUTPUTS
+
+    def draw(self, now_us: int, cell_V: float) -> float:
+        """Return the mean power [W] since the last call: electronics, servos at rest, and the flaps' travel."""
+        duration = 1e-6 * (now_us - self._drawn_us)
+        if duration > 0.0:
+            travel = self.flap_travel
+            turned, self._drawn_us, self._drawn_travel = travel - self._drawn_travel, now_us, travel
+            self._power = self._at_rest + self._servo_energy * turned / duration
+        return self._power
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return the flap angles, and the forces of base plate and flaps as isolated plates."""
+        plates = self.plate_forces_W.reshape(15)
+        return (
+            Channel("float64", lambda: self.flaps, (Quantity(FLAPS, "rad", "B"),)),
+            Channel("float32", lambda: plates, (Quantity(PLATES, "N", "W"),)),
+        )
+
+    @property
     def lost(self) -> str | None:
         """The first reason why the flight is over; None while it flies."""
         cause = int(self._s[at.LOST])
@@ -197,6 +238,18 @@ class Plant:
     def set_servo_fault(self, servo: int, trim_error: float = 0.0, speed: float = 1.0) -> None:
         """Mount servo 0..3 with an error [rad] and run it at `speed` times its pace, 0: stuck; the defaults restore it."""
         self._s[at.SERVO_TRIM + servo], self._s[at.SERVO_SPEED + servo] = trim_error, speed
+
+    def _trim(self, servo: int) -> Setting:
+        return Setting(
+            lambda: float(self.servo_trim[servo]),
+            lambda value: self.set_servo_fault(servo, value, self.servo_speed[servo]),
+        )
+
+    def _pace(self, servo: int) -> Setting:
+        return Setting(
+            lambda: float(self.servo_speed[servo]),
+            lambda value: self.set_servo_fault(servo, self.servo_trim[servo], value),
+        )
 
     @property
     def flap_travel(self) -> float:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 TIMER_MHZ = 21
 PERIOD_COUNTS = 52501
+OUTPUTS = ((4, 2), (2, 0), (2, 1), (4, 3))  # M1 to M4: TIM5_CH3, TIM3_CH1, TIM3_CH2, TIM5_CH4, counted from 0
 MIDDLE_COUNTS = 31500.0  # 1.5 ms
 WORDS_PER_RADIAN = 31290
 RAD_PER_COUNT = 65535 / (WORDS_PER_RADIAN * 21000)  # 477.455 us/rad: 65535 words per millisecond

@@ -204,7 +204,7 @@ def test_whatever_the_radio_brings_the_board_goes_on(bench: Bench) -> None:
 def test_servos_get_four_counts_of_a_pulse(bench: Bench) -> None:
     bench.run(100_000)
     assert all(len(counts) == 4 for counts in bench.counts)
-    assert all(0 < count <= 52_501 for counts in bench.counts for count in counts)
+    assert all(0 <= count <= 52_501 for counts in bench.counts for count in counts)  # 0: not set yet
 
 
 def test_what_a_board_cannot_report_is_absent(bench: Bench) -> None:

@@ -102,7 +102,7 @@ def main(library: str, *overrides: str) -> None:
         board = AppBoard(Path(library), Path(folder))
         site = Site(config, lab.events, Streams.of_seed(1), lambda source, text: None, board)
         served = ServedRobot(1, site, print)
-        served.robot.plant.hold()
+        served.robot.body.hold()
         served.robot.watch(0)
         ends = Ends(lab, clock.readers, config, 1)
         ends.robots.append(served)

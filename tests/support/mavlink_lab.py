@@ -80,7 +80,7 @@ class MavlinkLab:
     @property
     def place(self) -> Any:
         """Where the robot truly is [m, W]."""
-        return self.robot.plant.p_WB.copy()
+        return self.robot.body.p_WB.copy()
 
     def command(self, number: int, *params: float) -> Any:
         """Send a COMMAND_LONG; returns what comes of it, None when no acknowledgement comes."""

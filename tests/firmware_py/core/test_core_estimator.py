@@ -164,8 +164,8 @@ def flight() -> list[Record]:
             (5_000_000, (0.0, -0.5, 0.3), (0.002, 0.0, 0.0)),
             (7_500_000, (0.0, 0.0, -0.5), (0.0, 0.001, -0.003)),
         ):
-            flight.events.at(at_us, lambda _, f=force, t=torque: flight.robot.plant.push(f, t))
-            flight.events.at(at_us + 100_000, lambda _: flight.robot.plant.push((0.0, 0.0, 0.0)))
+            flight.events.at(at_us, lambda _, f=force, t=torque: flight.robot.body.push(f, t))
+            flight.events.at(at_us + 100_000, lambda _: flight.robot.body.push((0.0, 0.0, 0.0)))
         assert flight.run().lost is None
     return records
 

@@ -21,10 +21,10 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
-from hil.world.body import MIRRORS
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.geometry import axis_of
 from hil.world.plant import Plant
+from hil.world.shape import MIRRORS
 
 ON = MarkersConfig(enabled=True)
 EXACT = MarkersConfig(enabled=True, noise=0.0)
@@ -355,4 +355,4 @@ def test_markers_leave_all_other_randomness_as_it_was() -> None:
 
 
 def random_parts(flight: Flight) -> tuple[object, ...]:
-    return flight.robot.plant.flow_W.tolist(), flight.robot.board.imu, flight.line.radio.up.sent
+    return flight.robot.body.flow_W.tolist(), flight.robot.board.imu, flight.line.radio.up.sent

@@ -27,10 +27,10 @@ from hil.laboratory.run import fly
 from hil.pictures.gallery import pictures_of
 from hil.pictures.panels import Plot, Still
 from hil.pictures.picture import Picture
-from hil.world.body import SIGNS
 from hil.world.config import TunnelConfig
 from hil.world.correction import TABLE
 from hil.world.plant import Plant
+from hil.world.shape import SIGNS
 from support.flights import explain, flown
 
 FAMILIES = ("yaw-", "height-sine", "y-square", "pushes", "side-wind-", "occlusion", "airspeed-")

@@ -363,15 +363,15 @@ def test_faults_on_one_knob_add_up_and_leave_it_as_it_was() -> None:
     pace: list[float] = []
 
     def look(_: int) -> None:
-        wind.append(flight.robot.plant.tunnel.side_wind[1])
-        pace.append(float(flight.robot.plant.servo_speed[0]))
+        wind.append(flight.robot.body.tunnel.side_wind[1])
+        pace.append(float(flight.robot.body.servo_speed[0]))
 
     for moment in (0.1, 0.3, 0.45, 0.7, 0.9, 1.1):
         flight.events.at(flight.release_us + round(moment * 1e6), look)
     flight.run()
     assert wind == pytest.approx([0.2, 1.2, 3.2, 3.2, 2.2, 0.2])
     assert pace == pytest.approx([0.8, 0.4, 0.0, 0.4, 0.8, 0.8])
-    assert flight.robot.plant.tunnel.side_wind == (0.1, 0.2, 0.3)
+    assert flight.robot.body.tunnel.side_wind == (0.1, 0.2, 0.3)
 
 
 @pytest.mark.long
@@ -385,7 +385,7 @@ def test_side_wind_blows_either_way_up_to_20_metres_per_second(
     before[axis] = wind
     plant.tunnel.set_side_wind(*before)
     (knob,) = KINDS[kind].knobs
-    knob.turn(SimpleNamespace(plant=plant), knob.blend(wind, more))  # type: ignore[arg-type]
+    knob.turn(SimpleNamespace(body=plant), knob.blend(wind, more))  # type: ignore[arg-type]
     before[axis] = min(max(wind + more, -20.0), 20.0)
     assert plant.tunnel.side_wind == tuple(before)
 
@@ -418,9 +418,9 @@ def test_what_changed_between_two_faults_stays_changed() -> None:
     flight = lockstep_flight(
         Request.of(HOVER, duration_s=1.0, faults=[parse("wind.fan@0.1:0.1=0.9"), parse("wind.fan@0.5:0.1=0.9")])
     )  # fmt: skip
-    flight.events.at(1_300_000, lambda _: flight.robot.plant.tunnel.set_fan_factor(1.1))
+    flight.events.at(1_300_000, lambda _: flight.robot.body.tunnel.set_fan_factor(1.1))
     flight.run()
-    assert flight.robot.plant.tunnel.fan_factor == 1.1
+    assert flight.robot.body.tunnel.fan_factor == 1.1
 
 
 def test_the_log_counts_the_faults_in_force_and_names_them(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_a_robot_that_is_lost_is_put_back_after_a_second_and_flies_again_among_t
     assert sum("it is put back" in text for text in said) == 1
     assert sum(text.endswith("released") for text in said) == 2
     assert bench.robot().free
-    assert bench.robot().plant.servo_speed[0] == pytest.approx(0.9)  # the servo is as slow as before
+    assert bench.robot().body.servo_speed[0] == pytest.approx(0.9)  # the servo is as slow as before
 
 
 def test_robots_on_one_time_line_fly_as_each_does_alone() -> None:
@@ -77,7 +77,7 @@ def test_robots_on_one_time_line_fly_as_each_does_alone() -> None:
         alone = Bench(1, 4 + number)
         alone.fly(3.0)
         ours, theirs = together.robot(number), alone.robot()
-        assert ours.plant.state.tolist() == theirs.plant.state.tolist()
+        assert ours.body.state.tolist() == theirs.body.state.tolist()
         assert ours.firmware.signals.estimate.tolist() == theirs.firmware.signals.estimate.tolist()
 
 
@@ -92,7 +92,7 @@ def test_firmware_that_waits_for_every_instant_flies_as_one_that_runs_ahead() ->
     waiting.server.lab.clock = Instant()
     ahead.fly(2.5)
     waiting.fly(2.5)
-    assert ahead.robot().plant.state.tolist() == waiting.robot().plant.state.tolist()
+    assert ahead.robot().body.state.tolist() == waiting.robot().body.state.tolist()
     assert (
         ahead.robot().firmware.signals.estimate.tolist() == waiting.robot().firmware.signals.estimate.tolist()
     )
@@ -144,15 +144,15 @@ def test_a_typed_fault_acts_at_once_and_ends_by_itself() -> None:
     type_line, answers = live(bench)
     bench.fly(3.0)
     type_line("2 push.y:0.2=0.5")
-    assert bench.robot(2).plant.pushes.tolist() == [0.0, 0.5, 0.0, 0.0, 0.0, 0.0]
-    assert bench.robot(1).plant.pushes.tolist() == [0.0] * 6
+    assert bench.robot(2).body.pushes.tolist() == [0.0, 0.5, 0.0, 0.0, 0.0, 0.0]
+    assert bench.robot(1).body.pushes.tolist() == [0.0] * 6
     bench.fly(0.3)
-    assert bench.robot(2).plant.pushes.tolist() == [0.0] * 6
+    assert bench.robot(2).body.pushes.tolist() == [0.0] * 6
     type_line("wind.side_y=0.5")
     type_line("wind.side_y=0.25")
-    assert bench.robot(1).plant.tunnel.side_wind[1] == pytest.approx(0.75)
+    assert bench.robot(1).body.tunnel.side_wind[1] == pytest.approx(0.75)
     type_line("clear")
-    assert bench.robot(1).plant.tunnel.side_wind[1] == 0.0
+    assert bench.robot(1).body.tunnel.side_wind[1] == 0.0
     assert answers == []
     assert any(text.endswith("fault push.y:0.2=0.5 ends") for text in bench.said)
 
@@ -258,7 +258,7 @@ def site_in(lab: Laboratory) -> Site:
 def test_a_holder_lets_nobody_go_who_does_not_fly() -> None:
     lab = Laboratory(FreeRunning())
     robot = ServedRobot(1, site_in(lab), print).robot
-    robot.plant.hold()
+    robot.body.hold()
     lab.robots.append(robot)
     gone: list[int] = []
     Holder(robot, gone.append)

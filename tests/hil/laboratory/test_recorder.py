@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hil.errors import LabError
-from hil.laboratory.recorder import Channel, Quantity, Recorder, load_events, load_log
+from hil.laboratory.recorder import Recorder, load_events, load_log
+from hil.world.body import Channel, Quantity
 
 
 def make(folder: Path, values: np.ndarray) -> Recorder:

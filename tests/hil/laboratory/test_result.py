@@ -16,9 +16,10 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_again
 from hil.laboratory.experiment import Source, unknown
 from hil.laboratory.metrics import Metric, Verdict
-from hil.laboratory.recorder import Channel, Quantity, Recorder
+from hil.laboratory.recorder import Recorder
 from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.result import RESULT, Program, QueueReport, Result, metadata_of, read_result, write_result
+from hil.world.body import Channel, Quantity
 from support.command import Cli
 
 KEYS = """

@@ -48,7 +48,7 @@ def test_both_fidelities_fly_alike_in_open_loop_from_the_same_seed(task: str) ->
     for action in actions(100, 0.25):
         mine, theirs = fast.step(action), whole.step(action)
         assert whole.flight is not None
-        plant = whole.flight.robot.plant
+        plant = whole.flight.robot.body
         np.testing.assert_allclose(fast.truth[at.P : at.P + 3], plant.p_WB, atol=0.002)
         np.testing.assert_allclose(fast.truth[at.V : at.V + 3], plant.v_WB, atol=0.02)
         np.testing.assert_allclose(fast.truth[at.Q : at.Q + 4], plant.q_WB, atol=0.005)
@@ -165,7 +165,7 @@ def test_faults_act_in_the_laboratory() -> None:
     for action in actions(60, 0.5):
         env.step(action)
     assert env.flight is not None
-    assert env.flight.robot.plant.servo_speed.tolist() == [1.0, 0.0, 1.0, 1.0]
+    assert env.flight.robot.body.servo_speed.tolist() == [1.0, 0.0, 1.0, 1.0]
     env.close()
 
 

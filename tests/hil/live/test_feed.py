@@ -10,11 +10,12 @@ import pytest
 
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
-from hil.laboratory.recorder import Channel, Quantity, Recorder, load_log
+from hil.laboratory.recorder import Recorder, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.live import feed
 from hil.live.feed import Feed, LiveView
+from hil.world.body import Channel, Quantity
 
 # Pictures that do not behave, in place of `hil.live.picture`; what they do is their whole program.
 STALLS = "print('ready', flush=True); import signal; signal.pause()"
@@ -207,8 +208,9 @@ def test_nothing_is_imported_while_a_flight_is_recorded_and_shown() -> None:
     program = f"""
 import sys, tempfile
 from pathlib import Path
-from hil.laboratory.recorder import Channel, Quantity, Recorder
+from hil.laboratory.recorder import Recorder
 from hil.live.feed import LiveView
+from hil.world.body import Channel, Quantity
 view = LiveView([sys.executable, '-c', {TAKES_ALL!r}], print)
 with tempfile.TemporaryDirectory() as folder:
     recorder = Recorder(Path(folder), (Channel('float64', lambda: 0.0, (Quantity(('x',), 'm'),)),), {{}}, view)

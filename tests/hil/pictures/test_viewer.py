@@ -42,9 +42,9 @@ from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
 from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
 from hil.world import layout as at
-from hil.world.body import place_plates
 from hil.world.config import GeometryConfig, GroundConfig
 from hil.world.geometry import surfaces, weigh
+from hil.world.shape import place_plates
 
 RELEASE_US = load_config().flight.release_us
 angles = st.floats(-1.5, 1.5)

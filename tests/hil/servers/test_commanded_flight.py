@@ -72,7 +72,7 @@ class Script:
         """Note how far the robot is from its goal while there is one."""
         pilot, board_us = self.robot.firmware.pilot, self.robot.firmware.kernel.now_us
         if pilot.planner.phase(board_us) is not Phase.IDLE:
-            self._errors.append(self.robot.plant.p_WB - pilot.planner.at(board_us).position)
+            self._errors.append(self.robot.body.p_WB - pilot.planner.at(board_us).position)
 
     def follows(self, duration_s: float) -> bool:
         """Whether the robot had a goal for that long, followed it within the limit on every axis and was not lost."""
@@ -108,7 +108,7 @@ class Script:
 
     def off(self, x: float, y: float, z: float) -> float:
         """How far the robot is from there [m]."""
-        return float(np.abs(self.robot.plant.p_WB - (x, y, z)).max())
+        return float(np.abs(self.robot.body.p_WB - (x, y, z)).max())
 
 
 @pytest.mark.long
@@ -122,7 +122,7 @@ def test_a_standard_sequence_takes_off_moves_and_lands() -> None:
     script.commander.go_to(0.12, -0.08, 1.2, 0.5, 3.0)
     script.wait(5.0)
     assert script.off(0.12, -0.08, 1.2) < 0.06
-    assert to_euler_zyx(script.robot.plant.q_WB)[2] == pytest.approx(0.5, abs=0.1)
+    assert to_euler_zyx(script.robot.body.q_WB)[2] == pytest.approx(0.5, abs=0.1)
     script.commander.land(0.9, 3.0, yaw=None)
     script.wait(2.9)
     assert script.off(0.12, -0.08, 0.9) < 0.08

@@ -42,7 +42,7 @@ class Fuzzed:
         for _ in range(round(duration_s * 10)):
             lab.end_at(lab.now_us + 100_000)
             lab.run()
-            furthest = max(furthest, float(np.abs(robot.plant.p_WB - robot.config.flight.home).max()))
+            furthest = max(furthest, float(np.abs(robot.body.p_WB - robot.config.flight.home).max()))
         return furthest
 
     def flood(self, now_us: int) -> None:

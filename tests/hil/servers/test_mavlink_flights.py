@@ -97,7 +97,7 @@ def test_offboard_flies_to_its_goals_and_holds_the_last_one_when_they_stop(poses
         lab.repeat(goal, 3.0)
         places = lab.repeat(goal, 2.0)
         assert max(rms_cm(places, goal)) < 6.0
-        w, _, _, z = lab.robot.plant.q_WB
+        w, _, _, z = lab.robot.body.q_WB
         assert abs(np.degrees(2 * np.arctan2(z, w) - goal[3] + np.pi) % 360 - 180) < 5
     assert lab.of("HEARTBEAT")[-1].custom_mode == OFFBOARD
     target, place = lab.of("POSITION_TARGET_LOCAL_NED")[-1], lab.of("LOCAL_POSITION_NED")[-1]

@@ -16,7 +16,8 @@ from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.world.battery import Battery, endurance, open_circuit_voltage
-from hil.world.config import BatteryConfig
+from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
+from hil.world.plant import Plant
 from support.flights import flown
 
 CONFIG = BatteryConfig()
@@ -76,11 +77,18 @@ def test_endurance_is_that_of_the_differential_equation(power: float) -> None:
 
 
 def test_draw_is_the_power_model_of_the_paper_and_the_servos() -> None:
-    battery = Battery(CONFIG)
-    assert battery.power == pytest.approx(0.3 + 4 * 0.50)
+    plant = Plant(
+        GeometryConfig(), PlantConfig(), TunnelConfig(), ServoConfig(), np.random.default_rng(1), loads=CONFIG
+    )
+    plant.hold()
+    assert Battery(CONFIG, plant.draw(0, 4.0)).power == pytest.approx(0.3 + 4 * 0.50)
+    before = plant.flaps.copy()
+    plant.set_counts(0, (33_000,) * 4)
     for row in range(1, 101):
-        battery.draw(row * 10_000, 4 * 0.8 * row * 0.01)  # every flap turns at 0.8 rad/s
-        assert battery.power == pytest.approx(0.3 + 4 * (0.50 + 0.33 * 0.8))
+        plant.advance(row * 10_000)
+        speed, before = np.abs(plant.flaps - before).sum() / 0.01, plant.flaps.copy()  # none turns back
+        assert plant.draw(row * 10_000, 4.0) == pytest.approx(0.3 + 4 * 0.50 + 0.33 * speed)
+    assert speed < 1e-6
     # By a prototype apart from this code: hover with the author's gains, 3.28 W and 33.8 min of 1.85 Wh
     assert endurance(CONFIG, 3.28, 3.2) / 60 == pytest.approx(33.8, rel=0.03)
 
