@@ -11,14 +11,16 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from ground_station.latency import STAGES, reported_stages
-from hil.laboratory.metrics import BOX, free_flight
+from hil.experiments.measures import yaw_and_goal
+from hil.laboratory.faults import spans_of
+from hil.laboratory.metrics import BOX, body, column, free_flight
 from hil.laboratory.recorder import release_of
 from hil.laboratory.schedule import runs
 from hil.pictures import curves, monitor
 from hil.pictures.curves import since_release
 from hil.pictures.panels import INK, Bar, Panel, Plot, Series, Still, lanes, panel
-from hil.pictures.path import path_around
-from hil.pictures.picture import Picture
+from hil.pictures.path import Course, path_of
+from hil.pictures.picture import KNOWN, LINK, PROCESSOR, WHAT, Picture
 
 TENTH, SECOND = 10, 100  # rows
 BUSY_PERCENT = 0.02  # of the processor, above which a task gets a colour
@@ -26,9 +28,44 @@ SCHEDULE_US = 20_000  # of the scheduler's picture
 LANE_INCH = 0.25  # a task's row there
 
 
+def course_of(rows: pa.Table) -> Course:
+    """Return the path of the body and of its goal after the release [cm], from the first goal in W."""
+    flight = free_flight(rows)
+    goal = 100 * column(flight, "goal.x", "goal.y", "goal.z")
+    times = column(flight, "t")
+    troubled = np.zeros(len(times), np.bool_)
+    for span in spans_of(rows.schema.metadata):
+        troubled |= (times >= span.begin_us) & (times <= span.end_us)
+    return Course(100 * body(flight, "x", "y", "z") - goal[:1], goal - goal[:1], troubled, 100 * BOX)
+
+
 def track(rows: pa.Table) -> Still:
-    """Draw the path around the target: in space, from above, from the side."""
-    return path_around(curves.POSITION.read(free_flight(rows)), 100 * BOX)
+    """Draw the path against the goal's: in space, from above, from the side."""
+    return path_of(course_of(rows))
+
+
+def course(rows: pa.Table) -> Plot:
+    """Draw position and yaw over time against a goal that moves."""
+    flight, shown = free_flight(rows), course_of(rows)
+    times = since_release(flight)
+    lines = []
+    for axis, (name, colour) in enumerate(zip(curves.POSITION.names, curves.POSITION.colours, strict=True)):
+        lines += [
+            Series(name, colour, times, shown.flown[:, axis], width=1.2),
+            Series(f"goal {name}", colour, times, shown.goal[:, axis], dashed=True),
+        ]
+    yaw, wanted = (np.degrees(angle) for angle in yaw_and_goal(flight))
+    turns = (
+        Series("yaw", curves.BLUE, times, yaw, width=1.2),
+        Series("goal", INK, times, wanted, dashed=True),
+    )
+    return Plot((Panel("position [cm]", tuple(lines), height=2.1), Panel("yaw [deg]", turns)))
+
+
+def goal_moves(rows: pa.Table) -> bool:
+    """Whether the goal moved or turned after the release."""
+    goal = column(free_flight(rows), "goal.x", "goal.y", "goal.z", "goal.yaw")
+    return len(goal) > 1 and bool(np.ptp(goal, axis=0).any())
 
 
 def errors(rows: pa.Table) -> Plot:
@@ -62,10 +99,18 @@ def age(rows: pa.Table) -> Plot:
     """Draw the age of each pose at the estimator and, where it is reported, the time without one."""
     plots = [plot for plot in (curves.AGE, curves.HORIZON) if plot.needs in rows.column_names]
     series = [line for plot in plots for line in panel(plot, rows, "").series]
-    panels = [Panel("on board [ms]", tuple(series))]
-    if curves.SINCE_FUSION.needs in rows.column_names:
-        panels.append(panel(curves.SINCE_FUSION, rows, "without", height=1.2))
-    return Plot(tuple(panels))
+    panels = [Panel("age on board [ms]", tuple(series), least=0.0)]
+    return Plot((*panels, *without_a_pose(rows)))
+
+
+def without_a_pose(rows: pa.Table) -> tuple[Panel, ...]:
+    """Draw the longest time since a fused pose in every tenth of a second; nothing for a board that does not report it."""
+    if curves.SINCE_FUSION.needs not in rows.column_names or rows.num_rows == 0:
+        return ()
+    begins = np.arange(0, rows.num_rows, TENTH)
+    longest = np.fmax.reduceat(curves.since_fusion(rows)[:, 0], begins)
+    line = Series("longest since a fused pose", curves.RED, since_release(rows)[begins], longest, width=1.2)
+    return (Panel("without a pose [ms]", (line,), height=1.1, least=0.0),)
 
 
 def latency_budget(ages: pa.Table) -> Plot:
@@ -116,17 +161,17 @@ def _up_and_down(
 
 
 def station(rows: pa.Table) -> Plot:
-    """Draw what a real link and its station could not use, reported battery and load, and the states."""
+    """Draw what a real link and its station could not use, reported battery and load."""
     health = [
         panel(plot, rows, label, height=1.2)
         for plot, label in ((monitor.BATTERY, "battery"), (monitor.LOAD, "processor"))
         if plot.needs in rows.column_names and np.isfinite(plot.read(rows)).any()
     ]
-    return Plot((panel(curves.STATION, rows, "not used"), *health, _states(rows)))
+    return Plot((panel(curves.STATION, rows, "not used"), *health))
 
 
 def board(rows: pa.Table) -> Plot:
-    """Draw the load of the processor by task, the measurement queue and the states."""
+    """Draw the load of the processor by task, and the measurement queue."""
     load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
     times, shares = since_release(tenths)[1:], load.read(tenths).T
     busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT] or [0]
@@ -134,14 +179,18 @@ def board(rows: pa.Table) -> Plot:
     return Plot(
         (
             Panel("processor [%]", tasks, height=1.8, stacked=True, least=0.0),
-            panel(curves.QUEUE, rows, "queue", height=1.4),
-            _states(rows),
+            panel(curves.QUEUE, rows, "queue", height=1.1),
         )
     )
 
 
-def _states(rows: pa.Table) -> Panel:
+def states(rows: pa.Table) -> Plot:
     """Draw the states of supervisor and robot, or real flight, as bars."""
+    return Plot((lanes_of_states(rows),))
+
+
+def lanes_of_states(rows: pa.Table) -> Panel:
+    """Return the states of supervisor and robot, or real flight, as bars."""
     release_us, end_s = release_of(rows.schema.metadata), since_release(rows)[-1:]
     rows_of_bars = []
     for lane, states in reversed(curves.lanes_of(rows.column_names).items()):
@@ -181,32 +230,44 @@ def schedule(table: pa.Table) -> Plot:
 
 PICTURES = (
     Picture(
-        "Track",
-        "Position of the body relative to the target (red +) after the release, in the goal frame, with the 20 cm box.",
-        track,
-    ),
-    Picture(
         "Errors",
-        "Truth, in a real flight the cameras' poses, against the goal. Dashed: 6 cm, which the paper's robot mostly keeps, "
-        "and 20 degrees, which it always keeps.",
+        "Position and attitude against the goal: the truth, in a real flight the cameras' poses. Dashed: 6 cm, which the "
+        "paper's robot mostly keeps, and 20 degrees, which it always keeps.",
         errors,
     ),
     Picture(
         "Flaps",
         "True angle of each flap and the commanded angle; of a real board, the angle that its estimator has.",
         flaps,
+        question=WHAT,
+    ),
+    Picture(
+        "States",
+        "What the supervisor on board decided, and whether the robot was free.",
+        states,
+        question=KNOWN,
+    ),
+    Picture(
+        "Estimate",
+        "The board's estimate less the truth, in the goal frame; of a real flight, less the cameras' poses.",
+        estimate,
+        question=KNOWN,
     ),
     Picture(
         "Age",
-        "Age of the pose when the estimator takes it, and the horizon of its predictor (0: it is switched off); "
-        "time since the last fused pose, which grows while none comes or each is refused (a real board has the age only).",
+        "Age of the pose when the estimator takes it, and the horizon of its predictor (0: it is switched off); the longest "
+        "time since a fused pose, which grows while none comes or each is refused (a real board has the age only).",
         age,
+        question=KNOWN,
     ),
     Picture(
         "Radio",
         "Mean time of a packet in the air, per second; packets lost and sent again, since the start.",
         radio,
         needs="link.retried",
+        question=LINK,
+        folded=True,
+        about=("radio",),
     ),
     Picture(
         "Serial line",
@@ -215,31 +276,54 @@ PICTURES = (
         "end could read.",
         serial_line,
         needs="serial.up_busy",
-    ),
-    Picture(
-        "Board",
-        "Share of the processor by task, over 0.1 s, of tasks with 0.02 % or more; fullest state so far of the measurement "
-        "queue (poses, gyro and accelerometer samples) and what it dropped; states of the supervisor and of the robot.",
-        board,
-        needs="rtos.measurements_dropped",
+        question=LINK,
+        folded=True,
+        about=("serial",),
     ),
     Picture(
         "Station",
         "Poses that were late or could not be used, telemetry that could not be read, since the start; the board's battery "
-        "and load, if it reports them; states of the supervisor and of the flight.",
+        "and load, if it reports them.",
         station,
         needs="link.late",
+        question=LINK,
     ),
     Picture(
-        "Estimate",
-        "Estimate less truth, in the goal frame; of a real flight, estimate less the cameras' poses.",
-        estimate,
+        "Board",
+        "Share of the processor by task, over 0.1 s, of tasks with 0.02 % or more; fullest state so far of the measurement "
+        "queue (poses, gyro and accelerometer samples) and what it dropped.",
+        board,
+        needs="rtos.measurements_dropped",
+        question=PROCESSOR,
     ),
 )
-OWN_LOGIC = Picture("Own logic", "What the modules of `[logic]` log of their memory.", own_logic)
+TRACK = Picture(
+    "Path",
+    "Flown path (blue, red while a fault was in force; ring: release, dot: end) from the first goal (cross), W. A goal that "
+    "moves is dashed; around one that does not, the 20 cm box.",
+    track,
+)
+COURSE = Picture(
+    "Path against goal",
+    "Flown (solid) and wanted (dashed) position from the first goal in W, and yaw.",
+    course,
+)
+OWN_LOGIC = Picture("Own logic", "What your own modules log of their memory.", own_logic, question=KNOWN)
 LATENCY_BUDGET = Picture(
     "Latency budget",
     "Where poses spent their time from the exposure to the board, as the ground station reported for each that it sent.",
     latency_budget,
+    question=LINK,
+    folded=True,
+    about=("mocap", "radio", "serial"),
 )
-SCHEDULE = Picture("Scheduler", "Which task had the processor, for 20 ms.", schedule, alone=True)
+SCHEDULE = Picture(
+    "Scheduler",
+    "Which task had the processor, for 20 ms.",
+    schedule,
+    needs="us",
+    alone=True,
+    question=PROCESSOR,
+    folded=True,
+    about=("cpu",),
+)

@@ -40,6 +40,7 @@ class PageFigure:
     plot: dict[str, Any] | None = None  # by `embedded`
     alone: bool = False  # a plot with a window of time of its own
     marks: Marks = NOTHING
+    folded: bool = False
 
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
@@ -55,7 +56,11 @@ def data_uri(content: bytes, kind: str = "png") -> str:
 
 def draw(picture: Picture, marks: Marks, *flights: "pa.Table") -> PageFigure:
     """Return a picture of flights for a page."""
-    figure = PageFigure(picture.title.lower().replace(" ", "-"), picture.title, picture.caption)
+    acted = {spell.text.partition(".")[0] for spell in marks.spells if spell.kind == "fault"}
+    figure = PageFigure(
+        picture.title.lower().replace(" ", "-"), picture.title, picture.caption,
+        folded=picture.folded and not acted.intersection(picture.about),
+    )  # fmt: skip
     shown = picture.draw(*flights)
     if isinstance(shown, Still):
         return replace(figure, source=data_uri(shown.content, shown.kind))

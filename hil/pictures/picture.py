@@ -13,6 +13,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+WHERE, WHAT, KNOWN, LINK, PROCESSOR = (
+    "Where was it?",
+    "What did it do?",
+    "What did the board know?",
+    "What did the link do?",
+    "What did the processor do?",
+)
+QUESTIONS = (WHERE, WHAT, KNOWN, LINK, PROCESSOR)
+
+
 @dataclass(frozen=True, slots=True)
 class Picture:
     """A figure of the report. An experiment's own takes several flights, the trials, and emphasises the first."""
@@ -22,6 +32,9 @@ class Picture:
     draw: Callable[..., Plot | Still]  # of the log of a flight, of several, or of a schedule
     needs: str = "t"  # the column that it needs
     alone: bool = False  # panels with a time axis of their own
+    question: str = WHERE  # that it answers, in whose part of the report it is
+    folded: bool = False  # until a reader opens it, or a fault of the groups `about` was injected
+    about: tuple[str, ...] = ()
 
 
 def painted(draw: Callable[..., Figure], *flights: pa.Table) -> Still:

@@ -20,12 +20,13 @@ from hil.laboratory.recorder import load_events, load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
 from hil.pictures.curves import own_logic, with_marks
-from hil.pictures.figures import LATENCY_BUDGET, OWN_LOGIC, PICTURES, SCHEDULE
+from hil.pictures.figures import COURSE, LATENCY_BUDGET, OWN_LOGIC, PICTURES, SCHEDULE, TRACK, goal_moves
 from hil.pictures.gallery import pictures_of
 from hil.pictures.links import link_to
 from hil.pictures.pages import draw, write_page, zoomable
 from hil.pictures.panels import marks_of_flight
-from hil.pictures.story import close_ups, story_of
+from hil.pictures.picture import QUESTIONS
+from hil.pictures.story import close_ups, failures_of, story_of
 
 REPORT = "report.html"
 TEMPLATE = "report.html.j2"
@@ -62,16 +63,21 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     result, events = read_result(folder, find_again), load_events(folder)
     log = with_marks(load_log(folder), events)
     experiment = experiment or result.request.experiment
-    own = pictures_of(experiment)
     ages, schedule = ages_in_time_of(iter([log]), folder), load_schedule(folder)
-    of_log = [*own, *PICTURES, *([OWN_LOGIC] if own_logic(log) else [])]
+    drawn = [
+        (picture, log)
+        for picture in [*([COURSE] if goal_moves(log) else []), *pictures_of(experiment), *PICTURES]
+    ]
+    drawn += [(OWN_LOGIC, log)] if own_logic(log) else []
+    drawn += [(LATENCY_BUDGET, ages)] if ages.num_rows else []
+    drawn += [(SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata))] if schedule.num_rows else []
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
-    figures = [draw(picture, marks, log) for picture in of_log if picture.needs in log.column_names]
-    if ages.num_rows:
-        figures.append(draw(LATENCY_BUDGET, marks, ages))
-    if schedule.num_rows:
-        figures.append(draw(SCHEDULE, marks, schedule.replace_schema_metadata(log.schema.metadata)))
-    close = close_ups(log, marks)
+    figures = {question: [
+        draw(picture, marks, rows)
+        for picture, rows in drawn if picture.question == question and picture.needs in rows.column_names
+    ] for question in QUESTIONS}  # fmt: skip
+    failures = failures_of(log, result)
+    close = close_ups(log, marks, failures[0].at_s if failures else None)
     config = stored_in(log.schema.metadata, "config")
     return write_page(
         folder / REPORT,
@@ -82,12 +88,16 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         faults=fault_rows(span.fault for span in spans_of(log.schema.metadata)),
         events=events,
         release_us=release_of(log.schema.metadata),
+        failures=failures,
         story=story_of(log, result),
+        track=draw(TRACK, marks, log),
         marked=marks.kinds,
-        pictures=figures,
+        figures=figures,
         close_ups=close,
         link_to=link_to,
-        zoomable=zoomable([*figures, *(one.figure for one in close)]),
+        zoomable=zoomable(
+            [*(one.figure for one in close), *(one for part in figures.values() for one in part)]
+        ),
         latency_bounds=LATENCY_BOUNDS_US,
         log_rows=log.num_rows,
         config=json.dumps(config, indent=2),

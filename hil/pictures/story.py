@@ -1,9 +1,10 @@
-"""The story of a flight, which its report begins with: what happened when, in seconds from the release; and close-ups of
-what happened around each fault, and in the last seconds before a loss.
+"""The story of a flight, which its report begins with: what failed, and what happened when, in seconds from the release;
+and close-ups of what happened around each fault, around the first limit passed, and in the last seconds before a loss.
 """
 
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
@@ -11,14 +12,17 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from firmware_py.wire.supervisor import State
+from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import spans_of
 from hil.laboratory.metrics import BOX, NEAR, attitude_error, column, free_flight, position_error
 from hil.laboratory.recorder import release_of
 from hil.laboratory.result import Result
 from hil.pictures import curves
 from hil.pictures.curves import since_release
+from hil.pictures.evidence import evidence
+from hil.pictures.figures import lanes_of_states, without_a_pose
 from hil.pictures.pages import PageFigure, embedded
-from hil.pictures.panels import Marks, Plot, Spell, panel, saturated
+from hil.pictures.panels import Marks, Panel, Plot, Series, Spell, panel, saturated
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +71,7 @@ def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.
         **{f"within_6cm_{axis}": (error[:, index], NEAR) for index, axis in enumerate("xyz")},
         "in_box": (error.max(axis=1), BOX),
         "attitude_max": (np.abs(attitude_error(flight)).max(axis=1), None),
+        "uncontrolled": ((column(flight, "supervisor.state") != State.FLYING).astype(np.float64), 0.5),
     }
     for verdict in result.verdicts:
         if not verdict.holds and verdict.metric in beyond:
@@ -74,6 +79,49 @@ def _passed(flight: pa.Table, result: Result) -> Iterator[tuple[str, NDArray[np.
             wrong = values > (verdict.bound if bound is None else bound)
             if wrong.any():
                 yield verdict.metric, wrong
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A limit that failed."""
+
+    text: str  # the verdict
+    at_s: float | None  # first passed; None: it has no such instant
+    cause: str  # the fault that came before; empty where the instant is unknown
+
+
+RECENT_S = 3.0  # a fault that ended longer ago is not named as the cause
+
+
+def failures_of(log: pa.Table, result: Result) -> list[Failure]:
+    """Return the limits that failed, those with an instant first and in the order of time."""
+    free = free_flight(log)
+    times = since_release(free)
+    passed = (
+        {name: float(times[_first(wrong)]) for name, wrong in _passed(free, result)} if len(times) else {}
+    )
+    if result.outcome == "lost" and len(times):
+        passed["lost"] = float(times[-1])
+    found = [
+        Failure(str(one), at_s := passed.get(one.metric), "" if at_s is None else _before(log, at_s))
+        for one in result.failed
+    ]
+    return sorted(found, key=lambda failure: math.inf if failure.at_s is None else failure.at_s)
+
+
+def _before(log: pa.Table, at_s: float) -> str:
+    """Return which fault was in force, or had ended shortly before an instant: the one that began last."""
+    release_us = release_of(log.schema.metadata)
+    spans = [(1e-6 * (span.begin_us - release_us), span) for span in spans_of(log.schema.metadata)]
+    recent = [
+        (begin_s, str(span.fault), KINDS[span.fault.kind].meaning)
+        for begin_s, span in spans
+        if begin_s <= at_s <= 1e-6 * (span.end_us - release_us) + RECENT_S
+    ]
+    if not recent:
+        return "no fault was in force"
+    begin_s, fault, meaning = max(recent)
+    return f"{at_s - begin_s:.2f} s after the begin of {fault} ({meaning})"
 
 
 BEFORE_S, AFTER_S = 0.5, 1.0  # of a fault
@@ -89,31 +137,42 @@ class CloseUp:
     at_s: float
     begin_s: float
     end_s: float
+    evidence: tuple[str, ...]
 
 
-def close_ups(log: pa.Table, marks: Marks) -> list[CloseUp]:
-    """Return a figure for each instant at which faults begin, and for the loss."""
+def close_ups(log: pa.Table, marks: Marks, passed_s: float | None = None) -> list[CloseUp]:
+    """Return a figure for each instant at which faults begin, the loss, and the first limit passed, unless one shows it."""
     times = since_release(log)
     shown: list[CloseUp] = []
-    for title, at_s, begin_s, end_s in _windows(marks):
+    for title, at_s, begin_s, end_s in _windows(marks, passed_s):
         rows = log.filter((times >= begin_s) & (times <= end_s))
         if rows.num_rows > 1:
             plot = embedded(_plot(rows, (begin_s, end_s)))
             figure = PageFigure(f"close-up-{len(shown) + 1}", title, "", plot=plot, alone=True, marks=marks)
-            shown.append(CloseUp(figure, at_s, begin_s, end_s))
+            of_it = tuple(evidence(rows.filter(since_release(rows) >= min(at_s, begin_s + BEFORE_S))))
+            shown.append(CloseUp(figure, at_s, begin_s, end_s, of_it))
     return shown
 
 
-def _windows(marks: Marks) -> Iterator[tuple[str, float, float, float]]:
-    """Yield title, instant, begin and end [s]."""
+def _windows(marks: Marks, passed_s: float | None) -> list[tuple[str, float, float, float]]:
+    """Return title, instant, begin and end [s]."""
     faults = [spell for spell in marks.spells if spell.kind == "fault"]
+    windows = []
     for begin_s, together in groupby(sorted(faults, key=_begin), key=_begin):
         spells = list(together)
         end_s = min(max(spell.end_s for spell in spells), begin_s + FAULT_S) + AFTER_S
-        yield ", ".join(spell.text for spell in spells), begin_s, begin_s - BEFORE_S, end_s
-    for loss in marks.instants:
-        if loss.kind == "lost":
-            yield f"Loss: {loss.text}", loss.t_s, loss.t_s - LAST_S, loss.t_s + BEFORE_S
+        windows.append((", ".join(spell.text for spell in spells), begin_s, begin_s - BEFORE_S, end_s))
+    further = [
+        (f"Loss: {loss.text}", loss.t_s, loss.t_s - LAST_S, loss.t_s + BEFORE_S)
+        for loss in marks.instants
+        if loss.kind == "lost"
+    ]
+    if passed_s is not None:
+        further.append(("First limit passed", passed_s, passed_s - FAULT_S, passed_s + AFTER_S))
+    for window in further:
+        if not any(begin_s <= window[1] <= end_s for _, _, begin_s, end_s in windows):
+            windows.append(window)
+    return windows
 
 
 def _begin(spell: Spell) -> float:
@@ -121,17 +180,28 @@ def _begin(spell: Spell) -> float:
 
 
 def _plot(rows: pa.Table, window_s: tuple[float, float]) -> Plot:
-    since = [
-        panel(plot, rows, label, height=1.2)
-        for plot, label in ((curves.SINCE_FUSION, "without a pose"), (curves.AGE, "age of the pose"))
-        if plot.needs in rows.column_names
-    ]
+    """Draw the truth with what the board believed and commanded."""
+    commanded = curves.FLAPS_COMMAND.needs in rows.column_names
     return Plot(
         (
-            panel(curves.POSITION, rows, "position error"),
-            panel(curves.ATTITUDE, rows, "attitude error"),
-            panel(curves.FLAPS, rows, "flaps"),
-            *since[:1],
+            _with(curves.POSITION, curves.POSITION_ESTIMATE, "estimate", rows, "position error"),
+            _with(curves.ATTITUDE, curves.ATTITUDE_ESTIMATE, "estimate", rows, "attitude error"),
+            _with(curves.FLAPS, curves.FLAPS_COMMAND, "command", rows, "flaps")
+            if commanded
+            else panel(curves.FLAPS, rows, "flaps"),
+            *without_a_pose(rows),
+            lanes_of_states(rows),
         ),
         window_s,
     )
+
+
+def _with(curve: curves.Curves, other: curves.Curves, name: str, rows: pa.Table, label: str) -> Panel:
+    """Return a panel of curves, with others dashed in the same colours; the first of those names them."""
+    times, values = since_release(rows), other.read(rows)
+    dashed = (
+        Series(name if index == 0 else "", colour, times, values[:, index], dashed=True)
+        for index, colour in enumerate(curve.colours)
+    )
+    drawn = panel(curve, rows, label)
+    return replace(drawn, series=(*drawn.series, *dashed))

@@ -4,7 +4,7 @@
   const told = JSON.parse(document.getElementById("figures").textContent);
   const SHADES = { held: "#8888882e", fault: "#d55e002e", failsafe: "#cc79a74d", "flap limit": "#b8a900" };
   const MARKS = { operator: "#0072b2", lost: "#000000" };
-  const AXIS_PX = 84, INCH_PX = 88, STRIP_PX = 4, RIGHT_PX = 10, TEXT = "11px system-ui, sans-serif";
+  const AXIS_PX = 84, INCH_PX = 88, TICKS_PX = 17, STRIP_PX = 4, RIGHT_PX = 10, TEXT = "11px system-ui, sans-serif";
   const PRINTED_PX = 690; // what fits beside the margins of a page of A4
   const charts = [];
   let moving = false;
@@ -79,7 +79,7 @@
       ctx.fillRect(begin, top, end - begin, u.valToPos(lane + 0.1, "y", true) - top);
       write(bar.name, Math.max(begin, bbox.left) + 4 * scale, top + 12 * scale, end - 4 * scale, "#000000");
     }
-    if (first) name(u);
+    if (first && panel.series.length) name(u);
     ctx.restore();
 
     function write(text, x, y, room_to, colour) {
@@ -138,7 +138,7 @@
         y: {
           range: (u, low, high) => {
             if (lanes.length) return [0, lanes.length];
-            const [least, most] = uPlot.rangeNum(low ?? -1, high ?? 1, 0.08, true);
+            const [least, most] = uPlot.rangeNum(Math.min(low ?? -1, ...panel.limits), Math.max(high ?? 1, ...panel.limits), 0.08, true);
             return [panel.least ?? least, panel.most ?? most];
           },
         },
@@ -146,14 +146,15 @@
       axes: [
         { show: true, size: last ? 32 : 0, values: last ? undefined : () => [], label: last ? "time from the release [s]" : undefined, labelSize: 20, labelFont: TEXT, font: TEXT,
           ticks: { show: last }, grid: { stroke: "#00000018" } },
-        { size: AXIS_PX, font: TEXT, grid: { show: !lanes.length, stroke: "#00000018" },
+        { size: AXIS_PX, space: TICKS_PX, font: TEXT, grid: { show: !lanes.length, stroke: "#00000018" },
           splits: lanes.length ? () => lanes.map((_, lane) => lane + 0.5) : undefined,
           values: lanes.length ? () => lanes : undefined },
       ],
       series: [
         { label: "s", value: (u, value) => (value == null ? "–" : value.toFixed(2)) },
         ...lines.map((line, index) => ({
-          label: line.name,
+          label: line.name || " ",
+          class: line.name ? "named" : "unnamed",
           stroke: line.colour,
           fill: panel.stacked ? line.colour : undefined,
           width: line.width * 1.3,
@@ -196,14 +197,15 @@
       const whole = figure.window ?? (figure.alone ? spanOf(ends(panels)) : shared);
       const key = figure.alone ? figure.place : "flight";
       panels.forEach(([panel, data], at) => {
-        const label = document.createElement("div");
+        const label = document.createElement(panel.series.length ? "tr" : "div");
         label.className = "axis";
         label.textContent = panel.label;
-        place.append(label);
         const last = at === panels.length - 1;
         if (panel.bars.length && data[0].length === 0) data = [whole];
         moving = true; // until all stand, none moves another
         const u = new uPlot(optionsOf(figure, panel, data, at === 0, last, key, whole), data, place);
+        if (panel.series.length) u.root.querySelector(".u-legend").prepend(label);
+        else u.root.before(label);
         charts.push({ u, key, place });
         u.setScale("x", { min: whole[0], max: whole[1] });
         moving = false;
@@ -218,12 +220,18 @@
   }
 
   function fit(width) {
-    for (const { u, place } of charts) u.setSize({ width: width ?? place.clientWidth, height: u.height });
+    for (const { u, place } of charts) {
+      if (place.clientWidth) u.setSize({ width: width ?? place.clientWidth, height: u.height });
+    }
   }
 
   build();
   fit();
   addEventListener("resize", () => fit());
-  addEventListener("beforeprint", () => fit(PRINTED_PX));
+  document.addEventListener("toggle", () => fit(), true);
+  addEventListener("beforeprint", () => {
+    document.querySelectorAll("figure details").forEach((part) => (part.open = true));
+    fit(PRINTED_PX);
+  });
   addEventListener("afterprint", () => fit());
 })();

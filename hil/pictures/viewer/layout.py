@@ -8,6 +8,7 @@ from hil.pictures.viewer.track import timeline_of
 
 FOLLOWED_S = 20.0  # shown by the curves of a live flight
 TRAIL_S = 4.0
+WANTED_S = 15.0  # of the goal's path, before and after
 # Title and origin of each plot; the first two have their own place, the rest are tabs.
 VIEWS = (
     ("Position error [cm]", "position"),
@@ -28,8 +29,8 @@ LEGEND = """
 |---|---|
 | plates, flaps 1 to 4 | the true robot, of a real flight by the cameras; flaps in the colours of their curves |
 | white outline | the board's estimate |
-| red box and cross | 20 cm around the goal |
-| white line | the path of the last 4 s |
+| red box, cross and outline | the goal: 20 cm around it, the robot as it should be; its line points along the wanted x |
+| white line, red line | the path of the last 4 s; the goal's, of the last and the next 15 s |
 | yellow arrows | drag of the plates, 15 cm per newton |
 | blue arrow | the air's movement in 0.02 s; pale: its sideways part in 0.1 s |
 | pink arrow | a push, 15 cm per newton, shown for half a second at least |
@@ -85,6 +86,7 @@ def blueprint(schema: pa.Schema, live: bool = False) -> rrb.Blueprint:
 def _tunnel(timeline: str) -> rrb.Spatial3DView:
     before = rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S)
     now = rrb.TimeRangeBoundary.cursor_relative()
+    begin, end = (rrb.TimeRangeBoundary.cursor_relative(seconds=seconds) for seconds in (-WANTED_S, WANTED_S))
     return rrb.Spatial3DView(
         name="Wind tunnel",
         origin="world",
@@ -94,6 +96,7 @@ def _tunnel(timeline: str) -> rrb.Spatial3DView:
         background=(14, 18, 22),  # pale lines stay visible in a light theme, too
         line_grid=False,
         overrides={
-            "world/trail": [rrb.VisibleTimeRanges(rrb.VisibleTimeRange(timeline, start=before, end=now))]
+            "world/trail": [rrb.VisibleTimeRanges(rrb.VisibleTimeRange(timeline, start=before, end=now))],
+            "world/wanted": [rrb.VisibleTimeRanges(rrb.VisibleTimeRange(timeline, start=begin, end=end))],
         },
     )

@@ -60,8 +60,9 @@ class Scene:
         for flap in range(4):
             turn = scene.turn_quaternion(self._flap_axes[flap], flaps[:, flap])
             self._place(f"robot/plates/flap_{flap + 1}", times, np.zeros_like(p_WB), turn)
-        goal = column(rows, "goal.x", "goal.y", "goal.z")
-        self._place("goal", times, goal, np.array([yaw_quaternion(yaw) for yaw in column(rows, "goal.yaw")]))
+        self._place(
+            "goal", times, goal_of(rows), np.array([yaw_quaternion(yaw) for yaw in column(rows, "goal.yaw")])
+        )
         pose = column(rows, *(f"estimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")))
         known = np.isfinite(pose).all(axis=1)  # a real board may not have reported it yet
         q_GE = [from_euler_zyx(*angles) for angles in pose[known, 3:].tolist()]
@@ -71,7 +72,9 @@ class Scene:
             self._add_forces(rows, p_WB, origins)
         if len(self._markers):
             self._colour_markers(joined, fresh)
-        self._add_trail(joined)
+        self._add_trail("trail", joined, body(joined, "x", "y", "z"))
+        moved = np.r_[False, (np.diff(goal_of(joined), axis=0) != 0.0).any(axis=1)]
+        self._add_trail("wanted", joined, np.where(moved[:, None], goal_of(joined), np.nan))
 
     def add_tether(self, rows: pa.Table) -> None:
         """Draw the tether of a simulated robot."""
@@ -108,13 +111,12 @@ class Scene:
             arrows = rr.Arrows3D.columns(vectors=vectors, origins=p_WB - vectors - (0, 0, below))
             self._track.send(f"world/{name}", times, arrows)
 
-    def _add_trail(self, joined: pa.Table) -> None:
-        """Draw the path from each row to the next where the robot was seen in both."""
-        path = body(joined, "x", "y", "z")
+    def _add_trail(self, name: str, joined: pa.Table, path: NDArray[np.float64]) -> None:
+        """Draw a path from each row to the next where it is known in both."""
         steps = np.stack((path[:-1], path[1:]), axis=1).astype(np.float32)
-        seen = np.isfinite(steps).all(axis=(1, 2))
-        strips = rr.LineStrips3D.columns(strips=steps[seen])
-        self._track.send("world/trail", column(joined, "t")[1:][seen], strips)
+        known = np.isfinite(steps).all(axis=(1, 2))
+        strips = rr.LineStrips3D.columns(strips=steps[known])
+        self._track.send(f"world/{name}", column(joined, "t")[1:][known], strips)
 
     def _colour_markers(self, rows: pa.Table, fresh: int) -> None:
         """Colour the markers where they appear or vanish, from row `fresh` on."""
@@ -156,6 +158,8 @@ class Scene:
         static = self._track.static
         static("world/goal/cross", rr.LineStrips3D(cross, colors=0xD55E00FF, radii=0.0025))
         static("world/goal/box", rr.LineStrips3D(scene.box_lines(BOX), colors=0xD55E00A0, radii=0.0012))
+        wanted = [*scene.outline(self._geometry), np.array([(0.0, 0.0, 0.0), (2 * AXIS, 0.0, 0.0)])]
+        static("world/goal/ghost", rr.LineStrips3D(wanted, colors=0xD55E00FF, radii=0.0012))
         ghost = rr.LineStrips3D(scene.outline(self._geometry), colors=0xFFFFFF90, radii=0.0012)
         static("world/goal/estimate/ghost", ghost)
 
@@ -193,6 +197,15 @@ class Scene:
             ("wind", 0xA6DDF5FF, 0.005),
         ):
             self._track.static(f"world/{name}", rr.Arrows3D.from_fields(colors=[colour], radii=[radius]))
-        for name, colour, radius in (("tether", 0x99A3ADFF, 0.0015), ("trail", 0xFFFFFFC0, 0.0018)):
+        for name, colour, radius in (
+            ("tether", 0x99A3ADFF, 0.0015),
+            ("trail", 0xFFFFFFC0, 0.0018),
+            ("wanted", 0xD55E00C0, 0.0018),
+        ):
             line = rr.LineStrips3D.from_fields(colors=[colour], radii=[radius])
             self._track.static(f"world/{name}", line)
+
+
+def goal_of(rows: pa.Table) -> NDArray[np.float64]:
+    """Return the goal, (N, 3) [m] in W."""
+    return column(rows, "goal.x", "goal.y", "goal.z")

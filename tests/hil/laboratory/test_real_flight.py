@@ -172,9 +172,11 @@ def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Pa
     assert "yaw-step-0, real flight" in text
     assert "seed" not in {row[0] for row in page.tables["run"]}
     drawn = [picture.title for picture in PICTURES if picture.needs in load_log(folder).column_names]
-    assert drawn == ["Track", "Errors", "Flaps", "Age", "Station", "Estimate"]
+    assert drawn == ["Errors", "Flaps", "States", "Estimate", "Age", "Station"]
     shown = [name for name, plot in page.plots.items() if not plot["alone"]]
-    assert len(page.pictures) + len(shown) == 1 + len(drawn) + 1  # its own, and the latency budget
+    assert (
+        len(page.pictures) + len(shown) == 1 + len(drawn) + 3
+    )  # its own, path, path against goal, latency budget
 
 
 def test_what_an_operator_did_is_marked_in_the_figures_at_its_time(both: tuple[Path, Path]) -> None:
@@ -264,7 +266,7 @@ def test_what_is_judged_begins_with_the_trajectory_and_ends_with_its_experiment(
         pytest.approx(-1.0, abs=0.05),
         pytest.approx(0.0, abs=0.05),
     )
-    bars = [bar.name for bar in figures.station(log).panels[-1].bars if bar.lane == "flight"]
+    bars = [bar.name for bar in figures.states(log).panels[0].bars if bar.lane == "flight"]
     assert bars == ["not judged", "judged", "not judged"]
 
 
@@ -434,7 +436,6 @@ def test_battery_and_load_are_logged_and_shown_where_the_board_tells_them(tmp_pa
     assert [panel.label for panel in figures.station(log).panels] == [
         "not used [so far]",
         "battery [V]",
-        "states",
     ]
 
 

@@ -27,6 +27,7 @@ ACT = """
 addEventListener("load", async () => {
   document.documentElement.style.width = "WIDTHpx";
   dispatchEvent(new Event("resize"));
+  document.querySelectorAll("details").forEach((part) => (part.open = true));
   const pause = () => new Promise((done) => setTimeout(done, 300));
   await pause();
   document.querySelector("#story a[data-begin='0.5']").click();

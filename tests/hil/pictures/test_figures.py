@@ -94,8 +94,8 @@ def test_curves_and_states_stand_at_seconds_from_the_release() -> None:
         for name in ("cpu.KALMAN", "rtos.measurements_high_water", "rtos.measurements_dropped")
     }
     states = {"supervisor.state": [2, 2, 3, 3], "flight.free": [0, 1, 1, 1]}
-    board = figures.board(log([0, 0, 0, 0], **counts, **states))
-    _, queue, lanes = board.panels
+    rows = log([0, 0, 0, 0], **counts, **states)
+    (_, queue), (lanes,) = figures.board(rows).panels, figures.states(rows).panels
     assert queue.series[0].times == pytest.approx([0.0, 0.01, 0.02, 0.03])
     assert queue.label == "queue [measurements]", "poses"
     shown = [(bar.lane, bar.name, bar.begin_s, bar.end_s) for bar in lanes.bars]

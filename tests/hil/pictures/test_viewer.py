@@ -346,6 +346,16 @@ def test_a_real_flight_has_the_same_scene_and_what_nobody_knows_is_not_drawn(tmp
     assert counted["/plot/position/marks/pose_too_late_for_the_link"] == 1 + 1
 
 
+def test_the_goal_has_a_path_where_it_moves(tmp_path: Path) -> None:
+    moving = np.where(np.arange(30) < 20, 0.0, 0.01 * np.arange(30))
+    log = real_log()
+    log = log.set_column(log.column_names.index("goal.x"), "goal.x", pa.array(moving))
+    counted = rows_by_entity(staged(tmp_path / "moving.rrd", log))
+    assert counted["/world/wanted"] == 9 + 1  # and its colour
+    assert counted["/world/goal/ghost"] == 1
+    assert rows_by_entity(staged(tmp_path / "still.rrd", real_log()))["/world/wanted"] == 1
+
+
 def test_rates_are_those_of_the_second_before() -> None:
     rows = pa.table({"t": 10_000 * np.arange(300), "n": np.arange(300) // 2, "m": 3 * np.arange(300)})
     rates = monitor.rates(rows, ("n", "m"), np.array([0, 10, 100, 250]))

@@ -1,0 +1,78 @@
+"""What the report says about a fault: the robot, the board's belief, its poses and its flaps, as the log has them."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.faults import parse
+from hil.laboratory.metrics import column, free_flight, position_error
+from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
+from hil.laboratory.result import read_result
+from hil.laboratory.run import fly
+from hil.pictures.curves import since_release
+from hil.pictures.evidence import evidence
+from hil.pictures.figures import course_of, goal_moves
+from hil.pictures.story import failures_of
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("evidence") / "run"
+    faults = tuple(map(parse, ("mocap.dropout@0.5:0.4", "servo.stuck.2@1.2", "push.y@1.5=3")))
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=3.0, faults=faults), folder)
+    return folder
+
+
+def numbers(sentence: str) -> list[float]:
+    return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", sentence)]
+
+
+def test_the_robot_and_the_time_without_a_pose_are_those_of_the_log(folder: Path) -> None:
+    log = load_log(folder)
+    rows = log.filter((since_release(log) >= 0.5) & (since_release(log) <= 1.1))
+    robot, belief, supervisor, poses, *_ = evidence(rows)
+    error = 100 * np.abs(position_error(rows))
+    assert numbers(robot)[0] == pytest.approx(error.max(), abs=0.06)
+    assert f"({'xyz'[int(np.argmax(error.max(axis=0)))]}, at" in robot
+    assert belief.startswith("The board's estimate was up to")
+    assert supervisor == "Its supervisor: flying all the time."
+    longest_ms, from_s = numbers(poses)
+    assert 400 < longest_ms < 460, "the dropout, and what was under way"
+    assert from_s == pytest.approx(0.5, abs=0.06)
+
+
+def test_a_stuck_flap_is_named_with_what_the_board_believed(folder: Path) -> None:
+    log = load_log(folder)
+    rows = log.filter(since_release(log) >= 1.2)
+    (stuck,) = [sentence for sentence in evidence(rows) if sentence.startswith("Flap 2")]
+    away, at_s, stood, believed = numbers(stuck)[1:]
+    truth = np.degrees(column(rows, "truth.flap_2"))
+    assert away > 10
+    assert stood == pytest.approx(truth[np.argmin(np.abs(since_release(rows) - at_s))], abs=0.6)
+    assert -53 < believed < 1, "the range of an even flap"
+    assert evidence(log.slice(0, 1)) == []
+
+
+def test_a_limit_that_failed_names_the_fault_that_began_last(folder: Path) -> None:
+    log, result = load_log(folder), read_result(folder)
+    failures = failures_of(log, result)
+    assert {failure.text for failure in failures} == set(map(str, result.failed))
+    first = failures[0]
+    assert first.at_s is not None
+    assert first.at_s > 1.5
+    assert first.cause == f"{first.at_s - 1.5:.2f} s after the begin of push.y@1.5=3 (force along y of W)"
+
+
+def test_the_course_is_the_flight_from_the_first_goal_red_while_a_fault_is_in_force(folder: Path) -> None:
+    log = load_log(folder)
+    course, free = course_of(log), free_flight(log)
+    assert course.holds
+    assert not goal_moves(log)
+    assert course.flown == pytest.approx(100 * position_error(free)), "a goal that holds at yaw 0"
+    times = since_release(free)
+    within = ((times >= 0.5) & (times <= 0.9)) | (times >= 1.2)
+    assert (course.troubled == within).mean() > 0.98
