@@ -352,6 +352,7 @@ class Supervisor(Struct):
     ready: i32  # it would fly with poses and an IMU, whose failures end by themselves
     flown: i32  # since the gyro's zero was last sought
     aloft: i32  # the robot may be in the air, or its flaps are moved
+    led: i32  # it flies with absolute poses, to where a commander leads it
     begun: i32
     now_us: i32  # of the last look
     pose_seen: i32

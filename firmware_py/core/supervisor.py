@@ -201,11 +201,14 @@ def mode_of(data: Input, supervisor: Supervisor) -> i32:
 
 @kernel
 def watch_rest(data: Input, supervisor: Supervisor) -> None:
-    """Notice when the robot is at rest: it has not flown, or was taken out of the flight long enough to be down."""
+    """Notice who leads, and rest: the robot has not flown, or was taken out of the flight long enough to be down."""
     if supervisor.state == STATE_FLYING:
         supervisor.flown = i32(1)
     if supervisor.armed != 0 and supervisor.stopped == 0:
         supervisor.down_us = i32(0)
+    supervisor.led = i32(0)
+    if supervisor.state == STATE_FLYING and data.poses_absolute != 0:
+        supervisor.led = i32(1)
     supervisor.aloft = i32(1)
     if data.mode == MODE_HOVER and (supervisor.flown == 0 or supervisor.down_us >= DOWN_US):
         supervisor.aloft = i32(0)

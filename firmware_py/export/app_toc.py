@@ -160,17 +160,19 @@ static void switch_written(uint8_t *wanted, uint8_t *before, volatile bool *on, 
 
 static void stop_written(void) {
   static uint8_t before;
-  switch_written(&stop_wanted, &before, &floaty_requests.stop, &floaty_requests.recover);
+  switch_written(&stop_wanted, &before, &floaty_requests[FLOATY_REQUEST_STOP],
+                 &floaty_requests[FLOATY_REQUEST_RECOVER]);
 }
 
 static void armed_written(void) {
   static uint8_t before = 1;
-  switch_written(&armed_wanted, &before, &floaty_requests.arm, &floaty_requests.disarm);
+  switch_written(&armed_wanted, &before, &floaty_requests[FLOATY_REQUEST_ARM],
+                 &floaty_requests[FLOATY_REQUEST_DISARM]);
 }
 
 static void reset_written(void) {
   if (reset_wanted) {
-    floaty_requests.reset = true;
+    floaty_requests[FLOATY_RESET] = true;
   }
   reset_wanted = 0;
 }

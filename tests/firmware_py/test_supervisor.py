@@ -347,6 +347,17 @@ def test_flaps_that_are_moved_by_hand_are_not_at_rest() -> None:
     assert bench.core.supervisor.fields.aloft
 
 
+def test_a_commander_leads_a_flight_with_absolute_poses_and_no_other() -> None:
+    bench = in_flight(lambda bench: bench.fly(100_000))
+    led = []
+    for absolute, end in ((0, bench.view.recover), (1, bench.view.recover), (1, bench.view.stop)):
+        bench.data.poses_absolute = absolute
+        end()
+        bench.look()
+        led.append(bench.core.supervisor.fields.led)
+    assert led == [0, 1, 0]
+
+
 def test_a_gyro_is_stale_after_20_steps_and_alive_after_100_with_new_counts() -> None:
     bench = in_flight(lambda bench: bench.steps(50, moving=True))
     found = []

@@ -13,6 +13,7 @@
 #include "app.h"
 #include "app_channel.h"
 #include "cfassert.h"
+#include "crc32.h"
 #include "crtp.h"
 #include "crtp_supervisor.h"
 #include "debug.h"
@@ -178,6 +179,11 @@ BaseType_t xQueueGenericSend(QueueHandle_t q, const void *const item, TickType_t
   }
   memcpy(q->storage + (q->first + q->used) % q->length * q->size, item, q->size);
   q->used += 1;
+  return pdTRUE;
+}
+BaseType_t xQueueGenericReset(QueueHandle_t q, BaseType_t new) {
+  (void)new;
+  q->first = q->used = 0;
   return pdTRUE;
 }
 BaseType_t xQueueReceive(QueueHandle_t q, void *const item, TickType_t ticks) {
@@ -384,4 +390,15 @@ void stub_param_set(int i, double value) {
   if (__start_param_table[i].callback) {
     __start_param_table[i].callback();
   }
+}
+
+uint32_t crc32CalculateBuffer(const void *buffer, size_t size) {
+  uint32_t crc = 0xffffffff;
+  for (const uint8_t *byte = buffer; size > 0; byte++, size--) {
+    crc ^= *byte;
+    for (int bit = 0; bit < 8; bit++) {
+      crc = crc & 1 ? crc >> 1 ^ 0xedb88320 : crc >> 1;
+    }
+  }
+  return ~crc;
 }

@@ -16,6 +16,7 @@
 #include "autoconf.h"
 #include "cfassert.h"
 #include "controller.h"
+#include "crc32.h"
 #include "crtp.h"
 #include "crtp_supervisor.h"
 #include "debug.h"
@@ -55,6 +56,8 @@ _Static_assert(SAME(QueueHandle_t, struct QueueDefinition *), "queue");
 VALUE(queueSEND_TO_BACK, 0)
 FUNCTION(xQueueGenericCreateStatic, QueueHandle_t, UBaseType_t, UBaseType_t, uint8_t *, StaticQueue_t *, uint8_t)
 FUNCTION(xQueueGenericSend, BaseType_t, QueueHandle_t, const void *, TickType_t, BaseType_t)
+FUNCTION(xQueueGenericReset, BaseType_t, QueueHandle_t, BaseType_t)
+TYPE(xQueueReset(NULL), BaseType_t)
 FUNCTION(xQueueReceive, BaseType_t, QueueHandle_t, void *, TickType_t)
 TYPE(xQueueCreateStatic(1, 1, NULL, NULL), QueueHandle_t)
 TYPE(xQueueSend(NULL, NULL, 0), BaseType_t)
@@ -70,6 +73,7 @@ FUNCTION(appInit, void, void)
 FUNCTION(systemWaitStart, void, void)
 FUNCTION(cfAssertNormalStartTest, bool, void)
 FUNCTION(watchdogNormalStartTest, bool, void)
+FUNCTION(crc32CalculateBuffer, uint32_t, const void *, size_t)
 FUNCTION(crtpSupervisorSetEmergencyStop, void, void)
 FUNCTION(crtpSupervisorNotifyEmergencyStopWatchdog, void, void)
 FUNCTION(crtpSupervisorIsEmergencyStopRequested, bool, void)

@@ -8,10 +8,8 @@
  * what it computes in the laboratory, bit for bit, from the same counts, poses and instants.
  *
  * Time: what is decided by time counts ticks, which nobody can set. How long a pose waited is measured in microseconds,
- * by a clock that the parameter usec.reset sets to zero. Both are handed on as 32 bits, which wrap. With hardware in the loop, neither counts while a sample of the
- * host is missing: floaty_hil.h.
- *
- * What receives poses and requests, and talks on the console, is floaty_task.c.
+ * by a clock that the parameter usec.reset sets to zero. Both are handed on as 32 bits, which wrap. With hardware in the
+ * loop, neither counts while a sample of the host is missing: floaty_hil.c.
  */
 #define DEBUG_MODULE "FLOATY"
 
@@ -37,8 +35,6 @@
 #include "supervisor.h"
 #include "usec_time.h"
 
-#include "floaty_hil.h"
-#include "floaty_servos.h"
 #include "floaty_settings.h"
 
 #define STEP_US 1000
@@ -55,12 +51,10 @@ FloatySampling floaty_sampling;
 FloatySupervisor floaty_supervisor;
 FloatyReport floaty_report;
 FloatyObserved floaty_observed;
-FloatyRequests floaty_requests;
+volatile bool floaty_requests[FLOATY_REQUEST_FEED];
 
 static logVarId_t gyro_raw[3];
 static bool gyro_found;
-static volatile int32_t followed; /* FLOATY_SETPOINT_... */
-static volatile TickType_t controlled_tick;
 static bool holding;    /* in this step the flight stands still */
 static bool controlled; /* in this step the controller runs */
 
@@ -91,15 +85,6 @@ void floaty_hover(void) {
   floaty_servos_write(control.count);
 }
 
-void floaty_lose_control(void) {
-  call_lose_control();
-  floaty_hover();
-}
-
-uint32_t floaty_controlled_tick(void) {
-  return controlled_tick;
-}
-
 void floaty_queue_pose(const FloatyPose *pose) {
   FloatyPose oldest;
   while (xQueueSend(pose_queue, pose, 0) != pdTRUE) {
@@ -109,23 +94,19 @@ void floaty_queue_pose(const FloatyPose *pose) {
   }
 }
 
-int32_t floaty_followed(void) {
-  return followed;
-}
-
 int32_t floaty_pose_clock_us(void) {
-  return (int32_t)((uint32_t)usecTimestamp() - floaty_hil_held() * STEP_US);
+  return (int32_t)((uint32_t)usecTimestamp() - floaty_hil_held * STEP_US);
 }
 
 static int32_t loop_us(void) {
-  return (int32_t)((xTaskGetTickCount() - floaty_hil_held()) * STEP_US);
+  return (int32_t)((xTaskGetTickCount() - floaty_hil_held) * STEP_US);
 }
 
 /* The estimator, in the stabilizer task */
 
-static bool asked(volatile bool *request) {
-  const bool was = *request;
-  *request = false;
+static bool asked(int32_t wanted) {
+  const bool was = floaty_requests[wanted];
+  floaty_requests[wanted] = false;
   return was;
 }
 
@@ -164,13 +145,9 @@ static void tell_state(state_t *state, stabilizerStep_t step) {
   const FloatyReport *r = &floaty_report;
   state->position = (point_t){step, r->position[0], r->position[1], r->position[2]};
   state->velocity = (point_t){step, r->velocity[0], r->velocity[1], r->velocity[2]};
-  state->attitude.roll = DEGREES * r->attitude[0];
-  state->attitude.pitch = -DEGREES * r->attitude[1];
-  state->attitude.yaw = DEGREES * r->attitude[2];
-  state->attitudeQuaternion.w = r->quaternion[0];
-  state->attitudeQuaternion.x = r->quaternion[1];
-  state->attitudeQuaternion.y = r->quaternion[2];
-  state->attitudeQuaternion.z = r->quaternion[3];
+  state->attitude = (attitude_t){step, DEGREES * r->attitude[0], -DEGREES * r->attitude[1], DEGREES * r->attitude[2]};
+  const float *q = r->quaternion;
+  state->attitudeQuaternion = (quaternion_t){.x = q[1], .y = q[2], .z = q[3], .w = q[0]};
 }
 
 static bool find_gyro(void) {
@@ -189,7 +166,7 @@ void estimatorOutOfTreeInit(void) {
     return;
   }
   gyro_found = find_gyro();
-  floaty_requests.reset = true;
+  floaty_requests[FLOATY_RESET] = true;
   floaty_toc_apply();
   floaty_hover(); /* with the trims of the EEPROM */
 }
@@ -204,10 +181,7 @@ bool estimatorOutOfTreeTest(void) {
 
 /* Another gyro measures from now on, and what was flown before is over. */
 static void begin_afresh(void) {
-  FloatyPose pose;
-  while (xQueueReceive(pose_queue, &pose, 0) == pdTRUE) {
-    /* of another flight */
-  }
+  xQueueReset(pose_queue);
   call_begin_afresh();
   call_reset();
   floaty_hover();
@@ -228,17 +202,14 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (holding) {
     return;
   }
-  if (asked(&floaty_requests.reset)) {
+  if (asked(FLOATY_RESET)) {
     call_reset();
   }
-  floaty_input.poses_absolute = floaty_input.absolute && floaty_hil_mode() == FLOATY_HIL_OFF; /* a host sends corrections */
-  if (floaty_input.poses_absolute && floaty_supervisor.state == FLOATY_STATE_FLYING) {
-    /* The firmware's supervisor, which looks at this next, takes more than the idle thrust for a flight; else it would
-     * disarm and stop its commander 30 s after arming. One more is less than a step of the motors' PWM: no pulse. */
-    const uint32_t idle = powerDistributionGetIdleThrust();
-    motorsSetRatio(MOTOR_M4, (uint16_t)(idle < UINT16_MAX ? idle + 1 : UINT16_MAX));
-  }
-  take_measurements(stabilizerStep - floaty_hil_held());
+  floaty_input.poses_absolute = floaty_input.absolute && floaty_hil_mode == FLOATY_HIL_OFF; /* a host sends corrections */
+  /* The firmware's supervisor, which looks at this next, takes more than the idle thrust for a flight; else it would
+   * disarm and stop its commander 30 s after arming. One more is less than a step of the motors' PWM: no pulse. */
+  motorsSetRatio(MOTOR_M4, (uint16_t)(floaty_supervisor.led ? powerDistributionGetIdleThrust() + 1 : 0));
+  take_measurements(stabilizerStep - floaty_hil_held);
   if (floaty_sampling.estimate_due) {
     call_estimate();
     tell_state(state, stabilizerStep);
@@ -248,17 +219,11 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
 /* The controller, in the stabilizer task */
 
 static void serve_requests(void) {
-  if (asked(&floaty_requests.recover)) {
-    request(FLOATY_REQUEST_RECOVER);
-  }
-  if (asked(&floaty_requests.arm)) {
-    request(FLOATY_REQUEST_ARM);
-  }
-  if (asked(&floaty_requests.disarm)) {
-    request(FLOATY_REQUEST_DISARM);
-  }
-  if (asked(&floaty_requests.stop)) {
-    request(FLOATY_REQUEST_STOP);
+  static const int32_t ORDER[] = {FLOATY_REQUEST_RECOVER, FLOATY_REQUEST_ARM, FLOATY_REQUEST_DISARM, FLOATY_REQUEST_STOP};
+  for (unsigned i = 0; i < sizeof ORDER / sizeof ORDER[0]; i++) {
+    if (asked(ORDER[i])) {
+      request(ORDER[i]);
+    }
   }
   /* The firmware's own stop, by ports 6 and 9, their watchdogs or stabilizer.stop. */
   if (crtpSupervisorIsEmergencyStopRequested() || supervisorIsLocked()) {
@@ -297,18 +262,18 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
   floaty_input.now_us = loop_us();
   serve_requests();
   read_setpoint(setpoint);
-  followed = call_follow();
+  floaty_observed.followed = call_follow();
   if (holding) {
-    controlled_tick = xTaskGetTickCount(); /* nothing is wrong with the loop */
+    floaty_observed.controlled_tick = xTaskGetTickCount(); /* nothing is wrong with the loop */
   } else if (controlled) {
     floaty_input.connected = crtpIsConnected();
     call_supervise();
     call_control();
-    if (floaty_hil_mode() != FLOATY_HIL_STILL) {
+    if (floaty_hil_mode != FLOATY_HIL_STILL) {
       floaty_servos_write(floaty_control.count);
     }
     floaty_hil_tell(true);
-    controlled_tick = xTaskGetTickCount();
+    floaty_observed.controlled_tick = xTaskGetTickCount();
   }
   if (stabilizerStep % BATTERY_STEPS == 0) {
     floaty_input.battery_mv = (int32_t)(1000.0f * pmGetBatteryVoltage());

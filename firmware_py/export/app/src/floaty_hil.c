@@ -1,16 +1,13 @@
-/* See floaty_hil.h.
+/* Hardware in the loop: see floaty_app.h.
  *
  * Samples wait in a buffer that one task fills and another empties. Each variable is written by one task only: the
  * receiving task begins a new stream when it sees that the stabilizer task has begun another mode, and the stabilizer task
  * looks at no stream but that of its mode. The first sample is taken when enough of them wait for the link's jitter; the
  * host keeps its clock so that about as many go on waiting.
  */
-#include "floaty_hil.h"
+#include "floaty_calls.h"
 
 #include <string.h>
-
-#include "floaty_app.h"
-#include "floaty_wire.h"
 
 #define AXES 3
 #define BUFFER 64         /* samples; a power of two, of which 65536 is a multiple, and more than a host lets be under way */
@@ -32,12 +29,12 @@ static uint16_t gap;               /* `received` when the last sample came that 
 static volatile uint8_t stream;    /* the modes that had begun when the stream did; the last to be written */
 
 /* Of the stabilizer task */
-static volatile uint8_t mode;
+volatile uint8_t floaty_hil_mode;
 static volatile uint8_t modes;     /* begun so far */
 static volatile uint16_t used;     /* samples taken of the stream */
 static Sample taken;               /* last */
 static uint16_t late;              /* steps that took the last sample again */
-static volatile uint32_t held;     /* steps in which the flight stood still, ever */
+volatile uint32_t floaty_hil_held;
 static uint32_t held_before;       /* this mode */
 static uint16_t silent_steps;
 static bool running;               /* samples are taken */
@@ -45,19 +42,6 @@ static bool running;               /* samples are taken */
 void floaty_hil_ask(uint8_t asked) {
   silent_steps = 0;
   wanted = asked;
-}
-
-uint8_t floaty_hil_mode(void) {
-  return mode;
-}
-
-uint32_t floaty_hil_held(void) {
-  return held;
-}
-
-/* Whether a sample of this mode has come. */
-static bool begun(void) {
-  return stream == modes;
 }
 
 /* What is not the next sample is not taken: the host sends what is missing, and all behind it, again. */
@@ -100,7 +84,7 @@ static void go_on(Sample *sample, const uint8_t *step, uint8_t width) {
 
 void floaty_hil_receive(const CRTPPacket *packet) {
   FloatyWireSamples head;
-  if (mode == FLOATY_HIL_OFF || packet->size < sizeof head) {
+  if (floaty_hil_mode == FLOATY_HIL_OFF || packet->size < sizeof head) {
     return;
   }
   memcpy(&head, packet->data, sizeof head);
@@ -124,24 +108,24 @@ void floaty_hil_receive(const CRTPPacket *packet) {
 }
 
 bool floaty_hil_switched(void) {
-  if (mode != FLOATY_HIL_OFF && silent_steps >= SILENT_STEPS) {
+  if (floaty_hil_mode != FLOATY_HIL_OFF && silent_steps >= SILENT_STEPS) {
     wanted = FLOATY_HIL_OFF;
   }
-  if (mode == wanted) {
+  if (floaty_hil_mode == wanted) {
     return false;
   }
   used = late = silent_steps = 0;
-  held_before = held;
+  held_before = floaty_hil_held;
   memset(&taken, 0, sizeof taken);
   running = false;
-  mode = wanted;
+  floaty_hil_mode = wanted;
   modes += 1;
   return true;
 }
 
 bool floaty_hil_holds(void) {
-  const uint16_t waiting = begun() ? (uint16_t)(received - used) : 0;
-  if (mode == FLOATY_HIL_OFF) {
+  const uint16_t waiting = stream == modes ? (uint16_t)(received - used) : 0;
+  if (floaty_hil_mode == FLOATY_HIL_OFF) {
     return false;
   }
   running = running || waiting >= FLOATY_HIL_WAITING;
@@ -153,7 +137,7 @@ bool floaty_hil_holds(void) {
   if (running && silent_steps > FLOATY_HIL_HOLD) {
     return false;
   }
-  held += 1;
+  floaty_hil_held += 1;
   if (silent_steps % TELL_STEPS == 0) {
     floaty_hil_tell(false);
   }
@@ -161,7 +145,7 @@ bool floaty_hil_holds(void) {
 }
 
 bool floaty_hil_sample(int32_t counts[3]) {
-  if (mode == FLOATY_HIL_OFF) {
+  if (floaty_hil_mode == FLOATY_HIL_OFF) {
     return true;
   }
   const bool fresh = silent_steps == 0;
@@ -179,27 +163,19 @@ bool floaty_hil_sample(int32_t counts[3]) {
 
 void floaty_hil_tell(bool fresh) {
   CRTPPacket packet;
-  if (mode == FLOATY_HIL_OFF) {
+  if (floaty_hil_mode == FLOATY_HIL_OFF) {
     return;
   }
-  const bool come = begun();
+  const bool come = stream == modes; /* a sample of this mode */
   const FloatyWireLoop loop = {
       .used = come ? (uint16_t)(first + used) : 0,
       .waiting = come ? (uint8_t)(received - used) : 0,
-      .state = (uint8_t)floaty_supervisor.state,
-      .cause = (uint8_t)floaty_supervisor.cause,
       .fresh = fresh,
-      .held = (uint16_t)(held - held_before),
+      .held = (uint16_t)(floaty_hil_held - held_before),
       .late = late,
       .lost = come ? lost : 0,
       .doubled = come ? doubled : 0,
-      .m1 = (uint16_t)floaty_control.count[0],
-      .m2 = (uint16_t)floaty_control.count[1],
-      .m3 = (uint16_t)floaty_control.count[2],
-      .m4 = (uint16_t)floaty_control.count[3],
-      .fused = (uint16_t)floaty_estimator.fused,
-      .refused = (uint16_t)floaty_estimator.refused,
-      .age = (uint16_t)floaty_report.age,
+      FLOATY_LOOP_OF_CORE,
   };
   memset(&packet, 0, sizeof packet);
   packet.port = FLOATY_PORT_CORE;

@@ -1,22 +1,20 @@
-/* See floaty_port.h.
+/* The core, call by call for a host: see floaty_app.h.
  *
  * Requests arrive in the task CRTP-RX, and are executed there. What flies is not touched, and nothing is executed unless the
  * robot is at rest. A call is measured with the scheduler suspended, 1.2 ms at most: no other task runs in it, interrupts
  * do. So none is executed with hardware in the loop, whose flight would be late.
  */
-#include "floaty_port.h"
+#include "floaty_calls.h"
 
 #include <string.h>
 
 #include "FreeRTOS.h"
 #include "task.h"
 
+#include "crc32.h"
 #include "crtp.h"
 #include "pm.h"
 #include "stm32fxxx.h"
-
-#include "floaty_calls.h"
-#include "floaty_hil.h"
 
 #define CLOCK_MHZ 168
 
@@ -28,22 +26,6 @@ static uint8_t session;           /* 0: none */
 static uint16_t done;             /* its requests that were executed */
 static uint16_t last_call;        /* number of the last call */
 static FloatyWireCalled called;   /* and its answer */
-
-/* CRC-32 as of zlib. */
-static uint32_t digest(void) {
-  static const uint32_t TABLE[16] = {
-      0x00000000, 0x1db71064, 0x3b6e20c8, 0x26d930ac, 0x76dc4190, 0x6b6b51f4, 0x4db26158, 0x5005713c,
-      0xedb88320, 0xf00f9344, 0xd6d6a3e8, 0xcb61b38c, 0x9b64c2b0, 0x86d3d2d4, 0xa00ae278, 0xbdbdf21c,
-  };
-  const uint8_t *bytes = (const uint8_t *)&memory;
-  uint32_t crc = 0xffffffff;
-  for (uint32_t i = 0; i < sizeof memory; i++) {
-    crc ^= bytes[i];
-    crc = TABLE[crc & 15] ^ crc >> 4;
-    crc = TABLE[crc & 15] ^ crc >> 4;
-  }
-  return ~crc;
-}
 
 static uint8_t hello(uint8_t wanted, uint8_t *body) {
   FloatyWireAbout about = {FLOATY_VERSION, (uint8_t)floaty_supervisor.state, sizeof memory, 0, CLOCK_MHZ, "", ""};
@@ -67,7 +49,7 @@ static void execute(uint8_t entry) {
   called.answer = (int8_t)call_on(&memory, entry);
   called.cycles = DWT->CYCCNT - begin;
   xTaskResumeAll();
-  called.digest = digest();
+  called.digest = crc32CalculateBuffer(&memory, sizeof memory);
 }
 
 /* What serves a request returns the size of its answer, NO_ANSWER, or what refuses it. */
@@ -139,13 +121,9 @@ static int health(uint8_t *body) {
       .gyro_x = (int16_t)gyro[0],
       .gyro_y = (int16_t)gyro[1],
       .gyro_z = (int16_t)gyro[2],
-      .calibrated = (uint8_t)floaty_sampling.calibrated,
       .battery_mv = (uint16_t)(1000.0f * pmGetBatteryVoltage()),
       .heap_free = (uint32_t)xPortGetFreeHeapSize(),
-      .m1 = (uint16_t)floaty_control.count[0],
-      .m2 = (uint16_t)floaty_control.count[1],
-      .m3 = (uint16_t)floaty_control.count[2],
-      .m4 = (uint16_t)floaty_control.count[3],
+      FLOATY_HEALTH_OF_CORE,
   };
   memcpy(body, &answer, sizeof answer);
   return sizeof answer;
@@ -161,7 +139,7 @@ static int serve(const FloatyWireHead *head, const uint8_t *data, uint32_t lengt
   if (head->session != session || session == 0) {
     return REFUSED(NO_SESSION);
   }
-  const bool in_the_loop = floaty_hil_mode() != FLOATY_HIL_OFF;
+  const bool in_the_loop = floaty_hil_mode != FLOATY_HIL_OFF;
   if (!in_the_loop && floaty_supervisor.aloft && head->kind != FLOATY_KIND_HEALTH) {
     return REFUSED(FLYING);
   }

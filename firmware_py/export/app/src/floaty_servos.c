@@ -1,11 +1,11 @@
-/* See floaty_servos.h.
+/* The servo outputs: see floaty_app.h.
  *
  * The pins are the original's (BigQuad map): M1 PA2, M2 PB4, M3 PB5, M4 PA3. PA2 and PA3 hang on TIM5 (channels 3 and 4)
  * instead of TIM2, whose time base and channel 4 belong to the firmware's own motor driver: both timers run at 84 MHz,
  * the signal is the same. PB4 and PB5 are channels 1 and 2 of TIM3. Of the firmware, only the drivers of some decks use these
  * two timers: buzzer, rpm and lighthouse tester TIM5, LED ring, rpm and CPPM receiver TIM3.
  */
-#include "floaty_servos.h"
+#include "floaty_app.h"
 
 #include "stm32fxxx.h"
 
@@ -46,14 +46,11 @@ void floaty_servos_init(const int32_t count[4]) {
   output.TIM_OCMode = TIM_OCMode_PWM1;
   output.TIM_OutputState = TIM_OutputState_Enable;
   output.TIM_OCPolarity = TIM_OCPolarity_High;
-  output.TIM_Pulse = (uint32_t)count[0];
   TIM_OC3Init(TIM5, &output);
-  output.TIM_Pulse = (uint32_t)count[1];
   TIM_OC1Init(TIM3, &output);
-  output.TIM_Pulse = (uint32_t)count[2];
   TIM_OC2Init(TIM3, &output);
-  output.TIM_Pulse = (uint32_t)count[3];
   TIM_OC4Init(TIM5, &output);
+  floaty_servos_write(count);
   TIM_OC3PreloadConfig(TIM5, TIM_OCPreload_Enable);
   TIM_OC1PreloadConfig(TIM3, TIM_OCPreload_Enable);
   TIM_OC2PreloadConfig(TIM3, TIM_OCPreload_Enable);

@@ -8,7 +8,7 @@
  */
 #define DEBUG_MODULE "FLOATY"
 
-#include "floaty_app.h"
+#include "floaty_calls.h"
 
 #include <string.h>
 
@@ -27,17 +27,9 @@
 #include "system.h"
 #include "watchdog.h"
 
-#include "floaty_port.h"
 #include "floaty_settings.h"
 
-#define CHANNEL_GENERIC 1
-#define EMERGENCY_STOP 3
-#define EMERGENCY_STOP_WATCHDOG 4
-#define EXT_POSE 8
 #define POSE_SIZE (1 + 7 * sizeof(float))
-#define AGE_UNIT_US 500
-#define AGE_UNKNOWN_CODE 255
-#define AGE_UNKNOWN (-1)
 #define STALE_MS 50 /* without a controller step: servos to hover */
 #define LOOK_MS 20  /* how often the task looks at that */
 #define POSE_LINE_MS 10000 /* between lines about poses that are refused */
@@ -50,27 +42,27 @@ static StaticTask_t task;
 
 /* EXT_POSE, x y z [m], qx qy qz qw as little-endian float32, and perhaps the age in units of 0.5 ms: firmware_py/wire/crtp.py. */
 static void receive_pose(const uint8_t *data, uint32_t length) {
-  FloatyPose pose = {.arrival_us = floaty_pose_clock_us(), .age_us = AGE_UNKNOWN};
-  if ((length != POSE_SIZE && length != POSE_SIZE + 1) || data[0] != EXT_POSE) {
+  FloatyPose pose = {.arrival_us = floaty_pose_clock_us(), .age_us = -1}; /* unknown */
+  if ((length != POSE_SIZE && length != POSE_SIZE + 1) || data[0] != FLOATY_EXT_POSE) {
     floaty_observed.malformed += 1;
     return;
   }
   memcpy(pose.position, data + 1, sizeof pose.position);
   memcpy(pose.quaternion + 1, data + 1 + sizeof pose.position, 3 * sizeof(float));
   memcpy(pose.quaternion, data + POSE_SIZE - sizeof(float), sizeof(float)); /* x y z w on the wire */
-  if (length > POSE_SIZE && data[POSE_SIZE] != AGE_UNKNOWN_CODE) {
-    pose.age_us = data[POSE_SIZE] * AGE_UNIT_US;
+  if (length > POSE_SIZE && data[POSE_SIZE] != FLOATY_AGE_UNKNOWN_CODE) {
+    pose.age_us = data[POSE_SIZE] * FLOATY_AGE_UNIT_US;
   }
   floaty_queue_pose(&pose);
 }
 
 static void receive_localisation(CRTPPacket *packet) {
-  if (packet->channel != CHANNEL_GENERIC || packet->size < 1) {
+  if (packet->channel != FLOATY_CHANNEL_GENERIC || packet->size < 1) {
     return; /* a position without attitude is no pose */
   }
-  if (packet->data[0] == EMERGENCY_STOP && packet->size == 1) {
+  if (packet->data[0] == FLOATY_EMERGENCY_STOP && packet->size == 1) {
     crtpSupervisorSetEmergencyStop(); /* as port 9 */
-  } else if (packet->data[0] == EMERGENCY_STOP_WATCHDOG && packet->size == 1) {
+  } else if (packet->data[0] == FLOATY_EMERGENCY_STOP_WATCHDOG && packet->size == 1) {
     crtpSupervisorNotifyEmergencyStopWatchdog();
   } else {
     receive_pose(packet->data, packet->size);
@@ -78,10 +70,7 @@ static void receive_localisation(CRTPPacket *packet) {
 }
 
 static void announce_state(void) {
-  static const char *const STATES[] = {"calibrating", "waiting", "flying", "failsafe"};
-  static const char *const CAUSES[] = {"",           ", silence",  ", out of bounds", ", emergency stop",
-                                       ", low battery", ", disarmed", ", no control",
-                                       ", controller not finite", ", estimator not finite", ", imu stale"};
+  static const char *const STATES[] = FLOATY_STATE_TEXTS, *const CAUSES[] = FLOATY_CAUSE_TEXTS;
   static int32_t state = FLOATY_STATE_CALIBRATING, cause = FLOATY_CAUSE_NONE;
   const int32_t new_state = floaty_supervisor.state, new_cause = floaty_supervisor.cause;
   if (new_state != state || new_cause != cause) {
@@ -98,7 +87,7 @@ static void announce_setpoint(void) {
       [FLOATY_SETPOINT_OF_CORRECTIONS] = "poses are corrections, see extPose.absolute",
   };
   static const char *refused;
-  const char *why = REASONS[floaty_followed()];
+  const char *why = REASONS[floaty_observed.followed];
   if (why != NULL && why != refused) {
     DEBUG_PRINT("set-point not followed: %s\n", why);
   }
@@ -120,13 +109,14 @@ static void announce_poses(void) {
 /* A loop that stands still, or a controller that is not Floaty's. */
 static void watch_control(void) {
   static bool stale;
-  const TickType_t controlled = floaty_controlled_tick(); /* 0: not yet, and the servos are at hover since the start */
+  const TickType_t controlled = floaty_observed.controlled_tick;
   if (controlled == 0 || xTaskGetTickCount() - controlled < M2T(STALE_MS)) {
     stale = false;
   } else if (!stale) {
     stale = true;
     floaty_observed.stale_hovers += 1;
-    floaty_lose_control();
+    call_lose_control();
+    floaty_hover();
   }
 }
 
