@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from hil.pictures.compare import Comparison
     from hil.studies.two_boards import Seed
 
+NAMED = 5  # columns that only one run has
 folder_type = click.Path(path_type=Path)
 
 
@@ -58,12 +59,18 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
     for heading in ("first", "second", "difference"):
         table.add_column(heading, justify="right")
     table.add_column("unit")
-    for pair in comparison.metrics:
+    differing = [pair for pair in comparison.metrics if pair.difference != 0]
+    for pair in differing:
         numbers = (*pair.values, pair.difference)
         shown = ("–" if math.isnan(number) else f"{number:.4g}" for number in numbers)
         table.add_row(pair.name, *shown, pair.unit)
-    console.print(table)
-    console.print(comparison.span, soft_wrap=True)
+    for name, x, y in comparison.settings:
+        console.print(f"{name}: {x} | {y}", soft_wrap=True)
+    if differing:
+        console.print(table)
+    console.print(
+        f"{len(comparison.metrics) - len(differing)} metrics are equal. {comparison.span}", soft_wrap=True
+    )
     if comparison.apart:
         apart = Table(title="distance at the same time since the release")
         for heading in ("", "rms", "largest", "unit"):
@@ -71,11 +78,10 @@ def _print_comparison(first: Path, second: Path, comparison: "Comparison") -> No
         for one in comparison.apart:
             apart.add_row(one.name, f"{one.rms:.3g}", f"{one.largest:.3g}", one.unit)
         console.print(apart)
-    for name, x, y in comparison.settings:
-        console.print(f"{name}: {x} | {y}", soft_wrap=True)
     for folder, missing in zip((first, second), comparison.missing, strict=True):
         if missing:
-            console.print(f"not in {folder}: {', '.join(missing)}", soft_wrap=True)
+            more = f" and {len(missing) - NAMED} more, which the page names" if len(missing) > NAMED else ""
+            console.print(f"not in {folder}: {', '.join(missing[:NAMED])}{more}", soft_wrap=True)
     if comparison.one_is_real:
         console.print("one flight is real, the other simulated: they share no rows")
     elif comparison.first is not None:

@@ -23,15 +23,16 @@ from hil.pictures import curves
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import png
 from hil.pictures.pages import PageFigure, embedded, write_page, zoomable
-from hil.pictures.panels import Panel, Plot, Series
+from hil.pictures.panels import Panel, Plot, Series, Signal
 from hil.pictures.trials import DARK
 
 ROW_S = 0.01
 AROUND_US = 1_000_000  # shown before and after the judged part of a real flight
 PICTURE, PAGE = "compare.png", "compare.html"
 PAIR = (DARK, curves.ORANGE)
+SHOWN_CURVES = (curves.POSITION, curves.ATTITUDE, curves.FLAPS)
 # The keys of a result that describe its settings.
-SETTINGS = ("experiment", "profile", "seed", "duration_s", "link", "board")
+SETTINGS = ("experiment", "profile", "overrides", "faults", "seed", "duration_s", "link", "board")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,19 +136,23 @@ def write_comparison(
     """
     logs, names = (_judged(a.log), _judged(b.log)), (str(a.result.folder), str(b.result.folder))
     plot = pair(logs, names)
-    figure = PageFigure(
+    figures = [PageFigure(
         "both",
         "Both flights",
         f"Position and attitude against the goal and the flap angles over time. Blue: {names[0]}; orange: {names[1]}. "
         "Times count from the release of each.",
         plot=embedded(plot),
-    )
+    )]  # fmt: skip
+    if apart := difference(a.log, b.log):
+        figures.append(PageFigure(
+            "difference", "Difference", "Second less first at the same time since the release.", plot=embedded(apart)
+        ))  # fmt: skip
     with writing("--out", folder):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / PICTURE).write_bytes(png(lambda: plot))
         return write_page(
-            folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, why=why, figure=figure,
-            zoomable=zoomable([figure]),
+            folder / PAGE, "compare.html.j2", a=a, b=b, comparison=comparison, why=why, figures=figures,
+            zoomable=zoomable(figures),
         )  # fmt: skip
 
 
@@ -155,15 +160,31 @@ def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Plot:
     """Return position, attitude and flap angles of two flights over time."""
     times = [since_release(log) for log in logs]
     panels = []
-    for curve in (curves.POSITION, curves.ATTITUDE, curves.FLAPS):
+    for curve in SHOWN_CURVES:
         read = [curve.read(log) for log in logs]
         for index, title in enumerate(curve.names):
             both = tuple(
                 Series(name, colour, at, values[:, index])
                 for name, colour, at, values in zip(names, PAIR, times, read, strict=True)
             )
-            panels.append(Panel(f"{title} [{curve.unit}]", both, height=0.95))
+            panels.append(Panel(f"{title} [{curve.unit}]", both, height=1.25))
     return Plot(tuple(panels))
+
+
+def difference(a: pa.Table, b: pa.Table) -> Plot | None:
+    """Return the second flight less the first over the time that both flew; None where they have none in common."""
+    panels = []
+    for curve, label in zip(SHOWN_CURVES, ("position", "attitude", "flaps"), strict=True):
+        times, miss = _miss(a, b, curve)
+        if len(times) > 1:
+            lines = zip(curve.names, curve.colours, miss.T, strict=True)
+            panels.append(
+                Panel(
+                    f"{label} [{curve.unit}]",
+                    tuple(Series(name, colour, times, values) for name, colour, values in lines),
+                )
+            )
+    return Plot(tuple(panels)) if panels else None
 
 
 def _judged(log: pa.Table) -> pa.Table:
@@ -180,18 +201,27 @@ def _apart(a: pa.Table, b: pa.Table) -> Iterator[Apart]:
     lined_up = release_of(a.schema.metadata) == release_of(b.schema.metadata)
     if (lined_up and not (is_real(a) or is_real(b))) or min(log.num_rows for log in free) < 2:
         return
+    for curve in SHOWN_CURVES:
+        _, differences = _miss(a, b, curve)
+        for name, values in zip(curve.names, differences.T, strict=True):
+            miss = values[np.isfinite(values)]
+            if len(miss):
+                yield Apart(name, curve.unit, float(np.sqrt((miss**2).mean())), float(np.abs(miss).max()))
+
+
+def _miss(a: pa.Table, b: pa.Table, curve: curves.Curves) -> tuple[Signal, Signal]:
+    """Return the times since the release that both flew, and second less first there, (N, names)."""
+    free = [free_flight(log) for log in (a, b)]
+    if min(log.num_rows for log in free) < 2:
+        return np.empty(0), np.empty((0, len(curve.names)))
     times, others = (since_release(log) for log in free)
     common = times <= others[-1]
-    for plot in (curves.POSITION, curves.ATTITUDE, curves.FLAPS):
-        first, second = (plot.read(log) for log in free)
-        for index, name in enumerate(plot.names):
-            values = np.unwrap(second[:, index], period=360) if plot is curves.ATTITUDE else second[:, index]
-            miss = np.interp(times[common], others, values) - first[common, index]
-            if plot is curves.ATTITUDE:
-                miss = (miss + 180) % 360 - 180
-            miss = miss[np.isfinite(miss)]
-            if len(miss):
-                yield Apart(name, plot.unit, float(np.sqrt((miss**2).mean())), float(np.abs(miss).max()))
+    first, second = (curve.read(log) for log in free)
+    if curve is curves.ATTITUDE:
+        second = np.unwrap(second, period=360, axis=0)
+    columns = [np.interp(times[common], others, values) for values in second.T]
+    miss = np.stack(columns, axis=1) - first[common]
+    return times[common], (miss + 180) % 360 - 180 if curve is curves.ATTITUDE else miss
 
 
 def _first_difference(a: pa.Table, b: pa.Table, columns: list[str]) -> FirstDifference | None:
@@ -252,9 +282,10 @@ def _metric_pairs(a: Result, b: Result) -> list[MetricPair]:
 def _differing_settings(a: FlownRun, b: FlownRun) -> list[tuple[str, str, str]]:
     trees = [
         {name: value for name, value in run.result.request.stored().items() if name in SETTINGS}
-        | {"outcome": run.result.outcome, "commit": run.result.program.commit}
-        | {f"versions.{name}": number for name, number in run.result.program.versions.items()}
+        | {"outcome": run.result.outcome}
         | _flat(stored_in(run.log.schema.metadata, "config"))
+        | {"commit": run.result.program.commit}
+        | {f"versions.{name}": number for name, number in run.result.program.versions.items()}
         for run in (a, b)
     ]
     names = [*trees[0], *(name for name in trees[1] if name not in trees[0])]
@@ -273,4 +304,6 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value)) or "–"
     return "–" if value is None else str(value)

@@ -21,7 +21,7 @@ from hil.laboratory.metrics import free_flight, measure, position_error
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.pictures.compare import FlownRun, compare, load_flown, pair, write_comparison
+from hil.pictures.compare import FlownRun, compare, difference, load_flown, pair, write_comparison
 from support.command import Cli
 from support.html_page import Page
 
@@ -163,6 +163,15 @@ def test_flights_that_are_released_at_other_instants_are_compared_by_the_time_si
     assert told["y"].rms == pytest.approx(np.sqrt((miss**2).mean()), rel=1e-6)
 
 
+def test_the_difference_is_the_second_less_the_first_at_the_same_time(runs: dict[str, Path]) -> None:
+    a, b = load_flown(runs["one"]), load_flown(runs["two"])
+    plot = difference(a.log, b.log)
+    assert plot is not None
+    miss = 100 * np.subtract(*(position_error(free_flight(run.log)) for run in (b, a)))
+    assert [line.values for line in plot.panels[0].series] == [pytest.approx(axis) for axis in miss.T]
+    assert difference(a.log, b.log.slice(0, 0)) is None
+
+
 @pytest.mark.long
 def test_the_caption_names_the_colours_of_the_lines(runs: dict[str, Path], tmp_path: Path) -> None:
     a, b = load_flown(runs["one"]), load_flown(runs["two"])
@@ -188,7 +197,13 @@ def test_the_command_tells_the_difference_by_its_exit_code(
     assert (tmp_path / "new" / "compare.png").read_bytes().startswith(b"\x89PNG")
     page = (tmp_path / "new" / "compare.html").read_text(encoding="utf-8")
     assert "first differ in row" in page
-    assert len(Page(page).plots["both"]["panels"]) == 10
+    told = Page(page)
+    assert len(told.plots["both"]["panels"]) == 10
+    assert len(told.plots["difference"]["panels"]) == 3
+    assert ["seed", "1", "2"] in told.tables["settings"]
+    assert page.index('id="settings"') < page.index('id="differing"') < page.index('id="both"')
+    assert all(float(row[3]) != 0 for row in told.tables["differing"][1:])
+    assert all(float(row[3]) == 0 for row in told.tables["equal"][1:])
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "no parquet", "no flight", "no json"])
