@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         LabError,
         Metric,
         Request,
+        RigidBody,
         Run,
         column,
         declare,
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Request", "Run", "column", "declare",
-    "fault", "fly", "knob", "load_run", "position_error",
+    "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Request", "RigidBody", "Run", "column",
+    "declare", "fault", "fly", "knob", "load_run", "position_error",
 ]  # fmt: skip
 
 

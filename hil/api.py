@@ -37,10 +37,12 @@ from hil.laboratory.request import RADIO, Options, Request
 from hil.laboratory.result import Outcome, Result, read_result
 from hil.laboratory.run import MakeFlight
 from hil.laboratory.run import fly as fly_into
+from hil.world.rigid import RigidBody
 
 __all__ = [
-    "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Options", "Request", "Run",
-    "column", "command_of", "declare", "fault", "fly", "knob", "load_run", "position_error", "request_of",
+    "Along", "Experiment", "Fault", "Goal", "Kind", "Knob", "LabError", "Metric", "Options", "Request",
+    "RigidBody", "Run", "column", "command_of", "declare", "fault", "fly", "knob", "load_run", "position_error",
+    "request_of",
 ]  # fmt: skip
 
 Progress = Callable[[float], None]  # (share of the flight, 0..1)

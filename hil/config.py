@@ -46,9 +46,18 @@ class FlightConfig(Section):
     )
 
 
+class RobotConfig(Section):
+    """What flies."""
+
+    body: str = Field(
+        "floaty", description="floaty, or the file with a body of your own (docs/tutorials/your-own-robot.md)"
+    )
+
+
 class LabConfig(FirmwareConfig):
     """What is flashed, and the world around it."""
 
+    robot: RobotConfig = Field(default_factory=RobotConfig)
     geometry: GeometryConfig = Field(default_factory=GeometryConfig)
     plant: PlantConfig = Field(default_factory=PlantConfig)
     actuators: ServoConfig = Field(default_factory=ServoConfig)
@@ -77,7 +86,7 @@ def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -
     tree = _read_profile(profile, ())
     for override in overrides:
         _apply(tree, override)
-    _locate_logic(tree, Path.cwd())
+    _locate_files(tree, Path.cwd())
     try:
         config = LabConfig.model_validate(tree)
         load_logic(config.logic)
@@ -90,13 +99,14 @@ def load_config(profile: str = DEFAULT_PROFILE, overrides: Iterable[str] = ()) -
     return config
 
 
-def _locate_logic(tree: dict[str, Any], folder: Path) -> None:
-    """Make the paths in `[logic]`, which begin at this folder, absolute."""
-    section = tree.get("logic")
-    if isinstance(section, dict):
-        for key in LogicConfig.model_fields.keys() & section.keys():
-            if isinstance(section[key], str) and section[key]:
-                section[key] = str((folder / section[key]).resolve())
+def _locate_files(tree: dict[str, Any], folder: Path) -> None:
+    """Make the paths in `[logic]` and `[robot]`, which begin at this folder, absolute."""
+    for name, model in (("logic", LogicConfig), ("robot", RobotConfig)):
+        section: Any = tree.get(name)
+        for key in model.model_fields.keys() & section.keys() if isinstance(section, dict) else ():
+            value = section[key]
+            if isinstance(value, str) and value and (name == "logic" or value.endswith(".py")):
+                section[key] = str((folder / value).resolve())
 
 
 def settings_of(overrides: Overrides) -> tuple[str, ...]:
@@ -141,7 +151,7 @@ def base_name(profile: str) -> str:
 def _read_profile(profile: str, children: tuple[Path, ...]) -> dict[str, Any]:
     path = _find_profile(profile, children)
     tree = read_toml("profile", path)
-    _locate_logic(tree, path.parent)
+    _locate_files(tree, path.parent)
     base = tree.pop("base", None)
     if base is None:
         return tree

@@ -42,10 +42,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
 # The rooms of hil from the ground up: a room imports from itself and from floors below, a `config` also from other configs.
 FLOORS = (
     ("errors", "clock", "events", "installation"),
-    ("arguments", "world", "stm32f405"),
+    ("arguments", "own_files", "world", "stm32f405"),
     ("crazyflie",),
     ("devices",),
     ("config",),
+    ("bodies",),
     ("laboratory",),
     ("experiments", "demonstrations"),
     ("pictures", "exports"),

@@ -1,6 +1,7 @@
 """`floaty new` and `floaty policy`: folders with a control law, profile and tests, ready to fly.
 
-The first has a small law of the user's own, with experiments, the second a trained network as a law.
+The first has a small law of the user's own, with experiments, or a robot of the user's own; the second a trained network
+as a law.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 TEMPLATES = Path(__file__).parent / "project"  # NAME.in
 POLICY_TEMPLATES = Path(__file__).parent / "policy_project"
+ROBOT_TEMPLATES = Path(__file__).parent / "robot_project"
 NAMED = {"gitignore": ".gitignore"}  # files that would act on the template itself
 TOLERANCE = 1e-4  # of an action, -1..1
 ROOM = 0.9  # of the control slot: the cycles are those of one compiler, on some states
@@ -30,9 +32,12 @@ ROOM = 0.9  # of the control slot: the cycles are those of one compiler, on some
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-def new(folder: Path) -> None:
+@click.option(
+    "--robot", is_flag=True, help="A robot of your own: robot.py, its controller, profile and tests."
+)
+def new(folder: Path, robot: bool) -> None:
     """Make a project in DIR, which is new or empty: controller.py, profile.toml, experiments.py, tests, README.md."""
-    write_project("new", TEMPLATES, folder, name=project_name("new", folder))
+    write_project("new", ROBOT_TEMPLATES if robot else TEMPLATES, folder, name=project_name("new", folder))
     console.print(
         f"cd {folder}; floaty fly hover --profile profile.toml; pytest; see README.md for more",
         soft_wrap=True, markup=False,

@@ -1,22 +1,19 @@
 """The user's own experiments: in a Python file, as FILE.py:NAME, or in an installed package, as an entry point.
 
-A file is executed once per content. Modules beside it can be imported. Every error in it is one
-line that names file and line.
+Every error in a file is one line that names file and line.
 """
 
 import hashlib
 import importlib.util
-import sys
 from dataclasses import replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from types import ModuleType
 
 from hil.errors import LabError, blame, hint
 from hil.laboratory.experiment import Experiment, Source
+from hil.own_files import load_file
 
 GROUP = "floaty.experiments"
-_LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of the executed text
 
 
 def in_file(reference: str) -> Experiment:
@@ -35,38 +32,13 @@ def in_file(reference: str) -> Experiment:
 
 def in_whole_file(path: Path) -> dict[str, Experiment]:
     """Return the experiments of a file by the names of their variables. Raises `LabError` when it cannot be executed."""
-    module, digest = load_file(path)
+    module, digest = load_file("experiment", path)
     place = path.resolve()
     return {
         name: replace(value, source=Source(f"{place}:{name}", digest))
         for name, value in vars(module).items()
         if isinstance(value, Experiment)
     }
-
-
-def load_file(path: Path) -> tuple[ModuleType, str]:
-    """Return the module of a file, and the file's SHA-256. Raises `LabError` when it cannot be executed."""
-    place = path.resolve()
-    try:
-        content = place.read_bytes()
-    except OSError as error:
-        raise LabError(f"experiment {path}: {error.strerror or error}") from None
-    digest = hashlib.sha256(content).hexdigest()
-    known, module = _LOADED.get(place, ("", None))
-    if module is not None and known == digest:
-        return module, digest
-    name = f"floaty_own_{place.stem}_{hashlib.sha256(str(place).encode()).hexdigest()[:12]}"
-    module = ModuleType(name)
-    module.__file__ = str(place)
-    if str(place.parent) not in sys.path:
-        sys.path.append(str(place.parent))
-    sys.modules[name] = module  # pickled objects refer to it
-    try:
-        exec(compile(content, place, "exec"), vars(module))
-    except Exception as error:
-        raise LabError(f"experiment {path}: {blame(error)}") from error
-    _LOADED[place] = digest, module
-    return module, digest
 
 
 def entries() -> dict[str, EntryPoint]:

@@ -18,6 +18,7 @@ from firmware_py.export.usage import Usage
 from firmware_py.logic.loading import digest_of
 from firmware_py.rtos import TaskReport
 from ground_station.latency import Stage
+from hil.bodies import digest_of_body
 from hil.config import LabConfig
 from hil.devices.board_firmware import ImageReport
 from hil.errors import LabError
@@ -51,11 +52,12 @@ class Program:
     versions: Mapping[str, str]  # of the packages
     commit: str
     logic: str  # hash of the user's modules in the core, empty without
+    robot: str = ""  # hash of the file of the user's own body, empty without
 
     @classmethod
     def of(cls, config: LabConfig) -> "Program":
         """Return this program, with the modules of a configuration."""
-        return cls(versions(), commit(), digest_of(config.logic))
+        return cls(versions(), commit(), digest_of(config.logic), digest_of_body(config))
 
 
 def metadata_of(request: Request, program: Program) -> dict[str, str]:

@@ -11,11 +11,13 @@ from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cache
+from math import isfinite
 from typing import Literal
 
 import numpy as np
 
 from ground_station.mocap import MocapFrame
+from hil.bodies import make_body
 from hil.config import LabConfig, load_config
 from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, Memory, Thief, VirtualBoard, unsupported
@@ -29,7 +31,6 @@ from hil.errors import LabError
 from hil.events import EventQueue
 from hil.world.battery import Battery, open_circuit_voltage
 from hil.world.body import Body
-from hil.world.plant import Plant
 
 IMU_PERIOD_US = 1_000
 # Share of the noise in flight before the fans run; the stock firmware requires less than 100 counts squared.
@@ -103,15 +104,7 @@ class Robot:
         self.say = site.say
         self.free = False
         self.powered = True
-        self.body: Body = Plant(
-            config.geometry,
-            config.plant,
-            config.tunnel,
-            config.actuators,
-            streams.gusts,
-            self.start_W,
-            config.battery,
-        )
+        self.body: Body = make_body(config, streams.gusts, self.start_W)
         at_rest = self.body.draw(0, open_circuit_voltage(config.battery.charge))
         self.battery: Battery = Battery(config.battery, at_rest)
         self.imu: VirtualImu = VirtualImu(config.imu, streams.imu)
@@ -226,6 +219,8 @@ class Robot:
         self.body.advance(now_us)
         self.battery.draw(now_us, self.body.draw(now_us, self.battery.voltage))
         self.board.supply(self.battery.millivolts)
+        if not isfinite(self.body.state.sum()):
+            return f"the body is nowhere: p_WB = {self.body.p_WB.tolist()}, q_WB = {self.body.q_WB.tolist()}"
         return self.body.lost
 
     # Interrupts

@@ -14,7 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from ground_station.latency import STAGES
-from hil.laboratory.metrics import attitude_error, column, is_real, position_error
+from hil.laboratory.metrics import attitude_error, column, position_error
 from hil.laboratory.recorder import OPERATOR, release_of
 
 ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK, GREY = (
@@ -101,8 +101,11 @@ def _four(prefix: str) -> tuple[str, ...]:
 
 
 def _flaps(rows: pa.Table) -> NDArray[np.float64]:
-    """Return the true angles of the flaps [deg], or a real board's estimates."""
-    return np.degrees(column(rows, *_four("telemetry.flap_" if is_real(rows) else "truth.flap_")))
+    """Return the true angles of the flaps [deg], or a real board's estimates; NaN of a robot without flaps."""
+    for names in (_four("truth.flap_"), _four("telemetry.flap_")):
+        if names[0] in rows.column_names:
+            return np.degrees(column(rows, *names))
+    return np.full((rows.num_rows, 4), np.nan)
 
 
 _XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hil.world import layout as at
 from hil.world.fixed_order import atan2, compiled, exp
 from hil.world.ground import stand
-from hil.world.plates import State, drag
+from hil.world.plates import State, blow, drag, orient
 
 GRAVITY = 9.81  # [m/s2]
 
@@ -38,6 +38,19 @@ def pull(s: State) -> None:
 def evaluate(s: State) -> None:
     """Compute forces and accelerations from state, inputs and constants."""
     drag(s)
+    accelerate(s)
+
+
+@compiled
+def surround(s: State) -> None:
+    """Compute attitude and air from state and inputs."""
+    orient(s)
+    blow(s)
+
+
+@compiled
+def accelerate(s: State) -> None:
+    """Compute tether, net and accelerations, for the force and torque in DRAG."""
     pull(s)
     stand(s)
     r, f, g, m = at.R, at.DRAG, at.GROUND, s[at.MASS]
@@ -136,10 +149,28 @@ def watch(s: State) -> None:
 
 
 @compiled
-def step(s: State, draws: NDArray[np.float64], step_us: float) -> None:
-    """Advance the plant by one step with 14 unit normal `draws`; ACC and ALPHA hold for the start."""
+def gust(s: State, draws: NDArray[np.float64]) -> None:
+    """Advance the gusts by one step with 14 unit normal `draws`."""
     for i in range(14):
         s[at.GUSTS + i] = s[at.GUST_DECAY + i] * s[at.GUSTS + i] + s[at.GUST_KICK + i] * draws[i]
+
+
+@compiled
+def move(s: State, before: State, duration: State) -> None:
+    """Set the state to that `before` (13,), moved for `duration[0]` [s] with the velocities and accelerations in `s`."""
+    h = duration[0]
+    for i in range(3):
+        s[at.P + i] = before[i] + h * s[at.V + i]
+        s[at.V + i] = before[3 + i] + h * s[at.ACC + i]
+    rotate(s, before[6], before[7], before[8], before[9], h)
+    for i in range(3):
+        s[at.OMEGA + i] = before[10 + i] + h * s[at.ALPHA + i]
+
+
+@compiled
+def step(s: State, draws: NDArray[np.float64], step_us: float) -> None:
+    """Advance the plant by one step with 14 unit normal `draws`; ACC and ALPHA hold for the start."""
+    gust(s, draws)
     start_us = s[at.TIME_US]
     middle_us, end_us = start_us + 0.5 * step_us, start_us + step_us
     s[at.TIME_US] = end_us

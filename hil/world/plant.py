@@ -1,8 +1,4 @@
-"""Floaty in the tunnel, as the laboratory sees it (`hil.world.body`): time passes, pulses arrive, truth can be read.
-
-The truth lives on a grid of whole milliseconds from time 0: `advance(now_us)` does every step that ends at or before
-`now_us`. The same generator and the same calls give the same bits however the time to an instant is divided into calls.
-"""
+"""Floaty in the tunnel, as the laboratory sees it (`hil.world.body`): pulses arrive, flaps turn, plates catch the flow."""
 
 import math
 from collections.abc import Sequence
@@ -10,35 +6,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from firmware_py.compiling import bound
-from firmware_py.elementary import cos
 from hil.errors import LabError
 from hil.world import layout as at
 from hil.world.body import Channel, Quantity, Setting, Vector, View
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
 from hil.world.correction import LEVEL, Constants, OperatingPoint, calm, linearise, trim_and_correct
-from hil.world.fixed_order import normal
 from hil.world.geometry import weigh
+from hil.world.in_tunnel import UPRIGHT, InTunnel
 from hil.world.motion import advance, evaluate
 from hil.world.plates import State
 from hil.world.servos import OUTPUTS, commanded_angles, next_period_us
 from hil.world.shape import SIGNS, place_plates
 from hil.world.tunnel import Tunnel
 
-NOISE_ROWS = 2048  # steps of gusts drawn at once
 SERVOS = 4
 LOADS = BatteryConfig()
 FLAPS = tuple(f"truth.flap_{number}" for number in (1, 2, 3, 4))
 PLATES = tuple(
     f"force.{part}_{axis}" for part in ("base", "flap1", "flap2", "flap3", "flap4") for axis in "xyz"
 )
-
-LOSS_TEXTS = {
-    at.LEFT_SIDEWAYS: "left the flow: {:.2f} m from the axis",
-    at.ROSE: "left the flow: {:.2f} m above the hover point",
-    at.FELL: "fell: {:.2f} m below the hover point",
-    at.TETHER_TAUT: "tether taut, {:.2f} m below the hover point",
-    at.TUMBLED: "tumbled: tilt {:.2f} rad",
-}
 
 
 def assemble(geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig) -> tuple[State, Tunnel]:
@@ -53,17 +39,16 @@ def assemble(geometry: GeometryConfig, config: PlantConfig, tunnel: TunnelConfig
     return s, air
 
 
-class Plant:
+class Plant(InTunnel):
     """Body, servos, tether and the air around them.
 
-    Attributes (read-only numpy views of the present truth, SI):
-        truth (layout.SIZE,) everything; state (13,) p_WB, v_WB, q_WB, omega_B in one piece;
-        p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; flaps (4,) [rad] signed flap angles;
+    Attributes (read-only numpy views of the present truth, SI), besides those of `InTunnel`:
+        truth (layout.SIZE,) everything; flaps (4,) [rad] signed flap angles;
         wrench_B (6,) force [N] and torque [N m] of the flow about the centre of mass;
         zero_offset (4,) [rad] of the servos' middle, for which the board was trimmed;
-        servo_trim (4,) [rad] and servo_speed (4,), pushes (6,) force [N, W] and torque [N m, B]: the values last set;
-        specific_force_B (3,) at the centre of mass; flow_W (3,) air there; plate_forces_W (5, 3) base and four flaps as
-        isolated plates (without the identified correction, so they do not add up to the whole force).
+        servo_trim (4,) [rad] and servo_speed (4,): the values last set;
+        plate_forces_W (5, 3) base and four flaps as isolated plates (without the identified correction, so they do not add
+        up to the whole force).
     """
 
     def __init__(
@@ -80,27 +65,12 @@ class Plant:
 
         Of the battery's configuration it takes what its servos and its electronics draw.
         """
-        self.tunnel: Tunnel
-        s, self.tunnel = assemble(geometry, config, tunnel)
-        self._s, self._airspeed = s, config.airspeed
-
-        tether, ground, limits = config.tether, config.ground, config.limits
-        s[at.TETHER_ANCHOR + 2] = tunnel.hover_height + tether.anchor_height
-        s[at.TETHER_LENGTH], s[at.TETHER_STIFFNESS] = tether.length, tether.stiffness
-        s[at.TETHER_DAMPING] = tether.damping
-        s[at.NET_HEIGHT], s[at.FRICTION] = ground.height, ground.friction
-        s[at.NET_STIFFNESS], s[at.NET_DAMPING] = ground.stiffness, ground.damping
-        s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = ground.foot_spread, ground.foot_below
-        s[at.FOOT_REACH] = math.sqrt(
-            2.0 * ground.foot_spread * ground.foot_spread + ground.foot_below * ground.foot_below
-        )
-        s[at.LIMIT_RADIUS], s[at.LIMIT_BELOW], s[at.LIMIT_ABOVE] = limits.radius, limits.below, limits.above
-        s[at.LIMIT_COS_TILT] = cos(limits.tilt)
-
+        s, air = assemble(geometry, config, tunnel)
+        super().__init__(s, air, config, rng_gust)
+        self._airspeed = config.airspeed
         s[at.SERVO_TAU], s[at.SERVO_RATE], s[at.DEAD_BAND] = servos.tau, servos.rate_limit, servos.dead_band
         self.zero_offset = servos.zero_offset
         self.servo_trim, self.servo_speed = self._view(at.SERVO_TRIM, 4), self._view(at.SERVO_SPEED, 4)
-        self.pushes = self._view(at.PUSH, 6)
         self.settings = {
             f"{what}.{servo + 1}": of(servo)
             for servo in range(4)
@@ -111,34 +81,20 @@ class Plant:
         self._counts: Sequence[int] = ()
         self._commanded = (SIGNS * config.hover_angle).tolist()
         s[at.COMMAND : at.COMMAND + 4] = self._commanded
-        s[at.NEXT_US] = s[at.AFTER_US] = math.inf
-
-        self._rng = rng_gust
-        self._draws = normal(rng_gust, (NOISE_ROWS, 14))
-        self._now_us = np.zeros(1, np.int64)
-        self._due_us = 0  # until then the truth stays
         self._evaluate = bound(evaluate, s)
         self._advance = bound(advance, s, self._draws, self._now_us)
-        self.truth, self.state = self._view(0, at.SIZE), self._view(at.P, 13)
-        self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
-        self.omega_B, self.flaps = self._view(at.OMEGA, 3), self._view(at.FLAPS, 4)
-        self.specific_force_B, self.flow_W = self._view(at.SPECIFIC_FORCE, 3), self._view(at.FLOW, 3)
+        self.truth, self.flaps = self._view(0, at.SIZE), self._view(at.FLAPS, 4)
         self.acceleration_W, self.alpha_B = self._view(at.ACC, 3), self._view(at.ALPHA, 3)
         self.wrench_B = self._view(at.DRAG, 6)
         self.plate_forces_W = self._view(at.PLATE_FORCES, 15).reshape(5, 3)
         self.place(
             (0.0, 0.0, tunnel.hover_height) if p_WB is None else p_WB,
-            (1.0, 0.0, 0.0, 0.0),
+            UPRIGHT,
             flaps=self._commanded,
         )
         self._at_rest = loads.electronics_power + SERVOS * loads.servo_power  # [W]
         self._servo_energy, self._power = loads.servo_energy, self._at_rest
         self._drawn_us, self._drawn_travel = 0, self.flap_travel
-
-    def _view(self, start: int, count: int) -> View:
-        view = self._s[start : start + count]
-        view.flags.writeable = False
-        return view
 
     def place(
         self,
@@ -148,28 +104,12 @@ class Plant:
         omega_B: Vector = (0.0, 0.0, 0.0),
         flaps: Vector | None = None,
     ) -> None:
-        """Set the state of the body; `q_WB` is normalised, `flaps` None leaves them as they are. Raises LabError."""
-        s = self._s
-        length = math.sqrt(math.fsum(component * component for component in q_WB))
-        if not (
-            length > 0.0
-            and all(map(math.isfinite, (*p_WB, *q_WB, *v_WB, *omega_B, *(() if flaps is None else flaps))))
-        ):
-            raise LabError(f"cannot place the plant at p_WB = {p_WB}, q_WB = {q_WB}: not a finite pose")
-        s[at.P : at.P + 3], s[at.Q : at.Q + 4] = p_WB, np.asarray(q_WB) / length
-        s[at.V : at.V + 3], s[at.OMEGA : at.OMEGA + 3] = v_WB, omega_B
+        """Set the state of the body, and the flaps' angles [rad]; None leaves them as they are. Raises LabError."""
         if flaps is not None:
-            s[at.FLAPS : at.FLAPS + 4] = flaps
-        self._evaluate()
-
-    def advance(self, now_us: int) -> None:
-        """Bring the truth to the last whole millisecond at or before `now_us`."""
-        if now_us < self._due_us:
-            return
-        self._now_us[0] = now_us
-        while self._advance():
-            self._draws[:] = normal(self._rng, self._draws.shape)
-        self._due_us = now_us - now_us % at.STEP_US + at.STEP_US
+            if not all(map(math.isfinite, flaps)):
+                raise LabError(f"cannot place the plant with flaps = {flaps}: not finite")
+            self._s[at.FLAPS : at.FLAPS + 4] = flaps
+        super().place(p_WB, q_WB, v_WB, omega_B)
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
         """Take the counts of the four timer registers; they reach the servos at the next PWM period."""
@@ -205,35 +145,6 @@ class Plant:
             Channel("float64", lambda: self.flaps, (Quantity(FLAPS, "rad", "B"),)),
             Channel("float32", lambda: plates, (Quantity(PLATES, "N", "W"),)),
         )
-
-    @property
-    def lost(self) -> str | None:
-        """The first reason why the flight is over; None while it flies."""
-        cause = int(self._s[at.LOST])
-        if cause == 0:
-            return None
-        return LOSS_TEXTS[cause].format(self._s[at.LOST_VALUE])
-
-    def hold(self) -> None:
-        """Clamp the body where it is, at rest; flaps, air and sensors continue."""
-        s = self._s
-        s[at.HELD] = 1.0
-        s[at.V : at.V + 3] = s[at.OMEGA : at.OMEGA + 3] = 0.0
-        self._evaluate()
-
-    def put_back(self, p_WB: Vector) -> None:
-        """Clamp the body upright at a place, with all causes of a loss cleared; the flaps stay as they are."""
-        self._s[at.LOST] = 0.0
-        self.place(p_WB, (1.0, 0.0, 0.0, 0.0))
-        self.hold()
-
-    def release(self) -> None:
-        self._s[at.HELD] = 0.0
-        self._evaluate()
-
-    def push(self, force_W: Vector, torque_B: Vector = (0.0, 0.0, 0.0)) -> None:
-        """Apply a force [N, W] at the centre of mass and a torque [N m, B] until the next call."""
-        self._s[at.PUSH : at.PUSH + 3], self._s[at.PUSH_TORQUE : at.PUSH_TORQUE + 3] = force_W, torque_B
 
     def set_servo_fault(self, servo: int, trim_error: float = 0.0, speed: float = 1.0) -> None:
         """Mount servo 0..3 with an error [rad] and run it at `speed` times its pace, 0: stuck; the defaults restore it."""

@@ -27,6 +27,7 @@ from hil import (
     LabError,
     Metric,
     Request,
+    RigidBody,
     Run,
     column,
     declare,
@@ -257,7 +258,7 @@ def test_numbers_of_numpy_count_as_numbers() -> None:
 
 
 def test_every_public_name_is_called_here() -> None:
-    called = {call.function for call in CALLS} | {LabError, Request, Run, column}
+    called = {call.function for call in CALLS} | {LabError, Request, RigidBody, Run, column}
     assert {getattr(hil, name) for name in hil.__all__} <= called
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from firmware_py.geometry import from_euler_zyx, yaw_quaternion
 from hil.devices.markers import DIAMETER, marker_places
 from hil.laboratory.faults import parse
-from hil.laboratory.metrics import BOX, body, column, is_real
+from hil.laboratory.metrics import BOX, body, column
 from hil.laboratory.recorder import stored_in
 from hil.pictures import curves, scene
 from hil.pictures.viewer.track import RecordingTrack, Times, rgba
@@ -67,7 +67,7 @@ class Scene:
         known = np.isfinite(pose).all(axis=1)  # a real board may not have reported it yet
         q_GE = [from_euler_zyx(*angles) for angles in pose[known, 3:].tolist()]
         self._place("goal/estimate", times[known], pose[known, :3], np.array(q_GE).reshape(-1, 4))
-        if not is_real(rows):  # of a real flight no forces are known
+        if "force.base_x" in rows.column_names:  # of a real flight no forces are known
             origins = scene.drag_origins(self._geometry, p_WB, q_WB, flaps)
             self._add_forces(rows, p_WB, origins)
         if len(self._markers):

@@ -78,6 +78,20 @@ def test_a_folder_that_cannot_be_is_one_line_and_nothing_is_written(
 
 
 @pytest.mark.long
+def test_a_project_of_a_robot_flies_and_its_tests_pass(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, pytester: pytest.Pytester
+) -> None:
+    monkeypatch.chdir(pytester.path)
+    assert cli("new", "--robot", "ball") == 0
+    assert files_in(Path("ball")) == sorted({*FILES, "robot.py"} - {"experiments.py", "pyproject.toml"})
+    monkeypatch.chdir("ball")
+    assert cli("fly", "hover", "--profile", "profile.toml", "--duration", "3") == 0
+    assert read_result(Path("runs/hover-1")).program.robot  # the hash of the robot that flew
+    assert Path("runs/hover-1/report.html").is_file()
+    pytester.runpytest_inprocess().assert_outcomes(passed=2)
+
+
+@pytest.mark.long
 def test_a_project_flies_and_its_tests_pass(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, pytester: pytest.Pytester
 ) -> None:

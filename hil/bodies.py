@@ -1,0 +1,70 @@
+"""The bodies that can fly: those that ship, by name, and the user's own in a file (docs/tutorials/your-own-robot.md)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.config import LabConfig
+from hil.errors import LabError, blame, hint
+from hil.own_files import load_file
+from hil.world.body import Body, Vector
+from hil.world.plant import Plant
+
+Make = Callable[[LabConfig, np.random.Generator, Vector], Body]
+OWN = "Robot"  # what a file defines: a class or function that is called as a `Make`
+SIZES = {"state": 13, "p_WB": 3, "q_WB": 4, "omega_B": 3, "specific_force_B": 3, "flow_W": 3, "pushes": 6}
+PARTS = (
+    "outputs", "tunnel", "settings", "lost", "advance", "set_counts", "draw", "hold", "release", "put_back", "push",
+    "channels",
+)  # fmt: skip
+
+
+def floaty(config: LabConfig, rng_gust: np.random.Generator, p_WB: Vector) -> Body:
+    """Return a Floaty of the profile's shape."""
+    return Plant(
+        config.geometry, config.plant, config.tunnel, config.actuators, rng_gust, p_WB, config.battery
+    )
+
+
+BODIES: dict[str, Make] = {"floaty": floaty}
+
+
+def make_body(config: LabConfig, rng_gust: np.random.Generator, p_WB: Vector) -> Body:
+    """Return the body of a profile, upright and at rest at a place. Raises `LabError` when it cannot be made."""
+    name = config.robot.body
+    if name in BODIES:
+        return BODIES[name](config, rng_gust, p_WB)
+    what = f"robot.body = {name}"
+    if not name.endswith(".py"):
+        raise LabError(f"{what}: neither a body ({hint(name, BODIES)}) nor a path that ends in .py")
+    module, _ = load_file("robot.body =", Path(name))
+    make = getattr(module, OWN, None)
+    if not callable(make):
+        raise LabError(f"{what}: no {OWN} in it; expected a class {OWN}, made of RigidBody")
+    try:
+        body = make(config, rng_gust, p_WB)
+        _check(body)
+    except Exception as error:
+        raise LabError(f"{what}: {blame(error)}") from error
+    made: Body = body
+    return made
+
+
+def digest_of_body(config: LabConfig) -> str:
+    """Return the SHA-256 of the file of the user's own body; empty for one that ships."""
+    name = config.robot.body
+    return load_file("robot.body =", Path(name))[1] if name.endswith(".py") else ""
+
+
+def _check(body: Any) -> None:
+    """Raise `LabError` for what lacks a part of a body, or has arrays of other sizes."""
+    kind = type(body).__name__
+    missing = [name for name in (*SIZES, *PARTS) if not hasattr(body, name)]
+    if missing:
+        raise LabError(f"{kind} has no {', '.join(missing)}; RigidBody has them all")
+    for name, size in SIZES.items():
+        value = getattr(body, name)
+        if not (isinstance(value, np.ndarray) and value.shape == (size,) and value.dtype == np.float64):
+            raise LabError(f"{kind}.{name} = {value!r}: expected an array of {size} float64")

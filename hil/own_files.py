@@ -1,0 +1,35 @@
+"""Python files of the user's own: each is executed once per content, and modules beside it can be imported."""
+
+import hashlib
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from hil.errors import LabError, blame
+
+_LOADED: dict[Path, tuple[str, ModuleType]] = {}  # with the hash of the executed text
+
+
+def load_file(what: str, path: Path) -> tuple[ModuleType, str]:
+    """Return the module of a file, and the file's SHA-256. Raises `LabError`, which begins with `what` and the path."""
+    place = path.resolve()
+    try:
+        content = place.read_bytes()
+    except OSError as error:
+        raise LabError(f"{what} {path}: {error.strerror or error}") from None
+    digest = hashlib.sha256(content).hexdigest()
+    known, module = _LOADED.get(place, ("", None))
+    if module is not None and known == digest:
+        return module, digest
+    name = f"floaty_own_{place.stem}_{hashlib.sha256(str(place).encode()).hexdigest()[:12]}"
+    module = ModuleType(name)
+    module.__file__ = str(place)
+    if str(place.parent) not in sys.path:
+        sys.path.append(str(place.parent))
+    sys.modules[name] = module  # pickled objects refer to it
+    try:
+        exec(compile(content, place, "exec"), vars(module))
+    except Exception as error:
+        raise LabError(f"{what} {path}: {blame(error)}") from error
+    _LOADED[place] = digest, module
+    return module, digest

@@ -1,0 +1,126 @@
+"""A rigid body in the tunnel: its truth, the air around it, its holder, pushes, tether, net and limits.
+
+The truth lives on a grid of whole milliseconds from time 0: `advance(now_us)` does every step that ends at or before
+`now_us`. The same generator and the same calls give the same bits however the time to an instant is divided into calls.
+What the flow and the actuators do is up to a subclass: `hil.world.plant`, `hil.world.rigid`.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from firmware_py.elementary import cos
+from hil.errors import LabError
+from hil.world import layout as at
+from hil.world.body import Vector, View
+from hil.world.config import PlantConfig
+from hil.world.fixed_order import normal
+from hil.world.plates import State
+from hil.world.tunnel import Tunnel
+
+NOISE_ROWS = 2048  # steps of gusts drawn at once
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+LOSS_TEXTS = {
+    at.LEFT_SIDEWAYS: "left the flow: {:.2f} m from the axis",
+    at.ROSE: "left the flow: {:.2f} m above the hover point",
+    at.FELL: "fell: {:.2f} m below the hover point",
+    at.TETHER_TAUT: "tether taut, {:.2f} m below the hover point",
+    at.TUMBLED: "tumbled: tilt {:.2f} rad",
+}
+
+
+class InTunnel:
+    """The part of a body that all bodies in the tunnel share. `s` is its array, with mass and inertia in it.
+
+    Attributes (read-only numpy views of the present truth, SI): state (13,) p_WB, v_WB, q_WB, omega_B in one piece;
+    p_WB, v_WB (3,) in W; q_WB (4,) w x y z; omega_B (3,) in B; specific_force_B (3,) at the centre of mass; flow_W (3,) of
+    the air there; pushes (6,) force [N, W] and torque [N m, B] last set.
+    """
+
+    # Compute forces and accelerations from the state; do every step up to `_now_us`, True: the draws ran out before.
+    _evaluate: Callable[[], object]
+    _advance: Callable[[], bool]
+
+    def __init__(self, s: State, tunnel: Tunnel, config: PlantConfig, rng_gust: np.random.Generator) -> None:
+        self._s, self.tunnel = s, tunnel
+        tether, ground, limits = config.tether, config.ground, config.limits
+        s[at.TETHER_ANCHOR + 2] = s[at.HOVER_HEIGHT] + tether.anchor_height
+        s[at.TETHER_LENGTH], s[at.TETHER_STIFFNESS] = tether.length, tether.stiffness
+        s[at.TETHER_DAMPING] = tether.damping
+        s[at.NET_HEIGHT], s[at.FRICTION] = ground.height, ground.friction
+        s[at.NET_STIFFNESS], s[at.NET_DAMPING] = ground.stiffness, ground.damping
+        s[at.FOOT_SPREAD], s[at.FOOT_BELOW] = ground.foot_spread, ground.foot_below
+        s[at.FOOT_REACH] = math.sqrt(
+            2.0 * ground.foot_spread * ground.foot_spread + ground.foot_below * ground.foot_below
+        )
+        s[at.LIMIT_RADIUS], s[at.LIMIT_BELOW], s[at.LIMIT_ABOVE] = limits.radius, limits.below, limits.above
+        s[at.LIMIT_COS_TILT] = cos(limits.tilt)
+        s[at.NEXT_US] = s[at.AFTER_US] = math.inf
+        self._rng = rng_gust
+        self._draws = normal(rng_gust, (NOISE_ROWS, 14))
+        self._now_us = np.zeros(1, np.int64)
+        self._due_us = 0  # until then the truth stays
+        self.state, self.pushes = self._view(at.P, 13), self._view(at.PUSH, 6)
+        self.p_WB, self.v_WB, self.q_WB = self._view(at.P, 3), self._view(at.V, 3), self._view(at.Q, 4)
+        self.omega_B = self._view(at.OMEGA, 3)
+        self.specific_force_B, self.flow_W = self._view(at.SPECIFIC_FORCE, 3), self._view(at.FLOW, 3)
+
+    def _view(self, start: int, count: int) -> View:
+        view = self._s[start : start + count]
+        view.flags.writeable = False
+        return view
+
+    def place(
+        self,
+        p_WB: Vector,
+        q_WB: Vector,
+        v_WB: Vector = (0.0, 0.0, 0.0),
+        omega_B: Vector = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Set the state of the body; `q_WB` is normalised. Raises LabError for what is no pose."""
+        s = self._s
+        length = math.sqrt(math.fsum(component * component for component in q_WB))
+        if not (length > 0.0 and all(map(math.isfinite, (*p_WB, *q_WB, *v_WB, *omega_B)))):
+            raise LabError(f"cannot place the plant at p_WB = {p_WB}, q_WB = {q_WB}: not a finite pose")
+        s[at.P : at.P + 3], s[at.Q : at.Q + 4] = p_WB, np.asarray(q_WB) / length
+        s[at.V : at.V + 3], s[at.OMEGA : at.OMEGA + 3] = v_WB, omega_B
+        self._evaluate()
+
+    def advance(self, now_us: int) -> None:
+        """Bring the truth to the last whole millisecond at or before `now_us`."""
+        if now_us < self._due_us:
+            return
+        self._now_us[0] = now_us
+        while self._advance():
+            self._draws[:] = normal(self._rng, self._draws.shape)
+        self._due_us = now_us - now_us % at.STEP_US + at.STEP_US
+
+    @property
+    def lost(self) -> str | None:
+        """The first reason why the flight is over; None while it flies."""
+        cause = int(self._s[at.LOST])
+        if cause == 0:
+            return None
+        return LOSS_TEXTS[cause].format(self._s[at.LOST_VALUE])
+
+    def hold(self) -> None:
+        """Clamp the body where it is, at rest; actuators, air and sensors continue."""
+        s = self._s
+        s[at.HELD] = 1.0
+        s[at.V : at.V + 3] = s[at.OMEGA : at.OMEGA + 3] = 0.0
+        self._evaluate()
+
+    def put_back(self, p_WB: Vector) -> None:
+        """Clamp the body upright at a place, with all causes of a loss cleared; the actuators stay as they are."""
+        self._s[at.LOST] = 0.0
+        self.place(p_WB, UPRIGHT)
+        self.hold()
+
+    def release(self) -> None:
+        self._s[at.HELD] = 0.0
+        self._evaluate()
+
+    def push(self, force_W: Vector, torque_B: Vector = (0.0, 0.0, 0.0)) -> None:
+        """Apply a force [N, W] at the centre of mass and a torque [N m, B] until the next call."""
+        self._s[at.PUSH : at.PUSH + 3], self._s[at.PUSH_TORQUE : at.PUSH_TORQUE + 3] = force_W, torque_B

@@ -1,0 +1,184 @@
+"""A robot of the user's own: a rigid body whose forces a Python method computes; integration, air and holder are here.
+
+A subclass states mass and inertia and computes a wrench; it may move actuators once per millisecond. The same midpoint rule
+as Floaty's on the same grid. Elementary functions have the same bits everywhere only if they are those of
+`firmware_py.elementary`.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from firmware_py.compiling import bound
+from hil.errors import LabError, blame
+from hil.world import layout as at
+from hil.world.body import Channel, Setting, Vector
+from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
+from hil.world.in_tunnel import UPRIGHT, InTunnel
+from hil.world.motion import accelerate, gust, move, surround, watch
+from hil.world.servos import OUTPUTS
+from hil.world.tunnel import Tunnel
+
+STEP_S = at.STEP_US * 1e-6
+EXPECTED = "expected force and torque, each of three numbers"
+
+
+class World(Protocol):
+    """The sections of a profile that every body in the tunnel needs."""
+
+    @property
+    def tunnel(self) -> TunnelConfig:
+        """The flow."""
+
+    @property
+    def plant(self) -> PlantConfig:
+        """Of it: tether, ground and limits."""
+
+    @property
+    def battery(self) -> BatteryConfig:
+        """Of it: what the electronics draw."""
+
+
+class RigidBody(InTunnel):
+    """A body made of `mass` [kg], `inertia` about x, y, z of B [kg m2] and a method `wrench`.
+
+    `counts` are those of the board's four timers, of the last that were set.
+    """
+
+    mass: ClassVar[float]
+    inertia: ClassVar[tuple[float, float, float]]
+    outputs: Sequence[tuple[int, int]] = OUTPUTS
+    settings: Mapping[str, Setting] = {}
+
+    def __init__(self, world: World, rng_gust: np.random.Generator, p_WB: Vector) -> None:
+        """Start upright and at rest at a place [m]. Raises `LabError` for a subclass that is none."""
+        s = np.zeros(at.SIZE)
+        super().__init__(s, Tunnel(world.tunnel, s), world.plant, rng_gust)
+        self._check_masses()
+        s[at.MASS], s[at.INERTIA : at.INERTIA + 3] = self.mass, self.inertia
+        self.counts: tuple[int, ...] = (0, 0, 0, 0)
+        self._electronics = world.battery.electronics_power
+        self._failed: str | None = None
+        self._row = 0
+        self._before, self._duration = np.zeros(13), np.zeros(1)
+        self._draw = np.zeros(14)
+        self._surround, self._accelerate, self._watch = (
+            bound(kernel, s) for kernel in (surround, accelerate, watch)
+        )
+        self._gust, self._move = bound(gust, s, self._draw), bound(move, s, self._before, self._duration)
+        self.place(p_WB, UPRIGHT)
+        if self._failed is not None:
+            raise LabError(self._failed)
+
+    # For the subclass
+
+    def wrench(self, wind_B: list[float]) -> tuple[Vector, Vector]:
+        """Return force [N] and torque [N m] without weight, each (3,) in B; `wind_B` [m/s] is the air against the body."""
+        raise LabError(f"{type(self).__name__} has no method wrench")
+
+    def actuate(self, duration: float) -> None:
+        """Move the actuators for a millisecond, `duration` [s], towards `counts`."""
+
+    def power(self) -> float:
+        """Return what the actuators draw now [W]."""
+        return 0.0
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return what it logs besides its motion."""
+        return ()
+
+    @property
+    def time_s(self) -> float:
+        """The time of the laboratory."""
+        return 1e-6 * float(self._s[at.TIME_US])
+
+    # For the laboratory
+
+    def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
+        """Take the counts of the timers; they act from the next millisecond on."""
+        self.advance(now_us)
+        self.counts = tuple(counts)
+
+    def draw(self, now_us: int, cell_V: float) -> float:
+        """Return the power [W] of electronics and actuators."""
+        return self._electronics + self.power()
+
+    @property
+    def lost(self) -> str | None:
+        """The first reason why the flight is over, also what its own code did wrong; None while it flies."""
+        return self._failed or super().lost
+
+    def _check_masses(self) -> None:
+        for name, count in (("mass", 1), ("inertia", 3)):
+            value: Any = getattr(self, name, None)
+            numbers = list(_numbers(value)) if count > 1 else list(_numbers((value,)))
+            if len(numbers) != count or not all(0.0 < number < math.inf for number in numbers):
+                what = "a number above 0" if count == 1 else "three numbers above 0"
+                raise LabError(f"{type(self).__name__}.{name} = {value!r}: expected {what}")
+
+    def _evaluate(self) -> None:
+        """Compute air, wrench and accelerations; a wrench that is none ends the flight with the body clamped."""
+        self._surround()
+        s = self._s
+        if self._failed is None:
+            try:
+                given: Any = self.wrench(s[at.WIND : at.WIND + 3].tolist())
+            except Exception as error:
+                return self._fail(blame(error))
+            parts = list(given) if isinstance(given, tuple | list) else []
+            numbers = [number for part in parts for number in _numbers(part)]
+            if len(parts) != 2 or len(numbers) != 6:
+                return self._fail(f"{type(self).__name__}.wrench returned {given!r}: {EXPECTED}")
+            if not all(map(math.isfinite, numbers)):
+                return self._fail(
+                    f"{type(self).__name__}.wrench returned force {numbers[:3]} N, torque {numbers[3:]} N m"
+                )
+            s[at.DRAG : at.DRAG + 6] = numbers
+        self._accelerate()
+        return None
+
+    def _fail(self, why: str) -> None:
+        self._failed = f"{why} at {self.time_s:.2f} s" if self._s[at.TIME_US] else why
+        self._s[at.DRAG : at.DRAG + 6] = 0.0
+        self._s[at.HELD] = 1.0
+        self._accelerate()
+
+    def _advance(self) -> bool:
+        """Do every step that ends at or before `_now_us[0]`; return True when the draws ran out before that."""
+        s, now_us = self._s, self._now_us[0]
+        while s[at.TIME_US] + at.STEP_US <= now_us:
+            if self._row == len(self._draws):
+                self._row = 0
+                return True
+            self._draw[:] = self._draws[self._row]
+            self._row += 1
+            self._step()
+        return False
+
+    def _step(self) -> None:
+        s = self._s
+        self._gust()
+        s[at.TIME_US] += at.STEP_US
+        if self._failed is None:
+            try:
+                self.actuate(STEP_S)
+            except Exception as error:
+                self._fail(blame(error))
+        if s[at.HELD] != 0.0:
+            self._evaluate()
+            return
+        self._before[:] = self.state
+        for duration in (0.5 * STEP_S, STEP_S):
+            self._duration[0] = duration
+            self._move()
+            self._evaluate()
+        if s[at.LOST] == 0.0:
+            self._watch()
+
+
+def _numbers(part: Any) -> Iterator[float]:
+    """Yield the numbers of what should be a vector; nothing for anything else."""
+    if isinstance(part, Sequence | np.ndarray) and not isinstance(part, str):
+        yield from (float(one) for one in part if isinstance(one, int | float | np.generic))
