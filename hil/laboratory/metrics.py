@@ -204,7 +204,7 @@ def known(table: pa.Table) -> pa.Table:
     """Return the rows that have a pose and an estimate; in a real flight the cameras or the board may not report them."""
     if not is_real(table):
         return table
-    return table.filter(np.isfinite(column(table, "cameras.x") + column(table, "estimate.x")))
+    return rows_where(table, np.isfinite(column(table, "cameras.x") + column(table, "estimate.x")))
 
 
 @checked
@@ -227,10 +227,10 @@ def attitude_error(table: pa.Table) -> NDArray[np.float64]:
 
 def free_flight(table: pa.Table) -> pa.Table:
     """Return the rows after the release; of a real flight, those in which the cameras saw the robot."""
-    return _rows(table, _free(table) & (_seen(table) if is_real(table) else True))
+    return rows_where(table, _free(table) & (_seen(table) if is_real(table) else True))
 
 
-def _rows(table: pa.Table, chosen: NDArray[np.bool_]) -> pa.Table:
+def rows_where(table: pa.Table, chosen: NDArray[np.bool_]) -> pa.Table:
     """Return the rows that are chosen; when they stand together, as they mostly do, without a copy of an hour's flight."""
     numbers = np.flatnonzero(chosen)
     if len(numbers) and numbers[-1] - numbers[0] + 1 == len(numbers):
@@ -248,7 +248,7 @@ def _seen(table: pa.Table) -> NDArray[np.bool_]:
 
 def _time_seen(table: pa.Table) -> tuple[float, float]:
     """Return how long [s] the robot was seen between the release and the end, and how long it was not."""
-    free = _rows(table, _free(table))
+    free = rows_where(table, _free(table))
     times, seen = column(free, "t"), _seen(free) if is_real(table) else np.ones(free.num_rows, np.bool_)
     if (last := times[seen][-1]) >= times[-1] - UNDER_WAY_US:
         times, seen = times[times <= last], seen[times <= last]
@@ -259,7 +259,7 @@ def _time_seen(table: pa.Table) -> tuple[float, float]:
 
 def _without_control(table: pa.Table) -> tuple[float, float]:
     """Return how long [s] the supervisor was in failsafe after the release, and how long no loop was closed."""
-    free = _rows(table, _free(table))
+    free = rows_where(table, _free(table))
     times, state = column(free, "t"), column(free, "supervisor.state")
     open_loop = state != State.FLYING
     if not is_real(table):
@@ -271,7 +271,7 @@ def _without_control(table: pa.Table) -> tuple[float, float]:
 
 def _boots(table: pa.Table) -> int:
     """Return how often a board began to calibrate its gyro after the release, which it does after a reset."""
-    calibrating = column(_rows(table, _free(table)), "supervisor.state") == State.CALIBRATING
+    calibrating = column(rows_where(table, _free(table)), "supervisor.state") == State.CALIBRATING
     return int((calibrating[1:] & ~calibrating[:-1]).sum())
 
 

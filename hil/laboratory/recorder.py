@@ -7,12 +7,14 @@ metadata; the schema carries configuration, seed, versions and commit. `load_log
 
 import hashlib
 import json
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from types import ModuleType
 from typing import IO, Any, Protocol
 
@@ -37,6 +39,7 @@ if "pandas" not in sys.modules:
 
 ROWS_PER_BATCH, BATCH_US = 100, 1_000_000  # whichever is full first goes to disk
 BATCHES_PER_PIECE = 160  # of a long flight's log, written and read at once
+PIECES_IN_MEMORY = 5  # of a log that is read as a whole: some ten minutes
 ROWS_SHOWN = 20  # given to the onlooker together: five times a second
 OPERATOR = "operator"  # source of the events that an operator caused at the terminal
 RELEASE_US = b"release_us"  # in the metadata of a log whose flight was released
@@ -185,11 +188,24 @@ def load_log(folder: Path) -> pa.Table:
 
     Raises `LabError` when the folder holds no log that can be read.
     """
-    return pa.concat_tables(log_pieces(folder))
+    pieces = log_pieces(folder)
+    table = pa.concat_tables(islice(pieces, PIECES_IN_MEMORY))
+    following = next(pieces, None)
+    return table if following is None else _mapped(chain([table, following], pieces), folder)
+
+
+def _mapped(pieces: Iterator[pa.Table], folder: Path) -> pa.Table:
+    """Return a long log as one table in a file without a name, of which only the columns that are read use memory."""
+    first, place = next(pieces), folder if os.access(folder, os.W_OK) else None
+    with NamedTemporaryFile(dir=place, prefix=".", suffix=".arrow") as file:
+        with pa.ipc.new_file(file.name, first.schema) as writer:
+            for piece in chain([first], pieces):
+                writer.write_table(piece)
+        return pa.ipc.open_file(pa.memory_map(file.name)).read_all()
 
 
 def log_pieces(folder: Path) -> Iterator[pa.Table]:
-    """Yield the log in the order of time, at least one piece, each of a quarter of an hour or less; else like `load_log`."""
+    """Yield the log in the order of time, at least one piece, each of some minutes; else like `load_log`."""
     pa.default_memory_pool().release_unused()  # what was done with a long log before has left hundreds of megabytes
     if (folder / PARQUET).is_file():
         try:
@@ -251,7 +267,8 @@ def _with_release(table: pa.Table) -> pa.Table:
 def _read_stream(path: Path) -> Iterator[pa.Table]:
     """Yield the log in pieces, at least one; that of a real flight in one piece, which its corrections need."""
     try:
-        with pa.ipc.open_stream(str(path)) as reader:
+        # A mapped file would stay in memory.
+        with pa.OSFile(str(path)) as file, pa.ipc.open_stream(file) as reader:
             schema, batches = reader.schema, []
             real = "cameras.x" in schema.names
             with suppress(StopIteration, pa.ArrowInvalid, OSError):  # the end, or where a process died

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from hil.errors import LabError, writing
 from hil.experiments import find_again
-from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure
+from hil.laboratory.metrics import METRICS, SHOWN, column, free_flight, is_real, measure, rows_where
 from hil.laboratory.recorder import load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
 from hil.pictures import curves
@@ -193,7 +193,7 @@ def _judged(log: pa.Table) -> pa.Table:
     if not is_real(log) or free.num_rows == 0:
         return log
     times, (first_us, last_us) = column(log, "t"), column(free, "t")[[0, -1]]
-    return log.filter((times >= first_us - AROUND_US) & (times <= last_us + AROUND_US))
+    return rows_where(log, (times >= first_us - AROUND_US) & (times <= last_us + AROUND_US))
 
 
 def _apart(a: pa.Table, b: pa.Table) -> Iterator[Apart]:
@@ -261,7 +261,7 @@ def _up_to(run: FlownRun, end_s: float) -> Result:
     """Return the result of a flight with the metrics of its first `end_s` after the release."""
     if _flown_s(run) < end_s + ROW_S:
         return run.result
-    log = run.log.filter(since_release(run.log) < end_s + ROW_S / 2)
+    log = rows_where(run.log, since_release(run.log) < end_s + ROW_S / 2)
     metrics = measure(log, lost=False)
     experiment = run.result.request.experiment
     if experiment.is_known and (free := free_flight(log)).num_rows > 1:

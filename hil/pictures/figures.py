@@ -149,7 +149,7 @@ def _up_and_down(
     rows: pa.Table, step: int, read: Callable[[pa.Table], NDArray[np.float64]], label: str
 ) -> Panel:
     """Draw the curves of `read` on every `step`-th row, for both directions of the link."""
-    thinned = rows.take(np.arange(0, rows.num_rows, step))
+    thinned = _every(step, rows, "link.", "serial.")
     times, values = since_release(thinned)[1:], read(thinned)
     return Panel(
         label,
@@ -158,6 +158,12 @@ def _up_and_down(
             for index, name in enumerate(("up", "down"))
         ),
     )
+
+
+def _every(step: int, rows: pa.Table, *groups: str) -> pa.Table:
+    """Return `t` and groups of columns in every `step`-th row; a long log is mapped, so only these are read."""
+    names = [name for name in rows.column_names if name == "t" or name.startswith(groups)]
+    return rows.select(names).take(np.arange(0, rows.num_rows, step))
 
 
 def station(rows: pa.Table) -> Plot:
@@ -172,7 +178,7 @@ def station(rows: pa.Table) -> Plot:
 
 def board(rows: pa.Table) -> Plot:
     """Draw the load of the processor by task, and the measurement queue."""
-    load, tenths = curves.processor(rows.column_names), rows.take(np.arange(0, rows.num_rows, TENTH))
+    load, tenths = curves.processor(rows.column_names), _every(TENTH, rows, "cpu.")
     times, shares = since_release(tenths)[1:], load.read(tenths).T
     busy = [index for index, share in enumerate(shares) if share.max(initial=0.0) >= BUSY_PERCENT] or [0]
     tasks = tuple(Series(load.names[index], load.colours[index], times, shares[index]) for index in busy)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from firmware_py.wire.supervisor import State
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import spans_of
-from hil.laboratory.metrics import BOX, NEAR, attitude_error, column, free_flight, position_error
+from hil.laboratory.metrics import BOX, NEAR, attitude_error, column, free_flight, position_error, rows_where
 from hil.laboratory.recorder import release_of
 from hil.laboratory.result import Result
 from hil.pictures import curves
@@ -145,7 +145,7 @@ def close_ups(log: pa.Table, marks: Marks, passed_s: float | None = None) -> lis
     times = since_release(log)
     shown: list[CloseUp] = []
     for title, at_s, begin_s, end_s in _windows(marks, passed_s):
-        rows = log.filter((times >= begin_s) & (times <= end_s))
+        rows = rows_where(log, (times >= begin_s) & (times <= end_s))
         if rows.num_rows > 1:
             plot = embedded(_plot(rows, (begin_s, end_s)))
             figure = PageFigure(f"close-up-{len(shown) + 1}", title, "", plot=plot, alone=True, marks=marks)

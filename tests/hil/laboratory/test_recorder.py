@@ -4,10 +4,11 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from hil.errors import LabError
-from hil.laboratory.recorder import Recorder, load_events, load_log
+from hil.laboratory.recorder import BATCHES_PER_PIECE, ROWS_PER_BATCH, Recorder, load_events, load_log
 from hil.world.body import Channel, Quantity
 
 
@@ -35,6 +36,25 @@ def test_rows_survive_the_way_to_parquet(tmp_path: Path) -> None:
     assert table.column("n").to_pylist() == list(range(250))
     assert table.schema.metadata[b"seed"] == b"7"
     assert not (tmp_path / "log.arrows").exists()
+
+
+@pytest.mark.parametrize("writable", [True, False])
+def test_a_long_log_is_read_without_memory_for_all_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writable: bool
+) -> None:
+    rows = 2 * ROWS_PER_BATCH * BATCHES_PER_PIECE + 7
+    recorder = make(tmp_path, np.ones(2))
+    for row in range(rows):
+        recorder.row(row)
+    recorder.close()
+    whole, files = load_log(tmp_path), sorted(tmp_path.iterdir())
+    monkeypatch.setattr("hil.laboratory.recorder.PIECES_IN_MEMORY", 1)
+    monkeypatch.setattr("os.access", lambda path, mode: writable)
+    before = pa.total_allocated_bytes()
+    mapped = load_log(tmp_path)
+    assert pa.total_allocated_bytes() - before < whole.nbytes / 10
+    assert mapped.equals(whole, check_metadata=True)
+    assert sorted(tmp_path.iterdir()) == files
 
 
 def killed(folder: Path, lost_bytes: int = 0) -> Path:
