@@ -30,7 +30,7 @@ _forget_zero = sampling.forget_zero
 _supervise = supervisor.supervise
 _see_pose = supervisor.see_pose
 _serve = supervisor.serve
-_lose_control = supervisor.lose_control
+_watch_control = supervisor.watch_control
 _begin_flight = supervisor.begin_flight
 
 
@@ -134,9 +134,9 @@ def follow(parameters: Memory[Parameters], data: Memory[Input]) -> i32:
 
 
 @kernel
-def lose_control(supervisor: Memory[Supervisor]) -> None:
-    """Note that nobody asks for the mode any more; the next look says otherwise."""
-    _lose_control(supervisor[0])
+def watch_control(data: Memory[Input], supervisor: Memory[Supervisor]) -> i32:
+    """Notice that nobody asks for the mode any more; returns whether that is new. The next look says otherwise."""
+    return _watch_control(data[0], supervisor[0])
 
 
 @kernel

@@ -10,7 +10,7 @@ Whatever forbids it leads to the same defined flap state, the hover angles. How 
     emergency stop  by request, or because a started emergency stop watchdog was not fed for 1 s: ends only with a reboot.
                     A stop that is not locked ends with a request to recover, too
     low battery     below the limit for 5 s: ends only with a request to recover when the voltage is back above it
-    no control      nobody has asked for the mode: ends when somebody does
+    no control      nobody has asked for the mode for 50 ms: ends when somebody does
 
 Before the first pose, and while there is nothing to fly to, it waits. One outlier pose is refused by the estimator's gate
 and has no effect here. Times are counted from look to look, so that a clock that wraps does no harm.
@@ -51,6 +51,7 @@ from firmware_py.core.subset import Integer, elapsed, i32, kernel
 
 WATCHDOG_US = 1000000  # Crazyflie firmware
 BATTERY_LOW_US = 5000000  # original firmware
+CONTROL_US = 50000  # without a look the controller stands still, or another one runs in its place
 EPISODE_GAP_US = 50000  # two bounded steps no further apart belong to one episode
 EPISODE_LIMIT_US = 200000
 BOUNDS_RECOVERY_US = 500000
@@ -289,10 +290,13 @@ def serve(parameters: Parameters, data: Input, sampling: Sampling, supervisor: S
 
 
 @kernel
-def lose_control(supervisor: Supervisor) -> None:
-    """Note that nobody asks for the mode any more; the next look says otherwise."""
+def watch_control(data: Input, supervisor: Supervisor) -> i32:
+    """Notice that nobody asks for the mode any more; returns whether that is new. The next look says otherwise."""
+    if supervisor.cause == CAUSE_NO_CONTROL or since_last_look(data, supervisor) < CONTROL_US:
+        return i32(0)
     supervisor.state = i32(STATE_FAILSAFE)
     supervisor.cause = i32(CAUSE_NO_CONTROL)
+    return i32(1)
 
 
 @kernel

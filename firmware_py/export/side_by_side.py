@@ -50,7 +50,7 @@ class SideBySide:
     def __init__(self, blocks: CoreBlocks, targets: Mapping[str, RunnerFactory]) -> None:
         self.targets = [ComparedTarget(name, blocks, factory) for name, factory in targets.items()]
         self._reference = PythonRunner(blocks)
-        self._blocks = blocks
+        self.blocks = blocks
         self._inputs = blocks.inputs
         self._tick = 0
         self.reached: set[tuple[int, int]] = set()  # the supervisor's states, each with its cause
@@ -58,15 +58,15 @@ class SideBySide:
     def call(self, name: str) -> int:
         """Execute an entry point on the reference, and on every target that has not differed yet."""
         self._tick += name == "estimate"
-        taken = self._blocks.calls[name]
+        taken = self.blocks.calls[name]
         running = [target for target in self.targets if target.divergence is None]
         for target in running:
             for block in self._inputs.intersection(taken):
-                target.blocks.named[block].memory[:] = self._blocks.named[block].memory
+                target.blocks.named[block].memory[:] = self.blocks.named[block].memory
         result = self._reference.call(name)
-        supervisor = self._blocks.supervisor.fields
+        supervisor = self.blocks.supervisor.fields
         self.reached.add((int(supervisor.state), int(supervisor.cause)))
-        memories = {block: self._blocks.named[block].bytes() for block in taken}
+        memories = {block: self.blocks.named[block].bytes() for block in taken}
         for target in running:
             target.calls += 1
             try:

@@ -87,7 +87,7 @@ class Call(IntEnum):
     TAKE_SAMPLE = 5
     SUPERVISE = 6
     REQUEST = 7
-    LOSE_CONTROL = 8
+    WATCH_CONTROL = 8
     BEGIN_AFRESH = 9
     ADMITS = 10
     FOLLOW = 11

@@ -375,12 +375,20 @@ def test_a_sample_that_is_late_on_a_link_is_no_fault_of_the_gyro() -> None:
     assert bench.look() == MODE_FLY
 
 
-def test_lost_control_is_a_failsafe_until_the_next_look() -> None:
-    bench = in_flight(lambda bench: bench.fly(100_000))
-    bench.core.run.call("lose_control")
+@STARTS_US
+def test_control_is_lost_once_after_50_ms_without_a_look_and_until_the_next_one(start_us: int) -> None:
+    bench = in_flight(lambda bench: bench.fly(990_000), start_us)
     supervisor = bench.core.supervisor.fields
-    assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.NO_CONTROL)
-    assert bench.fly(10_000) == MODE_FLY
+    for _ in range(2):
+        assert [bench.watch_control(after_us) for after_us in (49_999, 50_000, 70_000)] == [0, 1, 0]
+        assert (supervisor.state, supervisor.cause) == (State.FAILSAFE, Cause.NO_CONTROL)
+        assert bench.fly(10_000) == MODE_FLY
+
+
+def test_nobody_misses_a_controller_that_has_not_begun() -> None:
+    bench = SupervisorBench(look=False)
+    assert bench.watch_control(1_000_000) == 0
+    assert bench.view.state is State.CALIBRATING
 
 
 def test_a_flight_that_begins_afresh_waits_for_gyro_and_pose_and_is_not_armed_by_it() -> None:

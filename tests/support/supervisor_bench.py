@@ -14,7 +14,7 @@ FULL_MV = 3900
 class SupervisorBench:
     """A board that has just booted at an instant; `view` is what the rest of the firmware sees."""
 
-    def __init__(self, now_us: int = 0, runner: RunnerFactory = PythonRunner) -> None:
+    def __init__(self, now_us: int = 0, runner: RunnerFactory = PythonRunner, look: bool = True) -> None:
         self.core = CoreBlocks(parameters_of(load_config()), runner)
         self.core.run.call("reset")
         for _ in range(20):  # until a pose can belong to the past
@@ -25,7 +25,8 @@ class SupervisorBench:
         self.now_us = now_us
         self.data.battery_mv = FULL_MV
         self.gyro = 0
-        self.look()
+        if look:
+            self.look()
 
     @property
     def found(self) -> tuple[State, Cause]:
@@ -36,6 +37,11 @@ class SupervisorBench:
         self.now_us += after_us
         self.view.look(self.now_us)
         return int(self.data.mode)
+
+    def watch_control(self, after_us: int) -> int:
+        """Return whether somebody who looks after the controller finds, some time from now, that it is newly lost."""
+        self.data.now_us = wrapped(self.now_us + after_us)
+        return self.core.run.call("watch_control")
 
     def calibrate(self) -> None:
         """Hold the robot still for as long as its gyro needs."""

@@ -271,7 +271,7 @@ int main(void) {
         calls += floaty_core_supervise(&parameters, &data, &estimator, &sampling, &supervisor);
         calls += floaty_core_request(&parameters, &data, &sampling, &supervisor);
         calls += floaty_core_admits(&parameters, &data) + floaty_core_follow(&parameters, &data);
-        floaty_core_lose_control(&supervisor);
+        calls += floaty_core_watch_control(&data, &supervisor);
         floaty_core_begin_afresh(&data, &sampling, &supervisor);
         floaty_core_control(&parameters, &data, &estimator, &control);
     }

@@ -55,7 +55,6 @@ volatile bool floaty_requests[FLOATY_REQUEST_FEED];
 
 static logVarId_t gyro_raw[3];
 static bool gyro_found;
-static bool holding;    /* in this step the flight stands still */
 static bool controlled; /* in this step the controller runs */
 
 /* In ordinary memory: the macros of static_mem.h would put it into CCM, which is full. */
@@ -98,7 +97,7 @@ int32_t floaty_pose_clock_us(void) {
   return (int32_t)((uint32_t)usecTimestamp() - floaty_hil_held * STEP_US);
 }
 
-static int32_t loop_us(void) {
+int32_t floaty_loop_us(void) {
   return (int32_t)((xTaskGetTickCount() - floaty_hil_held) * STEP_US);
 }
 
@@ -115,7 +114,7 @@ static void hand_pose_to_core(const FloatyPose *pose) {
   memcpy(floaty_input.pose_quaternion, pose->quaternion, sizeof floaty_input.pose_quaternion);
   floaty_input.pose_age_us = pose->age_us;
   floaty_input.pose_waited_us = (int32_t)((uint32_t)floaty_pose_clock_us() - (uint32_t)pose->arrival_us);
-  floaty_input.now_us = loop_us();
+  floaty_input.now_us = floaty_loop_us();
   call_file_pose();
 }
 
@@ -198,8 +197,8 @@ void estimatorOutOfTree(state_t *state, const stabilizerStep_t stabilizerStep) {
   if (floaty_hil_switched()) {
     begin_afresh();
   }
-  holding = floaty_hil_holds();
-  if (holding) {
+  controlled = false;
+  if (floaty_hil_holds()) {
     return;
   }
   if (asked(FLOATY_RESET)) {
@@ -259,13 +258,11 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
   (void)sensors;
   (void)state;
   memset(control, 0, sizeof *control); /* no motors */
-  floaty_input.now_us = loop_us();
+  floaty_input.now_us = floaty_loop_us();
   serve_requests();
   read_setpoint(setpoint);
   floaty_observed.followed = call_follow();
-  if (holding) {
-    floaty_observed.controlled_tick = xTaskGetTickCount(); /* nothing is wrong with the loop */
-  } else if (controlled) {
+  if (controlled) {
     floaty_input.connected = crtpIsConnected();
     call_supervise();
     call_control();
@@ -273,7 +270,6 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
       floaty_servos_write(floaty_control.count);
     }
     floaty_hil_tell(true);
-    floaty_observed.controlled_tick = xTaskGetTickCount();
   }
   if (stabilizerStep % BATTERY_STEPS == 0) {
     floaty_input.battery_mv = (int32_t)(1000.0f * pmGetBatteryVoltage());

@@ -18,11 +18,10 @@ typedef struct {
 
 /* What the app observes itself. */
 typedef struct {
-  volatile int32_t followed;         /* what became of the stock commander's last set-point, FLOATY_SETPOINT_... */
-  volatile uint32_t controlled_tick; /* of the last controller step; 0: none yet, and the servos are at hover */
-  uint32_t malformed;     /* packets on the pose channels that no one could read */
-  uint32_t overflows;     /* poses that a newer one drove out of the full queue */
-  uint32_t stale_hovers;  /* times no controller step came and the servos were put to hover */
+  volatile int32_t followed; /* what became of the stock commander's last set-point, FLOATY_SETPOINT_... */
+  uint32_t malformed;        /* packets on the pose channels that no one could read */
+  uint32_t overflows;        /* poses that a newer one drove out of the full queue */
+  uint32_t stale_hovers;     /* times nobody controlled and the servos were put to hover */
 } FloatyObserved;
 
 extern FloatyParameters floaty_parameters;
@@ -43,6 +42,9 @@ void floaty_begin(void);
 
 /* floaty_app.c: the raw counts of the board's own gyro, zero where there is none that is known. */
 void floaty_gyro(int32_t counts[3]);
+
+/* floaty_app.c: the clock of the loop [us]; it wraps, and stands still while the flight does. */
+int32_t floaty_loop_us(void);
 
 /* floaty_app.c: the clock by which poses arrive [us]; it wraps. */
 int32_t floaty_pose_clock_us(void);

@@ -30,8 +30,7 @@
 #include "floaty_settings.h"
 
 #define POSE_SIZE (1 + 7 * sizeof(float))
-#define STALE_MS 50 /* without a controller step: servos to hover */
-#define LOOK_MS 20  /* how often the task looks at that */
+#define LOOK_MS 20 /* how often the task looks whether the controller runs */
 #define POSE_LINE_MS 10000 /* between lines about poses that are refused */
 #define SELF_TEST_MS 100
 #define SELF_TEST_LOOKS 50 /* 5 s; the self-test ends 2.4 s after a reset, later with decks */
@@ -106,16 +105,11 @@ static void announce_poses(void) {
   refused = count;
 }
 
-/* A loop that stands still, or a controller that is not Floaty's. */
+/* A loop that stands still, or a controller that is not Floaty's: this task alone would notice. */
 static void watch_control(void) {
-  static bool stale;
-  const TickType_t controlled = floaty_observed.controlled_tick;
-  if (controlled == 0 || xTaskGetTickCount() - controlled < M2T(STALE_MS)) {
-    stale = false;
-  } else if (!stale) {
-    stale = true;
+  floaty_input.now_us = floaty_loop_us();
+  if (call_watch_control()) {
     floaty_observed.stale_hovers += 1;
-    call_lose_control();
     floaty_hover();
   }
 }
