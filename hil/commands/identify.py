@@ -122,7 +122,10 @@ def _print_constants(found: "Identification") -> None:
 @seed_option
 @click.option("--board", metavar="BOARD", default="python", show_default=True, help="As for `floaty fly`.")
 @click.option(
-    "--out", type=folder_type, metavar="FILE.toml", help="A profile with the gains; of rounds, the best one."
+    "--out",
+    type=folder_type,
+    metavar="FILE.toml",
+    help="A profile with the gains; of rounds, of the last one that gained.",
 )
 @click.option(
     "--runs", type=folder_type, default=Path("runs/tune"), show_default=True, metavar="DIR", help="Of all flights."
@@ -166,7 +169,7 @@ def tune(
                 if repeat is not None:
                     console.print(f"round {number}")
                 _print_round(one)
-                if best is None or one.rms < best.rms:
+                if best is None or one.better:
                     best = one
         except LabError as error:
             if best is None:

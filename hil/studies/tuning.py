@@ -34,7 +34,7 @@ HOVER_S = 60.0
 EXCITATIONS = tuple(f"identify-u{number}" for number in range(1, 5))
 FLOWN = 3  # of the worst robots
 FACTOR_MAX = 4.0  # of plant.constant_factors
-BETTER = 0.95  # of the last round's rms, or it is the last
+BETTER = 0.95  # of the old gains' rms, or the round is the last
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,13 +178,13 @@ class Round:
 
     @property
     def better(self) -> bool:
-        """Whether the new gains hover no worse than the old ones."""
+        """Whether the new gains hover no worse than the old ones, with the same model on board and in the same wind."""
         return rms(self.flown[0]) <= rms(self.tuned.before)
 
     @property
-    def rms(self) -> float:
-        """The rms of the better gains, for the profile's robot."""
-        return min(rms(self.flown[0]), rms(self.tuned.before))
+    def worth_another(self) -> bool:
+        """Whether the new gains hover so much better than the old ones that another round may gain more."""
+        return rms(self.flown[0]) <= BETTER * rms(self.tuned.before)
 
     @property
     def profile(self) -> str:
@@ -202,11 +202,10 @@ def fly_round(profile: str, flights: TuningFlights, count: int) -> Round:
 
 
 def rounds(profile: str, flights: TuningFlights, count: int, most: int) -> Iterator[Round]:
-    """Yield rounds of excitation, identification and tuning, `most` of them or until one is no better than the last.
+    """Yield rounds of excitation, identification and tuning, `most` of them or until new gains are hardly better.
 
     Raises `LabError` when a robot is lost, or nothing is identified.
     """
-    last = float("inf")
     for number in range(1, most + 1):
         folder = flights.folder / f"round-{number}"
         own = replace(flights, folder=folder, seed=flights.seed + 10 * (number - 1))
@@ -221,6 +220,6 @@ def rounds(profile: str, flights: TuningFlights, count: int, most: int) -> Itera
         yield one
         if one.flown[0].outcome != "completed":
             raise LabError(f"round {number} ends: the new gains lose the robot: {one.flown[0].error}")
-        if one.rms > BETTER * last:
+        if not one.worth_another:
             return
-        last, profile = one.rms, one.profile
+        profile = one.profile

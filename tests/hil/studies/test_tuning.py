@@ -3,16 +3,20 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hil.campaigns.jobs import Job, Row
 from hil.config import load_config
 from hil.design.axes import ROLL, gains_in, robot_of
 from hil.design.loop import FREQUENCIES, Timing, build
 from hil.design.tune import Flow, GainTask, judged, refuse_late
 from hil.errors import LabError
+from hil.laboratory.request import Options
 from hil.laboratory.robot import Streams
+from hil.studies.tuning import Round
 from hil.world.plant import Plant
 from support.command import Cli
 
@@ -53,6 +57,29 @@ def test_a_loop_that_bears_less_delay_than_the_link_has_is_refused_with_both_num
         match=f"roll, y tolerates {1e3 * least:.1f} ms of delay, and poses arrive up to 100.0 ms later",
     ):
         refuse_late([one], 0.1)
+
+
+def hovered(rms_m: float, outcome: str = "completed") -> Row:
+    metrics = {"rms_x": rms_m, "rms_y": 0.0, "rms_z": 0.0}
+    return Row(Job(0, "hover", Options(), {}), outcome, "", True, "", metrics, {})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "better", "another"),
+    [
+        (hovered(0.02), hovered(0.018), True, True),
+        (hovered(0.02), hovered(0.0195), True, False),
+        (hovered(0.02), hovered(0.021), False, False),
+        (hovered(0.02), hovered(0.01, "lost"), False, False),
+    ],
+)
+def test_new_gains_are_judged_beside_the_old_ones_on_the_same_model(
+    old: Row, new: Row, better: bool, another: bool
+) -> None:
+    tuned = SimpleNamespace(before=old)
+    one = Round(tuned, (new,), "given.toml", Path("tuned.toml"))  # type: ignore[arg-type]
+    assert (one.better, one.worth_another) == (better, another)
+    assert one.profile == ("tuned.toml" if better else "given.toml")
 
 
 @pytest.mark.long
