@@ -226,6 +226,16 @@ class Run:
         """The files of the run by their names: log.parquet, events.jsonl, telemetry.csv, result.json, …"""
         return Known("file", {path.name: path for path in sorted(self.folder.iterdir())})
 
+    @checked
+    def plot(self, *columns: str) -> Any:
+        """Return a matplotlib figure of columns of the log, one axis per unit; of errors and flaps if none is named.
+
+        The flight's faults and events are marked as in the report. Raises `LabError` for a column that the log lacks.
+        """
+        from hil.pictures.drawing import plotted
+
+        return plotted(self.log, columns)
+
     def write_report(self) -> Path:
         """Write `report.html` with all figures, and return its path."""
         from hil.pictures.report import write_report  # loads matplotlib

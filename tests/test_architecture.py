@@ -68,6 +68,7 @@ CONFINED: dict[str, tuple[str, ...]] = {
     "rerun": ("hil/pictures/viewer/",),
     "foxglove": ("hil/exports/mcap.py", "hil/live/foxglove_server.py"),
     "gymnasium": ("hil/learn/",),
+    "av": ("hil/pictures/video.py",),
     "youplot": ("hil/pictures/pages.py",),
     "time": (
         "hil/clock.py", "hil/commands/listing.py",

@@ -1,4 +1,4 @@
-"""Make the documentation's pictures anew: python tools/pictures.py [NAME.png ...]; all of them without a name.
+"""Make the documentation's pictures anew: python tools/pictures.py [NAME ...]; all of them without a name.
 
 Each is made from a flight that is flown for it. Needs chromium for the report, rerun and Xvfb for the scenes, and a
 cfclient (FLOATY_CFCLIENT names the Python that has it) for its window; what is missing is said, and the picture stays as
@@ -75,8 +75,9 @@ def scene(run: Path, at_s: float, out: Path) -> None:
 
 
 def hover(out: Path) -> None:
-    floaty("fly hover --duration 10 --fault push.y@4=1.5 --fault mocap.dropout@7.5=1 --out run")
-    scene(Path("run"), 4.35, out)
+    floaty("fly hover --duration 6 --fault push.y@2=2 --out run")
+    floaty("export run --gif")
+    shutil.copy(Path("run") / "flight.gif", out)
 
 
 def markers(out: Path) -> None:
@@ -136,7 +137,7 @@ def served(*options: str) -> Iterator[None]:
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {
-    "hover-rerun.png": hover,
+    "hover.gif": hover,
     "markers.png": markers,
     "report.png": report,
     "latency-study.png": latency,

@@ -47,10 +47,12 @@ def report(run: Path) -> None:
 @click.option(
     "--tlog", "as_tlog", is_flag=True, help="flight.tlog: MAVLink, for ground stations and pymavlink."
 )
-def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool) -> None:
-    """Write the log of RUN, a run folder, in other formats, beside it."""
-    if not (as_csv or as_mcap or as_tlog):
-        raise LabError(f"export {run}: no format given: --csv, --mcap, --tlog")
+@click.option("--video", "as_video", is_flag=True, help="flight.mp4: scene and curves, 30 frames per second.")
+@click.option("--gif", "as_gif", is_flag=True, help="flight.gif: the same for a page; at most a minute.")
+def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool, as_video: bool, as_gif: bool) -> None:
+    """Write RUN, a run folder, in other formats, beside its log."""
+    if not (as_csv or as_mcap or as_tlog or as_video or as_gif):
+        raise LabError(f"export {run}: no format given: --csv, --mcap, --tlog, --video, --gif")
     if as_csv:
         from hil.exports.wide_csv import write_csv
 
@@ -63,3 +65,11 @@ def export(run: Path, as_csv: bool, as_mcap: bool, as_tlog: bool) -> None:
         from hil.exports.tlog import write_tlog
 
         console.print(f"  {write_tlog(run)}", soft_wrap=True)
+    if as_video:
+        from hil.pictures.video import write_video
+
+        console.print(f"  {write_video(run)}", soft_wrap=True)
+    if as_gif:
+        from hil.pictures.video import write_gif
+
+        console.print(f"  {write_gif(run)}", soft_wrap=True)

@@ -13,8 +13,21 @@ import pyarrow as pa
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hil.pictures.curves import BLUE, GREY, PINK, RED, YELLOW
-from hil.pictures.panels import INK, Marks, Panel, Plot, marks_of_flight
+from hil.laboratory.metrics import column
+from hil.pictures import panels
+from hil.pictures.curves import (
+    ATTITUDE,
+    BLUE,
+    FLAPS,
+    GREY,
+    PINK,
+    POSITION,
+    RED,
+    SERIES_COLOURS,
+    YELLOW,
+    since_release,
+)
+from hil.pictures.panels import INK, Marks, Panel, Plot, Series, marks_of_flight
 
 MARK_LENGTH = 28  # letters
 WIDTH, DPI = 9.2, 115  # [in], 1/in
@@ -44,6 +57,21 @@ def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
             made = figure_of(made, marks_of_flight(flights[0]) if flights else Marks())
         made.savefig(file, format="png", dpi=DPI)
     return file.getvalue()
+
+
+def plotted(log: pa.Table, names: Sequence[str]) -> Figure:
+    """Return a figure of columns of a log, a panel for each unit; without names, of errors and flaps."""
+    shown = ((POSITION, "position error"), (ATTITUDE, "attitude error"), (FLAPS, "flaps"))
+    times, by_unit = since_release(log), dict[str, list[Series]]()
+    for index, name in enumerate(names):
+        values = column(log, name)  # raises for a name that the log lacks
+        unit = (log.schema.field(name).metadata or {}).get(b"unit", b"").decode()
+        line = Series(name, SERIES_COLOURS[index % len(SERIES_COLOURS)], times, values)
+        by_unit.setdefault(unit, []).append(line)
+    chosen = [Panel(f"[{unit or '1'}]", tuple(lines), height=2.2) for unit, lines in by_unit.items()]
+    standard = [panels.panel(curve, log, label, height=1.9) for curve, label in shown] if not names else []
+    with matplotlib.rc_context(STYLE):
+        return figure_of(Plot((*chosen, *standard)), marks_of_flight(log))
 
 
 def figure_of(plot: Plot, marks: Marks) -> Figure:

@@ -1,5 +1,6 @@
 """The story of a flight, which its report begins with: what failed, and what happened when, in seconds from the release;
-and close-ups of what happened around each fault, around the first limit passed, and in the last seconds before a loss.
+and close-ups of what happened around each fault, around the first limit passed, and in the last seconds before a loss,
+with sentences on the robot, the board's belief, its poses and its flaps, which only state what was recorded.
 """
 
 import math
@@ -14,13 +15,22 @@ from numpy.typing import NDArray
 from firmware_py.wire.supervisor import State
 from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import spans_of
-from hil.laboratory.metrics import BOX, NEAR, attitude_error, column, free_flight, position_error, rows_where
-from hil.laboratory.recorder import release_of
+from hil.laboratory.metrics import (
+    BOX,
+    NEAR,
+    attitude_error,
+    column,
+    free_flight,
+    is_real,
+    position_error,
+    rows_where,
+)
+from hil.laboratory.recorder import release_of, stored_in
 from hil.laboratory.result import Result
 from hil.pictures import curves
-from hil.pictures.curves import since_release
-from hil.pictures.evidence import evidence
+from hil.pictures.curves import Curves, since_release
 from hil.pictures.figures import lanes_of_states, without_a_pose
+from hil.pictures.monitor import REFUSALS
 from hil.pictures.pages import PageFigure, embedded
 from hil.pictures.panels import Marks, Panel, Plot, Series, Spell, panel, saturated
 
@@ -196,7 +206,7 @@ def _plot(rows: pa.Table, window_s: tuple[float, float]) -> Plot:
     )
 
 
-def _with(curve: curves.Curves, other: curves.Curves, name: str, rows: pa.Table, label: str) -> Panel:
+def _with(curve: Curves, other: Curves, name: str, rows: pa.Table, label: str) -> Panel:
     """Return a panel of curves, with others dashed in the same colours; the first of those names them."""
     times, values = since_release(rows), other.read(rows)
     dashed = (
@@ -205,3 +215,73 @@ def _with(curve: curves.Curves, other: curves.Curves, name: str, rows: pa.Table,
     )
     drawn = panel(curve, rows, label)
     return replace(drawn, series=(*drawn.series, *dashed))
+
+
+GAP_MS = 50.0  # without a fused pose: worth a sentence
+FAR_DEG = 10.0  # of a flap from its command, for longer than a servo needs
+FAR_S = 0.1
+OUTWARDS = np.array([1.0, -1.0, 1.0, -1.0])  # the sign of an opening flap's angle
+
+
+def evidence(rows: pa.Table) -> list[str]:
+    """Return sentences about rows of a log; none about fewer than two."""
+    return [*_robot(rows), *_belief(rows), *_poses(rows), *_flaps(rows)] if rows.num_rows > 1 else []
+
+
+def _robot(rows: pa.Table) -> Iterator[str]:
+    seen = "In truth" if not is_real(rows) else "By the cameras"
+    far, turned = _largest(curves.POSITION, rows), _largest(curves.ATTITUDE, rows)
+    if far and turned:
+        yield f"{seen} the robot was up to {far} away from its goal, and {turned} from its attitude."
+
+
+def _belief(rows: pa.Table) -> Iterator[str]:
+    off, tilted = _largest(curves.POSITION_MISS, rows), _largest(curves.ATTITUDE_MISS, rows)
+    if off and tilted:
+        yield f"The board's estimate was up to {off} and {tilted} wrong."
+    begins, names = curves.changes(rows, curves.SUPERVISOR)
+    since = begins * 1e-6 + since_release(rows)[0] - column(rows, "t")[0] * 1e-6
+    if len(names) == 1:
+        yield f"Its supervisor: {names[0]} all the time."
+    else:
+        yield f"Its supervisor: {', '.join(f'{n} from {t:.2f} s' for n, t in zip(names, since, strict=True))}."
+
+
+def _poses(rows: pa.Table) -> Iterator[str]:
+    if curves.SINCE_FUSION.needs in rows.column_names:
+        gaps = curves.since_fusion(rows)[:, 0]
+        if np.isfinite(gaps).any() and (longest := float(np.nanmax(gaps))) > GAP_MS:
+            end_s = since_release(rows)[np.nanargmax(gaps)]
+            yield f"It fused no pose for {longest:.0f} ms, from {end_s - 1e-3 * longest:.2f} s on."
+    for text, names in REFUSALS.items():
+        known = [name for name in names if name in rows.column_names]
+        count = sum(float(np.ptp(column(rows, name))) for name in known)
+        if count > 0:
+            yield f"{text.capitalize()}: {count:.0f} times."
+
+
+def _flaps(rows: pa.Table) -> Iterator[str]:
+    hover = stored_in(rows.schema.metadata, "config").get("allocation", {}).get("hover_angle")
+    if curves.FLAPS_COMMAND.needs not in rows.column_names or is_real(rows) or hover is None:
+        return
+    angles, times = curves.FLAPS.read(rows), since_release(rows)
+    away = np.abs(angles - curves.FLAPS_COMMAND.read(rows))
+    deviations = column(rows, *(f"estimate.flap_{flap}" for flap in (1, 2, 3, 4)))
+    believed = np.degrees(OUTWARDS * hover + deviations)
+    for flap in range(4):
+        if (away[:, flap] > FAR_DEG).mean() * (times[-1] - times[0]) > FAR_S:
+            row = int(np.argmax(np.abs(angles - believed)[:, flap]))
+            yield (
+                f"Flap {flap + 1} was up to {away[:, flap].max():.0f} deg away from its command: at {times[row]:.2f} s it "
+                f"stood at {angles[row, flap]:.0f} deg, and the board believed {believed[row, flap]:.0f} deg."
+            )
+
+
+def _largest(curve: Curves, rows: pa.Table) -> str:
+    """Return the largest value with its axis and instant; empty where nothing is known."""
+    values: NDArray[np.float64] = np.abs(curve.read(rows))
+    if not np.isfinite(values).any():
+        return ""
+    row, axis = np.unravel_index(np.nanargmax(values), values.shape)
+    at_s = since_release(rows)[row]
+    return f"{values[row, axis]:.1f} {curve.unit} ({curve.names[axis]}, at {at_s:.2f} s)"

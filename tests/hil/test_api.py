@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -166,3 +167,31 @@ def test_an_own_metric_has_its_unit_and_a_value_also_where_it_was_not_measured()
     assert run.unit_of("tilt") == "rad"
     assert load_run(run.folder).unit_of("tilt") == "rad"
     assert load_run(run.folder).experiment is None
+
+
+def test_the_notebook_flies_sweeps_and_plots() -> None:
+    cells = json.loads((PAGE.parents[1] / "tutorials" / "fly-sweep-plot.ipynb").read_text(encoding="utf-8"))[
+        "cells"
+    ]
+    names: dict[str, Any] = {}
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    moved_cm = names["moved_cm"]
+    assert moved_cm == sorted(moved_cm), "the harder the push, the farther"
+    assert moved_cm[-1] > 10 > moved_cm[0]
+    (line, _) = names["figure"].axes[0].lines
+    assert line.get_ydata() == pytest.approx(moved_cm)
+
+
+def test_a_plot_has_one_axis_per_unit_and_refuses_what_the_log_lacks() -> None:
+    run = fly("hover", duration_s=0.5)
+    position, speed = run.plot("truth.y", "truth.vy", "goal.y").axes
+    assert [line.get_label() for line in position.lines[:2]] == ["truth.y", "goal.y"]
+    assert position.lines[0].get_ydata() == pytest.approx(run.log.column("truth.y").to_numpy())
+    assert speed.get_ylabel() == "[m/s]"
+    assert [axes.get_ylabel() for axes in run.plot().axes] == [
+        "position error [cm]", "attitude error [deg]", "flaps [deg]",
+    ]  # fmt: skip
+    with pytest.raises(LabError, match=r"column 'truth\.yy': the log has none"):
+        run.plot("truth.yy")

@@ -182,4 +182,4 @@ def test_the_command_writes_what_was_asked_for_and_asks_when_nothing_was(cli: Cl
     assert {path.name for path in folder.glob("flight.*")} == {"flight.csv", "flight.tlog"}
     assert cli("export", folder, "--mcap") == 0
     assert (folder / "flight.mcap").is_file()
-    assert "--csv, --mcap, --tlog" in cli.refusal("export", folder)
+    assert "--csv, --mcap, --tlog, --video, --gif" in cli.refusal("export", folder)

@@ -14,9 +14,8 @@ from hil.laboratory.request import Request
 from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.pictures.curves import since_release
-from hil.pictures.evidence import evidence
 from hil.pictures.figures import course_of, goal_moves
-from hil.pictures.story import failures_of
+from hil.pictures.story import evidence, failures_of
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,74 @@
+"""The animation of a flight: 30 frames per second, the robot where it was, the curves up to each instant."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from hil.config import load_config
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.metrics import free_flight
+from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
+from hil.pictures import video
+from support.command import Cli
+
+av = pytest.importorskip("av")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("video") / "run"
+    fly(Request.of(EXPERIMENTS["yaw-step"], duration_s=1.0), folder)
+    return folder
+
+
+def test_video_and_gif_last_as_long_as_the_flight_at_30_frames_per_second(folder: Path, cli: Cli) -> None:
+    assert cli("export", folder, "--video", "--gif") == 0
+    with av.open(str(folder / "flight.mp4")) as file:
+        (stream,) = file.streams.video
+        assert stream.average_rate == 30
+        pictures = [frame.to_image() for frame in file.decode(stream)]
+    assert len(pictures) == 30
+    assert pictures[0].size == (880, 440)
+    with Image.open(folder / "flight.gif") as picture:
+        assert picture.n_frames == 30
+        lengths = []
+        for frame in range(30):
+            picture.seek(frame)
+            lengths.append(picture.info["duration"])
+    assert sum(lengths) == 1000
+
+
+def test_each_frame_shows_the_robot_of_its_instant_and_the_curves_up_to_it(folder: Path) -> None:
+    pictures = [np.asarray(picture).astype(int) for picture in video.frames(load_log(folder))]
+    scenes = [picture[:, : video.SIDE] for picture in pictures]
+    assert all((np.abs(a - b).max(axis=2) > 40).any() for a, b in pairwise(scenes))
+    ink = [(picture[:, video.SIDE :].min(axis=2) < 100).sum() for picture in pictures]
+    assert ink[0] < ink[15] < ink[-1]
+
+
+def test_the_robot_has_its_plates_where_the_geometry_has_them() -> None:
+    geometry = load_config().geometry
+    still = np.array([1.0, 0.0, 0.0, 0.0])
+    shown = video.faces(geometry, np.zeros(4), np.array([1.0, 2.0, 3.0]), still)
+    corners = np.concatenate([corners for corners, _ in shown])
+    assert np.ptp(corners[:, :2], axis=0) == pytest.approx([geometry.footprint] * 2, rel=0.06)
+    assert corners[:, :2].mean(axis=0) == pytest.approx([1.0, 2.0], abs=1e-6)
+    assert len({colour for _, colour in shown}) == 5
+
+
+def test_a_flight_that_never_began_or_is_too_long_for_a_gif_is_one_line(
+    folder: Path, cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = load_log(folder)
+    rows = log.num_rows - free_flight(log).num_rows
+    (tmp_path / "held").mkdir()
+    pq.write_table(log.slice(0, rows), tmp_path / "held" / "log.parquet")
+    assert "never began" in cli.refusal("export", tmp_path / "held", "--video")
+    monkeypatch.setattr(video, "GIF_MOST", 20)
+    assert "1 s: a GIF holds at most 0 s; use --video" in cli.refusal("export", folder, "--gif")
