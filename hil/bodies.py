@@ -8,16 +8,16 @@ import numpy as np
 
 from hil.config import LabConfig
 from hil.errors import LabError, blame, hint
+from hil.floaty.plant import Plant
 from hil.own_files import load_file
 from hil.world.body import Body, Vector
-from hil.world.plant import Plant
 
 Make = Callable[[LabConfig, np.random.Generator, Vector], Body]
 OWN = "Robot"  # what a file defines: a class or function that is called as a `Make`
 SIZES = {"state": 13, "p_WB": 3, "q_WB": 4, "omega_B": 3, "specific_force_B": 3, "flow_W": 3, "pushes": 6}
 PARTS = (
-    "outputs", "tunnel", "settings", "lost", "advance", "set_counts", "draw", "hold", "release", "put_back", "push",
-    "channels",
+    "outputs", "tunnel", "settings", "look", "markers", "lost", "advance", "set_counts", "draw", "hold", "release",
+    "put_back", "push", "channels",
 )  # fmt: skip
 
 

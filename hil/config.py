@@ -23,9 +23,9 @@ from hil.arguments import shown
 from hil.crazyflie.config import RadioConfig
 from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, SerialConfig
 from hil.errors import LabError, hint
+from hil.floaty.geometry import check
+from hil.floaty.shape import check_hover
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.geometry import check
-from hil.world.shape import check_hover
 
 DEFAULT_PROFILE = "floaty"
 Overrides = Sequence[str] | Mapping[str, Any]  # "section.key=value", or the values by "section.key"

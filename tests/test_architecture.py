@@ -41,9 +41,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
 
 # The rooms of hil from the ground up: a room imports from itself and from floors below, a `config` also from other configs.
 FLOORS = (
-    ("errors", "clock", "events", "installation"),
+    ("errors", "clock", "events", "installation", "scene"),
     ("arguments", "own_files", "world", "stm32f405"),
-    ("crazyflie",),
+    ("crazyflie", "floaty"),
     ("devices",),
     ("config",),
     ("bodies",),
@@ -249,7 +249,7 @@ def test_file_keeps_to_its_room(path: Path) -> None:
         ("ground_station/station.py", "from firmware_py.firmware import Firmware"),
         ("ground_station/tracker.py", "from firmware_py.core import maths"),
         ("hil/laboratory/robot.py", "from firmware_py.core import entry"),
-        ("hil/world/plant.py", "from hil.devices.imu import VirtualImu"),
+        ("hil/floaty/plant.py", "from hil.devices.imu import VirtualImu"),
         ("hil/laboratory/flight.py", "from hil.experiments import EXPERIMENTS"),
         ("hil/pictures/report.py", "import hil.servers.server"),
         ("hil/campaigns/run.py", "from distributed import Client"),
@@ -264,8 +264,8 @@ def test_file_keeps_to_its_room(path: Path) -> None:
         ("hil/devices/imu.py", "from numpy.random import default_rng"),
         ("hil/devices/markers.py", "import numpy as np\nx = np.cos(1.0)"),
         ("ground_station/trajectory.py", "from math import sin"),
-        ("hil/world/shape.py", "x = AXIS @ vector"),
-        ("hil/world/correction.py", "import numpy as np\nx = np.polynomial.polynomial.polyfit(a, b, 3)"),
+        ("hil/floaty/shape.py", "x = AXIS @ vector"),
+        ("hil/floaty/correction.py", "import numpy as np\nx = np.polynomial.polynomial.polyfit(a, b, 3)"),
         ("hil/devices/cameras.py", "x = rng.standard_normal(3)"),
     ],
 )

@@ -37,11 +37,11 @@ from firmware_py.fast import STALE, STATE
 from hil.commands.app import COMMANDS
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
+from hil.floaty.plant import Plant
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.recorder import Recorder
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
-from hil.world.plant import Plant
 
 ROOT = Path(__file__).parent.parent
 FLIGHT_S = 30.0

@@ -18,11 +18,11 @@ from rich.table import Table
 
 from hil.campaigns.run import Runner
 from hil.errors import LabError
+from hil.floaty.paper_table import PAPER_TABLE
 from hil.identify.identify import IDENTIFIED, IdentifiedConstant, identify
 from hil.identify.record import load_record
 from hil.laboratory.request import Options
 from hil.studies.tuning import EXCITATIONS
-from hil.world.paper_table import PAPER_TABLE
 
 FIRST_SEED = 1001  # nothing was developed on these
 UNTOUCHED = ("z_vz",)  # follows from the plate's physics

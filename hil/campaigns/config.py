@@ -15,8 +15,8 @@ from pydantic_core import ErrorDetails
 
 from hil.config import DEFAULT_PROFILE, read_toml
 from hil.errors import LabError, hint
+from hil.floaty.paper_table import PAPER_TABLE
 from hil.world.config import ConstantName
-from hil.world.paper_table import PAPER_TABLE
 
 Value = bool | int | float | str
 Sampling = Literal["random", "sobol", "latin", "saltelli", "morris"]

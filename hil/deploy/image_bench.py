@@ -22,8 +22,8 @@ from hil.devices.image_firmware import ChipImage, ImageFirmware
 from hil.devices.imu import VirtualImu
 from hil.errors import LabError
 from hil.events import EventQueue
+from hil.floaty.plant import Plant
 from hil.laboratory.robot import BENCH_NOISE, Streams
-from hil.world.plant import Plant
 
 STEP_US = 1_000
 ANSWER_US = 200_000  # within which a client gets the answer to a write

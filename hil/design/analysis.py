@@ -13,11 +13,11 @@ from hil.design.authority import QUANTITIES, attainable, pressure_at, single, wr
 from hil.design.claims import Claim, claims, robot_lines
 from hil.design.linear import calm_plates
 from hil.design.sweeps import Point, authorities, hover_angles, scaling, stability
+from hil.floaty.shape import SIGNS
 from hil.pictures.drawing import png
 from hil.pictures.pages import PageFigure, data_uri, write_page
 from hil.world import layout as at
 from hil.world.motion import evaluate
-from hil.world.shape import SIGNS
 
 CHECKED = 200  # openings at which plant and plate equations are compared
 

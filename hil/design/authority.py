@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.design.linear import Linear
+from hil.floaty.geometry import axis_of, weigh
+from hil.floaty.shape import MIRRORS, MIX, SIGNS, flap_plates
 from hil.world.config import GeometryConfig
-from hil.world.geometry import axis_of, weigh
 from hil.world.motion import GRAVITY
-from hil.world.shape import MIRRORS, MIX, SIGNS, flap_plates
 
 GRID = 11  # openings of each flap between its limits
 LEVEL_SHARE = 0.02  # of the weight: within it the lift counts as holding the height

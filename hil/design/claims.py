@@ -25,8 +25,8 @@ from hil.design.sweeps import (
     updrafts,
 )
 from hil.design.trim import balanced, changed
-from hil.world.geometry import weigh
-from hil.world.paper_table import PAPER_TABLE
+from hil.floaty.geometry import weigh
+from hil.floaty.paper_table import PAPER_TABLE
 
 AGREES, DIFFERS, NOTHING = "agrees", "differs", "no value"
 ROUGHLY = 0.15  # relative deviation that "approximately" still covers

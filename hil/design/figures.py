@@ -12,11 +12,13 @@ from scipy.spatial import ConvexHull
 
 from hil.design.authority import QUANTITIES, Attainable
 from hil.design.sweeps import FACTORS, HEIGHTS, KINKS, OPENINGS, HoverAngles, Law, Point, Stability
+from hil.floaty.drawing import look_of
+from hil.floaty.geometry import weigh
+from hil.floaty.shape import SIGNS
 from hil.pictures import scene
 from hil.pictures.curves import (
     AXIS_COLOURS,
     BLUE,
-    FLAP_COLOURS,
     GREEN,
     GREY,
     ORANGE,
@@ -25,8 +27,7 @@ from hil.pictures.curves import (
     SERIES_COLOURS,
 )
 from hil.pictures.drawing import WIDTH
-from hil.world.geometry import weigh
-from hil.world.shape import SIGNS
+from hil.world.config import GroundConfig
 
 COLOURS = dict(zip(QUANTITIES, (*AXIS_COLOURS, ORANGE), strict=True))
 PAPER_BAND_DEG = (20.0, 25.0)
@@ -37,13 +38,12 @@ def shape(point: Point) -> Figure:
     """Draw the robot at its hover: from above, along x and along y."""
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     height = weigh(point.geometry).axis_height
-    base = scene.base_mesh(point.geometry)
-    parts = [(base.vertices[base.triangles] + (0.0, 0.0, height), GREY)]
-    for flap, axis in enumerate(scene.flap_axes(point.geometry)):
-        mesh = scene.flap_mesh(point.geometry, flap)
-        q = scene.turn_quaternion(axis, np.array([SIGNS[flap] * point.opening]))
-        turned = scene.rotated(q, mesh.vertices) + np.array([0.0, 0.0, height])
-        parts.append((turned[mesh.triangles], FLAP_COLOURS[flap]))
+    parts = []
+    for part in look_of(point.geometry, GroundConfig()).parts:
+        opening = SIGNS[int(part.label) - 1] * point.opening if part.label else 0.0
+        q = scene.turn_quaternion(np.array(part.axis), np.array([opening]))
+        turned = scene.rotated(q, part.triangles.reshape(-1, 3)) + np.array(part.place)
+        parts.append((turned.reshape(-1, 3, 3), part.colour if part.label else GREY))
     views = (("from above", 1, 0), ("along x: roll", 1, 2), ("along y: pitch", 0, 2))
     for axes, (title, across, up) in zip(figure.subplots(1, 3), views, strict=True):
         for triangles, colour in parts:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.design.axes import ANGLE, AXES, FLAP, NUISANCES, PITCH, RATE, ROLL, VELOCITY, Axis, Matrix
+from hil.floaty.correction import DIFFERENCE, Constants, accelerations, calm, slope
+from hil.floaty.plant import assemble
 from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
-from hil.world.correction import DIFFERENCE, Constants, accelerations, calm, slope
-from hil.world.plant import assemble
 from hil.world.plates import State
 
 CAUSES = ("vx", "vy", "vz", "qx", "qy", "qz", "ox", "oy", "oz", "u1", "u2", "u3", "u4")

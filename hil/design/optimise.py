@@ -18,7 +18,7 @@ from hil.design.axes import PITCH, ROLL
 from hil.design.sweeps import RESERVE, Point, authorities
 from hil.design.trim import balanced, changed, opening_at, speed_at
 from hil.errors import LabError
-from hil.world.geometry import weigh
+from hil.floaty.geometry import weigh
 
 BOUNDS = {  # shares of the footprint, except the kink
     "kink": (0.0, math.radians(80.0)), "height": (0.0, 0.5), "base": (0.15, 0.5), "strip": (0.02, 0.2),

@@ -12,9 +12,9 @@ from hil.design.authority import QUANTITIES, authority, reach
 from hil.design.axes import ROLL
 from hil.design.linear import Linear, linear, stiffness
 from hil.design.trim import balanced, changed, coefficient_of, scaled, speed_at
+from hil.floaty.geometry import weigh
+from hil.floaty.shape import AIR_DENSITY
 from hil.world.config import GeometryConfig
-from hil.world.geometry import weigh
-from hil.world.shape import AIR_DENSITY
 
 KINKS = np.radians(np.arange(0.0, 90.1, 3.75))
 HEIGHTS = np.arange(0.0, 0.1201, 0.015)  # [m] of the flap axes above the centre of mass

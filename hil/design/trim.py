@@ -11,9 +11,9 @@ import numpy as np
 
 from hil.config import LabConfig
 from hil.errors import LabError
+from hil.floaty.geometry import weigh
+from hil.floaty.shape import drag_coefficient
 from hil.world.config import GeometryConfig
-from hil.world.geometry import weigh
-from hil.world.shape import drag_coefficient
 
 OPENINGS = np.radians(np.arange(-20.0, 75.5, 2.5))  # searched for a trim
 

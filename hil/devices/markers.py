@@ -1,11 +1,6 @@
 """Eight reflective markers on the robot, and which of them the cameras around the tunnel see.
 
-The places of the real robot's markers are not published; here they sit on rigid parts, which excludes the flaps: four
-on the flap axes, which do not move when the flaps turn, two on posts over the base plate, two on the frame below.
-No two arms are alike, so that no other assignment of labels fits (the closest misses by 19 mm, test_markers.py), any
-three markers are far from one line, and they spread far enough for both noise figures of `[mocap]` to come out of one:
-1.1 mm per marker and axis makes 0.4 mm and 0.004 rad of the pose. `hil.devices.rigid_body` makes points and poses of
-what is seen.
+The robot's body says where they are. `hil.devices.rigid_body` makes points and poses of what is seen.
 """
 
 import math
@@ -17,16 +12,14 @@ from numpy.typing import NDArray
 from firmware_py.elementary import cos, sin
 from firmware_py.geometry import Quaternion, Vector
 from hil.devices.config import MARKERS, MarkersConfig
-from hil.world.config import GeometryConfig, GroundConfig
+from hil.scene import Markers, Points
 from hil.world.fixed_order import product
-from hil.world.geometry import weigh
 
 COUNT = MARKERS
 DIAMETER = 0.014  # [m]; chosen, a common size
 TRUNK_RADIUS = 0.03  # [m] of the parts around the centre of mass: batteries and boards; chosen
 TRUNK_AREA = TRUNK_RADIUS * TRUNK_RADIUS  # [m2]
 
-Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 NO_POINTS: Points = np.zeros((0, 3))
 
@@ -53,32 +46,13 @@ class Sighting:
         return self.ghosts if self.pose else np.vstack((self.points[self.seen], self.ghosts))
 
 
-def marker_places(geometry: GeometryConfig, ground: GroundConfig) -> Points:
-    """Return the markers' places in B, (8, 3) [m]."""
-    corner, base, axis = geometry.footprint / 2, geometry.base_side, weigh(geometry).axis_height
-    spread, below = ground.foot_spread, ground.foot_below
-    return np.array(
-        [
-            (1.00 * corner, -1.00 * corner, axis),  # on the axes of flaps 1 to 4
-            (0.85 * corner, 0.85 * corner, axis),
-            (-0.95 * corner, 0.95 * corner, axis),
-            (-0.70 * corner, -0.70 * corner, axis),
-            (0.375 * base, 0.0, axis + 0.02),  # on posts over the base plate
-            (-0.375 * base, 0.25 * base, axis + 0.06),
-            (spread, 0.0, -0.4 * below),  # on the frame that holds batteries and feet
-            (-0.5 * spread, -spread, -below),
-        ]
-    )
-
-
 class Cameras:
     """The cameras' places, and what the robot itself hides from them.
 
-    Base plate and flaps are one flat square for that, whatever the flap angles; the parts below them are a ball around the
-    centre of mass. A marker is placed when enough cameras have it in sight.
+    That is one flat square, and a ball around the centre of mass. A marker is placed when enough cameras have it in sight.
     """
 
-    def __init__(self, config: MarkersConfig, geometry: GeometryConfig, ground: GroundConfig) -> None:
+    def __init__(self, config: MarkersConfig, markers: Markers) -> None:
         azimuths = [2.0 * math.pi * camera / config.cameras for camera in range(config.cameras)]
         self._p_WC = np.array(
             [
@@ -87,9 +61,8 @@ class Cameras:
             ]
         )
         self._needed = config.min_cameras
-        self._plate_height = weigh(geometry).axis_height
-        self._plate_half = geometry.footprint / 2
-        self._places = marker_places(geometry, ground)
+        self._plate_height, self._plate_half = markers.plate_height, markers.plate_half
+        self._places = markers.places
         self._squares = (self._places**2).sum(axis=1)[:, None]
         self._over_plate = self._places[:, 2:] - self._plate_height
 

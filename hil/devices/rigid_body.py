@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from firmware_py.geometry import Quaternion, Vector, rotation_matrix
 from hil.devices.config import MarkersConfig
-from hil.devices.markers import COUNT, NO_POINTS, Cameras, Mask, Points, Sighting, marker_places
-from hil.world.config import GeometryConfig, GroundConfig
+from hil.devices.markers import COUNT, NO_POINTS, Cameras, Mask, Sighting
+from hil.scene import Markers, Points
 from hil.world.fixed_order import eigen, normal, product
 
 NOISE_ROWS = 512  # exposures of noise drawn at once
@@ -94,13 +94,12 @@ class VirtualMarkers:
     def __init__(
         self,
         config: MarkersConfig,
-        geometry: GeometryConfig,
-        ground: GroundConfig,
+        markers: Markers,
         rng: np.random.Generator,
     ) -> None:
         self._config = config
-        self._cameras = Cameras(config, geometry, ground)
-        self._places = marker_places(geometry, ground)
+        self._cameras = Cameras(config, markers)
+        self._places = markers.places
         self._body = RigidBody(self._places)
         self._rng = rng
         self._rng_labels, self._rng_ghosts = rng.spawn(2)
@@ -161,10 +160,8 @@ class VirtualMarkers:
         return labels
 
 
-def make_markers(
-    config: MarkersConfig, geometry: GeometryConfig, ground: GroundConfig, rng: np.random.Generator
-) -> VirtualMarkers | None:
+def make_markers(config: MarkersConfig, markers: Markers, rng: np.random.Generator) -> VirtualMarkers | None:
     """Return the markers on a robot; None when they are not enabled."""
     if not config.enabled:
         return None
-    return VirtualMarkers(config, geometry, ground, rng)
+    return VirtualMarkers(config, markers, rng)

@@ -11,12 +11,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from firmware_py.wire.supervisor import Cause, State
+from hil.floaty.geometry import weigh
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import stored_in
 from hil.world.battery import endurance
 from hil.world.config import BatteryConfig, GeometryConfig
-from hil.world.geometry import weigh
 
 if TYPE_CHECKING:
     import pyarrow as pa

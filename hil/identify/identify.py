@@ -17,15 +17,15 @@ import numpy as np
 
 from hil.design.axes import AXES
 from hil.errors import LabError
+from hil.floaty.correction import OperatingPoint
+from hil.floaty.paper_table import PAPER_TABLE
+from hil.floaty.plant import Plant
 from hil.identify.joint import Estimate, Excited, excited_axes, instrumental, joint
 from hil.identify.plates import turns_of
 from hil.identify.record import Record
 from hil.identify.response import DELAY, LAG, UNIT
 from hil.identify.two_controllers import two_controllers
 from hil.laboratory.robot import Streams
-from hil.world.correction import OperatingPoint
-from hil.world.paper_table import PAPER_TABLE
-from hil.world.plant import Plant
 
 IDENTIFIED, WEAK, UNKNOWN = "identified", "weak", "not identifiable"
 NARROW, KNOWN = 0.25, 0.7  # half width of the interval over the value

@@ -15,11 +15,11 @@ from scipy.signal import lfilter
 
 from firmware_py.geometry import from_euler_zyx
 from hil.config import LabConfig
+from hil.floaty.plant import Plant
+from hil.floaty.shape import MIX, SIGNS
 from hil.identify.record import Array, Record
 from hil.laboratory.robot import Streams
 from hil.world.motion import GRAVITY
-from hil.world.plant import Plant
-from hil.world.shape import MIX, SIGNS
 
 # Inputs that act as the plates do, and the axis of B about which they turn; the identified pitch and height act otherwise.
 BENT = {0: 0, 2: 2}

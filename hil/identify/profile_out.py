@@ -13,11 +13,11 @@ import numpy as np
 from hil.config import base_name, load_config
 from hil.design.axes import AXES, NUISANCES
 from hil.errors import LabError, writing
+from hil.floaty.shape import MIX
 from hil.identify.identify import UNKNOWN, Identification
 from hil.identify.response import DELAY, LAG
 from hil.identify.robots import write_known
 from hil.world.servos import WORDS_PER_RADIAN
-from hil.world.shape import MIX
 
 TRIM_LEAST = 0.005  # [rad] least mean input for which a trim is written
 

@@ -17,9 +17,9 @@ from firmware_py.wire.supervisor import State
 from ground_station.telemetry_log import POSE_COLUMNS, TELEMETRY, TIME_COLUMN
 from hil.config import LabConfig, load_config
 from hil.errors import LabError
+from hil.floaty.shape import MIX, SIGNS
 from hil.laboratory.recorder import load_log, release_of
 from hil.laboratory.result import read_result
-from hil.world.shape import MIX, SIGNS
 
 Array = NDArray[np.float64]
 BOARD_COLUMN = "board.t [ms]"

@@ -16,6 +16,7 @@ from ground_station.clock import clock_us
 from ground_station.mocap import MocapFrame
 from ground_station.program import Cockpit
 from ground_station.telemetry_log import TELEMETRY
+from hil.bodies import make_body
 from hil.errors import LabError, writing
 from hil.laboratory.ages import STATION_START, ages_of, reported_ages
 from hil.laboratory.channels import station_channels
@@ -24,6 +25,7 @@ from hil.laboratory.metrics import check_limits, free_flight, judge, measure
 from hil.laboratory.recorder import Onlooker, Recorder, load_log
 from hil.laboratory.request import Request
 from hil.laboratory.result import Outcome, Program, Result, metadata_of, with_resets, write_result
+from hil.laboratory.robot import Streams
 from hil.world.config import LimitsConfig
 
 
@@ -57,6 +59,8 @@ class RealFlight:
         self._now_us = self._next_us = 0
         self._is_free = False  # the row that is being recorded belongs to what is judged
         self._whole = False  # all of it was flown
+        body = make_body(request.config, Streams.of_seed(0).gusts, request.config.flight.home)
+        self._look_of_robot = body.look
         self._lost: str | None = None
         self._state: int | None = None  # the supervisor's
         self._broken = False  # nothing can be written any more
@@ -91,7 +95,7 @@ class RealFlight:
 
     def _begin(self, cockpit: Cockpit) -> None:
         metadata = {
-            **metadata_of(self._request, self._program),
+            **metadata_of(self._request, self._program, self._look_of_robot),
             STATION_START.decode(): str(self._start_us),
         }
         channels = station_channels(

@@ -27,6 +27,7 @@ from hil.laboratory.experiment import unknown
 from hil.laboratory.metrics import Figure, Metric, Verdict, measure
 from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.request import Find, Request, StoredRequest
+from hil.scene import Look
 
 RESULT = "result.json"
 PARTS = ("request", "program", "experiment", "bench")  # whose own parts stand beside the others in the file
@@ -60,12 +61,13 @@ class Program:
         return cls(versions(), commit(), digest_of(config.logic), digest_of_body(config))
 
 
-def metadata_of(request: Request, program: Program) -> dict[str, str]:
-    """Return the origin of a flight as text for its log's schema."""
+def metadata_of(request: Request, program: Program, look: Look) -> dict[str, str]:
+    """Return the origin of a flight and the look of its robot as text for its log's schema."""
     return {
         "request": json.dumps(request.stored()),
         "program": json.dumps(asdict(program)),
         "config": request.config.model_dump_json(),
+        "look": json.dumps(look.stored()),
     }
 
 

@@ -111,7 +111,7 @@ class Robot:
         self.mocap = VirtualMocap(
             config.mocap,
             streams.mocap,
-            make_markers(config.markers, config.geometry, config.plant.ground, streams.markers),
+            make_markers(config.markers, self.body.markers, streams.markers),
         )
         self.air, self.uart = ports.air, ports.uart
         self.executor = site.executor

@@ -66,7 +66,9 @@ def fly(
             raise
         drop_older(folder)
         program = Program.of(request.config)
-        recorder = Recorder(folder, flight.channels(), metadata_of(request, program), onlooker)
+        recorder = Recorder(
+            folder, flight.channels(), metadata_of(request, program, flight.robot.body.look), onlooker
+        )
         pace, loaded = Pace(), False
 
         def on_progress(now_us: int) -> None:

@@ -24,11 +24,11 @@ from firmware_py.core.observation import ACTIONS, act, observe
 from firmware_py.core.servo import drive_servos
 from firmware_py.core.structs import ATTITUDE, FLAP, RATE, Control, Estimator
 from hil.config import LabConfig
+from hil.floaty.plant import Plant
 from hil.learn.tasks import PUSH_S, PUSHES, Episode
 from hil.world import layout as at
 from hil.world.fixed_order import SOURCES, atan2, exp, normal, sine_ahead
 from hil.world.motion import evaluate, step
-from hil.world.plant import Plant
 from hil.world.servos import MIDDLE_COUNTS, PERIOD_COUNTS, RAD_PER_COUNT, TIMER_MHZ
 
 CONTROL_US = 10_000

@@ -29,6 +29,7 @@ from hil.campaigns.sampling import draw
 from hil.config import DEFAULT_PROFILE, Overrides, load_config, settings_of
 from hil.devices.board_firmware import PythonBoard
 from hil.errors import LabError
+from hil.floaty.plant import Plant
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.faults import Fault
 from hil.laboratory.flight import Flight
@@ -46,7 +47,6 @@ from hil.learn.batch import (
     tilt_of,
 )
 from hil.learn.tasks import AXES, PUSH_KINDS, PUSH_S, Episode, Task, draw_episode, find_task
-from hil.world.plant import Plant
 
 Fidelity = Literal["fast", "firmware"]
 JUST_BEFORE_US = 1  # a step ends so long before the controller acts, after the estimator

@@ -4,7 +4,7 @@ Pillow draws the robot, its goal and both paths, from above and beside, as the v
 curves once, of which each frame shows the part up to its instant.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, cycle
 from pathlib import Path
 
@@ -24,8 +24,7 @@ from hil.pictures import curves, scene
 from hil.pictures.curves import since_release
 from hil.pictures.drawing import STYLE, figure_of
 from hil.pictures.panels import Plot, marks_of_flight, panel
-from hil.world.config import GeometryConfig
-from hil.world.geometry import weigh
+from hil.scene import Look, Part, Points
 
 VIDEO, GIF = "flight.mp4", "flight.gif"
 FRAMES_HZ = 30
@@ -38,9 +37,6 @@ TRAIL_S = 4.0
 EYE = np.array([0.75, -0.62, 0.42])  # [m] from the middle of the scene
 ZOOM = 3.3  # width of what lies as far away as the middle, as a share of that distance
 SKY, INK, GOAL, PATH, TIME = (14, 18, 22), (136, 153, 170), (213, 94, 0), (255, 255, 255), (60, 60, 60)
-BASE = "#c8ccd0"
-
-Points = NDArray[np.float64]
 
 
 def write_video(run: Path) -> Path:
@@ -97,17 +93,15 @@ def frames(log: pa.Table) -> Iterator[Image.Image]:
         yield whole
 
 
-def faces(geometry: GeometryConfig, flaps: Points, p_WB: Points, q_WB: Points) -> list[tuple[Points, str]]:
-    """Return the robot's triangles (3, 3) in W with their colours, for flap angles (4,) and a pose."""
-    height = np.array([0.0, 0.0, weigh(geometry).axis_height])
-    parts = [(scene.base_mesh(geometry), np.array([1.0, 0.0, 0.0, 0.0]), BASE)]
-    for flap, (axis, colour) in enumerate(zip(scene.flap_axes(geometry), curves.FLAP_COLOURS, strict=True)):
-        turn = scene.turn_quaternion(axis, flaps[flap : flap + 1])[0]
-        parts.append((scene.flap_mesh(geometry, flap), turn, colour))
+def faces(
+    parts: Sequence[Part], turns: Sequence[Points], p_WB: Points, q_WB: Points
+) -> list[tuple[Points, str]]:
+    """Return the triangles (3, 3) in W of parts that are turned in B by quaternions (4,), with their colours, at a pose."""
     shown = []
-    for mesh, q_BF, colour in parts:
-        corners = p_WB + scene.rotated(q_WB[None], height + scene.rotated(q_BF[None], mesh.vertices))
-        shown += [(corners[triangle], colour) for triangle in mesh.triangles]
+    for part, q_BF in zip(parts, turns, strict=True):
+        corners_B = np.array(part.place) + scene.rotated(q_BF[None], part.triangles.reshape(-1, 3))
+        corners = p_WB + scene.rotated(q_WB[None], corners_B)
+        shown += [(triangle, part.colour) for triangle in corners.reshape(-1, 3, 3)]
     return shown
 
 
@@ -115,11 +109,9 @@ class _Scene:
     """Draws the robot at a row of a flight, its path, its goal with the box, and the goal's path."""
 
     def __init__(self, flight: pa.Table) -> None:
-        self._geometry = GeometryConfig.model_validate(
-            stored_in(flight.schema.metadata, "config").get("geometry", {})
-        )
+        self._robot = Look.read(stored_in(flight.schema.metadata, "look"))
+        self._turns = [scene.turn_of(part, flight) for part in self._robot.parts]
         self._p_WB, self._q_WB = body(flight, "x", "y", "z"), body(flight, "qw", "qx", "qy", "qz")
-        self._flaps = np.radians(curves.FLAPS.read(flight))
         self._goal, self._yaw = column(flight, "goal.x", "goal.y", "goal.z"), column(flight, "goal.yaw")
         self._times = since_release(flight)
         middle = self._goal.mean(axis=0)
@@ -135,15 +127,16 @@ class _Scene:
         self._line(draw, self._goal[:: FRAMES_HZ // 6], GOAL, 1)
         wanted = [
             *scene.box_lines(BOX),
-            *scene.outline(self._geometry),
+            *self._robot.outline,
             np.array([(0.0, 0.0, 0.0), (0.16, 0.0, 0.0)]),
         ]
         for line in wanted:
             self._line(draw, goal + scene.rotated(q_WG, line), GOAL, 1)
         begin = int(np.searchsorted(self._times, self._times[row] - TRAIL_S))
         self._line(draw, self._p_WB[begin : row + 1 : 3], PATH, 2)
-        plates = faces(self._geometry, self._flaps[row], self._p_WB[row], self._q_WB[row])
-        placed = [(*self._seen(corners), colour) for corners, colour in plates]
+        turns = [turn[row] for turn in self._turns]
+        surfaces = faces(self._robot.parts, turns, self._p_WB[row], self._q_WB[row])
+        placed = [(*self._seen(corners), colour) for corners, colour in surfaces]
         for points, _, colour in sorted(placed, key=lambda one: -one[1].mean()):
             draw.polygon([*map(tuple, points.tolist())], fill=colour)
         return picture.resize((SIDE, HEIGHT), Image.Resampling.BOX)

@@ -35,8 +35,9 @@ from ground_station.sources.natnet import (
 )
 from ground_station.sources.natnet_reader import Version
 from hil.clock import Readers
-from hil.devices.markers import DIAMETER, NO_POINTS, Points, Sighting
+from hil.devices.markers import DIAMETER, NO_POINTS, Sighting
 from hil.errors import LabError
+from hil.scene import Points
 from hil.servers.dongle_server import HOST
 from hil.servers.natnet_bytes import encode_frame, encode_models, encode_server_info
 

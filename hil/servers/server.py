@@ -14,7 +14,7 @@ from hil.config import LabConfig
 from hil.crazyflie.nrf51 import Power
 from hil.devices.board_firmware import Executor
 from hil.devices.dongle import VirtualDongle
-from hil.devices.markers import NO_POINTS, marker_places
+from hil.devices.markers import NO_POINTS
 from hil.errors import LabError
 from hil.laboratory.channels import (
     battery_channel,
@@ -80,11 +80,7 @@ class Ends:
     def serve_motive(self, settings: Streaming) -> VirtualMotive:
         """Let Motive see every robot, under its number."""
         names = {robot.number: name_of(robot.number) for robot in self.robots}
-        markers = (
-            marker_places(self._config.geometry, self._config.plant.ground)
-            if self._config.markers.enabled
-            else NO_POINTS
-        )
+        markers = self.robots[0].robot.body.markers.places if self._config.markers.enabled else NO_POINTS
         self.motive = VirtualMotive(settings, names, self._readers, markers)
         for served in self.robots:
             served.robot.seen_by(partial(self.motive.take, served.number))

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from hil.config import LabConfig
 from hil.design.authority import pressure_at, wrenches
+from hil.floaty.plant import Plant
+from hil.floaty.shape import SIGNS
 from hil.laboratory.robot import Streams
 from hil.world.fixed_order import normal
 from hil.world.layout import STEP_US
-from hil.world.plant import Plant
-from hil.world.shape import SIGNS
 
 Wrench = NDArray[np.float64]  # (6,): force [N] and torque [N m] in B
 

@@ -18,6 +18,7 @@ from hil.design.margins import peak_of
 from hil.design.profile import changes, toml_text
 from hil.design.tune import GainTask, TunedAxis, by_regulator, design, judged, refuse_late
 from hil.errors import LabError, writing
+from hil.floaty.plant import Plant
 from hil.identify.flow import flow_of
 from hil.identify.identify import identify
 from hil.identify.profile_out import write_profile
@@ -28,7 +29,6 @@ from hil.laboratory.result import read_result
 from hil.laboratory.robot import Streams
 from hil.studies.study_run import distance
 from hil.world.config import ConstantName
-from hil.world.plant import Plant
 
 HOVER_S = 60.0
 EXCITATIONS = tuple(f"identify-u{number}" for number in range(1, 5))

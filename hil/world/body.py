@@ -1,6 +1,6 @@
 """A robot's body as the laboratory knows it: timer outputs in; motion, air, supply power, loss and log columns out.
 
-Floaty (`hil.world.plant`) is one of them. SI units; frames W (world, z up) and B (body, x forward, y left, z up, origin at
+Floaty (`hil.floaty.plant`) is one of them. SI units; frames W (world, z up) and B (body, x forward, y left, z up, origin at
 the centre of mass). Instants are the laboratory's, in whole microseconds.
 """
 
@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.scene import Look, Markers
 from hil.world.tunnel import Tunnel
 
 Vector = Sequence[float]
@@ -87,6 +88,14 @@ class Body(Motion, Protocol):
     @property
     def pushes(self) -> View:
         """The force [N, W] and torque [N m, B] of the last `push`, (6,)."""
+
+    @property
+    def look(self) -> Look:
+        """What it looks like, for the pictures."""
+
+    @property
+    def markers(self) -> Markers:
+        """Its markers for the cameras."""
 
     @property
     def settings(self) -> Mapping[str, Setting]:

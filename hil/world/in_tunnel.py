@@ -2,7 +2,7 @@
 
 The truth lives on a grid of whole milliseconds from time 0: `advance(now_us)` does every step that ends at or before
 `now_us`. The same generator and the same calls give the same bits however the time to an instant is divided into calls.
-What the flow and the actuators do is up to a subclass: `hil.world.plant`, `hil.world.rigid`.
+What the flow and the actuators do is up to a subclass: `hil.floaty.plant`, `hil.world.rigid`.
 """
 
 import math

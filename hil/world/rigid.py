@@ -13,6 +13,7 @@ import numpy as np
 
 from firmware_py.compiling import bound
 from hil.errors import LabError, blame
+from hil.scene import Look, Markers, Part, ball, eight_markers
 from hil.world import layout as at
 from hil.world.body import Channel, Setting, Vector
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
@@ -51,6 +52,8 @@ class RigidBody(InTunnel):
     inertia: ClassVar[tuple[float, float, float]]
     outputs: Sequence[tuple[int, int]] = OUTPUTS
     settings: Mapping[str, Setting] = {}
+    parts: tuple[Part, ...] = (ball(0.05),)
+    radius: float = 0.1  # [m] of the ball on which the cameras' markers are
 
     def __init__(self, world: World, rng_gust: np.random.Generator, p_WB: Vector) -> None:
         """Start upright and at rest at a place [m]. Raises `LabError` for a subclass that is none."""
@@ -95,6 +98,17 @@ class RigidBody(InTunnel):
         return 1e-6 * float(self._s[at.TIME_US])
 
     # For the laboratory
+
+    @property
+    def look(self) -> Look:
+        """Its parts; the ghost at the goal is a cross."""
+        cross = tuple(np.array((-line, line)) for line in self.radius * np.eye(3))
+        return Look(self.parts, (), cross, (0.0, 0.0, 0.0), tuple(map(tuple, self.markers.places.tolist())))
+
+    @property
+    def markers(self) -> Markers:
+        """Eight markers that nothing hides but the trunk."""
+        return Markers(eight_markers(self.radius))
 
     def set_counts(self, now_us: int, counts: Sequence[int]) -> None:
         """Take the counts of the timers; they act from the next millisecond on."""

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from ground_station.mocap import MocapFrame
-from hil.devices.markers import NO_POINTS, Sighting, marker_places
+from hil.devices.markers import NO_POINTS, Sighting
+from hil.floaty.drawing import marker_places
 from hil.servers.dongle_server import Readers
 from hil.servers.motive import Streaming, Up, VirtualMotive
 from hil.world.config import GeometryConfig, GroundConfig

@@ -138,7 +138,7 @@ def test_a_bad_row_is_one_line_and_exit_code_two_before_anything_is_planted(
 
 
 def test_every_room_has_its_own_count() -> None:
-    paths = ("hil/world/plant.py", "hil/world/native/plant.c", "hil/clock.py", "hil/live/feed.py")
+    paths = ("hil/world/plates.py", "hil/world/native/plant.c", "hil/clock.py", "hil/live/feed.py")
     rows = [planted_mistakes.Mistake(path, old, "b", ("test.py",)) for path in paths for old in "ac"]
     assert planted_mistakes.by_room(rows, [rows[0], rows[2], rows[-1]]) == [
         ("hil", 2, 2), ("hil/live", 1, 2), ("hil/world", 2, 4),

@@ -6,14 +6,14 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from firmware_py.geometry import from_euler_zyx, yaw_quaternion
-from hil.devices.markers import DIAMETER, marker_places
+from hil.devices.markers import DIAMETER
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import BOX, body, column
 from hil.laboratory.recorder import stored_in
-from hil.pictures import curves, scene
+from hil.pictures import scene
 from hil.pictures.viewer.track import RecordingTrack, Times, rgba
-from hil.world.config import GeometryConfig, PlantConfig, TunnelConfig
-from hil.world.geometry import weigh
+from hil.scene import Look, Part
+from hil.world.config import PlantConfig, TunnelConfig
 
 METRES_PER_NEWTON = 0.15  # length of the drag arrows, and of pushes
 SECONDS_OF_FLOW = 0.02  # length of the flow's arrow: the distance that the air moves in that time
@@ -26,11 +26,10 @@ AXIS = 0.08  # [m] length of drawn axes
 MARKERS_SEEN = "markers.visible"
 SEEN, HIDDEN = 0xFFFFFFFF, 0xFF3030FF  # colours of markers
 STEEL = 0x707880FF
-PARTS = ("base", "flap1", "flap2", "flap3", "flap4")
 
 
 class Scene:
-    """Draws what has a place, from the rows of a log whose schema holds the configuration."""
+    """Draws what has a place, from the rows of a log whose schema holds configuration and look."""
 
     def __init__(self, track: RecordingTrack, schema: pa.Schema) -> None:
         config = stored_in(schema.metadata, "config")
@@ -38,13 +37,11 @@ class Scene:
             key: value for key, value in config.get("plant", {}).items() if key in PlantConfig.model_fields
         }
         self._track = track
-        self._geometry = GeometryConfig.model_validate(config.get("geometry", {}))
+        self._robot = Look.read(stored_in(schema.metadata, "look"))
+        self._forced = [part for part in self._robot.parts if f"{part.force}_x" in schema.names]
         self._plant = PlantConfig.model_validate(plant)  # older logs have the shape in [plant]
         self._tunnel = TunnelConfig.model_validate(config.get("tunnel", {}))
-        self._flap_axes = scene.flap_axes(self._geometry)
-        self._markers = (
-            marker_places(self._geometry, self._plant.ground) if MARKERS_SEEN in schema.names else ()
-        )
+        self._markers = self._robot.markers if MARKERS_SEEN in schema.names else ()
         self._build_tunnel()
         self._build_goal()
         self._build_robot()
@@ -54,12 +51,12 @@ class Scene:
         """Draw the rows from `fresh` on; those before are known already."""
         rows = joined.slice(fresh)
         times, p_WB, q_WB = column(rows, "t"), body(rows, "x", "y", "z"), body(rows, "qw", "qx", "qy", "qz")
-        flaps = np.radians(curves.FLAPS.read(rows))
         self._place("robot", times, p_WB, q_WB)
         self._place("held", times, p_WB, np.broadcast_to((1.0, 0.0, 0.0, 0.0), q_WB.shape))
-        for flap in range(4):
-            turn = scene.turn_quaternion(self._flap_axes[flap], flaps[:, flap])
-            self._place(f"robot/plates/flap_{flap + 1}", times, np.zeros_like(p_WB), turn)
+        for part in self._robot.parts:
+            if part.angle:
+                place = np.broadcast_to(part.place, p_WB.shape)
+                self._place(f"robot/parts/{part.name}", times, place, scene.turn_of(part, rows))
         self._place(
             "goal", times, goal_of(rows), np.array([yaw_quaternion(yaw) for yaw in column(rows, "goal.yaw")])
         )
@@ -67,9 +64,10 @@ class Scene:
         known = np.isfinite(pose).all(axis=1)  # a real board may not have reported it yet
         q_GE = [from_euler_zyx(*angles) for angles in pose[known, 3:].tolist()]
         self._place("goal/estimate", times[known], pose[known, :3], np.array(q_GE).reshape(-1, 4))
-        if "force.base_x" in rows.column_names:  # of a real flight no forces are known
-            origins = scene.drag_origins(self._geometry, p_WB, q_WB, flaps)
-            self._add_forces(rows, p_WB, origins)
+        if "flow.x" in rows.column_names:  # of a real flight neither flow nor forces are known
+            self._add_flow(rows, p_WB)
+        if self._forced:
+            self._add_forces(rows, p_WB, q_WB)
         if len(self._markers):
             self._colour_markers(joined, fresh)
         self._add_trail("trail", joined, body(joined, "x", "y", "z"))
@@ -80,7 +78,8 @@ class Scene:
         """Draw the tether of a simulated robot."""
         if "truth.x" not in rows.column_names:
             return
-        top = scene.tops(self._geometry, body(rows, "x", "y", "z"), body(rows, "qw", "qx", "qy", "qz"))
+        q_WB = body(rows, "qw", "qx", "qy", "qz")
+        top = body(rows, "x", "y", "z") + scene.rotated(q_WB, np.array(self._robot.knot))
         anchor = (0.0, 0.0, self._tunnel.hover_height + self._plant.tether.anchor_height)
         lines = np.stack((np.broadcast_to(anchor, top.shape), top), axis=1).astype(np.float32)
         self._track.send("world/tether", column(rows, "t"), rr.LineStrips3D.columns(strips=lines))
@@ -98,14 +97,21 @@ class Scene:
         shown_us = max(PUSH_SHOWN_US, int(1e6 * min(fault.duration_s, 1e6)))
         self._track.at(t_us + shown_us, path, rr.Clear(recursive=False))
 
-    def _add_forces(self, rows: pa.Table, p_WB: NDArray[np.float64], origins: NDArray[np.float64]) -> None:
-        """Draw drag and flow."""
-        times = column(rows, "t")
-        forces = column(rows, *(f"force.{part}_{axis}" for part in PARTS for axis in "xyz"))
-        drag = METRES_PER_NEWTON * forces.reshape(-1, 3)
-        arrows = rr.Arrows3D.columns(vectors=drag, origins=origins.reshape(-1, 3))
-        self._track.send("world/drag", times, arrows.partition(np.full(len(times), len(PARTS))))
-        flow = column(rows, "flow.x", "flow.y", "flow.z")
+    def _add_forces(self, rows: pa.Table, p_WB: NDArray[np.float64], q_WB: NDArray[np.float64]) -> None:
+        """Draw the forces on parts."""
+        times, parts = column(rows, "t"), self._forced
+        forces = column(rows, *(f"{part.force}_{axis}" for part in parts for axis in "xyz"))
+        origins = [
+            p_WB + scene.rotated(q_WB, scene.force_origin(part, scene.turn_of(part, rows))) for part in parts
+        ]
+        arrows = rr.Arrows3D.columns(
+            vectors=METRES_PER_NEWTON * forces.reshape(-1, 3),
+            origins=np.stack(origins, axis=1).reshape(-1, 3),
+        )
+        self._track.send("world/drag", times, arrows.partition(np.full(len(times), len(parts))))
+
+    def _add_flow(self, rows: pa.Table, p_WB: NDArray[np.float64]) -> None:
+        times, flow = column(rows, "t"), column(rows, "flow.x", "flow.y", "flow.z")
         shift, wind = SECONDS_OF_FLOW * flow, SECONDS_OF_WIND * flow * (1.0, 1.0, 0.0)
         for name, vectors, below in (("flow", shift, 0.1), ("wind", wind, 0.0)):
             arrows = rr.Arrows3D.columns(vectors=vectors, origins=p_WB - vectors - (0, 0, below))
@@ -158,37 +164,35 @@ class Scene:
         static = self._track.static
         static("world/goal/cross", rr.LineStrips3D(cross, colors=0xD55E00FF, radii=0.0025))
         static("world/goal/box", rr.LineStrips3D(scene.box_lines(BOX), colors=0xD55E00A0, radii=0.0012))
-        wanted = [*scene.outline(self._geometry), np.array([(0.0, 0.0, 0.0), (2 * AXIS, 0.0, 0.0)])]
+        wanted = [*self._robot.outline, np.array([(0.0, 0.0, 0.0), (2 * AXIS, 0.0, 0.0)])]
         static("world/goal/ghost", rr.LineStrips3D(wanted, colors=0xD55E00FF, radii=0.0012))
-        ghost = rr.LineStrips3D(scene.outline(self._geometry), colors=0xFFFFFF90, radii=0.0012)
+        ghost = rr.LineStrips3D(list(self._robot.outline), colors=0xFFFFFF90, radii=0.0012)
         static("world/goal/estimate/ghost", ghost)
 
     def _build_robot(self) -> None:
-        static, geometry = self._track.static, self._geometry
-        height = weigh(geometry).axis_height
+        static = self._track.static
         case = rr.Boxes3D(half_sizes=[(0.022, 0.016, 0.012)], colors=0x404850FF, fill_mode="solid")
         static("world/robot/body", case)
-        rod = [[(0, 0, 0), (0, 0, height)]]
-        static("world/robot/rod", rr.LineStrips3D(rod, colors=STEEL, radii=0.003))
-        stand = scene.stand_lines(geometry, self._plant.ground)
-        static("world/robot/stand", rr.LineStrips3D(stand, colors=STEEL, radii=0.0015))
+        static("world/robot/frame", rr.LineStrips3D(list(self._robot.frame), colors=STEEL, radii=0.0015))
         static("world/robot/axes", rr.TransformAxes3D(AXIS))
-        static("world/robot/plates", rr.Transform3D(translation=(0, 0, height)))
-        self._build_plate("base", scene.base_mesh(geometry), "#c8ccd0")
-        for flap, colour in enumerate(curves.FLAP_COLOURS):
-            mesh, name = scene.flap_mesh(geometry, flap), f"flap_{flap + 1}"
-            self._build_plate(name, mesh, colour)
-            number = rr.Points3D([scene.mesh_centre(mesh)], radii=0.002, colors=rgba(colour), labels=name[-1])
-            static(f"world/robot/plates/{name}/number", number)
+        for part in self._robot.parts:
+            self._build_part(part)
         if len(self._markers):
             static("world/robot/markers", rr.Points3D(self._markers, radii=DIAMETER / 2))
 
-    def _build_plate(self, name: str, mesh: scene.Mesh, colour: str) -> None:
+    def _build_part(self, part: Part) -> None:
+        static, path = self._track.static, f"world/robot/parts/{part.name}"
+        if not part.angle:
+            static(path, rr.Transform3D(translation=part.place))
         surface = rr.Mesh3D(
-            vertex_positions=mesh.vertices, triangle_indices=mesh.triangles, vertex_normals=mesh.normals(),
-            albedo_factor=rgba(colour),
+            vertex_positions=part.triangles.reshape(-1, 3), vertex_normals=scene.normals_of(part).reshape(-1, 3),
+            triangle_indices=np.arange(3 * len(part.triangles)).reshape(-1, 3), albedo_factor=rgba(part.colour),
         )  # fmt: skip
-        self._track.static(f"world/robot/plates/{name}", surface)
+        static(path, surface)
+        if part.label:
+            centre = [scene.centre_of(part.triangles)]
+            number = rr.Points3D(centre, radii=0.002, colors=rgba(part.colour), labels=part.label)
+            static(f"{path}/number", number)
 
     def _build_arrows(self) -> None:
         for name, colour, radius in (

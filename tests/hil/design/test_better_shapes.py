@@ -19,11 +19,11 @@ from hil.design.sweeps import Point, authorities, flat_high
 from hil.design.trim import coefficient_of, scaled
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.floaty.geometry import weigh
+from hil.floaty.plant import Plant
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.world.config import PlantConfig, ServoConfig, TunnelConfig
-from hil.world.geometry import weigh
-from hil.world.plant import Plant
 from support.command import Cli
 
 CONFIG = load_config()

@@ -18,10 +18,10 @@ from hil.design.linear import Linear, linear
 from hil.design.sweeps import Point
 from hil.design.trim import balanced, changed, coefficient_of, opening_at, scaled, speed_at
 from hil.errors import LabError
+from hil.floaty.geometry import weigh
+from hil.floaty.paper_table import PAPER_TABLE
+from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.geometry import weigh
-from hil.world.paper_table import PAPER_TABLE
-from hil.world.plant import Plant
 from support.command import Cli
 from support.geometries import geometries
 

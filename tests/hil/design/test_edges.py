@@ -11,7 +11,7 @@ from hil.design.authority import reach, single
 from hil.design.margins import Margins, margins_of, worst
 from hil.design.sweeps import HoverAngles, Point
 from hil.design.trim import OPENINGS, balanced, changed, coefficient_of, opening_at, scaled, speed_at
-from hil.world.geometry import weigh
+from hil.floaty.geometry import weigh
 from support.geometries import geometries
 
 G0, COEFFICIENT = load_config().geometry, coefficient_of(load_config())

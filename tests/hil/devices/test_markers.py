@@ -14,17 +14,18 @@ from ground_station.mocap import MocapFrame
 from hil.config import load_config
 from hil.devices.cameras import VirtualMocap
 from hil.devices.config import MarkersConfig, MocapConfig
-from hil.devices.markers import COUNT, TRUNK_RADIUS, Cameras, Sighting, marker_places
+from hil.devices.markers import COUNT, TRUNK_RADIUS, Cameras, Sighting
 from hil.devices.rigid_body import GHOST_REACH, NOISE_ROWS, WORST_PAIR, RigidBody, VirtualMarkers
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.floaty.drawing import marker_places, markers_of
+from hil.floaty.geometry import axis_of
+from hil.floaty.plant import Plant
+from hil.floaty.shape import MIRRORS
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
 from hil.laboratory.request import Request
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.geometry import axis_of
-from hil.world.plant import Plant
-from hil.world.shape import MIRRORS
 
 ON = MarkersConfig(enabled=True)
 EXACT = MarkersConfig(enabled=True, noise=0.0)
@@ -44,7 +45,7 @@ turns = st.tuples(number, number, number, number).filter(lambda q: sum(x * x for
 
 
 def markers(config: MarkersConfig = ON, seed: int = 1) -> VirtualMarkers:
-    return VirtualMarkers(config, GEOMETRY, GROUND, np.random.default_rng(seed))
+    return VirtualMarkers(config, markers_of(GEOMETRY, GROUND), np.random.default_rng(seed))
 
 
 def look(config: MarkersConfig, turn: Rotation | None = None, p_WB: Array = HOME, seed: int = 1) -> Sighting:
@@ -275,7 +276,7 @@ def test_a_marker_is_seen_when_enough_rays_are_free(
         hits = ray_hits(PLACES[row], turn.inv().apply(camera - p))
         assume(len(hits) == 1)  # not by a hair
         free.append(not hits.pop())
-    seen = Cameras(config, GEOMETRY, GROUND).see(np.array(p), turn.as_matrix())
+    seen = Cameras(config, markers_of(GEOMETRY, GROUND)).see(np.array(p), turn.as_matrix())
     assert seen[row] == (sum(free) >= config.min_cameras)
 
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from hil.devices.config import ImuConfig
 from hil.devices.imu import VirtualImu
 from hil.errors import LabError
+from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.plant import Plant
 
 GYRO_LSB = math.radians(2000 / 32768)  # [rad/s] data sheet
 ACCEL_LSB = 24 * 9.81 / 32768  # [m/s2] data sheet

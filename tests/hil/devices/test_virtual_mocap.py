@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from ground_station.mocap import MocapFrame
 from hil.devices.cameras import VirtualMocap
 from hil.devices.config import MocapConfig
+from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.plant import Plant
 
 TURN = Rotation.from_euler("ZYX", [1.0, 0.2, -0.3])
 PLACE = (0.1, 0.2, 0.3)

@@ -19,6 +19,9 @@ from hil.experiments import EXPERIMENTS
 from hil.experiments.airspeed import LIFT_PER_RAD, attainable, hover_angle
 from hil.experiments.measures import recoveries, response, steps, y_steps
 from hil.experiments.pushes import FAULTS, PUSHES
+from hil.floaty.correction import TABLE
+from hil.floaty.plant import Plant
+from hil.floaty.shape import SIGNS
 from hil.laboratory.faults import Fault
 from hil.laboratory.metrics import ALWAYS, METRICS
 from hil.laboratory.recorder import load_events, load_log
@@ -28,9 +31,6 @@ from hil.pictures.gallery import pictures_of
 from hil.pictures.panels import Plot, Still
 from hil.pictures.picture import Picture
 from hil.world.config import TunnelConfig
-from hil.world.correction import TABLE
-from hil.world.plant import Plant
-from hil.world.shape import SIGNS
 from support.flights import explain, flown
 
 FAMILIES = ("yaw-", "height-sine", "y-square", "pushes", "side-wind-", "occlusion", "airspeed-")

@@ -8,10 +8,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hil.experiments.take_off import CONTROLLER_ON, FANS_OFF, LANDING_FROM, STANDING_Z
+from hil.floaty.plant import Plant
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.plant import Plant
 from support.flights import flown
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)

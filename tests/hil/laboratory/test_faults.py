@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hil.config import load_config
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, Experiment
+from hil.floaty.plant import Plant
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind
 from hil.laboratory.faults import Fault, check, parse, spans_of
 from hil.laboratory.lockstep import lockstep_flight
@@ -31,7 +32,6 @@ from hil.laboratory.result import Result, read_result
 from hil.laboratory.run import fly
 from hil.pictures.report import write_report
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig
-from hil.world.plant import Plant
 from hil.world.tunnel import TunnelConfig
 from support.command import Cli
 from support.flights import hover

@@ -19,6 +19,7 @@ from hil.laboratory.metrics import Metric, Verdict
 from hil.laboratory.recorder import Recorder
 from hil.laboratory.request import REAL, Bench, Request
 from hil.laboratory.result import RESULT, Program, QueueReport, Result, metadata_of, read_result, write_result
+from hil.scene import Look
 from hil.world.body import Channel, Quantity
 from support.command import Cli
 
@@ -120,7 +121,7 @@ def test_what_is_no_result_is_one_line_that_names_file_and_value(
     cli: Cli, result: Result, damage: Callable[[Path], None], told: str
 ) -> None:
     write_result(result)
-    killed(result.folder, metadata_of(result.request, result.program))
+    killed(result.folder, metadata_of(result.request, result.program, Look()))
     damage(result.folder)
     error = cli.refusal("report", result.folder)
     assert error.startswith(f"floaty: {result.folder / RESULT}: ")
@@ -133,7 +134,7 @@ def killed(folder: Path, metadata: dict[str, str]) -> None:
 
 
 def test_the_origin_of_a_killed_run_is_read_from_its_log(result: Result) -> None:
-    killed(result.folder, metadata_of(result.request, result.program))
+    killed(result.folder, metadata_of(result.request, result.program, Look()))
     read = read_result(result.folder)
     assert (read.request, read.program) == (result.request, result.program)
     assert (read.outcome, read.passed, read.hash, read.folder) == ("error", False, "", result.folder)

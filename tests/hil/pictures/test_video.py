@@ -10,6 +10,7 @@ from PIL import Image
 
 from hil.config import load_config
 from hil.experiments import EXPERIMENTS
+from hil.floaty.drawing import look_of
 from hil.laboratory.metrics import free_flight
 from hil.laboratory.recorder import load_log
 from hil.laboratory.request import Request
@@ -53,9 +54,9 @@ def test_each_frame_shows_the_robot_of_its_instant_and_the_curves_up_to_it(folde
 
 
 def test_the_robot_has_its_plates_where_the_geometry_has_them() -> None:
-    geometry = load_config().geometry
-    still = np.array([1.0, 0.0, 0.0, 0.0])
-    shown = video.faces(geometry, np.zeros(4), np.array([1.0, 2.0, 3.0]), still)
+    geometry, still = load_config().geometry, np.array([1.0, 0.0, 0.0, 0.0])
+    parts = look_of(geometry, load_config().plant.ground).parts
+    shown = video.faces(parts, [still] * len(parts), np.array([1.0, 2.0, 3.0]), still)
     corners = np.concatenate([corners for corners, _ in shown])
     assert np.ptp(corners[:, :2], axis=0) == pytest.approx([geometry.footprint] * 2, rel=0.06)
     assert corners[:, :2].mean(axis=0) == pytest.approx([1.0, 2.0], abs=1e-6)

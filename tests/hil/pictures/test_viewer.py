@@ -23,9 +23,11 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.wire.supervisor import State
 from hil.config import load_config
-from hil.devices.markers import marker_places
 from hil.errors import LabError
 from hil.experiments import EXPERIMENTS
+from hil.floaty.drawing import flap_axes, look_of, marker_places, stand_lines
+from hil.floaty.geometry import surfaces
+from hil.floaty.shape import place_plates
 from hil.laboratory.fault_kinds import MARKERS_ON
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column
@@ -41,10 +43,9 @@ from hil.pictures.viewer.plots import PLOTS
 from hil.pictures.viewer.recording import RerunFlight, write_rrd, write_run_rrd
 from hil.pictures.viewer.scene import HIDDEN, METRES_PER_NEWTON, PUSH_SHOWN_US, SEEN
 from hil.pictures.viewer.track import FROM_RELEASE, FROM_START, timeline_of
+from hil.scene import Look, Part, ball, box
 from hil.world import layout as at
 from hil.world.config import GeometryConfig, GroundConfig
-from hil.world.geometry import surfaces, weigh
-from hil.world.shape import place_plates
 
 RELEASE_US = load_config().flight.release_us
 angles = st.floats(-1.5, 1.5)
@@ -81,7 +82,7 @@ def moments(path: Path, entity: str) -> list[int]:
 def test_a_recording_holds_every_row_of_the_log(folder: Path) -> None:
     log, path = load_log(folder), write_run_rrd(folder)
     assert log.num_rows == 150
-    fast = ["robot", "robot/plates/flap_1", "robot/plates/flap_4", "goal", "goal/estimate", "drag", "flow"]
+    fast = ["robot", "robot/parts/flap_1", "robot/parts/flap_4", "goal", "goal/estimate", "drag", "flow"]
     plots = [name for name, plot in PLOTS.items() if plot.needs in log.column_names]
     assert "link/loss/radio" in plots
     for entity in (*(f"/world/{name}" for name in fast), *(f"/plot/{name}" for name in plots)):
@@ -189,7 +190,7 @@ def test_a_live_flight_sends_what_the_file_holds(folder: Path, tmp_path: Path) -
 
 def test_an_empty_log_has_a_recording(folder: Path, tmp_path: Path) -> None:
     write_rrd(iter([load_log(folder).slice(0, 0)]), [], SCHEMA.empty_table(), tmp_path / "empty.rrd")
-    assert rows_by_entity(tmp_path / "empty.rrd")["/world/robot/plates/flap_1"] == 1  # its mesh
+    assert rows_by_entity(tmp_path / "empty.rrd")["/world/robot/parts/flap_1"] == 1  # its mesh
 
 
 def test_without_rerun_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,35 +213,29 @@ SHAPES: tuple[dict[str, object], ...] = (
 def test_a_drawn_flap_lies_where_the_plant_has_it(shape: dict[str, object], angle: float, flap: int) -> None:
     geometry, s = GeometryConfig.model_validate(shape), np.zeros(at.SIZE)
     place_plates(s, geometry, 0.4)
-    mesh = scene.flap_mesh(geometry, flap)
-    turn = Rotation.from_quat(
-        scene.turn_quaternion(scene.flap_axes(geometry)[flap], np.array([angle]))[0], scalar_first=True
-    )
-    vertices = np.add(turn.apply(mesh.vertices), (0, 0, weigh(geometry).axis_height))
+    part = look_of(geometry, GroundConfig()).parts[1 + flap]
+    turn = Rotation.from_quat(scene.turn_of(part, pa.table({part.angle: [angle]}))[0], scalar_first=True)
+    turned = np.add(turn.apply(part.triangles.reshape(-1, 3)), part.place).reshape(-1, 3, 3)
     strip = len(surfaces(geometry)[-1].corners) - 2  # triangles, the last ones
     phi = -angle if flap % 2 == 0 else angle  # the plant's flaps 1 and 3 are mirror images
     series = np.array([1.0, np.cos(phi), np.sin(phi)])
-    for plate, triangles in (
-        (2 * flap, mesh.triangles[:-strip]),
-        (2 * flap + 1, mesh.triangles[-strip:]),
-    ):
-        part = scene.Mesh(vertices, triangles)
+    for plate, which in ((2 * flap, slice(-strip)), (2 * flap + 1, slice(-strip, None))):
         n, r = (series @ s[base + 9 * plate :][:9].reshape(3, 3) for base in (at.NORMAL, at.CENTRE))
-        np.testing.assert_allclose(scene.mesh_centre(part), r, atol=1e-12)
-        np.testing.assert_allclose(_area(part), s[at.AREA + plate], rtol=1e-12)
-        normal = turn.apply(mesh.normals()[part.triangles[0, 0]])
+        np.testing.assert_allclose(scene.centre_of(turned[which]), r, atol=1e-12)
+        np.testing.assert_allclose(_area(turned[which]), s[at.AREA + plate], rtol=1e-12)
+        normal = turn.apply(scene.normals_of(part)[which][0, 0])
         np.testing.assert_allclose(normal, n, atol=1e-12)
 
 
-def _area(mesh: scene.Mesh) -> float:
-    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
+def _area(triangles: NDArray[np.float64]) -> float:
+    a, b, c = np.moveaxis(triangles, 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
 def test_the_lowest_marker_sits_on_the_drawn_stand() -> None:
     geometry, ground = GeometryConfig(), GroundConfig()
     lowest = min(marker_places(geometry, ground), key=lambda place: place[2])
-    foot = scene.stand_lines(geometry, ground)[0]
+    foot = stand_lines(geometry, ground)[0]
     along = [
         np.linalg.norm(lowest - a) + np.linalg.norm(lowest - b) - np.linalg.norm(b - a)
         for a, b in pairwise(foot)
@@ -249,25 +244,35 @@ def test_the_lowest_marker_sits_on_the_drawn_stand() -> None:
 
 
 def test_the_drawn_areas_are_the_papers() -> None:
-    geometry = GeometryConfig()
-    parts = [scene.base_mesh(geometry), *(scene.flap_mesh(geometry, flap) for flap in range(4))]
-    areas = [_area(part) for part in parts]
+    areas = [_area(part.triangles) for part in look_of(GeometryConfig(), GroundConfig()).parts]
     assert areas == pytest.approx([0.0064, 0.0116, 0.0116, 0.0116, 0.0116], abs=5e-5)
     assert sum(areas) == pytest.approx(0.23**2)
 
 
 def test_drag_acts_on_the_turned_flaps(folder: Path) -> None:
-    log, geometry = load_log(folder), GeometryConfig()
-    p_WB = column(log, "truth.x", "truth.y", "truth.z")
-    q_WB = column(log, "truth.qw", "truth.qx", "truth.qy", "truth.qz")
+    log = load_log(folder)
     flaps = column(log, *(f"truth.flap_{number}" for number in (1, 2, 3, 4)))
-    origins = scene.drag_origins(geometry, p_WB, q_WB, flaps)
-    body = Rotation.from_quat(q_WB, scalar_first=True)
-    np.testing.assert_allclose(origins[:, 0], p_WB + body.apply([0, 0, 0.07]), atol=1e-12)
-    for flap in range(4):
-        turn = body * Rotation.from_rotvec(flaps[:, flap, None] * scene.flap_axes(geometry)[flap])
-        centre = scene.mesh_centre(scene.flap_mesh(geometry, flap))
-        np.testing.assert_allclose(origins[:, flap + 1], origins[:, 0] + turn.apply(centre), atol=1e-12)
+    base, *parts = look_of(GeometryConfig(), GroundConfig()).parts
+    origins = scene.force_origin(base, scene.turn_of(base, log))
+    np.testing.assert_allclose(origins, np.broadcast_to([0, 0, 0.07], origins.shape), atol=1e-12)
+    for flap, part in enumerate(parts):
+        turn = Rotation.from_rotvec(flaps[:, flap, None] * flap_axes(GeometryConfig())[flap])
+        expected = np.add(turn.apply(scene.centre_of(part.triangles)), (0, 0, 0.07))
+        np.testing.assert_allclose(scene.force_origin(part, scene.turn_of(part, log)), expected, atol=1e-12)
+
+
+def test_a_look_is_stored_and_read_back_equal() -> None:
+    look = look_of(GeometryConfig(), GroundConfig())
+    again = Look.read(json.loads(json.dumps(look.stored())))
+    assert json.dumps(again.stored()) == json.dumps(look.stored())
+    assert Look.read({}).parts == ()
+
+
+@pytest.mark.parametrize(("part", "area"), [(ball(0.1), 4 * np.pi * 0.01), (box((0.1, 0.2, 0.3)), 0.22)])
+def test_closed_parts_have_their_area_and_turn_outwards(part: Part, area: float) -> None:
+    assert _area(part.triangles) == pytest.approx(area, rel=0.12)
+    outwards = (scene.normals_of(part)[:, 0] * part.triangles.mean(axis=1)).sum(axis=1)
+    assert (outwards > 0.0).all()
 
 
 def test_the_shares_of_the_processor_are_spent_time_over_time() -> None:
@@ -330,14 +335,15 @@ def real_log(rows: int = 30) -> pa.Table:
     }
     columns |= {"estimator.rejected": np.where(silent, np.nan, np.arange(rows) // 20)}
     request = json.dumps({"link": "udp://127.0.0.1:19850", "experiment": "hover"})
-    return pa.table(columns).replace_schema_metadata({"request": request})
+    look = json.dumps(look_of(GeometryConfig(), GroundConfig()).stored())
+    return pa.table(columns).replace_schema_metadata({"request": request, "look": look})
 
 
 def test_a_real_flight_has_the_same_scene_and_what_nobody_knows_is_not_drawn(tmp_path: Path) -> None:
     path = staged(tmp_path / "real.rrd", real_log())
     assert timeline_of(real_log().schema.metadata) == (FROM_START, 0)
     counted = rows_by_entity(path)
-    for name in ("robot", "robot/plates/flap_1", "goal/estimate"):
+    for name in ("robot", "robot/parts/flap_1", "goal/estimate"):
         assert counted[f"/world/{name}"] - (name != "robot" and "flap" in name) == 20, name
     assert counted["/world/goal"] == 30
     assert counted["/world/trail"] == 19 + 1  # and its colour

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from hil.commands import app
 from hil.config import load_config
 from hil.design.authority import pressure_at, wrenches
+from hil.floaty.plant import Plant
 from hil.studies.drag_model import ANGLES_DEG, QUANTITIES, ROWS, SWEEPS, measure
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.plant import Plant
 
 AZIMUTHS = np.radians((-45.0, 45.0, 135.0, -135.0))  # of the flap axes, outwards
 AXES = np.array([0.0, 0.0, 0.07])  # above the centre of mass

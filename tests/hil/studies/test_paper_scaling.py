@@ -10,8 +10,8 @@ from hil.campaigns.run import Runner
 from hil.config import load_config
 from hil.design.claims import AGREES
 from hil.design.sweeps import point_of
+from hil.floaty.geometry import weigh
 from hil.studies.paper_scaling import PROFILES, fly_scaling
-from hil.world.geometry import weigh
 
 
 @pytest.mark.long

@@ -14,10 +14,10 @@ from hil.design.axes import ROLL, gains_in, robot_of
 from hil.design.loop import FREQUENCIES, Timing, build
 from hil.design.tune import Flow, GainTask, judged, refuse_late
 from hil.errors import LabError
+from hil.floaty.plant import Plant
 from hil.laboratory.request import Options
 from hil.laboratory.robot import Streams
 from hil.studies.tuning import Round
-from hil.world.plant import Plant
 from support.command import Cli
 
 

@@ -10,6 +10,7 @@ from scipy.integrate import quad, solve_ivp
 
 from hil.experiments import EXPERIMENTS
 from hil.experiments.specific_power import VEHICLES
+from hil.floaty.plant import Plant
 from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column, free_flight
 from hil.laboratory.recorder import load_events, load_log
@@ -17,7 +18,6 @@ from hil.laboratory.request import Request
 from hil.laboratory.run import fly
 from hil.world.battery import Battery, endurance, open_circuit_voltage
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.plant import Plant
 from support.flights import flown
 
 CONFIG = BatteryConfig()

@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from hil.errors import LabError
+from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.plant import Plant
 from support.paths import VECTORS
 
 VECTORS = json.loads((VECTORS / "plant.json").read_text())

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from hil.floaty.plant import Plant
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.plant import Plant
 from hil.world.servos import commanded_angles, next_period_us
 from support.paths import VECTORS
 

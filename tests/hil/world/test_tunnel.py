@@ -7,9 +7,9 @@ import pytest
 from pydantic import ValidationError
 
 from hil.errors import LabError
+from hil.floaty.plant import Plant
 from hil.world import layout as at
 from hil.world.config import GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.plant import Plant
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 

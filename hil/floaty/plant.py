@@ -7,16 +7,18 @@ import numpy as np
 
 from firmware_py.compiling import bound
 from hil.errors import LabError
+from hil.floaty.correction import LEVEL, Constants, OperatingPoint, calm, linearise, trim_and_correct
+from hil.floaty.drawing import look_of, markers_of
+from hil.floaty.geometry import weigh
+from hil.floaty.shape import SIGNS, place_plates
+from hil.scene import Look, Markers
 from hil.world import layout as at
 from hil.world.body import Channel, Quantity, Setting, Vector, View
 from hil.world.config import BatteryConfig, GeometryConfig, PlantConfig, ServoConfig, TunnelConfig
-from hil.world.correction import LEVEL, Constants, OperatingPoint, calm, linearise, trim_and_correct
-from hil.world.geometry import weigh
 from hil.world.in_tunnel import UPRIGHT, InTunnel
 from hil.world.motion import advance, evaluate
 from hil.world.plates import State
 from hil.world.servos import OUTPUTS, commanded_angles, next_period_us
-from hil.world.shape import SIGNS, place_plates
 from hil.world.tunnel import Tunnel
 
 SERVOS = 4
@@ -67,7 +69,7 @@ class Plant(InTunnel):
         """
         s, air = assemble(geometry, config, tunnel)
         super().__init__(s, air, config, rng_gust)
-        self._airspeed = config.airspeed
+        self._airspeed, self._geometry, self._ground = config.airspeed, geometry, config.ground
         s[at.SERVO_TAU], s[at.SERVO_RATE], s[at.DEAD_BAND] = servos.tau, servos.rate_limit, servos.dead_band
         self.zero_offset = servos.zero_offset
         self.servo_trim, self.servo_speed = self._view(at.SERVO_TRIM, 4), self._view(at.SERVO_SPEED, 4)
@@ -123,6 +125,16 @@ class Plant(InTunnel):
         # An earlier change may have been latched since the last millisecond: then this one queues behind it.
         at_us, angles = (at.AFTER_US, at.AFTER) if s[at.NEXT_US] <= now_us else (at.NEXT_US, at.NEXT)
         s[at_us], s[angles : angles + 4] = next_period_us(now_us), self._commanded
+
+    @property
+    def look(self) -> Look:
+        """Base plate, flaps and stand."""
+        return look_of(self._geometry, self._ground)
+
+    @property
+    def markers(self) -> Markers:
+        """The eight markers of the cameras."""
+        return markers_of(self._geometry, self._ground)
 
     @property
     def outputs(self) -> Sequence[tuple[int, int]]:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from firmware_py.elementary import cos, sin
 from hil.errors import LabError
+from hil.floaty.geometry import area_and_centre, axis_of, raised, surfaces, weigh
 from hil.world import layout as at
 from hil.world.config import GeometryConfig, PlantConfig
-from hil.world.geometry import area_and_centre, axis_of, raised, surfaces, weigh
 from hil.world.motion import GRAVITY
 from hil.world.plates import State
 

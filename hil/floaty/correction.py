@@ -13,14 +13,14 @@ import numpy as np
 from firmware_py.compiling import bound
 from firmware_py.elementary import cos, sin
 from firmware_py.geometry import from_euler_zyx, multiply
+from hil.floaty.geometry import Weight
+from hil.floaty.paper_table import PAPER_TABLE
+from hil.floaty.shape import MIX
 from hil.world import layout as at
 from hil.world.config import PlantConfig
 from hil.world.fixed_order import fit_polynomial, product
-from hil.world.geometry import Weight
 from hil.world.motion import GRAVITY, evaluate
-from hil.world.paper_table import PAPER_TABLE
 from hil.world.plates import LIFT_U4_MAX, State
-from hil.world.shape import MIX
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

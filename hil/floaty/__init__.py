@@ -1,0 +1,1 @@
+"""Floaty: its shape, its plates in the flow, its identified correction, and how it is drawn."""

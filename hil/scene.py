@@ -1,0 +1,129 @@
+"""What a robot looks like: its parts as triangles, its frame as lines, its markers; stored with a log for the pictures.
+
+Lengths in m, in B or in the frame F of a part, which is parallel to B while its angle is 0. Colours are `#rrggbb`.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.elementary import cos, sin
+
+Points = NDArray[np.float64]
+Three = tuple[float, float, float]
+CENTRE: Three = (0.0, 0.0, 0.0)
+UP: Three = (0.0, 0.0, 1.0)
+PALE = "#c8ccd0"
+AROUND, DOWN = 12, 6  # faces of a ball along its equator, and from pole to pole
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A rigid part. With `angle`, a column of the log [rad], it turns about `axis` through `place`.
+
+    `force` is the beginning of the names of the columns with the force on it [N, W]: `force.base` for `force.base_x`.
+    """
+
+    name: str
+    triangles: Points  # (N, 3, 3) in F
+    colour: str = PALE
+    place: Three = CENTRE  # of F's origin in B
+    axis: Three = UP  # unit vector in F
+    angle: str = ""
+    force: str = ""
+    label: str = ""
+    closed: bool = False  # its triangles turn outwards; else it is a plate, seen from both sides
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Markers:
+    """Eight markers, and what hides them: a flat square in B, and a ball around the centre of mass."""
+
+    places: Points  # (8, 3) in B
+    plate_height: float = 0.0
+    plate_half: float = 0.0  # of its side; 0: none
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """A whole robot."""
+
+    parts: tuple[Part, ...] = ()
+    frame: tuple[Points, ...] = ()  # lines through (N, 3) points: what holds the parts together
+    outline: tuple[Points, ...] = ()  # of its ghost at the goal
+    knot: Three = CENTRE  # where the tether is tied
+    markers: tuple[Three, ...] = ()  # places
+
+    def stored(self) -> dict[str, Any]:
+        """Return it ready for JSON."""
+        parts = [
+            {name: getattr(part, name) for name in Part.__slots__} | {"triangles": part.triangles.tolist()}
+            for part in self.parts
+        ]
+        lines = {name: [line.tolist() for line in getattr(self, name)] for name in ("frame", "outline")}
+        return {"parts": parts, **lines, "knot": self.knot, "markers": self.markers}
+
+    @classmethod
+    def read(cls, stored: Mapping[str, Any]) -> "Look":
+        """Return what was stored; nothing to draw for a log without."""
+        parts = tuple(
+            Part(**{**part, "triangles": np.array(part["triangles"]).reshape(-1, 3, 3)})
+            for part in stored.get("parts", ())
+        )
+        frame, outline = (
+            tuple(np.array(line).reshape(-1, 3) for line in stored.get(name, ()))
+            for name in ("frame", "outline")
+        )
+        return cls(
+            parts,
+            frame,
+            outline,
+            tuple(stored.get("knot", CENTRE)),
+            tuple(map(tuple, stored.get("markers", ()))),
+        )
+
+
+def ball(radius: float, centre: Three = CENTRE, colour: str = PALE) -> Part:
+    """Return a ball."""
+
+    def point(row: int, turn: int) -> Three:
+        down, around = math.pi * row / DOWN, 2.0 * math.pi * turn / AROUND
+        return (radius * sin(down) * cos(around), radius * sin(down) * sin(around), radius * cos(down))
+
+    quads = [
+        (point(row, turn), point(row + 1, turn), point(row + 1, turn + 1), point(row, turn + 1))
+        for row in range(DOWN)
+        for turn in range(AROUND)
+    ]
+    return Part("ball", _halved(quads), colour, centre, closed=True)
+
+
+def box(size: Three, centre: Three = CENTRE, colour: str = PALE) -> Part:
+    """Return a box with edges along x, y and z."""
+    x, y, z = (0.5 * edge for edge in size)
+    low = [(-x, -y, -z), (x, -y, -z), (x, y, -z), (-x, y, -z)]
+    high = [(a, b, z) for a, b, _ in low]
+    sides = [(low[i], low[i - 3], high[i - 3], high[i]) for i in range(4)]
+    return Part("box", _halved([tuple(low[::-1]), tuple(high), *sides]), colour, centre, closed=True)
+
+
+def _halved(quads: Sequence[tuple[Three, ...]]) -> Points:
+    """Return quadrilaterals as triangles, without those that have no area."""
+    halves = ((a, b, c) for q in quads for a, b, c in ((q[0], q[1], q[2]), (q[0], q[2], q[3])))
+    return np.array([half for half in halves if len(set(half)) == 3])
+
+
+def eight_markers(radius: float) -> Points:
+    """Return places for eight markers around a robot, of which no two exchanged look alike, (8, 3)."""
+    directions = np.array(
+        [
+            (1.0, -0.2, 0.1), (0.5, 0.8, 0.3), (-0.7, 0.6, 0.0), (-0.8, -0.5, 0.3),
+            (0.2, 0.1, 1.0), (-0.1, 0.4, 0.8), (0.4, -0.6, -0.5), (-0.2, -0.9, 0.4),
+        ]
+    )  # fmt: skip
+    lengths = np.sqrt((directions * directions).sum(axis=1))[:, None]
+    return np.asarray(radius * directions / lengths)
