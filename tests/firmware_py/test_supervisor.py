@@ -10,6 +10,7 @@ from firmware_py.core import structs
 from firmware_py.core.sampling import RECOVERY_STEPS, STALE_STEPS
 from firmware_py.core.structs import MODE_FLY, MODE_HOVER, MODE_MANUAL
 from firmware_py.core.supervisor import (
+    BATTERY_LOW_US,
     DOWN_US,
     EPISODE_GAP_US,
     EPISODE_LIMIT_US,
@@ -322,6 +323,24 @@ def test_a_board_that_is_disarmed_while_it_calibrates_is_in_failsafe() -> None:
     bench.view.arm(False)
     bench.look()
     assert bench.found == (State.FAILSAFE, Cause.DISARMED)
+
+
+def test_a_board_says_that_it_can_fly_when_its_gyro_is_calibrated_and_not_before() -> None:
+    bench = SupervisorBench()
+    told = [supervisor_bits(bench.view) & CAN_FLY]
+    bench.calibrate()
+    bench.look()
+    assert [*told, supervisor_bits(bench.view) & CAN_FLY] == [0, CAN_FLY]
+
+
+def test_a_battery_is_low_after_exactly_five_seconds_below_the_limit_on_end() -> None:
+    bench = in_flight(lambda bench: None)
+    for last_us in (BATTERY_LOW_US - 1, BATTERY_LOW_US):
+        bench.data.battery_mv = bench.parameters.low_battery_mv
+        bench.look(1)
+        bench.data.battery_mv -= 1
+        bench.look(last_us)
+        assert (bench.view.cause is Cause.LOW_BATTERY) == (last_us == BATTERY_LOW_US)
 
 
 def test_nothing_is_in_the_air_before_a_flight_and_five_seconds_after_it_was_stopped() -> None:
