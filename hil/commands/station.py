@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ground_station.config import GroundConfig
 from ground_station.controls import ControlsError
 from ground_station.errors import LinkError, MocapError
 from ground_station.trajectory import Goal, Trajectory
@@ -29,6 +28,7 @@ from hil.commands.tables import print_result
 from hil.errors import LabError
 
 if TYPE_CHECKING:
+    from ground_station.config import GroundConfig
     from hil.config import LabConfig
 
 
@@ -188,6 +188,8 @@ def _trajectory_of(name: str) -> Callable[[Goal, int], Trajectory]:
 
 def settings_of(config: LabConfig) -> GroundConfig:
     """Return the ground station's settings of a profile."""
+    from ground_station.config import GroundConfig
+
     return GroundConfig(
         station=config.station,
         tracker=config.tracker,

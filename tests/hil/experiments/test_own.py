@@ -128,7 +128,10 @@ def test_a_file_that_changes_between_the_flights_of_a_sweep_is_named(changed: st
 
 def test_a_file_is_executed_once_for_every_content() -> None:
     write("wide = " + PLAIN % "")
-    assert load_file(Path("mine.py"))[0] is load_file(Path("../", Path.cwd().name, "mine.py"))[0]
+    assert (
+        load_file("experiment", Path("mine.py"))[0]
+        is load_file("experiment", Path("../", Path.cwd().name, "mine.py"))[0]
+    )
     first = in_file("mine.py:wide")
     write("wide = " + PLAIN.replace("0.3", "0.5") % "")
     assert (first.duration_s, in_file("mine.py:wide").duration_s) == (0.3, 0.5)
