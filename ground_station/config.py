@@ -20,6 +20,20 @@ class StationConfig(Section):
     )
 
 
+class PilotConfig(Section):
+    """How a robot with the Crazyflie's own firmware is flown: from the floor to the floor, by the Crazyflie's services."""
+
+    enabled: bool = Field(False, description="true: the board has the Crazyflie's own firmware, an image")
+    parameters: dict[str, dict[str, float]] = Field(
+        {},
+        description="written before the take-off, by group and name; stabilizer.estimator 2 is Kalman, "
+        "stabilizer.controller 1 PID, 2 Mellinger, 3 INDI",
+    )
+    take_off_s: float = number(2.0, "[0.5, 20]", "from the floor to home [s]; cflib's examples")
+    settle_s: float = number(2.0, "[0, 60]", "at home before the experiment's trajectory begins [s]; chosen")
+    land_s: float = number(2.0, "[0.5, 20]", "from the last goal to the floor [s]; cflib's examples")
+
+
 class TrackerConfig(Section):
     """What the ground station accepts as a pose of the robot."""
 

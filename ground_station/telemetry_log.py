@@ -51,18 +51,19 @@ def _columns_of(blocks: tuple[Block, ...]) -> tuple[list[str], dict[int, int]]:
     return titles, first
 
 
-_TELEMETRY_COLUMNS, _FIRST_COLUMN = _columns_of(ALL_BLOCKS)
 _TIMES = (TIME_COLUMN, POSE_COLUMNS[0])  # to the microsecond
-_FORMATS = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *_TELEMETRY_COLUMNS)]
-_ROW = ",".join(["%d", *_FORMATS]) + "\n"
 
 
 class TelemetryLog:
-    """Writes the CSV file at `path`; an unwritable path raises `OSError`."""
+    """Writes the CSV file at `path`, of samples of `blocks`; an unwritable path raises `OSError`."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, blocks: tuple[Block, ...] = ALL_BLOCKS) -> None:
+        titles, self._first_column = _columns_of(blocks)
+        self._empty = [nan] * len(titles)
+        formats = ["%.6f" if title in _TIMES else "%.7g" for title in (*_GROUND_COLUMNS, *titles)]
+        self._row = ",".join(["%d", *formats]) + "\n"
         self._file = path.open("w", encoding="utf-8", newline="\n")
-        self._file.write(",".join(("board.t [ms]", *_GROUND_COLUMNS, *_TELEMETRY_COLUMNS)) + "\n")
+        self._file.write(",".join(("board.t [ms]", *_GROUND_COLUMNS, *titles)) + "\n")
         self._timestamp_ms: int | None = None
         self._ground: tuple[float, ...] = ()
         self._telemetry: list[float] = []
@@ -83,8 +84,8 @@ class TelemetryLog:
             self._timestamp_ms = sample.timestamp_ms
             ages = [1e-6 * us for us in budget.last()]
             self._ground = (*_ground_values(now_us, goal, frame, track), *ages)
-            self._telemetry = [nan] * len(_TELEMETRY_COLUMNS)
-        first = _FIRST_COLUMN[sample.block.id]
+            self._telemetry = self._empty.copy()
+        first = self._first_column[sample.block.id]
         self._telemetry[first : first + len(sample.values)] = sample.values
         if now_us >= self._next_flush_us:
             self._file.flush()
@@ -98,7 +99,7 @@ class TelemetryLog:
 
     def _write_row(self) -> None:
         if self._timestamp_ms is not None:
-            self._file.write(_ROW % (self._timestamp_ms, *self._ground, *self._telemetry))
+            self._file.write(self._row % (self._timestamp_ms, *self._ground, *self._telemetry))
 
 
 def _ground_values(

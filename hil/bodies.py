@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from hil.config import LabConfig
+from hil.crazyflie.quadrotor import Quadrotor
 from hil.errors import LabError, blame, hint
 from hil.floaty.plant import Plant
 from hil.own_files import load_file
@@ -28,7 +29,12 @@ def floaty(config: LabConfig, rng_gust: np.random.Generator, p_WB: Vector) -> Bo
     )
 
 
-BODIES: dict[str, Make] = {"floaty": floaty}
+def crazyflie(config: LabConfig, rng: np.random.Generator, p_WB: Vector) -> Body:
+    """Return a Crazyflie 2.1+."""
+    return Quadrotor(config.quadrotor, config.tunnel, config.battery, rng, p_WB)
+
+
+BODIES: dict[str, Make] = {"floaty": floaty, "crazyflie": crazyflie}
 
 
 def make_body(config: LabConfig, rng_gust: np.random.Generator, p_WB: Vector) -> Body:

@@ -18,9 +18,10 @@ from firmware_py.config import FirmwareConfig, LogicConfig
 from firmware_py.errors import FirmwareError
 from firmware_py.logic.loading import load_logic
 from firmware_py.section import Section, number
-from ground_station.config import CaptureConfig, StationConfig, TrackerConfig
+from ground_station.config import CaptureConfig, PilotConfig, StationConfig, TrackerConfig
 from hil.arguments import shown
 from hil.crazyflie.config import RadioConfig
+from hil.crazyflie.quadrotor import QuadrotorConfig
 from hil.devices.config import ImuConfig, MarkersConfig, MocapConfig, SerialConfig
 from hil.errors import LabError, hint
 from hil.floaty.geometry import check
@@ -50,7 +51,8 @@ class RobotConfig(Section):
     """What flies."""
 
     body: str = Field(
-        "floaty", description="floaty, or the file with a body of your own (docs/tutorials/your-own-robot.md)"
+        "floaty",
+        description="floaty, crazyflie, or the file with a body of your own (docs/tutorials/your-own-robot.md)",
     )
 
 
@@ -61,6 +63,7 @@ class LabConfig(FirmwareConfig):
     geometry: GeometryConfig = Field(default_factory=GeometryConfig)
     plant: PlantConfig = Field(default_factory=PlantConfig)
     actuators: ServoConfig = Field(default_factory=ServoConfig)
+    quadrotor: QuadrotorConfig = Field(default_factory=QuadrotorConfig)
     battery: BatteryConfig = Field(default_factory=BatteryConfig)
     tunnel: TunnelConfig = Field(default_factory=TunnelConfig)
     imu: ImuConfig = Field(default_factory=ImuConfig)
@@ -69,6 +72,7 @@ class LabConfig(FirmwareConfig):
     radio: RadioConfig = Field(default_factory=RadioConfig)
     serial: SerialConfig = Field(default_factory=SerialConfig)
     station: StationConfig = Field(default_factory=StationConfig)
+    pilot: PilotConfig = Field(default_factory=PilotConfig)
     tracker: TrackerConfig = Field(default_factory=TrackerConfig)
     capture: CaptureConfig = Field(default_factory=CaptureConfig)
     flight: FlightConfig = Field(default_factory=FlightConfig)

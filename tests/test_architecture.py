@@ -26,7 +26,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "firmware_py.fast", "firmware_py.section", "firmware_py.table",
     ),
     "hil.stm32f405": ("hil", "firmware_py.export", "firmware_py.extras"),
-    "hil.crazyflie": ("hil", "firmware_py.wire.scalars", "firmware_py.elementary", "firmware_py.section"),
+    "hil.crazyflie": (
+        "hil", "firmware_py.wire.scalars", "firmware_py.elementary", "firmware_py.section", "firmware_py.compiling",
+    ),
     "hil.learn": ("hil", "ground_station", "firmware_py"),
     "hil.demonstrations": ("hil", "firmware_py"),
     "hil": (

@@ -10,6 +10,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from firmware_py.wire import WireError, check_size
+from firmware_py.wire.crtp import header
 
 PORT = 8
 MAX_TRAJECTORIES = 10
@@ -115,3 +116,8 @@ def decode(data: bytes) -> tuple[Command, tuple[float, ...]]:
     if not all(isfinite(value) for value in fields):
         raise WireError(f"high-level command {command.name.lower()} {fields}: must be finite")
     return command, fields
+
+
+def encode(command: Command, *fields: float) -> bytes:
+    """The complete packet of a command with its fields, in the order in which they travel."""
+    return bytes((header(PORT, 0), command)) + _LAYOUTS[command].pack(*fields)

@@ -4,12 +4,12 @@ Facts: crazyflie-firmware 2a18fc29 (crtp_commander_generic.c), cflib 0.1.34.
 """
 
 import struct
-from math import isfinite, radians, remainder, tau
+from math import degrees, isfinite, radians, remainder, tau
 
 from firmware_py.elementary import atan2
 from firmware_py.geometry import Vector
 from firmware_py.wire import WireError, check_size
-from firmware_py.wire.crtp import check_place
+from firmware_py.wire.crtp import PORT_GENERIC_SETPOINT, check_place, header
 from firmware_py.wire.localisation import unpack_quaternion
 
 CHANNEL_SETPOINT, CHANNEL_NOTICE = 0, 1
@@ -39,3 +39,14 @@ def decode_place(data: bytes) -> tuple[Vector, float]:
     x, y, z = (value * _MILLIMETRE for value in fields[:3])
     qw, qx, qy, qz = unpack_quaternion(fields[9])
     return (x, y, z), atan2(2.0 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
+
+
+def encode_place(p: Vector, yaw: float) -> bytes:
+    """The complete packet of a position set-point [m, rad]."""
+    place = _POSITION.pack(*p, degrees(yaw))[1:]
+    return bytes((header(PORT_GENERIC_SETPOINT, CHANNEL_SETPOINT), POSITION)) + place
+
+
+def encode_end() -> bytes:
+    """The complete packet after the last set-point: the high-level commander takes over at once."""
+    return bytes((header(PORT_GENERIC_SETPOINT, CHANNEL_NOTICE),)) + bytes(NOTICE_SIZE)

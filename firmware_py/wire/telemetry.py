@@ -118,6 +118,15 @@ BATTERY = Block(4, SLOW_PERIOD_MS, _variables("pm", "vbat", Scalar.F32, "V"))
 LOAD = Block(5, SLOW_PERIOD_MS, _variables("system", "load", Scalar.F32, "%"))  # of the processor
 SLOW_BLOCKS = (BATTERY, LOAD)
 ALL_BLOCKS = (*BLOCKS, *SLOW_BLOCKS)
+# Of a Crazyflie with its own firmware; MOTION and BATTERY it has as well. Roll, pitch and yaw are in its degrees.
+CRAZYFLIE_STATE = Block(
+    6,
+    PERIOD_MS,
+    tuple(variable for variable in ATTITUDE.variables if variable.scale is not None)
+    + _variables("motor", "m1 m2 m3 m4", Scalar.U16, "")
+    + _variables("supervisor", "info", Scalar.U16, ""),
+)
+CRAZYFLIE_BLOCKS = (MOTION, CRAZYFLIE_STATE, BATTERY)
 
 
 def state_in(samples: Sequence[Sample]) -> int | None:

@@ -24,14 +24,21 @@ START_ORDER = tuple(sorted(ALL_BLOCKS, key=lambda block: block is not CONTROL))
 
 
 class LogBlocks:
-    """`transmit` takes the instant and a packet; `table` returns the numbers of the board's log variables."""
+    """`transmit` takes the instant and a packet; `table` returns the numbers of the board's log variables.
+
+    `blocks` are started in their order.
+    """
 
     def __init__(
-        self, transmit: Callable[[int, bytes], object], table: Callable[[], Mapping[str, int]]
+        self,
+        transmit: Callable[[int, bytes], object],
+        table: Callable[[], Mapping[str, int]],
+        blocks: Sequence[Block] = START_ORDER,
     ) -> None:
         self.notices: list[str] = []  # lines for the user: blocks that the board cannot send
         self._transmit = transmit
         self._table = table
+        self._wanted = blocks
         self._dialogue: Dialogue[Packet] = Dialogue()
         self._blocks: dict[int, Block] = {}  # those that the board can send
         self._controlled_ms = 0  # the last time stamp of CONTROL
@@ -69,11 +76,11 @@ class LogBlocks:
 
     def _script(self) -> Script[Packet]:
         table = self._table()
-        names = {block: [variable.name for variable in block.variables] for block in START_ORDER}
+        names = {block: [variable.name for variable in block.variables] for block in self._wanted}
         missing = [name for names_of in names.values() for name in names_of if name not in table]
         if missing:
             self.notices.append(f"the board has no {', '.join(missing)}: without these blocks of telemetry")
-        blocks = [block for block in START_ORDER if not set(missing) & set(names[block])]
+        blocks = [block for block in self._wanted if not set(missing) & set(names[block])]
         self._blocks = {block.id: block for block in blocks}
         if not blocks:
             return ()

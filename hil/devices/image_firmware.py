@@ -3,7 +3,7 @@
 Power comes on `WARM_UP_US` before the laboratory's time begins, because an image needs seconds to start;
 the robot rests in its holder meanwhile. A reset in flight takes as long as it takes.
 
-Of the robot's state there is what the exported app has, found by symbols; an image without the app has none of it.
+Of the robot's state there is what the exported app has, found by symbols; of an image without it, what that itself logs.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from hil.crazyflie import syslink
 from hil.crazyflie.crazyflie import Crazyflie
 from hil.crazyflie.log_table import ImageVariable, log_numbers, log_table, parameter_table
 from hil.devices.board_firmware import ImageReport, PowerOn
+from hil.devices.crazyflie_signals import stock_signals
 from hil.errors import LabError
 from hil.stm32f405.chip import SOFTWARE, WATCHDOG, build_machine
 from hil.stm32f405.freertos import HEAP, HEAP_LEAST
@@ -128,7 +129,8 @@ class ImageFirmware:
         self.variables = [v for v in table.values() if v.name.startswith("excite.")]
         self.log_numbers = log_numbers(self.image, self.chip)
         self.parameters = parameter_table(self.image, self.chip)
-        self.signals = self._signals(table)
+        self._table = table
+        self._app = self._signals_of_app(table) if self.image.has("floaty_estimator") else None
         self.statistics = ImageStatistics(self.kernel)
         if rest is not None:
             self._warm_up(rest)
@@ -200,7 +202,12 @@ class ImageFirmware:
 
     # What is read of the app
 
-    def _signals(self, table: dict[str, ImageVariable]) -> Signals:
+    @property
+    def signals(self) -> Signals:
+        """Views on the app's core; of an image without the app, the stock firmware's present values."""
+        return self._app or stock_signals(self._table)
+
+    def _signals_of_app(self, table: dict[str, ImageVariable]) -> Signals:
         estimator, control = (
             self._struct("floaty_estimator", ESTIMATOR),
             self._struct("floaty_control", CONTROL),

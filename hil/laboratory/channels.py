@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 from math import nan
 from typing import TYPE_CHECKING, Any
 
+from firmware_py.elementary import cos, sin
 from firmware_py.firmware import DEADLINES_US
 from firmware_py.logic.plugs import GROUP
-from firmware_py.signals import COUNTERS
+from firmware_py.signals import COUNTERS, Signals
 from firmware_py.table import whole_names
 from firmware_py.wire.telemetry import BLOCKS, SLOW_BLOCKS
 from ground_station.latency import STAGES
@@ -207,21 +208,52 @@ def _view(array: Any) -> Callable[[], Any]:
 
 def flight_channels(robot: Robot, trajectory: Trajectory) -> tuple[Channel, ...]:
     """Return the channels of any flight; the first column, `t`, is the recorder's own."""
-    body, board, signals = robot.body, robot.board, robot.firmware.signals
-    counters = (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us"))
+    body, board, firmware = robot.body, robot.board, robot.firmware
+    imu = Channel("int16", lambda: board.imu, (quantity("imu", "gx gy gz ax ay az", "counts", "S"),))
     return (
-        Channel("int8", lambda: (robot.free, signals.supervisor.state), STATES),
+        Channel("int8", lambda: (robot.free, firmware.signals.supervisor.state), STATES),
         Channel("float64", _view(body.state), TRUTH),
         *body.channels(),
         Channel("float32", _view(body.flow_W), (quantity("flow", "x y z", "m/s", "W"),)),
         Channel("float64", lambda: _coordinates(trajectory.at(board.now_us)), GOAL),
+        *(
+            _core_channels(firmware.signals, imu)
+            if firmware.signals.counters.size
+            else _stock_channels(robot, trajectory, imu)
+        ),
+        *_scheduler_channels(firmware),
+    )
+
+
+def _core_channels(signals: Signals, imu: Channel) -> tuple[Channel, ...]:
+    """Return what our flight core shows, with the samples that it gets."""
+    counters = (quantity("estimator", " ".join(COUNTERS[:-1])), quantity("estimator", COUNTERS[-1], "us"))
+    return (
         Channel("float32", _view(signals.estimate), (*ESTIMATE, quantity("estimate", FLAPS, "rad", "B"))),
         Channel("float32", _view(signals.u), (INPUTS,)),
         Channel("float32", _view(signals.flap), (quantity("control", FLAPS, "rad", "B"),)),
         Channel("int32", _view(signals.count), (MOTORS,)),
-        Channel("int16", lambda: board.imu, (quantity("imu", "gx gy gz ax ay az", "counts", "S"),)),
+        imu,
         Channel("int32", _view(signals.counters), counters),
-        *_scheduler_channels(robot.firmware),
+    )
+
+
+def _stock_channels(robot: Robot, trajectory: Trajectory, imu: Channel) -> tuple[Channel, ...]:
+    """Return what the Crazyflie's own firmware shows, with the samples that it gets; its estimate brought into G."""
+    board, firmware = robot.board, robot.firmware
+
+    def estimate() -> Sequence[float]:
+        goal, now = trajectory.at(board.now_us), firmware.signals.estimate.tolist()
+        c, s = cos(goal.yaw), sin(goal.yaw)
+        x, y, z, vx, vy, vz, roll, pitch, yaw, *rates = now
+        dx, dy, dz = x - goal.p_WG[0], y - goal.p_WG[1], z - goal.p_WG[2]
+        place = (c * dx + s * dy, c * dy - s * dx, dz)
+        return (*place, c * vx + s * vy, c * vy - s * vx, vz, roll, pitch, yaw - goal.yaw, *rates)
+
+    return (
+        Channel("float32", estimate, ESTIMATE),
+        Channel("int32", lambda: firmware.signals.count, (quantity("motor", "m1 m2 m3 m4"),)),
+        imu,
     )
 
 

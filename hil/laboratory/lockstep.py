@@ -8,7 +8,10 @@ from pathlib import Path
 
 from firmware_py.errors import FirmwareError
 from firmware_py.export.boards import runner_of
+from firmware_py.wire.telemetry import ALL_BLOCKS, CRAZYFLIE_BLOCKS
 from ground_station.errors import LinkError
+from ground_station.links.crazyflie_link import CrazyflieLink, FlightTimes
+from ground_station.links.crtp_controls import Entry
 from ground_station.links.frame_log import FRAME_LOG, FrameLog
 from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation, Link
@@ -16,7 +19,6 @@ from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
 from ground_station.trajectory import Goal
 from hil.clock import Clock, FreeRunning, Paced
-from hil.config import LabConfig
 from hil.crazyflie.shockburst import Air
 from hil.devices.board_firmware import Executor, Flashed, PythonBoard
 from hil.devices.image_firmware import ChipImage
@@ -24,7 +26,7 @@ from hil.devices.image_settings import ImageSettings
 from hil.devices.radio import Receiver, VirtualRadio
 from hil.devices.real_core import is_link, real_core
 from hil.devices.uart import VirtualSerial
-from hil.errors import LabError
+from hil.errors import LabError, hint
 from hil.laboratory.channels import radio_channel, serial_channel, tracker_channel
 from hil.laboratory.flight import Flight
 from hil.laboratory.laboratory import Laboratory
@@ -44,22 +46,24 @@ class ModelledLine:
         serial = request.bench.link == MAVLINK
         self.record: Path | None = None  # the log has the goals already
         self._release_us = config.flight.release_us
-        self.trajectory = request.experiment.trajectory(Goal(config.flight.home, 0.0), self._release_us)
+        self.trajectory = request.trajectory
         self.tracker = tracker_of(config.tracker, config.mocap.period_us)
         air = Air.of(config.radio)
         uart = VirtualSerial(config.serial, events, streams.serial) if serial else None
         self.radio = VirtualRadio(config.radio, events, streams.radio, air, site.executor.wire_us)
         self.robot = Robot(site, Ports(self.radio.downlink, None if serial else air, uart))
         self._frames: FrameLog | None = None
+        self._pilot: CrazyflieLink | None = None
         self._link, self._channel = (
-            self._radio(config) if uart is None else self._serial(site, uart, telemetry)
+            self._radio(request) if uart is None else self._serial(site, uart, telemetry)
         )
-        self._telemetry = TelemetryLog(telemetry) if telemetry else None
+        blocks = CRAZYFLIE_BLOCKS if config.pilot.enabled else ALL_BLOCKS
+        self._telemetry = TelemetryLog(telemetry, blocks) if telemetry else None
         self.station = GroundStation(
             self._link, self.trajectory, self._telemetry, config.station, self.tracker
         )
         on_ground: Receiver = self.station.on_packet
-        if self.robot.firmware.flashed is not None:
+        if self.robot.firmware.flashed is not None and not config.pilot.enabled:
             on_ground = self._set_up(site, self.robot.firmware.flashed)
         self.radio.connect(self.robot.packet_received, on_ground, self.robot.polled)
         if uart is not None:
@@ -92,11 +96,35 @@ class ModelledLine:
         """The counters of line and tracker."""
         return (self._channel,), (tracker_channel(self.tracker),) if self.tracker else ()
 
-    def _radio(self, config: LabConfig) -> tuple[Link, Channel]:
-        link = LoopbackLink(
-            self.radio.uplink, config.station.link_latency_us, lambda: self.robot.firmware.log_numbers
+    def _radio(self, request: Request) -> tuple[Link, Channel]:
+        latency_us = request.config.station.link_latency_us
+        channel = radio_channel(self.radio)
+        if request.times is not None:
+            self._pilot = pilot = self._crazyflie_link(request, request.times, latency_us)
+            return pilot, channel
+        link = LoopbackLink(self.radio.uplink, latency_us, lambda: self.robot.firmware.log_numbers)
+        return link, channel
+
+    def _crazyflie_link(self, request: Request, times: FlightTimes, latency_us: int) -> CrazyflieLink:
+        """Return the link that flies the stock firmware. Raises `LabError` for a parameter that the image lacks."""
+        config, flashed = request.config, self.robot.firmware.flashed
+        table = {} if flashed is None else flashed.parameters
+        for group, values in config.pilot.parameters.items():
+            for name in values:
+                if f"{group}.{name}" not in table:
+                    raise LabError(
+                        f"pilot.parameters.{group}.{name}: the image has no such parameter; "
+                        f"{hint(f'{group}.{name}', [*table])}"
+                    )
+        return CrazyflieLink(
+            self.radio.uplink,
+            latency_us,
+            lambda: self.robot.firmware.log_numbers,
+            {name: Entry(one.number, one.scalar, one.writable, False) for name, one in table.items()},
+            config.pilot,
+            Goal(config.flight.home, 0.0),
+            times,
         )
-        return link, radio_channel(self.radio)
 
     def _serial(self, site: Site, uart: VirtualSerial, telemetry: Path | None) -> tuple[Link, Channel]:
         """Return the station's end of the serial line. Raises `LabError` when no flight fits on it."""
@@ -127,7 +155,11 @@ class ModelledLine:
         self.radio.uplink(now_us, packet)
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
-        return [("station", line) for line in self.station.notices()]
+        lines = self.station.notices()
+        if self._pilot is not None:
+            lines += self._pilot.notices
+            self._pilot.notices.clear()
+        return [("station", line) for line in lines]
 
     def finish(self, lab: Laboratory) -> None:
         """Nothing: the station ends with its time line."""

@@ -313,7 +313,7 @@ def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str,
             values[f"samples_{name}"] = float(column(flight, f"loop.{name}")[-1])
     if is_real(table):
         values["poses_refused"] = float(column(flight, "estimator.rejected")[-1])
-    else:
+    elif "estimator.refused" in table.schema.names:
         refused = column(flight, "estimator.refused", "estimator.too_old", "estimator.invalid").sum(axis=1)
         values["poses_refused"] = float(refused[-1])
     if "tracker.refused" in table.schema.names:
@@ -322,6 +322,8 @@ def measure(table: pa.Table, lost: bool, resets: int | None = None) -> dict[str,
 
 
 def _mean_age(flight: pa.Table) -> float:
+    if "estimator.pose_age_us" not in flight.schema.names:
+        return np.nan
     ages = column(flight, "estimator.pose_age_us")
     ages = ages[np.isfinite(ages)]  # a real board has not reported it before its first telemetry
     return float(ages.mean()) * 1e-6 if len(ages) else np.nan

@@ -24,6 +24,7 @@ from pydantic import (
 from pydantic_core.core_schema import CoreSchema, with_info_after_validator_function
 
 from firmware_py.export.boards import BOARDS, CORTEX_M4, PYTHON
+from ground_station.links.crazyflie_link import FlightTimes, FromFloor
 from ground_station.links.schemes import SCHEMES
 from ground_station.trajectory import Goal, Trajectory
 from hil.arguments import checked
@@ -193,7 +194,22 @@ class Request:
         check(on_top, self.duration_s, self.bench.link, self.config.markers.enabled)
         check_limits(self.limits, self.experiment.metrics)
         home = self.config.flight.home
+        if self.times is not None:
+            self._check_pilot(self.times)
         self.experiment.check_goals(home, self.duration_s, partial(why_left, self.config))
+
+    def _check_pilot(self, times: FlightTimes) -> None:
+        """Raise `LabError` when the Crazyflie's firmware cannot be flown like that."""
+        if not self.bench.is_image or self.bench.link != RADIO:
+            raise LabError(
+                f"profile {self.profile}: its robot flies with the Crazyflie's own firmware over the radio; "
+                "--board FILE: the image, an ELF file"
+            )
+        if times.land_us < times.begin_us:
+            least = self.duration_s - 1e-6 * (times.land_us - times.begin_us)
+            raise LabError(
+                f"--duration {self.duration_s:g}: take-off and landing alone take {least:g} s (profile {self.profile})"
+            )
 
     @cached_property
     def config(self) -> LabConfig:
@@ -204,6 +220,23 @@ class Request:
     def planned_faults(self) -> tuple[Fault, ...]:
         """The faults of the flight. Raises `LabError` for an unknown kind."""
         return _parsed(self.faults)
+
+    @cached_property
+    def times(self) -> FlightTimes | None:
+        """When a robot with the Crazyflie's firmware takes off and lands; None for one that hovers from its release on."""
+        if not self.config.pilot.enabled:
+            return None
+        return FlightTimes.of(self.config.pilot, self.config.flight.release_us, round(self.duration_s * 1e6))
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The goals of the flight."""
+        flight, home, times = self.config.flight, Goal(self.config.flight.home, 0.0), self.times
+        if times is None:
+            return self.experiment.trajectory(home, flight.release_us)
+        floor = flight.home[2] + flight.start_offset[2]
+        flown = self.experiment.trajectory(home, times.begin_us)
+        return FromFloor(flown, floor, home, self.config.pilot, times)
 
     @property
     def is_real(self) -> bool:
@@ -259,7 +292,11 @@ def _parsed(faults: Sequence[Fault | str]) -> tuple[Fault, ...]:
 
 
 def why_left(config: LabConfig, p_W: Sequence[float]) -> str:
-    """Return why a robot at a place [m] has left the flow, by the limits of the plant; empty when it has not."""
+    """Return why a robot at a place [m] has left the flow or its room, by the limits of its body; empty when it has not."""
+    if config.pilot.enabled:
+        room, ceiling = config.quadrotor.room, config.quadrotor.ceiling
+        inside = max(abs(p_W[0]), abs(p_W[1])) <= room and 0.0 <= p_W[2] <= ceiling
+        return "" if inside else f"{tuple(p_W)} m; up to {room:g} m sideways and {ceiling:g} m high"
     limits, height = config.plant.limits, p_W[2] - config.tunnel.hover_height
     if (radius := math.sqrt(p_W[0] * p_W[0] + p_W[1] * p_W[1])) > limits.radius:
         return f"{radius:.2f} m from the axis; up to {limits.radius:g} m"

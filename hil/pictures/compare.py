@@ -30,7 +30,6 @@ ROW_S = 0.01
 AROUND_US = 1_000_000  # shown before and after the judged part of a real flight
 PICTURE, PAGE = "compare.png", "compare.html"
 PAIR = (DARK, curves.ORANGE)
-SHOWN_CURVES = (curves.POSITION, curves.ATTITUDE, curves.FLAPS)
 # The keys of a result that describe its settings.
 SETTINGS = ("experiment", "profile", "overrides", "faults", "seed", "duration_s", "link", "board")
 
@@ -156,11 +155,16 @@ def write_comparison(
         )  # fmt: skip
 
 
+def shown_curves(log: pa.Table) -> tuple[tuple[str, curves.Curves], ...]:
+    """Return the curves that are compared, with their names."""
+    return (("position", curves.POSITION), ("attitude", curves.ATTITUDE), *curves.actuators(log))
+
+
 def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Plot:
     """Return position, attitude and flap angles of two flights over time."""
     times = [since_release(log) for log in logs]
     panels = []
-    for curve in SHOWN_CURVES:
+    for _, curve in shown_curves(logs[0]):
         read = [curve.read(log) for log in logs]
         for index, title in enumerate(curve.names):
             both = tuple(
@@ -174,7 +178,7 @@ def pair(logs: Sequence[pa.Table], names: Sequence[str]) -> Plot:
 def difference(a: pa.Table, b: pa.Table) -> Plot | None:
     """Return the second flight less the first over the time that both flew; None where they have none in common."""
     panels = []
-    for curve, label in zip(SHOWN_CURVES, ("position", "attitude", "flaps"), strict=True):
+    for label, curve in shown_curves(a):
         times, miss = _miss(a, b, curve)
         if len(times) > 1:
             lines = zip(curve.names, curve.colours, miss.T, strict=True)
@@ -201,7 +205,7 @@ def _apart(a: pa.Table, b: pa.Table) -> Iterator[Apart]:
     lined_up = release_of(a.schema.metadata) == release_of(b.schema.metadata)
     if (lined_up and not (is_real(a) or is_real(b))) or min(log.num_rows for log in free) < 2:
         return
-    for curve in SHOWN_CURVES:
+    for _, curve in shown_curves(a):
         _, differences = _miss(a, b, curve)
         for name, values in zip(curve.names, differences.T, strict=True):
             miss = values[np.isfinite(values)]

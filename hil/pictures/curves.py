@@ -50,7 +50,11 @@ class Curves:
     colours: tuple[str, ...]
     unit: str
     read: Read
-    needs: str = "t"  # a column that only some logs have
+    needs: str = "t"  # columns of which a log has one at least
+
+    def fits(self, columns: Iterable[str]) -> bool:
+        """Whether a log with these columns has what is read."""
+        return not set(self.needs.split()).isdisjoint(columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,12 @@ class States:
     column: str
     names: tuple[str, ...]
     colours: tuple[str, ...]
+
+
+def actuators(log: pa.Table) -> tuple[tuple[str, Curves], ...]:
+    """Return what moves the robot, with its name: flaps, rotors, or nothing that is known here."""
+    moving = (("flaps", FLAPS), ("rotors", ROTORS))
+    return tuple((name, plot) for name, plot in moving if plot.fits(log.column_names))
 
 
 def since_release(log: pa.Table) -> NDArray[np.float64]:
@@ -124,14 +134,30 @@ ATTITUDE_MISS = Curves(
     "deg",
     lambda rows: (ATTITUDE_ESTIMATE.read(rows) - ATTITUDE.read(rows) + 180) % 360 - 180,
 )
-FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _flaps)
+FLAPS = Curves(_four("flap "), FLAP_COLOURS, "deg", _flaps, needs="truth.flap_1 telemetry.flap_1")
+ROTORS = Curves(
+    _four("M"), FLAP_COLOURS, "mN", plain(*_four("rotor.thrust_"), scale=1e3), needs="rotor.thrust_1"
+)
+MOTORS = Curves(
+    _four("M"), FLAP_COLOURS, "%", plain(*_four("motor.m"), scale=100 / 65535), needs="rotor.thrust_1"
+)
 FLAPS_COMMAND = Curves(
     _four("command "), FLAP_COLOURS, "deg", _degrees(*_four("control.flap_")), needs="control.flap_1"
 )
 INPUTS = Curves(
-    ("u1 roll", "u2 pitch", "u3 yaw", "u4 height"), FLAP_COLOURS, "deg", _degrees(*_four("control.u"))
+    ("u1 roll", "u2 pitch", "u3 yaw", "u4 height"),
+    FLAP_COLOURS,
+    "deg",
+    _degrees(*_four("control.u")),
+    needs="control.u1",
 )
-AGE = Curves(("age of the pose",), (BLUE,), "ms", plain("estimator.pose_age_us", scale=1e-3))
+AGE = Curves(
+    ("age of the pose",),
+    (BLUE,),
+    "ms",
+    plain("estimator.pose_age_us", scale=1e-3),
+    needs="estimator.pose_age_us",
+)
 HORIZON = Curves(
     ("horizon",), (ORANGE,), "ms", plain("estimator.horizon", scale=TICK_MS), needs="estimator.horizon"
 )

@@ -95,9 +95,16 @@ def flaps(rows: pa.Table) -> Plot:
     return Plot(tuple(panels))
 
 
+def rotors(rows: pa.Table) -> Plot:
+    """Draw the thrust of the rotors and what the firmware commands."""
+    return Plot(
+        (panel(curves.ROTORS, rows, "thrust", height=1.8), panel(curves.MOTORS, rows, "command", height=1.8))
+    )
+
+
 def age(rows: pa.Table) -> Plot:
     """Draw the age of each pose at the estimator and, where it is reported, the time without one."""
-    plots = [plot for plot in (curves.AGE, curves.HORIZON) if plot.needs in rows.column_names]
+    plots = [plot for plot in (curves.AGE, curves.HORIZON) if plot.fits(rows.column_names)]
     series = [line for plot in plots for line in panel(plot, rows, "").series]
     panels = [Panel("age on board [ms]", tuple(series), least=0.0)]
     return Plot((*panels, *without_a_pose(rows)))
@@ -245,6 +252,15 @@ PICTURES = (
         "Flaps",
         "True angle of each flap and the commanded angle; of a real board, the angle that its estimator has.",
         flaps,
+        needs=curves.FLAPS.needs,
+        question=WHAT,
+    ),
+    Picture(
+        "Rotors",
+        "Thrust of each rotor: M1 front right, M2 back right, M3 back left, M4 front left. The words that the firmware "
+        "sends to their timers, as shares of the whole.",
+        rotors,
+        needs=curves.ROTORS.needs,
         question=WHAT,
     ),
     Picture(
@@ -264,6 +280,7 @@ PICTURES = (
         "Age of the pose when the estimator takes it, and the horizon of its predictor (0: it is switched off); the longest "
         "time since a fused pose, which grows while none comes or each is refused (a real board has the age only).",
         age,
+        needs=curves.AGE.needs,
         question=KNOWN,
     ),
     Picture(

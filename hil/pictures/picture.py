@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -30,11 +30,15 @@ class Picture:
     title: str
     caption: str
     draw: Callable[..., Plot | Still]  # of the log of a flight, of several, or of a schedule
-    needs: str = "t"  # the column that it needs
+    needs: str = "t"  # columns of which it needs one at least
     alone: bool = False  # panels with a time axis of their own
     question: str = WHERE  # that it answers, in whose part of the report it is
     folded: bool = False  # until a reader opens it, or a fault of the groups `about` was injected
     about: tuple[str, ...] = ()
+
+    def fits(self, columns: Iterable[str]) -> bool:
+        """Whether it can be drawn of a log with these columns."""
+        return not set(self.needs.split()).isdisjoint(columns)
 
 
 def painted(draw: Callable[..., Figure], *flights: pa.Table) -> Still:

@@ -74,7 +74,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)
     figures = {question: [
         draw(picture, marks, rows)
-        for picture, rows in drawn if picture.question == question and picture.needs in rows.column_names
+        for picture, rows in drawn if picture.question == question and picture.fits(rows.column_names)
     ] for question in QUESTIONS}  # fmt: skip
     failures = failures_of(log, result)
     close = close_ups(log, marks, failures[0].at_s if failures else None)

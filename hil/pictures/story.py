@@ -192,13 +192,17 @@ def _begin(spell: Spell) -> float:
 def _plot(rows: pa.Table, window_s: tuple[float, float]) -> Plot:
     """Draw the truth with what the board believed and commanded."""
     commanded = curves.FLAPS_COMMAND.needs in rows.column_names
+    moving = [
+        _with(plot, curves.FLAPS_COMMAND, "command", rows, name)
+        if commanded and plot is curves.FLAPS
+        else panel(plot, rows, name)
+        for name, plot in curves.actuators(rows)
+    ]
     return Plot(
         (
             _with(curves.POSITION, curves.POSITION_ESTIMATE, "estimate", rows, "position error"),
             _with(curves.ATTITUDE, curves.ATTITUDE_ESTIMATE, "estimate", rows, "attitude error"),
-            _with(curves.FLAPS, curves.FLAPS_COMMAND, "command", rows, "flaps")
-            if commanded
-            else panel(curves.FLAPS, rows, "flaps"),
+            *moving,
             *without_a_pose(rows),
             lanes_of_states(rows),
         ),

@@ -15,6 +15,7 @@ def test_shipped_profiles_load() -> None:
     assert profile_names() == [
         "as-flown",
         "cad",
+        "crazyflie",
         "design-best",
         "design-double",
         "design-flat",

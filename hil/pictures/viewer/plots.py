@@ -23,6 +23,8 @@ PLOTS: Mapping[str, Curves] = {
     "flaps/angle": curves.FLAPS,
     "flaps/command": curves.FLAPS_COMMAND,
     "inputs": curves.INPUTS,
+    "rotors/thrust": curves.ROTORS,
+    "rotors/command": curves.MOTORS,
     "miss/position": curves.POSITION_MISS,
     "miss/attitude": curves.ATTITUDE_MISS,
     "age/pose": curves.AGE,
@@ -58,7 +60,7 @@ class ShownCurves:
         """Return the curves of a log."""
         names = set(schema.names)
         return cls(
-            {path: plot for path, plot in PLOTS.items() if plot.needs in names},
+            {path: plot for path, plot in PLOTS.items() if plot.fits(names)},
             {path: rate for path, rate in RATES.items() if set(rate.columns) <= names},
             curves.processor(schema.names),
         )

@@ -171,7 +171,7 @@ def test_the_report_of_a_real_flight_says_whose_eyes_it_has(both: tuple[Path, Pa
     assert "what the cameras saw" in text
     assert "yaw-step-0, real flight" in text
     assert "seed" not in {row[0] for row in page.tables["run"]}
-    drawn = [picture.title for picture in PICTURES if picture.needs in load_log(folder).column_names]
+    drawn = [picture.title for picture in PICTURES if picture.fits(load_log(folder).column_names)]
     assert drawn == ["Errors", "Flaps", "States", "Estimate", "Age", "Station"]
     shown = [name for name, plot in page.plots.items() if not plot["alone"]]
     assert (

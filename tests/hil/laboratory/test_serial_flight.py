@@ -106,7 +106,7 @@ def test_telemetry_over_the_line_is_the_estimate(result: Result) -> None:
 
 def test_the_report_shows_the_line(result: Result) -> None:
     names = load_log(result.folder).column_names
-    shown = [picture.title for picture in PICTURES if picture.needs in names]
+    shown = [picture.title for picture in PICTURES if picture.fits(names)]
     assert "Serial line" in shown
     assert "Radio" not in shown
 

@@ -40,7 +40,7 @@ from support.html_page import Page, lines_of
 def report(folder: Path) -> Page:
     page = Page(write_report(folder).read_text(encoding="utf-8"))
     drawn = [
-        picture for picture in hil.pictures.report.PICTURES if picture.needs in load_log(folder).column_names
+        picture for picture in hil.pictures.report.PICTURES if picture.fits(load_log(folder).column_names)
     ]
     others = [table for table in (ages.reported_ages(folder), load_schedule(folder)) if table.num_rows]
     close_ups = [name for name in page.plots if name.startswith("close-up")]

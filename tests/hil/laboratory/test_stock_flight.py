@@ -1,0 +1,116 @@
+"""The Crazyflie's own firmware, unmodified, flies a Crazyflie's body: the ELF that FLOATY_STOCK_ELF names, byte for byte."""
+
+import os
+from math import degrees, radians
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from firmware_py.wire.supervisor import Cause, State
+from hil.api import Request, column, fly
+from hil.config import load_config
+from hil.devices.crazyflie_signals import stock_signals
+from hil.errors import LabError
+from hil.experiments.hover import HOVER
+from hil.laboratory.request import why_left
+
+ELF = os.environ.get("FLOATY_STOCK_ELF", "")
+needs_image = pytest.mark.skipif(
+    not ELF, reason="FLOATY_STOCK_ELF names no build of Bitcraze's firmware: no Crazyflie was flown"
+)
+PROFILE = "crazyflie"
+
+
+def test_profile_without_an_image_is_one_clear_line() -> None:
+    with pytest.raises(
+        LabError, match=r"^profile crazyflie: its robot flies with .* --board FILE: the image"
+    ):
+        Request.of(HOVER, profile=PROFILE)
+
+
+def test_flight_too_short_for_take_off_and_landing_is_refused(tmp_path: Path) -> None:
+    image = tmp_path / "cf2.elf"
+    image.write_bytes(b"")
+    with pytest.raises(LabError, match=r"^--duration 6: take-off and landing alone take 7.3 s"):
+        Request.of(HOVER, profile=PROFILE, board=str(image), duration_s=6.0)
+    assert Request.of(HOVER, profile=PROFILE, board=str(image), duration_s=7.5).times is not None
+
+
+def test_goals_stay_in_the_room() -> None:
+    config = load_config(PROFILE)
+    assert why_left(config, (0.0, 1.9, 1.0)) == ""
+    assert "up to 2 m sideways and 2.5 m high" in why_left(config, (0.0, 2.1, 1.0))
+
+
+def table(**values: float) -> dict[str, SimpleNamespace]:
+    return {
+        name.replace("__", "."): SimpleNamespace(read=lambda value=value: value)
+        for name, value in values.items()
+    }
+
+
+def test_stock_log_variables_are_read_in_si_and_our_signs() -> None:
+    signals = stock_signals(
+        table(
+            stateEstimate__x=1, stateEstimate__roll=10, stateEstimate__pitch=20, gyro__z=90, motor__m2=40000
+        )
+    )  # type: ignore[arg-type]
+    assert signals.estimate[0] == 1.0
+    assert signals.estimate[6] == pytest.approx(radians(10))
+    assert signals.estimate[7] == pytest.approx(-radians(20))
+    assert signals.estimate[11] == pytest.approx(radians(90))
+    assert signals.estimate[1] != signals.estimate[1]  # unknown
+    assert signals.count.tolist() == [0, 40000, 0, 0]
+    assert signals.counters.size == signals.u.size == signals.flap.size == 0
+
+
+@pytest.mark.parametrize(
+    ("bits", "state", "cause"),
+    [
+        (0b0000_1110, State.WAITING, Cause.NONE),
+        (0b0001_1110, State.FLYING, Cause.NONE),
+        (0b0011_0010, State.FAILSAFE, Cause.NONE),
+        (0b1001_0010, State.FAILSAFE, Cause.NONE),
+        (0b0100_0000, State.FAILSAFE, Cause.EMERGENCY_STOP),
+    ],
+)
+def test_bits_of_the_stock_supervisor_are_our_states(bits: int, state: State, cause: Cause) -> None:
+    supervisor = stock_signals(table(supervisor__info=bits)).supervisor  # type: ignore[arg-type]
+    assert (supervisor.state, supervisor.cause) == (state, cause)
+
+
+@needs_image
+@pytest.mark.parametrize("controller", [1, 2, 3], ids=["pid", "mellinger", "indi"])
+def test_takes_off_holds_and_lands_with_each_controller(controller: int, tmp_path: Path) -> None:
+    """INDI sinks a second behind its goal, and the firmware stops the motors when the goal has landed: so slowly."""
+    settings = {"pilot.parameters.stabilizer.controller": controller, "pilot.land_s": 5.0}
+    run = fly("hover", tmp_path / "run", profile=PROFILE, board=ELF, overrides=settings, duration_s=14.0)
+    assert run.result.outcome == "completed"
+    held = [verdict for verdict in run.result.verdicts if verdict.metric in ("max_x", "max_y")]
+    assert all(verdict.holds for verdict in held), held
+    log = run.log
+    assert column(log, "truth.z").max() > 0.9
+    assert column(log, "truth.z")[-1] < 0.02
+    in_air = (column(log, "truth.z") > 0.9) & (abs(column(log, "truth.vz")) < 0.02)
+    share = column(log, "motor.m1", "motor.m2", "motor.m3", "motor.m4")[in_air].mean() / 65535
+    volts = column(log, "battery.voltage")[in_air].mean()
+    assert share * volts == pytest.approx(
+        2.40, rel=0.03
+    )  # [V] of Bitcraze's curve at a quarter of the weight
+    assert degrees(abs(column(log, "estimate.roll")[in_air]).max()) < 3.0
+
+
+@needs_image
+def test_same_seed_has_the_same_hash_and_an_unknown_parameter_one_line(tmp_path: Path) -> None:
+    one, other = (
+        fly("hover", tmp_path / name, profile=PROFILE, board=ELF, duration_s=7.5).result.hash for name in "ab"
+    )
+    assert one == other
+    with pytest.raises(
+        LabError, match=r"^pilot.parameters.stabilizer.controler: the image has no such parameter"
+    ):
+        fly(
+            "hover", tmp_path / "c", profile=PROFILE, board=ELF,
+            overrides={"pilot.parameters.stabilizer.controler": 1},
+        )  # fmt: skip
