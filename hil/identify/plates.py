@@ -9,6 +9,7 @@ those at the mean flap angles.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import lfilter
@@ -23,14 +24,25 @@ from hil.world.motion import GRAVITY
 
 # Inputs that act as the plates do, and the axis of B about which they turn; the identified pitch and height act otherwise.
 BENT = {0: 0, 2: 2}
-SIDEWAYS = 1  # y: its force depends on flaps and roll, and bends with both
-STEP = 0.02  # [rad] of the differences
+SIDEWAYS, HEIGHT = 1, 2  # y, whose force depends on flaps and roll and bends with both; z
+STEP = 0.02  # [rad, m/s, rad/s] of the differences
+Rates = tuple[float, float, float]
+STILL: Rates = (0.0, 0.0, 0.0)
 
 
-def straightened(record: Record) -> tuple[Array, Array]:
-    """Return the inputs (N, 4) [rad] as if their effects were linear, and the acceleration along y (N,) [m/s2] that is not.
+@dataclass(frozen=True, slots=True)
+class Straightened:
+    """A record as if effects were linear, on its own instants."""
 
-    The flaps follow their commands by the profile's lag.
+    u: Array  # (N, 4) [rad]
+    bent: Array  # (N, 2) [m/s2] the accelerations along y and z that are not linear
+
+
+def straightened(record: Record) -> Straightened:
+    """Return inputs as if their effects were linear, and the accelerations along y and z that are not.
+
+    Along z these are what roll and sideways velocity do to a robot that leans in a side wind. The flaps follow their
+    commands by the profile's lag.
     """
     step, config = record.period_s, record.config
     share = 1.0 - np.exp(-step * config.model.flap_rate)
@@ -38,48 +50,61 @@ def straightened(record: Record) -> tuple[Array, Array]:
     u = np.stack([np.interp(t, record.u_t, column) for column in record.u.T], axis=1)
     mean = u.mean(axis=0)
     moved = lfilter([share], [1.0, share - 1.0], u - mean, axis=0)
-    roll = np.interp(t, record.pose_t, record.pose[:, 3])
-    middle = float(roll.mean())
+    roll, y = (np.interp(t, record.pose_t, record.pose[:, column]) for column in (3, SIDEWAYS))
+    middle, speed = float(roll.mean()), np.gradient(y, step)
     motion = _plates(config)
 
-    every = np.array([motion(mean + one, tilt) for one, tilt in zip(moved, roll.tolist(), strict=True)])
-    level = np.array([motion(mean + one, middle) for one in moved])
-    every[:, SIDEWAYS] *= GRAVITY / every[:, 2].mean()  # the flight, not the profile, knows the mass
+    def aside(speed: float, roll: float = middle) -> float:
+        return float(motion(mean, roll, speed)[SIDEWAYS])
+
+    model = config.model
+    # In which a robot that leans so stays in place.
+    wind = (model.y_u1 * mean[0] + model.y_roll * middle) / model.y_vy
+    damping = (aside(STEP - wind) - aside(-STEP - wind)) / (2 * STEP)
+    tilting = (aside(-wind, middle + STEP) - aside(-wind, middle - STEP)) / (2 * STEP)
     slopes = [
-        (motion(mean + aside, middle) - motion(mean - aside, middle)) / (2 * STEP)
-        for aside in STEP * np.eye(4)
+        (motion(mean + more, middle, -wind) - motion(mean - more, middle, -wind)) / (2 * STEP)
+        for more in STEP * np.eye(4)
     ]
+    level = np.array([motion(mean + one, middle, -wind) for one in moved])
+    every = np.array([
+        motion(mean + one, tilt, along - wind)
+        for one, tilt, along in zip(moved, roll.tolist(), speed.tolist(), strict=True)
+    ])  # fmt: skip
+    scale = GRAVITY / level[:, 2].mean()  # the flight, not the profile, knows the mass
     straight = record.u.copy()
     for number, about in BENT.items():
         more = level[:, 3 + about] / slopes[number][3 + about] - moved[:, number]
         commanded = lfilter([1.0 / share, (share - 1.0) / share], [1.0], more - more.mean())
         straight[:, number] += np.interp(record.u_t, t, commanded)
-    causes = np.column_stack([moved[:, 0], roll - middle])
-    tilted = (motion(mean, middle + STEP) - motion(mean, middle - STEP))[SIDEWAYS] / (2 * STEP)
-    scale = GRAVITY / motion(mean, middle)[2]
-    aside = every[:, SIDEWAYS] - causes @ np.array([slopes[0][SIDEWAYS], tilted]) * scale
-    return straight, np.interp(record.t, t, aside - aside.mean())
+    linear = slopes[0][SIDEWAYS] * moved[:, 0] + tilting * (roll - middle) + damping * speed
+    bent = scale * np.column_stack([every[:, SIDEWAYS] - linear, every[:, 2] - level[:, 2]])
+    bent -= bent.mean(axis=0)
+    return Straightened(straight, np.stack([np.interp(record.t, t, one) for one in bent.T], axis=1))
 
 
 def turns_of(record: Record) -> dict[str, float]:
     """Return x_rate and y_rate [m/s/rad] of plates at the mean flap angles: by how much turning alone pushes the robot."""
     motion, mean = _plates(record.config), record.u.mean(axis=0)
-    about_x = motion(mean, 0.0, (STEP, 0.0, 0.0)) - motion(mean, 0.0, (-STEP, 0.0, 0.0))
-    about_y = motion(mean, 0.0, (0.0, STEP, 0.0)) - motion(mean, 0.0, (0.0, -STEP, 0.0))
+    about_x = motion(mean, turn=(STEP, 0.0, 0.0)) - motion(mean, turn=(-STEP, 0.0, 0.0))
+    about_y = motion(mean, turn=(0.0, STEP, 0.0)) - motion(mean, turn=(0.0, -STEP, 0.0))
     return {"y_rate": float(about_x[1]) / (2 * STEP), "x_rate": float(about_y[0]) / (2 * STEP)}
 
 
 def _plates(config: LabConfig) -> Callable[..., Array]:
-    """Return the specific force (W) and angular acceleration (B), (6,), of plates alone by inputs, roll and rates."""
+    """Return a function from inputs, roll, velocity along y and rates to specific force (W) and angular acceleration (B).
+
+    Both are those of plates alone in calm air, (6,) together.
+    """
     plain = config.plant.model_copy(update={"variant": "plate", "constant_factors": {}, "mass_factor": 1.0})
     air = config.tunnel.model_copy(update={"side_wind": (0.0, 0.0, 0.0)})
     plates = Plant(config.geometry, plain, air, config.actuators, Streams.of_seed(1).gusts)
     hover = SIGNS * config.allocation.hover_angle
     place = (0.0, 0.0, config.tunnel.hover_height)
 
-    def motion(inputs: Array, roll: float, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
+    def motion(inputs: Array, roll: float = 0.0, speed: float = 0.0, turn: Rates = STILL) -> Array:
         q_WB = from_euler_zyx(roll, 0.0, 0.0)
-        plates.place(place, q_WB, omega_B=turn, flaps=(hover + MIX @ inputs).tolist())
+        plates.place(place, q_WB, (0.0, speed, 0.0), turn, flaps=(hover + MIX @ inputs).tolist())
         return np.array([*plates.acceleration_W[:2], plates.acceleration_W[2] + GRAVITY, *plates.alpha_B])
 
     return motion

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import LabError
-from hil.identify.plates import SIDEWAYS, straightened
+from hil.identify.plates import HEIGHT, SIDEWAYS, straightened
 from hil.identify.record import Array, Record
 
 Complex = NDArray[np.complexfloating[Any, Any]]
@@ -120,17 +120,17 @@ def period_spectra(record: Record) -> tuple[list[NDArray[np.int_]], Array, Compl
             f"{record.name}: rows of {record.period_s * 1e3:.0f} ms are too far apart for the excitation's lines"
         )
     w = 2 * np.pi * SPACING_HZ * lines
-    straight, sideways = straightened(record)
-    commanded = np.concatenate([record.excitation, straight], axis=1)
-    of_board = np.column_stack([record.rates, sideways])
+    straight = straightened(record)
+    commanded = np.concatenate([record.excitation, straight.u], axis=1)
+    of_board = np.concatenate([record.rates, straight.bent], axis=1)
     periods = []
     for start in starts:
         parts = []
         for t, values in ((record.u_t, commanded), (record.t, of_board), (record.pose_t, record.pose)):
             rows = (t >= start - 1e-6) & (t < start + PERIOD_S - 1e-6)
             parts.append(_fit(t[rows] - start, values[rows], w, record.name))
-        rates, bent, seen = parts[1][:, :3], parts[1][:, 3], parts[2]
-        seen[:, SIDEWAYS] += bent / w**2
+        rates, bent, seen = parts[1][:, :3], parts[1][:, 3:], parts[2]
+        seen[:, [SIDEWAYS, HEIGHT]] += bent / w[:, None] ** 2
         periods.append(np.concatenate([parts[0], rates, seen], axis=1))
     P = np.array(periods)
     _refuse_impure(record.name, lines, own, np.abs(P[:, :, :4]))

@@ -153,9 +153,9 @@ def test_every_point_has_the_row_of_its_flight() -> None:
     )
 
 
-def pairs(count: int, rate: float, alike: float) -> np.ndarray:
+def pairs(count: int, rate: float, alike: float, seed: int = 4) -> np.ndarray:
     """Return flights of two profiles at `count` points, (count, 2), which agree at least in a share of the points."""
-    rng = np.random.default_rng(4)
+    rng = np.random.default_rng(seed)
     failed = rng.random((count, 2)) < rate
     same = rng.random(count) < alike
     failed[same, 1] = failed[same, 0]
@@ -178,6 +178,16 @@ def test_the_interval_of_clusters_is_that_of_a_bootstrap_over_the_clusters(alike
     assert (low, high) == pytest.approx(tuple(again.confidence_interval), abs=0.003)
     naive = interval(failed.mean(), failed.size)
     assert (high - low) / (naive[1] - naive[0]) == pytest.approx((1.0 + alike) ** 0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.2])
+def test_nineteen_of_twenty_intervals_contain_the_rate_of_pairs_that_agree_in_94_percent(rate: float) -> None:
+    alike = 1.0 - 0.06 / (2 * rate * (1 - rate))
+    inside = []
+    for seed in range(300):
+        low, high = tallied(pairs(250, rate, alike, seed)).interval
+        inside.append(low <= rate <= high)
+    assert 0.92 <= np.mean(inside) <= 0.99
 
 
 def test_clusters_of_which_none_fails_count_once() -> None:

@@ -231,10 +231,27 @@ def test_u3_is_straightened_by_the_law_of_flat_plates_sin_phi_cos_phi_squared() 
     u[:, 2] = 0.2 * np.sin(2 * np.pi * 0.2 * t)
     zero = np.zeros((len(t), 3))
     record = Record("r", t, t, u, 0 * u, zero, t, np.zeros((len(t), 6)), 0.0, 0.0, CONFIG, False)
-    straight, sideways = straightened(record)
+    straight = straightened(record)
     high, low = (np.sin(hover + aside) * np.cos(hover + aside) ** 2 for aside in (0.2, -0.2))
     expected = 0.5 * (high - low) / (np.cos(hover) * (1 - 3 * np.sin(hover) ** 2))
-    assert straight[1000:, 2].max() == pytest.approx(expected, rel=0.01)
+    assert straight.u[1000:, 2].max() == pytest.approx(expected, rel=0.01)
     assert expected < 0.97 * 0.2
-    assert straight[:, [1, 3]] == pytest.approx(u[:, [1, 3]])
-    assert sideways == pytest.approx(0.0, abs=1e-9)
+    assert straight.u[:, [1, 3]] == pytest.approx(u[:, [1, 3]])
+    assert straight.bent == pytest.approx(0.0, abs=1e-9)
+
+
+def test_roll_lifts_a_robot_that_leans_and_no_other() -> None:
+    t, zero = 0.02 * np.arange(3000), np.zeros((3000, 3))
+    swing, still = 0.02 * np.sin(2 * np.pi * 0.5 * t), np.zeros((3000, 4))
+
+    def lifted(lean: float) -> float:
+        pose = np.zeros((len(t), 6))
+        pose[:, 3] = lean + swing
+        record = Record("r", t, t, still, still, zero, t, pose, 0.0, 0.0, CONFIG, False)
+        return float(swing @ straightened(record).bent[:, 1] / (swing @ swing))
+
+    assert lifted(0.0) == pytest.approx(0.0, abs=1e-3)
+    assert lifted(0.1) == pytest.approx(-lifted(-0.1), rel=1e-3)
+    assert lifted(0.1) < -9.81 * np.sin(0.1), (
+        "the vertical share of its force, and less of the flow from below"
+    )
