@@ -29,6 +29,7 @@ from hil.commands.options import (
 from hil.errors import LabError, require
 
 if TYPE_CHECKING:
+    from hil.config import LabConfig
     from hil.servers.motive import Streaming
     from hil.servers.serial_server import Address
     from hil.servers.server import Ends
@@ -83,7 +84,8 @@ class Asked:
 @click.option("--boards", type=click.IntRange(1, BOARDS_MAX), default=1, show_default=True, metavar="N")
 @click.option(
     "--station", type=click.Choice(["corrections", "poses"]), is_flag=False, flag_value="corrections",
-    help="Fly at home with the built-in ground station; poses: it sends absolute poses, and clients say where to fly.",
+    help="Fly at home with the built-in ground station; poses: it sends absolute poses, and clients say where to fly. "
+    "Of the profile crazyflie: always poses.",
 )  # fmt: skip
 @click.option(
     "--motive/--no-motive", default=True, show_default=True, help="Stream the cameras' poses over NatNet."
@@ -130,6 +132,7 @@ def serve(asked: Asked) -> int:
         () if asked.station == "corrections" else ("predictor.absolute=true",)
     )  # as Bitcraze's programs send them
     config = load_config(asked.profile, (*markers, *poses, *asked.overrides))
+    station = _station_of(asked, config)
     ends = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
     planned = [parse(text) for text in asked.faults]
     check(planned, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
@@ -143,9 +146,9 @@ def serve(asked: Asked) -> int:
     try:
         streaming = streaming_of(config.capture) if asked.motive else None
         _open_ends(server.ends, asked.udp, asked.radio_port if asked.radio else None, ends, streaming)
-        if asked.station is not None:
+        if station is not None:
             for robot in server.ends.robots:
-                robot.fly(asked.station == "poses")
+                robot.fly(station == "poses")
         LiveFaults(server, say).listen(sys.stdin)
         stops = stop_signals()
         say("serving; Ctrl-C ends")
@@ -157,6 +160,22 @@ def serve(asked: Asked) -> int:
         say(f"motive could not read {server.ends.motive.malformed} packets")
     say(f"stopped; time stood still for {server.clock.stood_still_us / 1000:.0f} ms")
     return 0
+
+
+def _station_of(asked: Asked, config: LabConfig) -> str | None:
+    """Return what the built-in ground station sends. Raises `LabError` where the robot and its board do not fit."""
+    if not config.pilot.enabled:
+        return asked.station
+    if asked.board is None:
+        raise LabError(
+            f"profile {asked.profile}: its robot flies with the Crazyflie's own firmware; "
+            "--board FILE: the image, an ELF file"
+        )
+    if asked.station == "corrections":
+        raise LabError(
+            f"--station corrections: the Crazyflie's own firmware of profile {asked.profile} takes poses"
+        )
+    return "poses"
 
 
 def _check_options(asked: Asked) -> None:

@@ -11,7 +11,7 @@ WATCH_PERIOD_US = 10_000
 
 
 class Holder:
-    """Watches one robot. `let_go` is called when it has flown in its holder for a second."""
+    """Watches one robot. `let_go` is called when it has flown in its holder for a second, or when it stands by itself."""
 
     def __init__(self, robot: Robot, let_go: Callable[[int], None]) -> None:
         self._robot = robot
@@ -31,6 +31,9 @@ class Holder:
     def _watch(self, now_us: int) -> None:
         robot = self._robot
         if robot.free or robot.body.lost is not None:
+            return
+        if robot.config.pilot.enabled:  # it stands on the floor
+            self._let_go(now_us)
             return
         if not robot.powered or robot.firmware.signals.supervisor.state is not State.FLYING:
             self._flying_since_us = None

@@ -3,13 +3,14 @@
 Its EEPROM and deck memory survive a restart of the server, in two files of a folder.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from firmware_py.wire import WireError
 from firmware_py.wire.memories import CONFIG_SIZE, decode_config, encode_config
 from firmware_py.wire.memories import RadioSettings as EepromSettings
-from firmware_py.wire.parameters import encode_pose_kind
+from firmware_py.wire.parameters import SetByName, encode_pose_kind, encode_set_by_name
 from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation
 from ground_station.tracker import tracker_of
@@ -20,6 +21,7 @@ from hil.crazyflie.crazyflie import POLL_PERIOD_US
 from hil.crazyflie.nrf51 import RATES, AirSettings, Nrf51
 from hil.crazyflie.shockburst import Air
 from hil.devices.board import InjectFailure, Memory, unsupported
+from hil.devices.board_firmware import BoardFirmware
 from hil.devices.radio import VirtualRadio
 from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
@@ -87,13 +89,19 @@ WORLD = Goal((0.0, 0.0, 0.0), 0.0)  # seen from here a pose is absolute
 class _PosesOnly(LoopbackLink):
     """Carries corrections, or absolute poses; telemetry belongs to the clients."""
 
-    def __init__(self, transmit: Callable[[int, bytes], object], latency_us: int, absolute: bool) -> None:
+    def __init__(
+        self,
+        transmit: Callable[[int, bytes], object],
+        latency_us: int,
+        settings: Callable[[], Sequence[bytes]],
+    ) -> None:
         super().__init__(transmit, latency_us, dict)
-        self._absolute = absolute
+        self._settings = settings
 
     def start_telemetry(self, now_us: int) -> None:
-        """Set what the poses are instead: an image that has booted begins with absolute ones."""
-        self._transmit(now_us, encode_pose_kind(self._absolute))
+        """Send settings instead."""
+        for packet in self._settings():
+            self._transmit(now_us, packet)
 
 
 class ServedRobot:
@@ -182,11 +190,30 @@ class ServedRobot:
         With absolute poses the goal is the clients' matter.
         """
         config = self.robot.config
-        link = _PosesOnly(self._wire, config.station.link_latency_us, absolute)
+        settings = (
+            partial(self._pilot_settings, []) if config.pilot.enabled else partial(_pose_kind, absolute)
+        )
+        link = _PosesOnly(self._wire, config.station.link_latency_us, settings)
         tracker = tracker_of(config.tracker, config.mocap.period_us)
         goal = WORLD if absolute else Goal(config.flight.home, 0.0)
         ground = GroundStation(link, Hold(goal), None, config.station, tracker)
         self.robot.seen_by(lambda frame, now_us, _: ground.on_frame(frame, now_us))
+
+    def _pilot_settings(self, told: list[BoardFirmware]) -> Sequence[bytes]:
+        """Return the profile's parameters for the Crazyflie's own firmware, once per boot; `told` has the last one."""
+        firmware = self.robot.firmware
+        if firmware in told or firmware.flashed is None:
+            return ()
+        told[:] = [firmware]
+        table, parameters = firmware.flashed.parameters, self.robot.config.pilot.parameters
+        wanted = {
+            f"{group}.{name}": value for group, one in parameters.items() for name, value in one.items()
+        }
+        return [
+            encode_set_by_name(SetByName(name, table[name].scalar, value))
+            for name, value in wanted.items()
+            if name in table
+        ]
 
     def _wire(self, now_us: int, data: bytes) -> None:
         def arrive(now_us: int) -> None:
@@ -275,6 +302,11 @@ class ServedRobot:
     def _from_line(self, now_us: int, data: bytes) -> None:
         if self._line_end is not None:
             self._line_end.send(data)
+
+
+def _pose_kind(absolute: bool) -> Sequence[bytes]:
+    """Return what sets what the poses are: an image that has booted begins with absolute ones."""
+    return (encode_pose_kind(absolute),)
 
 
 def _factory_config(number: int, config: LabConfig) -> bytes:

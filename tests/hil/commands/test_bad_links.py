@@ -64,6 +64,13 @@ def test_a_station_refuses_a_port_on_which_no_board_listens(cli: Cli) -> None:
         (["fly", "hover", "--link", RADIO, "--seeds", "2"], "--seeds is for flights in lockstep"),
         (["serve", "--set", "radio.uplink_loss=2"], "radio.uplink_loss = 2"),
         (["serve", "--boards", "11"], "11"),
+        (["serve", "--profile", "crazyflie"], "profile crazyflie: its robot flies with the Crazyflie's own firmware"),
+        (
+            ["serve", "--profile", "crazyflie", "--board", "x.elf", "--station", "corrections"],
+            "--station corrections: the Crazyflie's own firmware",
+        ),
+        (["fly", "hover", "--profile", "crazyflie"], "--board FILE: the image, an ELF file"),
+        (["fly", "hover", "--profile", "crazyflie", "--board", "no.elf"], "--board no.elf"),
         (["serve", "--udp", "65530", "--boards", "10"], "--udp 65530"),
         (["serve", "--mavlink", "usb"], "--mavlink usb: expected pty"),
         (["serve", "--mavlink", "udp:70000"], "--mavlink udp:70000: port 70000"),

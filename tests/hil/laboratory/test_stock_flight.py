@@ -13,7 +13,9 @@ from hil.config import load_config
 from hil.devices.crazyflie_signals import stock_signals
 from hil.errors import LabError
 from hil.experiments.hover import HOVER
+from hil.laboratory.lockstep import image_at
 from hil.laboratory.request import why_left
+from hil.servers.server import Plan, Server
 
 ELF = os.environ.get("FLOATY_STOCK_ELF", "")
 needs_image = pytest.mark.skipif(
@@ -114,3 +116,22 @@ def test_same_seed_has_the_same_hash_and_an_unknown_parameter_one_line(tmp_path:
             "hover", tmp_path / "c", profile=PROFILE, board=ELF,
             overrides={"pilot.parameters.stabilizer.controler": 1},
         )  # fmt: skip
+
+
+@needs_image
+def test_served_robot_stands_on_the_floor_and_is_told_of_the_profiles_parameters() -> None:
+    server = Server(Plan(load_config(PROFILE), executor=image_at(ELF, None)), lambda text: None)
+    try:
+        served = server.ends.robots[0]
+        served.fly(absolute=True)
+        server.lab.end_at(1_000_000)
+        server.lab.run()
+        robot = served.robot
+        assert robot.free
+        assert robot.firmware.flashed is not None
+        assert robot.firmware.flashed.parameters["stabilizer.estimator"].read() == 2
+        assert robot.body.p_WB[2] == pytest.approx(0.0145, abs=1e-3)
+        table = robot.firmware.signals.estimate
+        assert table[:3] == pytest.approx(robot.body.p_WB, abs=0.02)  # by the poses
+    finally:
+        server.ends.close()
