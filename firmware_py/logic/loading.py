@@ -148,7 +148,7 @@ def _load(modules: tuple[tuple[str, str, str], ...]) -> Loaded:
         translation = translate(texts | {"entry": entry.text}, shown)
     files = {name: file for name, file, _ in modules}
     modules = tuple((name, file, flown[name][1]) for name, file, _ in modules)
-    package = f"{PACKAGE}_{hashlib.sha256(repr(modules).encode()).hexdigest()[:16]}"
+    package = f"{PACKAGE}_{digest[:16]}"  # of the text alone: equal modules share their machine code, wherever they lie
     run = _execute(modules, compose(plugs, package).text, package)
     structs: dict[str, type[Struct]] = {GUARD: Guard}
     for plug in plugs:

@@ -29,6 +29,7 @@ def files_in(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
+@pytest.mark.long
 def test_a_policy_becomes_a_law_with_the_answers_of_its_framework(cli: Cli) -> None:
     file = write_onnx(Path("hover.onnx"), network(), before=("Sub", "Div", "Clip"))
     assert cli("policy", file, "--out", "law") == 0, cli.err

@@ -122,6 +122,7 @@ def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> No
     assert sum(one.duration_s + one.config.flight.release_us * 1e-6 for one in flights) >= 100.0
 
 
+@pytest.mark.long
 def test_the_check_reaches_every_state_and_cause_of_the_core_and_every_entry_point() -> None:
     called: set[str] = set()
 

@@ -23,7 +23,7 @@ def actions(count: int, size: float) -> np.ndarray:
     return np.repeat(rng.uniform(-size, size, (-(-count // 5), 4)), 5, axis=0)[:count].astype(np.float32)
 
 
-@pytest.mark.parametrize("fidelity", ["fast", "firmware"])
+@pytest.mark.parametrize("fidelity", ["fast", pytest.param("firmware", marks=pytest.mark.long)])
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_s_checker_passes(task: str, fidelity: str) -> None:
     env = gymnasium.make(f"floaty/{task}-v0", fidelity=fidelity, duration_s=0.5)
