@@ -136,18 +136,17 @@ def optimise(asked: Search) -> None:
         about = f"What floaty design optimise --figure {figure} --seed {asked.seed} derived from {profile}."
         write_profile(best.point, asked.write_to, about)
     named = {profile: found.reference, "best": best}
-    marks = {name: tuple(search.places((one,), figure)[0].tolist()) for name, one in named.items()}
+    marks = {name: tuple(search.placed((one,), figure)[0].tolist()) for name, one in named.items()}
     axes = (
         "stability: -f_αα [1/s²]",
         figure + (" / that of the profile's robot" if figure == "least-authority" else ""),
     )
     picture = folder_for(asked.out) / f"pareto-{figure}.png"
-    picture.write_bytes(png(lambda: figures.pareto(axes, search.places(found.tried, figure), front, marks)))
+    picture.write_bytes(png(lambda: figures.pareto(axes, search.placed(found.tried, figure), front, marks)))
     for name, value in robot_lines(best.point):
         console.print(f"{name:38} {value}", soft_wrap=True)
-    console.print(
-        f"{figure}: {marks['best'][1]:.3f}; {profile}: {marks[profile][1]:.3f}; {len(found.tried)} robots flew"
-    )
+    own = f"{marks[profile][1]:.3f}" if found.reference_flies else "not stable and steering around its hover"
+    console.print(f"{figure}: {marks['best'][1]:.3f}; {profile}: {own}; {len(found.tried)} robots flew")
     for line in search.exercise(found, *updrafts):
         console.print(line, soft_wrap=True)
     console.print(f"picture  {picture}", soft_wrap=True)

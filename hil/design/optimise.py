@@ -3,6 +3,10 @@
 The hover angle follows: mass, speed and drag coefficient leave one for each flap area. Every robot is passively
 stable in roll and pitch and steers sideways with one sign at openings up to `RESERVE` smaller and larger than the hover's: a
 robot like the paper's reverses its sign there (its steady x per u2). All shapes tried are kept, for the Pareto picture.
+
+Differential evolution begins at the profile's robot, its neighbours and shapes from everywhere; a shape that violates
+conditions is the worse the more it does. The optimum lies where conditions end: the least authority is then climbed along
+them by sequential quadratic programming, from the best shape and from the profile's, and again until that gains nothing.
 """
 
 import math
@@ -11,10 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import differential_evolution
+from scipy.optimize import differential_evolution, minimize
+from scipy.special import ndtri
+from scipy.stats import qmc
 
-from hil.design.authority import least
+from hil.design.authority import QUANTITIES, least
 from hil.design.axes import PITCH, ROLL
+from hil.design.linear import Linear, places
 from hil.design.sweeps import RESERVE, Point, authorities
 from hil.design.trim import balanced, changed, opening_at, speed_at
 from hil.errors import LabError
@@ -23,7 +30,14 @@ from hil.floaty.geometry import weigh
 BOUNDS = {  # shares of the footprint, except the kink
     "kink": (0.0, math.radians(80.0)), "height": (0.0, 0.5), "base": (0.15, 0.5), "strip": (0.02, 0.2),
 }  # fmt: skip
-POPULATION, GENERATIONS = 10, 25
+LOW, HIGH = np.array(list(BOUNDS.values())).T
+POPULATION, GENERATIONS = 40, 25
+NEAR = 0.1  # of the bounds, standard deviation of the reference's neighbours
+AGAIN, GAIN = 5, 1e-4  # how often a climb begins again, as long as it gains that much
+MARGIN = 1e-4  # of conditions during a climb, so that it ends where they hold
+NO_HOVER = 10.0  # loss
+# Typical sizes of the conditions: Routh's three of an axis, and steering times stiffness.
+SIZES = (5.0, 100.0, 1000.0, 1000.0)
 STEP = math.radians(3.0)  # between the openings at which a range of speeds is checked
 BAD = -1.0  # figure of a robot that violates a condition
 
@@ -42,6 +56,7 @@ class Tried:
 class Optimum:
     best: Tried
     reference: Tried
+    reference_flies: bool  # by the conditions of the search
     tried: tuple[Tried, ...]
 
 
@@ -69,11 +84,31 @@ def _flies(point: Point) -> bool:
     )
 
 
+def around(point: Point) -> list[Point]:
+    """Return the robot at its opening, and `RESERVE` below and above it."""
+    return [replace(point, opening=point.opening + aside) for aside in (-RESERVE, 0.0, RESERVE)]
+
+
+def conditions(point: Point) -> NDArray[np.float64]:
+    """Return numbers (24,) that are positive where the robot is stable and steers, smooth in the shape, about 1."""
+    return np.concatenate([_conditions(one.linear) for one in around(point)])
+
+
+def _conditions(model: Linear) -> NDArray[np.float64]:
+    f = model.constants
+    steering = (f.y_u1 * f.roll_roll - f.y_roll * f.roll_u1, f.x_pitch * f.pitch_u2 - f.x_u2 * f.pitch_pitch)
+    found = []
+    for axis, steers in zip((ROLL, PITCH), steering, strict=True):
+        A = model.A[np.ix_(places(axis), places(axis))]
+        # Hurwitz: s^3 + a2 s^2 + a1 s + a0 is stable where these are positive.
+        a2, a1, a0 = -np.trace(A), (np.trace(A) ** 2 - np.trace(A @ A)) / 2.0, -np.linalg.det(A)
+        found.append(np.array([a2, a0, a2 * a1 - a0, steers]) / SIZES)
+    return np.concatenate(found)
+
+
 def least_authority(point: Point, reference: Mapping[str, float]) -> float:
     """Return the least authority over roll, pitch, yaw and lift as a share of the reference's; BAD when it cannot fly."""
-    around = (point.opening - RESERVE, point.opening, point.opening + RESERVE)
-    robots = [replace(point, opening=one) for one in around]
-    return least(authorities(point), dict(reference)) if all(map(_flies, robots)) else BAD
+    return least(authorities(point), dict(reference)) if all(map(_flies, around(point))) else BAD
 
 
 def speed_range(point: Point, reference: Mapping[str, float]) -> float:
@@ -88,52 +123,95 @@ FIGURES: Mapping[str, Callable[[Point, Mapping[str, float]], float]] = {
 }
 
 
+class Shapes:
+    """The shapes of a search, as shares of the footprint (4,) in the order of BOUNDS, with those that were tried."""
+
+    def __init__(self, reference: Point, figure: str) -> None:
+        self._reference, self._of, self._speed = reference, FIGURES[figure], reference.speed
+        self.share = authorities(reference)
+        self.tried: list[Tried] = []
+        geometry, span = reference.geometry, reference.geometry.footprint
+        height = weigh(geometry).axis_height
+        own = [geometry.kink_angle, height / span, geometry.base_side / span, geometry.strip_width / span]
+        self.first = np.clip(own, LOW, HIGH)
+
+    def build(self, x: NDArray[np.float64]) -> Point | None:
+        """Return the robot of a shape; None where it has no hover at the reference's speed within the flaps' range."""
+        geometry, span = self._reference.geometry, self._reference.geometry.footprint
+        kink, height, base, strip = np.clip(x, LOW, HIGH).tolist()
+        try:
+            shape = changed(geometry, kink_angle=kink, base_side=base * span, strip_width=strip * span)
+            shape = balanced(shape, height * span)
+            opening = opening_at(shape, self._reference.coefficient, self._speed)
+        except LabError:
+            return None
+        point = replace(self._reference, geometry=shape, opening=opening)
+        return point if point.low < opening < point.high else None
+
+    def loss(self, x: NDArray[np.float64]) -> float:
+        """Return the negative figure, or by how much the conditions are violated, which is positive."""
+        point = self.build(x)
+        if point is None:
+            return NO_HOVER
+        lack = float(np.tanh(np.maximum(-conditions(point), 0.0)).sum())
+        value = BAD if lack else self._of(point, self.share)
+        if value > BAD:
+            ratio = value if self._of is speed_range else 0.0
+            self.tried.append(_look(point, self.share, ratio))
+        return lack or -value
+
+    def begin(self, seed: int) -> NDArray[np.float64]:
+        """Return the first generation: the reference, its neighbours, and as many shapes from everywhere."""
+        near = ndtri(qmc.LatinHypercube(len(LOW), rng=seed).random(POPULATION // 2 - 1))
+        far = qmc.LatinHypercube(len(LOW), rng=seed).random(POPULATION // 2)
+        places = [self.first, *(self.first + NEAR * near * (HIGH - LOW)), *(LOW + far * (HIGH - LOW))]
+        return np.asarray(np.clip(places, LOW, HIGH), float)
+
+    def climb(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the shape with the largest least authority that is reached along the conditions from x."""
+
+        def above(z: NDArray[np.float64]) -> NDArray[np.float64]:
+            point = self.build(LOW + z[:-1] * (HIGH - LOW))
+            if point is None:
+                return np.full(len(QUANTITIES) + 24, -NO_HOVER)
+            found = authorities(point)
+            shares = [found[name] / self.share[name] - z[-1] for name in QUANTITIES]
+            return np.concatenate([shares, conditions(point) - MARGIN])
+
+        z = np.append((x - LOW) / (HIGH - LOW), 0.0)
+        slope = np.append(np.zeros(len(LOW)), -1.0)
+        for _ in range(AGAIN):
+            before = z[-1]
+            z = minimize(
+                lambda z: -z[-1], z, jac=lambda z: slope, method="SLSQP", bounds=[*[(0, 1)] * len(LOW), (None, None)],
+                constraints={"type": "ineq", "fun": above}, options={"maxiter": 40, "ftol": 1e-7, "eps": 1e-5},
+            ).x  # fmt: skip
+            if abs(z[-1] - before) < GAIN:
+                break
+        return np.asarray(LOW + z[:-1] * (HIGH - LOW), float)
+
+
 def optimise(reference: Point, figure: str, seed: int, generations: int = GENERATIONS) -> Optimum:
     """Return the robot with the largest figure at the reference's span, mass, drag coefficient and speed."""
-    of, share, speed = FIGURES[figure], authorities(reference), reference.speed
-    tried: list[Tried] = []
-
-    def build(x: NDArray[np.float64]) -> Point | None:
-        span = reference.geometry.footprint
-        try:
-            shape = changed(
-                reference.geometry,
-                kink_angle=float(x[0]),
-                base_side=float(x[2]) * span,
-                strip_width=float(x[3]) * span,
-            )
-            shape = balanced(shape, float(x[1]) * span)
-            opening = opening_at(shape, reference.coefficient, speed)
-        except LabError:  # no hover at this speed
-            return None
-        return replace(reference, geometry=shape, opening=opening)
-
-    def loss(x: NDArray[np.float64]) -> float:
-        point = build(x)
-        if point is None or not point.low < point.opening < point.high:
-            return -BAD
-        value = of(point, share)
-        if value > BAD:
-            tried.append(_look(point, share, value if of is speed_range else 0.0))
-        return -value
-
+    shapes = Shapes(reference, figure)
+    bounds, first = list(BOUNDS.values()), shapes.begin(seed)
     found = differential_evolution(
-        loss,
-        list(BOUNDS.values()),
-        popsize=POPULATION,
-        maxiter=generations,
-        seed=seed,
-        polish=False,
-        tol=1e-4,
+        shapes.loss, bounds, init=first, maxiter=generations, seed=seed, polish=False, tol=1e-4
     )
-    if -found.fun <= 0.0 or not tried:
+    if figure == "least-authority":
+        for x in (found.x, shapes.first):
+            shapes.loss(shapes.climb(x))
+    tried = shapes.tried
+    if not tried:
         size = f"{reference.geometry.footprint:g} m and {weigh(reference.geometry).mass:.3g} kg"
         raise LabError(
-            f"no robot of {size} is stable and steers at {speed:.3g} m/s with openings of "
+            f"no robot of {size} is stable and steers at {reference.speed:.3g} m/s with openings of "
             f"{math.degrees(reference.low):.0f} to {math.degrees(reference.high):.0f} deg"
         )
-    best = max(tried, key=lambda one: one.ratio if of is speed_range else one.authority)
-    return Optimum(best, _look(reference, share, speed_range(reference, share)), tuple(tried))
+    best = max(tried, key=lambda one: one.ratio if figure == "speed-range" else one.authority)
+    share = shapes.share
+    own = _look(reference, share, speed_range(reference, share))
+    return Optimum(best, own, all(map(_flies, around(reference))), tuple(tried))
 
 
 def _look(point: Point, reference: Mapping[str, float], ratio: float) -> Tried:
@@ -143,7 +221,7 @@ def _look(point: Point, reference: Mapping[str, float], ratio: float) -> Tried:
 
 def front(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
     """Return (M, 2) of stability -f_αα and figure: robots that no other one beats in both."""
-    found = sorted(places(tried, figure).tolist(), reverse=True)
+    found = sorted(placed(tried, figure).tolist(), reverse=True)
     kept: list[list[float]] = []
     for place in found:
         if not kept or place[1] > kept[-1][1]:
@@ -151,7 +229,7 @@ def front(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
     return np.array(kept)
 
 
-def places(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
+def placed(tried: tuple[Tried, ...], figure: str) -> NDArray[np.float64]:
     """Return stability -f_αα [1/s2] and figure of each robot, (N, 2)."""
     return np.array(
         [(-one.stiffness, one.ratio if figure == "speed-range" else one.authority) for one in tried]

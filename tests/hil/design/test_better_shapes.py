@@ -108,8 +108,34 @@ def test_the_flat_robot_falls_over_in_the_time_that_its_pole_says() -> None:
 
 
 @cache
-def small_search(figure: str) -> search.Optimum:
-    return search.optimise(PAPER, figure, 1, generations=1)
+def small_search(figure: str, seed: int = 1) -> search.Optimum:
+    return search.optimise(PAPER, figure, seed, generations=1)
+
+
+@pytest.mark.long
+def test_searches_from_other_seeds_end_at_the_same_robot() -> None:
+    one, other = (small_search("least-authority", seed).best for seed in (1, 11))
+    assert other.authority == pytest.approx(one.authority, rel=0.002)
+    kinks = [math.degrees(found.point.geometry.kink_angle) for found in (one, other)]
+    assert kinks[0] == pytest.approx(kinks[1], abs=0.5)
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_conditions_are_positive_where_the_robot_is_stable_and_steers(name: str) -> None:
+    for one in search.around(point_of(name)):
+        model = one.linear
+        stable = max(model.growth(ROLL), model.growth(PITCH)) < 0.0
+        steers = min(model.steady(ROLL), model.steady(PITCH)) > 0.0
+        assert (search.conditions(one)[8:16] > 0.0).all() == (stable and steers)
+
+
+def test_a_shape_is_the_worse_the_more_it_violates_conditions() -> None:
+    paper = Point(CONFIG.geometry, coefficient_of(CONFIG), math.radians(25.0), 0.0, 0.9)
+    shapes = search.Shapes(paper, "least-authority")
+    slightly, more = (shapes.loss(shapes.first + np.array([0.0, down, 0.0, 0.0])) for down in (0.0, 0.1))
+    assert 0.0 < slightly < more < search.NO_HOVER
+    assert shapes.loss(np.where([True, False, True, True], search.HIGH, search.LOW)) == search.NO_HOVER
+    assert not shapes.tried
 
 
 @pytest.mark.long
@@ -132,7 +158,7 @@ def test_the_optimum_keeps_span_mass_speed_and_is_stable_and_steers_around_its_h
 def test_the_front_is_what_nothing_beats_in_both() -> None:
     found = small_search("least-authority")
     places, front = (
-        search.places(found.tried, "least-authority"),
+        search.placed(found.tried, "least-authority"),
         search.front(found.tried, "least-authority"),
     )
     for stable, figure in places:
@@ -144,7 +170,7 @@ def test_the_front_is_what_nothing_beats_in_both() -> None:
 def test_lighter_or_wider_robots_hold_slower_air_in_the_same_proportion() -> None:
     low, high = search.held(PAPER)
     lines = search.exercise(
-        search.Optimum(*2 * (search.Tried(PAPER, -16.0, 1.0, high / low),), ()), low / 1.25, high / 1.25
+        search.Optimum(*2 * (search.Tried(PAPER, -16.0, 1.0, high / low),), True, ()), low / 1.25, high / 1.25
     )
     mass, span = 0.34 / 1.25**2, 23.0 * 1.25
     assert f"with {1e3 * mass:.0f} g instead of 340 g" in lines[1]
