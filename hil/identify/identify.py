@@ -187,9 +187,9 @@ def _verdict(one: IdentifiedConstant, evidence: Evidence, usual: float) -> tuple
         return UNKNOWN, f"coherence {evidence.coherence:.2f}: the response hardly follows the excitation"
     if one.differs:
         return UNKNOWN, "the instruments and the joint fit exclude each other"
-    if abs(value) > PLAUSIBLE * abs(usual):
-        return UNKNOWN, f"more than {PLAUSIBLE:g} times the profile's {usual:.4g}"
     relative = half / abs(value) if value else float("inf")
+    if relative <= KNOWN and abs(value) > PLAUSIBLE * abs(usual):
+        return WEAK, f"± {relative:.0%}, but more than {PLAUSIBLE:g} times the profile's {usual:.4g}"
     if relative <= NARROW:
         return IDENTIFIED, f"± {relative:.0%}"
     if relative <= KNOWN:

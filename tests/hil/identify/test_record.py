@@ -183,23 +183,25 @@ def constant(
 
 
 @pytest.mark.parametrize(
-    ("found", "evidence", "usual", "reason"),
+    ("found", "evidence", "reason"),
     [
-        (constant((64.0, 1.0)), Evidence(10.1, 0.0, 1.0), 64.0, "misses the log by 3.2 times"),
-        (constant((64.0, 1.0)), Evidence(1.0, 0.06, 1.0), 64.0, "at their limits in 6%"),
-        (constant((64.0, 1.0)), Evidence(1.0, 0.0, 0.34), 64.0, "coherence 0.34"),
-        (constant((64.0, 1.0), (50.0, 12.0)), Evidence(1.0, 0.0, 1.0), 64.0, "exclude each other"),
-        (constant((64.0, 1.0)), Evidence(1.0, 0.0, 1.0), -6.3, "more than 10 times the profile's -6.3"),
+        (constant((64.0, 1.0)), Evidence(10.1, 0.0, 1.0), "misses the log by 3.2 times"),
+        (constant((64.0, 1.0)), Evidence(1.0, 0.06, 1.0), "at their limits in 6%"),
+        (constant((64.0, 1.0)), Evidence(1.0, 0.0, 0.34), "coherence 0.34"),
+        (constant((64.0, 1.0), (50.0, 12.0)), Evidence(1.0, 0.0, 1.0), "exclude each other"),
     ],
-    ids=["misfit", "saturated", "incoherent", "contradicted", "implausible"],
+    ids=["misfit", "saturated", "incoherent", "contradicted"],
 )  # fmt: skip
-def test_a_narrow_interval_is_not_enough(
-    found: IdentifiedConstant, evidence: Evidence, usual: float, reason: str
-) -> None:
+def test_a_narrow_interval_is_not_enough(found: IdentifiedConstant, evidence: Evidence, reason: str) -> None:
     assert _verdict(found, Evidence(1.0, 0.0, 1.0), 64.0)[0] == IDENTIFIED or found.differs
-    verdict, why = _verdict(found, evidence, usual)
+    verdict, why = _verdict(found, evidence, 64.0)
     assert verdict == UNKNOWN
     assert reason in why
+
+
+def test_a_value_far_from_the_profile_s_is_weak_however_narrow_its_interval() -> None:
+    verdict, why = _verdict(constant((64.0, 1.0)), Evidence(1.0, 0.0, 1.0), -6.3)
+    assert (verdict, why) == (WEAK, "± 2%, but more than 10 times the profile's -6.3")
 
 
 def test_the_worst_record_counts_and_of_several_the_clearest_response() -> None:
