@@ -6,7 +6,7 @@ from hil.experiments.hover import HOVER
 from hil.experiments.identification import IDENTIFICATION
 from hil.experiments.overload import OVERLOAD
 from hil.experiments.own import entries, in_file, in_package
-from hil.experiments.position import HEIGHT_SINE, Y_SQUARE
+from hil.experiments.position import EIGHT, HEIGHT_SINE, Y_SQUARE
 from hil.experiments.power import ENDURANCE, POWER
 from hil.experiments.pushes import PUSHED
 from hil.experiments.take_off import TAKE_OFF_LANDING
@@ -23,6 +23,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         *YAW_SINES,
         HEIGHT_SINE,
         Y_SQUARE,
+        EIGHT,
         PUSHED,
         *SIDE_WINDS,
         OCCLUSION,

@@ -1,7 +1,7 @@
-"""Position: the paper's sine in height, 20 cm at 0.05 Hz, and square in y, 10 cm to either side.
+"""Position: the paper's sine in height, 20 cm at 0.05 Hz, and square in y, 10 cm to either side; a figure of eight.
 
 The square's period is that of the author's ground station, 10 s; the amplitude is the flow's: beyond 20 cm from its axis
-hovering is not stable (paper, Horizontal tracking performance).
+hovering is not stable (paper, Horizontal tracking performance). The eight is larger: for robots that need no flow.
 """
 
 from functools import partial
@@ -12,6 +12,7 @@ from hil.laboratory.experiment import Experiment
 
 BEGIN_S = 1.0  # the robot is at rest after its release
 HEIGHT_HZ, SQUARE_HZ = 0.05, 0.1
+EIGHT_HZ, EIGHT_M = 0.15, 0.4  # up to 0.53 m/s
 
 
 def rise_and_sink(home: Goal, release_us: int) -> Trajectory:
@@ -22,6 +23,12 @@ def rise_and_sink(home: Goal, release_us: int) -> Trajectory:
 def jump_sideways(home: Goal, release_us: int) -> Trajectory:
     """Jump between 10 cm to the left and 10 cm to the right."""
     return Offsets(home, release_us + round(BEGIN_S * 1e6), y=Square(0.1, -0.1, SQUARE_HZ))
+
+
+def eight(home: Goal, release_us: int) -> Trajectory:
+    """Fly a figure of eight, 80 cm long and 40 cm wide."""
+    begin_us = release_us + round(BEGIN_S * 1e6)
+    return Offsets(home, begin_us, x=Sine(EIGHT_M, EIGHT_HZ), y=Sine(EIGHT_M / 2, 2 * EIGHT_HZ))
 
 
 HEIGHT_SINE = Experiment(
@@ -41,4 +48,11 @@ Y_SQUARE = Experiment(
     trajectory=jump_sideways,
     measure=y_steps,
     pictures=("y-square",),
+)
+EIGHT = Experiment(
+    name="figure-eight",
+    summary="fly a figure of eight of 80 by 40 cm (profile crazyflie; it leads out of Floaty's flow)",
+    duration_s=24.0,
+    limits={"lost": 0.0, "rms_x": 0.2, "rms_y": 0.2, "max_x": 0.35, "max_y": 0.35},
+    trajectory=eight,
 )

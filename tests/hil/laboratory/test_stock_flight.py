@@ -104,6 +104,13 @@ def test_takes_off_holds_and_lands_with_each_controller(controller: int, tmp_pat
 
 
 @needs_image
+@pytest.mark.parametrize("experiment", ["y-square", "figure-eight"])
+def test_follows_steps_and_a_figure_of_eight_within_its_limits(experiment: str, tmp_path: Path) -> None:
+    result = fly(experiment, tmp_path / "run", profile=PROFILE, board=ELF).result
+    assert [str(verdict) for verdict in result.verdicts if not verdict.holds] == []
+
+
+@needs_image
 def test_same_seed_has_the_same_hash_and_an_unknown_parameter_one_line(tmp_path: Path) -> None:
     one, other = (
         fly("hover", tmp_path / name, profile=PROFILE, board=ELF, duration_s=7.5).result.hash for name in "ab"
