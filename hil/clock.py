@@ -32,6 +32,9 @@ class Clock(Protocol):
     def notices(self) -> list[str]:
         """Lines for the user since the last call."""
 
+    def pause(self, wait: Callable[[], None]) -> None:
+        """Let simulated time stand still while `wait` runs."""
+
 
 class FreeRunning:
     """Every instant may happen at once."""
@@ -51,6 +54,9 @@ class FreeRunning:
     def notices(self) -> list[str]:
         """Nothing: there is no wall clock to fall behind."""
         return []
+
+    def pause(self, wait: Callable[[], None]) -> None:
+        wait()
 
 
 class Paced:
@@ -126,6 +132,11 @@ class Paced:
             if readable in self.readers:  # not closed by another reader
                 self.readers[readable](now_us)
         self._readable = []
+
+    def pause(self, wait: Callable[[], None]) -> None:
+        began_us = self.wall_us()
+        wait()
+        self.shift(self.wall_us() - began_us)
 
     def notices(self) -> list[str]:
         """Lines for the user since the last call, one per simulated second at the most."""

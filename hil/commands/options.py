@@ -131,12 +131,13 @@ def stop_signals() -> list[int]:
 
 
 def open_live(target: str | None) -> LiveView | None:
-    """Open the picture that `--view` asks for; it closes with the command, however that ends."""
+    """Open the picture that `--view` asks for, for this command; it closes with the command, however that ends."""
     if target is None:
         return None
     from hil.live.feed import open_view
 
-    return click.get_current_context().with_resource(closing(open_view(target, say)))
+    context = click.get_current_context()
+    return context.with_resource(closing(open_view(target, str(context.info_name), say)))
 
 
 def close_live(view: LiveView | None, result: Result | None = None) -> None:

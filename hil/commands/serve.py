@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,9 +31,10 @@ from hil.errors import LabError, require
 
 if TYPE_CHECKING:
     from hil.config import LabConfig
+    from hil.live.feed import LiveView
     from hil.servers.motive import Streaming
     from hil.servers.serial_server import Address
-    from hil.servers.server import Ends
+    from hil.servers.server import Ends, Server
 
 UDP_PORT = 19850  # where cflib looks for boards
 RADIO_PORT = 19840
@@ -149,10 +151,17 @@ def serve(asked: Asked) -> int:
         if station is not None:
             for robot in server.ends.robots:
                 robot.fly(station == "poses")
-        LiveFaults(server, say).listen(sys.stdin)
+        faults = LiveFaults(server, say if view is None else partial(_answer, view, server))
+        faults.listen(sys.stdin)
         stops = stop_signals()
         say("serving; Ctrl-C ends")
-        server.run(lambda: bool(stops))
+
+        def stopping() -> bool:
+            for line in view.lines() if view is not None else ():
+                faults.take(line, server.lab.now_us)
+            return bool(stops)
+
+        server.run(stopping)
     finally:
         server.ends.close()
     close_live(view)
@@ -176,6 +185,12 @@ def _station_of(asked: Asked, config: LabConfig) -> str | None:
             f"--station corrections: the Crazyflie's own firmware of profile {asked.profile} takes poses"
         )
     return "poses"
+
+
+def _answer(view: LiveView, server: Server, text: str) -> None:
+    """Print an answer, and show it in the panel."""
+    say(text)
+    view.answer(server.lab.now_us, text)
 
 
 def _check_options(asked: Asked) -> None:

@@ -129,8 +129,13 @@ def station(asked: Asked) -> int:
         if flight is not None:
             flight.note(OPERATOR, text)
 
+    def reply(text: str) -> None:
+        say(text)
+        if view is not None:
+            view.answer(0 if flight is None else flight.log_us, text)
+
     operator = Operator(
-        _trajectory_of, say, note, view.know if view is not None and asked.target == "foxglove" else None
+        _trajectory_of, reply, note, view.know if view is not None and asked.target == "foxglove" else None
     )
     terminal = Terminal(lambda: (*COMMANDS, *EXPERIMENTS, *operator.known))
 

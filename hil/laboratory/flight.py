@@ -58,6 +58,9 @@ class Line(Protocol):
     def trajectory(self) -> Trajectory:
         """The trajectory that the ground station flies."""
 
+    def steer(self, trajectory: Trajectory) -> None:
+        """Fly another trajectory from now on. Raises `LabError` where the ground station is another program."""
+
     def channels(self) -> tuple[tuple[Channel, ...], tuple[Channel, ...]]:
         """The channels to record: of the line itself, and of the ground station."""
 
@@ -232,6 +235,11 @@ class Flight:
             self._recorder.note(self.now_us, source, text)
         else:
             self._early.append((source, text))
+
+    def show(self) -> None:
+        """Show who looks on the rows so far."""
+        if self._recorder is not None:
+            self._recorder.show()
 
     def write_schedule(self, folder: Path) -> None:
         """Write the scheduler's trace."""

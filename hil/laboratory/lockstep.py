@@ -17,7 +17,7 @@ from ground_station.links.loopback import LoopbackLink
 from ground_station.station import GroundStation, Link
 from ground_station.telemetry_log import TelemetryLog
 from ground_station.tracker import tracker_of
-from ground_station.trajectory import Goal
+from ground_station.trajectory import FlightPlan, Goal, Trajectory
 from hil.clock import Clock, FreeRunning, Paced
 from hil.crazyflie.shockburst import Air
 from hil.devices.board_firmware import Executor, Flashed, PythonBoard
@@ -46,7 +46,8 @@ class ModelledLine:
         serial = request.bench.link == MAVLINK
         self.record: Path | None = None  # the log has the goals already
         self._release_us = config.flight.release_us
-        self.trajectory = request.trajectory
+        self.trajectory = FlightPlan(Goal(config.flight.home, 0.0), lambda *_: request.trajectory)
+        self.trajectory.start(self._release_us)
         self.tracker = tracker_of(config.tracker, config.mocap.period_us)
         air = Air.of(config.radio)
         uart = VirtualSerial(config.serial, events, streams.serial) if serial else None
@@ -149,6 +150,10 @@ class ModelledLine:
     def _note_frame(self, now_us: int, data: bytes) -> None:
         if self._frames is not None:
             self._frames.note(now_us, data)
+
+    def steer(self, trajectory: Trajectory) -> None:
+        """Fly another trajectory from now on."""
+        self.trajectory.steer(trajectory)
 
     def command(self, now_us: int, packet: bytes) -> None:
         """Send a packet of the operator over the radio."""

@@ -82,6 +82,11 @@ class RealFlight:
             return
         self._write(lambda recorder: recorder.note(now_us - self._start_us, source, text))
 
+    @property
+    def log_us(self) -> int:
+        """The present instant by the log's clock."""
+        return self._now_us - self._start_us
+
     def turn(self, cockpit: Cockpit, now_us: int) -> None:
         """Record a row when it is time to."""
         if now_us < self._next_us:

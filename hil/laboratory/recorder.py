@@ -104,7 +104,7 @@ class Recorder:
         if self._row == ROWS_PER_BATCH or now_us - self._times[0] >= BATCH_US:
             self._write_batch()
         elif self._row - self._shown == ROWS_SHOWN:
-            self._show()
+            self.show()
 
     def read_from(self, channels: tuple[Channel, ...]) -> None:
         """Sample these from now on: the same quantities of another object, like a board that has booted again."""
@@ -136,7 +136,7 @@ class Recorder:
         return self._hash.hexdigest()
 
     def _write_batch(self) -> None:
-        self._show()
+        self.show()
         columns = self._columns(0)
         self._row = self._shown = 0
         for values in columns:
@@ -144,7 +144,8 @@ class Recorder:
         if self._stream is not None:
             self._stream.write_batch(self._batch(columns))
 
-    def _show(self) -> None:
+    def show(self) -> None:
+        """Pass the rows that it has not seen to the onlooker."""
         if self._onlooker is not None:
             self._onlooker.rows(self._batch(self._columns(self._shown)))
             self._shown = self._row

@@ -24,6 +24,7 @@ CATCH_UP_S = 10.0  # for it to show the rest at the end
 PIPE_BREAKS_S = 1.0  # for a writing thread to notice that the reader is gone
 QUEUE_PIECES = 300  # as the recorder shows them: a minute of flight
 TOGETHER = 100  # pieces that are written as one batch, when that many wait
+WAIT_S = 0.2  # before it looks whether the picture still runs
 LINES = 1000  # typed lines that wait to be fetched; texts before the first row
 EVENTS, PARAMETERS = b"events", b"parameters"  # metadata of a batch
 READY, FAILED, TAKEN, TYPED = "ready", "failed", "taken", "typed"  # first words of the returned lines
@@ -83,6 +84,7 @@ class LiveView:
         self.offered = self.taken = 0  # rows
         self.address = ""  # of a picture that is served until it ends
         self._texts: deque[dict[str, Any]] = deque(maxlen=LINES)
+        self._heard = threading.Event()  # a line came, or the picture has ended
         self._typed: deque[str] = deque(maxlen=LINES)
         self._parameters: deque[tuple[str, float]] = deque()  # not yet sent to the picture
         self._schema: pa.Schema | None = None
@@ -126,6 +128,18 @@ class LiveView:
     def lines(self) -> list[str]:
         """Return what was typed at the picture since the last call."""
         return _all(self._typed)
+
+    def wait(self) -> list[str]:
+        """Wait until something is typed, and return it; nothing when the picture has ended."""
+        while not self._typed and self._answers.is_alive():
+            self._heard.wait(WAIT_S)
+            self._heard.clear()
+        return self.lines()
+
+    def answer(self, t_us: int, text: str) -> None:
+        """Show a text at once."""
+        self.note(t_us, "panel", text)
+        self._flush()
 
     # The end
 
@@ -203,6 +217,7 @@ class LiveView:
                 self.taken = int(text)
             elif word == TYPED:
                 self._typed.append(text)
+                self._heard.set()
         if not self._up.is_set():
             self._failure = self._failure or "the viewer's process ended without a message"
             self._up.set()
@@ -213,9 +228,12 @@ def _all(waiting: deque[T], most: int = LINES) -> list[T]:
     return [waiting.popleft() for _ in range(min(len(waiting), most))]
 
 
-def open_view(target: str, say: Callable[[str], None]) -> LiveView:
-    """Return the picture for a target of `--view`. Raises `LabError` for an unknown one, or one that cannot open."""
-    return LiveView([sys.executable, "-m", "hil.live.picture", target], say)
+def open_view(target: str, program: str, say: Callable[[str], None]) -> LiveView:
+    """Return the picture for a target of `--view`, with the commands of a program: fly, serve or station.
+
+    Raises `LabError` for an unknown target, or one that cannot open.
+    """
+    return LiveView([sys.executable, "-m", "hil.live.picture", target, program], say)
 
 
 def missed_text(rows: int) -> str:

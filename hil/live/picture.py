@@ -1,6 +1,7 @@
-"""The process that shows a flight while it happens: `python -m hil.live.picture TARGET`, fed by `hil.live.feed`.
+"""The process that shows a flight while it happens: `python -m hil.live.picture TARGET PROGRAM`, fed by `hil.live.feed`.
 
-A TARGET is `window` (rerun's viewer), `web` (the same in a browser), `connect:HOST:PORT` (a viewer that is already open) or
+A TARGET is `window` (rerun's viewer), `web` (the same in a browser, with the commands of PROGRAM: fly, serve or station),
+`connect:HOST:PORT` (a viewer that is already open) or
 `foxglove` (a WebSocket server for Foxglove). Rows come in at standard input, lines go out at standard output.
 """
 
@@ -14,6 +15,7 @@ from typing import IO, Any, Protocol
 
 import pyarrow as pa
 
+from firmware_py.extras import install_command
 from hil.errors import LabError
 from hil.live.feed import EVENTS, FAILED, PARAMETERS, READY, TAKEN, TYPED
 
@@ -36,8 +38,14 @@ class Screen(Protocol):
         """End."""
 
 
-def open_screen(target: str, typed: Callable[[str], None]) -> Screen:
-    """Return the screen of a target; `typed` takes lines for the station's operator. Raises `LabError`."""
+def open_screen(target: str, program: str, typed: Callable[[str], None]) -> Screen:
+    """Return the screen of a target; `typed` takes lines for who flies. Raises `LabError`."""
+    if target == "web":
+        try:
+            from hil.live.panel import PanelScreen
+        except ImportError as error:
+            raise LabError(f"--view web: {error}: {install_command('view')}") from None
+        return PanelScreen(program, typed)
     if target == "foxglove":
         from hil.live.foxglove_server import FoxgloveScreen
 
@@ -47,9 +55,9 @@ def open_screen(target: str, typed: Callable[[str], None]) -> Screen:
     return RerunScreen(target)
 
 
-def run(target: str, rows: IO[bytes], say: Say) -> None:
+def run(target: str, program: str, rows: IO[bytes], say: Say) -> None:
     """Show what arrives until the stream ends."""
-    screen = open_screen(target, lambda line: say(TYPED, line))
+    screen = open_screen(target, program, lambda line: say(TYPED, line))
     say(READY, screen.address)
     taken = 0
     try:
@@ -80,7 +88,7 @@ def main() -> int:
             print(word, text, file=answers)
 
     try:
-        run(sys.argv[1], sys.stdin.buffer, say)
+        run(sys.argv[1], sys.argv[2], sys.stdin.buffer, say)
     except LabError as error:
         say(FAILED, str(error))
         return 1

@@ -37,6 +37,7 @@ TRAIL_S = 4.0
 EYE = np.array([0.75, -0.62, 0.42])  # [m] from the middle of the scene
 ZOOM = 3.3  # width of what lies as far away as the middle, as a share of that distance
 SKY, INK, GOAL, PATH, TIME = (14, 18, 22), (136, 153, 170), (213, 94, 0), (255, 255, 255), (60, 60, 60)
+GOAL_COLUMNS = ("goal.x", "goal.y", "goal.z")
 
 
 def write_video(run: Path) -> Path:
@@ -84,11 +85,13 @@ def _instants(log: pa.Table) -> NDArray[np.float64]:
 def frames(log: pa.Table) -> Iterator[Image.Image]:
     """Yield a picture of the flight for each thirtieth of a second after its release."""
     flight = known(free_flight(log))
-    instants, view, graph = _instants(log), _Scene(flight), _Graph(log, flight)
-    rows = np.searchsorted(since_release(flight), instants)
+    instants, view, graph = _instants(log), Scene(flight), _Graph(log, flight)
+    times, path, course = since_release(flight), body(flight, "x", "y", "z"), column(flight, *GOAL_COLUMNS)
+    rows = np.searchsorted(times, instants)
     for row, at_s in zip(rows.tolist(), instants.tolist(), strict=True):
         whole = Image.new("RGB", (SIDE + CURVES_WIDTH, HEIGHT), SKY)
-        whole.paste(view.at(row), (0, 0))
+        begin = int(np.searchsorted(times, times[row] - TRAIL_S))
+        whole.paste(view.at(flight.slice(row, 1), path[begin : row + 1 : 3], course[::5]), (0, 0))
         whole.paste(graph.at(at_s), (SIDE, 0))
         yield whole
 
@@ -105,38 +108,32 @@ def faces(
     return shown
 
 
-class _Scene:
+class Scene:
     """Draws the robot at a row of a flight, its path, its goal with the box, and the goal's path."""
 
     def __init__(self, flight: pa.Table) -> None:
+        """Look at the middle of the goals of these rows."""
         self._robot = Look.read(stored_in(flight.schema.metadata, "look"))
-        self._turns = [scene.turn_of(part, flight) for part in self._robot.parts]
-        self._p_WB, self._q_WB = body(flight, "x", "y", "z"), body(flight, "qw", "qx", "qy", "qz")
-        self._goal, self._yaw = column(flight, "goal.x", "goal.y", "goal.z"), column(flight, "goal.yaw")
-        self._times = since_release(flight)
-        middle = self._goal.mean(axis=0)
+        middle = column(flight, *GOAL_COLUMNS).mean(axis=0)
         back = EYE / np.linalg.norm(EYE)
         right = np.cross([0.0, 0.0, 1.0], back) / np.linalg.norm(back[:2])
         self._eye, self._look = middle + EYE, np.stack((right, np.cross(back, right), back))
 
-    def at(self, row: int) -> Image.Image:
-        """Return the picture of a row."""
+    def at(self, row: pa.Table, trail: Points, course: Points) -> Image.Image:
+        """Return the picture of one row, with the last places of the robot and the goal's path, (N, 3) [m] each."""
         picture = Image.new("RGB", (SHARPER * SIDE, SHARPER * HEIGHT), SKY)
         draw = ImageDraw.Draw(picture)
-        goal, q_WG = self._goal[row], np.array([yaw_quaternion(self._yaw[row])])
-        self._line(draw, self._goal[:: FRAMES_HZ // 6], GOAL, 1)
-        wanted = [
-            *scene.box_lines(BOX),
-            *self._robot.outline,
-            np.array([(0.0, 0.0, 0.0), (0.16, 0.0, 0.0)]),
-        ]
-        for line in wanted:
+        goal, q_WG = column(row, *GOAL_COLUMNS)[0], np.array([yaw_quaternion(column(row, "goal.yaw")[0])])
+        self._line(draw, course, GOAL, 1)
+        ahead = np.array([(0.0, 0.0, 0.0), (0.16, 0.0, 0.0)])
+        for line in (*scene.box_lines(BOX), *self._robot.outline, ahead):
             self._line(draw, goal + scene.rotated(q_WG, line), GOAL, 1)
-        begin = int(np.searchsorted(self._times, self._times[row] - TRAIL_S))
-        self._line(draw, self._p_WB[begin : row + 1 : 3], PATH, 2)
-        turns = [turn[row] for turn in self._turns]
-        surfaces = faces(self._robot.parts, turns, self._p_WB[row], self._q_WB[row])
-        placed = [(*self._seen(corners), colour) for corners, colour in surfaces]
+        self._line(draw, trail, PATH, 2)
+        p_WB, q_WB = body(row, "x", "y", "z")[0], body(row, "qw", "qx", "qy", "qz")[0]
+        turns = [scene.turn_of(part, row)[0] for part in self._robot.parts]
+        placed = [
+            (*self._seen(corners), colour) for corners, colour in faces(self._robot.parts, turns, p_WB, q_WB)
+        ]
         for points, _, colour in sorted(placed, key=lambda one: -one[1].mean()):
             draw.polygon([*map(tuple, points.tolist())], fill=colour)
         return picture.resize((SIDE, HEIGHT), Image.Resampling.BOX)
@@ -164,7 +161,7 @@ class _Graph:
         shown = (
             (curves.POSITION, "position error"),
             (curves.ATTITUDE, "attitude error"),
-            (curves.FLAPS, "flaps"),
+            *((curve, name) for name, curve in curves.actuators(flight)),
         )
         plot = Plot(tuple(panel(curve, flight, label) for curve, label in shown))
         with rc_context(STYLE | {"font.size": 7.0, "legend.fontsize": 6.5}):

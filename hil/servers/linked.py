@@ -135,6 +135,9 @@ class StationProcess:
         clock = Channel("int64", Paced.wall_us, (Quantity((STATION_CLOCK,), "us"),))
         return line, (clock,)
 
+    def steer(self, trajectory: Trajectory) -> None:
+        raise LabError("the goal is that of the ground station, a program of its own: steer it there")
+
     def command(self, now_us: int, packet: bytes) -> None:
         self.robot.packet_received(now_us, packet)
 

@@ -30,7 +30,7 @@ class Screen:
 
 def test_a_picture_shows_what_comes_and_counts_all_that_it_took(monkeypatch: pytest.MonkeyPatch) -> None:
     screen, said = Screen(), []
-    monkeypatch.setattr(picture, "open_screen", lambda target, typed: screen)
+    monkeypatch.setattr(picture, "open_screen", lambda target, program, typed: screen)
     schema = pa.schema([("x", pa.int64())])
     stream = io.BytesIO()
     with pa.ipc.new_stream(stream, schema) as writer:
@@ -43,7 +43,7 @@ def test_a_picture_shows_what_comes_and_counts_all_that_it_took(monkeypatch: pyt
                 pa.RecordBatch.from_arrays([pa.array(rows, pa.int64())], schema=schema), metadata
             )
     stream.seek(0)
-    picture.run("window", stream, lambda word, text: said.append((word, text)))
+    picture.run("window", "fly", stream, lambda word, text: said.append((word, text)))
     assert said == [(READY, "here"), (TAKEN, "3"), (TAKEN, "5"), (TAKEN, "5")]
     assert screen.shown == [
         ("rows", [1, 2, 3], ["a"]), ("values", {"b": 2.0}), ("rows", [4, 5], []), ("rows", [], ["c"]), "closed",

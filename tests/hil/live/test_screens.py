@@ -24,7 +24,7 @@ def test_an_unknown_target_says_what_is_allowed(target: str) -> None:
 def test_a_viewer_that_is_not_there_is_said_before_the_flight() -> None:
     port = free_port(0)
     with pytest.raises(LabError, match=f"connect:127.0.0.1:{port}: no viewer listens there"):
-        open_view(f"connect:127.0.0.1:{port}", [].append)
+        open_view(f"connect:127.0.0.1:{port}", "fly", [].append)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a display")

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,11 @@ from hil.experiments import EXPERIMENTS
 from hil.laboratory.faults import parse
 from hil.laboratory.request import Request
 from hil.laboratory.run import fly
+from hil.pictures.compare import compare, load_flown, write_comparison
 from hil.pictures.report import write_report
+from support.browser import BROWSER, browser
 from support.html_page import Page
 
-BROWSER = shutil.which("chromium")
 pytestmark = [
     pytest.mark.long,
     pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine"),
@@ -86,3 +86,16 @@ def test_every_panel_is_drawn_with_aligned_edges_and_one_zoom_and_cursor(tmp_pat
     assert len(moved) > 10
     # the story's link shows 0.5 s before the moment to 1.5 s after it
     assert [float(time) for time in moved] == pytest.approx([1.5] * len(moved), abs=0.1)
+
+
+def test_a_comparison_fits_a_phone_and_draws_every_panel(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0, seed=seed), tmp_path / str(seed))
+    a, b = (load_flown(tmp_path / str(seed)) for seed in (1, 2))
+    page = write_comparison(tmp_path / "page", a, b, compare(a, b))
+    with browser(tmp_path / "profile") as tab:
+        for width in (390, 1180):
+            tab.open(page.as_uri(), width)
+            tab.until("document.querySelectorAll('.uplot canvas').length === 13")
+            assert tab.value("document.documentElement.scrollWidth") <= width
+        assert tab.errors == []

@@ -168,7 +168,7 @@ def test_a_live_flight_sends_what_the_file_holds(folder: Path, tmp_path: Path) -
     try:
         while sink.poll() is None and not window.is_open(window.LOOPBACK, port):
             pass
-        view = open_view(f"connect:{window.LOOPBACK}:{port}", [].append)
+        view = open_view(f"connect:{window.LOOPBACK}:{port}", "fly", [].append)
         for event in load_events(folder):
             view.note(event["t_us"], event["source"], event["text"])
         for batch in load_log(folder).combine_chunks().to_batches(max_chunksize=40):

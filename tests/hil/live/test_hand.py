@@ -1,0 +1,100 @@
+"""What is pressed in the panel at a flight in lockstep acts and is an event; a panel that is only open changes nothing."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.flight import Flight
+from hil.laboratory.metrics import column
+from hil.laboratory.recorder import load_events, load_log
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
+from hil.live.hand import Hand
+from hil.pictures.curves import since_release
+
+
+class Script:
+    """A panel whose lines come at rows of the log, and one after the other while the flight is paused."""
+
+    def __init__(self, at: dict[int, list[str]], paused: tuple[str, ...] = ()) -> None:
+        self._at, self._paused, self._looks = at, list(paused), 0
+        self.answers: list[str] = []
+        self.shown = 0
+
+    def lines(self) -> list[str]:
+        self._looks += 1
+        return self._at.get(self._looks, [])
+
+    def wait(self) -> list[str]:
+        return [self._paused.pop(0)] if self._paused else []
+
+    def answer(self, t_us: int, text: str) -> None:
+        self.answers.append(text)
+
+    def rows(self, batch: pa.RecordBatch) -> None:
+        self.shown += batch.num_rows
+
+    def note(self, t_us: int, source: str, text: str) -> None:
+        pass
+
+
+def flown(folder: Path, view: Script | None, duration_s: float = 1.0) -> str:
+    hands: list[Hand] = []
+
+    def progress(now_us: int, flight: Flight) -> None:
+        if view is not None and not hands:
+            hands.append(Hand(view, flight))
+
+    return fly(Request.of(EXPERIMENTS["hover"], duration_s=duration_s), folder, progress, view).hash
+
+
+def test_a_panel_that_is_only_open_does_not_change_the_flight(tmp_path: Path) -> None:
+    assert flown(tmp_path / "seen", Script({})) == flown(tmp_path / "alone", None)
+
+
+def test_goal_fault_and_note_act_and_are_events(tmp_path: Path) -> None:
+    view = Script({
+        120: ["goal 0.05 0 1.15 10", "mark here", "mocap.dropout:0.2"],
+        150: ["goal 9 9 9", "goal 1 2", "push.y=99", "puhs.y", "step 5"],
+    })  # fmt: skip
+    flown(tmp_path / "run", view)
+    log = load_log(tmp_path / "run")
+    goal, times = column(log, "goal.x"), since_release(log)
+    assert set(np.round(goal, 6)) == {0.0, 0.05}
+    moved_s = times[np.flatnonzero(goal)[0]]
+    assert 0.1 < moved_s < 0.4
+    assert np.degrees(column(log, "goal.yaw"))[-1] == pytest.approx(10)
+    texts = [(event["source"], event["text"]) for event in load_events(tmp_path / "run")]
+    assert [text for source, text in texts if source == "operator"] == [
+        "goal 0.05 0 1.15 10", "mark here", "mocap.dropout:0.2",
+    ]  # fmt: skip
+    assert any("mocap.dropout" in text for source, text in texts if source == "lab")
+    assert len(view.answers) == 5
+    assert view.answers[0] == "goal 9 9 9: more than 1 m from home, 0 0 1.15"
+    assert view.answers[1].startswith("goal 1 2: expected goal X Y Z")
+    assert "99: " in view.answers[2]
+    assert view.answers[4] == "step 5: expected 10..60000 ms"
+
+
+def test_a_paused_flight_goes_on_step_by_step_and_ends_as_if_it_had_never_stood(tmp_path: Path) -> None:
+    view = Script({100: ["pause"]}, ("step 100", "step", "mark still", "go"))
+    assert flown(tmp_path / "paused", view) == flown(tmp_path / "alone", None)
+    events = [event for event in load_events(tmp_path / "paused") if event["source"] == "operator"]
+    times = {event["text"]: event["t_us"] for event in events}
+    assert times["step"] - times["step 100"] == 100_000
+    assert times["go"] == times["mark still"] == times["step"] + 10_000
+    assert view.shown == load_log(tmp_path / "paused").num_rows
+
+
+def test_a_panel_that_is_closed_lets_a_paused_flight_go_on(tmp_path: Path) -> None:
+    flown(tmp_path / "run", Script({100: ["pause"]}))
+    assert load_log(tmp_path / "run").num_rows > 190
+
+
+def test_stop_interrupts_the_flight(tmp_path: Path) -> None:
+    flown(tmp_path / "run", Script({100: ["stop"]}))
+    texts = [event["text"] for event in load_events(tmp_path / "run")]
+    assert "interrupted by the user" in texts

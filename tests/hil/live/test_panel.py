@@ -1,0 +1,126 @@
+"""The control panel's server: who may come, what it shows, and that a late page gets the newest state."""
+
+import json
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.ioloop import IOLoop
+from tornado.websocket import WebSocketClientConnection, websocket_connect
+
+from hil.experiments import EXPERIMENTS
+from hil.laboratory.recorder import load_log
+from hil.laboratory.request import Request
+from hil.laboratory.run import fly
+from hil.live.panel import COMMANDS, LINE_MOST, PanelScreen
+
+
+@pytest.fixture
+def typed() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def panel(typed: list[str]) -> Iterator[PanelScreen]:
+    panel = PanelScreen("fly", typed.append)
+    yield panel
+    panel.close()
+
+
+@pytest.fixture
+def loop() -> Iterator[IOLoop]:
+    loop = IOLoop(make_current=True)
+    yield loop
+    loop.close(all_fds=True)
+
+
+def connect(loop: IOLoop, panel: PanelScreen, token: str, origin: str) -> WebSocketClientConnection:
+    address = f"{panel.origin.replace('http', 'ws')}/socket?token={token}"
+    return loop.run_sync(
+        lambda: websocket_connect(HTTPRequest(address, headers={"Origin": origin})), timeout=20
+    )
+
+
+def receive(loop: IOLoop, socket: WebSocketClientConnection) -> dict:
+    text = loop.run_sync(socket.read_message, timeout=20)
+    assert isinstance(text, str)
+    return json.loads(text)
+
+
+@pytest.mark.parametrize("program", COMMANDS)
+def test_a_program_s_panel_has_its_commands(program: str) -> None:
+    panel = PanelScreen(program, [].append)
+    page = urllib.request.urlopen(panel.address, timeout=20).read().decode()
+    panel.close()
+    content = json.loads(page.split('id="content">')[1].split("</script>")[0])
+    assert content["commands"] == list(COMMANDS[program])
+    assert bool(content["faults"]) == (program != "station")
+    assert bool(content["parameters"]) == (program == "station")
+    assert "uPlot=function" in page
+
+
+@pytest.mark.parametrize("wrong", ["token", "host"])
+def test_a_page_without_the_token_or_by_another_name_is_refused(panel: PanelScreen, wrong: str) -> None:
+    address = panel.address if wrong == "host" else f"{panel.origin}/?token=guessed"
+    request = urllib.request.Request(address, headers={"Host": "evil.example"} if wrong == "host" else {})
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(request, timeout=20)
+    assert refused.value.code == 403
+    assert (
+        refused.value.read().decode()
+        == "The panel opens with the address that floaty prints, token and all.\n"
+    )
+    refused.value.close()
+
+
+@pytest.mark.parametrize("wrong", ["token", "origin"])
+def test_a_socket_of_another_origin_or_without_the_token_is_refused(
+    panel: PanelScreen, loop: IOLoop, typed: list[str], wrong: str
+) -> None:
+    token, origin = ("guessed", panel.origin) if wrong == "token" else (panel.token, "http://evil.example")
+    with pytest.raises(HTTPClientError) as refused:
+        connect(loop, panel, token, origin)
+    assert refused.value.code == 403
+    assert typed == []
+
+
+def test_lines_reach_the_flight_and_what_is_no_line_is_answered(
+    panel: PanelScreen, loop: IOLoop, typed: list[str]
+) -> None:
+    socket = connect(loop, panel, panel.token, panel.origin)
+    assert receive(loop, socket)["texts"] == []
+    for line in ("mark one", "x" * (LINE_MOST + 1), "mark two"):
+        loop.run_sync(lambda line=line: socket.write_message(line))
+    (answer,) = receive(loop, socket)["texts"]
+    assert answer == f"panel: a line of {LINE_MOST + 1} characters: expected 1..{LINE_MOST} printable ones"
+    panel.know({"extCtrl.y_P": 1.6})
+    assert receive(loop, socket)["values"] == {"extCtrl.y_P": 1.6}
+    assert typed == ["mark one", "mark two"]
+    socket.close()
+
+
+def test_a_page_shows_the_newest_row_with_scene_and_curves_and_a_late_one_skips_the_rest(
+    panel: PanelScreen, loop: IOLoop, tmp_path: Path
+) -> None:
+    fly(Request.of(EXPERIMENTS["hover"], duration_s=0.5), tmp_path / "run")
+    log = load_log(tmp_path / "run")
+    socket = connect(loop, panel, panel.token, panel.origin)
+    receive(loop, socket)
+    for first in range(0, 140, 20):
+        panel.show(log.slice(first, 20), [{"t_us": 0, "source": "lab", "text": f"from {first}"}])
+    texts: list[str] = []
+    curves: list[list[float]] = []
+    while len(texts) < 7:
+        message = receive(loop, socket)
+        texts += message["texts"]
+        curves += message["curves"]
+    assert texts == [f"lab: from {first}" for first in range(0, 140, 20)]
+    assert [row[0] for row in curves] == pytest.approx([-1.0 + 0.05 * index for index in range(28)], abs=0.01)
+    assert message["state"]["t_s"] == pytest.approx(0.39, abs=0.01)
+    assert message["state"]["supervisor"] == "flying"
+    assert message["state"]["goal"] == [0.0, 0.0, 1.15, 0.0]
+    assert message["scene"].startswith("data:image/png;base64,")
+    socket.close()
