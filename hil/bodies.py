@@ -1,6 +1,6 @@
 """The bodies that can fly: those that ship, by name, and the user's own in a file (docs/tutorials/your-own-robot.md)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +9,11 @@ import numpy as np
 from hil.config import LabConfig
 from hil.crazyflie.quadrotor import Quadrotor
 from hil.errors import LabError, blame, hint
+from hil.floaty.failures import SERVO_FAILURES
+from hil.floaty.paper_table import PAPER_TABLE
 from hil.floaty.plant import Plant
 from hil.own_files import load_file
-from hil.world.body import Body, Vector
+from hil.world.body import Body, Failure, Vector
 
 Make = Callable[[LabConfig, np.random.Generator, Vector], Body]
 OWN = "Robot"  # what a file defines: a class or function that is called as a `Make`
@@ -35,6 +37,10 @@ def crazyflie(config: LabConfig, rng: np.random.Generator, p_WB: Vector) -> Body
 
 
 BODIES: dict[str, Make] = {"floaty": floaty, "crazyflie": crazyflie}
+FAILURES: dict[str, Mapping[str, Failure]] = {"floaty": SERVO_FAILURES}  # kinds of faults by body
+MEASURED: Mapping[str, tuple[float, float]] = (
+    PAPER_TABLE  # `plant.constant_factors`: values and their uncertainty
+)
 
 
 def make_body(config: LabConfig, rng_gust: np.random.Generator, p_WB: Vector) -> Body:

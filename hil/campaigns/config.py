@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import ErrorDetails
 
+from hil.bodies import MEASURED
 from hil.config import DEFAULT_PROFILE, read_toml
 from hil.errors import LabError, hint
-from hil.floaty.paper_table import PAPER_TABLE
 from hil.world.config import ConstantName
 
 Value = bool | int | float | str
@@ -82,7 +82,7 @@ class TableConfig(_Part):
         """The constants, in the Table's order; the plant does not vary z_vz."""
         known = get_args(ConstantName)
         chosen = known if self.constants == "all" else self.constants
-        return tuple(name for name in PAPER_TABLE if name in chosen)
+        return tuple(name for name in MEASURED if name in chosen)
 
 
 class FlightLimits(_Part):
@@ -147,7 +147,7 @@ def table_dimensions(table: TableConfig | None) -> list[tuple[str, Distribution]
     """Return the constants that vary within the Table's uncertainty, as factors on the tabulated values."""
     found = []
     for name in table.names if table else ():
-        value, error = PAPER_TABLE[name]
+        value, error = MEASURED[name]
         spread = error / abs(value)
         varies = (
             Distribution(uniform=(1.0 - spread, 1.0 + spread))

@@ -104,9 +104,9 @@ def asked_as(kind: type[Asked]) -> Callable[[Callable[..., int | None]], Callabl
 def announce_compilation() -> None:
     """Announce that the first run compiles, because that takes a while."""
     from firmware_py.compiling import is_kept
-    from hil.world.motion import advance
+    from hil.devices.imu import channels
 
-    if not is_kept(advance):
+    if not is_kept(channels):
         notices.print(COMPILING, soft_wrap=True)
 
 

@@ -137,7 +137,7 @@ def serve(asked: Asked) -> int:
     station = _station_of(asked, config)
     ends = parse_addresses(asked.mavlink, asked.boards) if asked.mavlink is not None else []
     planned = [parse(text) for text in asked.faults]
-    check(planned, float("inf"), "mavlink" if ends else "radio", config.markers.enabled)
+    check(planned, float("inf"), "mavlink" if ends else "radio", config)
     announce_compilation()
     stack = click.get_current_context().with_resource(ExitStack())
     port = debugger(asked.gdb, Path(asked.board or ""), stack)

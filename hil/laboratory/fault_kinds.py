@@ -10,10 +10,13 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Literal
 
 from hil.arguments import checked, fits, shown
+from hil.bodies import FAILURES
 from hil.errors import LabError, blame, hint
+from hil.world.body import Failure
 
 if TYPE_CHECKING:
     from hil.crazyflie.shockburst import Air
@@ -67,6 +70,7 @@ class Kind:
     duration_s: float = math.inf  # default; inf: to the end of the flight
     link: Literal["", "radio", "mavlink"] = ""  # the only one on which it acts
     markers: bool = False  # acts on markers: only with `markers.enabled`
+    body: str = ""  # the only one that has the part that fails
 
     @property
     def sized(self) -> bool:
@@ -155,12 +159,21 @@ def _bias(axis: int) -> Knob:
     return Knob(lambda robot: robot.imu.rate_bias[axis], turn, add)
 
 
+@cache
 def _setting(name: str, blend: Blend) -> Knob:
     return Knob(
         lambda robot: robot.body.settings[name].read(),
         lambda robot, value: robot.body.settings[name].turn(value),
         blend,
     )
+
+
+def _of_body(body: str, one: Failure) -> Kind:
+    blend = {"add": add, "times": times}[one.blend]
+    return Kind(
+        one.meaning, one.unit, one.size, one.low, one.high, (_setting(one.setting, blend),), one.outcome, one.scale,
+        body=body,
+    )  # fmt: skip
 
 
 def _side_wind(axis: int) -> Knob:
@@ -221,7 +234,6 @@ GUSTS = Knob(
 )
 LOAD = _attribute(lambda robot: robot.thief, "share", lambda value, size: min(value + size, 1.0))
 SAG = _attribute(lambda robot: robot.battery, "sag_V", add)
-PACES = tuple(_setting(f"servo.pace.{number}", times) for number in (1, 2, 3, 4))
 
 DEG = math.radians(1.0)
 MS = 1e3  # us: times stay whole microseconds
@@ -303,25 +315,7 @@ KINDS: dict[str, Kind] = {
     "imu.silent": Kind(
         "the IMU raises no data-ready interrupt", "", 1.0, 1.0, 1.0, (SILENCE,), "failsafe", duration_s=GLIMPSE_S
     ),
-    **{
-        f"servo.stuck.{number}": Kind(
-            f"flap {number} is stuck", "", 0.0, 0.0, 0.0, (PACES[number - 1],), "degrades"
-        )
-        for number in (1, 2, 3, 4)
-    },
-    **{
-        f"servo.slow.{number}": Kind(
-            f"factor on the pace of servo {number}", "", 0.5, 0.01, 4.0, (PACES[number - 1],), "holds"
-        )
-        for number in (1, 2, 3, 4)
-    },
-    **{
-        f"servo.trim.{number}": Kind(
-            f"flap {number} deviates this far from its command", "deg", 5.0, -45.0, 45.0,
-            (_setting(f"servo.trim.{number}", add),), "holds", DEG,
-        )
-        for number in (1, 2, 3, 4)
-    },
+    **{name: _of_body(body, one) for body, kinds in FAILURES.items() for name, one in kinds.items()},
     "wind.side_x": Kind("side wind along x of W", "m/s", 0.25, -20.0, 20.0, (_side_wind(0),), "degrades"),
     "wind.side_y": Kind("side wind along y of W", "m/s", 2.0, -20.0, 20.0, (_side_wind(1),), "degrades"),
     "wind.fan": Kind("factor on all that the fans blow", "", 0.95, 0.0, 2.0, (FANS,), "degrades"),

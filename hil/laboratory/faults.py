@@ -11,9 +11,11 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hil.arguments import checked
+from hil.config import LabConfig
 from hil.errors import LabError, hint
 from hil.laboratory.fault_kinds import KINDS, MARKERS_ON, Kind, Knob
 from hil.laboratory.recorder import release_of, stored_in
@@ -93,8 +95,8 @@ def parse(text: str, live: bool = False) -> Fault:
     return Fault(parts["kind"], start_s, duration_s, size, live)
 
 
-def check(faults: Iterable[Fault], duration_s: float, link: str, markers: bool) -> None:
-    """Raise `LabError` when a fault begins after the flight, or acts on a link or on markers that the flight lacks."""
+def check(faults: Iterable[Fault], duration_s: float, link: str, config: LabConfig) -> None:
+    """Raise `LabError` when a fault begins after the flight, or acts on something that the flight lacks."""
     for fault in faults:
         if fault.start_s >= duration_s:
             raise LabError(
@@ -103,7 +105,10 @@ def check(faults: Iterable[Fault], duration_s: float, link: str, markers: bool) 
         needed = KINDS[fault.kind].link
         if needed and (needed == "mavlink") != link.startswith("mavlink"):
             raise LabError(f"fault {fault}: acts with --link {needed} only; this flight has --link {link}")
-        if KINDS[fault.kind].markers and not markers:
+        if (body := KINDS[fault.kind].body) not in ("", config.robot.body):
+            flown = Path(config.robot.body).name
+            raise LabError(f"fault {fault}: acts on a part of {body} only; this flight is one of {flown}")
+        if KINDS[fault.kind].markers and not config.markers.enabled:
             raise LabError(f"fault {fault}: needs --set {MARKERS_ON}")
 
 
@@ -194,6 +199,8 @@ def why_not(kind: Kind, robot: Robot) -> str:
         return "acts on a serial line; this robot has none"
     if kind.link == "radio" and robot.air is None:
         return "acts on a radio; this robot flies without"
+    if kind.body not in ("", robot.config.robot.body):
+        return f"acts on a part of {kind.body}; this robot is another"
     if kind.markers and robot.mocap.markers is None:
         return f"needs --set {MARKERS_ON}"
     return ""

@@ -191,7 +191,7 @@ class Request:
                 f"--duration {self.duration_s:g}: expected seconds, above 0 and up to {DURATION_MAX_S:g}"
             )
         on_top = self.planned_faults[len(self.experiment.faults) :]
-        check(on_top, self.duration_s, self.bench.link, self.config.markers.enabled)
+        check(on_top, self.duration_s, self.bench.link, self.config)
         check_limits(self.limits, self.experiment.metrics)
         home = self.config.flight.home
         if self.times is not None:

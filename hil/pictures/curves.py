@@ -67,8 +67,8 @@ class States:
 
 
 def actuators(log: pa.Table) -> tuple[tuple[str, Curves], ...]:
-    """Return what moves the robot, with its name: flaps, rotors, or nothing that is known here."""
-    moving = (("flaps", FLAPS), ("rotors", ROTORS))
+    """Return what moves the robot, with its name: flaps, rotors, or what a robot of the user's own logs."""
+    moving = (("flaps", FLAPS), ("rotors", ROTORS), *(("robot", plot) for plot in own_columns(log, "robot")))
     return tuple((name, plot) for name, plot in moving if plot.fits(log.column_names))
 
 
@@ -111,11 +111,9 @@ def _four(prefix: str) -> tuple[str, ...]:
 
 
 def _flaps(rows: pa.Table) -> NDArray[np.float64]:
-    """Return the true angles of the flaps [deg], or a real board's estimates; NaN of a robot without flaps."""
-    for names in (_four("truth.flap_"), _four("telemetry.flap_")):
-        if names[0] in rows.column_names:
-            return np.degrees(column(rows, *names))
-    return np.full((rows.num_rows, 4), np.nan)
+    """Return the true angles of the flaps [deg], or a real board's estimates."""
+    known = "truth.flap_" if "truth.flap_1" in rows.column_names else "telemetry.flap_"
+    return np.degrees(column(rows, *_four(known)))
 
 
 _XYZ, _RPY = ("x", "y", "z"), ("roll", "pitch", "yaw")
@@ -206,15 +204,15 @@ def processor(names: Iterable[str]) -> Curves:
     return Curves(shown, tuple(map(task_colour, shown)), "%", load)
 
 
-def own_logic(rows: pa.Table) -> list[Curves]:
-    """Return what the user's own logic has logged, a set of curves for each unit."""
+def own_columns(rows: pa.Table, group: str) -> list[Curves]:
+    """Return what the user's own `logic` or `robot` has logged, a set of curves for each unit."""
     by_unit: dict[str, list[str]] = {}
     for field in rows.schema:
-        if field.name.startswith("logic."):
+        if field.name.startswith(f"{group}."):
             by_unit.setdefault((field.metadata or {}).get(b"unit", b"").decode(), []).append(field.name)
     return [
         Curves(
-            tuple(name.removeprefix("logic.") for name in names),
+            tuple(name.removeprefix(f"{group}.") for name in names),
             tuple(SERIES_COLOURS[index % len(SERIES_COLOURS)] for index in range(len(names))),
             unit, plain(*names),
         )

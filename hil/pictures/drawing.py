@@ -18,13 +18,13 @@ from hil.pictures import panels
 from hil.pictures.curves import (
     ATTITUDE,
     BLUE,
-    FLAPS,
     GREY,
     PINK,
     POSITION,
     RED,
     SERIES_COLOURS,
     YELLOW,
+    actuators,
     since_release,
 )
 from hil.pictures.panels import INK, Marks, Panel, Plot, Series, marks_of_flight
@@ -61,7 +61,8 @@ def png(draw: Callable[..., Plot | Figure], *flights: pa.Table) -> bytes:
 
 def plotted(log: pa.Table, names: Sequence[str]) -> Figure:
     """Return a figure of columns of a log, a panel for each unit; without names, of errors and flaps."""
-    shown = ((POSITION, "position error"), (ATTITUDE, "attitude error"), (FLAPS, "flaps"))
+    moving = ((plot, name) for name, plot in actuators(log))
+    shown = ((POSITION, "position error"), (ATTITUDE, "attitude error"), *moving)
     times, by_unit = since_release(log), dict[str, list[Series]]()
     for index, name in enumerate(names):
         values = column(log, name)  # raises for a name that the log lacks

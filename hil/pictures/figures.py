@@ -225,7 +225,12 @@ def estimate(rows: pa.Table) -> Plot:
 
 def own_logic(rows: pa.Table) -> Plot:
     """Draw what the user's own logic logs, one axis for each unit."""
-    return Plot(tuple(panel(plot, rows, "own logic") for plot in curves.own_logic(rows)))
+    return Plot(tuple(panel(plot, rows, "own logic") for plot in curves.own_columns(rows, "logic")))
+
+
+def own_robot(rows: pa.Table) -> Plot:
+    """Draw what the user's own robot logs, one axis for each unit."""
+    return Plot(tuple(panel(plot, rows, "robot") for plot in curves.own_columns(rows, "robot")))
 
 
 def schedule(table: pa.Table) -> Plot:
@@ -331,6 +336,7 @@ COURSE = Picture(
     "Flown (solid) and wanted (dashed) position from the first goal in W, and yaw.",
     course,
 )
+OWN_ROBOT = Picture("Robot", "What your own robot logs of itself.", own_robot, question=WHAT)
 OWN_LOGIC = Picture("Own logic", "What your own modules log of their memory.", own_logic, question=KNOWN)
 LATENCY_BUDGET = Picture(
     "Latency budget",

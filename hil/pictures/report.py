@@ -19,8 +19,17 @@ from hil.laboratory.metrics import METRICS, SHOWN, short_of
 from hil.laboratory.recorder import load_events, load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
 from hil.laboratory.schedule import load_schedule
-from hil.pictures.curves import own_logic, with_marks
-from hil.pictures.figures import COURSE, LATENCY_BUDGET, OWN_LOGIC, PICTURES, SCHEDULE, TRACK, goal_moves
+from hil.pictures.curves import own_columns, with_marks
+from hil.pictures.figures import (
+    COURSE,
+    LATENCY_BUDGET,
+    OWN_LOGIC,
+    OWN_ROBOT,
+    PICTURES,
+    SCHEDULE,
+    TRACK,
+    goal_moves,
+)
 from hil.pictures.gallery import pictures_of
 from hil.pictures.links import link_to
 from hil.pictures.pages import draw, write_page, zoomable
@@ -68,7 +77,8 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         (picture, log)
         for picture in [*([COURSE] if goal_moves(log) else []), *pictures_of(experiment), *PICTURES]
     ]
-    drawn += [(OWN_LOGIC, log)] if own_logic(log) else []
+    for group, picture in (("robot", OWN_ROBOT), ("logic", OWN_LOGIC)):
+        drawn += [(picture, log)] if own_columns(log, group) else []
     drawn += [(LATENCY_BUDGET, ages)] if ages.num_rows else []
     drawn += [(SCHEDULE, schedule.replace_schema_metadata(log.schema.metadata))] if schedule.num_rows else []
     marks = marks_of_flight(log, result.cause or "lost" if result.outcome == "lost" else None)

@@ -266,7 +266,7 @@ def _poses(rows: pa.Table) -> Iterator[str]:
 
 def _flaps(rows: pa.Table) -> Iterator[str]:
     hover = stored_in(rows.schema.metadata, "config").get("allocation", {}).get("hover_angle")
-    if curves.FLAPS_COMMAND.needs not in rows.column_names or is_real(rows) or hover is None:
+    if "truth.flap_1" not in rows.column_names or hover is None:
         return
     angles, times = curves.FLAPS.read(rows), since_release(rows)
     away = np.abs(angles - curves.FLAPS_COMMAND.read(rows))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,21 @@ class Setting:
 
     read: Callable[[], float]
     turn: Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A kind of fault of a body: sizes in `unit`, and which of its settings the size changes, in SI by `scale`."""
+
+    meaning: str
+    unit: str
+    size: float  # default
+    low: float
+    high: float
+    setting: str
+    blend: Literal["add", "times"]  # several sizes with one another and with the setting
+    outcome: Literal["holds", "degrades", "failsafe", "lost"]  # of the hover, as of `Kind`
+    scale: float = 1.0
 
 
 class Motion(Protocol):

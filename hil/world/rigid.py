@@ -7,6 +7,7 @@ as Floaty's on the same grid. Elementary functions have the same bits everywhere
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -15,7 +16,7 @@ from firmware_py.compiling import bound
 from hil.errors import LabError, blame
 from hil.scene import Look, Markers, Part, ball, eight_markers
 from hil.world import layout as at
-from hil.world.body import Channel, Setting, Vector
+from hil.world.body import Channel, Quantity, Setting, Vector
 from hil.world.config import BatteryConfig, PlantConfig, TunnelConfig
 from hil.world.in_tunnel import UPRIGHT, InTunnel
 from hil.world.motion import accelerate, gust, move, surround, watch
@@ -53,6 +54,7 @@ class RigidBody(InTunnel):
     outputs: Sequence[tuple[int, int]] = OUTPUTS
     settings: Mapping[str, Setting] = {}
     parts: tuple[Part, ...] = (ball(0.05),)
+    logged: Mapping[str, tuple[str, str]] = {}  # by attribute: the names of its numbers, and their unit
     radius: float = 0.1  # [m] of the ball on which the cameras' markers are
 
     def __init__(self, world: World, rng_gust: np.random.Generator, p_WB: Vector) -> None:
@@ -89,8 +91,15 @@ class RigidBody(InTunnel):
         return 0.0
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return what it logs besides its motion."""
-        return ()
+        """Return what it logs besides its motion: the `logged` attributes, as columns `robot.NAME`."""
+        return tuple(
+            Channel(
+                "float64",
+                partial(getattr, self, name),
+                (Quantity(tuple(f"robot.{one}" for one in names.split()), unit),),
+            )
+            for name, (names, unit) in self.logged.items()
+        )
 
     @property
     def time_s(self) -> float:

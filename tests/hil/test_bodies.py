@@ -9,9 +9,13 @@ import pytest
 from hil.bodies import make_body
 from hil.config import load_config
 from hil.errors import LabError
+from hil.laboratory.faults import parse
 from hil.laboratory.metrics import column, free_flight
-from hil.laboratory.recorder import load_log
+from hil.laboratory.recorder import load_log, stored_in
 from hil.laboratory.result import Result
+from hil.pictures import video
+from hil.pictures.report import write_report
+from hil.scene import Look
 from support.flights import hover
 from support.paths import ROOT
 
@@ -138,3 +142,44 @@ def test_a_body_that_fails_in_flight_is_lost_with_the_cause(value: str, cause: s
     result = hover(tmp_path / "run", profile=project(tmp_path, robot), duration_s=1.0)
     assert result.outcome == "lost"
     assert result.cause == f"{cause} at 1.20 s"
+
+
+def test_the_tutorial_shows_the_robot_that_a_new_project_has() -> None:
+    text = (PROJECT / "robot.py.in").read_text(encoding="utf-8")
+    assert f"```python\n{text}```" in (ROOT / "docs/tutorials/your-own-robot.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 80
+
+
+def test_a_fault_of_floatys_parts_is_refused_for_another_body(tmp_path: Path) -> None:
+    with pytest.raises(LabError, match=r"servo\.stuck\.1@1.*acts on a part of floaty only"):
+        hover(tmp_path / "run", profile=project(tmp_path), duration_s=2.0, faults=[parse("servo.stuck.1@1")])
+
+
+def test_faults_of_the_air_cameras_and_battery_act_on_it(tmp_path: Path) -> None:
+    faults = [parse("wind.fan@0.2:0.3=0.5"), parse("mocap.dropout@0.2:0.1"), parse("battery.sag@0.2=0.5")]
+    result = hover(tmp_path / "run", profile=project(tmp_path), duration_s=0.6, faults=faults)
+    log = free_flight(load_log(result.folder))
+    seconds = 1e-6 * (column(log, "t") - column(log, "t")[0])
+    assert column(log, "flow.z")[(seconds > 0.25) & (seconds < 0.45)].mean() == pytest.approx(5.0, abs=0.4)
+    assert column(log, "battery.voltage")[-1] < column(log, "battery.voltage")[0] - 0.4
+    write_report(result.folder)  # with close-ups of the faults
+
+
+def test_cameras_see_its_markers(tmp_path: Path) -> None:
+    result = hover(tmp_path / "run", "markers.enabled=true", profile=project(tmp_path), duration_s=0.5)
+    log = free_flight(load_log(result.folder))
+    assert result.outcome == "completed"
+    assert (column(log, "markers.visible") > 0).all()
+    assert column(log, "markers.error").max() < 0.005
+
+
+def test_its_report_and_scene_show_what_it_describes(flown: Result) -> None:
+    write_report(flown.folder)
+    page = (flown.folder / "report.html").read_text(encoding="utf-8")
+    assert "What your own robot logs of itself." in page
+    assert "along_x" in page
+    assert "True angle of each flap" not in page
+    look = Look.read(stored_in(load_log(flown.folder).schema.metadata, "look"))
+    assert [part.name for part in look.parts] == ["ball"]
+    picture = np.asarray(next(video.frames(load_log(flown.folder))))
+    assert (picture[:, : video.SIDE] == (200, 204, 208)).all(axis=2).sum() > 1000  # the ball, pale

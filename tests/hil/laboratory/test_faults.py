@@ -116,18 +116,18 @@ def test_a_wrong_fault_is_one_line_and_exit_code_two(
 
 @pytest.mark.parametrize("link", ["radio", "udp://127.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"])
 def test_a_fault_of_the_radio_acts_on_every_radio_and_on_no_serial_line(link: str) -> None:
-    check([parse("radio.cut@1")], 3.0, link, markers=False)
+    check([parse("radio.cut@1")], 3.0, link, load_config())
     with pytest.raises(LabError, match="acts with --link mavlink only"):
-        check([parse("serial.cut@1")], 3.0, link, markers=False)
+        check([parse("serial.cut@1")], 3.0, link, load_config())
 
 
 def test_a_radio_fault_is_refused_on_the_serial_line() -> None:
     with pytest.raises(LabError, match="--link radio only"):
-        check([parse("radio.loss@1")], 30.0, MAVLINK, markers=False)
+        check([parse("radio.loss@1")], 30.0, MAVLINK, load_config())
 
 
 def test_markers_have_faults_on_either_link() -> None:
-    check([parse("marker.swap@1")], 30.0, MAVLINK, markers=True)
+    check([parse("marker.swap@1")], 30.0, MAVLINK, load_config(overrides=[MARKERS_ON]))
 
 
 # Every kind acts from its begin to its end and no longer
