@@ -229,7 +229,9 @@ OUTWARDS = np.array([1.0, -1.0, 1.0, -1.0])  # the sign of an opening flap's ang
 
 def evidence(rows: pa.Table) -> list[str]:
     """Return sentences about rows of a log; none about fewer than two."""
-    return [*_robot(rows), *_belief(rows), *_poses(rows), *_flaps(rows)] if rows.num_rows > 1 else []
+    if rows.num_rows < 2:
+        return []
+    return [*_robot(rows), *_belief(rows), *_poses(rows), *_limits(rows), *_flaps(rows)]
 
 
 def _robot(rows: pa.Table) -> Iterator[str]:
@@ -262,6 +264,16 @@ def _poses(rows: pa.Table) -> Iterator[str]:
         count = sum(float(np.ptp(column(rows, name))) for name in known)
         if count > 0:
             yield f"{text.capitalize()}: {count:.0f} times."
+
+
+def _limits(rows: pa.Table) -> Iterator[str]:
+    times = since_release(rows)
+    shown = [
+        f"flap {flap} for {at_limit.mean() * (times[-1] - times[0]):.2f} s, from {times[_first(at_limit)]:.2f} s on"
+        for flap, at_limit in saturated(rows)
+    ]
+    if shown:
+        yield f"Commands at their limits: {'; '.join(shown)}."
 
 
 def _flaps(rows: pa.Table) -> Iterator[str]:

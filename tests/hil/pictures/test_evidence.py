@@ -15,6 +15,7 @@ from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.pictures.curves import since_release
 from hil.pictures.figures import course_of, goal_moves
+from hil.pictures.panels import saturated
 from hil.pictures.story import evidence, failures_of
 
 
@@ -54,6 +55,17 @@ def test_a_stuck_flap_is_named_with_what_the_board_believed(folder: Path) -> Non
     assert stood == pytest.approx(truth[np.argmin(np.abs(since_release(rows) - at_s))], abs=0.6)
     assert -53 < believed < 1, "the range of an even flap"
     assert evidence(log.slice(0, 1)) == []
+
+
+def test_commands_at_their_limits_are_named_with_how_long_they_stood_there(folder: Path) -> None:
+    log = load_log(folder)
+    rows = log.filter(since_release(log) >= 1.5)
+    (limits,) = [sentence for sentence in evidence(rows) if sentence.startswith("Commands at their limits: ")]
+    for flap, at_limit in saturated(rows):
+        (told,) = [part for part in limits.split(": ")[1].split("; ") if part.startswith(f"flap {flap} ")]
+        _, stood_s, from_s = numbers(told.rstrip("."))
+        assert stood_s == pytest.approx(0.01 * at_limit.sum(), abs=0.02)
+        assert from_s == pytest.approx(since_release(rows)[np.argmax(at_limit)], abs=0.006)
 
 
 def test_a_limit_that_failed_names_the_fault_that_began_last(folder: Path) -> None:
