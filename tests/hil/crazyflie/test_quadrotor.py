@@ -225,6 +225,31 @@ def test_same_bits_however_time_is_divided() -> None:
     assert len(set(states)) == 1
 
 
+def test_a_plain_law_through_the_mixer_takes_off_holds_and_stays_level() -> None:
+    """The signs of powerDistributionLegacy, 8-bit words and a battery that sags: what an image has to cope with."""
+    body = make(None, motor_spread=0.02)
+    for now_us in range(0, 4_000_000, 2_000):
+        body.advance(now_us)
+        if now_us % 10_000 == 0:
+            body.draw(now_us, 3.8)
+        x, y, z = body.q_WB[1:]
+        p, q, r = body.omega_B
+        height, climb = body.p_WB[2], body.v_WB[2]
+        thrust = 160.0 + 90.0 * (1.0 - height) - 60.0 * climb
+        roll, pitch, yaw = -(300.0 * x + 10.0 * p), -(300.0 * y + 10.0 * q), -(200.0 * z + 30.0 * r)
+        motors = (
+            thrust - roll - pitch - yaw,
+            thrust - roll + pitch + yaw,
+            thrust + roll + pitch - yaw,
+            thrust + roll - pitch + yaw,
+        )
+        body.set_counts(now_us, [min(max(round(motor), 0), 255) for motor in motors])
+    assert body.lost is None
+    assert body.p_WB[2] == pytest.approx(1.0, abs=0.05)
+    assert abs(body.q_WB[0]) == pytest.approx(1.0, abs=1e-3)
+    assert np.abs(body.omega_B).max() < 0.2
+
+
 def test_seeds_draw_other_motors() -> None:
     one, other = (spun_up((0.6,) * 4, seed=seed, motor_spread=0.02).thrust.copy() for seed in (1, 2))
     assert np.abs(one - other).max() > 1e-5

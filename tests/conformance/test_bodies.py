@@ -1,0 +1,80 @@
+"""What every body that ships keeps: it is held and released, feels its weight, is pushed, draws power, and can be drawn."""
+
+import numpy as np
+import pytest
+
+from hil.bodies import BODIES, make_body
+from hil.config import LabConfig, load_config
+from hil.world.body import Body
+
+PROFILES = {"floaty": "floaty", "crazyflie": "crazyflie"}
+G = 9.81
+
+
+@pytest.fixture(params=sorted(PROFILES))
+def config(request: pytest.FixtureRequest) -> LabConfig:
+    return load_config(PROFILES[request.param])
+
+
+@pytest.fixture
+def body(config: LabConfig) -> Body:
+    home, offset = config.flight.home, config.flight.start_offset
+    place = tuple(np.add(home, offset).tolist())
+    made = make_body(config, np.random.default_rng(1), place)
+    made.draw(0, 3.9)
+    made.hold()
+    return made
+
+
+def test_every_body_that_ships_is_tried() -> None:
+    assert set(PROFILES) == set(BODIES)
+
+
+def test_held_it_stays_and_feels_its_weight(body: Body) -> None:
+    before = body.state.tobytes()
+    body.advance(100_000)
+    assert body.state.tobytes() == before
+    assert body.specific_force_B == pytest.approx([0.0, 0.0, G], abs=1e-9)
+    assert body.lost is None
+
+
+def test_views_keep_their_memory_and_cannot_be_written(body: Body) -> None:
+    views = (body.state, body.p_WB, body.q_WB, body.omega_B, body.specific_force_B, body.flow_W, body.pushes)
+    places = [view.ctypes.data for view in views]
+    body.release()
+    body.advance(50_000)
+    again = (body.state, body.p_WB, body.q_WB, body.omega_B, body.specific_force_B, body.flow_W, body.pushes)
+    assert [view.ctypes.data for view in again] == places
+    assert not any(view.flags.writeable for view in views)
+    assert body.state[:3] == pytest.approx(body.p_WB)
+    assert body.state[6:10] == pytest.approx(body.q_WB)
+    assert body.state[10:] == pytest.approx(body.omega_B)
+
+
+def test_a_push_moves_it_and_being_put_back_ends_that(body: Body, config: LabConfig) -> None:
+    body.release()
+    body.push((0.0, 1.0, 0.0))
+    assert body.pushes.tolist() == [0.0, 1.0, 0.0, 0.0, 0.0, 0.0]
+    body.advance(50_000)
+    assert body.p_WB[1] > 1e-4
+    body.put_back(config.flight.home)
+    assert body.p_WB.tolist() == list(config.flight.home)
+    assert body.lost is None
+
+
+def test_it_draws_at_least_what_its_electronics_do(body: Body, config: LabConfig) -> None:
+    body.advance(10_000)
+    assert body.draw(10_000, 3.9) >= config.battery.electronics_power
+
+
+def test_it_names_an_output_per_count_and_logs_as_many_values_as_columns(body: Body) -> None:
+    body.set_counts(1_000, [0] * len(body.outputs))
+    for channel in body.channels():
+        columns = sum(len(quantity.names) for quantity in channel.quantities)
+        assert np.size(channel.read()) == columns
+
+
+def test_it_can_be_drawn_and_seen(body: Body) -> None:
+    assert body.look.parts
+    assert all(part.triangles.shape[1:] == (3, 3) for part in body.look.parts)
+    assert body.markers.places.shape == (8, 3)
