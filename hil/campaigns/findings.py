@@ -109,6 +109,7 @@ class FailureMap:
     """A logistic map from the cube to the chance of failing."""
 
     axes: tuple[CubeAxis, ...]
+    flights: NDArray[np.int64]  # (N,) their numbers
     points: Array  # (N, D) 0..1, as flown
     failed: NDArray[np.bool_]  # (N,)
     weights: Array  # (D,) log-odds from one end of the axis to the other
@@ -163,7 +164,7 @@ def find(spec: Spec, flights: pa.Table) -> Findings:
     limits = _limits(spec, flights)
     points = points_of(spec)
     which = flights["index"].to_numpy() // spec.cells
-    mapped = _failure_map(spec, as_flown(spec, points)[which], ~passed)
+    mapped = _failure_map(spec, flights["index"].to_numpy(), as_flown(spec, points)[which], ~passed)
     influences = [*_influences(spec, points, which, flights, limits, ~passed)]
     if mapped is not None:
         influences.insert(0, mapped.influence)
@@ -224,7 +225,9 @@ def _limits(spec: Spec, flights: pa.Table) -> tuple[Limited, ...]:
     return tuple(found)
 
 
-def _failure_map(spec: Spec, points: Array, failed: NDArray[np.bool_]) -> FailureMap | None:
+def _failure_map(
+    spec: Spec, flights: NDArray[np.int64], points: Array, failed: NDArray[np.bool_]
+) -> FailureMap | None:
     known = axes(spec)
     if not known or min(failed.sum(), (~failed).sum()) < MAPPED_FROM:
         return None
@@ -239,7 +242,7 @@ def _failure_map(spec: Spec, points: Array, failed: NDArray[np.bool_]) -> Failur
         return float(loss + 0.5 * (pull * weights).sum()), slope.sum(axis=0) + pull
 
     fitted = minimize(cost, np.zeros(1 + len(known)), jac=True, method="L-BFGS-B").x
-    return FailureMap(known, points, failed, fitted[1:], float(fitted[0]))
+    return FailureMap(known, flights, points, failed, fitted[1:], float(fitted[0]))
 
 
 def _influences(

@@ -1,12 +1,16 @@
 """The report of a campaign: `report.html`, which is self-contained, and `result.json` for programs."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from hil.campaigns.config import Spec, spec_text
 from hil.campaigns.dataset import Dataset, about
@@ -22,17 +26,20 @@ IN_A_ROW = 3
 GRID = 60
 TICKS = 5
 SHADES = 10
+BINS = (5, 40)  # of a histogram, by the number of flights
+FEW = 100  # flights, up to which a histogram shows each and counts linearly
 
 
 def write_report(named: str, spec: Spec, dataset: Dataset, complete: bool) -> tuple[Path, Findings]:
     """Write report and result of the dataset of a campaign, as the user names it; return report and findings."""
     folder, findings = dataset.folder, find(spec, dataset.table())
     histograms = [one for one in findings.limits if len(one.values) > 1]
-    mapped = findings.failure_map
+    drawn = None if findings.failure_map is None else _map(findings.failure_map)
     page = write_page(
         folder / REPORT, "campaign.html.j2", spec=spec, found=findings, complete=complete,
         histograms=data_uri(png(lambda: _histograms(histograms))) if histograms else "",
-        failure_map=data_uri(png(lambda: _map(mapped))) if mapped is not None else "",
+        failure_map=data_uri(png(lambda: drawn.figure)) if drawn is not None else "",
+        places=drawn.places([one.index for one in findings.worst]) if drawn is not None else {},
         named=quote(named), begun=about(dataset.plan)["commit"],
     )  # fmt: skip
     text = json.dumps(_content(spec, findings, complete), indent=2)
@@ -79,10 +86,15 @@ def _histograms(limits: list[Limited]) -> Figure:
     grid = figure.subplots(rows, IN_A_ROW, squeeze=False).ravel()
     for axes, one in zip(grid, limits, strict=False):
         scale, unit = SHOWN.get(one.metric.unit, (1.0, one.metric.unit))
-        axes.hist(one.values * scale, bins=40, color=curves.BLUE)
+        count = len(one.values)
+        axes.hist(one.values * scale, bins=int(np.clip(2.0 * np.sqrt(count), *BINS)), color=curves.BLUE)
         axes.axvline(one.bound * scale, color=curves.RED, linestyle="--")
-        axes.set_yscale("log")  # so that the few failures are visible
-        axes.set_ylim(bottom=0.7)
+        if count > FEW:
+            axes.set_yscale("log")  # so that the few failures are visible
+            axes.set_ylim(bottom=0.7)
+        else:
+            axes.plot(one.values * scale, np.zeros(count), "|", color=curves.RED, markersize=8, clip_on=False)
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_xlabel(f"{one.name} [{unit}]" if unit else one.name)
         axes.set_title(f"{Path(one.experiment).name}, {Path(one.profile).name}", fontsize=8)
     for axes in grid[::IN_A_ROW]:
@@ -92,7 +104,24 @@ def _histograms(limits: list[Limited]) -> Figure:
     return figure
 
 
-def _map(found: FailureMap) -> Figure:
+@dataclass(frozen=True, slots=True)
+class DrawnMap:
+    """A failure map as a figure, and where the flights in it are."""
+
+    figure: Figure
+    axes: Axes
+    flights: dict[int, tuple[float, float]]  # the points that are drawn, by the flights' numbers
+
+    def places(self, flights: Sequence[int]) -> dict[int, tuple[float, float]]:
+        """Return where flights are in the figure, once it was written [% from its left and lower edge]."""
+        size, shown = self.figure.bbox.size, [one for one in flights if one in self.flights]
+        return {
+            one: tuple((100.0 * self.axes.transData.transform(self.flights[one]) / size).tolist())
+            for one in shown
+        }
+
+
+def _map(found: FailureMap) -> DrawnMap:
     """Draw the two numbers on which failing depends most, with the faults that they belong to, and those flights.
 
     All other numbers are at their centres, all other faults as frequent as they are.
@@ -124,7 +153,8 @@ def _map(found: FailureMap) -> Figure:
     axes.set_ylabel(found.axes[up].name)
     axes.set_yticks(*_ticks(found.axes[up]))
     axes.legend(loc="upper left", bbox_to_anchor=(1.2, 1.0))
-    return figure
+    numbers, places = found.flights[those].tolist(), found.points[those][:, (across, up)].tolist()
+    return DrawnMap(figure, axes, dict(zip(numbers, map(tuple, places), strict=True)))
 
 
 def _ticks(axis: CubeAxis) -> tuple[list[float], list[str]]:

@@ -1,16 +1,20 @@
 """A campaign of planted flights: the same dataset for any order, nothing lost or repeated, and what is found in it."""
 
 import gc
+import io
 import itertools
 import json
 import os
 import random
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 from scipy.stats import binomtest
 
 from hil.campaigns.config import Spec
@@ -230,6 +234,18 @@ def test_the_report_has_rates_influences_commands_and_pictures(tmp_path: Path) -
     assert len(page.tables["influences"]) == 1 + len(found.influences) > 2
     assert "floaty campaign &#39;my spec.toml&#39; --shrink FLIGHT" in path.read_text(encoding="utf-8")
     assert [picture[:4] for picture in page.pictures] == [b"\x89PNG"] * 2
+    text = path.read_text(encoding="utf-8")
+    rings = re.findall(
+        r'href="#flight-(\d+)" title="flight \1" style="left: ([\d.]+)%; bottom: ([\d.]+)%"', text
+    )
+    assert {int(flight) for flight, _, _ in rings} == {one.index for one in found.worst}
+    assert all(f'<tr id="flight-{flight}">' in text for flight, _, _ in rings)
+    with Image.open(io.BytesIO(page.pictures[1])) as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    height, width, _ = pixels.shape
+    for _, x, y in rings:
+        red, green, _ = pixels[round(height * (1 - float(y) / 100)), round(width * float(x) / 100)]
+        assert red > 1.5 * green, "the point of a flight that failed"
     told = json.loads((tmp_path / "result.json").read_text())
     assert (told["failed"], told["flown"]) == (found.rate.failed, 128)
 
