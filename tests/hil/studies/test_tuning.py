@@ -14,9 +14,11 @@ from hil.design.axes import ROLL, gains_in, robot_of
 from hil.design.loop import FREQUENCIES, Timing, build
 from hil.design.tune import Flow, GainTask, judged, refuse_late
 from hil.errors import LabError
+from hil.experiments import find_experiment
 from hil.floaty.plant import Plant
-from hil.laboratory.request import Options
+from hil.laboratory.request import Options, Request
 from hil.laboratory.robot import Streams
+from hil.laboratory.run import fly
 from hil.studies.tuning import Round
 from support.command import Cli
 
@@ -124,3 +126,13 @@ def test_a_round_from_the_authors_gains_and_the_plate_model_hovers_as_the_defaul
     )
     for axis in ("rms_x", "rms_y"):
         assert tuned[axis] < 1.15 * usual[axis], axis
+
+
+@pytest.mark.long
+def test_an_excitation_has_the_same_telemetry_on_every_board_so_gains_are_the_same(tmp_path: Path) -> None:
+    logs = set()
+    for board in ("python", "c", "cortex-m4"):
+        request = Request.of(find_experiment("identify-u3"), board=board, duration_s=6.0)
+        fly(request, tmp_path / board)
+        logs.add((tmp_path / board / "telemetry.csv").read_bytes())
+    assert len(logs) == 1
