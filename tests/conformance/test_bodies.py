@@ -1,19 +1,28 @@
-"""What every body that ships keeps: it is held and released, feels its weight, is pushed, draws power, and can be drawn."""
+"""What every body keeps, also one of the user's own: held it feels its weight, it is pushed, draws power, can be drawn."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hil.bodies import BODIES, make_body
 from hil.config import LabConfig, load_config
+from hil.scene import Look
 from hil.world.body import Body
+from support.paths import ROOT
 
 PROFILES = {"floaty": "floaty", "crazyflie": "crazyflie"}
+OWN = ROOT / "hil" / "commands" / "robot_project"
 G = 9.81
 
 
-@pytest.fixture(params=sorted(PROFILES))
-def config(request: pytest.FixtureRequest) -> LabConfig:
-    return load_config(PROFILES[request.param])
+@pytest.fixture(params=[*sorted(PROFILES), OWN])
+def config(request: pytest.FixtureRequest, tmp_path: Path) -> LabConfig:
+    if request.param in PROFILES:
+        return load_config(PROFILES[request.param])
+    for name in ("controller.py", "profile.toml", "robot.py"):
+        (tmp_path / name).write_text((OWN / f"{name}.in").read_text(encoding="utf-8"), encoding="utf-8")
+    return load_config(str(tmp_path / "profile.toml"))
 
 
 @pytest.fixture
@@ -78,3 +87,23 @@ def test_it_can_be_drawn_and_seen(body: Body) -> None:
     assert body.look.parts
     assert all(part.triangles.shape[1:] == (3, 3) for part in body.look.parts)
     assert body.markers.places.shape == (8, 3)
+    assert Look.read(body.look.stored()).stored() == body.look.stored()
+
+
+def test_the_same_instant_has_the_same_bits_however_the_time_to_it_is_divided(config: LabConfig) -> None:
+    ends = []
+    for instants in ([60_000], [1, 999, 1_000, 12_345, 60_000]):
+        made = make_body(config, np.random.default_rng(1), config.flight.home)
+        for now_us in instants:
+            made.advance(now_us)
+        ends.append(made.state.tobytes())
+    assert ends[0] == ends[1]
+
+
+def test_every_setting_can_be_turned_there_and_back(body: Body) -> None:
+    for name, setting in body.settings.items():
+        before = setting.read()
+        setting.turn(0.5)
+        assert setting.read() == pytest.approx(0.5), name
+        setting.turn(before)
+        assert setting.read() == before
