@@ -150,7 +150,7 @@ def _fly_one(request: Request, folder: Path, target: str | None) -> int:
 
         def show(now_us: int, flight: Flight) -> None:
             if view is not None and not hands:
-                hands.append(Hand(view, flight))
+                hands.append(Hand(view, flight, request.bench.in_lockstep))
             progress.update(bar, completed=now_us, total=flight.end_us, now=f"{now_us * 1e-6:6.1f} s")
 
         with writing("--out", folder):

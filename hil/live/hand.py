@@ -19,8 +19,8 @@ STEP_MS_MOST = 60_000
 class Hand:
     """Carries out the lines of a panel at a flight that flies; at the instants of its rows, which changes nothing else."""
 
-    def __init__(self, view: LiveView, flight: Flight) -> None:
-        self._view, self._flight = view, flight
+    def __init__(self, view: LiveView, flight: Flight, lockstep: bool = True) -> None:
+        self._view, self._flight, self._lockstep = view, flight, lockstep
         self._paused = False
         first_us = (flight.now_us // RECORD_PERIOD_US + 1) * RECORD_PERIOD_US + RECORD_PHASE_US
         flight.events.every(RECORD_PERIOD_US, first_us, self._look)
@@ -58,6 +58,8 @@ class Hand:
             self._flight.show()
 
     def _do(self, word: str, rest: str, now_us: int) -> None:
+        if word in ("pause", "step") and not self._lockstep:
+            raise LabError(f"{word}: the ground station is a program of its own, which does not stand still")
         if word in ("pause", "go"):
             self._paused = word == "pause"
         elif word == "step":

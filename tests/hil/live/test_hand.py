@@ -41,14 +41,14 @@ class Script:
         pass
 
 
-def flown(folder: Path, view: Script | None, duration_s: float = 1.0) -> str:
+def flown(folder: Path, view: Script | None, lockstep: bool = True) -> str:
     hands: list[Hand] = []
 
     def progress(now_us: int, flight: Flight) -> None:
         if view is not None and not hands:
-            hands.append(Hand(view, flight))
+            hands.append(Hand(view, flight, lockstep))
 
-    return fly(Request.of(EXPERIMENTS["hover"], duration_s=duration_s), folder, progress, view).hash
+    return fly(Request.of(EXPERIMENTS["hover"], duration_s=1.0), folder, progress, view).hash
 
 
 def test_a_panel_that_is_only_open_does_not_change_the_flight(tmp_path: Path) -> None:
@@ -87,6 +87,13 @@ def test_a_paused_flight_goes_on_step_by_step_and_ends_as_if_it_had_never_stood(
     assert times["step"] - times["step 100"] == 100_000
     assert times["go"] == times["mark still"] == times["step"] + 10_000
     assert view.shown == load_log(tmp_path / "paused").num_rows
+
+
+def test_a_flight_whose_station_is_another_program_does_not_pause(tmp_path: Path) -> None:
+    view = Script({100: ["pause", "step 50"]})
+    flown(tmp_path / "run", view, lockstep=False)
+    assert [answer.partition(":")[0] for answer in view.answers] == ["pause", "step"]
+    assert "does not stand still" in view.answers[0]
 
 
 def test_a_panel_that_is_closed_lets_a_paused_flight_go_on(tmp_path: Path) -> None:
