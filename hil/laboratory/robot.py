@@ -209,7 +209,7 @@ class Robot:
         self.free = False
 
     def put_back(self, now_us: int) -> None:
-        """Put the body into the holder, as at the start; flaps, air and faults are unchanged."""
+        """Put the body into the holder, as at the start; actuators, air and faults are unchanged."""
         self.body.advance(now_us)
         self.body.put_back(self.start_W)
         self.free = False
