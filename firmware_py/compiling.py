@@ -47,6 +47,9 @@ def compiler(*sources: Path) -> Callable[[Function], Function]:
         if PLAIN:
             return function
         stamp = shared.copy()
+        stamp.update(
+            function.__module__.encode()
+        )  # kept code names it: that of own logic has a hash of all its modules
         stamp.update(Path(inspect.getfile(function)).read_bytes())
         return cast(Function, Compiled(function, stamp.hexdigest()))
 

@@ -103,6 +103,17 @@ def test_the_memory_of_a_bound_call_lives_as_long_as_the_call() -> None:
     assert alive() is None
 
 
+def test_code_kept_for_a_module_is_not_taken_for_one_of_another_name() -> None:
+    """Kept code names its module, and that of own logic a hash of all its modules."""
+
+    def nothing() -> None: ...
+
+    stamps = set()
+    for nothing.__module__ in ("own_logic_1.own_controller", "own_logic_2.own_controller"):
+        stamps.add(compiler()(nothing).stamp)  # type: ignore[attr-defined]
+    assert len(stamps) == 2
+
+
 def test_compiled_functions_depend_on_no_file_that_their_cache_does_not_look_at() -> None:
     looked_at = ("hil.world.", "firmware_py.elementary", "firmware_py.core.", "hil.learn.", "math", "numpy")
     checked = 0
