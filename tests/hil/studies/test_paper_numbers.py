@@ -73,9 +73,10 @@ def test_new_gains_are_better_when_they_hover_no_worse() -> None:
         return Round(SimpleNamespace(before=before), (after,), "given", "written")  # type: ignore[arg-type]
 
     better, worse = of(placed(0.03, 0.04), placed(0.01)), of(placed(0.01), placed(0.03, 0.04))
-    assert (better.better, better.profile, better.rms) == (True, "written", 0.01)
-    assert (worse.better, worse.profile, worse.rms) == (False, "given", 0.01)
+    assert (better.better, better.profile, better.worth_another) == (True, "written", True)
+    assert (worse.better, worse.profile, worse.worth_another) == (False, "given", False)
     assert of(placed(0.01), placed(0.01)).better
+    assert not of(placed(0.01), placed(0.0099)).worth_another
     assert not of(placed(0.01), placed(0.0, outcome="lost")).better
     assert rms(placed(0.03, 0.0, 0.04)) == pytest.approx(0.05)
 
