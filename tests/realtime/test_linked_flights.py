@@ -42,7 +42,7 @@ def test_the_complete_laboratory_flies_hover_within_its_limits(tmp_path: Path) -
     assert budgets
     assert all("camera 20.0 + processing 18.0" in line and "assumed" not in line for line in budgets)
     assert not any("Traceback" in line or "connecting again" in line for line in said)
-    assert "<h2>Age of the poses</h2>" in (tmp_path / "run" / "report.html").read_text()
+    assert '<h2 id="poses">Age of the poses</h2>' in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_hover_holds_its_limits_when_a_third_of_the_packets_is_lost(tmp_path: Path) -> None:
