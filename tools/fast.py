@@ -37,7 +37,7 @@ MODULES = {
     "hil/crazyflie": "shockburst",
     "hil/devices": "board cameras radio",
     "hil/laboratory": "channels flight laboratory lockstep recorder robot",
-    "hil/world": "battery plant",
+    "hil/world": "battery",
 }
 FILES = [f"{folder}/{name}.py" for folder, names in MODULES.items() for name in names.split()]
 

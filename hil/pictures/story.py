@@ -278,7 +278,7 @@ def _limits(rows: pa.Table) -> Iterator[str]:
 
 def _flaps(rows: pa.Table) -> Iterator[str]:
     hover = stored_in(rows.schema.metadata, "config").get("allocation", {}).get("hover_angle")
-    if "truth.flap_1" not in rows.column_names or hover is None:
+    if hover is None or not {"truth.flap_1", "control.flap_1"} <= {*rows.column_names}:
         return
     angles, times = curves.FLAPS.read(rows), since_release(rows)
     away = np.abs(angles - curves.FLAPS_COMMAND.read(rows))

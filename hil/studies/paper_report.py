@@ -20,7 +20,7 @@ from hil.installation import commit, versions
 from hil.laboratory.metrics import METRICS
 from hil.laboratory.recorder import load_log
 from hil.laboratory.result import RESULT
-from hil.pictures.figures import PICTURES
+from hil.pictures.figures import PICTURES, TRACK
 from hil.pictures.gallery import pictures_of
 from hil.pictures.pages import PageFigure, data_uri, draw, write_page, zoomable
 from hil.pictures.panels import marks_of_flight
@@ -36,7 +36,7 @@ from hil.studies.study_run import StudyResult
 REPORT = "report.html"
 # Names of the pages beside those of the experiments.
 DRAG_MODEL, STUDIES, DESIGN = "drag-model", "studies", "design/design"
-OF_EVERY_FLIGHT = PICTURES[:2]  # for an experiment without pictures of its own
+OF_EVERY_FLIGHT = (TRACK, PICTURES[0])  # for an experiment without pictures of its own
 
 
 def write_paper(

@@ -198,6 +198,8 @@ def record_plausible(seed: int, ticks: int) -> Recording:
             )
             parameters.memory.view(np.uint32)[floats] = words.view(np.uint32)[floats]
             parameters.fields.target[:] = rng.normal(0, 0.3, 4)
+            parameters.fields.home[:2] = parameters.fields.target[:2]
+            fields.poses_absolute = tick % 250 == 0
             parameters.fields.predict, parameters.fields.age_measured = rng.random(2) < 0.8
             parameters.fields.horizon, parameters.fields.default_age_us = (
                 rng.integers(1, 13),

@@ -28,6 +28,7 @@ MAKE = "sets up an environment or runs the tests themselves"
 # Every command that is shown in a console block and not run there, with the reason: a pattern for its beginning.
 NOT_RUN = (
     (r"make (fly|test|test-all|docs|CRAZYFLIE_BASE=\S+)\b", MAKE),
+    (r"(git clone|make -C) ", IMAGE),
     (r"export PATH=", MAKE),
     (r"cd \$\(mktemp", MAKE),
     (r"floaty serve\b", SERVER),

@@ -162,7 +162,7 @@ def test_the_command_flies_reports_and_resumes(
     assert "of 4: " in cli.out
     for name in ("floaty", "as-flown"):
         assert f"  hover, {name}: 0 of 2" in cli.out
-        assert f"  hover, {name}, in_box: 0 of 2" in cli.out
+        assert f"  hover, {name}, within_6cm_x: 0 of 2" in cli.out
     page = Page((out / "report.html").read_text(encoding="utf-8"))
     assert [row[1] for row in page.tables["cells"][1:]] == ["floaty", "as-flown"]
     before = (out / "flights" / "all.parquet").read_bytes()
