@@ -6,13 +6,14 @@ end), size in the kind's unit: `mocap.dropout@10:0.5`, `push.y@3=2`, `servo.stuc
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hil.arguments import checked
 from hil.config import LabConfig
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 _LENGTH_AND_SIZE = r"(?::(?P<duration>[^@:=]+))?(?:=(?P<size>[^@:=]+))?"
 SHAPE = re.compile(rf"(?P<kind>[^@:=]+)@(?P<start>[^@:=]+){_LENGTH_AND_SIZE}")
 LIVE_SHAPE = re.compile(rf"(?P<kind>[^@:=]+){_LENGTH_AND_SIZE}")
+SWITCHED = re.compile(r"fault (?P<fault>[^@ ]+) (?P<change>begins|ends)")  # event of a live fault
+SWITCHED_ON = b"switched_on"  # key in the metadata of a log that is drawn
 
 
 @checked
@@ -121,11 +124,28 @@ def spans(faults: Iterable[Fault], release_us: int) -> list[Span]:
     ]  # fmt: skip
 
 
+def switched_on(events: Iterable[Mapping[str, Any]]) -> dict[bytes, bytes]:
+    """Return the live faults among the events of a flight as metadata of its log, for `spans_of`."""
+    found: list[list[Any]] = []  # fault, begin and end [us]
+    for event in events:
+        match = SWITCHED.fullmatch(event["text"]) if event["source"] == "lab" else None
+        if match is not None and match["change"] == "begins":
+            found.append([match["fault"], event["t_us"], math.inf])
+        elif match is not None:
+            for one in [one for one in found if one[0] == match["fault"] and one[2] == math.inf][:1]:
+                one[2] = event["t_us"]
+    return {SWITCHED_ON: json.dumps(found).encode()}
+
+
 def spans_of(metadata: Mapping[bytes, bytes] | None) -> list[Span]:
     """Return when the faults of a flight act, from the metadata of its log; those of kinds unknown here are left out."""
     texts = stored_in(metadata, "request").get("faults", ())
     faults = [parse(text) for text in texts if text.partition("@")[0] in KINDS]
-    return spans(faults, release_of(metadata))
+    live = json.loads((metadata or {}).get(SWITCHED_ON, b"[]"))
+    known = [one for one in live if re.split("[:=]", one[0])[0] in KINDS]
+    return spans(faults, release_of(metadata)) + [
+        Span(parse(text, live=True), *times) for text, *times in known
+    ]
 
 
 class Switchboard:

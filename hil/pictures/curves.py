@@ -14,6 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from ground_station.latency import STAGES
+from hil.laboratory.faults import switched_on
 from hil.laboratory.metrics import attitude_error, column, position_error
 from hil.laboratory.recorder import OPERATOR, release_of
 
@@ -241,9 +242,12 @@ def changes(rows: pa.Table, states: States) -> tuple[NDArray[np.float64], list[s
 
 
 def with_marks(log: pa.Table, events: Iterable[Mapping[str, Any]]) -> pa.Table:
-    """Return a log whose figures mark an operator's actions."""
+    """Return a log whose figures mark an operator's actions and the faults that were switched on in flight."""
+    events = list(events)
     marks = [(event["t_us"], event["text"]) for event in events if event["source"] == OPERATOR]
-    return log.replace_schema_metadata({**(log.schema.metadata or {}), MARKS: json.dumps(marks).encode()})
+    return log.replace_schema_metadata(
+        {**(log.schema.metadata or {}), MARKS: json.dumps(marks).encode(), **switched_on(events)}
+    )
 
 
 def marks_of(log: pa.Table) -> list[tuple[float, str]]:

@@ -14,7 +14,7 @@ from hil.experiments import find_again
 from hil.laboratory.ages import ages_in_time_of
 from hil.laboratory.experiment import Experiment
 from hil.laboratory.fault_kinds import KINDS
-from hil.laboratory.faults import Fault, spans_of
+from hil.laboratory.faults import Span, spans_of
 from hil.laboratory.metrics import METRICS, SHOWN, short_of
 from hil.laboratory.recorder import load_events, load_log, release_of, stored_in
 from hil.laboratory.result import Result, read_result
@@ -95,7 +95,7 @@ def write_report(folder: Path, experiment: Experiment | None = None) -> Path:
         result=result,
         found=experiment.is_known,
         rows=metric_rows(result),
-        faults=fault_rows(span.fault for span in spans_of(log.schema.metadata)),
+        faults=fault_rows(spans_of(log.schema.metadata), release_of(log.schema.metadata)),
         events=events,
         release_us=release_of(log.schema.metadata),
         failures=failures,
@@ -134,12 +134,13 @@ def metric_rows(result: Result) -> list[MetricRow]:
     return sorted(rows, key=lambda row: row.mark is None)
 
 
-def fault_rows(faults: Iterable[Fault]) -> list[FaultRow]:
+def fault_rows(spans: Iterable[Span], release_us: int) -> list[FaultRow]:
+    """Return one row per fault, with its times from the release."""
     rows = []
-    for fault in faults:
-        kind = KINDS[fault.kind]
-        size = f"{fault.size:g} {kind.unit}".strip() if kind.sized else ""
-        end_s = fault.start_s + fault.duration_s
+    for span in spans:
+        kind = KINDS[span.fault.kind]
+        size = f"{span.fault.size:g} {kind.unit}".strip() if kind.sized else ""
+        begin_s, end_s = (1e-6 * (us - release_us) for us in (span.begin_us, span.end_us))
         end = f"{end_s:.3f}" if end_s < math.inf else "with the flight"
-        rows.append(FaultRow(fault.kind, f"{fault.start_s:.3f}", end, size, kind.meaning))
+        rows.append(FaultRow(span.fault.kind, f"{begin_s:.3f}", end, size, kind.meaning))
     return rows

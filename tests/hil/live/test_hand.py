@@ -7,13 +7,18 @@ import pyarrow as pa
 import pytest
 
 from hil.experiments import EXPERIMENTS
+from hil.laboratory.faults import spans_of
 from hil.laboratory.flight import Flight
 from hil.laboratory.metrics import column
 from hil.laboratory.recorder import load_events, load_log
 from hil.laboratory.request import Request
+from hil.laboratory.result import read_result
 from hil.laboratory.run import fly
 from hil.live.hand import Hand
-from hil.pictures.curves import since_release
+from hil.pictures.curves import since_release, with_marks
+from hil.pictures.panels import marks_of_flight
+from hil.pictures.report import fault_rows
+from hil.pictures.story import close_ups, story_of
 
 
 class Script:
@@ -72,6 +77,18 @@ def test_goal_fault_and_note_act_and_are_events(tmp_path: Path) -> None:
         "goal 0.05 0 1.15 10", "mark here", "mocap.dropout:0.2",
     ]  # fmt: skip
     assert any("mocap.dropout" in text for source, text in texts if source == "lab")
+    log = with_marks(log, load_events(tmp_path / "run"))
+    (spell,) = [one for one in marks_of_flight(log).spells if one.kind == "fault"]
+    assert spell.text == "mocap.dropout:0.2=1"
+    assert (spell.begin_s, spell.end_s) == pytest.approx((moved_s, moved_s + 0.2), abs=0.02)
+    told = [moment.text for moment in story_of(log, read_result(tmp_path / "run"))]
+    assert [text for text in told if "fault" in text] == [
+        "fault mocap.dropout:0.2=1 begins", "fault mocap.dropout:0.2=1 ends",
+    ]  # fmt: skip
+    (close,) = close_ups(log, marks_of_flight(log))
+    assert close.figure.title == "mocap.dropout:0.2=1"
+    (row,) = fault_rows(spans_of(log.schema.metadata), 1_000_000)
+    assert float(row.end_s) - float(row.begin_s) == pytest.approx(0.2)
     assert len(view.answers) == 5
     assert view.answers[0] == "goal 9 9 9: more than 1 m from home, 0 0 1.15"
     assert view.answers[1].startswith("goal 1 2: expected goal X Y Z")
