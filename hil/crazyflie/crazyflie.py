@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from hil.crazyflie import syslink
+from hil.crazyflie import barometer, syslink
 from hil.crazyflie.parts import RADIO_BUSY, SYSLINK_USART, Parts
 from hil.stm32f405.chip import SOFTWARE, WATCHDOG, Chip, Why
 from hil.stm32f405.crash import Crash, CrashReports
@@ -18,6 +18,7 @@ from hil.stm32f405.freertos import FreeRtos
 from hil.stm32f405.gdb import DebuggedChip, GdbServer
 from hil.stm32f405.image import Image
 from hil.stm32f405.processor import ChipProcessor
+from hil.world.body import Carrier
 
 BATTERY_PERIOD_US = 100_000
 LOOK_PERIOD_US = 100_000  # for tasks that do not wait
@@ -64,10 +65,11 @@ class Crazyflie:
         polls: bool,
         debugger: GdbServer | None = None,
         outputs: Sequence[tuple[int, int]] = (),
+        carrier: Carrier | None = None,
     ) -> None:
         self.image = image
         self.chip = chip = Chip(image.code, image.base, library, image.constants)
-        self.parts = Parts(chip, np.frombuffer(outside.eeprom, np.uint8))
+        self.parts = Parts(chip, np.frombuffer(outside.eeprom, np.uint8), carrier)
         self.tasks = FreeRtos.of(image, chip.read)
         run = chip.run if debugger is None else DebuggedChip(chip, debugger, self.tasks).run
         self.processor = ChipProcessor(chip, self.tasks, self._act, run)
@@ -84,6 +86,7 @@ class Crazyflie:
         self._unknown = 0
         self._heard_us = 0  # the last packet of the radio, by the chip's time
         self.processor.every(BATTERY_PERIOD_US, self._report_battery)
+        self.processor.every(barometer.PERIOD_US, lambda now_us: self.parts.measure_pressure())
         self.processor.every(LOOK_PERIOD_US, lambda now_us: self._look_for_hang(HANG_US))
         if polls:
             self.processor.every(POLL_PERIOD_US, self._poll_idle_link)

@@ -1,7 +1,7 @@
 """What a Crazyflie 2.1 has around its STM32F405: BMI088 and BMP388 on I2C3, EEPROM on I2C1, pins.
 
 The sensors are register files, as their data sheets number them; the IMU's counts are put in from outside at every
-data-ready, which is the gyro's interrupt on PC14.
+data-ready, which is the gyro's interrupt on PC14. What the others measure they read off the body.
 """
 
 import struct
@@ -10,41 +10,39 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.crazyflie.barometer import Barometer
 from hil.stm32f405.chip import OTP, Chip
+from hil.world.body import Carrier
+from hil.world.fixed_order import normal
 
 GYRO_ADDRESSES, ACCEL_ADDRESSES, PRESSURE_ADDRESS, EEPROM_ADDRESS = (0x68, 0x69), (0x18, 0x19), 0x77, 0x50
 EEPROM_SIZE = 8192  # [bytes]
 DECK_BUS, SENSOR_BUS = 1, 3
 SYSLINK_USART = 6
-GYRO_ID, ACCEL_ID, PRESSURE_ID = 0x0F, 0x1E, 0x50
+GYRO_ID, ACCEL_ID = 0x0F, 0x1E
 GYRO_RATES, GYRO_SELF_TEST, GYRO_FINE = 0x02, 0x3C, 0x12  # data sheet: rate_ok and bist_rdy
 ACCEL_STATUS, ACCEL_READY, ACCELERATIONS = 0x03, 0x80, 0x12
-PRESSURE_STATUS, PRESSURE_READY, PRESSURE_DATA, PRESSURE_TRIM = 0x03, 0x70, 0x04, 0x31
-PRESSURE_NOW = bytes((0x00, 0x00, 0x70, 0x00, 0x00, 0x80))  # counts of pressure and temperature, 24 bits each
-TRIM = bytes.fromhex("0a6bb848f9ba06e80f1ef9d4619c77f3f610440c00")  # calibration of a specimen, 21 bytes
 DEVICE_TYPE = b"0;CF21\0"
 DATA_READY = ("C", 14)
 RADIO_BUSY = ("A", 4)  # the nRF51 holds it high while it takes no bytes
 
 
 class Parts:
-    """The parts around a chip; `eeprom` (8192,) uint8 may be shared with what keeps it."""
+    """The parts around a chip; without a carrier they rest. `eeprom` (8192,) uint8 may be shared with what keeps it."""
 
-    def __init__(self, chip: Chip, eeprom: NDArray[np.uint8]) -> None:
+    def __init__(self, chip: Chip, eeprom: NDArray[np.uint8], carrier: Carrier | None = None) -> None:
         if eeprom.size != EEPROM_SIZE:
             raise ValueError(f"an EEPROM of {eeprom.size} bytes: it has {EEPROM_SIZE}")
-        self._chip = chip
-        self.gyro, self.accel, self.pressure = (np.zeros(256, np.uint8) for _ in range(3))
+        self._chip, self._carrier = chip, carrier
+        self.gyro, self.accel, pressure = (np.zeros(256, np.uint8) for _ in range(3))
         self.gyro[0], self.gyro[GYRO_SELF_TEST] = GYRO_ID, GYRO_FINE
         self.accel[0], self.accel[ACCEL_STATUS] = ACCEL_ID, ACCEL_READY
-        self.pressure[0], self.pressure[PRESSURE_STATUS] = PRESSURE_ID, PRESSURE_READY
-        _put(self.pressure, PRESSURE_TRIM, TRIM)
-        _put(self.pressure, PRESSURE_DATA, PRESSURE_NOW)
+        self._barometer = Barometer(pressure)
         for address in GYRO_ADDRESSES:
             chip.add_device(SENSOR_BUS, address, self.gyro)
         for address in ACCEL_ADDRESSES:
             chip.add_device(SENSOR_BUS, address, self.accel)
-        chip.add_device(SENSOR_BUS, PRESSURE_ADDRESS, self.pressure)
+        chip.add_device(SENSOR_BUS, PRESSURE_ADDRESS, pressure, pairs=True)
         chip.add_device(DECK_BUS, EEPROM_ADDRESS, eeprom, address_bytes=2)
         chip.set_system(OTP, DEVICE_TYPE)
         for port in "ABCDE":
@@ -57,6 +55,13 @@ class Parts:
         _put(self.accel, ACCELERATIONS, struct.pack("<3h", *counts[3:]))
         self._chip.pin(*DATA_READY, True)
         self._chip.pin(*DATA_READY, False)
+
+    def measure_pressure(self) -> None:
+        """Put the next measurement into the barometer's registers."""
+        if self._carrier is not None:
+            self._barometer.measure(
+                float(self._carrier.motion.p_WB[2]), float(normal(self._carrier.rng, 1)[0])
+            )
 
 
 def _put(registers: NDArray[np.uint8], first: int, contents: bytes) -> None:

@@ -19,6 +19,7 @@ from firmware_py.rtos import TaskReport
 from firmware_py.signals import Signals
 from firmware_py.wire.scalars import Scalar
 from hil.crazyflie.shockburst import syslink_us
+from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
 
 if TYPE_CHECKING:
@@ -232,7 +233,7 @@ class PowerOn:
 
     `serial`: its UART leads somewhere. `polled`: a host polls its radio chip, also when it has nothing to send. `rest` gives
     the IMU's counts while the robot is at rest, before the laboratory's time begins; None for a reboot. `outputs` are
-    timer and channel, counted from 0, of what drives the robot.
+    timer and channel, counted from 0, of what drives the robot. `carrier` is what its other sensors measure.
     """
 
     board: Board
@@ -241,6 +242,7 @@ class PowerOn:
     polled: bool
     rest: Callable[[], ImuCounts] | None
     outputs: Sequence[tuple[int, int]] = OUTPUTS
+    carrier: Carrier | None = None
 
 
 class Executor(Protocol):

@@ -33,6 +33,7 @@ from hil.stm32f405.freertos import HEAP, HEAP_LEAST
 from hil.stm32f405.gdb import GdbServer
 from hil.stm32f405.image import Image
 from hil.stm32f405.processor import ChipProcessor
+from hil.world.body import Carrier
 from hil.world.servos import OUTPUTS
 
 # The stock firmware's self-test and gyro calibration take 3.06 s. The rest lets the app's estimator step at the phase of the
@@ -99,7 +100,7 @@ class ChipImage:
         return 0
 
     def boot(self, start: PowerOn) -> ImageFirmware:
-        return ImageFirmware(self, start.board, start.rest, not start.polled, start.outputs)
+        return ImageFirmware(self, start.board, start.rest, not start.polled, start.outputs, start.carrier)
 
 
 class ImageFirmware:
@@ -120,8 +121,11 @@ class ImageFirmware:
         rest: Callable[[], ImuCounts] | None,
         polls: bool = True,
         outputs: Sequence[tuple[int, int]] = OUTPUTS,
+        carrier: Carrier | None = None,
     ) -> None:
-        self._crazyflie = Crazyflie(flashed.image, flashed.library, board, polls, flashed.debugger, outputs)
+        self._crazyflie = Crazyflie(
+            flashed.image, flashed.library, board, polls, flashed.debugger, outputs, carrier
+        )
         self.image, self.chip, self.parts = flashed.image, self._crazyflie.chip, self._crazyflie.parts
         self.kernel = self.scheduler = self._crazyflie.processor
         self._board = board

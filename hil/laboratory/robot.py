@@ -30,7 +30,7 @@ from hil.devices.uart import VirtualSerial
 from hil.errors import LabError
 from hil.events import EventQueue
 from hil.world.battery import Battery, open_circuit_voltage
-from hil.world.body import Body
+from hil.world.body import Body, Carrier
 
 IMU_PERIOD_US = 1_000
 # Share of the noise in flight before the fans run; the stock firmware requires less than 100 counts squared.
@@ -53,11 +53,12 @@ class Streams:
     radio: np.random.Generator
     serial: np.random.Generator
     markers: np.random.Generator
+    board: np.random.Generator  # of its sensors besides the IMU
 
     @classmethod
     def of_seed(cls, seed: int) -> Streams:
         """Split a seed."""
-        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)))
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(7)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +117,7 @@ class Robot:
         self.air, self.uart = ports.air, ports.uart
         self.executor = site.executor
         self._ports = ports
+        self._carrier = Carrier(self.body, streams.board)
         self._thief: Thief | None = None
         self._seen_by: list[See] = []
         self._resets = 0
@@ -142,8 +144,9 @@ class Robot:
         specimen.set_noise_scale(BENCH_NOISE)
         rest = None if now_us else lambda: specimen.sample(self.body)
         start = PowerOn(
-            self.board, self.config, self.uart is not None, self._ports.polled, rest, self.body.outputs
-        )
+            self.board, self.config, self.uart is not None, self._ports.polled, rest, self.body.outputs,
+            self._carrier,
+        )  # fmt: skip
         self.firmware = self.executor.boot(start)
         self.board.run_on(self.firmware.kernel, self.events)
         if self._thief is not None:

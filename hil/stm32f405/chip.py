@@ -202,11 +202,14 @@ class Chip:
         size = self._library.machine_sent(self.state, usart - 1, self._sent)
         return bytes(self._ffi.buffer(self._sent, size)) if size else b""
 
-    def add_device(self, bus: int, address: int, memory: NDArray[np.uint8], address_bytes: int = 1) -> None:
-        """Put memory behind a 7-bit address on I2C 1..3."""
+    def add_device(
+        self, bus: int, address: int, memory: NDArray[np.uint8], address_bytes: int = 1, pairs: bool = False
+    ) -> None:
+        """Put memory behind a 7-bit address on I2C 1..3; `pairs`: every byte written has its own address before it."""
         self._kept.append(memory)
         place = self._pointer(memory)
-        if not self._library.machine_device(self.state, bus - 1, address, place, memory.size, address_bytes):
+        at = bus - 1, address, place, memory.size, address_bytes, pairs
+        if not self._library.machine_device(self.state, *at):
             raise LabError("more I2C devices than there is room for")
 
     def set_system(self, address: int, contents: bytes) -> None:

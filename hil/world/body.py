@@ -89,6 +89,14 @@ class Motion(Protocol):
         """(3,) [m/s] of the air at the centre of mass."""
 
 
+@dataclass(frozen=True, slots=True)
+class Carrier:
+    """What carries a board, and the random stream of its sensors."""
+
+    motion: Motion
+    rng: np.random.Generator
+
+
 class Body(Motion, Protocol):
     """What flies. It is made at rest at its start, and held there from `hold` to `release`."""
 

@@ -50,6 +50,7 @@ static void device_write(struct device *d, uint8_t byte)
         d->memory[d->pointer % d->size] = byte;
         d->pointer++;
         d->writes++;
+        d->left = d->pairs ? d->address_bytes : 0;
     }
 }
 

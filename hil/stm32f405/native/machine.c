@@ -518,12 +518,13 @@ int machine_watch(struct machine *m, uint32_t kind, uint32_t address, uint32_t s
     return 0;
 }
 
-int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes)
+int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes,
+                   uint32_t pairs)
 {
     if (m->devices == DEVICES)
         return 0;
     m->device[m->devices++] = (struct device){.memory = memory, .size = size, .bus = bus, .address = address,
-                                              .address_bytes = address_bytes};
+                                              .address_bytes = address_bytes, .pairs = pairs};
     return 1;
 }
 

@@ -79,7 +79,7 @@ struct timer {
 struct device { /* an I2C device that is memory: registers, or an EEPROM */
     uint8_t *memory;
     uint32_t size, pointer, address_bytes, left; /* `left`: bytes of the address that are still to come */
-    uint32_t bus, address, writes;
+    uint32_t bus, address, writes, pairs; /* `pairs`: every byte that is written has its own address before it */
     uint8_t burst[256]; /* what a read in progress sees */
 };
 
@@ -184,7 +184,8 @@ struct machine {
 uint64_t machine_size(void);
 int machine_attach(struct machine *m, const struct engine *engine, uint8_t *flash, uint8_t *ram, uint8_t *ccm,
                    const uint32_t *instructions_before, const uint32_t *cycles_before);
-int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes);
+int machine_device(struct machine *m, uint32_t bus, uint32_t address, uint8_t *memory, uint32_t size, uint32_t address_bytes,
+                   uint32_t pairs);
 void machine_reset(struct machine *m, uint32_t vectors, uint32_t cause);
 uint32_t machine_run(struct machine *m, uint64_t until);
 uint32_t machine_step(struct machine *m);

@@ -10,6 +10,7 @@ import pytest
 from firmware_py.wire.supervisor import Cause, State
 from hil.api import Request, column, fly
 from hil.config import load_config
+from hil.crazyflie.log_table import log_table
 from hil.devices.crazyflie_signals import stock_signals
 from hil.errors import LabError
 from hil.experiments.hover import HOVER
@@ -126,7 +127,7 @@ def test_same_seed_has_the_same_hash_and_an_unknown_parameter_one_line(tmp_path:
 
 
 @needs_image
-def test_served_robot_stands_on_the_floor_and_is_told_of_the_profiles_parameters() -> None:
+def test_served_robot_stands_on_the_floor_with_the_profiles_parameters_and_feels_its_height() -> None:
     server = Server(Plan(load_config(PROFILE), executor=image_at(ELF, None)), lambda text: None)
     try:
         served = server.ends.robots[0]
@@ -140,5 +141,15 @@ def test_served_robot_stands_on_the_floor_and_is_told_of_the_profiles_parameters
         assert robot.body.p_WB[2] == pytest.approx(0.0145, abs=1e-3)
         table = robot.firmware.signals.estimate
         assert table[:3] == pytest.approx(robot.body.p_WB, abs=0.02)  # by the poses
+        asl = next(v for v in log_table(robot.firmware.image, robot.firmware.chip) if v.name == "baro.asl")
+        heights = []
+        for second, height in enumerate((0.0, 2.0)):
+            robot.body.put_back((0.0, 0.0, height))
+            end_us = (2 + second) * 1_000_000
+            server.lab.end_at(end_us)
+            server.lab.run()
+            heights.append(asl.read())
+        assert heights[0] == pytest.approx(21.1, abs=0.5)  # [m] of 1013.25 hPa in the driver's atmosphere
+        assert heights[1] - heights[0] == pytest.approx(2.0, abs=0.5)
     finally:
         server.ends.close()

@@ -68,20 +68,21 @@ def test_a_byte_takes_nine_bits_on_the_bus(bench: Bench) -> None:
     assert bench[I2C1 + 0x14] & ADDR
 
 
-def test_what_is_written_to_a_device_is_read_back(bench: Bench) -> None:
+@pytest.mark.parametrize("pairs", [False, True])
+def test_what_is_written_to_a_device_is_read_back(bench: Bench, pairs: bool) -> None:
     memory = np.zeros(256, np.uint8)
-    bench.chip.add_device(1, 0x50, memory)
+    bench.chip.add_device(1, 0x50, memory, pairs=pairs)
     bench[I2C1 + 0x1C] = 35
     bench[I2C1] = START | ENABLED
     bench.until(I2C1 + 0x14, SB)
     bench[I2C1 + 0x10] = 0x50 << 1
     bench.until(I2C1 + 0x14, ADDR)
     bench[I2C1 + 0x18]  # clears ADDR
-    for byte in (0x20, 0xAB, 0xCD):
+    for byte in (0x20, 0xAB, 0x30, 0xCD) if pairs else (0x20, 0xAB, 0xCD):
         bench.until(I2C1 + 0x14, TXE)
         bench[I2C1 + 0x10] = byte
     bench.until(I2C1 + 0x14, BTF)
-    assert memory[0x20:0x22].tolist() == [0xAB, 0xCD]
+    assert memory[[0x20, 0x30 if pairs else 0x21]].tolist() == [0xAB, 0xCD]
     bench[I2C1] = STOP | ENABLED
     bench.wait(10)
     assert bench[I2C1 + 0x18] == 0  # no longer master, bus free
