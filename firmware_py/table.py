@@ -58,6 +58,12 @@ class CoreParameter(CoreVariable):
     persistent: bool = True
     default: float = 0.0  # of own logic, where a profile states none
 
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The lowest and highest allowed value, as a profile states it."""
+        low, high = sorted((self.low * self.scale, self.high * self.scale))
+        return low, high
+
 
 @dataclass(frozen=True, slots=True)
 class ProfileKey:

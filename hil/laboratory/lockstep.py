@@ -63,16 +63,20 @@ class ModelledLine:
         self.station = GroundStation(
             self._link, self.trajectory, self._telemetry, config.station, self.tracker
         )
-        on_ground: Receiver = self.station.on_packet
+        self._hearing: list[Receiver] = [self.station.on_packet]  # what the board sends over the radio
         if self.robot.firmware.flashed is not None and not config.pilot.enabled:
-            on_ground = self._set_up(site, self.robot.firmware.flashed)
-        self.radio.connect(self.robot.packet_received, on_ground, self.robot.polled)
+            self._set_up(site, self.robot.firmware.flashed)
+        self.radio.connect(self.robot.packet_received, self._on_ground, self.robot.polled)
         if uart is not None:
             uart.connect(self.robot.uart_ready, self.station.on_packet)
         self.robot.seen_by(lambda frame, now_us, _: self.station.on_frame(frame, now_us))
 
-    def _set_up(self, site: Site, flashed: Flashed) -> Receiver:
-        """Let the settings of the flight reach the board; returns what takes packets from it."""
+    def _on_ground(self, now_us: int, data: bytes) -> None:
+        for receive in self._hearing:
+            receive(now_us, data)
+
+    def _set_up(self, site: Site, flashed: Flashed) -> None:
+        """Let the settings of the flight reach the board."""
         settings = ImageSettings(
             flashed.parameters,
             flashed.differences,
@@ -82,12 +86,7 @@ class ModelledLine:
             partial(site.say, "lab"),
         )
         site.events.at(0, settings.begin)
-
-        def on_ground(now_us: int, data: bytes) -> None:
-            self.station.on_packet(now_us, data)
-            settings.hear(now_us, data)
-
-        return on_ground
+        self._hearing.append(settings.hear)
 
     def begin(self, release: Callable[[int], None]) -> None:
         """Have the release planned for when the profile has it."""
@@ -158,6 +157,12 @@ class ModelledLine:
     def command(self, now_us: int, packet: bytes) -> None:
         """Send a packet of the operator over the radio."""
         self.radio.uplink(now_us, packet)
+
+    def listen(self, receive: Receiver) -> None:
+        """Let an operator hear what the board sends over the radio, too."""
+        if self.robot.uart is not None:
+            raise LabError("over MAVLink a flight in lockstep has no operator who sets parameters")
+        self._hearing.append(receive)
 
     def look(self, now_us: int) -> list[tuple[str, str]]:
         lines = self.station.notices()

@@ -1,13 +1,24 @@
-"""What is pressed in the panel while a flight in lockstep is watched: time, goal, faults, notes.
+"""What is pressed in the panel while a flight in lockstep is watched: time, goal, faults, parameters, notes.
 
 A line acts at the next row of the log and is an event of the operator's: such a flight cannot be repeated by its request.
 """
 
 from math import isfinite, radians
 
+from firmware_py.table import OF_PROFILE, CoreParameter
+from firmware_py.wire.crtp import PORT_PARAMETERS, Packet, decode
+from firmware_py.wire.parameters import (
+    ENOENT,
+    OK,
+    SetByName,
+    encode_set_by_name,
+    encode_set_by_name_reply,
+)
+from ground_station.controls import ControlsError, Dialogue, Exchange, Script
 from ground_station.operator import REACH
 from ground_station.trajectory import Goal, Hold
-from hil.errors import LabError
+from hil.devices.image_settings import board_values
+from hil.errors import LabError, hint
 from hil.laboratory.faults import parse
 from hil.laboratory.flight import RECORD_PERIOD_US, RECORD_PHASE_US, Flight
 from hil.laboratory.recorder import OPERATOR
@@ -25,6 +36,10 @@ class Hand:
         first_us = (flight.now_us // RECORD_PERIOD_US + 1) * RECORD_PERIOD_US + RECORD_PHASE_US
         flight.events.every(RECORD_PERIOD_US, first_us, self._look)
         self._until_us: int | None = None  # of a step
+        self._dialogue: Dialogue[Packet] = Dialogue()  # with the board, about a parameter
+        self._asked = ""  # the line of it
+        self._listens = False
+        view.know([*board_values(flight.config).items()])
 
     def _look(self, now_us: int) -> None:
         """Do what was pressed, and stand still while the flight is paused."""
@@ -32,6 +47,12 @@ class Hand:
             self._paused, self._until_us = True, None
         for line in self._view.lines():
             self._take(line, now_us)
+        if (answer := self._dialogue.answer(now_us)) is not None:
+            self._view.know(answer.values)
+            if answer.error:
+                self._view.answer(now_us, f"{self._asked}: {answer.error}")
+            else:
+                self._flight.note(OPERATOR, self._asked)
         if self._paused:
             self._flight.lab.clock.pause(lambda: self._stand(now_us))
 
@@ -49,6 +70,9 @@ class Hand:
         if word == "stop":
             raise KeyboardInterrupt
         try:
+            if word == "set":
+                self._set(line, rest.strip(), now_us)
+                return  # it is noted when the board has it
             self._do(word, rest.strip(), now_us)
         except LabError as error:
             self._view.answer(now_us, str(error))
@@ -82,6 +106,43 @@ class Hand:
                 self._flight.switchboard.end(fault, now_us)
         elif word != "mark":
             self._flight.switchboard.act(parse(f"{word} {rest}".strip(), live=True), now_us)
+
+    def _set(self, line: str, rest: str, now_us: int) -> None:
+        """Begin to set a parameter; `_look` takes the answer."""
+        name, _, text = rest.partition(" ")
+        (value,) = _numbers(text, (1,), "set NAME VALUE")
+        one = OF_PROFILE.get(name)
+        if one is None:
+            raise LabError(f"set {name}: no such parameter; {hint(name, OF_PROFILE)}")
+        low, high = one.bounds
+        wanted = value / one.scale
+        if not (low <= value <= high and (one.scalar.is_float or one.scalar.cast(wanted) == wanted)):
+            whole = "" if one.scalar.is_float else ", whole numbers"
+            raise LabError(f"{line}: expected {low:g}..{high:g}{whole}")
+        if self._dialogue.busy:
+            raise LabError(f"{line}: the board has not answered {self._asked!r} yet")
+        if not self._listens:
+            self._flight.line.listen(self._hear)
+            self._listens = True
+        self._asked = line
+        self._dialogue.begin(now_us, self._written(one, wanted))
+
+    def _hear(self, now_us: int, data: bytes) -> None:
+        if self._dialogue.busy:
+            self._dialogue.hear(now_us, decode(data))
+
+    def _written(self, one: CoreParameter, value: float) -> Script[Packet]:
+        """Set it by its name, which every board with CRTP understands, and return the value."""
+        request = encode_set_by_name(SetByName(one.name, one.scalar, value))
+        begin = encode_set_by_name_reply(one.name, OK)[:-1]
+
+        def status(got: Packet) -> int | None:
+            return got.data[-1] if got.port == PORT_PARAMETERS and got.data[:-1] == begin else None
+
+        code = yield Exchange(lambda now_us: self._flight.line.command(now_us, request), status)
+        if code != OK:
+            raise ControlsError(f"the board has no {one.name}" if code == ENOENT else "the board refuses it")
+        return ((one.name, value),)
 
 
 def _numbers(text: str, counts: tuple[int, ...], usage: str) -> list[float]:

@@ -37,7 +37,7 @@ from hil.pictures.video import GOAL_COLUMNS, Scene
 PORT = 9095
 PAGE = Path(__file__).with_name("panel.html")
 COMMANDS: Mapping[str, tuple[str, ...]] = {  # of each program
-    "fly": ("goal", "fault", "clear", "mark", "pause", "step", "go", "stop"),
+    "fly": ("goal", "set", "fault", "clear", "mark", "pause", "step", "go", "stop"),
     "serve": ("fault", "clear", "restart"),
     "station": ("goal", "set", "mark", "arm", "save", "reset", "stop"),
 }
@@ -240,8 +240,10 @@ def _content(program: str) -> str:
         for name, kind in KINDS.items()
     ]  # fmt: skip
     parameters = [
-        {"name": key, "unit": one.unit, "low": one.low, "high": one.high} for key, one in OF_PROFILE.items()
-    ]
+        {"name": key, "unit": one.unit if abs(one.scale) == 1 else "", "low": one.bounds[0], "high": one.bounds[1],
+         "board": one.name, "scale": one.scale}
+        for key, one in OF_PROFILE.items()
+    ]  # fmt: skip
     content = {
         "program": program, "commands": COMMANDS[program],
         "faults": faults if "fault" in COMMANDS[program] else [],

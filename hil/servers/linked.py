@@ -141,6 +141,9 @@ class StationProcess:
     def command(self, now_us: int, packet: bytes) -> None:
         self.robot.packet_received(now_us, packet)
 
+    def listen(self, receive: Callable[[int, bytes], object]) -> None:
+        raise LabError("the ground station is a program of its own: set parameters there")
+
     def look(self, now_us: int) -> list[tuple[str, str]]:
         """Raise `LabError` when the station has ended, or nothing flies for too long; return what it said."""
         if now_us < WARM_UP_US:

@@ -32,6 +32,17 @@ def fill(tab: Tab, field: str, value: str) -> None:
     tab.value(f"{setting}.dispatchEvent(new Event('change'))")
 
 
+def drag(tab: Tab) -> None:
+    """Move the goal in the view from above by touch."""
+    left, top, size = tab.value(
+        "(() => { const view = document.getElementById('above'); view.scrollIntoView(); "
+        "const box = view.getBoundingClientRect(); return [box.left, box.top, box.width]; })()"
+    )
+    for kind, share in (("touchStart", 0.5), ("touchMove", 0.49), ("touchMove", 0.475), ("touchEnd", None)):
+        points = [] if share is None else [{"x": left + share * size, "y": top + share * size}]
+        tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
+
 def says(tab: Tab, text: str) -> float:
     """How long it takes until the page shows a text [s]."""
     began = time.monotonic()
@@ -47,6 +58,20 @@ def test_the_panel_of_a_flight_steers_disturbs_pauses_and_stops_it(tmp_path: Pat
         assert tab.value("document.documentElement.scrollWidth") <= 390
         tab.press("ArrowUp")
         says(tab, "operator: goal 0.020 0.000 1.150 0.000")
+        fill(tab, "parameter", "controller.gain_y")
+        assert "now -1.8" in tab.value("document.getElementById('bounds').textContent")
+        fill(tab, "value", "1e9")
+        click(tab, "#set")
+        says(tab, "panel: controller.gain_y 1e9: expected -20..20")
+        fill(tab, "value", "-1.7")
+        click(tab, "#set")
+        says(tab, "operator: set controller.gain_y -1.7")
+        assert tab.until("document.getElementById('bounds').textContent.includes('now -1.7')")
+        drag(tab)
+        says(tab, "operator: goal 0.050 0.030 1.150 0.000")
+        tab.value("navigator.getGamepads = () => [{ axes: [0, -1, 0, 0] }]")
+        tab.until(f"/operator: goal 0.0[6-9]/.test({TEXTS})")
+        tab.value("navigator.getGamepads = () => []")
         fill(tab, "fault", "push.y")
         fill(tab, "size", "99")
         click(tab, "#inject")
@@ -76,7 +101,8 @@ def test_the_panel_of_a_flight_steers_disturbs_pauses_and_stops_it(tmp_path: Pat
         click(tab, "#stop")
         assert flight.process.wait(timeout=60) == 130
     texts = [event["text"] for event in load_events(folder) if event["source"] == "operator"]
-    assert texts[:3] == ["goal 0.020 0.000 1.150 0.000", "push.y=0.5", "mark one"]
+    assert texts[:2] == ["goal 0.020 0.000 1.150 0.000", "set controller.gain_y -1.7"]
+    assert texts[texts.index("push.y=0.5") + 1] == "mark one"
     assert "interrupted by the user" in [event["text"] for event in load_events(folder)]
 
 

@@ -1,5 +1,6 @@
 """What is pressed in the panel at a flight in lockstep acts and is an event; a panel that is only open changes nothing."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ class Script:
     def __init__(self, at: dict[int, list[str]], paused: tuple[str, ...] = ()) -> None:
         self._at, self._paused, self._looks = at, list(paused), 0
         self.answers: list[str] = []
+        self.known: dict[str, float] = {}
         self.shown = 0
 
     def lines(self) -> list[str]:
@@ -41,6 +43,9 @@ class Script:
 
     def rows(self, batch: pa.RecordBatch) -> None:
         self.shown += batch.num_rows
+
+    def know(self, values: Sequence[tuple[str, float]]) -> None:
+        self.known |= dict(values)
 
     def note(self, t_us: int, source: str, text: str) -> None:
         pass
@@ -94,6 +99,29 @@ def test_goal_fault_and_note_act_and_are_events(tmp_path: Path) -> None:
     assert view.answers[1].startswith("goal 1 2: expected goal X Y Z")
     assert "99: " in view.answers[2]
     assert view.answers[4] == "step 5: expected 10..60000 ms"
+
+
+def test_a_parameter_is_set_over_the_radio_and_noted_when_the_board_has_it(tmp_path: Path) -> None:
+    view = Script({
+        120: ["set controller.gain_y -1.5", "set controller.gain_x -1.5"],
+        140: ["set controller.gain_y 1e9", "set controller.gian_y 1", "set controller.gain_y", "set predictor.horizon 1.5"],
+        160: ["set supervisor.pose_timeout_us 300000"],
+    })  # fmt: skip
+    flown(tmp_path / "run", view)
+    events = [event for event in load_events(tmp_path / "run") if event["source"] == "operator"]
+    assert [event["text"] for event in events] == [
+        "set controller.gain_y -1.5", "set supervisor.pose_timeout_us 300000",
+    ]  # fmt: skip
+    assert 1_200_000 < events[0]["t_us"] < 1_300_000
+    assert view.known["extCtrl.y_P"] == 1.5, "the board's gain has the other sign"
+    assert view.known["supervisor.poseTimeout"] == 300
+    assert view.answers == [
+        "set controller.gain_x -1.5: the board has not answered 'set controller.gain_y -1.5' yet",
+        "set controller.gain_y 1e9: expected -20..20",
+        "set controller.gian_y: no such parameter; did you mean controller.gain_y?",
+        "set : expected set NAME VALUE",
+        "set predictor.horizon 1.5: expected 1..12, whole numbers",
+    ]
 
 
 def test_a_paused_flight_goes_on_step_by_step_and_ends_as_if_it_had_never_stood(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def test_a_program_s_panel_has_its_commands(program: str) -> None:
     content = json.loads(page.split('id="content">')[1].split("</script>")[0])
     assert content["commands"] == list(COMMANDS[program])
     assert bool(content["faults"]) == (program != "station")
-    assert bool(content["parameters"]) == (program == "station")
+    assert bool(content["parameters"]) == (program != "serve")
     assert "uPlot=function" in page
 
 
