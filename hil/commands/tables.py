@@ -89,7 +89,8 @@ def print_result(result: Result) -> None:
         console.print(budget_line(result.ages), soft_wrap=True)
     if result.usage is not None:
         for name, load in result.usage.entries.items():
-            console.print(f"  {result.request.bench.board} {name:9} {load}", soft_wrap=True)
+            if load.calls:
+                console.print(f"  {result.request.bench.board} {name:11} {load}", soft_wrap=True)
     for name in ("report.html", "flight.rrd", "flight.perfetto-trace", "log.parquet"):
         if (result.folder / name).is_file():
             hint = f"   (floaty view {result.folder})" if name == "flight.rrd" else ""

@@ -23,6 +23,7 @@ from hil.errors import LabError
 from hil.experiments import EXPERIMENTS, find_experiment
 from hil.experiments.hover import HOVER
 from hil.laboratory.experiment import Experiment
+from hil.laboratory.fault_kinds import KINDS
 from hil.laboratory.faults import Fault, parse
 from hil.laboratory.flight import Flight
 from hil.laboratory.lockstep import lockstep_flight
@@ -118,8 +119,9 @@ def plan(
 ) -> list[Request]:
     """Return the flights to check: one experiment, every one, or by default hover and yaw step.
 
-    All but the first have with them a hover with faults, and those that take the supervisor through its states. What
-    only own logic can cause needs targets that are built for it (`own_logic`), and a profile that has none itself.
+    All but the first have with them a hover with the faults that act on the robot, and those that take the supervisor
+    through its states. What only own logic can cause needs targets that are built for it (`own_logic`), and a profile
+    that has none itself.
     """
     duration_s, faults = options.get("duration_s"), options.get("faults", ())
     if every and experiment is not None:
@@ -137,8 +139,10 @@ def plan(
         flights = [request(one, duration_s or min(one.duration_s, LONGEST_S)) for one in EXPERIMENTS.values()]
     else:
         flights = [request(find_experiment(name), duration_s) for name in DEFAULT]
-    length_s = duration_s or FAULTY_S
-    faulty = [fault for fault in map(parse, FAULTS) if fault.start_s < length_s]
+    length_s, body = duration_s or FAULTY_S, flights[0].config.robot.body
+    faulty = [
+        fault for fault in map(parse, FAULTS) if fault.start_s < length_s and KINDS[fault.kind].acts_on(body)
+    ]
     flights += request(HOVER, length_s, faulty), request(DRILL, None)
     if own_logic and flights[0].config.logic == LogicConfig():
         flights.append(request(FAILURE, None))

@@ -82,6 +82,10 @@ class Kind:
         """The requirements on the flight, as options of `floaty fly`; empty: none."""
         return f"--link {self.link}" if self.link else f"--set {MARKERS_ON}" if self.markers else ""
 
+    def acts_on(self, body: str) -> bool:
+        """Whether a robot with this body has the part that fails."""
+        return self.body in ("", body)
+
 
 def add(value: float, size: float) -> float:
     """Add up."""

@@ -108,9 +108,11 @@ def check(faults: Iterable[Fault], duration_s: float, link: str, config: LabConf
         needed = KINDS[fault.kind].link
         if needed and (needed == "mavlink") != link.startswith("mavlink"):
             raise LabError(f"fault {fault}: acts with --link {needed} only; this flight has --link {link}")
-        if (body := KINDS[fault.kind].body) not in ("", config.robot.body):
+        if not KINDS[fault.kind].acts_on(config.robot.body):
             flown = Path(config.robot.body).name
-            raise LabError(f"fault {fault}: acts on a part of {body} only; this flight is one of {flown}")
+            raise LabError(
+                f"fault {fault}: acts on a part of {KINDS[fault.kind].body} only; this flight is one of {flown}"
+            )
         if KINDS[fault.kind].markers and not config.markers.enabled:
             raise LabError(f"fault {fault}: needs --set {MARKERS_ON}")
 
@@ -219,7 +221,7 @@ def why_not(kind: Kind, robot: Robot) -> str:
         return "acts on a serial line; this robot has none"
     if kind.link == "radio" and robot.air is None:
         return "acts on a radio; this robot flies without"
-    if kind.body not in ("", robot.config.robot.body):
+    if not kind.acts_on(robot.config.robot.body):
         return f"acts on a part of {kind.body}; this robot is another"
     if kind.markers and robot.mocap.markers is None:
         return f"needs --set {MARKERS_ON}"

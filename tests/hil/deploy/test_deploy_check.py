@@ -122,6 +122,11 @@ def test_default_flights_are_ten_thousand_ticks_with_every_fault_in_time() -> No
     assert sum(one.duration_s + one.config.flight.release_us * 1e-6 for one in flights) >= 100.0
 
 
+def test_another_robot_flies_with_the_faults_that_act_on_it() -> None:
+    floaty, other = plan(None, False), plan(None, False, overrides=("robot.body=robot.py",))
+    assert set(floaty[2].faults) - set(other[2].faults) == {"servo.slow.2@42:4=0.5"}
+
+
 @pytest.mark.long
 def test_the_check_reaches_every_state_and_cause_of_the_core_and_every_entry_point() -> None:
     called: set[str] = set()
